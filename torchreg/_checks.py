@@ -1,0 +1,90 @@
+"""Argument checks; every message names the argument, what was expected, what came and what to do."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchreg.errors import InputError, InputTypeError
+
+
+def as_float_tensor(value: Any, name: str, *, like: Tensor | None = None) -> Tensor:
+    """Return ``value`` as a floating-point tensor, on the dtype and device of ``like`` when it is given.
+
+    Raises:
+        InputTypeError: if ``value`` cannot become a tensor of real numbers.
+    """
+    if not isinstance(value, Tensor):
+        try:
+            value = torch.as_tensor(value)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise InputTypeError(
+                f"{name} must be a tensor or an array of numbers, got {type(value).__name__}"
+            ) from error
+    if value.is_complex() or value.dtype == torch.bool:
+        raise InputTypeError(f"{name} must hold real numbers, got dtype {value.dtype}")
+    if like is not None:
+        return value.to(dtype=like.dtype, device=like.device)
+    return value if value.is_floating_point() else value.to(torch.get_default_dtype())
+
+
+def check_shape(value: Tensor, name: str, expected: Sequence[int | None | str], *, batch: bool = False) -> None:
+    """Raise InputError unless the trailing sizes of ``value`` are ``expected`` (None or a str: any size).
+
+    Args:
+        value: the tensor to look at.
+        name: the argument's name, for the message.
+        expected: trailing sizes; a str names a free size in the message.
+        batch: allow leading batch dimensions.
+    """
+    got = tuple(value.shape)
+    trailing = got[len(got) - len(expected) :] if len(got) >= len(expected) else ()
+    fits = len(trailing) == len(expected) and (batch or len(got) == len(expected))
+    if not fits or any(isinstance(want, int) and want != have for want, have in zip(expected, trailing, strict=True)):
+        sizes = ", ".join("*" if want is None else str(want) for want in expected)
+        lead = "..., " if batch else ""
+        raise InputError(f"{name} must have shape ({lead}{sizes}), got {got}")
+
+
+def check_finite(value: Tensor, name: str, hint: str = "") -> None:
+    """Raise InputError if ``value`` holds NaN or infinity, saying how many."""
+    bad = int((~torch.isfinite(value)).sum())
+    if bad:
+        raise InputError(
+            f"{name} must be finite, got {bad} non-finite of {value.numel()} numbers{'; ' + hint if hint else ''}"
+        )
+
+
+def check_points(value: Tensor, name: str, *, min_count: int = 1, batch: bool = True) -> None:
+    """Raise InputError unless ``value`` is a finite ``(..., N, 3)`` tensor with at least ``min_count`` points."""
+    check_shape(value, name, ("N", 3), batch=batch)
+    if value.shape[-2] < min_count:
+        raise InputError(f"{name} must hold at least {min_count} point(s), got {value.shape[-2]}")
+    check_finite(value, name)
+
+
+def check_positive(value: float, name: str, *, allow_zero: bool = False) -> None:
+    """Raise InputError unless the number ``value`` is finite and positive (or zero, when allowed)."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputTypeError(f"{name} must be a number, got {type(value).__name__}")
+    if not math.isfinite(value) or value < 0 or (value == 0 and not allow_zero):
+        raise InputError(f"{name} must be {'zero or ' if allow_zero else ''}positive and finite, got {value}")
+
+
+def check_choice(value: str, name: str, choices: Sequence[str]) -> None:
+    """Raise InputError unless ``value`` is one of ``choices``."""
+    if value not in choices:
+        raise InputError(f"{name} must be one of {', '.join(choices)}; got {value!r}")
+
+
+def check_same_kind(value: Tensor, name: str, other: Tensor, other_name: str) -> None:
+    """Raise InputTypeError unless the two tensors share dtype and device."""
+    if value.dtype != other.dtype or value.device != other.device:
+        raise InputTypeError(
+            f"{name} is {value.dtype} on {value.device} but {other_name} is {other.dtype} on {other.device}; "
+            f"convert one with .to()"
+        )

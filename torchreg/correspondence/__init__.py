@@ -1,0 +1,1 @@
+"""Who matches whom, and how much."""

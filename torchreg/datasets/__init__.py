@@ -1,0 +1,1 @@
+"""Made-up but physically sensible data."""

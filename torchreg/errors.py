@@ -1,0 +1,37 @@
+"""Exceptions and warnings of torchreg; each also derives from the builtin that callers already catch."""
+
+
+class TorchregError(Exception):
+    """Base class of every error that torchreg raises on purpose."""
+
+
+class InputError(TorchregError, ValueError):
+    """An argument has the wrong shape, size or value; the message names the argument."""
+
+
+class InputTypeError(TorchregError, TypeError):
+    """An argument has the wrong type or dtype; the message names the argument."""
+
+
+class FormatError(TorchregError, ValueError):
+    """A file is damaged, oversized or not what it says it is; the message names the file."""
+
+
+class ModelError(TorchregError, ValueError):
+    """A kinematic tree, rig or robot description is cyclic, disconnected, non-finite or otherwise unusable."""
+
+
+class SolverError(TorchregError, RuntimeError):
+    """A numerical method could not produce an answer within its bounded repairs."""
+
+
+class MissingExtraError(TorchregError, ImportError):
+    """An optional dependency is not installed; the message names the extra that brings it."""
+
+
+class TorchregWarning(UserWarning):
+    """Base class of torchreg's warnings."""
+
+
+class UnitsWarning(TorchregWarning):
+    """The sizes of data and model differ so much that the units probably do too."""

@@ -1,0 +1,1 @@
+"""Pure functions on tensors and frozen dataclasses; no nn.Module, no files."""

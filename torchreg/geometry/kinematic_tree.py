@@ -1,0 +1,94 @@
+"""The kinematic tree as plain data: what files deliver and what models are built from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg.errors import ModelError
+
+JOINT_TYPES = ("fixed", "revolute", "prismatic")
+
+
+@dataclass(frozen=True)
+class Joint:
+    """One frame of the tree and the joint that carries it on its parent.
+
+    A frame moves with its joint: ``T_parent_frame = offset @ motion(value)``, the motion about or along ``axis`` in the
+    frame's own coordinates. Joints with several degrees of freedom are stacked frames, which coincide.
+
+    Args:
+        name: name of the frame and of its degree of freedom.
+        parent: index of the parent frame in the tree, -1 for the root.
+        offset: (4, 4) float64 rigid transform ``T_parent_frame`` at value zero.
+        kind: one of ``JOINT_TYPES``.
+        axis: unit vector in frame coordinates (ignored for fixed joints).
+        lower: lower limit, radians or metres.
+        upper: upper limit, radians or metres.
+        mimic: (index of the followed frame, multiplier, offset), or None.
+    """
+
+    name: str
+    parent: int
+    offset: Tensor
+    kind: str = "fixed"
+    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    lower: float = -float("inf")
+    upper: float = float("inf")
+    mimic: tuple[int, float, float] | None = None
+
+
+@dataclass(frozen=True)
+class KinematicTree:
+    """A validated tree of frames in topological order (every parent before its children, one root).
+
+    Raises:
+        ModelError: if the tree is empty, cyclic, disconnected, non-finite, has doubled names or impossible limits.
+    """
+
+    joints: tuple[Joint, ...]
+
+    def __post_init__(self) -> None:
+        if not self.joints:
+            raise ModelError("the kinematic tree is empty: it needs at least one frame")
+        names = [joint.name for joint in self.joints]
+        doubled = sorted({name for name in names if names.count(name) > 1})
+        if doubled:
+            raise ModelError(f"frame names must be unique, these occur more than once: {', '.join(doubled[:5])}")
+        for index, joint in enumerate(self.joints):
+            _check_joint(index, joint, len(self.joints))
+
+    def __len__(self) -> int:
+        return len(self.joints)
+
+    def index(self, name: str) -> int:
+        """Return the index of the frame called ``name``; KeyError lists the known names."""
+        for index, joint in enumerate(self.joints):
+            if joint.name == name:
+                return index
+        raise KeyError(f"no frame is called {name!r}; known: {', '.join(joint.name for joint in self.joints)}")
+
+
+def _check_joint(index: int, joint: Joint, count: int) -> None:
+    if (index == 0) != (joint.parent == -1):
+        problem = "is a second root: the tree is disconnected" if joint.parent == -1 else "must be the root (parent -1)"
+        raise ModelError(f"frame {joint.name!r} {problem}")
+    if joint.parent >= index:
+        raise ModelError(
+            f"frame {joint.name!r} (index {index}) has parent index {joint.parent} of {count}: parents must come first, "
+            f"so the tree is cyclic or out of order"
+        )
+    if joint.kind not in JOINT_TYPES:
+        raise ModelError(f"joint {joint.name!r} has kind {joint.kind!r}; known: {', '.join(JOINT_TYPES)}")
+    if tuple(joint.offset.shape) != (4, 4) or not bool(torch.isfinite(joint.offset).all()):
+        raise ModelError(f"joint {joint.name!r} needs a finite (4, 4) offset")
+    rotation = joint.offset[:3, :3].double()
+    if not torch.allclose(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64), atol=1e-4) or rotation.det() < 0:
+        raise ModelError(f"joint {joint.name!r} has an offset that is not a rigid motion (scale, shear or mirror)")
+    length = sum(a * a for a in joint.axis) ** 0.5
+    if joint.kind != "fixed" and not abs(length - 1) < 1e-6:
+        raise ModelError(f"joint {joint.name!r} has axis {joint.axis} of length {length}; a unit vector is needed")
+    if not joint.lower <= joint.upper:
+        raise ModelError(f"joint {joint.name!r} has limits {joint.lower} to {joint.upper}; lower must not exceed upper")

@@ -1,0 +1,1 @@
+"""nn.Modules over (prediction, target); never hold a model."""

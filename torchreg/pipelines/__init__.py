@@ -1,0 +1,1 @@
+"""The loops: one file, one task, one public function."""

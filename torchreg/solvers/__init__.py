@@ -1,0 +1,1 @@
+"""Generic numerics that know nothing of hands or scans."""

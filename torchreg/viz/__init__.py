@@ -1,0 +1,1 @@
+"""Figures and conversions to other libraries, imported lazily."""
