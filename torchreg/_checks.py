@@ -32,7 +32,7 @@ def as_float_tensor(value: Any, name: str, *, like: Tensor | None = None) -> Ten
     return value if value.is_floating_point() else value.to(torch.get_default_dtype())
 
 
-def check_shape(value: Tensor, name: str, expected: Sequence[int | None | str], *, batch: bool = False) -> None:
+def check_shape(value: Tensor, name: str, expected: Sequence[int | str | None], *, batch: bool = False) -> None:
     """Raise InputError unless the trailing sizes of ``value`` are ``expected`` (None or a str: any size).
 
     Args:

@@ -77,8 +77,8 @@ def _check_joint(index: int, joint: Joint, count: int) -> None:
         raise ModelError(f"frame {joint.name!r} {problem}")
     if joint.parent >= index:
         raise ModelError(
-            f"frame {joint.name!r} (index {index}) has parent index {joint.parent} of {count}: parents must come first, "
-            f"so the tree is cyclic or out of order"
+            f"frame {joint.name!r} (index {index}) has parent index {joint.parent} of {count}: parents come "
+            f"first, so the tree is cyclic or out of order"
         )
     if joint.kind not in JOINT_TYPES:
         raise ModelError(f"joint {joint.name!r} has kind {joint.kind!r}; known: {', '.join(JOINT_TYPES)}")
