@@ -1,0 +1,294 @@
+"""Triangle meshes as plain data, with the few operations that everything above them shares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import as_float_tensor, check_choice, check_finite, check_same_kind, check_shape
+from torchreg.errors import InputError, InputTypeError
+
+MAX_SUBDIVISIONS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """A validated triangle mesh; vertices that no face uses are allowed.
+
+    Args:
+        vertices: (V, 3) finite coordinates, float32 or float64.
+        faces: (F, 3) vertex indices, stored as int64 on the device of the vertices; F may be zero.
+
+    Raises:
+        InputError: if a shape is wrong, a coordinate is not finite or an index is outside ``0 .. V - 1``.
+        InputTypeError: if the vertices are not real numbers or the faces not integers.
+    """
+
+    vertices: Tensor
+    faces: Tensor
+
+    def __post_init__(self) -> None:
+        vertices = as_float_tensor(self.vertices, "vertices")
+        check_shape(vertices, "vertices", ("V", 3))
+        check_finite(vertices, "vertices", "drop the faces that use them")
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", _check_faces(self.faces, vertices))
+
+    @property
+    def num_vertices(self) -> int:
+        """Number of vertices."""
+        return self.vertices.shape[0]
+
+    @property
+    def num_faces(self) -> int:
+        """Number of triangles."""
+        return self.faces.shape[0]
+
+    def to(self, *args: Any, **kwargs: Any) -> TriangleMesh:
+        """Return the mesh on another device or in another dtype; takes what ``Tensor.to`` takes."""
+        vertices = self.vertices.to(*args, **kwargs)
+        return TriangleMesh(vertices, self.faces.to(vertices.device))
+
+    def face_areas(self) -> Tensor:
+        """Return the (F,) areas of the triangles, in squared units of the vertices.
+
+        Differentiable: in the vertices; the gradient of a degenerate face is zero.
+        """
+        first, second = self._edges()
+        return 0.5 * torch.linalg.vector_norm(torch.linalg.cross(first, second, dim=-1), dim=-1)
+
+    def face_normals(self) -> Tensor:
+        """Return the (F, 3) unit normals, right-handed along the vertex order; zero for faces flat to rounding.
+
+        Differentiable: in the vertices; the gradient of a degenerate face is zero.
+        """
+        first, second = self._edges()
+        return _unit_cross(first, second)[0]
+
+    def vertex_normals(self, weighting: str = "angle") -> Tensor:
+        """Return the (V, 3) unit normals at the vertices, averaged over the adjoining faces.
+
+        Args:
+            weighting: ``"angle"`` weighs each face with its angle at the vertex, which does not depend on how the
+                surface was cut into triangles; ``"area"`` weighs it with its area, which is cheaper.
+
+        Returns:
+            Unit vectors; zero at vertices without a face (of nonzero area), or where the normals cancel.
+
+        Raises:
+            InputError: if ``weighting`` is neither.
+
+        Differentiable: in the vertices.
+
+        References: Thuermer and Wuethrich, "Computing vertex normals from polygonal facets", 1998 (angle weights).
+        """
+        check_choice(weighting, "weighting", ("angle", "area"))
+        first, second = self._edges()
+        normals, flat = _unit_cross(first, second)
+        if weighting == "area":
+            corners = (normals * self.face_areas()[:, None])[:, None].expand(-1, 3, -1)
+        else:
+            corners = normals[:, None] * _corner_angles(first, second, flat)[..., None]
+        total = torch.zeros_like(self.vertices).index_add(0, self.faces.reshape(-1), corners.reshape(-1, 3))
+        return _unit(total)[0]
+
+    def bounds(self) -> Tensor:
+        """Return the (2, 3) smallest and largest coordinates of the vertices; InputError if there are none."""
+        if self.num_vertices == 0:
+            raise InputError("vertices must hold at least 1 point for bounds(), got 0")
+        return torch.stack((self.vertices.amin(dim=0), self.vertices.amax(dim=0)))
+
+    def _edges(self) -> tuple[Tensor, Tensor]:
+        corners = self.vertices[self.faces]
+        return corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+
+
+def _check_faces(faces: Any, vertices: Tensor) -> Tensor:
+    if not isinstance(faces, Tensor):
+        try:
+            faces = torch.as_tensor(faces)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise InputTypeError(f"faces must be an (F, 3) array of integers, got {type(faces).__name__}") from error
+        if faces.numel() == 0:
+            faces = faces.reshape(0, 3).long()
+    if faces.is_floating_point() or faces.is_complex() or faces.dtype == torch.bool:
+        raise InputTypeError(f"faces must hold integers, got dtype {faces.dtype}; convert with .long()")
+    check_shape(faces, "faces", ("F", 3))
+    faces = faces.to(device=vertices.device, dtype=torch.int64)
+    if faces.numel():
+        low, high = int(faces.min()), int(faces.max())
+        if low < 0 or high >= vertices.shape[0]:
+            raise InputError(
+                f"faces must index the {vertices.shape[0]} vertices (0 to {vertices.shape[0] - 1}), got indices from "
+                f"{low} to {high}"
+            )
+    return faces
+
+
+def _unit(vectors: Tensor) -> tuple[Tensor, Tensor]:
+    """Return unit vectors and the (...,) mask of those that have none and are zero instead, also to the gradient."""
+    # Scaled by the largest component first: squares of tiny lengths underflow in float32.
+    scale = vectors.detach().abs().amax(dim=-1, keepdim=True)
+    empty = scale <= torch.finfo(vectors.dtype).tiny
+    scaled = torch.where(empty, torch.ones_like(vectors), vectors / torch.where(empty, torch.ones_like(scale), scale))
+    unit = scaled / torch.linalg.vector_norm(scaled, dim=-1, keepdim=True)
+    return torch.where(empty, torch.zeros_like(unit), unit), empty[..., 0]
+
+
+def _unit_cross(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """Return unit vectors along first x second, zero where the two are parallel to rounding, and the mask of those."""
+    first, first_empty = _unit(first)
+    second, second_empty = _unit(second)
+    cross = torch.linalg.cross(first, second, dim=-1)
+    sine = torch.linalg.vector_norm(cross.detach(), dim=-1)
+    flat = first_empty | second_empty | (sine <= 8 * torch.finfo(first.dtype).eps)
+    unit, _ = _unit(torch.where(flat[..., None], torch.zeros_like(cross), cross))
+    return unit, flat
+
+
+def _corner_angles(first: Tensor, second: Tensor, flat: Tensor) -> Tensor:
+    """Return the (F, 3) inner angles in radians; zero for flat faces."""
+    # Stand-in edges for flat faces keep 0/0 out of the backward pass.
+    stand_in = torch.eye(3, dtype=first.dtype, device=first.device)
+    first = torch.where(flat[:, None], stand_in[0], first)
+    second = torch.where(flat[:, None], stand_in[1], second)
+    sides = torch.stack((first, second - first, -second), dim=1)
+    outgoing = _unit(sides)[0]
+    incoming = -outgoing.roll(1, dims=1)
+    sine = torch.linalg.vector_norm(torch.linalg.cross(outgoing, incoming, dim=-1), dim=-1)
+    angles = torch.atan2(sine, (outgoing * incoming).sum(dim=-1))
+    return torch.where(flat[:, None], torch.zeros_like(angles), angles)
+
+
+def sample_surface(
+    mesh: TriangleMesh, count: int, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return ``count`` points drawn independently and uniformly by area from the surface.
+
+    Args:
+        mesh: the surface; at least one face with an area.
+        count: number of points.
+        generator: source of randomness; None draws from a fresh generator with seed 0, the same points at every call.
+
+    Returns:
+        points (count, 3), face_index (count,) int64, barycentric (count, 3) weights of the face's three vertices.
+
+    Raises:
+        InputError: if ``count`` is negative or the surface has no area.
+
+    Differentiable: in the vertices, with the drawn faces and weights held fixed.
+    """
+    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+        raise InputError(f"count must be a non-negative integer, got {count!r}")
+    device, dtype = mesh.vertices.device, mesh.vertices.dtype
+    # Cumulative areas in double precision: float32 sums stop growing on large meshes.
+    reach = TriangleMesh(mesh.vertices.detach().double(), mesh.faces).face_areas().cumsum(dim=0)
+    if mesh.num_faces == 0 or not float(reach[-1]) > 0:
+        raise InputError(f"mesh must have a surface to sample, got {mesh.num_faces} faces of total area 0")
+    if generator is None:
+        generator = torch.Generator(device=device).manual_seed(0)
+    draws = torch.rand(3, count, generator=generator, device=generator.device, dtype=torch.float64).to(device)
+    # Stay below the last value: faces of zero area at the end must not be drawn.
+    place = torch.minimum(draws[0] * reach[-1], torch.nextafter(reach[-1], torch.zeros_like(reach[-1])))
+    face_index = torch.searchsorted(reach, place, right=True)
+    root = draws[1].sqrt()
+    barycentric = torch.stack((1 - root, root * (1 - draws[2]), root * draws[2]), dim=-1).to(dtype)
+    return interpolate(mesh.vertices, mesh.faces, face_index, barycentric), face_index, barycentric
+
+
+def interpolate(values: Tensor, faces: Tensor, face_index: Tensor, barycentric: Tensor) -> Tensor:
+    """Return values given at the vertices, interpolated linearly at points of the surface.
+
+    Args:
+        values: (V, ...) floating-point values at the vertices.
+        faces: (F, 3) vertex indices.
+        face_index: (N,) face that each point lies on.
+        barycentric: (N, 3) weights of that face's vertices.
+
+    Returns:
+        (N, ...) interpolated values.
+
+    Raises:
+        InputError: if the sizes do not fit together.
+        InputTypeError: if values and weights differ in dtype or device.
+
+    Differentiable: in ``values`` and ``barycentric``.
+    """
+    check_shape(faces, "faces", ("F", 3))
+    check_shape(face_index, "face_index", ("N",))
+    check_shape(barycentric, "barycentric", (face_index.shape[0], 3))
+    check_same_kind(barycentric, "barycentric", values, "values")
+    return torch.einsum("nc,nc...->n...", barycentric, values[faces[face_index]])
+
+
+def unit_sphere(subdivisions: int = 3, *, dtype: torch.dtype | None = None) -> TriangleMesh:
+    """Return a closed, outward-facing approximation of the unit sphere: an icosahedron with its faces split in four.
+
+    Args:
+        subdivisions: how often the 20 faces are split; 10 * 4**subdivisions + 2 vertices; 0 to 8.
+        dtype: floating-point type of the vertices; torch's default when None.
+
+    Raises:
+        InputError: if ``subdivisions`` is out of range.
+    """
+    if isinstance(subdivisions, bool) or not isinstance(subdivisions, int) or not 0 <= subdivisions <= MAX_SUBDIVISIONS:
+        raise InputError(f"subdivisions must be an integer from 0 to {MAX_SUBDIVISIONS}, got {subdivisions!r}")
+    vertices, faces = _icosahedron()
+    for _ in range(subdivisions):
+        vertices, faces = _split_in_four(vertices, faces)
+        vertices = vertices / torch.linalg.vector_norm(vertices, dim=-1, keepdim=True)
+    return TriangleMesh(vertices.to(dtype or torch.get_default_dtype()), faces)
+
+
+def _icosahedron() -> tuple[Tensor, Tensor]:
+    # Two poles and two rings of five, turned against each other by 36 degrees, at heights +-1/sqrt(5).
+    height, step = 0.2**0.5, torch.pi / 5
+    turn = torch.arange(5, dtype=torch.float64) * 2 * step
+    rings = [
+        torch.stack(
+            (2 * height * (turn + lag).cos(), 2 * height * (turn + lag).sin(), torch.full_like(turn, z)), dim=-1
+        )
+        for lag, z in ((0.0, height), (step, -height))
+    ]
+    poles = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
+    faces = []
+    for here in range(5):
+        after = (here + 1) % 5
+        upper, upper_after, lower, lower_after = 1 + here, 1 + after, 6 + here, 6 + after
+        faces += [(0, upper, upper_after), (upper, lower, upper_after)]
+        faces += [(lower, lower_after, upper_after), (11, lower_after, lower)]
+    return torch.cat((poles[:1], *rings, poles[1:])), torch.tensor(faces)
+
+
+def _split_in_four(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+    sides = torch.stack((faces, faces.roll(-1, dims=1)), dim=-1).sort(dim=-1).values
+    edges, which = sides.reshape(-1, 2).unique(dim=0, return_inverse=True)
+    middle = which.reshape(-1, 3) + vertices.shape[0]
+    corners = [torch.stack((faces[:, k], middle[:, k], middle[:, k - 1]), dim=-1) for k in range(3)]
+    return torch.cat((vertices, vertices[edges].mean(dim=1))), torch.cat((*corners, middle))
+
+
+def concatenate(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """Return one mesh that holds all vertices and faces, in order.
+
+    Args:
+        meshes: at least one mesh, all of one dtype and device.
+
+    Raises:
+        InputError: if there is none.
+        InputTypeError: if dtypes or devices differ.
+
+    Differentiable: in the vertices.
+    """
+    if not meshes:
+        raise InputError("meshes must hold at least one mesh, got none")
+    faces, offset = [], 0
+    for index, mesh in enumerate(meshes):
+        check_same_kind(mesh.vertices, f"meshes[{index}]", meshes[0].vertices, "meshes[0]")
+        faces.append(mesh.faces + offset)
+        offset += mesh.num_vertices
+    return TriangleMesh(torch.cat([mesh.vertices for mesh in meshes]), torch.cat(faces))
