@@ -1,0 +1,215 @@
+"""The house: import layers, owners of third-party libraries, and one test file per module, all read off the source."""
+
+import ast
+import re
+import sys
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "torchreg"
+
+# Low to high; a module imports from lower layers or from its own package only.
+LAYERS = [
+    {"errors"},
+    {"_checks"},
+    {"results", "metrics"},
+    {"geometry"},
+    {"io", "solvers"},
+    {"capture", "models", "correspondence"},
+    {"losses", "datasets"},
+    {"pipelines"},
+    {"viz"},
+    {"cli"},
+    {"__init__", "__main__"},
+]
+RANK = {name: rank for rank, layer in enumerate(LAYERS) for name in layer}
+
+# Files or packages below torchreg/ that may import the library; libraries not named here are free.
+OWNERS = {
+    "pytorch_kinematics": {"models/kinematics.py"},
+    "kornia": {"geometry/rotation.py", "geometry/rigid.py", "capture"},
+    "scipy": {"solvers", "geometry"},
+    "skimage": {"capture"},
+    "trimesh": {"io", "viz"},
+    "pygltflib": {"io", "viz"},
+    "safetensors": {"io", "pipelines"},
+    "matplotlib": {"viz"},
+    "viser": {"viz"},
+    "plotly": {"viz"},
+    "typer": {"cli", "cli.py"},
+    "tqdm": {"cli", "cli.py"},
+}
+LAZY = {"matplotlib", "viser", "plotly"}
+LOWEST_THIRD_PARTY = {"errors.py": set(), "results.py": {"torch"}, "metrics.py": {"torch"}, "_checks.py": {"torch"}}
+IMPORT_NAMES = {"pytorch-kinematics": "pytorch_kinematics", "scikit-image": "skimage"}
+
+
+@dataclass(frozen=True)
+class Import:
+    """One imported dotted name; ``lazy`` when it happens inside a function or only for type checkers."""
+
+    name: str
+    line: int
+    lazy: bool
+
+
+def imports_of(source: str, path: str) -> Iterator[Import]:
+    """Yield every import in the source of torchreg/``path``, relative ones resolved."""
+    package = ["torchreg", *Path(path).parts[:-1]]
+
+    def walk(node: ast.AST, lazy: bool) -> Iterator[Import]:
+        if isinstance(node, ast.Import):
+            yield from (Import(alias.name, node.lineno, lazy) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            origin = ".".join([*base, *([node.module] if node.module else [])])
+            # `from torchreg import x` names the module x, `from torchreg.geometry.mesh import x` something inside mesh.
+            names = [alias.name for alias in node.names] if origin in {"torchreg"} else [None]
+            yield from (Import(f"{origin}.{name}" if name else origin, node.lineno, lazy) for name in names)
+        in_function = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+        for_types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+        for child in ast.iter_child_nodes(node):
+            yield from walk(child, lazy or in_function or for_types)
+
+    yield from walk(ast.parse(source), lazy=False)
+
+
+def unit_of(path: str) -> str:
+    """Return the package, or for a file at the top the module, that torchreg/``path`` belongs to."""
+    return Path(path).parts[0].removesuffix(".py")
+
+
+def layer_problems(source: str, path: str) -> list[str]:
+    """Return what torchreg/``path`` imports from its own layer's neighbors or from above."""
+    own = unit_of(path)
+    if own not in RANK:
+        return [f"torchreg/{path}: {own} has no place in the layers"]
+    problems = []
+    for item in imports_of(source, path):
+        if item.name.split(".")[0] != "torchreg":
+            continue
+        where = f"torchreg/{path}:{item.line} imports {item.name}"
+        target = item.name.partition(".")[2].partition(".")[0]
+        if target == own:
+            continue
+        if target == "__version__" and RANK[own] >= RANK["cli"]:
+            continue
+        if target not in RANK:
+            problems.append(f"{where}: import from the defining module, not from torchreg")
+        elif RANK[target] >= RANK[own]:
+            problems.append(f"{where}: {target} does not lie below {own}")
+    return problems
+
+
+def owner_problems(source: str, path: str, declared: set[str]) -> list[str]:
+    """Return the third-party imports of torchreg/``path`` that belong elsewhere, are undeclared or not lazy enough."""
+    problems = []
+    for item in imports_of(source, path):
+        library = item.name.split(".")[0]
+        where = f"torchreg/{path}:{item.line} imports {library}"
+        if library == "torchreg" or library in sys.stdlib_module_names:
+            continue
+        if library not in declared:
+            problems.append(f"{where}, which pyproject.toml does not declare")
+        if library in OWNERS and not {path, path.split("/")[0]} & OWNERS[library]:
+            problems.append(f"{where}, which belongs to {', '.join(sorted(OWNERS[library]))}")
+        if library in LAZY and not item.lazy:
+            problems.append(f"{where} when it is imported itself; import {library} inside the function that needs it")
+        if library not in LOWEST_THIRD_PARTY.get(path, {library}):
+            problems.append(f"{where}; the lowest layer knows torch at most")
+    return problems
+
+
+def declared_libraries() -> set[str]:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    rows = [*project["dependencies"], *(row for name in extras if name not in {"test", "dev"} for row in extras[name])]
+    names = {re.split(r"[<>=!~\[; ]", row)[0] for row in rows}
+    return {IMPORT_NAMES.get(name, name) for name in names}
+
+
+def sources() -> list[str]:
+    return sorted(path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py"))
+
+
+@pytest.mark.parametrize("path", sources())
+def test_imports_only_from_lower_layers(path):
+    assert layer_problems((PACKAGE / path).read_text(encoding="utf-8"), path) == []
+
+
+@pytest.mark.parametrize("path", sources())
+def test_third_party_libraries_stay_with_their_owners(path):
+    assert owner_problems((PACKAGE / path).read_text(encoding="utf-8"), path, declared_libraries()) == []
+
+
+@pytest.mark.parametrize("path", [path for path in sources() if Path(path).name not in {"__init__.py", "__main__.py"}])
+def test_every_module_has_its_test_file(path):
+    mirrored = Path("tests") / Path(path).parent / f"test_{Path(path).name.lstrip('_')}"
+    assert (ROOT / mirrored).is_file(), f"torchreg/{path} needs {mirrored}"
+
+
+@pytest.mark.parametrize("path", [path for path in sources() if path.endswith("/__init__.py")])
+def test_packages_hold_nothing_but_their_docstring(path):
+    body = ast.parse((PACKAGE / path).read_text(encoding="utf-8")).body
+    assert len(body) == 1
+    assert isinstance(body[0], ast.Expr)
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        ("geometry/mesh.py", "from torchreg.models.hand import Hand"),
+        ("geometry/mesh.py", "def f():\n    import torchreg.io.points"),
+        ("io/points.py", "from torchreg.solvers.lm import solve"),
+        ("io/points.py", "from ..solvers import lm"),
+        ("errors.py", "from torchreg import results"),
+        ("models/hand.py", "from torchreg import ArticulatedShape"),
+        ("models/hand.py", "import torchreg"),
+        ("pipelines/align.py", "from torchreg import __version__"),
+        ("losses/em.py", "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from torchreg.viz.figures import f"),
+        ("helpers/odd.py", ""),
+    ],
+)
+def test_the_layer_check_finds_what_is_wrong(path, source):
+    assert len(layer_problems(source, path)) == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "source"),
+    [
+        (
+            "geometry/mesh.py",
+            "from torchreg.geometry.rigid import se3_exp\nfrom .rotation import x\nfrom . import rigid",
+        ),
+        ("models/hand.py", "from torchreg.io.urdf import read\nfrom torchreg.errors import ModelError\nimport math"),
+        ("models/hand.py", "from ..geometry.mesh import TriangleMesh"),
+        ("cli.py", "from torchreg import __version__\nfrom torchreg import metrics"),
+    ],
+)
+def test_the_layer_check_accepts_what_is_right(path, source):
+    assert layer_problems(source, path) == []
+
+
+@pytest.mark.parametrize(
+    ("path", "source", "count"),
+    [
+        ("models/hand.py", "import trimesh", 1),
+        ("io/mesh.py", "import trimesh.creation", 0),
+        ("models/hand.py", "from pytorch_kinematics import Chain", 1),
+        ("models/kinematics.py", "import pytorch_kinematics as pk", 0),
+        ("geometry/mesh.py", "from kornia.geometry import liegroup", 1),
+        ("geometry/rigid.py", "import kornia", 0),
+        ("viz/figures.py", "import matplotlib.pyplot as plt", 1),
+        ("viz/figures.py", "def f():\n    import matplotlib.pyplot as plt", 0),
+        ("pipelines/align.py", "def f():\n    from tqdm import tqdm", 1),
+        ("metrics.py", "import numpy", 1),
+        ("io/mesh.py", "import plyfile", 1),
+    ],
+)
+def test_the_owner_check_tells_right_from_wrong(path, source, count):
+    assert len(owner_problems(source, path, declared_libraries())) == count

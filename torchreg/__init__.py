@@ -1,0 +1,78 @@
+"""Register articulated, bending shapes to 3-D data with PyTorch.
+
+``import torchreg`` is light: a public name is loaded, and torch with it, when it is first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torchreg import errors, metrics
+    from torchreg.correspondence.sigma import SigmaSchedule
+    from torchreg.geometry.mesh import TriangleMesh
+    from torchreg.io.points import load_mesh, load_points
+    from torchreg.losses.em import EMLoss
+    from torchreg.models.articulated import ArticulatedShape
+    from torchreg.models.hand import Hand
+    from torchreg.models.skin import BendingSkin
+    from torchreg.pipelines.align import AlignConfig, align
+    from torchreg.pipelines.calibrate import calibrate
+    from torchreg.pipelines.storage import load
+    from torchreg.results import AlignResult, Status
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "AlignConfig",
+    "AlignResult",
+    "ArticulatedShape",
+    "BendingSkin",
+    "EMLoss",
+    "Hand",
+    "SigmaSchedule",
+    "Status",
+    "TriangleMesh",
+    "__version__",
+    "align",
+    "calibrate",
+    "errors",
+    "load",
+    "load_mesh",
+    "load_points",
+    "metrics",
+]
+
+_MODULES = frozenset({"errors", "metrics"})
+
+_OWNERS = {
+    "AlignConfig": "pipelines.align",
+    "AlignResult": "results",
+    "ArticulatedShape": "models.articulated",
+    "BendingSkin": "models.skin",
+    "EMLoss": "losses.em",
+    "Hand": "models.hand",
+    "SigmaSchedule": "correspondence.sigma",
+    "Status": "results",
+    "TriangleMesh": "geometry.mesh",
+    "align": "pipelines.align",
+    "calibrate": "pipelines.calibrate",
+    "load": "pipelines.storage",
+    "load_mesh": "io.points",
+    "load_points": "io.points",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return import_module(f"{__name__}.{name}")
+    if name not in _OWNERS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}; public names: {', '.join(__all__)}")
+    value = getattr(import_module(f"{__name__}.{_OWNERS[name]}"), name)
+    globals()[name] = value  # the next use is a plain lookup
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
