@@ -1,0 +1,477 @@
+"""Reading robot descriptions (URDF): the kinematic tree, joint limits, link meshes and link primitives."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import io
+import math
+import re
+import struct
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import unquote
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+from trimesh.exchange.stl import HeaderError
+
+from torchreg._checks import check_choice
+from torchreg.errors import FormatError, MissingExtraError, ModelError
+from torchreg.geometry.kinematic_tree import Joint, KinematicTree
+from torchreg.geometry.mesh import TriangleMesh, concatenate
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_count, local_path, read_bytes
+
+_MAX_LINKS = 2000
+_MAX_URDF_BYTES = 64 * 1024**2
+_MAX_DEPTH = 64
+_KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": "fixed"}
+_PRIMITIVES = {
+    "box": ("size",),
+    "cylinder": ("radius", "length"),
+    "capsule": ("radius", "length"),
+    "sphere": ("radius",),
+}
+_MESH_SUFFIXES = (".stl", ".obj", ".dae", ".glb", ".ply", ".off")
+_DAE_UNIT = re.compile(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']\s*([0-9.eE+-]+)")
+_PARSER_ERRORS = (
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    RuntimeError,
+    ArithmeticError,
+    AssertionError,
+    SyntaxError,
+    EOFError,
+    ImportError,  # trimesh asks for an encoding detector when text is not UTF-8
+    struct.error,
+    HeaderError,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfPrimitive:
+    """A box, cylinder, capsule or sphere on a link.
+
+    Args:
+        kind: "box", "cylinder", "capsule" or "sphere"; cylinders and capsules lie along z, centered.
+        size: metres: three edge lengths of a box; radius and length (without the caps) of a cylinder or capsule;
+            radius of a sphere.
+        origin: (4, 4) float64 ``T_link_primitive``.
+    """
+
+    kind: str
+    size: tuple[float, ...]
+    origin: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class UrdfRecord:
+    """A robot as its file describes it: one frame per link, metres and radians.
+
+    Args:
+        name: name of the robot.
+        tree: one frame per link; a frame is called like the joint that carries it, the root like its link.
+        link_names: names of the links, in the order of ``tree.joints``.
+        link_meshes: mesh in link coordinates, float64, or None; visual geometry, else collision geometry.
+        link_primitives: boxes, cylinders, capsules and spheres of the same geometry.
+    """
+
+    name: str
+    tree: KinematicTree
+    link_names: tuple[str, ...]
+    link_meshes: tuple[TriangleMesh | None, ...]
+    link_primitives: tuple[tuple[UrdfPrimitive, ...], ...]
+
+
+def load_urdf(
+    path: str | Path,
+    *,
+    package_dirs: Sequence[str | Path] = (),
+    meshes: str = "require",
+    limits: FileLimits = DEFAULT_LIMITS,
+) -> UrdfRecord:
+    """Return the kinematic tree and the geometry of a URDF file, with all numbers in float64.
+
+    Frames come parents first, each branch in the file's order. A mimic joint that follows another mimic joint is
+    rewritten to follow the first one. A joint without ``<limit>`` (or without both bounds) is unlimited.
+
+    Args:
+        path: the .urdf file.
+        package_dirs: folders to search for ``package://NAME/...`` and ``model://NAME/...``: such a folder holds NAME
+            or is called NAME. The folders above the file are searched the same way.
+        meshes: "require" every mesh file, or "skip" those that are missing or need a reader that is not installed.
+        limits: largest sizes accepted; a robot may have 2000 links.
+
+    Returns:
+        The robot. Where a link has no readable visual geometry, its collision geometry stands in.
+
+    Raises:
+        FormatError: if the XML or a mesh is damaged, oversized, unexpanded xacro, or a mesh file is missing.
+        ModelError: if links and joints do not form one finite tree of revolute, prismatic and fixed joints.
+        MissingExtraError: if a COLLADA (.dae) mesh is needed and pycollada is not installed.
+    """
+    check_choice(meshes, "meshes", ("require", "skip"))
+    source = local_path(path)
+    robot = _parse(source, limits)
+    links = _named(source, robot, "link")
+    joints = _named(source, robot, "joint")
+    order = _ordered(source, links, joints)
+    geometry = _Geometry(source, [Path(folder) for folder in package_dirs], meshes == "require", limits)
+    shapes = [geometry.of_link(name, links[name]) for name, _ in order]
+    return UrdfRecord(
+        name=robot.get("name") or source.stem,
+        tree=_build_tree(source, order, joints),
+        link_names=tuple(name for name, _ in order),
+        link_meshes=tuple(mesh for mesh, _ in shapes),
+        link_primitives=tuple(primitives for _, primitives in shapes),
+    )
+
+
+class _StrictBuilder(ET.TreeBuilder):
+    """Builds the element tree, but refuses document types (which bring entities) and absurd nesting."""
+
+    depth = 0
+
+    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
+        raise FormatError(
+            f"has a document type declaration ({name!r}), which robot descriptions do not need; remove it"
+        )
+
+    def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:
+        self.depth += 1
+        if self.depth > _MAX_DEPTH:
+            raise FormatError(f"nests elements more than {_MAX_DEPTH} deep")
+        return super().start(tag, attrs)
+
+    def end(self, tag: str, /) -> ET.Element:
+        self.depth -= 1
+        return super().end(tag)
+
+
+def _parse(path: Path, limits: FileLimits) -> ET.Element:
+    content = read_bytes(path, limits)
+    if len(content) > _MAX_URDF_BYTES:
+        raise FormatError(f"{path}: {len(content)} bytes of XML, at most {_MAX_URDF_BYTES} are read")
+    expand = f"{path}: holds xacro macros; expand them first with `xacro {path.name} > robot.urdf`"
+    parser = ET.XMLParser(target=_StrictBuilder())
+    try:
+        parser.feed(content)
+        robot: ET.Element = parser.close()
+    except FormatError as error:
+        raise FormatError(f"{path}: {error}") from error
+    except (ET.ParseError, ValueError, LookupError) as error:
+        raise FormatError(expand if b"xacro:" in content else f"{path}: not well-formed XML ({error})") from error
+    if robot.tag != "robot":
+        raise FormatError(f"{path}: the outermost element must be <robot>, got <{robot.tag}>; convert the file to URDF")
+    for element in robot.iter():
+        text = " ".join(element.attrib.values())
+        if "xacro" in element.tag or "${" in text or "$(" in text:
+            raise FormatError(expand)
+    return robot
+
+
+def _named(path: Path, robot: ET.Element, tag: str) -> dict[str, ET.Element]:
+    """Return the links or joints by name."""
+    found: dict[str, ET.Element] = {}
+    for element in robot.findall(tag):
+        name = element.get("name")
+        if not name:
+            raise ModelError(f"{path}: {tag} number {len(found)} has no name")
+        if name in found:
+            raise ModelError(f"{path}: two {tag}s are called {name!r}; names must be unique")
+        found[name] = element
+    if tag == "link" and not 0 < len(found) <= _MAX_LINKS:
+        raise ModelError(f"{path}: a robot must have 1 to {_MAX_LINKS} links, got {len(found)}")
+    return found
+
+
+def _ordered(
+    path: Path, links: Mapping[str, ET.Element], joints: Mapping[str, ET.Element]
+) -> list[tuple[str, tuple[str, int] | None]]:
+    """Return (link, (its joint, index of the parent link)) with parents first."""
+    carrier: dict[str, str] = {}
+    children: dict[str, list[str]] = {name: [] for name in links}
+    for name, joint in joints.items():
+        parent, child = (_link_of(path, joint, name, role, links) for role in ("parent", "child"))
+        if child in carrier:
+            raise ModelError(f"{path}: link {child!r} has two parents, joints {carrier[child]!r} and {name!r}")
+        carrier[child] = name
+        children[parent].append(child)
+    roots = [name for name in links if name not in carrier]
+    if len(roots) > 1:
+        raise ModelError(
+            f"{path}: the robot is disconnected, {len(roots)} links have no parent: {', '.join(roots[:5])}"
+        )
+    order: list[tuple[str, tuple[str, int] | None]] = []
+    waiting: list[tuple[str, int]] = [(root, -1) for root in roots]
+    while waiting:
+        name, above = waiting.pop()
+        waiting.extend((child, len(order)) for child in reversed(children[name]))
+        order.append((name, (carrier[name], above) if above >= 0 else None))
+    if len(order) < len(links):
+        reached = {name for name, _ in order}
+        stuck = [name for name in links if name not in reached]
+        raise ModelError(f"{path}: the joints form a cycle through links {', '.join(stuck[:5])}")
+    return order
+
+
+def _link_of(path: Path, joint: ET.Element, name: str, role: str, links: Mapping[str, ET.Element]) -> str:
+    element = joint.find(role)
+    link = None if element is None else element.get("link")
+    if link is None or link not in links:
+        raise ModelError(f"{path}: joint {name!r} has {role} link {link!r}, which the file does not define")
+    return link
+
+
+def _build_tree(
+    path: Path, order: Sequence[tuple[str, tuple[str, int] | None]], joints: Mapping[str, ET.Element]
+) -> KinematicTree:
+    index = {carrier[0]: place for place, (_, carrier) in enumerate(order) if carrier is not None}
+    root = order[0][0]
+    frames = [Joint(f"{root}_root" if root in joints else root, -1, torch.eye(4, dtype=torch.float64))]
+    for _, carrier in order[1:]:
+        if carrier is not None:
+            frames.append(_build_joint(path, carrier[0], carrier[1], joints, index))
+    try:
+        return KinematicTree(tuple(frames))
+    except ModelError as error:
+        raise ModelError(f"{path}: {error}") from error
+
+
+def _build_joint(
+    path: Path, name: str, parent: int, joints: Mapping[str, ET.Element], index: Mapping[str, int]
+) -> Joint:
+    element, what = joints[name], f"{path}: joint {name!r}"
+    offset = _origin(element, what)
+    if _kind(joints, name, what) == "fixed":
+        return Joint(name, parent, offset)
+    axis = _floats(element.find("axis"), "xyz", 3, (1.0, 0.0, 0.0), what)
+    largest = max(abs(a) for a in axis)
+    if largest == 0:
+        raise ModelError(f"{what} has a zero axis; give it a direction")
+    length = largest * math.hypot(*(a / largest for a in axis))
+    lower, upper = _limits(element, what)
+    return Joint(
+        name=name,
+        parent=parent,
+        offset=offset,
+        kind=_kind(joints, name, what),
+        axis=(axis[0] / length, axis[1] / length, axis[2] / length),
+        lower=lower,
+        upper=upper,
+        mimic=_mimic(path, name, joints, index),
+    )
+
+
+def _kind(joints: Mapping[str, ET.Element], name: str, what: str) -> str:
+    given = joints[name].get("type")
+    if given in _KINDS:
+        return _KINDS[given]
+    raise ModelError(f"{what} is of type {given!r}; supported: {', '.join(_KINDS)}")
+
+
+def _limits(element: ET.Element, what: str) -> tuple[float, float]:
+    limit = element.find("limit")
+    given = None if limit is None else (limit.get("lower"), limit.get("upper"))
+    if element.get("type") == "continuous" or given is None or given == (None, None):
+        return -math.inf, math.inf
+    # One bound alone: the other one is zero by the format's definition.
+    return _floats(limit, "lower", 1, (0.0,), what)[0], _floats(limit, "upper", 1, (0.0,), what)[0]
+
+
+def _mimic(
+    path: Path, name: str, joints: Mapping[str, ET.Element], index: Mapping[str, int]
+) -> tuple[int, float, float] | None:
+    """Return (followed frame, multiplier, offset), through chains of mimic joints to the one that moves by itself."""
+    multiplier, offset, at, seen = 1.0, 0.0, name, {name}
+    while (mimic := joints[at].find("mimic")) is not None:
+        what = f"{path}: joint {at!r}"
+        target = mimic.get("joint")
+        if target is None or target not in joints:
+            raise ModelError(f"{what} mimics joint {target!r}, which the file does not define")
+        if target in seen:
+            raise ModelError(f"{what} mimics joint {target!r} in a cycle")
+        if _kind(joints, target, f"{path}: joint {target!r}") == "fixed":
+            raise ModelError(f"{what} mimics joint {target!r}, which is fixed")
+        offset += multiplier * _floats(mimic, "offset", 1, (0.0,), what)[0]
+        multiplier *= _floats(mimic, "multiplier", 1, (1.0,), what)[0]
+        at = target
+        seen.add(target)
+    return None if at == name else (index[at], multiplier, offset)
+
+
+def _floats(
+    element: ET.Element | None, attribute: str, count: int, default: tuple[float, ...], what: str
+) -> tuple[float, ...]:
+    """Return the finite numbers in an attribute; ``default`` where it (or the element) is missing."""
+    text = None if element is None else element.get(attribute)
+    if element is None or text is None:
+        return default
+    try:
+        numbers = tuple(float(word) for word in text.split())
+    except ValueError as error:
+        raise FormatError(f"{what}: {attribute}={text[:80]!r} in <{element.tag}> is not a list of numbers") from error
+    if len(numbers) != count:
+        raise FormatError(f"{what}: {attribute}={text[:80]!r} in <{element.tag}> must hold {count} number(s)")
+    if not all(math.isfinite(number) for number in numbers):
+        raise ModelError(f"{what}: {attribute}={text[:80]!r} in <{element.tag}> is not finite")
+    return numbers
+
+
+def _origin(element: ET.Element, what: str) -> Tensor:
+    """Return the (4, 4) transform of ``<origin>``: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    origin = element.find("origin")
+    translation = _floats(origin, "xyz", 3, (0.0, 0.0, 0.0), what)
+    roll, pitch, yaw = _floats(origin, "rpy", 3, (0.0, 0.0, 0.0), what)
+    cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
+    return torch.tensor(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, translation[0]],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr, translation[1]],
+            [-sp, cp * sr, cp * cr, translation[2]],
+            [0.0, 0.0, 0.0, 1.0],
+        ],
+        dtype=torch.float64,
+    )
+
+
+class _Geometry:
+    """Finds and reads the geometry of links; every mesh file is read once."""
+
+    def __init__(self, path: Path, package_dirs: Sequence[Path], require: bool, limits: FileLimits) -> None:
+        self._path, self._require, self._limits = path, require, limits
+        self._folders = [*package_dirs, *path.resolve().parents]
+        self._cache: dict[Path, TriangleMesh] = {}
+        self._total = 0
+
+    def of_link(self, name: str, link: ET.Element) -> tuple[TriangleMesh | None, tuple[UrdfPrimitive, ...]]:
+        """Return the mesh and the primitives of a link, from its visual or else its collision elements."""
+        meshes: list[TriangleMesh] = []
+        primitives: list[UrdfPrimitive] = []
+        for tag in ("visual", "collision"):
+            for element in link.findall(tag):
+                what = f"{self._path}: {tag} of link {name!r}"
+                for shape in element.findall("geometry/*"):
+                    if shape.tag == "mesh":
+                        meshes.extend(self._placed_mesh(shape, _origin(element, what), what))
+                    else:
+                        primitives.append(_primitive(shape, _origin(element, what), what))
+            if meshes or primitives:
+                break
+        return (concatenate(meshes) if meshes else None), tuple(primitives)
+
+    def _placed_mesh(self, shape: ET.Element, origin: Tensor, what: str) -> list[TriangleMesh]:
+        filename = shape.get("filename")
+        if not filename:
+            raise ModelError(f"{what} has a <mesh> without a filename")
+        scale = torch.tensor(_floats(shape, "scale", 3, (1.0, 1.0, 1.0), what), dtype=torch.float64)
+        if bool((scale == 0).any()):
+            raise ModelError(f"{what} has a mesh scale of zero")
+        mesh = self._read(filename, what)
+        if mesh is None:
+            return []
+        self._total += mesh.num_vertices
+        try:
+            check_count(self._total, "vertices", self._limits)
+        except FormatError as error:
+            raise FormatError(f"{what}: with this mesh the robot {error}") from error
+        vertices = (mesh.vertices * scale) @ origin[:3, :3].mT + origin[:3, 3]
+        # A mirrored mesh turns inside out unless its triangles turn around.
+        return [TriangleMesh(vertices, mesh.faces.flip(1) if float(scale.prod()) < 0 else mesh.faces)]
+
+    def _read(self, filename: str, what: str) -> TriangleMesh | None:
+        tried = self._candidates(filename, what)
+        found = next((place for place in tried if _is_file(place)), None)
+        if found is None:
+            if not self._require:
+                return None
+            raise FormatError(
+                f"{what}: mesh file {filename!r} was not found (looked at {', '.join(map(str, tried[:3]))}, ...); pass "
+                f"package_dirs=, or meshes='skip' to go without"
+            )
+        if found.suffix.lower() == ".dae" and importlib.util.find_spec("collada") is None:
+            if not self._require:
+                return None
+            raise MissingExtraError(
+                f"{what}: reading COLLADA mesh {found} needs pycollada; install torchreg[urdf], or pass meshes='skip'"
+            )
+        if found not in self._cache:
+            self._cache[found] = _read_mesh(found, self._limits)
+        return self._cache[found]
+
+    def _candidates(self, filename: str, what: str) -> list[Path]:
+        """Return the places where a mesh may lie, likeliest first."""
+        scheme, separator, rest = filename.partition("://")
+        if not separator:
+            return [self._path.parent / filename]
+        if scheme == "file":
+            return [self._path.parent / unquote(rest)]
+        if scheme not in ("package", "model"):
+            raise FormatError(f"{what}: mesh {filename!r} is remote; save it beside the URDF and give a relative path")
+        package, _, inner = rest.partition("/")
+        places = [folder / package / inner for folder in self._folders]
+        named = [folder / inner for folder in self._folders if folder.name == package]
+        return [*named, *places]
+
+
+def _is_file(place: Path) -> bool:
+    try:
+        return place.is_file()
+    except OSError:  # a name that the file system cannot hold
+        return False
+
+
+def _primitive(shape: ET.Element, origin: Tensor, what: str) -> UrdfPrimitive:
+    if shape.tag not in _PRIMITIVES:
+        raise ModelError(f"{what} has geometry <{shape.tag}>; known: mesh, {', '.join(_PRIMITIVES)}")
+    size: tuple[float, ...] = ()
+    for attribute in _PRIMITIVES[shape.tag]:
+        size += _floats(shape, attribute, 3 if shape.tag == "box" else 1, (), what)
+    if len(size) < (3 if shape.tag == "box" else len(_PRIMITIVES[shape.tag])) or min(size) <= 0:
+        raise ModelError(f"{what}: <{shape.tag}> needs a positive {' and '.join(_PRIMITIVES[shape.tag])}, got {size}")
+    return UrdfPrimitive(shape.tag, size, origin)
+
+
+def _read_mesh(path: Path, limits: FileLimits) -> TriangleMesh:
+    """Return the triangles of a mesh file, in metres where the file knows its unit."""
+    kind = path.suffix.lower()
+    if kind not in _MESH_SUFFIXES:
+        raise FormatError(f"{path}: meshes of kind {kind!r} are not read; known: {', '.join(_MESH_SUFFIXES)}")
+    content = read_bytes(path, limits)
+    unit = 1.0
+    errors: tuple[type[BaseException], ...] = _PARSER_ERRORS
+    if kind == ".dae":
+        errors = (*errors, importlib.import_module("collada.common").DaeError)
+        if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+            raise FormatError(f"{path}: has a document type declaration, which meshes do not need; remove it")
+        found = _DAE_UNIT.search(content)
+    try:
+        if kind == ".dae" and found:
+            unit = float(found[1])
+        # From memory and without a resolver, so that no material or texture file is opened.
+        scene = trimesh.load_scene(io.BytesIO(content), file_type=kind[1:], process=False, maintain_order=True)
+        parts = [
+            (
+                np.asarray(piece.vertices, dtype=np.float64),
+                np.asarray(piece.faces, dtype=np.int64),
+                scene.graph[node][0],
+            )
+            for node in scene.graph.nodes_geometry
+            if isinstance(piece := scene.geometry[scene.graph[node][1]], trimesh.Trimesh)
+        ]
+        pieces = [
+            TriangleMesh(torch.from_numpy((v @ matrix[:3, :3].T + matrix[:3, 3]) * unit), torch.from_numpy(f.copy()))
+            for v, f, matrix in parts
+            if len(f)
+        ]
+    except errors as error:
+        raise FormatError(f"{path}: not a readable {kind[1:]} mesh ({type(error).__name__}: {error})") from error
+    if not pieces:
+        raise FormatError(f"{path}: holds no triangles")
+    return concatenate(pieces)
