@@ -1,0 +1,189 @@
+"""Named tensors with metadata on disk."""
+
+import hashlib
+import json
+import math
+import os
+
+import pytest
+import torch
+
+from torchreg.errors import FormatError, InputError, InputTypeError
+from torchreg.io.atomic import write_atomic
+from torchreg.io.limits import FileLimits
+from torchreg.io.tensors import load_tensors, save_tensors
+
+METADATA = {"kind": "align", "steps": [1, 2.5, None, True], "nested": {"é": "ü"}, "sigma": math.inf, "low": -math.inf}
+
+
+def example() -> dict[str, torch.Tensor]:
+    base = torch.arange(12, dtype=torch.float64).reshape(3, 4)
+    return {
+        "zeta": base.T,
+        "alpha": base[:, :2],
+        "scalar": torch.tensor(2.5, requires_grad=True),
+        "empty": torch.zeros(0, 3),
+        "flags": torch.tensor([True, False]),
+        "faces": torch.tensor([[0, 1, 2]]),
+        "half": torch.tensor([math.nan, 1.0], dtype=torch.bfloat16),
+    }
+
+
+@pytest.fixture
+def saved(tmp_path):
+    path = tmp_path / "r.safetensors"
+    save_tensors(path, example(), METADATA)
+    return path
+
+
+def rewrite(path, change):
+    record = json.loads(path.with_suffix(".json").read_text("utf-8"))
+    change(record)
+    path.with_suffix(".json").write_text(json.dumps(record), "utf-8")
+
+
+def test_round_trip_is_exact_and_keeps_the_order(saved):
+    tensors, metadata = load_tensors(str(saved))
+    assert list(tensors) == list(example())
+    for name, value in example().items():
+        assert tensors[name].dtype == value.dtype
+        torch.testing.assert_close(tensors[name], value.detach(), rtol=0, atol=0, equal_nan=True)
+    assert not tensors["scalar"].requires_grad
+    assert metadata == METADATA
+    assert sorted(os.listdir(saved.parent)) == ["r.json", "r.safetensors"]
+
+
+def test_json_is_readable_and_standard(saved):
+    text = saved.with_suffix(".json").read_text("utf-8")
+
+    def refuse(word):
+        raise AssertionError(word)
+
+    record = json.loads(text, parse_constant=refuse)
+    assert record["tensors"]["zeta"] == {"dtype": "float64", "shape": [4, 3]}
+    assert "ü" in text
+    assert text.count("\n") > 20
+
+
+def test_nothing_at_all_can_be_saved(tmp_path):
+    save_tensors(tmp_path / "e.safetensors", {}, {"nan": math.nan, "tuple": (1, (2,))})
+    tensors, metadata = load_tensors(tmp_path / "e.safetensors")
+    assert tensors == {}
+    assert math.isnan(metadata["nan"])
+    assert metadata["tuple"] == [1, [2]]
+
+
+def test_saving_again_replaces_both(saved):
+    save_tensors(saved, {"one": torch.ones(1)}, {})
+    tensors, metadata = load_tensors(saved)
+    assert list(tensors) == ["one"]
+    assert metadata == {}
+
+
+def test_every_flipped_byte_and_truncation_is_noticed(saved):
+    content = saved.read_bytes()
+    for place in range(0, len(content), 7):
+        saved.write_bytes(content[:place] + bytes([content[place] ^ 16]) + content[place + 1 :])
+        with pytest.raises(FormatError, match="is damaged"):
+            load_tensors(saved)
+        saved.write_bytes(content[:place])
+        with pytest.raises(FormatError, match=r"r\.safetensors: is damaged"):
+            load_tensors(saved)
+
+
+def test_damaged_json_is_refused(saved):
+    beside = saved.with_suffix(".json")
+    content = beside.read_bytes()
+    for place in range(0, len(content) - 2, 11):
+        beside.write_bytes(content[:place])
+        with pytest.raises(FormatError, match=r"r\.json: cannot be read as JSON"):
+            load_tensors(saved)
+    beside.write_bytes(b"[" * 100_000)
+    with pytest.raises(FormatError, match="cannot be read as JSON"):
+        load_tensors(saved)
+    beside.write_bytes(b"\xff\xfe")
+    with pytest.raises(FormatError, match="cannot be read as JSON"):
+        load_tensors(saved)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda r: r.update(format="other"), "does not describe tensors"),
+        (lambda r: r.update(version=2), "has version 2, this release reads 1"),
+        (lambda r: r.update(metadata=[]), "'metadata' must be of type dict"),
+        (lambda r: r.pop("sha256"), "'sha256' must be of type str"),
+        (lambda r: r["tensors"].pop("zeta"), "its tensors are not those that r.json lists"),
+        (lambda r: r["tensors"]["zeta"].update(shape=[3, 4]), "its tensors are not those"),
+        (lambda r: r["tensors"]["zeta"].update(dtype="float32"), "its tensors are not those"),
+    ],
+)
+def test_json_that_does_not_belong_is_refused(saved, change, words):
+    rewrite(saved, change)
+    with pytest.raises(FormatError, match=words):
+        load_tensors(saved)
+
+
+def test_right_checksum_of_a_damaged_file(saved):
+    saved.write_bytes(b"\xff" * 40)
+    rewrite(saved, lambda r: r.update(sha256=hashlib.sha256(b"\xff" * 40).hexdigest()))
+    with pytest.raises(FormatError, match="cannot be read as safetensors"):
+        load_tensors(saved)
+
+
+def test_missing_files(saved, tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load_tensors(tmp_path / "none.safetensors")
+    saved.with_suffix(".json").unlink()
+    with pytest.raises(FormatError, match=r"the file r\.json must lie beside it"):
+        load_tensors(saved)
+    with pytest.raises(FileNotFoundError, match="does not exist; create it first"):
+        save_tensors(tmp_path / "no" / "r.safetensors", {}, {})
+
+
+def test_size_limit_and_addresses(saved):
+    with pytest.raises(FormatError, match="the limit is 100"):
+        load_tensors(saved, limits=FileLimits(max_bytes=100))
+    with pytest.raises(FormatError, match="is an address"):
+        load_tensors("https://host/r.safetensors")
+    with pytest.raises(InputError, match=r"path must end in \.safetensors"):
+        save_tensors(saved.with_suffix(".pt"), {}, {})
+
+
+@pytest.mark.parametrize(
+    ("tensors", "metadata", "error", "words"),
+    [
+        ({"a": [1.0]}, {}, InputTypeError, r"tensors\['a'\] must be a tensor under a str, got list"),
+        ({1: torch.ones(1)}, {}, InputTypeError, r"tensors\[1\] must be"),
+        ({"a": torch.eye(2).to_sparse()}, {}, InputTypeError, "must be dense, got layout torch.sparse_coo"),
+        ({"a": torch.ones(2, dtype=torch.complex128)}, {}, InputTypeError, "tensors cannot be stored"),
+        ({}, {"h": [{"loss": torch.ones(1)}]}, InputTypeError, r"metadata\.h\[0\]\.loss must be a dict, .* got Tensor"),
+        ({}, {3: 1}, InputTypeError, "metadata must have keys of type str, got 3"),
+        ({}, {"$float": 1}, InputError, "reserved"),
+    ],
+)
+def test_what_cannot_be_saved_leaves_nothing(tmp_path, tensors, metadata, error, words):
+    with pytest.raises(error, match=words):
+        save_tensors(tmp_path / "r.safetensors", tensors, metadata)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "f"
+    write_atomic(path, b"old")
+    path.chmod(0o640)
+
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", fail)
+        with pytest.raises(KeyboardInterrupt):
+            write_atomic(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+    write_atomic(path, b"new")
+    assert path.read_bytes() == b"new"
+    assert path.stat().st_mode & 0o777 == 0o640
+    with pytest.raises(IsADirectoryError, match="is a folder"):
+        write_atomic(tmp_path, b"")

@@ -1,0 +1,154 @@
+"""What a file may cost before it is opened: local regular files only, bounded in bytes, counts and expansion."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import stat
+import struct
+import zipfile
+import zlib
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from torchreg.errors import FormatError, InputError, InputTypeError
+
+# pathlib folds "//" into "/", so one slash after a scheme of two letters or more is enough (C:/ is a drive).
+_ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]+:/")
+
+ZIP_ERRORS = (
+    zipfile.BadZipFile, zlib.error, struct.error, NotImplementedError, EOFError, RuntimeError, ValueError,
+    OverflowError, OSError,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class FileLimits:
+    """Upper bounds that every loader checks before it allocates.
+
+    Args:
+        max_bytes: size of one file in bytes.
+        max_points: points or vertices of one cloud or mesh.
+        max_faces: triangles (or polygons) of one mesh.
+        max_zip_ratio: expanded over packed bytes of a zip archive.
+        max_expanded_bytes: sum of the expanded sizes in one archive.
+
+    Raises:
+        InputError: if a limit is not a positive number.
+    """
+
+    max_bytes: int = 2 * 1024**3
+    max_points: int = 20_000_000
+    max_faces: int = 40_000_000
+    max_zip_ratio: float = 200.0
+    max_expanded_bytes: int = 4 * 1024**3
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not value > 0:
+                raise InputError(f"{field.name} must be a positive number, got {value!r}")
+
+
+DEFAULT_LIMITS = FileLimits()
+
+
+def local_path(path: str | os.PathLike[str]) -> Path:
+    """Return ``path`` as a local path.
+
+    Args:
+        path: name of a file on this machine.
+
+    Raises:
+        FormatError: if it is an address such as ``http://``, ``file://`` or ``s3://``, a network share or no file name.
+        InputTypeError: if it is neither a str nor a path.
+    """
+    if not isinstance(path, (str, os.PathLike)) or isinstance(os.fspath(path), bytes):
+        raise InputTypeError(f"path must be a str or a pathlib.Path, got {type(path).__name__}")
+    text = os.fspath(path)
+    if _ADDRESS.match(text) or text.startswith("\\\\"):
+        raise FormatError(f"{text!r} is an address, not a local file: download it first and pass the file's path")
+    if not text or "\0" in text:
+        raise FormatError(f"{text!r} is not the name of a file")
+    return Path(text)
+
+
+def read_bytes(path: str | os.PathLike[str], limits: FileLimits = DEFAULT_LIMITS) -> bytes:
+    """Return the content of a local regular file, after looking at its size.
+
+    Args:
+        path: the file.
+        limits: ``max_bytes`` applies.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        IsADirectoryError: if it is a folder.
+        FormatError: if it is an address, a device, pipe or socket, or larger than allowed.
+    """
+    place = local_path(path)
+    mode = place.stat().st_mode  # before open(), which waits forever on a pipe
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(f"{place} is a folder; pass one file of it")
+    if not stat.S_ISREG(mode):
+        raise FormatError(f"{place} is not a regular file (a device, pipe or socket); copy its content into a file")
+    with place.open("rb") as stream:
+        size = os.fstat(stream.fileno()).st_size
+        check_size(size, place, limits)
+        return stream.read(size)  # a size, because the file may be growing
+
+
+def check_size(size: int, path: Path, limits: FileLimits) -> None:
+    """Raise FormatError if ``size`` bytes exceed ``limits.max_bytes``."""
+    if size > limits.max_bytes:
+        raise FormatError(
+            f"{path} holds {size} bytes, the limit is {limits.max_bytes}; if you trust it pass "
+            f"FileLimits(max_bytes=...)"
+        )
+
+
+def check_count(count: int, what: str, limits: FileLimits) -> None:
+    """Raise FormatError unless ``count`` items are allowed; ``what`` is "points" or "faces"."""
+    name = "max_faces" if what == "faces" else "max_points"
+    if not 0 <= count <= getattr(limits, name):
+        raise FormatError(
+            f"claims {count} {what}, allowed are 0 to {getattr(limits, name)}; if you trust it pass "
+            f"FileLimits({name}=...)"
+        )
+
+
+def check_expansion(packed: int, expanded: int, what: str, limits: FileLimits) -> None:
+    """Raise FormatError if ``packed`` bytes claim to expand beyond the allowed ratio or size."""
+    if expanded > limits.max_expanded_bytes or expanded > limits.max_zip_ratio * max(packed, 1):
+        raise FormatError(
+            f"{what} would expand {packed} bytes to {expanded}; allowed are {limits.max_expanded_bytes} bytes and "
+            f"{limits.max_zip_ratio:g}-fold; if you trust it pass FileLimits(max_zip_ratio=..., max_expanded_bytes=...)"
+        )
+
+
+def open_zip(content: bytes, limits: FileLimits = DEFAULT_LIMITS) -> zipfile.ZipFile:
+    """Return the archive held in ``content``, with the claimed sizes of all members checked before any is expanded.
+
+    Args:
+        content: the bytes of the archive.
+        limits: ``max_zip_ratio`` and ``max_expanded_bytes`` apply to the sum over all members.
+
+    Raises:
+        FormatError: if it is not a zip archive, a member is encrypted or doubled, or it would expand too far.
+    """
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(content))
+    except ZIP_ERRORS as error:
+        raise FormatError(f"is not a readable zip archive ({error})") from error
+    members = archive.infolist()
+    names = [member.filename for member in members]
+    if len(set(names)) != len(names):
+        raise FormatError("is a zip archive with several members of one name")
+    for member in members:
+        if member.flag_bits & 1:
+            raise FormatError(f"member {member.filename!r} is encrypted; save the archive without a password")
+        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise FormatError(f"member {member.filename!r} is packed by method {member.compress_type}; use deflate")
+    packed, expanded = (sum(getattr(m, size) for m in members) for size in ("compress_size", "file_size"))
+    check_expansion(packed, expanded, f"the archive of {len(members)} members", limits)
+    return archive

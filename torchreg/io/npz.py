@@ -1,0 +1,82 @@
+"""NPZ: numpy archives without pickled objects."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from typing import IO
+
+import numpy as np
+
+from torchreg.errors import FormatError
+from torchreg.io.limits import FileLimits, check_count, open_zip
+from torchreg.io.raw_cloud import Array, RawCloud, as_indices
+
+
+def read_npz(content: bytes, limits: FileLimits) -> RawCloud:
+    """Return the cloud of an archive: the array ``points`` (or ``vertices``), or the only (N, 3) array there is.
+
+    ``normals``, ``colors`` and ``faces`` are read when they are there. Shapes are compared with the bytes behind them
+    before anything is allocated; arrays of Python objects are refused.
+
+    Raises:
+        FormatError: if no array can be told to be the points, or one is damaged.
+    """
+    with open_zip(content, limits) as archive:
+        names = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
+        named = [key for key in ("points", "vertices") if key in names]
+        key = named[0] if named else _only_points(archive, names)
+        wanted = [name for name in (key, "normals", "colors", "faces") if name in names]
+        arrays = {name: _read_array(archive, names[name]) for name in wanted}
+    points = arrays[key]
+    check_count(len(points) if points.ndim else 0, "points", limits)
+    faces = arrays.get("faces")
+    if faces is not None:
+        check_count(len(faces) if faces.ndim else 0, "faces", limits)
+        faces = as_indices(faces, "faces")
+    return RawCloud(points, arrays.get("normals"), arrays.get("colors"), faces)
+
+
+def _only_points(archive: zipfile.ZipFile, names: dict[str, str]) -> str:
+    found = []
+    for key, name in names.items():
+        with archive.open(name) as stream:
+            shape, _, dtype = _read_header(stream, name)
+        if len(shape) == 2 and shape[1] == 3 and dtype.kind == "f":
+            found.append(key)
+    if len(found) != 1:
+        raise FormatError(
+            f"must hold an array 'points' of shape (N, 3), or one floating-point array of that shape; got "
+            f"{', '.join(sorted(names)[:8]) or 'no arrays'}"
+        )
+    return found[0]
+
+
+def _read_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    version = np.lib.format.read_magic(stream)
+    if version not in ((1, 0), (2, 0)):
+        raise FormatError(f"member {name!r} has the unknown array format {version}")
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, fortran, dtype = read(stream)
+    if dtype.hasobject or dtype.kind not in "iuf":
+        raise FormatError(f"member {name!r} must hold real numbers, got {dtype}; pickled objects are never loaded")
+    return shape, fortran, dtype
+
+
+def _read_array(archive: zipfile.ZipFile, name: str) -> Array:
+    stream = io.BytesIO(archive.read(name))
+    shape, fortran, dtype = _read_header(stream, name)
+    body, count = stream.read(), 1
+    for size in shape:
+        count *= size
+    if any(size < 0 for size in shape) or count * dtype.itemsize != len(body):
+        raise FormatError(f"member {name!r} claims the shape {shape} of {dtype} but holds {len(body)} bytes")
+    return np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
+
+
+def write_npz(cloud: RawCloud) -> bytes:
+    """Return an archive with the arrays that the cloud has."""
+    arrays = {name: getattr(cloud, name) for name in ("points", "normals", "colors", "faces")}
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **{name: array for name, array in arrays.items() if array is not None})
+    return stream.getvalue()

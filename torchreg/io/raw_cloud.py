@@ -1,0 +1,102 @@
+"""What the readers of single formats hand over: numpy arrays as they stood in the file, not yet judged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchreg.errors import FormatError
+
+Array = NDArray[Any]
+
+# Beyond this, float64 no longer holds every integer.
+_LARGEST_EXACT = 2**53
+
+
+@dataclass(frozen=True)
+class RawCloud:
+    """Arrays of one file.
+
+    Args:
+        points: (N, 3) floating point, in the precision of the file.
+        normals: (N, 3) or None.
+        colors: (N, 3), integers over their full range or floats from 0 to 1, or None.
+        faces: (F, 3) int64, 0-based, or None.
+    """
+
+    points: Array
+    normals: Array | None = None
+    colors: Array | None = None
+    faces: Array | None = None
+
+
+def parse_table(lines: Sequence[bytes], columns: int | None, what: str) -> Array:
+    """Return lines of numbers as a float64 (rows, columns) table.
+
+    Args:
+        lines: non-blank lines.
+        columns: how many numbers each line must hold; None takes what the first holds.
+        what: name of a row, for messages.
+
+    Raises:
+        FormatError: if a line holds another count of numbers, or something else.
+    """
+    if not lines:
+        return np.zeros((0, columns or 0))
+    try:
+        table = np.loadtxt([line.decode("ascii") for line in lines], dtype=np.float64, comments=None, ndmin=2)
+    except ValueError as error:  # also what is not ASCII
+        raise FormatError(f"a {what} is not a row of {columns or 'equally many'} numbers ({error})") from error
+    if len(table) != len(lines) or (columns is not None and table.shape[1] != columns):
+        raise FormatError(f"each {what} must hold {columns} numbers, got {table.shape[1]}")
+    return table
+
+
+def as_indices(values: Array, what: str) -> Array:
+    """Return numbers read as text or in any integer type as int64; FormatError unless they are whole and in range."""
+    if values.dtype.kind == "f":
+        if not np.all(np.isfinite(values)) or np.any(values != np.floor(values)):
+            raise FormatError(f"{what} must be whole numbers")
+    elif values.dtype.kind not in "iu":
+        raise FormatError(f"{what} must be whole numbers, got {values.dtype}")
+    if values.size and (values.max() >= _LARGEST_EXACT or values.min() <= -_LARGEST_EXACT):
+        raise FormatError(f"{what} are out of range")
+    return values.astype(np.int64)
+
+
+def as_integers(values: Array, kind: str, what: str) -> Array:
+    """Return whole numbers read as text in the integer type ``kind``; FormatError unless they fit."""
+    whole, bounds = as_indices(values, what), np.iinfo(kind)
+    if whole.size and (whole.min() < bounds.min or whole.max() > bounds.max):
+        raise FormatError(f"{what} must lie between {bounds.min} and {bounds.max}")
+    return whole.astype(kind)
+
+
+def stack_columns(columns: dict[str, Array], names: Sequence[str]) -> Array | None:
+    """Return the named columns side by side in their common type, or None if one of them is missing."""
+    if not all(name in columns for name in names):
+        return None
+    return np.stack([columns[name] for name in names], axis=-1)
+
+
+def fan_triangles(counts: Array, indices: Array) -> Array:
+    """Return the (F, 3) triangles of polygons, each cut as a fan from its first corner.
+
+    Args:
+        counts: (P,) corners of each polygon, int64.
+        indices: (sum of counts,) vertex indices of all polygons, one after the other.
+
+    Raises:
+        FormatError: if a polygon has fewer than three corners.
+    """
+    if counts.size and counts.min() < 3:
+        raise FormatError(f"a face must have at least 3 corners, got {int(counts.min())}")
+    triangles = counts - 2
+    start = np.repeat(np.cumsum(counts) - counts, triangles)
+    step = np.arange(int(triangles.sum())) - np.repeat(np.cumsum(triangles) - triangles, triangles)
+    corners = np.stack((start, start + step + 1, start + step + 2), axis=-1)
+    return indices[corners.reshape(-1)].reshape(-1, 3)
