@@ -234,8 +234,11 @@ def test_collada_unit_is_applied(tmp_path: Path) -> None:
     assert mesh is not None
     np.testing.assert_allclose(mesh.bounds(), [[-0.005] * 3, [0.005] * 3], atol=1e-9)
     (tmp_path / "box.dae").write_bytes(b'<!DOCTYPE a [<!ENTITY b "c">]>' + content)
-    with pytest.raises(FormatError, match="document type"):
+    with pytest.raises(FormatError, match=r"box\.dae.*document type"):
         load_urdf(path)
+    broken = content.replace(b"<library_effects>", b"<library_effects><effect id='x'><profile_COMMON/></effect>", 1)
+    (tmp_path / "box.dae").write_bytes(b"\n" + broken.replace(b"#", b"#no", 1))
+    assert load_urdf(path).link_meshes[0] is not None
     (tmp_path / "box.dae").write_bytes(b"not xml")
     with pytest.raises(FormatError, match="not a readable dae mesh"):
         load_urdf(path)

@@ -6,7 +6,6 @@ import importlib
 import importlib.util
 import io
 import math
-import re
 import struct
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
@@ -37,7 +36,7 @@ _PRIMITIVES = {
     "sphere": ("radius",),
 }
 _MESH_SUFFIXES = (".stl", ".obj", ".dae", ".glb", ".ply", ".off")
-_DAE_UNIT = re.compile(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']\s*([0-9.eE+-]+)")
+_DAE_LOOKS = ("library_images", "library_effects", "library_materials", "bind_material")
 _PARSER_ERRORS = (
     ValueError,
     TypeError,
@@ -154,22 +153,31 @@ class _StrictBuilder(ET.TreeBuilder):
         return super().end(tag)
 
 
+def _parse_xml(content: bytes) -> ET.Element:
+    parser = ET.XMLParser(target=_StrictBuilder())
+    try:
+        # Blank lines before the declaration are common, harmless, and an error to the parser.
+        parser.feed(content.lstrip(b" \t\r\n"))
+        root: ET.Element = parser.close()
+    except (ET.ParseError, ValueError, LookupError) as error:
+        if isinstance(error, FormatError):
+            raise
+        raise FormatError(f"not well-formed XML ({error})") from error
+    return root
+
+
 def _parse(path: Path, limits: FileLimits) -> ET.Element:
     content = read_bytes(path, limits)
     if len(content) > _MAX_URDF_BYTES:
         raise FormatError(f"{path}: {len(content)} bytes of XML, at most {_MAX_URDF_BYTES} are read")
     expand = f"{path}: holds xacro macros; expand them first with `xacro {path.name} > robot.urdf`"
-    parser = ET.XMLParser(target=_StrictBuilder())
     try:
-        parser.feed(content)
-        robot: ET.Element = parser.close()
+        robot = _parse_xml(content)
     except FormatError as error:
-        raise FormatError(f"{path}: {error}") from error
-    except (ET.ParseError, ValueError, LookupError) as error:
-        raise FormatError(expand if b"xacro:" in content else f"{path}: not well-formed XML ({error})") from error
+        raise FormatError(expand if b"<xacro:" in content else f"{path}: {error}") from error
     if robot.tag != "robot":
         raise FormatError(f"{path}: the outermost element must be <robot>, got <{robot.tag}>; convert the file to URDF")
-    for element in robot.iter():
+    for element in (inner for part in robot if part.tag != "gazebo" for inner in part.iter()):
         text = " ".join(element.attrib.values())
         if "xacro" in element.tag or "${" in text or "$(" in text:
             raise FormatError(expand)
@@ -358,6 +366,8 @@ class _Geometry:
             for element in link.findall(tag):
                 what = f"{self._path}: {tag} of link {name!r}"
                 for shape in element.findall("geometry/*"):
+                    if shape.tag == "material":  # misplaced in some files, and of no shape
+                        continue
                     if shape.tag == "mesh":
                         meshes.extend(self._placed_mesh(shape, _origin(element, what), what))
                     else:
@@ -448,12 +458,9 @@ def _read_mesh(path: Path, limits: FileLimits) -> TriangleMesh:
     errors: tuple[type[BaseException], ...] = _PARSER_ERRORS
     if kind == ".dae":
         errors = (*errors, importlib.import_module("collada.common").DaeError)
-        if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
-            raise FormatError(f"{path}: has a document type declaration, which meshes do not need; remove it")
-        found = _DAE_UNIT.search(content)
     try:
-        if kind == ".dae" and found:
-            unit = float(found[1])
+        if kind == ".dae":
+            content, unit = _bare_collada(content)
         # From memory and without a resolver, so that no material or texture file is opened.
         scene = trimesh.load_scene(io.BytesIO(content), file_type=kind[1:], process=False, maintain_order=True)
         parts = [
@@ -475,3 +482,14 @@ def _read_mesh(path: Path, limits: FileLimits) -> TriangleMesh:
     if not pieces:
         raise FormatError(f"{path}: holds no triangles")
     return concatenate(pieces)
+
+
+def _bare_collada(content: bytes) -> tuple[bytes, float]:
+    """Return a COLLADA document without materials, whose broken references would take the mesh along, and its unit."""
+    root = _parse_xml(content)
+    unit = root.find("{*}asset/{*}unit")
+    for parent in list(root.iter()):
+        for child in list(parent):
+            if child.tag.rpartition("}")[2] in _DAE_LOOKS:
+                parent.remove(child)
+    return ET.tostring(root), 1.0 if unit is None else float(unit.get("meter", "1"))

@@ -1,0 +1,334 @@
+"""Animated glTF: what a viewer would compute from the file equals linear blend skinning computed here."""
+
+import json
+import os
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pygltflib
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
+
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.mesh import TriangleMesh, unit_sphere
+from torchreg.io.gltf_write import save_animated_parts, save_animated_skin
+
+DTYPES = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+PARENTS = [2, -1, 1, 1]
+NAMES = ["tip", "root", "middle", "other"]
+
+
+def random_rigid(rng: np.random.Generator, *batch: int) -> np.ndarray:
+    matrices = np.tile(np.eye(4), (*batch, 1, 1))
+    count = int(np.prod(batch))
+    matrices[..., :3, :3] = Rotation.random(count, random_state=rng).as_matrix().reshape(*batch, 3, 3)
+    matrices[..., :3, 3] = rng.normal(size=(*batch, 3))
+    return matrices
+
+
+def scene(seed: int = 0, joints: int = 4, frames: int = 6, spread: int = 4) -> dict:
+    """Arguments of save_animated_skin, as arrays; every vertex follows ``spread`` joints."""
+    rng = np.random.default_rng(seed)
+    vertices = rng.normal(size=(30, 3))
+    weights = np.zeros((30, joints))
+    for row in weights:
+        row[rng.permutation(joints)[:spread]] = rng.uniform(0.05, 1, size=min(spread, joints))
+    return {
+        "vertices": vertices,
+        "faces": np.stack([rng.permutation(30)[:3] for _ in range(20)]),
+        "weights": weights / weights.sum(1, keepdims=True),
+        "joint_names": NAMES if joints == 4 else [f"joint{i}" for i in range(joints)],
+        "parents": PARENTS if joints == 4 else [-1, *range(joints - 1)],
+        "rest_transforms": random_rigid(rng, joints),
+        "joint_transforms": random_rigid(rng, frames, joints),
+        "times": np.arange(frames) / 30,
+    }
+
+
+def save(path: Path, arguments: dict) -> Path:
+    return save_animated_skin(
+        path, **{k: torch.as_tensor(v) if isinstance(v, np.ndarray) else v for k, v in arguments.items()}
+    )
+
+
+def blend(arguments: dict, frame: int) -> np.ndarray:
+    """Linear blend skinning from its definition, one vertex and joint at a time."""
+    posed = np.zeros((len(arguments["vertices"]), 3))
+    for j in range(arguments["weights"].shape[1]):
+        move = arguments["joint_transforms"][frame, j] @ np.linalg.inv(arguments["rest_transforms"][j])
+        posed += arguments["weights"][:, j : j + 1] * (arguments["vertices"] @ move[:3, :3].T + move[:3, 3])
+    return posed
+
+
+class Player:
+    """A minimal viewer: reads a file with pygltflib and evaluates nodes, animation and skin."""
+
+    def __init__(self, path: Path) -> None:
+        self.gltf = pygltflib.GLTF2().load(str(path))
+        self.blob = self.gltf.binary_blob()
+
+    def accessor(self, index: int) -> np.ndarray:
+        accessor = self.gltf.accessors[index]
+        view = self.gltf.bufferViews[accessor.bufferView]
+        dtype, width = DTYPES[accessor.componentType], WIDTHS[accessor.type]
+        return np.frombuffer(self.blob, dtype, accessor.count * width, view.byteOffset).reshape(-1, width)
+
+    def world(self, time: float | None) -> list[np.ndarray]:
+        """Node transforms at a time, or of the file's rest pose."""
+        tracks: dict[tuple[int, str], tuple[np.ndarray, np.ndarray]] = {}
+        for channel in self.gltf.animations[0].channels:
+            sampler = self.gltf.animations[0].samplers[channel.sampler]
+            tracks[channel.target.node, channel.target.path] = (
+                self.accessor(sampler.input)[:, 0],
+                self.accessor(sampler.output),
+            )
+        local = []
+        for index, node in enumerate(self.gltf.nodes):
+            translation = np.array(node.translation or [0, 0, 0])
+            rotation = Rotation.from_quat(node.rotation or [0, 0, 0, 1])
+            if time is not None and (index, "translation") in tracks:
+                times, values = tracks[index, "translation"]
+                translation = np.array([np.interp(time, times, values[:, c]) for c in range(3)])
+                times, values = tracks[index, "rotation"]
+                rotation = (
+                    Slerp(times, Rotation.from_quat(values))(np.clip(time, times[0], times[-1]))
+                    if len(times) > 1
+                    else Rotation.from_quat(values[0])
+                )
+            matrix = np.eye(4)
+            matrix[:3, :3], matrix[:3, 3] = rotation.as_matrix(), translation
+            local.append(matrix)
+        world: list[np.ndarray] = [np.eye(4)] * len(local)
+
+        def visit(index: int, above: np.ndarray) -> None:
+            world[index] = above @ local[index]
+            for child in self.gltf.nodes[index].children:
+                visit(child, world[index])
+
+        for root in self.gltf.scenes[self.gltf.scene].nodes:
+            visit(root, np.eye(4))
+        return world
+
+    def skinned(self, time: float | None) -> np.ndarray:
+        attributes = self.gltf.meshes[0].primitives[0].attributes
+        skin = self.gltf.skins[0]
+        inverse = self.accessor(skin.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1).astype(float)
+        world = self.world(time)
+        matrices = np.stack([world[node] @ inverse[j] for j, node in enumerate(skin.joints)])
+        points = np.c_[self.accessor(attributes.POSITION), np.ones(self.gltf.accessors[attributes.POSITION].count)]
+        posed = np.zeros((len(points), 4))
+        for number in range(2):
+            if getattr(attributes, f"JOINTS_{number}", None) is not None:
+                joints = self.accessor(getattr(attributes, f"JOINTS_{number}"))
+                weights = self.accessor(getattr(attributes, f"WEIGHTS_{number}"))
+                posed += np.einsum("vk,vkab,vb->va", weights, matrices[joints], points)
+        return posed[:, :3]
+
+
+@pytest.mark.parametrize(("joints", "spread"), [(1, 1), (4, 4), (9, 4), (9, 7), (300, 8)])
+def test_file_plays_like_blend_skinning(tmp_path: Path, joints: int, spread: int) -> None:
+    arguments = scene(joints, joints, spread=spread)
+    if joints == 300:  # a long chain of meter-long steps would lose digits to float32
+        arguments["rest_transforms"][:, :3, 3] *= 0.01
+        arguments["joint_transforms"][..., :3, 3] *= 0.01
+        arguments["parents"] = [-1] + [0] * 299
+    player = Player(save(tmp_path / "a.glb", arguments))
+    np.testing.assert_allclose(player.skinned(None), arguments["vertices"], atol=1e-5)
+    for frame, time in enumerate(arguments["times"]):
+        np.testing.assert_allclose(player.skinned(float(np.float32(time))), blend(arguments, frame), atol=1e-5)
+
+
+def test_nodes_follow_the_given_hierarchy(tmp_path: Path) -> None:
+    arguments = scene()
+    player = Player(save(tmp_path / "a.glb", arguments))
+    gltf = player.gltf
+    assert [gltf.nodes[j].name for j in gltf.skins[0].joints] == NAMES
+    for index, parent in enumerate(PARENTS):
+        above = [n.name for n in gltf.nodes if gltf.skins[0].joints[index] in n.children]
+        assert above == [NAMES[parent] if parent >= 0 else "armature"]
+    world = player.world(float(np.float32(arguments["times"][3])))
+    for index, node in enumerate(gltf.skins[0].joints):
+        np.testing.assert_allclose(world[node], arguments["joint_transforms"][3, index], atol=2e-6)
+
+
+def test_quaternions_take_the_short_way_through_full_turns(tmp_path: Path) -> None:
+    arguments = scene(joints=1, frames=80, spread=1)
+    angles = np.linspace(0, 6 * np.pi, 80)
+    arguments["joint_transforms"][:, 0, :3, :3] = Rotation.from_rotvec(np.outer(angles, [0.6, 0, 0.8])).as_matrix()
+    player = Player(save(tmp_path / "a.glb", arguments))
+    rotations = player.accessor(player.gltf.animations[0].samplers[1].output).astype(float)
+    assert (rotations[1:] * rotations[:-1]).sum(1).min() > 0.9
+    np.testing.assert_allclose(np.linalg.norm(rotations, axis=1), 1, atol=1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.floats(-4, 4), min_size=3, max_size=3))
+def test_node_rotations_agree_with_scipy(tmp_path_factory: pytest.TempPathFactory, vector: list[float]) -> None:
+    transform = np.eye(4)[None, None]
+    transform = np.tile(transform, (1, 1, 1, 1))
+    transform[0, 0, :3, :3] = Rotation.from_rotvec(vector).as_matrix()
+    path = tmp_path_factory.mktemp("q") / "a.glb"
+    save_animated_parts(path, [None], torch.from_numpy(transform), torch.zeros(1))
+    stored = Rotation.from_quat(pygltflib.GLTF2().load(str(path)).nodes[0].rotation)
+    assert (stored.inv() * Rotation.from_rotvec(vector)).magnitude() < 1e-6
+
+
+def test_accessors_are_aligned_and_bounded(tmp_path: Path) -> None:
+    arguments = scene(joints=9, spread=6)
+    arguments |= {"normals": np.r_[np.zeros((1, 3)), np.ones((29, 3))], "colors": np.full((30, 3), 0.25)}
+    player = Player(save(tmp_path / "a.glb", arguments))
+    gltf = player.gltf
+    assert all(view.byteOffset % 4 == 0 for view in gltf.bufferViews)
+    assert (tmp_path / "a.glb").stat().st_size % 4 == 0
+    attributes = gltf.meshes[0].primitives[0].attributes
+    position = gltf.accessors[attributes.POSITION]
+    stored = player.accessor(attributes.POSITION)
+    assert position.min == stored.min(0).tolist()
+    assert position.max == stored.max(0).tolist()
+    time = gltf.accessors[gltf.animations[0].samplers[0].input]
+    assert (time.min, time.max) == ([0.0], [float(np.float32(5 / 30))])
+    weights = np.c_[player.accessor(attributes.WEIGHTS_0), player.accessor(attributes.WEIGHTS_1)].astype(float)
+    np.testing.assert_allclose(weights.sum(1), 1, atol=2e-7)
+    joints = np.c_[player.accessor(attributes.JOINTS_0), player.accessor(attributes.JOINTS_1)]
+    assert (joints[weights == 0] == 0).all()
+    assert player.accessor(attributes.NORMAL)[0].tolist() == [0, 0, 1]
+    np.testing.assert_allclose(np.linalg.norm(player.accessor(attributes.NORMAL), axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(player.accessor(attributes.COLOR_0), np.tile([0.25, 0.25, 0.25, 1], (30, 1)))
+
+
+def test_small_fifth_weights_are_dropped(tmp_path: Path) -> None:
+    arguments = scene(joints=9, spread=4)
+    arguments["weights"] = arguments["weights"] + 5e-5
+    player = Player(save(tmp_path / "a.glb", arguments))
+    attributes = player.gltf.meshes[0].primitives[0].attributes
+    assert getattr(attributes, "JOINTS_1", None) is None
+    np.testing.assert_allclose(player.accessor(attributes.WEIGHTS_0).sum(1), 1, atol=2e-7)
+
+
+def test_large_indices_get_four_bytes(tmp_path: Path) -> None:
+    arguments = scene(joints=1, frames=1, spread=1)
+    count = 65536
+    arguments |= {"vertices": np.zeros((count, 3)), "weights": np.ones((count, 1)), "faces": np.array([[0, 1, 65535]])}
+    player = Player(save(tmp_path / "a.glb", arguments))
+    assert player.accessor(player.gltf.meshes[0].primitives[0].indices)[:, 0].tolist() == [0, 1, 65535]
+
+
+def test_parts_move_as_nodes(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    transforms = random_rigid(rng, 5, 3)
+    meshes = [unit_sphere(1), None, unit_sphere(0, dtype=torch.float64)]
+    times = torch.arange(5) * 0.5
+    path = save_animated_parts(
+        tmp_path / "p.glb", meshes, torch.from_numpy(transforms), times, ["a", "b", "c"], torch.eye(3)
+    )
+    player = Player(path)
+    assert [node.name for node in player.gltf.nodes] == ["a", "b", "c"]
+    assert [node.mesh for node in player.gltf.nodes] == [0, None, 1]
+    for frame in range(5):
+        np.testing.assert_allclose(np.stack(player.world(frame * 0.5)), transforms[frame], atol=1e-6)
+    points = player.accessor(player.gltf.meshes[1].primitives[0].attributes.POSITION)
+    np.testing.assert_allclose(points, meshes[2].vertices, atol=1e-7)  # type: ignore[union-attr]
+    factor = player.gltf.materials[1].pbrMetallicRoughness.baseColorFactor
+    assert factor == [0, 0, 1, 1]
+    unnamed = save_animated_parts(tmp_path / "q.glb", meshes, torch.from_numpy(transforms), times)
+    assert [node.name for node in Player(unnamed).gltf.nodes] == ["part_0", "part_1", "part_2"]
+
+
+def test_nothing_half_written_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "a.glb"
+    target.write_bytes(b"before")
+
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save(target, scene())
+    monkeypatch.undo()
+    assert target.read_bytes() == b"before"
+    assert os.listdir(tmp_path) == ["a.glb"]
+    save(target, scene())
+    length = struct.unpack("<I", target.read_bytes()[8:12])[0]
+    assert length == target.stat().st_size
+
+
+NONRIGID = np.tile(np.diag([1.0, 1.0, 1.1, 1.0]), (4, 1, 1))
+MIRROR = np.tile(np.diag([1.0, 1.0, -1.0, 1.0]), (4, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"vertices": np.zeros((30, 2))}, r"vertices must have shape \(V, 3\)"),
+        ({"vertices": np.full((30, 3), np.nan)}, "vertices must be finite"),
+        ({"faces": np.full((1, 3), 30)}, "faces must hold indices from 0 to 29, got 30 to 30"),
+        ({"faces": np.zeros((0, 3), int)}, "at least one triangle"),
+        ({"weights": np.zeros((30, 4))}, "30 zero row"),
+        ({"weights": -np.ones((30, 4))}, "not be negative"),
+        ({"weights": np.ones((30, 3))}, r"weights must have shape \(30, 4\)"),
+        ({"joint_names": ["a", "b", "a", "c"]}, "occur more than once: a"),
+        ({"joint_names": []}, "at least one name"),
+        ({"parents": [-1, 0, 1]}, r"one index per joint \(4\), got 3"),
+        ({"parents": [-1, 0, 1, 4]}, "parents of joint 'other' must be -1 to 3, got 4"),
+        ({"parents": [-1, 2, 1, 0]}, "cycle: root, middle"),
+        ({"rest_transforms": NONRIGID}, "rest_transforms must hold rigid motions"),
+        ({"rest_transforms": MIRROR}, "rest_transforms must hold rigid motions"),
+        ({"joint_transforms": np.zeros((5, 4, 4, 4))}, r"joint_transforms must have shape \(6, 4, 4, 4\)"),
+        ({"times": np.zeros(6)}, "strictly increasing"),
+        ({"times": np.arange(6) - 1.0}, "not negative"),
+        ({"times": np.zeros(0)}, "must not be empty"),
+        ({"colors": np.full((30, 3), 255.0)}, r"colors must lie in \[0, 1\]"),
+        ({"colors": np.zeros((29, 3))}, r"colors must have shape \(30, 3\)"),
+        ({"normals": np.zeros((29, 3))}, r"normals must have shape \(30, 3\)"),
+    ],
+)
+def test_bad_arguments_are_named(tmp_path: Path, change: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        save(tmp_path / "a.glb", scene() | change)
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_paths_types_and_parts(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"must end in \.glb"):
+        save(tmp_path / "a.gltf", scene())
+    with pytest.raises(InputError, match="existing folder"):
+        save(tmp_path / "no" / "a.glb", scene())
+    with pytest.raises(InputTypeError, match="faces must hold integers"):
+        save(tmp_path / "a.glb", scene() | {"faces": np.zeros((1, 3))})
+    with pytest.raises(InputError, match=r"one mesh per part name \(2\), got 1"):
+        save_animated_parts(tmp_path / "a.glb", [None], torch.eye(4).expand(1, 2, 4, 4), torch.zeros(1), ["a", "b"])
+    empty = TriangleMesh(torch.zeros(3, 3), torch.zeros(0, 3, dtype=torch.int64))
+    with pytest.raises(InputError, match=r"part_meshes\[0\]\.faces"):
+        save_animated_parts(tmp_path / "a.glb", [empty], torch.eye(4).expand(1, 1, 4, 4), torch.zeros(1))
+
+
+VALIDATOR = os.environ.get("GLTF_VALIDATOR", "")
+
+
+@pytest.mark.skipif(
+    not (VALIDATOR and shutil.which("node")),
+    reason="set GLTF_VALIDATOR to the folder of the npm package gltf-validator",
+)
+def test_khronos_validator_finds_no_errors(tmp_path: Path) -> None:
+    arguments = scene(joints=9, spread=6) | {"normals": np.ones((30, 3)), "colors": np.full((30, 4), 0.5)}
+    files = [save(tmp_path / "a.glb", arguments), save(tmp_path / "b.glb", scene(spread=2))]
+    part = torch.eye(4).expand(2, 1, 4, 4)
+    files.append(save_animated_parts(tmp_path / "c.glb", [unit_sphere(1)], part, torch.arange(2)))
+    script = (
+        "const v=require(process.argv[1]),fs=require('fs');"
+        "for(const f of process.argv.slice(2))v.validateBytes(new Uint8Array(fs.readFileSync(f)))"
+        ".then(r=>console.log(JSON.stringify(r.issues)));"
+    )
+    output = subprocess.run(
+        ["node", "-e", script, VALIDATOR, *map(str, files)], capture_output=True, text=True, check=True, timeout=60
+    ).stdout
+    for line in output.strip().splitlines():
+        issues = json.loads(line)
+        assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
