@@ -88,7 +88,7 @@ class Builder:
 
     def glb(self, path: Path) -> Path:
         document = copy.deepcopy(self.json)
-        document["buffers"] = document["buffers"] or [{"byteLength": len(self.blob)}]
+        document["buffers"] = document.get("buffers") or [{"byteLength": len(self.blob)}]
         text = json.dumps(document).encode()
         text = text.ljust(-(-len(text) // 4) * 4)
         chunks = struct.pack("<I4s", len(text), b"JSON") + text
