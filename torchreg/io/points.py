@@ -136,7 +136,8 @@ def load_points(
         raise FormatError(f"{place} has the unknown ending {place.suffix!r}; known: {', '.join(_READERS)}")
     content = read_bytes(place, limits)
     try:
-        return _judge(reader(content, place, limits), nan_policy, limits, dtype)
+        with np.errstate(all="ignore"):  # what overflows becomes infinite and is judged as that
+            return _judge(reader(content, place, limits), nan_policy, limits, dtype)
     except FormatError as error:
         raise FormatError(f"{place}: {error}") from error
     except PARSER_ERRORS as error:
@@ -202,8 +203,7 @@ def _judge(raw: RawCloud, nan_policy: str, limits: FileLimits, dtype: torch.dtyp
 def _rows(values: Array, what: str, count: int | None, dtype: torch.dtype) -> Tensor:
     if values.ndim != 2 or values.shape[1] != 3 or (count is not None and len(values) != count):
         raise FormatError(f"{what} must have shape ({count or 'N'}, 3), got {values.shape}")
-    with np.errstate(over="ignore", invalid="ignore"):  # what overflows becomes infinite and is judged as that
-        return torch.from_numpy(np.array(values, dtype=np.float64 if dtype == torch.float64 else np.float32))
+    return torch.from_numpy(np.array(values, dtype=np.float64 if dtype == torch.float64 else np.float32))
 
 
 def _to_unit_range(colors: Array) -> Array:
