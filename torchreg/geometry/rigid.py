@@ -1,0 +1,102 @@
+"""Rigid motions as 4 x 4 matrices acting on column vectors."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.rotation import left_jacobian, so3_exp
+
+
+def rigid_matrix(rotation: Tensor, translation: Tensor) -> Tensor:
+    """Return ``[[R, t], [0, 1]]``.
+
+    Args:
+        rotation: (..., 3, 3).
+        translation: (..., 3), metres.
+
+    Returns:
+        (..., 4, 4).
+
+    Differentiable: in both.
+    """
+    top = torch.cat([rotation, translation.unsqueeze(-1)], dim=-1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    return torch.cat([top, bottom], dim=-2)
+
+
+def se3_exp(twist: Tensor) -> Tensor:
+    """Return the rigid motion of a twist, the exponential map of SE(3).
+
+    Convention: twists are (translation, rotation).
+
+    Args:
+        twist: (..., 6), metres and radians.
+
+    Returns:
+        (..., 4, 4).
+
+    Differentiable: in ``twist``, also at zero.
+    """
+    translation, rotation = twist[..., :3], twist[..., 3:]
+    return rigid_matrix(so3_exp(rotation), (left_jacobian(rotation) @ translation.unsqueeze(-1)).squeeze(-1))
+
+
+def invert_rigid(matrix: Tensor) -> Tensor:
+    """Return the inverse of rigid motions, ``[[R^T, -R^T t], [0, 1]]``.
+
+    Args:
+        matrix: (..., 4, 4) rigid motions.
+
+    Returns:
+        (..., 4, 4).
+
+    Differentiable: in ``matrix``.
+    """
+    rotation = matrix[..., :3, :3].mT
+    return rigid_matrix(rotation, -(rotation @ matrix[..., :3, 3:]).squeeze(-1))
+
+
+def transform_points(matrix: Tensor, points: Tensor) -> Tensor:
+    """Return ``R x + t`` for every point.
+
+    Args:
+        matrix: (..., 4, 4).
+        points: (..., N, 3), with broadcastable batch dimensions and the same dtype.
+
+    Returns:
+        (..., N, 3).
+
+    Differentiable: in both.
+    """
+    return points @ matrix[..., :3, :3].mT + matrix[..., None, :3, 3]
+
+
+def fit_rigid(source: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
+    """Return the rigid motion that takes ``source`` nearest to ``target`` in the weighted least-squares sense.
+
+    ``argmin_T sum_i w_i |T x_i - y_i|^2``, by SVD of the cross-covariance with det R = +1.
+
+    Args:
+        source: (..., N, 3).
+        target: (..., N, 3), matched point by point.
+        weights: (..., N), not negative; all ones by default.
+
+    Returns:
+        (..., 4, 4).
+
+    Differentiable: in all, where the singular values of the cross-covariance differ.
+
+    References: Umeyama 1991.
+    """
+    weights = torch.ones_like(source[..., 0]) if weights is None else weights
+    weights = (weights / weights.sum(-1, keepdim=True).clamp_min(torch.finfo(source.dtype).tiny)).unsqueeze(-1)
+    source_mean = (weights * source).sum(-2, keepdim=True)
+    target_mean = (weights * target).sum(-2, keepdim=True)
+    covariance = (weights * (target - target_mean)).mT @ (source - source_mean)
+    u, _, vt = torch.linalg.svd(covariance)
+    sign = torch.det(u @ vt).sign()
+    flip = torch.diag_embed(torch.stack([torch.ones_like(sign), torch.ones_like(sign), sign], dim=-1))
+    rotation = u @ flip @ vt
+    translation = target_mean - source_mean @ rotation.mT
+    return rigid_matrix(rotation, translation.squeeze(-2))

@@ -1,0 +1,39 @@
+"""Choosing few points that cover many."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import check_points
+from torchreg.errors import InputError
+
+
+def farthest_points(points: Tensor, count: int, start: int = 0) -> Tensor:
+    """Return indices of points that cover a cloud evenly: each next one is the farthest from those chosen.
+
+    Args:
+        points: (N, 3).
+        count: how many; at most N.
+        start: index of the first.
+
+    Returns:
+        (count,) int64 indices, in the order of choice.
+
+    Raises:
+        InputError: if ``count`` is not between 1 and N.
+
+    Cost: O(N count).
+
+    References: Gonzalez 1985.
+    """
+    check_points(points, "points", batch=False)
+    if not 1 <= count <= len(points):
+        raise InputError(f"count must be between 1 and the number of points {len(points)}, got {count}")
+    chosen = torch.empty(count, dtype=torch.long, device=points.device)
+    chosen[0] = start
+    nearest = torch.full_like(points[:, 0], torch.inf)
+    for index in range(1, count):
+        nearest = torch.minimum(nearest, (points - points[chosen[index - 1]]).square().sum(-1))
+        chosen[index] = nearest.argmax()
+    return chosen

@@ -1,0 +1,141 @@
+"""Batched Levenberg-Marquardt with box limits, on vectors or manifolds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+_DAMPING_DOWN = 0.2
+_DAMPING_UP = 6.0
+_MIN_DAMPING = 1e-7
+_MAX_DAMPING = 1e7
+
+
+@dataclass(frozen=True)
+class Linearization:
+    """A least-squares problem around a state, for every problem of the batch.
+
+    Args:
+        cost: (B,) half the weighted sum of squared residuals.
+        gradient: (B, D) of the cost.
+        hessian: (B, D, D) its Gauss-Newton approximation ``J^T W J``.
+    """
+
+    cost: Tensor
+    gradient: Tensor
+    hessian: Tensor
+
+
+@dataclass(frozen=True)
+class LMResult:
+    """Where the iteration stopped.
+
+    Args:
+        state: (B, D).
+        cost: (B,) at the state.
+        damping: (B,) to continue with.
+        last_step: (B, D) the last accepted step, zero if none was.
+        num_steps: steps taken.
+    """
+
+    state: Tensor
+    cost: Tensor
+    damping: Tensor
+    last_step: Tensor
+    num_steps: int
+
+
+def levenberg_marquardt(
+    linearize: Callable[[Tensor], Linearization],
+    state: Tensor,
+    *,
+    retract: Callable[[Tensor, Tensor], Tensor] = torch.add,
+    lower: Tensor | None = None,
+    upper: Tensor | None = None,
+    damping: Tensor | None = None,
+    max_steps: int = 10,
+    atol: float = 0.0,
+) -> LMResult:
+    """Return the state of lowest cost that the iteration finds; problems of a batch proceed independently.
+
+    Each step solves ``(H + damping diag(H)) s = -g``. Variables at a limit whose gradient pushes outwards are frozen for
+    the step; the others are clamped at the limit. A step that raises the cost is undone and the damping raised.
+
+    Args:
+        linearize: state (B, D) to `Linearization`.
+        state: (B, D) start; moved inside the limits first.
+        retract: (state, step) to state; addition by default.
+        lower: (D,) limits of the state, or None.
+        upper: (D,) limits of the state, or None.
+        damping: (B,) relative damping to start with; 1e-3 by default.
+        max_steps: number of linearizations after the first.
+        atol: stop when every problem's largest step component is at most this.
+
+    Returns:
+        an `LMResult`.
+
+    Differentiable: no.
+
+    References: Marquardt 1963; Bertsekas 1982 for the limits.
+    """
+    low = torch.full_like(state[0], -torch.inf) if lower is None else lower
+    high = torch.full_like(state[0], torch.inf) if upper is None else upper
+    state = torch.minimum(torch.maximum(state, low), high)
+    damping = state.new_full(state.shape[:1], 1e-3) if damping is None else damping
+    current = linearize(state)
+    last_step = torch.zeros_like(state)
+    count = 0
+    for count in range(1, max_steps + 1):
+        step = damped_step(current, damping, frozen=_frozen(current.gradient, state, low, high))
+        trial_state = torch.minimum(torch.maximum(retract(state, step), low), high)
+        trial = linearize(trial_state)
+        better = trial.cost <= current.cost
+        keep = better.unsqueeze(-1)
+        state = torch.where(keep, trial_state, state)
+        last_step = torch.where(keep, step, last_step)
+        current = Linearization(
+            torch.where(better, trial.cost, current.cost),
+            torch.where(keep, trial.gradient, current.gradient),
+            torch.where(keep.unsqueeze(-1), trial.hessian, current.hessian),
+        )
+        damping = torch.where(better, damping * _DAMPING_DOWN, damping * _DAMPING_UP)
+        damping = damping.clamp(_MIN_DAMPING, _MAX_DAMPING)
+        if atol > 0 and float(step.abs().max()) <= atol:
+            break
+    return LMResult(state, current.cost, damping, last_step, count)
+
+
+def damped_step(problem: Linearization, damping: Tensor, *, frozen: Tensor | None = None) -> Tensor:
+    """Return the step ``-(H + damping diag(H))^-1 g``, zero in frozen variables and where nothing constrains one.
+
+    Args:
+        problem: the linearized problem.
+        damping: (B,) relative damping.
+        frozen: (B, D) True for variables to hold.
+
+    Returns:
+        (B, D).
+    """
+    hessian, gradient = problem.hessian, problem.gradient
+    diagonal = hessian.diagonal(dim1=-2, dim2=-1)
+    # A variable without curvature keeps its place: unit diagonal, zero gradient. The floor bounds the repair.
+    floor = diagonal.amax(-1, keepdim=True) * torch.finfo(hessian.dtype).eps
+    idle = diagonal <= floor
+    idle = idle if frozen is None else idle | frozen
+    free = (~idle).to(hessian.dtype)
+    # Scaling by the root of the diagonal makes metres and radians alike, and the factorization sound in float32.
+    scale = torch.where(idle, 1.0, diagonal).rsqrt()
+    outer = (scale * free).unsqueeze(-1) * (scale * free).unsqueeze(-2)
+    scaled = hessian * outer
+    scaled.diagonal(dim1=-2, dim2=-1).copy_(1 + damping.unsqueeze(-1).expand_as(scale))
+    factor, _ = torch.linalg.cholesky_ex(scaled)
+    right = (-gradient * scale * free).unsqueeze(-1)
+    step = torch.cholesky_solve(right, factor).squeeze(-1) * scale * free
+    return torch.where(torch.isfinite(step), step, 0.0)
+
+
+def _frozen(gradient: Tensor, state: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    return ((state <= lower) & (gradient > 0)) | ((state >= upper) & (gradient < 0)) | (lower == upper)
