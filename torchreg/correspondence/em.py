@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import threshold_
 
 # c of eq. 18 when the matched volume is negligible beside the working volume.
 OUTLIER_CONSTANT = 3 * math.sqrt(math.pi / 2)
@@ -15,8 +16,13 @@ OUTLIER_CONSTANT = 3 * math.sqrt(math.pi / 2)
 _MIN_FREE_SHARE = 0.05
 # Entries of the kernel matrix held at a time: in cache on a CPU, and far below 2 GB anywhere.
 _CHUNK_ENTRIES = 2_000_000
-# Below this ratio of extent to sigma the expanded square |x|^2 - 2 xy + |y|^2 is exact enough in float32.
-_MAX_EXPANDED_RATIO = 200.0
+# Below this ratio of extent to sigma the expanded square |x|^2 - 2 xy + |y|^2 moves no exponent by more than 0.02.
+_MAX_EXPANDED_RATIO = {torch.float32: 128.0, torch.float64: 3e6}
+# exp(-60) = 9e-27 is nothing beside any outlier constant; the kernel is zero from just above it.
+_MIN_EXPONENT = -60.0
+_MIN_KERNEL = 1e-26
+# Beyond this ratio squares may overflow; every sigma that small holds coincident points only.
+_MAX_RATIO = 1e15
 
 
 @dataclass(frozen=True)
@@ -44,10 +50,12 @@ def outlier_constant(num_points: int, sigma: Tensor, volume: Tensor) -> Tensor:
     Args:
         num_points: n, the number of model points.
         sigma: (...) metres.
-        volume: (...) V, the working volume, cubic metres.
+        volume: (...) V, the working volume, cubic metres; see `working_volume`.
 
     Returns:
         (...).
+
+    Differentiable: in ``sigma`` and ``volume``.
 
     References: Dewaele et al. 2006, eq. 18.
     """
@@ -56,7 +64,12 @@ def outlier_constant(num_points: int, sigma: Tensor, volume: Tensor) -> Tensor:
 
 
 def expectation(
-    model: Tensor, data: Tensor, sigma: Tensor, outlier: Tensor | float = OUTLIER_CONSTANT, *, mask: Tensor | None = None
+    model: Tensor,
+    data: Tensor,
+    sigma: Tensor,
+    outlier: Tensor | float = OUTLIER_CONSTANT,
+    *,
+    mask: Tensor | None = None,
 ) -> EStep:
     """Return lambda_i, G_i and the total posterior of every datum, without storing the N x M posterior.
 
@@ -67,12 +80,12 @@ def expectation(
     Args:
         model: (..., N, 3) posed model points, metres.
         data: (..., M, 3), metres, with batch dimensions that broadcast with the model's.
-        sigma: (...) metres.
-        outlier: (...) c.
-        mask: (..., M) False where a datum is padding.
+        sigma: (...) metres, positive.
+        outlier: (...) c, positive.
+        mask: (..., M) False where a datum is padding, whose coordinates are never looked at.
 
     Returns:
-        an `EStep`.
+        an `EStep`; a padded datum has posterior 0.
 
     Differentiable: no (see `EMLoss`).
 
@@ -81,50 +94,48 @@ def expectation(
     References: Dewaele et al. 2006, eqs. 17, 18, 20.
     """
     batch = torch.broadcast_shapes(model.shape[:-2], data.shape[:-2])
-    model = model.expand(*batch, *model.shape[-2:]).reshape(-1, *model.shape[-2:])
-    data = data.expand(*batch, *data.shape[-2:]).reshape(-1, *data.shape[-2:])
-    flat = model.shape[0]
-    sigma = _flat(sigma, batch, model)
-    outlier = _flat(outlier, batch, model)
-    valid = None if mask is None else mask.expand(*batch, mask.shape[-1]).reshape(flat, -1)
+    flat, num_model, num_data = math.prod(batch), model.shape[-2], data.shape[-2]
     with torch.no_grad():
+        model = model.expand(*batch, num_model, 3).reshape(flat, num_model, 3)
+        data = data.expand(*batch, num_data, 3).reshape(flat, num_data, 3)
+        sigma, outlier = _flat(sigma, batch, model), _flat(outlier, batch, model)
+        valid = None if mask is None else mask.expand(*batch, num_data).reshape(flat, num_data)
+        data, center = _centered(data, valid)
+        offset = model - center
+        extent = _extent(offset, data)
+        sigma = torch.maximum(sigma, extent / _MAX_RATIO)
+        expand = flat > 0 and float(extent) < _MAX_EXPANDED_RATIO[model.dtype] * float(sigma.min())
         scale = (2**-0.5 / sigma)[:, None, None]
-        center = data.mean(-2, keepdim=True)
-        scaled_model, scaled_data = (model - center) * scale, (data - center) * scale
-        weights, moments = torch.zeros_like(model[..., 0]), torch.zeros_like(model)
-        inlier = torch.zeros_like(data[..., 0])
-        for rows, columns in _chunks(flat, model.shape[1], data.shape[1]):
-            kernel = _kernel(scaled_model[rows], scaled_data[rows, columns])
-            total = kernel.sum(-2)
-            share = (total + outlier[rows, None]).reciprocal()
-            if valid is not None:
-                share = share * valid[rows, columns]
-            inlier[rows, columns] = total * share
-            payload = torch.cat([torch.ones_like(total).unsqueeze(-1), scaled_data[rows, columns]], dim=-1)
-            gathered = kernel @ (payload * share.unsqueeze(-1))
-            weights[rows] += gathered[..., 0]
-            moments[rows] += gathered[..., 1:]
-        held = weights.unsqueeze(-1).clamp_min(torch.finfo(weights.dtype).tiny)
-        scaled_targets = torch.where(weights.unsqueeze(-1) > 0, moments / held, scaled_model)
-        targets = scaled_targets / scale + center
+        scaled_model, scaled_data = offset * scale, data * scale
+        weights, moments, inlier = _accumulate(scaled_model, scaled_data, outlier, valid, expand)
+        held = weights.unsqueeze(-1) > torch.finfo(weights.dtype).tiny
+        scaled_targets = torch.where(held, moments / weights.unsqueeze(-1), scaled_model)
+        targets = torch.where(held, scaled_targets / scale + center, model)
         # sum_j alpha |Y - X|^2 splits into the spread of the held data and their offset from the model point.
         squares = _squared_error(scaled_model, scaled_data, scaled_targets, weights, inlier) / scale[:, 0, 0].square()
-    shape = (*batch,)
     return EStep(
-        weights.reshape(*shape, -1), targets.reshape(*shape, -1, 3), inlier.reshape(*shape, -1), squares.reshape(shape)
+        weights.reshape(*batch, num_model),
+        targets.reshape(*batch, num_model, 3),
+        inlier.reshape(*batch, num_data),
+        squares.reshape(batch),
     )
 
 
 def posterior(
-    model: Tensor, data: Tensor, sigma: Tensor, outlier: Tensor | float = OUTLIER_CONSTANT, *, mask: Tensor | None = None
+    model: Tensor,
+    data: Tensor,
+    sigma: Tensor,
+    outlier: Tensor | float = OUTLIER_CONSTANT,
+    *,
+    mask: Tensor | None = None,
 ) -> Tensor:
     """Return the full posterior alpha, for looking at or small problems.
 
     Args:
         model: (..., N, 3), metres.
         data: (..., M, 3), metres.
-        sigma: (...) metres.
-        outlier: (...) c.
+        sigma: (...) metres, positive.
+        outlier: (...) c, positive.
         mask: (..., M) False where a datum is padding (its column is zero).
 
     Returns:
@@ -137,14 +148,71 @@ def posterior(
     References: Dewaele et al. 2006, eq. 17.
     """
     sigma = torch.as_tensor(sigma, dtype=model.dtype, device=model.device)
-    exponent = -(model.unsqueeze(-2) - data.unsqueeze(-3)).square().sum(-1) / (2 * sigma.square())[..., None, None]
+    # Scaled before squaring: the square of a small sigma underflows.
+    scale = (2**-0.5 / sigma)[..., None, None, None]
+    exponent = -((model.unsqueeze(-2) - data.unsqueeze(-3)) * scale).square().sum(-1)
     level = torch.as_tensor(outlier, dtype=model.dtype, device=model.device).log()[..., None]
     alpha = (exponent - torch.logaddexp(exponent.logsumexp(-2), level).unsqueeze(-2)).exp()
-    return alpha if mask is None else alpha * mask.unsqueeze(-2)
+    return alpha if mask is None else torch.where(mask.unsqueeze(-2), alpha, 0.0)
+
+
+def working_volume(model: Tensor, data: Tensor, sigma: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Return V of eq. 18: the volume of the bounding box of data and posed model, grown by 3 sigma on each side.
+
+    Args:
+        model: (..., N, 3), metres.
+        data: (..., M, 3), metres.
+        sigma: (...) metres.
+        mask: (..., M) False where a datum is padding.
+
+    Returns:
+        (...), cubic metres.
+
+    Differentiable: in all but ``mask``.
+    """
+    low, high = data, data
+    if mask is not None:
+        low = torch.where(mask.unsqueeze(-1), data, torch.inf)
+        high = torch.where(mask.unsqueeze(-1), data, -torch.inf)
+    lowest = torch.minimum(low.amin(-2), model.amin(-2))
+    highest = torch.maximum(high.amax(-2), model.amax(-2))
+    return (highest - lowest + 6 * sigma.unsqueeze(-1)).prod(-1)
 
 
 def _flat(value: Tensor | float, batch: torch.Size, like: Tensor) -> Tensor:
     return torch.as_tensor(value, dtype=like.dtype, device=like.device).expand(batch).reshape(like.shape[0])
+
+
+def _centered(data: Tensor, valid: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the data with the origin moved to their mean, padding at the origin, and the mean (B, 1, 3)."""
+    if valid is None:
+        center = data.sum(-2, keepdim=True) / max(data.shape[-2], 1)
+        return data - center, center
+    valid = valid.unsqueeze(-1)
+    count = valid.sum(-2, keepdim=True).clamp_min(1)
+    center = torch.where(valid, data, 0.0).sum(-2, keepdim=True) / count
+    return torch.where(valid, data - center, 0.0), center
+
+
+def _accumulate(
+    model: Tensor, data: Tensor, outlier: Tensor, valid: Tensor | None, expand: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return lambda (B, N), sum_j alpha_ij Y_j (B, N, 3) and the inlier posterior (B, M) of scaled points."""
+    weights, moments = torch.zeros_like(model[..., 0]), torch.zeros_like(model)
+    inlier = torch.zeros_like(data[..., 0])
+    for rows, columns in _chunks(model.shape[0], model.shape[1], data.shape[1]):
+        part = data[rows, columns]
+        kernel = _kernel(model[rows], part, expand)
+        total = kernel.sum(-2)
+        share = (total + outlier[rows, None]).reciprocal()
+        if valid is not None:
+            share = share * valid[rows, columns]
+        inlier[rows, columns] = total * share
+        payload = torch.cat([torch.ones_like(part[..., :1]), part], dim=-1)
+        gathered = kernel @ (payload * share.unsqueeze(-1))
+        weights[rows] += gathered[..., 0]
+        moments[rows] += gathered[..., 1:]
+    return weights, moments, inlier
 
 
 def _chunks(batch: int, num_model: int, num_data: int) -> Iterator[tuple[slice, slice]]:
@@ -157,22 +225,28 @@ def _chunks(batch: int, num_model: int, num_data: int) -> Iterator[tuple[slice, 
             yield slice(row, row + rows), slice(column, column + columns)
 
 
-def _kernel(model: Tensor, data: Tensor) -> Tensor:
-    """Return ``exp(-|x - y|^2)`` (B, N, M) of scaled points."""
-    if model.dtype == torch.float64 or _extent(model, data) < _MAX_EXPANDED_RATIO:
-        squares = torch.baddbmm(
-            model.square().sum(-1, keepdim=True) + data.square().sum(-1).unsqueeze(-2), model, data.mT, alpha=-2.0
-        )
-        return squares.clamp_min_(0).neg_().exp_()
-    squares = (model[..., 0:1] - data[..., 0].unsqueeze(-2)).square_()
-    for axis in (1, 2):
-        difference = model[..., axis : axis + 1] - data[..., axis].unsqueeze(-2)
-        squares.addcmul_(difference, difference)
-    return squares.neg_().exp_()
+def _kernel(model: Tensor, data: Tensor, expand: bool) -> Tensor:
+    """Return ``exp(-|x - y|^2)`` (B, N, M) of scaled points, zero below 1e-26.
+
+    With ``expand`` the exponent ``2 xy - |x|^2 - |y|^2`` comes from one matrix product.
+    """
+    if expand:
+        left = torch.cat([2 * model, -model.square().sum(-1, keepdim=True), -torch.ones_like(model[..., :1])], dim=-1)
+        right = torch.cat([data, torch.ones_like(data[..., :1]), data.square().sum(-1, keepdim=True)], dim=-1)
+        exponent = left @ right.mT
+    else:
+        exponent = (model[..., 0:1] - data[..., 0].unsqueeze(-2)).square_()
+        for axis in (1, 2):
+            difference = model[..., axis : axis + 1] - data[..., axis].unsqueeze(-2)
+            exponent.addcmul_(difference, difference)
+        exponent.neg_()
+    # Where exp() underflows it takes ten times as long, and so does arithmetic on what it leaves.
+    return threshold_(exponent.clamp_(_MIN_EXPONENT, 0).exp_(), _MIN_KERNEL, 0.0)
 
 
-def _extent(model: Tensor, data: Tensor) -> float:
-    return float(torch.maximum(model.abs().max(), data.abs().max()))
+def _extent(model: Tensor, data: Tensor) -> Tensor:
+    both = [points.abs().amax() for points in (model, data) if points.numel() > 0]
+    return torch.stack(both).amax() if both else model.new_zeros(())
 
 
 def _squared_error(model: Tensor, data: Tensor, targets: Tensor, weights: Tensor, inlier: Tensor) -> Tensor:

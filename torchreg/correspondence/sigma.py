@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
-from torchreg._checks import check_positive
+from torchreg._checks import check_choice, check_positive
 from torchreg.errors import InputError, InputTypeError
 
 
@@ -16,9 +17,13 @@ class SigmaSchedule:
     Build one with `geometric`, `linear`, `constant` or `adaptive`.
 
     Args:
-        values: sigma of every step, metres, largest first; for "adaptive" the first value and the floor.
-        kind: "fixed" (the values are the schedule) or "adaptive" (sigma is estimated after each step).
+        values: sigma of every step, metres, never rising; for "adaptive" the first value and the floor.
         steps: number of steps.
+        kind: "fixed" (the values are the schedule) or "adaptive" (sigma is estimated after each step).
+
+    Raises:
+        InputError: if a value is not positive, the values rise, or their number does not fit ``steps`` and ``kind``.
+        InputTypeError: if ``steps`` is not an integer.
 
     References: Dewaele et al. 2006, section 3.3.
     """
@@ -28,12 +33,17 @@ class SigmaSchedule:
     kind: Literal["fixed", "adaptive"] = "fixed"
 
     def __post_init__(self) -> None:
-        if isinstance(self.steps, bool) or not isinstance(self.steps, int):
-            raise InputTypeError(f"steps must be an integer, got {type(self.steps).__name__}")
-        if self.steps < 1:
-            raise InputError(f"steps must be at least 1, got {self.steps}")
-        for value in self.values:
-            check_positive(value, "sigma")
+        check_choice(self.kind, "kind", ("fixed", "adaptive"))
+        _check_steps(self.steps)
+        expected = self.steps if self.kind == "fixed" else 2
+        if len(self.values) != expected:
+            raise InputError(
+                f"values must hold {expected} sigma(s) for {self.steps} {self.kind} steps, got {self.values}"
+            )
+        for index, value in enumerate(self.values):
+            check_positive(value, f"values[{index}]")
+        if any(later > earlier for earlier, later in pairwise(self.values)):
+            raise InputError(f"values must not rise from one step to the next, got {self.values}")
 
     @classmethod
     def geometric(cls, start: float, stop: float, steps: int = 5) -> SigmaSchedule:
@@ -42,22 +52,34 @@ class SigmaSchedule:
         Args:
             start: first sigma, metres: the largest motion that is to be found.
             stop: last sigma, metres: the noise of the data.
-            steps: number of sigmas.
+            steps: number of sigmas; with one, ``start`` is the only sigma.
+
+        Raises:
+            InputError: if a sigma is not positive, ``stop`` exceeds ``start``, or ``steps`` is below one.
+            InputTypeError: if a sigma is not a number, or ``steps`` not an integer.
         """
         _check_range(start, stop, steps)
         ratio = (stop / start) ** (1 / max(steps - 1, 1))
-        return cls(tuple(start * ratio**step for step in range(steps)), steps)
+        return cls(_between(start, stop, [start * ratio**step for step in range(steps)]), steps)
 
     @classmethod
     def linear(cls, start: float, stop: float, steps: int = 5) -> SigmaSchedule:
-        """Return sigmas that fall by the same amount each step, from ``start`` to ``stop``, metres."""
+        """Return sigmas that fall by the same amount each step, from ``start`` to ``stop``, metres.
+
+        Arguments and errors are those of `geometric`.
+        """
         _check_range(start, stop, steps)
         fall = (start - stop) / max(steps - 1, 1)
-        return cls(tuple(start - fall * step for step in range(steps)), steps)
+        return cls(_between(start, stop, [start - fall * step for step in range(steps)]), steps)
 
     @classmethod
     def constant(cls, sigma: float, steps: int = 5) -> SigmaSchedule:
-        """Return the same sigma for every step, metres."""
+        """Return the same sigma for every step, metres.
+
+        Raises:
+            InputError: if ``sigma`` is not positive, or ``steps`` is below one.
+            InputTypeError: if ``sigma`` is not a number, or ``steps`` not an integer.
+        """
         _check_range(sigma, sigma, steps)
         return cls((sigma,) * steps, steps)
 
@@ -65,7 +87,8 @@ class SigmaSchedule:
     def adaptive(cls, start: float, stop: float, steps: int = 20) -> SigmaSchedule:
         """Return the conventional schedule: sigma is re-estimated from the residuals, never below ``stop``.
 
-        The paper observes that it falls too quickly and gets trapped; it is here for comparison.
+        The paper observes that it falls too quickly and gets trapped; it is here for comparison. Arguments and errors
+        are those of `geometric`.
         """
         _check_range(start, stop, steps)
         return cls((start, stop), steps, "adaptive")
@@ -76,5 +99,16 @@ def _check_range(start: float, stop: float, steps: int) -> None:
     check_positive(stop, "stop")
     if stop > start:
         raise InputError(f"stop must not exceed start, got start {start} and stop {stop}")
+    _check_steps(steps)
+
+
+def _check_steps(steps: int) -> None:
+    if isinstance(steps, bool) or not isinstance(steps, int):
+        raise InputTypeError(f"steps must be an integer, got {type(steps).__name__}")
     if steps < 1:
         raise InputError(f"steps must be at least 1, got {steps}")
+
+
+def _between(start: float, stop: float, values: list[float]) -> tuple[float, ...]:
+    """Return the values with rounding beyond the two ends removed."""
+    return tuple(min(max(value, stop), start) for value in values)

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_choice
-from torchreg.errors import InputError
+from torchreg._checks import check_choice, check_points
 from torchreg.geometry.primitives import PRIMITIVE_KINDS
 from torchreg.geometry.rigid import rigid_matrix
 
+# Below this share of the largest spread, the second principal spread says that the points lie on a line.
+_LINE_SHARE = 1e-6
 # A tube open at both ends says little about its length: an ellipsoid may reach this far beyond the points.
 _MAX_OVERSHOOT = 1.4
 
@@ -44,19 +45,37 @@ def fit_primitive(points: Tensor, kind: str = "auto") -> FittedPrimitive:
         kind: a kind's name, or "auto" for the kind with the smallest mean distance.
 
     Returns:
-        the best `FittedPrimitive`. Fewer than four points, or points on a line, give a small ellipsoid around them.
+        the best `FittedPrimitive`, in float64. With "auto", fewer than four points, or points on a line, say nothing
+        about the kind and give a thin ellipsoid around them.
 
     Raises:
-        InputError: if ``points`` is empty or ``kind`` is unknown.
+        InputError: if ``points`` is empty or not finite, or ``kind`` is unknown.
+
+    Differentiable: no.
     """
     check_choice(kind, "kind", ("auto", *PRIMITIVE_KINDS))
-    if len(points) == 0:
-        raise InputError("points must hold at least one point to fit a solid to")
-    points = points.double()
-    frames = _principal_frames(points)
-    kinds = tuple(PRIMITIVE_KINDS) if kind == "auto" else (kind,)
-    fits = [_evaluate(points, name, frame, sizes) for name in kinds for frame in frames for sizes, frame in _SIZES[name](points, frame)]
+    check_points(points, "points", batch=False)
+    points = points.detach().double()
+    if kind == "auto":
+        kinds = ("ellipsoid",) if _shapeless(points) else tuple(PRIMITIVE_KINDS)
+    else:
+        kinds = (kind,)
+    candidates = [
+        (name, sizes, moved)
+        for name in kinds
+        for frame in _principal_frames(points)
+        for sizes, moved in _SIZES[name](points, frame)
+    ]
+    fits = [_evaluate(points, name, frame, sizes) for name, sizes, frame in candidates]
     return min(fits, key=lambda fit: fit.error)
+
+
+def _shapeless(points: Tensor) -> bool:
+    """Return whether the points are too few or on a line."""
+    if len(points) < 4:
+        return True
+    spreads = torch.linalg.svdvals(points - points.mean(0))
+    return bool(spreads[1] <= _LINE_SHARE * spreads[0])
 
 
 def _evaluate(points: Tensor, kind: str, frame: Tensor, sizes: Sequence[float]) -> FittedPrimitive:

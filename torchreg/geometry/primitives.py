@@ -1,8 +1,9 @@
 """Signed distances to the solids that make up an articulated shape, with analytic gradients.
 
 Every function takes points in the solid's own frame (long axis z, center at the origin) and one row of sizes per solid,
-and returns a signed distance that is negative inside, exact to first order at the surface. ``*_gradient`` functions return
-the pair (distance, gradient) without building an autograd graph of the distance.
+and returns a signed distance that is negative inside and zero on the surface. It is Euclidean for capsules and cones, to
+first order at the surface for ellipsoids, and measured along rays from the center for superquadrics. ``*_gradient``
+functions return the pair (distance, gradient) in closed form.
 """
 
 from __future__ import annotations
@@ -112,10 +113,10 @@ def _capsule_offset(points: Tensor, sizes: Tensor) -> Tensor:
 
 
 def cone_distance(points: Tensor, sizes: Tensor) -> Tensor:
-    """Return the distance to truncated cones with flat ends on the z axis.
+    """Return the exact distance to truncated cones with flat ends on the z axis.
 
-    The larger of the distances to mantle and ends; beyond both, the root of their squares. This is exact for a
-    cylinder, and for a cone everywhere but beyond the rims, where it is a close bound with the same zero set.
+    Inside it is the larger of the signed distances to mantle and end; outside, the distance to the mantle, the end or
+    the rim between them, whichever is nearest.
 
     Args:
         points: (..., 3), metres, in the cone's frame.
@@ -124,57 +125,61 @@ def cone_distance(points: Tensor, sizes: Tensor) -> Tensor:
     Returns:
         (...), metres.
 
-    Differentiable: in both, away from the axis and the edges of the nearest face, where one side's gradient is taken.
+    Differentiable: in both; where the nearest face changes, one side's gradient is taken.
     """
-    mantle, end = _cone_faces(points, sizes)[:2]
-    return _outside_both(mantle, end)[0]
+    faces = _ConeFaces(points, sizes)
+    return torch.where(faces.at_rim, faces.rim, torch.where(faces.at_mantle, faces.mantle, faces.end))
 
 
 def cone_gradient(points: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
     """Return (distance, gradient) of `cone_distance`."""
-    mantle, end, mantle_normal, end_normal = _cone_faces(points, sizes)
-    distance, mantle_share, end_share = _outside_both(mantle, end)
-    return distance, mantle_share.unsqueeze(-1) * mantle_normal + end_share.unsqueeze(-1) * end_normal
+    faces = _ConeFaces(points, sizes)
+    distance = torch.where(faces.at_rim, faces.rim, torch.where(faces.at_mantle, faces.mantle, faces.end))
+    zero = torch.zeros_like(distance)
+    radial = torch.where(faces.at_rim, faces.rim_radial / faces.rim, torch.where(faces.at_mantle, faces.cosine, zero))
+    lift = torch.where(faces.at_mantle, -faces.slope * faces.cosine, points[..., 2].sign())
+    lift = torch.where(faces.at_rim, faces.rim_axial / faces.rim, lift)
+    return distance, torch.cat([faces.outward * radial.unsqueeze(-1), lift.unsqueeze(-1)], dim=-1)
 
 
-def _cone_faces(points: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    half, bottom, top = sizes.unbind(-1)
-    squared = points[..., :2].square().sum(-1)
-    on_axis = squared == 0
-    radial = torch.where(on_axis, 0.0, torch.where(on_axis, 1.0, squared).sqrt())
-    along = points[..., 2]
-    slope = (top - bottom) / (2 * half)
-    cosine = (1 + slope.square()).rsqrt()
-    mantle = (radial - 0.5 * (top + bottom) - slope * along) * cosine
-    end = along.abs() - half
-    outward = points[..., :2] / torch.where(on_axis, 1.0, radial).unsqueeze(-1)
-    lift = (-slope * cosine).expand_as(radial)
-    mantle_normal = torch.cat([outward * cosine.unsqueeze(-1), lift.unsqueeze(-1)], dim=-1)
-    zero = torch.zeros_like(along)
-    end_normal = torch.stack([zero, zero, along.sign()], dim=-1)
-    return mantle, end, mantle_normal, end_normal
+class _ConeFaces:
+    """The distances of points to the faces and the rims of cones, in the half plane (radius, z), and which is nearest."""
 
-
-def _outside_both(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    corner = (first > 0) & (second > 0)
-    squared = torch.where(corner, first.square() + second.square(), 1.0)
-    root = squared.sqrt()
-    nearer = first >= second
-    distance = torch.where(corner, root, torch.maximum(first, second))
-    share_first = torch.where(corner, first / root, nearer.to(first.dtype))
-    share_second = torch.where(corner, second / root, (~nearer).to(first.dtype))
-    return distance, share_first, share_second
+    def __init__(self, points: Tensor, sizes: Tensor) -> None:
+        half, bottom, top = sizes.unbind(-1)
+        squared = points[..., :2].square().sum(-1)
+        on_axis = squared == 0
+        safe = torch.where(on_axis, 1.0, squared).sqrt()
+        radial = torch.where(on_axis, 0.0, safe)
+        along = points[..., 2]
+        self.outward = points[..., :2] / safe.unsqueeze(-1)
+        self.slope = (top - bottom) / (2 * half)
+        self.cosine = (1 + self.slope.square()).rsqrt()
+        self.mantle = (radial - 0.5 * (top + bottom) - self.slope * along) * self.cosine
+        self.end = along.abs() - half
+        # Height of the foot of the perpendicular on the mantle's line.
+        foot = along + self.slope * self.cosine * self.mantle
+        over_mantle = (self.mantle > 0) & (foot.abs() <= half)
+        over_end = (self.end > 0) & (radial <= torch.where(along < 0, bottom, top))
+        inside = (self.mantle <= 0) & (self.end <= 0)
+        self.at_mantle = over_mantle | (inside & (self.mantle >= self.end))
+        low = foot < 0
+        self.rim_radial = radial - torch.where(low, bottom, top)
+        self.rim_axial = along + torch.where(low, half, -half)
+        squared_rim = self.rim_radial.square() + self.rim_axial.square()
+        self.at_rim = ~(inside | over_mantle | over_end) & (squared_rim > 0)
+        self.rim = torch.where(self.at_rim, squared_rim, 1.0).sqrt()
 
 
 def superquadric_distance(points: Tensor, sizes: Tensor) -> Tensor:
-    """Return the radial distance to superquadrics, ``|x| (1 - 1 / k)``, with the inside-outside function k of degree one.
+    """Return the radial distance to superquadrics, ``|x| (1 - 1 / k)``, k the inside-outside function of degree one.
 
     ``k = ((|x/a|^(2/e2) + |y/b|^(2/e2))^(e2/e1) + |z/c|^(2/e1))^(e1/2)``. It is measured along the ray from the center,
     so it exceeds the Euclidean distance on oblique faces.
 
     Args:
         points: (..., 3), metres, in the superquadric's frame.
-        sizes: (..., 5): radii along x, y, z in metres; exponents e1, e2 in [0.1, 1.9] (1: ellipsoid, 0.1: nearly a box).
+        sizes: (..., 5): radii along x, y, z in metres; exponents e1, e2 in [0.1, 1.9] (1: ellipsoid, 0.1: near a box).
 
     Returns:
         (...), metres; minus the smallest radius at the center.
@@ -197,17 +202,21 @@ def superquadric_gradient(points: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor
 
 def _superquadric_level(points: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     radii, e1, e2 = sizes[..., :3], sizes[..., 3], sizes[..., 4]
-    scaled = points / radii
-    largest = scaled.abs().amax(-1)
+    scaled = (points / radii).abs()
+    largest = scaled.amax(-1)
     center = largest < 1e-6
-    # Degree one lets the largest coordinate be taken out, so that high powers neither overflow nor vanish.
-    largest = torch.where(center, 1.0, largest)
-    u = (scaled / largest.unsqueeze(-1)).abs().clamp_min(1e-12)
-    planar = u[..., 0] ** (2 / e2) + u[..., 1] ** (2 / e2)
-    inside = planar ** (e2 / e1) + u[..., 2] ** (2 / e1)
+    # Degree one lets the largest coordinate be taken out, of the plane and of the whole, so that high powers of small
+    # numbers are only ever added to one and neither overflow, nor vanish, nor divide by zero.
+    u = (scaled / torch.where(center, 1.0, largest).unsqueeze(-1)).clamp_min(1e-12)
+    widest = u[..., :2].amax(-1)
+    v = u[..., :2] / widest.unsqueeze(-1)
+    planar_sum = (v ** (2 / e2).unsqueeze(-1)).sum(-1)
+    planar = widest * planar_sum ** (e2 / 2)
+    inside = planar ** (2 / e1) + u[..., 2] ** (2 / e1)
     level = largest * inside ** (e1 / 2)
     power = inside ** (e1 / 2 - 1)
-    in_plane = (power * planar ** (e2 / e1 - 1)).unsqueeze(-1) * u[..., :2] ** (2 / e2 - 1).unsqueeze(-1)
+    in_plane = (power * planar ** (2 / e1 - 1) * planar_sum ** (e2 / 2 - 1)).unsqueeze(-1)
+    in_plane = in_plane * v ** (2 / e2 - 1).unsqueeze(-1)
     in_height = power * u[..., 2] ** (2 / e1 - 1)
     level_gradient = torch.cat([in_plane, in_height.unsqueeze(-1)], dim=-1) * points.sign() / radii
     squared = points.square().sum(-1)

@@ -18,10 +18,10 @@ def farthest_points(points: Tensor, count: int, start: int = 0) -> Tensor:
         start: index of the first.
 
     Returns:
-        (count,) int64 indices, in the order of choice.
+        (count,) int64 indices, all different, in the order of choice.
 
     Raises:
-        InputError: if ``count`` is not between 1 and N.
+        InputError: if ``count`` is not between 1 and N, or ``start`` is not an index of a point.
 
     Cost: O(N count).
 
@@ -30,10 +30,14 @@ def farthest_points(points: Tensor, count: int, start: int = 0) -> Tensor:
     check_points(points, "points", batch=False)
     if not 1 <= count <= len(points):
         raise InputError(f"count must be between 1 and the number of points {len(points)}, got {count}")
+    if not 0 <= start < len(points):
+        raise InputError(f"start must be the index of one of {len(points)} points, got {start}")
     chosen = torch.empty(count, dtype=torch.long, device=points.device)
     chosen[0] = start
     nearest = torch.full_like(points[:, 0], torch.inf)
     for index in range(1, count):
         nearest = torch.minimum(nearest, (points - points[chosen[index - 1]]).square().sum(-1))
+        # Below every distance, so that no point is chosen twice among duplicates.
+        nearest[chosen[index - 1]] = -1
         chosen[index] = nearest.argmax()
     return chosen

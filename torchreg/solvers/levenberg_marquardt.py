@@ -12,6 +12,8 @@ _DAMPING_DOWN = 0.2
 _DAMPING_UP = 6.0
 _MIN_DAMPING = 1e-7
 _MAX_DAMPING = 1e7
+# Rounding makes a singular Hessian of D variables indefinite by about D eps; a damping of a few times that covers it.
+_ROUNDING_COVER = 4.0
 
 
 @dataclass(frozen=True)
@@ -61,38 +63,43 @@ def levenberg_marquardt(
 ) -> LMResult:
     """Return the state of lowest cost that the iteration finds; problems of a batch proceed independently.
 
-    Each step solves ``(H + damping diag(H)) s = -g``. Variables at a limit whose gradient pushes outwards are frozen for
-    the step; the others are clamped at the limit. A step that raises the cost is undone and the damping raised.
+    Each step solves ``(H + damping diag(H)) s = -g``. Variables at a limit whose gradient pushes outwards are frozen
+    for the step; the others are clamped at the limit. A step that raises the cost, or whose system has no Cholesky
+    factor, is undone and the damping raised.
 
     Args:
         linearize: state (B, D) to `Linearization`.
-        state: (B, D) start; moved inside the limits first.
+        state: (B, D) start; clamped to the limits first.
         retract: (state, step) to state; addition by default.
-        lower: (D,) limits of the state, or None.
-        upper: (D,) limits of the state, or None.
+        lower: (D,) or (B, D) limits of the state, or None.
+        upper: (D,) or (B, D) limits of the state, none below ``lower``, or None.
         damping: (B,) relative damping to start with; 1e-3 by default.
         max_steps: number of linearizations after the first.
         atol: stop when every problem's largest step component is at most this.
 
     Returns:
-        an `LMResult`.
+        an `LMResult`; where the start has no finite cost, the start.
 
     Differentiable: no.
 
+    Cost: ``max_steps + 1`` linearizations and ``max_steps`` batched Cholesky factorizations.
+
     References: Marquardt 1963; Bertsekas 1982 for the limits.
     """
-    low = torch.full_like(state[0], -torch.inf) if lower is None else lower
-    high = torch.full_like(state[0], torch.inf) if upper is None else upper
+    low = state.new_full(state.shape[-1:], -torch.inf) if lower is None else lower
+    high = state.new_full(state.shape[-1:], torch.inf) if upper is None else upper
+    min_damping = max(_MIN_DAMPING, _ROUNDING_COVER * state.shape[-1] * torch.finfo(state.dtype).eps)
     state = torch.minimum(torch.maximum(state, low), high)
     damping = state.new_full(state.shape[:1], 1e-3) if damping is None else damping
     current = linearize(state)
     last_step = torch.zeros_like(state)
-    count = 0
-    for count in range(1, max_steps + 1):
-        step = damped_step(current, damping, frozen=_frozen(current.gradient, state, low, high))
+    num_steps = 0
+    while num_steps < max_steps:
+        num_steps += 1
+        step, sound = _solve(current, damping, _frozen(current.gradient, state, low, high))
         trial_state = torch.minimum(torch.maximum(retract(state, step), low), high)
         trial = linearize(trial_state)
-        better = trial.cost <= current.cost
+        better = (trial.cost <= current.cost) & sound
         keep = better.unsqueeze(-1)
         state = torch.where(keep, trial_state, state)
         last_step = torch.where(keep, step, last_step)
@@ -102,14 +109,16 @@ def levenberg_marquardt(
             torch.where(keep.unsqueeze(-1), trial.hessian, current.hessian),
         )
         damping = torch.where(better, damping * _DAMPING_DOWN, damping * _DAMPING_UP)
-        damping = damping.clamp(_MIN_DAMPING, _MAX_DAMPING)
-        if atol > 0 and float(step.abs().max()) <= atol:
+        damping = damping.clamp(min_damping, _MAX_DAMPING)
+        if atol > 0 and bool(((step.abs().amax(-1) <= atol) & sound).all()):
             break
-    return LMResult(state, current.cost, damping, last_step, count)
+    return LMResult(state, current.cost, damping, last_step, num_steps)
 
 
 def damped_step(problem: Linearization, damping: Tensor, *, frozen: Tensor | None = None) -> Tensor:
     """Return the step ``-(H + damping diag(H))^-1 g``, zero in frozen variables and where nothing constrains one.
+
+    A problem whose damped system has no Cholesky factor gets a zero step.
 
     Args:
         problem: the linearized problem.
@@ -118,7 +127,14 @@ def damped_step(problem: Linearization, damping: Tensor, *, frozen: Tensor | Non
 
     Returns:
         (B, D).
+
+    Differentiable: no.
     """
+    return _solve(problem, damping, frozen)[0]
+
+
+def _solve(problem: Linearization, damping: Tensor, frozen: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Return the damped step (B, D) and whether its system could be factored (B,)."""
     hessian, gradient = problem.hessian, problem.gradient
     diagonal = hessian.diagonal(dim1=-2, dim2=-1)
     # A variable without curvature keeps its place: unit diagonal, zero gradient. The floor bounds the repair.
@@ -131,10 +147,12 @@ def damped_step(problem: Linearization, damping: Tensor, *, frozen: Tensor | Non
     outer = (scale * free).unsqueeze(-1) * (scale * free).unsqueeze(-2)
     scaled = hessian * outer
     scaled.diagonal(dim1=-2, dim2=-1).copy_(1 + damping.unsqueeze(-1).expand_as(scale))
-    factor, _ = torch.linalg.cholesky_ex(scaled)
+    factor, info = torch.linalg.cholesky_ex(scaled)
     right = (-gradient * scale * free).unsqueeze(-1)
     step = torch.cholesky_solve(right, factor).squeeze(-1) * scale * free
-    return torch.where(torch.isfinite(step), step, 0.0)
+    sound = info == 0
+    # A NaN in the gradient alone leaves the factor sound; its trial must not reach the caller's function.
+    return torch.where(torch.isfinite(step) & sound.unsqueeze(-1), step, 0.0), sound
 
 
 def _frozen(gradient: Tensor, state: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
