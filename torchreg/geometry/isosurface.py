@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from itertools import permutations
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_shape
+from torchreg._checks import as_float_tensor, check_finite, check_positive, check_shape
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 
 # Kuhn's six tetrahedra of a cube: the monotone paths from corner 0 to corner 7; they match across cube faces.
 _TETRAHEDRA = [[0, 1 << a, (1 << a) | (1 << b), 7] for a, b, _ in permutations(range(3))]
+# Offsets of the 8 corners: bit a of a corner's number is its step along axis a.
+_CORNERS = [(c & 1, c >> 1 & 1, c >> 2 & 1) for c in range(8)]
+# Per number of inside corners (which come first): triangles as three (inside, outside) edges, with normals towards the
+# outside where the four corners are right-handed.
+_TRIANGLES = {
+    1: [((0, 1), (0, 2), (0, 3))],
+    2: [((0, 2), (0, 3), (1, 2)), ((1, 2), (0, 3), (1, 3))],
+    3: [((0, 3), (1, 3), (2, 3))],
+}
 _MAX_GRID_POINTS = 50_000_000
 _CHUNK = 65_536
 
@@ -29,7 +39,7 @@ def isosurface(
     Args:
         field: (n, 3) points to (n,) values.
         lower: (3,) lower corner of the box.
-        upper: (3,) upper corner of the box.
+        upper: (3,) upper corner of the box; the grid may reach up to one spacing beyond it.
         spacing: edge length of the grid's cubes, in the unit of the box.
         chunk: number of points the field is asked for at a time.
 
@@ -37,74 +47,107 @@ def isosurface(
         the mesh; without faces if the field does not change sign on the grid.
 
     Raises:
-        InputError: if the box is empty or would need more than 50 million grid points.
+        InputError: if the box is empty or would need more than 50 million grid points, or the field does not return
+            one finite value per point.
 
     Differentiable: no.
 
     Cost: one evaluation of the field per grid point.
+
+    References: Doi and Koide 1991.
     """
-    check_shape(lower, "lower", (3,))
-    check_shape(upper, "upper", (3,))
-    if not spacing > 0 or not bool((upper > lower).all()):
-        raise InputError(f"spacing must be positive and upper above lower, got {spacing}, {lower.tolist()}, {upper.tolist()}")
-    sizes = [int(n) for n in ((upper - lower) / spacing).ceil().long() + 1]
-    if sizes[0] * sizes[1] * sizes[2] > _MAX_GRID_POINTS:
-        raise InputError(f"spacing {spacing} gives a grid of {sizes} points, over {_MAX_GRID_POINTS}; choose a larger one")
+    grid = _Grid(as_float_tensor(lower, "lower"), as_float_tensor(upper, "upper"), spacing)
     with torch.no_grad():
-        axes = [lower[a] + spacing * torch.arange(n, dtype=lower.dtype, device=lower.device) for a, n in enumerate(sizes)]
-        points = torch.cartesian_prod(*axes)
-        values = torch.cat([field(part) for part in points.split(chunk)])
-        return _march(points, values, sizes)
+        count = math.prod(grid.sizes)
+        parts = torch.arange(count, device=grid.lower.device).split(chunk)
+        values = torch.cat([_evaluate(field, grid.points(index)) for index in parts])
+        check_finite(values, "the field's values")
+        return _march(grid, values)
 
 
-def _march(points: Tensor, values: Tensor, sizes: list[int]) -> TriangleMesh:
-    corners = _cut_cubes(values, sizes)
+class _Grid:
+    """A cubic grid: flat indices to points, without holding the points."""
+
+    def __init__(self, lower: Tensor, upper: Tensor, spacing: float) -> None:
+        for name, corner in (("lower", lower), ("upper", upper)):
+            check_shape(corner, name, (3,))
+            check_finite(corner, name)
+        check_positive(spacing, "spacing")
+        if not bool((upper > lower).all()):
+            raise InputError(f"upper must be above lower on every axis, got {upper.tolist()} and {lower.tolist()}")
+        self.lower = lower
+        self.spacing = spacing
+        self.sizes = [math.ceil(extent / spacing) + 1 for extent in (upper - lower).tolist()]
+        if math.prod(self.sizes) > _MAX_GRID_POINTS:
+            raise InputError(
+                f"spacing {spacing} gives a grid of {self.sizes} points, over {_MAX_GRID_POINTS}; choose a larger one"
+            )
+
+    def steps(self, index: Tensor) -> Tensor:
+        """Return the (..., 3) steps along the axes of flat indices."""
+        rows = index // self.sizes[2]
+        return torch.stack([rows // self.sizes[1], rows % self.sizes[1], index % self.sizes[2]], dim=-1)
+
+    def points(self, index: Tensor) -> Tensor:
+        """Return the (..., 3) points of flat indices."""
+        return self.lower + self.spacing * self.steps(index).to(self.lower.dtype)
+
+
+def _evaluate(field: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
+    values = field(points)
+    check_shape(values, "the field's values", (len(points),))
+    return values
+
+
+def _march(grid: _Grid, values: Tensor) -> TriangleMesh:
+    corners = _cut_cubes(values, grid.sizes)
     tetrahedra = corners[:, torch.tensor(_TETRAHEDRA, device=values.device)].reshape(-1, 4)
     inside = values[tetrahedra] < 0
     count = inside.sum(-1)
     # Inside corners first: then only the number of inside corners decides the triangles.
     tetrahedra = tetrahedra.gather(-1, inside.long().argsort(dim=-1, descending=True, stable=True))
-    edges = []
-    for number, triangles in _TRIANGLES.items():
+    triangles = []
+    for number, table in _TRIANGLES.items():
         chosen = tetrahedra[count == number]
-        edges += [torch.stack([chosen[:, list(pair)] for pair in triangle], dim=1) for triangle in triangles]
-    ends = torch.cat(edges) if edges else tetrahedra.new_zeros(0, 3, 2)
-    flat, inverse = ends.reshape(-1, 2).unique(dim=0, return_inverse=True)
-    inner, outer = values[flat[:, 0]], values[flat[:, 1]]
-    share = (inner / (inner - outer)).unsqueeze(-1)
-    vertices = points[flat[:, 0]] + share * (points[flat[:, 1]] - points[flat[:, 0]])
-    faces = inverse.reshape(-1, 3)
-    return TriangleMesh(vertices, _oriented(vertices, faces, points, ends))
+        edges = torch.stack([chosen[:, torch.tensor(row, device=chosen.device)] for row in table], dim=1)
+        triangles.append(torch.where(_left_handed(grid, chosen)[:, None, None, None], edges.flip(2), edges))
+    ends = torch.cat([part.reshape(-1, 3, 2) for part in triangles])
+    # A corner of value zero is one vertex for all its edges; the triangles that collapse there are dropped.
+    ends = torch.where((values[ends[..., 1]] == 0).unsqueeze(-1), ends[..., 1:], ends)
+    faces = ends[..., 0] * values.numel() + ends[..., 1]
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    keys, faces = faces.unique(return_inverse=True)
+    edges = torch.stack([keys // values.numel(), keys % values.numel()], dim=-1)
+    return TriangleMesh(_crossings(grid, values, edges), faces.reshape(-1, 3))
 
 
-# Per number of inside corners (which come first): triangles as three (inside, outside) edges.
-_TRIANGLES = {
-    1: [((0, 1), (0, 2), (0, 3))],
-    2: [((0, 2), (0, 3), (1, 2)), ((1, 2), (0, 3), (1, 3))],
-    3: [((0, 3), (1, 3), (2, 3))],
-}
+def _crossings(grid: _Grid, values: Tensor, edges: Tensor) -> Tensor:
+    """Return the zeros of the field, linear along (inside, outside) edges; the corner itself for a doubled corner."""
+    inner, outer = values[edges].unbind(-1)
+    span = inner - outer
+    share = torch.where(span == 0, 0.0, inner / torch.where(span == 0, 1.0, span))
+    start, end = grid.points(edges).unbind(1)
+    return start + share.unsqueeze(-1).to(start.dtype) * (end - start)
+
+
+def _left_handed(grid: _Grid, tetrahedra: Tensor) -> Tensor:
+    """Return whether the corners of tetrahedra (T, 4) are left-handed; on integer steps, so never in doubt."""
+    steps = grid.steps(tetrahedra)
+    a, b, c = (steps[:, 1:] - steps[:, :1]).unbind(1)
+    return (torch.linalg.cross(a, b) * c).sum(-1) < 0
 
 
 def _cut_cubes(values: Tensor, sizes: list[int]) -> Tensor:
-    """Return the 8 corner indices of every cube in which the field changes sign."""
-    index = torch.arange(values.numel(), device=values.device).reshape(sizes)
-    corners = torch.stack(
-        [
-            index[x : sizes[0] - 1 + x, y : sizes[1] - 1 + y, z : sizes[2] - 1 + z].reshape(-1)
-            for x, y, z in ((c & 1, c >> 1 & 1, c >> 2 & 1) for c in range(8))
-        ],
-        dim=-1,
-    )
-    signs = values[corners] < 0
-    return corners[signs.any(-1) & ~signs.all(-1)]
-
-
-def _oriented(vertices: Tensor, faces: Tensor, points: Tensor, ends: Tensor) -> Tensor:
-    """Return the faces with normals that point from the inside ends of their edges to the outside ends."""
-    a, b, c = vertices[faces].unbind(1)
-    normal = torch.linalg.cross(b - a, c - a)
-    outwards = (points[ends[:, :, 1]] - points[ends[:, :, 0]]).sum(1)
-    flip = (normal * outwards).sum(-1) < 0
-    faces = torch.where(flip.unsqueeze(-1), faces[:, [0, 2, 1]], faces)
-    # A corner value of exactly zero collapses triangles to a point.
-    return faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    """Return the (C, 8) flat corner indices of every cube in which the field changes sign."""
+    negative = (values < 0).reshape(sizes)
+    shape = [size - 1 for size in sizes]
+    some = torch.zeros(shape, dtype=torch.bool, device=values.device)
+    every = torch.ones_like(some)
+    for x, y, z in _CORNERS:
+        corner = negative[x : x + shape[0], y : y + shape[1], z : z + shape[2]]
+        some |= corner
+        every &= corner
+    first = (some & ~every).nonzero()
+    strides = torch.tensor([sizes[1] * sizes[2], sizes[2], 1], device=values.device)
+    offsets = torch.tensor(_CORNERS, device=values.device)
+    return ((first.unsqueeze(1) + offsets) * strides).sum(-1)
