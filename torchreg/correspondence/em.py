@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import threshold_
 
 # c of eq. 18 when the matched volume is negligible beside the working volume.
 OUTLIER_CONSTANT = 3 * math.sqrt(math.pi / 2)
@@ -241,7 +240,7 @@ def _kernel(model: Tensor, data: Tensor, expand: bool) -> Tensor:
             exponent.addcmul_(difference, difference)
         exponent.neg_()
     # Where exp() underflows it takes ten times as long, and so does arithmetic on what it leaves.
-    return threshold_(exponent.clamp_(_MIN_EXPONENT, 0).exp_(), _MIN_KERNEL, 0.0)
+    return torch.threshold_(exponent.clamp_(_MIN_EXPONENT, 0).exp_(), _MIN_KERNEL, 0.0)
 
 
 def _extent(model: Tensor, data: Tensor) -> Tensor:

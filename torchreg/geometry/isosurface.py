@@ -59,8 +59,9 @@ def isosurface(
     grid = _Grid(as_float_tensor(lower, "lower"), as_float_tensor(upper, "upper"), spacing)
     with torch.no_grad():
         count = math.prod(grid.sizes)
-        parts = torch.arange(count, device=grid.lower.device).split(chunk)
-        values = torch.cat([_evaluate(field, grid.points(index)) for index in parts])
+        parts = [(start, min(start + chunk, count)) for start in range(0, count, chunk)]
+        device = grid.lower.device
+        values = torch.cat([_evaluate(field, grid.points(torch.arange(*part, device=device))) for part in parts])
         check_finite(values, "the field's values")
         return _march(grid, values)
 
