@@ -43,7 +43,7 @@ def test_trees_do_not_change():
         tree.joints[0].parent = 1
 
 
-@given(st.lists(st.integers(0, 10**6), max_size=12), st.integers(0, 2**32 - 1))
+@given(st.lists(st.integers(0, 10**6), max_size=12), st.integers(0, 2**31))
 def test_any_topologically_ordered_tree_with_rigid_offsets_passes(draws, seed):
     joints = [joint("0", -1)]
     for index, draw in enumerate(draws, start=1):
@@ -69,6 +69,7 @@ def matrix(**entries):
         (1, {"parent": -1}, "frame 'base' is a second root: the tree is disconnected"),
         (1, {"parent": 2}, r"frame 'base' \(index 1\) has parent index 2 of 3: .*cyclic"),
         (1, {"parent": 1}, "frame 'base' .*cyclic or out of order"),
+        (1, {"parent": -2}, "frame 'base' .* has parent index -2 of 3"),
         (2, {"name": "palm"}, "frame names must be unique, these occur more than once: palm"),
         (1, {"kind": "ball"}, "joint 'base' has kind 'ball'; known: fixed, revolute, prismatic"),
         (1, {"offset": torch.eye(3)}, r"joint 'base' needs a finite \(4, 4\) offset"),
@@ -85,6 +86,22 @@ def matrix(**entries):
         (1, {"axis": (0.0, float("nan"), 0.0)}, "joint 'base' has axis .* of length nan"),
         (1, {"lower": 1.0, "upper": -1.0}, "joint 'base' has limits 1.0 to -1.0; lower must not exceed upper"),
         (1, {"lower": float("nan")}, "joint 'base' has limits nan"),
+        (
+            1,
+            {"lower": float("inf"), "upper": float("inf")},
+            "joint 'base' has limits inf to inf, which no finite value",
+        ),
+        (1, {"axis": (0.6, 0.8)}, "joint 'base' has axis .* a unit vector is needed"),
+        (1, {"offset": matrix(m30=0.1)}, "joint 'base' has an offset whose last row is .* it must be 0, 0, 0, 1"),
+        (1, {"offset": matrix(m33=2.0)}, "joint 'base' has an offset whose last row is .* it must be 0, 0, 0, 1"),
+        (2, {"mimic": (3, 1.0, 0.0)}, "joint 'tip' mimics the joint of index 3, but there are 3"),
+        (2, {"mimic": (-1, 1.0, 0.0)}, "joint 'tip' mimics the joint of index -1, but there are 3"),
+        (2, {"mimic": (2, 1.0, 0.0)}, "joint 'tip' follows itself through its mimic joints: tip"),
+        (1, {"mimic": (2, 1.0, 0.0)}, "joint 'base' follows itself through its mimic joints: base, tip"),
+        (2, {"mimic": (1, float("nan"), 0.0)}, "joint 'tip' has a mimic of multiplier nan"),
+        (2, {"mimic": (1, 1.0, float("inf"))}, "joint 'tip' has a mimic of .*offset inf"),
+        (2, {"mimic": (0, 1.0, 0.0)}, "joint 'tip' mimics 'palm': neither of the two may be fixed"),
+        (2, {"kind": "fixed"}, "joint 'tip' mimics 'base': neither of the two may be fixed"),
     ],
 )
 def test_impossible_trees_are_refused_by_name(index, change, message):

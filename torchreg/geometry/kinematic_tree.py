@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -27,7 +28,7 @@ class Joint:
         axis: unit vector in frame coordinates (ignored for fixed joints).
         lower: lower limit, radians or metres.
         upper: upper limit, radians or metres.
-        mimic: (index of the followed frame, multiplier, offset), or None.
+        mimic: (index of the followed frame, multiplier, offset), or None; ``value = multiplier * followed + offset``.
     """
 
     name: str
@@ -45,7 +46,8 @@ class KinematicTree:
     """A validated tree of frames in topological order (every parent before its children, one root).
 
     Raises:
-        ModelError: if the tree is empty, cyclic, disconnected, non-finite, has doubled names or impossible limits.
+        ModelError: if the tree is empty, cyclic, disconnected, non-finite, has doubled names, impossible limits, or
+            joints that follow themselves, a fixed joint or none at all.
     """
 
     joints: tuple[Joint, ...]
@@ -59,6 +61,9 @@ class KinematicTree:
             raise ModelError(f"frame names must be unique, these occur more than once: {', '.join(doubled[:5])}")
         for index, joint in enumerate(self.joints):
             _check_joint(index, joint, len(self.joints))
+            _check_axis_and_limits(joint)
+        for joint in self.joints:
+            _check_mimic(joint, self.joints)
 
     def __len__(self) -> int:
         return len(self.joints)
@@ -75,20 +80,47 @@ def _check_joint(index: int, joint: Joint, count: int) -> None:
     if (index == 0) != (joint.parent == -1):
         problem = "is a second root: the tree is disconnected" if joint.parent == -1 else "must be the root (parent -1)"
         raise ModelError(f"frame {joint.name!r} {problem}")
-    if joint.parent >= index:
+    if not -1 <= joint.parent < index:
         raise ModelError(
             f"frame {joint.name!r} (index {index}) has parent index {joint.parent} of {count}: parents come "
-            f"first, so the tree is cyclic or out of order"
+            f"first (-1 marks the root), so the tree is cyclic or out of order"
         )
     if joint.kind not in JOINT_TYPES:
         raise ModelError(f"joint {joint.name!r} has kind {joint.kind!r}; known: {', '.join(JOINT_TYPES)}")
     if tuple(joint.offset.shape) != (4, 4) or not bool(torch.isfinite(joint.offset).all()):
         raise ModelError(f"joint {joint.name!r} needs a finite (4, 4) offset")
-    rotation = joint.offset[:3, :3].double()
+    rotation, bottom = joint.offset[:3, :3].double(), joint.offset[3].tolist()
+    if bottom != [0.0, 0.0, 0.0, 1.0]:
+        raise ModelError(f"joint {joint.name!r} has an offset whose last row is {bottom}; it must be 0, 0, 0, 1")
     if not torch.allclose(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64), atol=1e-4) or rotation.det() < 0:
         raise ModelError(f"joint {joint.name!r} has an offset that is not a rigid motion (scale, shear or mirror)")
+
+
+def _check_axis_and_limits(joint: Joint) -> None:
     length = sum(a * a for a in joint.axis) ** 0.5
-    if joint.kind != "fixed" and not abs(length - 1) < 1e-6:
+    if joint.kind != "fixed" and not (len(joint.axis) == 3 and abs(length - 1) < 1e-6):
         raise ModelError(f"joint {joint.name!r} has axis {joint.axis} of length {length}; a unit vector is needed")
     if not joint.lower <= joint.upper:
         raise ModelError(f"joint {joint.name!r} has limits {joint.lower} to {joint.upper}; lower must not exceed upper")
+    if joint.lower == math.inf or joint.upper == -math.inf:
+        raise ModelError(f"joint {joint.name!r} has limits {joint.lower} to {joint.upper}, which no finite value meets")
+
+
+def _check_mimic(joint: Joint, joints: tuple[Joint, ...]) -> None:
+    """Follow the chain of joints that ``joint`` mimics to one that moves by itself."""
+    seen = [joint.name]
+    at = joint
+    while at.mimic is not None:
+        followed, multiplier, offset = at.mimic
+        if not 0 <= followed < len(joints):
+            raise ModelError(f"joint {at.name!r} mimics the joint of index {followed}, but there are {len(joints)}")
+        if not (math.isfinite(multiplier) and math.isfinite(offset)):
+            raise ModelError(
+                f"joint {at.name!r} has a mimic of multiplier {multiplier} and offset {offset}; not finite"
+            )
+        at = joints[followed]
+        if at.name in seen:
+            raise ModelError(f"joint {joint.name!r} follows itself through its mimic joints: {', '.join(seen)}")
+        seen.append(at.name)
+    if len(seen) > 1 and "fixed" in (joint.kind, at.kind):
+        raise ModelError(f"joint {joint.name!r} mimics {at.name!r}: neither of the two may be fixed")

@@ -1,0 +1,46 @@
+"""Result records: frozen, complete, and independent of the pipelines that fill them."""
+
+from dataclasses import FrozenInstanceError, fields, replace
+
+import pytest
+import torch
+
+from torchreg.results import AlignRecord, AlignResult, Status
+
+
+def result():
+    return AlignResult(
+        pose=torch.zeros(27),
+        registered=torch.zeros(5, 3),
+        keypoints=torch.zeros(21, 3),
+        distances=torch.zeros(4),
+        inliers=torch.ones(4, dtype=torch.bool),
+        posterior=torch.ones(4),
+        sigma=torch.tensor(0.002),
+        cost=torch.tensor(1.5),
+        status=Status.CONVERGED,
+    )
+
+
+def test_results_do_not_change():
+    with pytest.raises(FrozenInstanceError):
+        result().pose = torch.ones(27)
+    record = AlignRecord("em", 0, 5, torch.ones(1), torch.ones(1), torch.zeros(1, 27), torch.zeros(1))
+    with pytest.raises(FrozenInstanceError):
+        record.step = 1
+
+
+def test_history_is_empty_unless_given_and_fields_can_be_replaced():
+    assert result().history == ()
+    assert replace(result(), status=Status.NO_DATA).status is Status.NO_DATA
+
+
+def test_every_field_is_documented():
+    for record in (AlignResult, AlignRecord):
+        for field in fields(record):
+            assert f"        {field.name}: " in record.__doc__, field.name
+
+
+def test_a_status_has_one_spelling_in_files():
+    assert [Status(status.value) for status in Status] == list(Status)
+    assert {status.value for status in Status} >= {"converged", "max_steps", "few_inliers", "no_data"}

@@ -1,0 +1,528 @@
+"""Articulated shapes: a kinematic tree whose parts are solids that fuse into one surface."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchreg._checks import as_float_tensor, check_positive, check_shape
+from torchreg.errors import InputError, ModelError
+from torchreg.geometry.isosurface import isosurface
+from torchreg.geometry.kinematic_tree import KinematicTree
+from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.rigid import rigid_matrix
+from torchreg.geometry.rotation import compose_rotation_vectors, left_jacobian, so3_exp, wrap_rotation_vector
+from torchreg.models.kinematics import KinematicChain
+from torchreg.models.primitives import Primitive, PrimitiveSet
+from torchreg.models.rigs import RigSurface, ShapeSpec, spec_from_arrays, spec_from_gltf, spec_from_urdf
+from torchreg.models.skin import LinearBlendSkin
+
+_MAX_SURFACE_CELLS = 1_500_000
+BASE_DOF_NAMES = ("base_x", "base_y", "base_z", "base_rx", "base_ry", "base_rz")
+
+
+class ArticulatedShape(nn.Module):
+    """A kinematic tree with one solid per part, a fused surface, and 6 degrees of freedom for its base.
+
+    A pose is a vector: base translation (metres), base rotation vector (radians), then the joints. Parts are the frames
+    that carry a solid; the neighbors of a part are the next part above it in the tree and the next parts below. Only
+    neighbors fuse, so two fingers may touch.
+
+    The base moves the root of the tree: ``T_world_frame = T(translation) R(rotation vector) T_root_frame``, so it turns
+    about the origin of the coordinates that the tree is given in (the file's origin), not about the root's own frame.
+
+    Args:
+        tree: the kinematic tree.
+        part_frames: names of the frames that carry a solid, one per part.
+        primitives: one `Primitive` per part.
+        nu: fusion length of the field in metres; about a quarter of a part's thickness fuses smoothly.
+        part_names: names of the parts; the frame names by default.
+        free_base: False pins the base at the origin (its six limits are zero).
+        surface: mesh and skin weights of the file the shape came from, if any.
+        dtype: of all parameters and buffers; the default dtype if None.
+
+    Raises:
+        ModelError: if parts and primitives do not match the tree.
+
+    References: Dewaele et al. 2006, section 2.
+    """
+
+    adjacency: Tensor
+    part_index: Tensor
+    rest: Tensor
+    lower: Tensor
+    upper: Tensor
+    _owners: Tensor
+    _part_moves: Tensor
+
+    def __init__(
+        self,
+        tree: KinematicTree,
+        part_frames: Sequence[str],
+        primitives: Sequence[Primitive],
+        *,
+        nu: float = 0.003,
+        part_names: Sequence[str] | None = None,
+        free_base: bool = True,
+        surface: RigSurface | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__()
+        check_positive(nu, "nu")
+        if not part_frames or len(part_frames) != len(primitives):
+            raise ModelError(
+                f"a shape needs one primitive per part, got {len(primitives)} for {len(part_frames)} part frames"
+            )
+        if len(set(part_frames)) != len(part_frames):
+            raise ModelError("two parts share a frame; give each part a frame of its own (a fixed joint will do)")
+        self.nu = float(nu)
+        self.chain = KinematicChain(tree)
+        self.primitives = PrimitiveSet(primitives)
+        self.part_names = tuple(part_names or part_frames)
+        self.surface = surface
+        frames = [tree.index(name) for name in part_frames]
+        parents = _part_parents(tree, frames)
+        self.part_parents = tuple(parents)
+        self.register_buffer("part_index", torch.tensor(frames), persistent=False)
+        self.register_buffer("adjacency", _adjacency(parents), persistent=False)
+        self.register_buffer("_owners", torch.tensor(_offset_owners(tree, frames)), persistent=False)
+        self.register_buffer("_part_moves", self.chain.moves[frames].unsqueeze(-1), persistent=False)
+        base = torch.zeros(6, dtype=torch.float64) if not free_base else torch.full((6,), math.inf, dtype=torch.float64)
+        self.register_buffer("lower", torch.cat([-base, self.chain.lower]), persistent=False)
+        self.register_buffer("upper", torch.cat([base, self.chain.upper]), persistent=False)
+        rest = torch.zeros(self.num_dofs, dtype=torch.float64).clamp(self.lower, self.upper)
+        self.register_buffer("rest", rest, persistent=False)
+        self.log_length_scales = nn.Parameter(torch.zeros(len(frames), dtype=torch.float64))
+        self.log_radius_scales = nn.Parameter(torch.zeros(len(frames), dtype=torch.float64))
+        self.to(dtype or torch.get_default_dtype())
+
+    @classmethod
+    def from_spec(cls, spec: ShapeSpec, **options: Any) -> ArticulatedShape:
+        """Return the shape of a `ShapeSpec` (tree, parts, solids, and the file's surface)."""
+        options = {"nu": spec.nu, **{key: value for key, value in options.items() if value is not None}}
+        return cls(spec.tree, spec.part_frames, spec.primitives, surface=spec.surface, **options)
+
+    @classmethod
+    def from_urdf(
+        cls,
+        path: str | Path,
+        *,
+        package_dirs: Sequence[str | Path] = (),
+        primitive: str = "auto",
+        free_base: bool = True,
+        nu: float | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> ArticulatedShape:
+        """Return the shape of a robot: its URDF tree, with solids taken from primitives or fitted to link meshes.
+
+        Args:
+            path: the URDF file.
+            package_dirs: folders in which ``package://`` names are looked up.
+            primitive: "auto" (what each link's geometry is nearest to) or the kind fitted to every link.
+            free_base: False if the robot's base is bolted to the origin.
+            nu: fusion length, metres; from the parts' thickness by default.
+            dtype: of the module; the default dtype if None.
+
+        Returns:
+            the shape; links without geometry are frames but not parts.
+
+        Raises:
+            FormatError: if a file is missing, damaged or oversized.
+            ModelError: if the tree is cyclic, disconnected or non-finite, or no link has geometry.
+        """
+        spec = spec_from_urdf(path, package_dirs=package_dirs, primitive=primitive)
+        return cls.from_spec(spec, free_base=free_base, nu=nu, dtype=dtype)
+
+    @classmethod
+    def from_gltf(
+        cls,
+        path: str | Path,
+        *,
+        parents: Mapping[str, str | None] | None = None,
+        axes: Mapping[str, Sequence[str | Sequence[float]]] | None = None,
+        limits: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+        primitive: str = "ellipsoid",
+        nu: float | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> ArticulatedShape:
+        """Return the shape of a rigged glTF: skeleton to tree, solids fitted to the vertices each joint owns.
+
+        The rest pose (zeros) is the file's bind pose.
+
+        Args:
+            path: a .glb or .gltf file with one skin.
+            parents: parent name of each joint (None: root), for files whose node hierarchy is flat.
+            axes: rotation axes of each joint as "x", "y", "z" or unit vectors in joint coordinates; an empty list
+                makes the joint rigid. Joints not named are balls: x, y, z in this order.
+            limits: (lower, upper) in radians for each axis of a joint; unlimited by default.
+            primitive: kind of the fitted solids.
+            nu: fusion length, metres; from the parts' thickness by default.
+            dtype: of the module; the default dtype if None.
+
+        Returns:
+            the shape; `file_skin` gives the file's own skin.
+
+        Raises:
+            FormatError: if the file is damaged, oversized, or has no skin.
+            ModelError: if the hierarchy is cyclic or disconnected, or a name is unknown.
+        """
+        spec = spec_from_gltf(path, parents=parents, axes=axes, limits=limits, primitive=primitive)
+        return cls.from_spec(spec, nu=nu, dtype=dtype)
+
+    @classmethod
+    def from_skinned_mesh(
+        cls,
+        vertices: Tensor,
+        faces: Tensor,
+        weights: Tensor,
+        joints: Tensor,
+        parents: Sequence[int],
+        *,
+        joint_names: Sequence[str] | None = None,
+        axes: Mapping[str, Sequence[str | Sequence[float]]] | None = None,
+        limits: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+        primitive: str = "ellipsoid",
+        nu: float | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> ArticulatedShape:
+        """Return the shape of a skinned mesh given as arrays, as owners of SMPL or MANO files have them.
+
+        Args:
+            vertices: (V, 3) in the bind pose, metres.
+            faces: (F, 3) integer.
+            weights: (V, J) skin weights, rows sum to one.
+            joints: (J, 3) joint positions or (J, 4, 4) joint frames ``T_world_joint`` in the bind pose.
+            parents: parent index of each joint, -1 (or, as in SMPL, 4294967295) for the root.
+            joint_names: J names; "joint_0", ... by default.
+            axes: see `from_gltf`.
+            limits: see `from_gltf`.
+            primitive: kind of the fitted solids.
+            nu: fusion length, metres; from the parts' thickness by default.
+            dtype: of the module; the default dtype if None.
+
+        Returns:
+            the shape; `file_skin` gives the linear blend skin of the given weights.
+
+        Raises:
+            InputError: if the arrays do not fit together.
+            ModelError: if the hierarchy is cyclic or disconnected.
+        """
+        spec = spec_from_arrays(
+            vertices, faces, weights, joints, parents,
+            joint_names=joint_names, axes=axes, limits=limits, primitive=primitive,
+        )  # fmt: skip
+        return cls.from_spec(spec, nu=nu, dtype=dtype)
+
+    @property
+    def num_dofs(self) -> int:
+        """Number of degrees of freedom: 6 of the base, then the joints."""
+        return 6 + self.chain.num_dofs
+
+    @property
+    def num_parts(self) -> int:
+        """Number of parts."""
+        return len(self.part_names)
+
+    @property
+    def dof_names(self) -> tuple[str, ...]:
+        """Names of the degrees of freedom, in the order of a pose."""
+        return BASE_DOF_NAMES + self.chain.dof_names
+
+    def rest_pose(self) -> Tensor:
+        """Return the pose (num_dofs,) with every joint at zero, or at the limit nearest to zero."""
+        return self.rest.clone()
+
+    def check_pose(self, pose: Tensor, name: str = "pose") -> Tensor:
+        """Return ``pose`` as a tensor of this module's dtype and device; raise InputError if its size is wrong."""
+        pose = as_float_tensor(pose, name, like=self.rest)
+        check_shape(pose, name, (self.num_dofs,), batch=True)
+        return pose
+
+    def clamp(self, pose: Tensor) -> Tensor:
+        """Return the pose with joints moved to their nearest limit and the base rotation wrapped to at most pi."""
+        pose = torch.cat([pose[..., :3], wrap_rotation_vector(pose[..., 3:6]), pose[..., 6:]], dim=-1)
+        return torch.minimum(torch.maximum(pose, self.lower), self.upper)
+
+    def retract(self, pose: Tensor, step: Tensor) -> Tensor:
+        """Return the pose moved by a tangent step; the base rotation is updated by composition, ``exp(step) exp(w)``.
+
+        Args:
+            pose: (..., num_dofs).
+            step: (..., num_dofs), in the coordinates of `part_twists` with ``chart="tangent"``.
+
+        Returns:
+            (..., num_dofs).
+
+        Differentiable: in both.
+        """
+        turned = compose_rotation_vectors(step[..., 3:6], pose[..., 3:6])
+        return torch.cat([pose[..., :3] + step[..., :3], turned, pose[..., 6:] + step[..., 6:]], dim=-1)
+
+    def frame_transforms(self, pose: Tensor) -> Tensor:
+        """Return ``T_world_frame`` of every frame of the tree.
+
+        Args:
+            pose: (..., num_dofs).
+
+        Returns:
+            (..., F, 4, 4).
+
+        Raises:
+            InputError: if the pose has the wrong size.
+
+        Differentiable: in ``pose`` and `log_length_scales`.
+        """
+        check_shape(pose, "pose", (self.num_dofs,), batch=True)
+        base = rigid_matrix(so3_exp(pose[..., 3:6]), pose[..., :3])
+        return base.unsqueeze(-3) @ self.chain(pose[..., 6:], self._offset_scales())
+
+    def part_transforms(self, pose: Tensor) -> Tensor:
+        """Return ``T_world_part`` of every part, ``p_world = T_world_part @ p_part``.
+
+        Args:
+            pose: (..., num_dofs).
+
+        Returns:
+            (..., P, 4, 4).
+
+        Raises:
+            InputError: if the pose has the wrong size.
+
+        Differentiable: in ``pose`` and `log_length_scales`.
+        """
+        return self.frame_transforms(pose)[..., self.part_index, :, :]
+
+    def keypoints(self, pose: Tensor) -> Tensor:
+        """Return the keypoints of the shape: the origins of the parts.
+
+        Args:
+            pose: (..., num_dofs).
+
+        Returns:
+            (..., P, 3), metres.
+
+        Raises:
+            InputError: if the pose has the wrong size.
+
+        Differentiable: in ``pose`` and `log_length_scales`.
+        """
+        return self.part_transforms(pose)[..., :3, 3]
+
+    def part_twists(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
+        """Return the part transforms and the twist each degree of freedom gives to each part.
+
+        A point x of part p moves by ``twist[p, k, :3] + twist[p, k, 3:] x x`` per unit of degree of freedom k.
+
+        Args:
+            pose: (..., num_dofs).
+            chart: "pose" for derivatives with respect to the pose vector, "tangent" for steps taken with `retract`.
+
+        Returns:
+            transforms (..., P, 4, 4) and twists (..., P, num_dofs, 6) as (translation, rotation).
+
+        Differentiable: in ``pose``.
+        """
+        frames = self.frame_transforms(pose)
+        joints = self._part_moves * self.chain.joint_twists(frames)[0].unsqueeze(-3)
+        if self.chain.has_mimics:
+            joints = self.chain.couplings.mT @ joints
+        base = _base_twists(pose, chart)
+        base = base.unsqueeze(-3).expand(*base.shape[:-2], self.num_parts, 6, 6)
+        return frames[..., self.part_index, :, :], torch.cat([base, joints], dim=-2)
+
+    def part_distances(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Return the distance of points to the solid of every part, before fusion.
+
+        Args:
+            points: (..., N, 3), metres.
+            pose: (..., num_dofs).
+
+        Returns:
+            (..., N, P), metres, negative inside.
+
+        Differentiable: in ``points``, ``pose`` and all shape parameters.
+        """
+        local = self._local_points(points, self._solid_frames(self.part_transforms(pose)))
+        return self.primitives(local, self._scaled_sizes())
+
+    def distance(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Return the signed distance of points to the fused surface, ``d = -nu log phi``.
+
+        phi sums the fields ``exp(-d_q / nu)`` of the dominating part and its neighbors only, in the log domain.
+
+        Args:
+            points: (..., N, 3), metres.
+            pose: (..., num_dofs).
+
+        Returns:
+            (..., N), metres, negative inside; first-order accurate near the surface.
+
+        Raises:
+            InputError: if a shape is wrong.
+
+        Differentiable: in ``points``, ``pose`` and all shape parameters, where the dominating part is unique.
+
+        References: Dewaele et al. 2006, eqs. 1 and 2.
+        """
+        check_shape(points, "points", ("N", 3), batch=True)
+        return self._fuse(self.part_distances(points, pose))[0]
+
+    def distance_jacobian(self, points: Tensor, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
+        """Return the fused distance and its analytic Jacobian with respect to all degrees of freedom.
+
+        Args:
+            points: (..., N, 3), metres, fixed in the world.
+            pose: (..., num_dofs).
+            chart: see `part_twists`.
+
+        Returns:
+            distance (..., N) and Jacobian (..., N, num_dofs).
+
+        Differentiable: no; it is a derivative already.
+        """
+        transforms, twists = self.part_twists(pose, chart=chart)
+        solids = self._solid_frames(transforms)
+        local = self._local_points(points, solids)
+        distances, gradients = self.primitives.distance_and_gradient(local, self._scaled_sizes())
+        fused, shares = self._fuse(distances)
+        # A solid that moves by a twist leaves the point behind; force and moment are taken in the solid's own frame.
+        force = gradients * shares.unsqueeze(-1)
+        wrench = torch.cat([force, torch.linalg.cross(local, force)], dim=-1).flatten(-2)
+        linear, angular = twists[..., :3], twists[..., 3:]
+        linear = linear + torch.linalg.cross(angular, solids[..., None, :, 3].expand_as(angular))
+        local_twists = torch.cat([linear @ solids[..., :3], angular @ solids[..., :3]], dim=-1)
+        return fused, -(wrench @ local_twists.transpose(-1, -2).flatten(-3, -2))
+
+    def transform_jacobian(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
+        """Return the stacked part transforms and their analytic derivatives, the rows that skins are linear in.
+
+        Args:
+            pose: (..., num_dofs).
+            chart: see `part_twists`.
+
+        Returns:
+            rows (..., 4 P, 3): for each part the transposed ``[R | t]``; derivatives (..., 4 P, 3, num_dofs).
+
+        Differentiable: in ``pose``.
+        """
+        transforms, twists = self.part_twists(pose, chart=chart)
+        rows = transforms[..., :3, :].mT
+        linear, angular = twists[..., :3], twists[..., 3:]
+        turn = torch.linalg.cross(angular.unsqueeze(-3), rows.unsqueeze(-2))
+        shift = nn.functional.pad(linear.unsqueeze(-3), (0, 0, 0, 0, 3, 0))
+        return rows.flatten(-3, -2), (turn + shift).transpose(-1, -2).flatten(-4, -3)
+
+    def surface_mesh(self, pose: Tensor | None = None, spacing: float | None = None) -> TriangleMesh:
+        """Return a mesh of the fused surface.
+
+        Args:
+            pose: (num_dofs,); the rest pose by default.
+            spacing: edge length of the grid, metres; by default `nu`, but at most 1.5 million grid points.
+
+        Returns:
+            a closed mesh in the module's dtype and device.
+
+        Raises:
+            InputError: if the grid would be too large.
+
+        Differentiable: no.
+        """
+        pose = self.rest_pose() if pose is None else self.check_pose(pose)
+        with torch.no_grad():
+            transforms = self.part_transforms(pose)
+            positions = self._solid_frames(transforms)[..., 3]
+            reach = self.primitives.reaches(self._scaled_sizes()).unsqueeze(-1) + 3 * self.nu
+            lower, upper = (positions - reach).amin(0), (positions + reach).amax(0)
+        if spacing is None:
+            spacing = max(self.nu, float((upper - lower).prod() / _MAX_SURFACE_CELLS) ** (1 / 3))
+        return isosurface(lambda points: self.distance(points, pose), lower, upper, spacing)
+
+    def file_skin(self) -> LinearBlendSkin:
+        """Return the skin of the file this shape was read from: its vertices under its own weights.
+
+        Raises:
+            InputError: if the shape was not read from a file with a mesh.
+        """
+        if self.surface is None:
+            raise InputError("this shape has no file skin: it was not read from a file with a mesh")
+        vertices = self.surface.vertices.to(self.rest)
+        return LinearBlendSkin(
+            self, vertices, self.surface.weights.to(self.rest), self.rest_pose(), faces=self.surface.faces
+        )
+
+    def _offset_scales(self) -> Tensor:
+        return nn.functional.pad(self.log_length_scales, (1, 0))[self._owners].exp()
+
+    def _scaled_sizes(self) -> list[Tensor]:
+        return self.primitives.scaled_sizes(self.log_length_scales.exp(), self.log_radius_scales.exp())
+
+    def _solid_frames(self, transforms: Tensor) -> Tensor:
+        """Return ``[R | t]`` (..., P, 3, 4) of every solid in the world."""
+        centers = self.primitives.centers * self.log_length_scales.exp().unsqueeze(-1)
+        poses = torch.cat([self.primitives.rotations, centers.unsqueeze(-1)], dim=-1)
+        return transforms[..., :3, :3] @ poses + nn.functional.pad(transforms[..., :3, 3:], (3, 0))
+
+    def _local_points(self, points: Tensor, solids: Tensor) -> Tensor:
+        """Return points (..., N, P, 3) in every solid's frame."""
+        check_finite_dtype(points, self.rest)
+        rotations = solids[..., :3].transpose(-3, -2).flatten(-2)
+        offsets = (solids[..., None, :, 3] @ solids[..., :3]).flatten(-3)
+        return (points @ rotations - offsets.unsqueeze(-2)).unflatten(-1, (self.num_parts, 3))
+
+    def _fuse(self, distances: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the fused distance (..., N) and each part's share in its gradient (..., N, P)."""
+        nearest, dominating = distances.min(dim=-1, keepdim=True)
+        fields = torch.where(self.adjacency[dominating.squeeze(-1)], (nearest - distances) / self.nu, -math.inf).exp()
+        total = fields.sum(-1, keepdim=True)
+        return (nearest - self.nu * total.log()).squeeze(-1), fields / total
+
+
+def check_finite_dtype(points: Tensor, like: Tensor) -> None:
+    """Raise InputError unless ``points`` has the dtype and device of the module: mixed dtypes lose precision."""
+    if points.dtype != like.dtype or points.device != like.device:
+        raise InputError(
+            f"points are {points.dtype} on {points.device} but the shape is {like.dtype} on {like.device}; "
+            f"convert one of them with .to()"
+        )
+
+
+def _base_twists(pose: Tensor, chart: str) -> Tensor:
+    identity = torch.eye(3, dtype=pose.dtype, device=pose.device).expand(*pose.shape[:-1], 3, 3)
+    angular = identity if chart == "tangent" else left_jacobian(pose[..., 3:6]).mT
+    linear = torch.linalg.cross(pose[..., None, :3].expand_as(angular), angular)
+    translation = torch.cat([identity, torch.zeros_like(identity)], dim=-1)
+    return torch.cat([translation, torch.cat([linear, angular], dim=-1)], dim=-2)
+
+
+def _part_parents(tree: KinematicTree, frames: list[int]) -> list[int]:
+    parents = []
+    for frame in frames:
+        ancestor = tree.joints[frame].parent
+        while ancestor >= 0 and ancestor not in frames:
+            ancestor = tree.joints[ancestor].parent
+        parents.append(frames.index(ancestor) if ancestor >= 0 else -1)
+    return parents
+
+
+def _adjacency(parents: list[int]) -> Tensor:
+    adjacency = torch.eye(len(parents), dtype=torch.bool)
+    for part, parent in enumerate(parents):
+        if parent >= 0:
+            adjacency[part, parent] = adjacency[parent, part] = True
+    return adjacency
+
+
+def _offset_owners(tree: KinematicTree, frames: list[int]) -> list[int]:
+    """Return, per frame, 1 + the part whose length carries it, or 0: the nearest part above it in the tree."""
+    owners = []
+    for joint in tree.joints:
+        ancestor = joint.parent
+        while ancestor >= 0 and ancestor not in frames:
+            ancestor = tree.joints[ancestor].parent
+        owners.append(frames.index(ancestor) + 1 if ancestor >= 0 else 0)
+    return owners

@@ -1,0 +1,196 @@
+"""A human hand: 16 ellipsoid parts, 27 degrees of freedom, adult proportions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import check_choice, check_positive
+from torchreg.geometry.kinematic_tree import Joint, KinematicTree
+from torchreg.geometry.rigid import rigid_matrix
+from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.primitives import Primitive
+
+FINGER_NAMES = ("thumb", "index", "middle", "ring", "little")
+# Ellipsoids of inner phalanges reach past their joints by this factor, so that neighbors overlap and fuse smoothly.
+_OVERLAP = 1.12
+
+
+@dataclass(frozen=True)
+class _Finger:
+    """Proportions of one finger of a right hand, millimeters and degrees; x: thumb side, y: back, z: to the tips."""
+
+    base: tuple[float, float, float]
+    lengths_mm: tuple[float, float, float]
+    radii_mm: tuple[float, float, float]
+    segments: tuple[str, str, str]
+    joints: tuple[tuple[str, tuple[tuple[str, float, float], ...]], ...]
+    direction: tuple[float, float, float]
+    dorsal: tuple[float, float, float]
+
+
+_FINGER_JOINTS = (
+    ("mcp", (("abduction", -20.0, 20.0), ("flexion", -20.0, 95.0))),
+    ("pip", (("flexion", -5.0, 110.0),)),
+    ("dip", (("flexion", -5.0, 85.0),)),
+)
+_THUMB_JOINTS = (
+    ("cmc", (("abduction", -35.0, 35.0), ("flexion", -30.0, 45.0))),
+    ("mcp", (("abduction", -15.0, 15.0), ("flexion", -15.0, 65.0))),
+    ("ip", (("flexion", -20.0, 85.0),)),
+)
+_PHALANGES = ("proximal", "middle", "distal")
+
+
+def _long_finger(base: tuple[float, float, float], spread_deg: float, lengths: tuple[float, float, float],
+                 radii: tuple[float, float, float]) -> _Finger:  # fmt: skip
+    spread = math.radians(spread_deg)
+    direction = (math.sin(spread), 0.0, math.cos(spread))
+    return _Finger(base, lengths, radii, _PHALANGES, _FINGER_JOINTS, direction, (0.0, 1.0, 0.0))
+
+
+_FINGERS = {
+    "thumb": _Finger(
+        (22.0, -8.0, 20.0), (46.0, 34.0, 29.0), (13.0, 10.5, 9.5), ("metacarpal", "proximal", "distal"),
+        _THUMB_JOINTS, (0.66, -0.36, 0.66), (0.68, 0.60, -0.42),
+    ),
+    "index": _long_finger((26.0, 3.0, 91.0), 4.0, (44.0, 26.0, 23.0), (9.5, 8.5, 7.5)),
+    "middle": _long_finger((4.0, 5.0, 94.0), 0.0, (48.0, 31.0, 24.0), (9.8, 8.7, 7.8)),
+    "ring": _long_finger((-16.0, 3.0, 87.0), -4.0, (44.0, 29.0, 24.0), (9.3, 8.2, 7.4)),
+    "little": _long_finger((-34.0, -1.0, 78.0), -9.0, (35.0, 21.0, 21.0), (8.3, 7.3, 6.5)),
+}  # fmt: skip
+_PALM_CENTER_MM = (-3.0, 0.0, 47.0)
+_PALM_RADII_MM = (44.0, 15.0, 56.0)
+
+
+class Hand(ArticulatedShape):
+    """A hand with 16 parts and 27 degrees of freedom: 6 of the palm, thumb 2 + 2 + 1, fingers 2 + 1 + 1.
+
+    At the zero pose the wrist is at the origin, the fingers point along +z, the back of the hand faces +y and the thumb
+    of a right hand lies on +x. Positive flexion closes the hand, positive abduction moves towards the thumb side.
+
+    Bone lengths and radii are learnable: ``log_length_scales`` and ``log_radius_scales``, one per part, give
+    `bone_lengths` and `radii`.
+
+    Args:
+        side: "right" or "left".
+        scale: overall size; 1 is an adult hand, 0.197 m from the wrist to the tip of the middle finger.
+        nu: fusion length, metres.
+        dtype: of all parameters and buffers; the default dtype if None.
+
+    Raises:
+        InputError: if ``side`` is unknown, or ``scale`` or ``nu`` not positive.
+
+    References: Dewaele et al. 2006, section 2.
+    """
+
+    def __init__(
+        self, side: str = "right", *, scale: float = 1.0, nu: float = 0.003, dtype: torch.dtype | None = None
+    ) -> None:
+        check_choice(side, "side", ("right", "left"))
+        check_positive(scale, "scale")
+        self.side = side
+        unit = 1e-3 * scale
+        mirror = 1.0 if side == "right" else -1.0
+        joints, part_frames = [Joint("palm", -1, torch.eye(4, dtype=torch.float64))], ["palm"]
+        palm_pose = _translation(_PALM_CENTER_MM, unit, mirror)
+        primitives = [Primitive("ellipsoid", tuple(radius * unit for radius in _PALM_RADII_MM), palm_pose)]
+        bones = [math.hypot(*_FINGERS["middle"].base) * unit]
+        for name, finger in _FINGERS.items():
+            _add_finger(joints, part_frames, name, finger, unit, mirror)
+            primitives += _phalanx_primitives(finger, unit)
+            bones += [length * unit for length in finger.lengths_mm]
+        part_names = ["palm"] + [f"{name}_{segment}" for name, f in _FINGERS.items() for segment in f.segments]
+        super().__init__(
+            KinematicTree(tuple(joints)), part_frames, primitives, nu=nu, part_names=part_names, dtype=dtype
+        )
+        self.register_buffer("_bones", torch.tensor(bones, dtype=self.rest.dtype), persistent=False)
+
+    _bones: Tensor
+
+    @property
+    def bone_lengths(self) -> Tensor:
+        """Length (16,) of each part's bone, metres: of the palm from wrist to middle finger, of a phalanx to its end.
+
+        Differentiable: in `log_length_scales`.
+        """
+        return self._bones * self.log_length_scales.exp()
+
+    @property
+    def radii(self) -> Tensor:
+        """Radii (16, 3) of each part's ellipsoid along its x, y and z (the bone's) axis, metres.
+
+        Differentiable: in the sizes, `log_length_scales` and `log_radius_scales`.
+        """
+        return self._scaled_sizes()[0]
+
+    @property
+    def fingertip_parts(self) -> tuple[int, ...]:
+        """Indices of the five distal phalanges, thumb to little finger."""
+        return tuple(3 * finger + 3 for finger in range(5))
+
+    def keypoints(self, pose: Tensor) -> Tensor:
+        """Return 21 keypoints: wrist, then thumb to little finger, each from its base joint to its tip.
+
+        Args:
+            pose: (..., 27).
+
+        Returns:
+            (..., 21, 3), metres.
+
+        Raises:
+            InputError: if the pose has the wrong size.
+
+        Differentiable: in ``pose`` and the bone lengths.
+        """
+        parts = self.part_transforms(pose)
+        origins = parts[..., :3, 3]
+        distal = list(self.fingertip_parts)
+        tips = origins[..., distal, :] + parts[..., distal, :3, 2] * self.bone_lengths[distal].unsqueeze(-1)
+        fingers = torch.cat([origins[..., 1:, :].unflatten(-2, (5, 3)), tips.unsqueeze(-2)], dim=-2)
+        return torch.cat([origins[..., :1, :], fingers.flatten(-3, -2)], dim=-2)
+
+
+def _translation(offset_mm: tuple[float, float, float], unit: float, mirror: float) -> Tensor:
+    offset = torch.tensor(offset_mm, dtype=torch.float64) * unit * torch.tensor([mirror, 1.0, 1.0], dtype=torch.float64)
+    return rigid_matrix(torch.eye(3, dtype=torch.float64), offset)
+
+
+def _finger_rotation(finger: _Finger, mirror: float) -> Tensor:
+    """Return the finger's frame: z along it, y towards its back, mirrored for a left hand."""
+    z = torch.tensor(finger.direction, dtype=torch.float64)
+    z = z / z.norm()
+    y = torch.tensor(finger.dorsal, dtype=torch.float64)
+    y = y - (y @ z) * z
+    y = y / y.norm()
+    rotation = torch.stack([torch.linalg.cross(y, z), y, z], dim=-1)
+    flip = torch.diag(torch.tensor([mirror, 1.0, 1.0], dtype=torch.float64))
+    return flip @ rotation @ flip
+
+
+def _add_finger(
+    joints: list[Joint], part_frames: list[str], name: str, finger: _Finger, unit: float, mirror: float
+) -> None:
+    parent = 0
+    base = torch.tensor(finger.base, dtype=torch.float64) * unit * torch.tensor([mirror, 1.0, 1.0], dtype=torch.float64)
+    offset = rigid_matrix(_finger_rotation(finger, mirror), base)
+    for (joint_name, motions), length in zip(finger.joints, finger.lengths_mm, strict=True):
+        for motion, lower, upper in motions:
+            axis = (1.0, 0.0, 0.0) if motion == "flexion" else (0.0, mirror, 0.0)
+            frame = f"{name}_{joint_name}_{motion}"
+            joints.append(Joint(frame, parent, offset, "revolute", axis, math.radians(lower), math.radians(upper)))
+            parent, offset = len(joints) - 1, torch.eye(4, dtype=torch.float64)
+        part_frames.append(joints[-1].name)
+        offset = _translation((0.0, 0.0, length), unit, 1.0)
+
+
+def _phalanx_primitives(finger: _Finger, unit: float) -> list[Primitive]:
+    primitives = []
+    for index, (length, radius) in enumerate(zip(finger.lengths_mm, finger.radii_mm, strict=True)):
+        half = 0.5 * length * (_OVERLAP if index < 2 else 1.0)
+        center = _translation((0.0, 0.0, 0.5 * length), unit, 1.0)
+        primitives.append(Primitive("ellipsoid", (radius * unit, radius * unit, half * unit), center))
+    return primitives

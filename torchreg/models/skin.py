@@ -1,0 +1,224 @@
+"""Skins: points that ride on an articulated shape."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from torchreg._checks import as_float_tensor, check_points, check_positive, check_shape
+from torchreg.errors import InputError
+from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
+from torchreg.geometry.rigid import invert_rigid, transform_points
+from torchreg.geometry.sampling import farthest_points
+
+# Candidates per chosen point; more cover the surface more evenly.
+_OVERSAMPLING = 8
+
+if TYPE_CHECKING:
+    from torchreg.models.articulated import ArticulatedShape
+
+
+class LinearBlendSkin(nn.Module):
+    """Points that move by a weighted mean of part motions, ``sum_p w_p T_p(pose) T_p(reference)^-1 x``.
+
+    The mean is linear in the part transforms, so posing all points is one matrix product.
+
+    Args:
+        shape: the articulated shape that carries the points.
+        points: (N, 3) in the reference pose, metres.
+        weights: (N, P), rows sum to one.
+        reference_pose: (num_dofs,).
+        normals: (N, 3) unit normals in the reference pose, if known.
+        faces: (F, 3) triangles over the points, if any.
+
+    Raises:
+        InputError: if sizes do not fit, or rows of weights do not sum to one.
+    """
+
+    basis: Tensor
+    weights: Tensor
+    points: Tensor
+    reference_pose: Tensor
+    normals: Tensor | None
+    faces: Tensor | None
+
+    def __init__(
+        self,
+        shape: ArticulatedShape,
+        points: Tensor,
+        weights: Tensor,
+        reference_pose: Tensor,
+        *,
+        normals: Tensor | None = None,
+        faces: Tensor | None = None,
+    ) -> None:
+        super().__init__()
+        self.shape = shape
+        points = as_float_tensor(points, "points", like=shape.rest).detach()
+        check_points(points, "points", batch=False)
+        weights = as_float_tensor(weights, "weights", like=points).detach()
+        check_shape(weights, "weights", (len(points), shape.num_parts))
+        if not torch.allclose(weights.sum(-1), torch.ones_like(weights[:, 0]), atol=1e-4) or bool((weights < 0).any()):
+            raise InputError("weights must not be negative and every row must sum to one")
+        reference_pose = shape.check_pose(reference_pose, "reference_pose").detach()
+        self.register_buffer("reference_pose", reference_pose, persistent=False)
+        self.register_buffer("points", points, persistent=False)
+        self.register_buffer("weights", weights, persistent=False)
+        self.register_buffer("normals", normals, persistent=False)
+        self.register_buffer("faces", faces, persistent=False)
+        with torch.no_grad():
+            inverse = invert_rigid(shape.part_transforms(reference_pose))
+            local = transform_points(inverse, points.expand(shape.num_parts, -1, -1)).transpose(0, 1)
+        rows = nn.functional.pad(local, (0, 1), value=1.0) * weights.unsqueeze(-1)
+        self.register_buffer("basis", rows.flatten(-2).contiguous(), persistent=False)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def forward(self, pose: Tensor) -> Tensor:
+        """Return the points in a pose.
+
+        Args:
+            pose: (..., num_dofs).
+
+        Returns:
+            (..., N, 3), metres.
+
+        Differentiable: in ``pose`` and the shape's bone lengths.
+
+        References: Dewaele et al. 2006, eq. 3.
+        """
+        return self.basis @ self.shape.part_transforms(pose)[..., :3, :].mT.flatten(-3, -2)
+
+    def jacobian(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
+        """Return the posed points and their analytic Jacobian with respect to all degrees of freedom.
+
+        Args:
+            pose: (..., num_dofs).
+            chart: see `ArticulatedShape.part_twists`.
+
+        Returns:
+            points (..., N, 3) and Jacobian (..., N, 3, num_dofs).
+
+        Differentiable: in ``pose``.
+        """
+        rows, derivative = self.shape.transform_jacobian(pose, chart=chart)
+        jacobian = self.basis @ derivative.flatten(-2)
+        return self.basis @ rows, jacobian.unflatten(-1, derivative.shape[-2:])
+
+    def posed_normals(self, pose: Tensor) -> Tensor:
+        """Return the unit normals in a pose, turned with the weighted mean of the part rotations.
+
+        Args:
+            pose: (..., num_dofs).
+
+        Returns:
+            (..., N, 3).
+
+        Raises:
+            InputError: if the skin has no normals.
+        """
+        if self.normals is None:
+            raise InputError("this skin has no normals; pass normals= when building it")
+        rotations = self.shape.part_transforms(pose)[..., :3, :3]
+        reference = self.shape.part_transforms(self.reference_pose)[..., :3, :3]
+        motion = torch.einsum("np,...pij->...nij", self.weights, rotations @ reference.mT)
+        return nn.functional.normalize((motion @ self.normals.unsqueeze(-1)).squeeze(-1), dim=-1)
+
+
+class BendingSkin(LinearBlendSkin):
+    """Points near the surface that slide and stretch where the surface bends.
+
+    ``T(X, pose) = (phi_p^a T_p X + phi_r^a T_r X) / (phi_p^a + phi_r^a)``, p the dominating part of X, r its neighbor
+    with the largest field, both in the reference pose; the weight of p is ``sigmoid(a (d_r - d_p) / nu)``.
+
+    Args:
+        shape: the articulated shape that carries the points.
+        points: (N, 3) in the reference pose, metres.
+        reference_pose: (num_dofs,); the rest pose by default.
+        sharpness: a; 2 lets the skin slide and stretch, 10 is near rigid.
+        normals: (N, 3) unit normals in the reference pose, if known.
+        faces: (F, 3) triangles over the points, if any.
+
+    Raises:
+        InputError: if sizes do not fit or ``sharpness`` is not positive.
+
+    References: Dewaele et al. 2006, eq. 3.
+    """
+
+    def __init__(
+        self,
+        shape: ArticulatedShape,
+        points: Tensor,
+        reference_pose: Tensor | None = None,
+        sharpness: float = 2.0,
+        *,
+        normals: Tensor | None = None,
+        faces: Tensor | None = None,
+    ) -> None:
+        check_positive(sharpness, "sharpness")
+        reference_pose = shape.rest_pose() if reference_pose is None else reference_pose
+        points = as_float_tensor(points, "points", like=shape.rest).detach()
+        check_points(points, "points", batch=False)
+        with torch.no_grad():
+            pose = shape.check_pose(reference_pose, "reference_pose")
+            weights = bending_weights(shape, points, pose, sharpness)
+        super().__init__(shape, points, weights, reference_pose, normals=normals, faces=faces)
+        self.sharpness = sharpness
+
+
+def bending_weights(shape: ArticulatedShape, points: Tensor, pose: Tensor, sharpness: float) -> Tensor:
+    """Return the weights (N, P) of eq. 3: the dominating part and its strongest neighbor share each point.
+
+    Args:
+        shape: the articulated shape.
+        points: (N, 3), metres.
+        pose: (num_dofs,) the pose in which the fields are evaluated.
+        sharpness: a.
+
+    Returns:
+        (N, P), rows sum to one, at most two entries per row.
+
+    References: Dewaele et al. 2006, eq. 3.
+    """
+    distances = shape.part_distances(points, pose)
+    nearest, dominating = distances.min(-1)
+    neighbors = shape.adjacency[dominating].scatter(-1, dominating.unsqueeze(-1), False)
+    second, neighbor = distances.masked_fill(~neighbors, torch.inf).min(-1)
+    share = torch.sigmoid(sharpness * (second - nearest) / shape.nu)
+    weights = torch.zeros_like(distances)
+    weights.scatter_(-1, neighbor.unsqueeze(-1), (1 - share).unsqueeze(-1))
+    return weights.scatter_(-1, dominating.unsqueeze(-1), share.unsqueeze(-1))
+
+
+def sample_skin(shape: ArticulatedShape, count: int = 500, *, sharpness: float = 2.0, seed: int = 0) -> LinearBlendSkin:
+    """Return model points that cover the shape's surface evenly, in the rest pose, with normals.
+
+    A shape read from a file with a mesh gives points of that mesh under the file's weights; any other gives points of
+    the fused surface under the bending skin.
+
+    Args:
+        shape: the articulated shape.
+        count: number of points.
+        sharpness: a of the bending skin.
+        seed: of the candidates among which the points are chosen.
+
+    Returns:
+        a skin with ``count`` points.
+
+    Cost: meshing the fused surface takes about half a second; keep the skin when aligning many clouds.
+    """
+    mesh = shape.surface_mesh() if shape.surface is None else TriangleMesh(
+        shape.surface.vertices.to(shape.rest), shape.surface.faces.to(shape.rest.device)
+    )  # fmt: skip
+    generator = torch.Generator().manual_seed(seed)
+    points, face, barycentric = sample_surface(mesh.to("cpu"), _OVERSAMPLING * count, generator=generator)
+    chosen = farthest_points(points, count)
+    points, face, barycentric = points[chosen].to(shape.rest), face[chosen], barycentric[chosen]
+    normals = mesh.face_normals()[face.to(mesh.faces.device)]
+    if shape.surface is None:
+        return BendingSkin(shape, points, shape.rest_pose(), sharpness, normals=normals)
+    weights = interpolate(shape.surface.weights, shape.surface.faces, face, barycentric.to(shape.surface.weights))
+    return LinearBlendSkin(shape, points, weights, shape.rest_pose(), normals=normals)
