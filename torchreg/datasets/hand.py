@@ -1,0 +1,341 @@
+"""Made-up measurements of a hand, or of any articulated shape, with exact truth: single clouds and moving sequences."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import check_choice, check_positive
+from torchreg.errors import InputError
+from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
+from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
+from torchreg.geometry.visibility import sample_visible
+from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.hand import Hand
+from torchreg.models.skin import BendingSkin, LinearBlendSkin
+
+_DISTANCE = 0.5
+_POSITION_SPREAD = 0.03
+_BOX_MARGIN = 0.05
+# Fingers up, palm to a camera that looks along +z with -y up.
+_FACING = (math.pi / 2, 0.0, 0.0)
+_SECONDS_PER_BEND = 2.5
+_SECONDS_PER_TURN = 5.0
+# Joints without limits are moved within these, radians (metres for sliding joints).
+_OPEN_LIMIT = math.pi / 2
+
+
+@dataclass(frozen=True, eq=False)
+class HandCloud:
+    """A measured cloud and the truth behind it.
+
+    Args:
+        points: (M, 3), metres, in random order.
+        inliers: (M,) bool, True for points of the shape.
+        part_labels: (M,) int64 part of each point, -1 for outliers.
+        pose: (num_dofs,) the true pose.
+    """
+
+    points: Tensor
+    inliers: Tensor
+    part_labels: Tensor
+    pose: Tensor
+
+
+def surface_skin(shape: ArticulatedShape, *, spacing: float | None = None, sharpness: float = 2.0) -> LinearBlendSkin:
+    """Return the shape's whole surface as a skin with faces: the mesh of its file, else its fused surface at rest.
+
+    Args:
+        shape: the articulated shape.
+        spacing: edge length of the fused surface's grid, metres; see `ArticulatedShape.surface_mesh`.
+        sharpness: a of the bending skin.
+
+    Returns:
+        `shape.file_skin()` or a `BendingSkin`, with faces.
+
+    Cost: meshing takes about a second; keep the skin.
+    """
+    if shape.surface is not None:
+        return shape.file_skin()
+    mesh = shape.surface_mesh(spacing=spacing)
+    return BendingSkin(shape, mesh.vertices, shape.rest_pose(), sharpness, faces=mesh.faces)
+
+
+def make_hand_cloud(
+    shape: ArticulatedShape,
+    pose: Tensor,
+    *,
+    num_points: int = 500,
+    noise: float = 0.0015,
+    outlier_ratio: float = 0.33,
+    camera: Tensor | None = None,
+    skin: LinearBlendSkin | None = None,
+    generator: torch.Generator | None = None,
+) -> HandCloud:
+    """Return a noisy cloud of a shape in a pose, with outliers, as a range camera would deliver it.
+
+    Args:
+        shape: the true shape.
+        pose: (num_dofs,) the true pose.
+        num_points: number of points on the surface.
+        noise: standard deviation of each coordinate, metres.
+        outlier_ratio: outliers as a share of all points, at least 0 and below 1; they lie uniformly in the bounding box
+            of the posed surface grown by 5 cm on each side.
+        camera: (3,) position of a camera; points then lie on the side it sees, uniformly over its picture. None: on
+            all sides, uniformly by area.
+        skin: what moves the true surface, with faces; by default `surface_skin`, which is made anew at every call.
+        generator: source of randomness; None draws from a fresh generator with seed 0, the same cloud at every call.
+
+    Returns:
+        the cloud, in the shape's dtype and on its device.
+
+    Raises:
+        InputError: if an argument is out of range or the skin has no faces.
+    """
+    if isinstance(num_points, bool) or not isinstance(num_points, int) or num_points < 1:
+        raise InputError(f"num_points must be a positive integer, got {num_points!r}")
+    check_positive(noise, "noise", allow_zero=True)
+    if not 0 <= outlier_ratio < 1:
+        raise InputError(f"outlier_ratio must be at least 0 and below 1, got {outlier_ratio}")
+    pose = shape.check_pose(pose).detach()
+    if pose.ndim != 1:
+        raise InputError(f"pose must have shape ({shape.num_dofs},), got {tuple(pose.shape)}; make one cloud per pose")
+    skin = surface_skin(shape) if skin is None else skin
+    if skin.faces is None:
+        raise InputError("skin must have faces to draw points from; make it with surface_skin(shape)")
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    with torch.no_grad():
+        mesh = TriangleMesh(skin(pose), skin.faces)
+        if camera is None:
+            surface, face, barycentric = sample_surface(mesh, num_points, generator)
+        else:
+            surface, face, barycentric = sample_visible(mesh, camera, num_points, generator, density="pixel")
+        labels = interpolate(skin.weights, mesh.faces, face, barycentric).argmax(-1)
+        surface = surface + noise * _normal((num_points, 3), generator, surface)
+        num_outliers = round(num_points * outlier_ratio / (1 - outlier_ratio))
+        lower, upper = mesh.bounds()
+        place = _uniform((num_outliers, 3), generator, surface)
+        clutter = lower - _BOX_MARGIN + place * (upper - lower + 2 * _BOX_MARGIN)
+        order = torch.randperm(num_points + num_outliers, generator=generator, device=generator.device)
+        order = order.to(surface.device)
+        return HandCloud(
+            torch.cat([surface, clutter])[order],
+            order < num_points,
+            torch.cat([labels, labels.new_full((num_outliers,), -1)])[order],
+            pose,
+        )
+
+
+def random_hand_pose(
+    hand: ArticulatedShape,
+    generator: torch.Generator | None = None,
+    *,
+    bend: float = 0.6,
+    distance: float = _DISTANCE,
+) -> Tensor:
+    """Return a random pose within the joint limits, turned at random, before a camera at the origin looking along +z.
+
+    A hand's fingers curl each as a whole and spread apart, so that they do not run through each other; the joints of
+    other shapes move independently around the rest pose.
+
+    Args:
+        hand: the shape.
+        generator: source of randomness; None draws from a fresh generator with seed 0, the same pose at every call.
+        bend: share of the way to their limits that joints move at most, 0 to 1.
+        distance: from the origin to the middle of the shape, metres, up to 3 cm to each side; for a unit of your own,
+            choose a few times the size of the shape.
+
+    Returns:
+        (num_dofs,), metres and radians; a base that cannot move stays where it is.
+
+    Raises:
+        InputError: if ``bend`` is not between 0 and 1 or ``distance`` not positive.
+    """
+    _check_share(bend, "bend")
+    check_positive(distance, "distance")
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    draws = _uniform((3, hand.num_dofs - 6), generator, hand.rest)
+    quaternion = _normal((4,), generator, hand.rest)
+    offset = _uniform((3,), generator, hand.rest)
+    pose = hand.rest_pose()
+    curls, share = _curl_groups(hand), bend * draws[0]
+    if isinstance(hand, Hand):
+        # One draw per finger and a little of each joint's own.
+        share = bend * (0.8 * draws[1][curls] + 0.2 * draws[0])
+        pose[6:] = _hand_joints(hand, share, 2 * draws[2] - 1, bend)
+    else:
+        lower, upper = _joint_ranges(hand)
+        pose[6:] = pose[6:] + bend * torch.where(draws[1] < 0.5, lower, upper) * draws[0]
+    axis_length = quaternion[1:].norm()
+    pose[3:6] = 2 * torch.atan2(axis_length, quaternion[0].abs()) * quaternion[1:] / axis_length * quaternion[0].sign()
+    shift = distance / _DISTANCE * _POSITION_SPREAD * (2 * offset - 1)
+    target = hand.rest.new_tensor([0.0, 0.0, distance]) + shift
+    return _placed(hand, pose, target)
+
+
+def hand_motion(
+    shape: ArticulatedShape,
+    kind: str = "bend",
+    num_frames: int = 100,
+    fps: float = 20.0,
+    *,
+    bend: float = 0.6,
+    distance: float = _DISTANCE,
+    seed: int = 0,
+) -> Tensor:
+    """Return the poses of a smooth motion before a camera at the origin that looks along +z with -y up.
+
+    Args:
+        shape: a hand, or any articulated shape.
+        kind: "bend": the fingers close and open one after the other, every 2.5 s, while the hand sways a little;
+            "rotate": the hand, its fingers half bent, turns around its own axis once in 5 s.
+        num_frames: number of frames.
+        fps: frames per second.
+        bend: share of the way to their limits that joints move at most, 0 to 1.
+        distance: from the origin to the middle of the shape, metres.
+        seed: decides about how deep each joint bends and when.
+
+    Returns:
+        (num_frames, num_dofs), metres and radians; the rotation vectors have angles of at most pi.
+
+    Raises:
+        InputError: if an argument is out of range.
+    """
+    check_choice(kind, "kind", ("bend", "rotate"))
+    if isinstance(num_frames, bool) or not isinstance(num_frames, int) or num_frames < 1:
+        raise InputError(f"num_frames must be a positive integer, got {num_frames!r}")
+    check_positive(fps, "fps")
+    check_positive(distance, "distance")
+    _check_share(bend, "bend")
+    generator = torch.Generator().manual_seed(seed)
+    draws = _uniform((3, shape.num_dofs - 6), generator, shape.rest)
+    sway = _uniform((6,), generator, shape.rest)
+    seconds = (torch.arange(num_frames, dtype=torch.float64) / fps).to(shape.rest)
+    curls = _curl_groups(shape)
+    wave = 0.5 - 0.5 * torch.cos(2 * math.pi * (seconds[:, None] / _SECONDS_PER_BEND - 0.1 * curls))
+    depth = 0.8 + 0.2 * draws[0]
+    share = bend * depth * (wave if kind == "bend" else 0.4 + 0.2 * wave)
+    pose = shape.rest_pose().expand(num_frames, -1).clone()
+    if isinstance(shape, Hand):
+        pose[:, 6:] = _hand_joints(shape, share, 2 * draws[1] - 1, bend)
+    else:
+        lower, upper = _joint_ranges(shape)
+        pose[:, 6:] = pose[:, 6:] + share * torch.where(draws[2] < 0.5, lower, upper)
+    angle = 0.2 * torch.sin(2 * math.pi * (seconds[:, None] / _SECONDS_PER_TURN + sway[:3]))
+    turn = compose_rotation_vectors(angle, shape.rest.new_tensor(_FACING).expand_as(angle))
+    if kind == "rotate":
+        about = 2 * math.pi * seconds / _SECONDS_PER_TURN
+        turn = compose_rotation_vectors(turn, about[:, None] * shape.rest.new_tensor([0.0, 0.0, 1.0]))
+    pose[:, 3:6] = turn
+    drift = _POSITION_SPREAD * torch.sin(2 * math.pi * (seconds[:, None] / _SECONDS_PER_TURN + sway[3:]))
+    target = shape.rest.new_tensor([0.0, 0.0, distance]) + distance / _DISTANCE * drift
+    return _placed(shape, pose, target)
+
+
+def hand_sequence(
+    kind: str = "bend",
+    num_frames: int = 100,
+    fps: float = 20.0,
+    *,
+    shape: ArticulatedShape | None = None,
+    num_points: int = 500,
+    noise: float = 0.0015,
+    outlier_ratio: float = 0.33,
+    camera: Tensor | None = None,
+    skin: LinearBlendSkin | None = None,
+    bend: float = 0.6,
+    seed: int = 0,
+) -> tuple[HandCloud, ...]:
+    """Return the clouds of a moving hand, frame after frame, with the exact poses of `hand_motion`.
+
+    Args:
+        kind: "bend" or "rotate", see `hand_motion`.
+        num_frames: number of frames.
+        fps: frames per second.
+        shape: the true shape; an adult right hand by default.
+        num_points: see `make_hand_cloud`.
+        noise: see `make_hand_cloud`.
+        outlier_ratio: see `make_hand_cloud`.
+        camera: (3,) see `make_hand_cloud`; the motion passes before a camera at ``torch.zeros(3)``.
+        skin: see `make_hand_cloud`; made once for all frames.
+        bend: see `hand_motion`.
+        seed: of motion and measurements.
+
+    Returns:
+        num_frames clouds.
+
+    Raises:
+        InputError: if an argument is out of range.
+    """
+    shape = Hand() if shape is None else shape
+    poses = hand_motion(shape, kind, num_frames, fps, bend=bend, seed=seed)
+    skin = surface_skin(shape) if skin is None else skin
+    generator = torch.Generator().manual_seed(seed)
+    return tuple(
+        make_hand_cloud(
+            shape, pose, num_points=num_points, noise=noise, outlier_ratio=outlier_ratio, camera=camera, skin=skin,
+            generator=generator,
+        )
+        for pose in poses
+    )  # fmt: skip
+
+
+def _uniform(size: tuple[int, ...], generator: torch.Generator, like: Tensor) -> Tensor:
+    """Return numbers in [0, 1) drawn in double precision where the generator lives, in the kind of ``like``."""
+    return torch.rand(size, generator=generator, device=generator.device, dtype=torch.float64).to(like)
+
+
+def _normal(size: tuple[int, ...], generator: torch.Generator, like: Tensor) -> Tensor:
+    """Return normal numbers drawn in double precision where the generator lives, in the kind of ``like``."""
+    return torch.randn(size, generator=generator, device=generator.device, dtype=torch.float64).to(like)
+
+
+def _check_share(value: float, name: str) -> None:
+    check_positive(value, name, allow_zero=True)
+    if value > 1:
+        raise InputError(f"{name} must be between 0 and 1, got {value}")
+
+
+def _joint_ranges(shape: ArticulatedShape) -> tuple[Tensor, Tensor]:
+    """Return how far each joint may move down and up from rest."""
+    rest = shape.rest[6:]
+    lower = shape.lower[6:].clamp(min=-_OPEN_LIMIT) - rest
+    upper = shape.upper[6:].clamp(max=_OPEN_LIMIT) - rest
+    return lower.clamp(max=0), upper.clamp(min=0)
+
+
+def _curl_groups(shape: ArticulatedShape) -> Tensor:
+    """Return for each joint the number of its finger, or of the joint in other shapes."""
+    if not isinstance(shape, Hand):
+        return torch.arange(shape.num_dofs - 6, device=shape.rest.device)
+    fingers = [name.split("_")[0] for name in shape.dof_names[6:]]
+    known = list(dict.fromkeys(fingers))
+    return torch.tensor([known.index(finger) for finger in fingers], device=shape.rest.device)
+
+
+def _hand_joints(hand: Hand, share: Tensor, spread: Tensor, bend: float) -> Tensor:
+    """Return joint angles (..., 21) of a hand: flexions at ``share`` of their limits, spread -1 to 1 of abductions."""
+    names = hand.dof_names[6:]
+    # Away from the middle finger: thumb and index towards the thumb side, ring and little finger away from it.
+    outward = {"index": 1.0, "ring": -1.0, "little": -1.0}
+    away = spread.new_tensor([outward.get(name.split("_")[0], 0.0) for name in names])
+    flexion = torch.tensor([name.endswith("flexion") for name in names], device=spread.device)
+    sideways = torch.where(away != 0, away * spread.abs(), 0.3 * spread)
+    # Fingers that close come together again.
+    straight = 1 - share
+    abduction = 0.4 * bend * straight * sideways * hand.upper[6:]
+    return torch.where(flexion, share * hand.upper[6:], abduction)
+
+
+def _placed(shape: ArticulatedShape, pose: Tensor, target: Tensor) -> Tensor:
+    """Return the pose with its base moved so that the middle of the parts lies at ``target``."""
+    pose = torch.maximum(torch.minimum(pose, shape.upper), shape.lower)
+    still = torch.cat([torch.zeros_like(pose[..., :6]), pose[..., 6:]], dim=-1)
+    with torch.no_grad():
+        middle = shape.part_transforms(still)[..., :3, 3].mean(-2)
+    turned = (so3_exp(pose[..., 3:6]) @ middle.unsqueeze(-1)).squeeze(-1)
+    moved = torch.cat([target - turned, pose[..., 3:]], dim=-1)
+    return torch.maximum(torch.minimum(moved, shape.upper), shape.lower)
