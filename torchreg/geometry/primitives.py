@@ -109,7 +109,7 @@ def _capsule_offset(points: Tensor, sizes: Tensor) -> Tensor:
     half = sizes[..., 0]
     along = points[..., 2]
     nearest = torch.minimum(torch.maximum(along, -half), half)
-    return torch.cat([points[..., :2], (along - nearest).unsqueeze(-1)], dim=-1)
+    return torch.cat([points[..., :2].expand(*nearest.shape, 2), (along - nearest).unsqueeze(-1)], dim=-1)
 
 
 def cone_distance(points: Tensor, sizes: Tensor) -> Tensor:
@@ -203,11 +203,12 @@ def superquadric_gradient(points: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor
 def _superquadric_level(points: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     radii, e1, e2 = sizes[..., :3], sizes[..., 3], sizes[..., 4]
     scaled = (points / radii).abs()
+    center = scaled.amax(-1) < 1e-6
+    scaled = torch.where(center.unsqueeze(-1), 1.0, scaled)
     largest = scaled.amax(-1)
-    center = largest < 1e-6
     # Degree one lets the largest coordinate be taken out, of the plane and of the whole, so that high powers of small
     # numbers are only ever added to one and neither overflow, nor vanish, nor divide by zero.
-    u = (scaled / torch.where(center, 1.0, largest).unsqueeze(-1)).clamp_min(1e-12)
+    u = (scaled / largest.unsqueeze(-1)).clamp_min(1e-12)
     widest = u[..., :2].amax(-1)
     v = u[..., :2] / widest.unsqueeze(-1)
     planar_sum = (v ** (2 / e2).unsqueeze(-1)).sum(-1)
