@@ -1,0 +1,152 @@
+import time
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from torchreg.datasets.hand import hand_sequence, surface_skin
+from torchreg.errors import InputError
+from torchreg.models.hand import Hand
+from torchreg.viz.animation import animate_alignment, save_animation
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return Hand()
+
+
+@pytest.fixture(scope="module")
+def skin(hand):
+    return surface_skin(hand, spacing=0.007)
+
+
+@pytest.fixture(scope="module")
+def clouds(hand, skin):
+    return hand_sequence("bend", 4, 5.0, shape=hand, skin=skin, num_points=200, camera=torch.zeros(3))
+
+
+def frames_of(path):
+    with Image.open(path) as file:
+        pictures = []
+        for index in range(file.n_frames):
+            file.seek(index)
+            pictures.append((np.asarray(file.convert("RGB")), file.info["duration"]))
+        return pictures, file.info.get("loop")
+
+
+def plain(color, size=(30, 40)):
+    return np.full((*size, 3), color, dtype=np.uint8)
+
+
+def test_arrays_tensors_and_functions_become_frames(tmp_path):
+    told = []
+    frames = [plain((255, 0, 0)), torch.zeros(30, 40, 3), lambda ax: ax.fill([0, 1, 1, 0], [0, 0, 1, 1], color="lime")]
+    path = save_animation(
+        tmp_path / "a.gif", frames, 10, size=(40, 30), on_frame=lambda done, total: told.append((done, total))
+    )
+    pictures, loop = frames_of(path)
+    assert [picture.shape for picture, _ in pictures] == [(30, 40, 3)] * 3
+    assert [duration for _, duration in pictures] == [100] * 3
+    assert loop == 0
+    np.testing.assert_array_equal(pictures[0][0], plain((255, 0, 0)))
+    np.testing.assert_array_equal(pictures[1][0], plain((0, 0, 0)))
+    np.testing.assert_allclose(pictures[2][0][15, 20], (0, 255, 0), atol=5)
+    assert told == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_colors_keep_their_tone(tmp_path):
+    ramp = np.linspace(0, 1, 64)[None, :, None].repeat(8, 0).repeat(3, 2)
+    (picture, _) = frames_of(save_animation(tmp_path / "a.gif", [ramp, 1 - ramp]))[0][0]
+    assert np.abs(picture / 255 - ramp).max() < 0.03
+
+
+def test_an_interruption_leaves_the_frames_so_far(tmp_path):
+    def stop(done, _):
+        if done == 2:
+            raise KeyboardInterrupt
+
+    frames = [plain((20 * index, 0, 0)) for index in range(1, 6)]
+    with pytest.raises(KeyboardInterrupt):
+        save_animation(tmp_path / "a.gif", frames, on_frame=stop)
+    assert len(frames_of(tmp_path / "a.gif")[0]) == 2
+
+
+def test_an_interruption_before_the_first_frame_leaves_no_file(tmp_path):
+    def interrupt(ax):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        save_animation(tmp_path / "a.gif", [interrupt])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failing_frame_leaves_no_file(tmp_path):
+    with pytest.raises(InputError, match=r"frames\[1\] must be \(30, 40, 3\) like frames\[0\], got \(9, 9, 3\)"):
+        save_animation(tmp_path / "a.gif", [plain(0), plain(0, (9, 9))])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("frames", "name", "fps", "error", "message"),
+    [
+        ([], "a.gif", 20, InputError, "frames must hold at least one frame"),
+        ([plain(0)], "a.mp4", 20, InputError, r"path must end in \.gif, got 'a\.mp4'"),
+        ([plain(0)], "none/a.gif", 20, FileNotFoundError, "does not exist"),
+        ([plain(0)], "a.gif", 0.0, InputError, "fps must be positive"),
+        ([np.zeros((4, 4))], "a.gif", 20, InputError, r"frames\[0\] must have shape \(H, W, 3\)"),
+        ([np.full((4, 4, 3), 7.0)], "a.gif", 20, InputError, r"frames\[0\] must be uint8 or lie in \[0, 1\]"),
+        ([np.full((4, 4, 3), np.nan)], "a.gif", 20, InputError, r"frames\[0\] must be uint8 or lie in \[0, 1\]"),
+    ],
+)
+def test_save_animation_refuses(tmp_path, frames, name, fps, error, message):
+    with pytest.raises(error, match=message):
+        save_animation(tmp_path / name, frames, fps)
+
+
+def test_an_alignment_plays_small_and_quickly(hand, skin, clouds, tmp_path):
+    poses = torch.stack([cloud.pose for cloud in clouds])
+    begin = time.process_time()
+    path = animate_alignment(
+        tmp_path / "a.gif",
+        hand,
+        poses,
+        [cloud.points for cloud in clouds],
+        inliers=[cloud.inliers for cloud in clouds],
+        skin=skin,
+    )
+    # CPU time with room for a slow machine; 0.1 s per frame is usual.
+    assert (time.process_time() - begin) / len(clouds) < 2.0
+    assert path.stat().st_size / len(clouds) < 1.5e6 / 40
+    pictures, _ = frames_of(path)
+    assert [picture.shape for picture, _ in pictures] == [(360, 360, 3)] * 4
+    assert pictures[0][1] == 50
+    assert np.abs(pictures[0][0].astype(int) - pictures[2][0]).mean() > 1
+
+
+def test_a_coarse_surface_and_all_points_by_default(hand, clouds, tmp_path):
+    told = []
+    path = animate_alignment(
+        tmp_path / "a.gif",
+        hand,
+        clouds[0].pose[None],
+        [clouds[0].points],
+        camera=torch.tensor([0.1, -0.1, 0.0]),
+        size=(60, 50),
+        on_frame=lambda done, total: told.append((done, total)),
+    )
+    assert frames_of(path)[0][0][0].shape == (50, 60, 3)
+    assert told == [(1, 1)]
+
+
+def test_animate_alignment_refuses(hand, skin, clouds, tmp_path):
+    path, points = tmp_path / "a.gif", [clouds[0].points]
+    pose = hand.rest_pose()[None]
+    with pytest.raises(InputError, match=r"poses must have shape \(1, 27\), got \(2, 27\)"):
+        animate_alignment(path, hand, pose.expand(2, -1), points, skin=skin)
+    with pytest.raises(InputError, match=r"inliers must hold one mask per cloud \(1\), got 0"):
+        animate_alignment(path, hand, pose, points, inliers=[], skin=skin)
+    with pytest.raises(InputError, match="clouds must hold at least one cloud"):
+        animate_alignment(path, hand, pose[:0], [], skin=skin)
+    with pytest.raises(InputError, match="path must end in"):
+        animate_alignment(tmp_path / "a.avi", hand, pose, points, skin=skin)
