@@ -9,7 +9,10 @@ import torch
 from torch import Tensor
 
 _DAMPING_DOWN = 0.2
+_DAMPING_DOUBT = 2.0
 _DAMPING_UP = 6.0
+# A step that brings less than this share of the decrease that its slope promises makes the model doubtful.
+_DOUBTFUL_SHARE = 0.5
 _MIN_DAMPING = 1e-7
 _MAX_DAMPING = 1e7
 # Rounding makes a singular Hessian of D variables indefinite by about D eps; a damping of a few times that covers it.
@@ -65,7 +68,8 @@ def levenberg_marquardt(
 
     Each step solves ``(H + damping diag(H)) s = -g``. Variables at a limit whose gradient pushes outwards are frozen
     for the step; the others are clamped at the limit. A step that raises the cost, or whose system has no Cholesky
-    factor, is undone and the damping raised.
+    factor, is undone and the damping raised; one that lowers it by much less than promised is kept and the damping
+    raised a little.
 
     Args:
         linearize: state (B, D) to `Linearization`.
@@ -99,7 +103,11 @@ def levenberg_marquardt(
         step, sound = _solve(current, damping, _frozen(current.gradient, state, low, high))
         trial_state = torch.minimum(torch.maximum(retract(state, step), low), high)
         trial = linearize(trial_state)
-        better = (trial.cost <= current.cost) & sound
+        decrease = current.cost - trial.cost
+        better = (decrease >= 0) & sound
+        # A quadratic falls by at least half of slope times step. Steps that overshoot almost to the same height would
+        # else zigzag for long, each of them accepted.
+        trusted = decrease >= (-0.5 * _DOUBTFUL_SHARE) * (current.gradient * step).sum(-1)
         keep = better.unsqueeze(-1)
         state = torch.where(keep, trial_state, state)
         last_step = torch.where(keep, step, last_step)
@@ -108,8 +116,8 @@ def levenberg_marquardt(
             torch.where(keep, trial.gradient, current.gradient),
             torch.where(keep.unsqueeze(-1), trial.hessian, current.hessian),
         )
-        damping = torch.where(better, damping * _DAMPING_DOWN, damping * _DAMPING_UP)
-        damping = damping.clamp(min_damping, _MAX_DAMPING)
+        accepted = torch.where(trusted, damping * _DAMPING_DOWN, damping * _DAMPING_DOUBT)
+        damping = torch.where(better, accepted, damping * _DAMPING_UP).clamp_(min_damping, _MAX_DAMPING)
         if atol > 0 and bool(((step.abs().amax(-1) <= atol) & sound).all()):
             break
     return LMResult(state, current.cost, damping, last_step, num_steps)
@@ -118,7 +126,8 @@ def levenberg_marquardt(
 def damped_step(problem: Linearization, damping: Tensor, *, frozen: Tensor | None = None) -> Tensor:
     """Return the step ``-(H + damping diag(H))^-1 g``, zero in frozen variables and where nothing constrains one.
 
-    A problem whose damped system has no Cholesky factor gets a zero step.
+    A variable counts as unconstrained when its curvature is below the rounding of the largest one's. A problem whose
+    damped system has no Cholesky factor gets a zero step.
 
     Args:
         problem: the linearized problem.
