@@ -132,7 +132,7 @@ def test_a_rejected_step_keeps_the_state_and_raises_the_damping():
 
 def test_a_step_that_brings_little_is_kept_but_raises_the_damping():
     def linearize(state):
-        # The Hessian is just over half of the true one: undamped steps jump to nearly the same height across the minimum.
+        # The Hessian is just over half of the true one: undamped steps reach nearly the same height on the other side.
         return Linearization(0.5 * state.square().sum(-1), state, torch.full((1, 1, 1), 0.505, dtype=D))
 
     start = torch.ones(1, 1, dtype=D)

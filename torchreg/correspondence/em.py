@@ -218,7 +218,7 @@ def _chunks(batch: int, num_model: int, num_data: int) -> Iterator[tuple[slice, 
     """Yield slices over batch and data that keep the kernel matrix within the chunk size."""
     per_problem = num_model * num_data
     rows = max(1, _CHUNK_ENTRIES // max(per_problem, 1))
-    columns = num_data if per_problem <= _CHUNK_ENTRIES else max(1, _CHUNK_ENTRIES // num_model)
+    columns = max(1, num_data if per_problem <= _CHUNK_ENTRIES else _CHUNK_ENTRIES // num_model)
     for row in range(0, batch, rows):
         for column in range(0, num_data, columns):
             yield slice(row, row + rows), slice(column, column + columns)

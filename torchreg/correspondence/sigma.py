@@ -38,7 +38,7 @@ class SigmaSchedule:
         expected = self.steps if self.kind == "fixed" else 2
         if len(self.values) != expected:
             raise InputError(
-                f"values must hold {expected} sigma(s) for {self.steps} {self.kind} steps, got {self.values}"
+                f"values must hold {expected} sigmas for {self.steps} {self.kind} steps, got {self.values}"
             )
         for index, value in enumerate(self.values):
             check_positive(value, f"values[{index}]")
