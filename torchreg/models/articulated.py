@@ -17,8 +17,8 @@ from torchreg.geometry.kinematic_tree import KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import compose_rotation_vectors, left_jacobian, so3_exp, wrap_rotation_vector
-from torchreg.models.kinematics import KinematicChain
-from torchreg.models.primitives import Primitive, PrimitiveSet
+from torchreg.models.kinematics import KinematicChain, neighbor_matrix, part_parents
+from torchreg.models.primitives import Primitive, PrimitiveSet, fuse
 from torchreg.models.rigs import RigSurface, ShapeSpec, spec_from_arrays, spec_from_gltf, spec_from_urdf
 from torchreg.models.skin import LinearBlendSkin
 
@@ -86,10 +86,10 @@ class ArticulatedShape(nn.Module):
         self.part_names = tuple(part_names or part_frames)
         self.surface = surface
         frames = [tree.index(name) for name in part_frames]
-        parents = _part_parents(tree, frames)
+        parents = part_parents(tree, frames)
         self.part_parents = tuple(parents)
         self.register_buffer("part_index", torch.tensor(frames), persistent=False)
-        self.register_buffer("adjacency", _adjacency(parents), persistent=False)
+        self.register_buffer("adjacency", neighbor_matrix(parents), persistent=False)
         self.register_buffer("_owners", torch.tensor(_offset_owners(tree, frames)), persistent=False)
         self.register_buffer("_part_moves", self.chain.moves[frames].unsqueeze(-1), persistent=False)
         base = torch.zeros(6, dtype=torch.float64) if not free_base else torch.full((6,), math.inf, dtype=torch.float64)
@@ -105,7 +105,9 @@ class ArticulatedShape(nn.Module):
     def from_spec(cls, spec: ShapeSpec, **options: Any) -> ArticulatedShape:
         """Return the shape of a `ShapeSpec` (tree, parts, solids, and the file's surface)."""
         options = {"nu": spec.nu, **{key: value for key, value in options.items() if value is not None}}
-        return cls(spec.tree, spec.part_frames, spec.primitives, surface=spec.surface, **options)
+        return cls(
+            spec.tree, spec.part_frames, spec.primitives, part_names=spec.part_names, surface=spec.surface, **options
+        )
 
     @classmethod
     def from_urdf(
@@ -114,6 +116,7 @@ class ArticulatedShape(nn.Module):
         *,
         package_dirs: Sequence[str | Path] = (),
         primitive: str = "auto",
+        meshes: str = "require",
         free_base: bool = True,
         nu: float | None = None,
         dtype: torch.dtype | None = None,
@@ -123,19 +126,22 @@ class ArticulatedShape(nn.Module):
         Args:
             path: the URDF file.
             package_dirs: folders in which ``package://`` names are looked up.
-            primitive: "auto" (what each link's geometry is nearest to) or the kind fitted to every link.
+            primitive: "auto" (the file's own solids, and for meshes the kind nearest to them) or the kind fitted to
+                every link.
+            meshes: "require" every mesh file, or "skip" those that are missing or need a reader not installed.
             free_base: False if the robot's base is bolted to the origin.
             nu: fusion length, metres; from the parts' thickness by default.
             dtype: of the module; the default dtype if None.
 
         Returns:
-            the shape; links without geometry are frames but not parts.
+            the shape. Degrees of freedom are called like the joints, parts like the links; links without geometry are
+            frames but not parts, and the further solids of a link with several are parts LINK_1, LINK_2, ...
 
         Raises:
             FormatError: if a file is missing, damaged or oversized.
             ModelError: if the tree is cyclic, disconnected or non-finite, or no link has geometry.
         """
-        spec = spec_from_urdf(path, package_dirs=package_dirs, primitive=primitive)
+        spec = spec_from_urdf(path, package_dirs=package_dirs, primitive=primitive, meshes=meshes)
         return cls.from_spec(spec, free_base=free_base, nu=nu, dtype=dtype)
 
     @classmethod
@@ -370,7 +376,7 @@ class ArticulatedShape(nn.Module):
         References: Dewaele et al. 2006, eqs. 1 and 2.
         """
         check_shape(points, "points", ("N", 3), batch=True)
-        return self._fuse(self.part_distances(points, pose))[0]
+        return fuse(self.part_distances(points, pose), self.adjacency, self.nu)[0]
 
     def distance_jacobian(self, points: Tensor, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
         """Return the fused distance and its analytic Jacobian with respect to all degrees of freedom.
@@ -389,7 +395,7 @@ class ArticulatedShape(nn.Module):
         solids = self._solid_frames(transforms)
         local = self._local_points(points, solids)
         distances, gradients = self.primitives.distance_and_gradient(local, self._scaled_sizes())
-        fused, shares = self._fuse(distances)
+        fused, shares = fuse(distances, self.adjacency, self.nu)
         # A solid that moves by a twist leaves the point behind; force and moment are taken in the solid's own frame.
         force = gradients * shares.unsqueeze(-1)
         wrench = torch.cat([force, torch.linalg.cross(local, force)], dim=-1).flatten(-2)
@@ -445,15 +451,16 @@ class ArticulatedShape(nn.Module):
     def file_skin(self) -> LinearBlendSkin:
         """Return the skin of the file this shape was read from: its vertices under its own weights.
 
+        Its reference pose is all zeros, the pose of the file, whether or not the joint limits allow it.
+
         Raises:
             InputError: if the shape was not read from a file with a mesh.
         """
         if self.surface is None:
             raise InputError("this shape has no file skin: it was not read from a file with a mesh")
         vertices = self.surface.vertices.to(self.rest)
-        return LinearBlendSkin(
-            self, vertices, self.surface.weights.to(self.rest), self.rest_pose(), faces=self.surface.faces
-        )
+        faces = self.surface.faces.to(self.rest.device)
+        return LinearBlendSkin(self, vertices, self.surface.weights, torch.zeros_like(self.rest), faces=faces)
 
     def _offset_scales(self) -> Tensor:
         return nn.functional.pad(self.log_length_scales, (1, 0))[self._owners].exp()
@@ -474,13 +481,6 @@ class ArticulatedShape(nn.Module):
         offsets = (solids[..., None, :, 3] @ solids[..., :3]).flatten(-3)
         return (points @ rotations - offsets.unsqueeze(-2)).unflatten(-1, (self.num_parts, 3))
 
-    def _fuse(self, distances: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the fused distance (..., N) and each part's share in its gradient (..., N, P)."""
-        nearest, dominating = distances.min(dim=-1, keepdim=True)
-        fields = torch.where(self.adjacency[dominating.squeeze(-1)], (nearest - distances) / self.nu, -math.inf).exp()
-        total = fields.sum(-1, keepdim=True)
-        return (nearest - self.nu * total.log()).squeeze(-1), fields / total
-
 
 def check_finite_dtype(points: Tensor, like: Tensor) -> None:
     """Raise InputError unless ``points`` has the dtype and device of the module: mixed dtypes lose precision."""
@@ -497,24 +497,6 @@ def _base_twists(pose: Tensor, chart: str) -> Tensor:
     linear = torch.linalg.cross(pose[..., None, :3].expand_as(angular), angular)
     translation = torch.cat([identity, torch.zeros_like(identity)], dim=-1)
     return torch.cat([translation, torch.cat([linear, angular], dim=-1)], dim=-2)
-
-
-def _part_parents(tree: KinematicTree, frames: list[int]) -> list[int]:
-    parents = []
-    for frame in frames:
-        ancestor = tree.joints[frame].parent
-        while ancestor >= 0 and ancestor not in frames:
-            ancestor = tree.joints[ancestor].parent
-        parents.append(frames.index(ancestor) if ancestor >= 0 else -1)
-    return parents
-
-
-def _adjacency(parents: list[int]) -> Tensor:
-    adjacency = torch.eye(len(parents), dtype=torch.bool)
-    for part, parent in enumerate(parents):
-        if parent >= 0:
-            adjacency[part, parent] = adjacency[parent, part] = True
-    return adjacency
 
 
 def _offset_owners(tree: KinematicTree, frames: list[int]) -> list[int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import pytorch_kinematics as pk
 import torch
@@ -134,6 +134,36 @@ class KinematicChain(nn.Module):
         angular = axis * revolute
         linear = torch.linalg.cross(at_joint[..., 3], angular) + axis * (1 - revolute)
         return torch.cat([linear, angular], dim=-1), self.moves
+
+
+def part_parents(tree: KinematicTree, frames: Sequence[int]) -> list[int]:
+    """Return, per part, the next part above it in the tree, -1 for none.
+
+    Args:
+        tree: the kinematic tree.
+        frames: index of each part's frame.
+    """
+    part_of = {frame: part for part, frame in enumerate(frames)}
+    parents = []
+    for frame in frames:
+        ancestor = tree.joints[frame].parent
+        while ancestor >= 0 and ancestor not in part_of:
+            ancestor = tree.joints[ancestor].parent
+        parents.append(part_of.get(ancestor, -1))
+    return parents
+
+
+def neighbor_matrix(parents: Sequence[int]) -> Tensor:
+    """Return (P, P) booleans: True for each part itself, its parent and its children.
+
+    Args:
+        parents: parent of each part, -1 for none.
+    """
+    neighbors = torch.eye(len(parents), dtype=torch.bool)
+    for part, parent in enumerate(parents):
+        if parent >= 0:
+            neighbors[part, parent] = neighbors[parent, part] = True
+    return neighbors
 
 
 def _build_chain(tree: KinematicTree) -> pk.Chain:

@@ -10,9 +10,18 @@ from torch import Tensor, nn
 
 from torchreg.errors import ModelError
 from torchreg.geometry.primitives import PRIMITIVE_KINDS
+from torchreg.geometry.rigid import rigid_matrix
+from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
+from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
 
 # Boxes reach their corners and capsules their round ends: the norm of the sizes and half as much again covers both.
 _BALL_FACTOR = 1.5
+# Fitting solids to a surface: residuals beyond this many fusion lengths lose weight; weights of the terms beside the
+# fused distance; fusion lengths of residual that a change by the solid's own size is worth.
+_REFINE_SCALE = 1.5
+_OWN_WEIGHT = 0.3
+_RIVAL_WEIGHT = 0.3
+_REFINE_STIFFNESS = 2.0
 
 
 @dataclass(frozen=True)
@@ -128,6 +137,140 @@ class PrimitiveSet(nn.Module):
         ]
         distance = torch.cat([pair[0] for pair in pairs], dim=-1)[..., self.kind_order]
         return distance, torch.cat([pair[1] for pair in pairs], dim=-2)[..., self.kind_order, :]
+
+
+def fuse(distances: Tensor, neighbors: Tensor, nu: float) -> tuple[Tensor, Tensor]:
+    """Return the distance to the fused surface, ``-nu log phi``, and each solid's share in its gradient.
+
+    phi sums the fields ``exp(-d_q / nu)`` of the dominating solid and its neighbors only, in the log domain.
+
+    Args:
+        distances: (..., P) to every solid, metres.
+        neighbors: (P, P) booleans, True on the diagonal.
+        nu: fusion length, metres.
+
+    Returns:
+        (...) metres and (..., P), which sums to one.
+
+    Differentiable: in ``distances``, where the dominating solid is unique.
+
+    References: Dewaele et al. 2006, eqs. 1 and 2.
+    """
+    nearest, dominating = distances.min(dim=-1, keepdim=True)
+    fields = torch.where(neighbors[dominating.squeeze(-1)], (nearest - distances) / nu, -torch.inf).exp()
+    total = fields.sum(-1, keepdim=True)
+    return (nearest - nu * total.log()).squeeze(-1), fields / total
+
+
+def refine_primitives(
+    primitives: Sequence[Primitive], neighbors: Tensor, nu: float, points: Tensor, owners: Tensor, max_steps: int = 30
+) -> list[Primitive]:
+    """Return solids moved, turned and resized so that their fused surface runs through surface points.
+
+    Damped least squares over all solids at once: the fused distance of every point, to a lesser degree the distance to
+    the solid that owns it and by how much another solid is nearer, and a weak pull to the start, which keeps whole the
+    solids that show only a patch. Residuals beyond the fusion length lose weight.
+
+    Args:
+        primitives: first guess, one per part, with poses in the points' coordinates.
+        neighbors: (P, P) booleans, which solids fuse; True on the diagonal.
+        nu: fusion length, metres.
+        points: (N, 3) on the surface, metres.
+        owners: (N,) part that each point belongs to.
+        max_steps: damped least-squares steps.
+
+    Returns:
+        one `Primitive` per part, of the same kinds.
+
+    References: Marquardt 1963.
+    """
+    solids = PrimitiveSet(primitives).requires_grad_(False)
+    problem = _Refinement(solids, neighbors, nu, points.double(), owners)
+    start = torch.zeros(1, len(primitives) * problem.width, dtype=torch.float64)
+    found = levenberg_marquardt(problem.linearize, start, retract=problem.retract, max_steps=max_steps)
+    rotations, centers, sizes = problem.solids_at(found.state)
+    members = [int(part) for kind in solids.kinds for part in solids.get_buffer(f"members_{kind}")]
+    rows = dict(zip(members, (row.tolist() for size in sizes for row in size), strict=True))
+    poses = rigid_matrix(rotations, centers)
+    return [Primitive(first.kind, tuple(rows[part]), poses[part]) for part, first in enumerate(primitives)]
+
+
+@dataclass(frozen=True)
+class _Refinement:
+    """The problem of `refine_primitives`. Its state has one row per part: center (3), turn (3), logarithms of sizes."""
+
+    solids: PrimitiveSet
+    neighbors: Tensor
+    nu: float
+    points: Tensor
+    owners: Tensor
+
+    @property
+    def width(self) -> int:
+        return 6 + max(size.shape[-1] for size in self.solids.sizes)
+
+    def solids_at(self, state: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
+        rows = state.view(len(self.solids), self.width)
+        sizes = [
+            size * (rows[self.solids.get_buffer(f"members_{kind}"), 6 : 6 + size.shape[-1]]).exp()
+            for kind, size in zip(self.solids.kinds, self.solids.sizes, strict=True)
+        ]
+        return self.solids.rotations @ so3_exp(rows[:, 3:6]), self.solids.centers + rows[:, :3], sizes
+
+    def retract(self, state: Tensor, step: Tensor) -> Tensor:
+        """Return the state after a step whose moves and turns are in the solids' own frames."""
+        rows, change = state.view(-1, self.width), step.view(-1, self.width)
+        rotations = self.solids.rotations @ so3_exp(rows[:, 3:6])
+        centers = rows[:, :3] + (rotations @ change[:, :3].unsqueeze(-1)).squeeze(-1)
+        turns = compose_rotation_vectors(rows[:, 3:6], change[:, 3:6])
+        return torch.cat([centers, turns, rows[:, 6:] + change[:, 6:]], dim=-1).view(1, -1)
+
+    def linearize(self, state: Tensor) -> Linearization:
+        rotations, centers, sizes = self.solids_at(state)
+        local = ((self.points.unsqueeze(-2) - centers).unsqueeze(-2) @ rotations).squeeze(-2)
+        distances, gradients = self.solids.distance_and_gradient(local, sizes)
+        turning = -torch.linalg.cross(local, gradients)
+        motions = torch.cat([-gradients, turning, self._size_gradients(local, sizes)], dim=-1)
+        cost, gradient, hessian = self._pull(state, rotations)
+        for residual, shares, weight in self._residuals(distances):
+            scaled = (residual / (_REFINE_SCALE * self.nu)).square()
+            trust = weight / (1 + scaled)
+            jacobian = (motions * shares.unsqueeze(-1)).flatten(1)
+            cost = cost + 0.5 * weight * (_REFINE_SCALE * self.nu) ** 2 * scaled.log1p().sum()
+            gradient = gradient + jacobian.mT @ (trust * residual)
+            hessian = hessian + jacobian.mT @ (trust.unsqueeze(-1) * jacobian)
+        return Linearization(cost.view(1), gradient.view(1, -1), hessian.unsqueeze(0))
+
+    def _residuals(self, distances: Tensor) -> list[tuple[Tensor, Tensor, float]]:
+        """Return (residual (N,), shares of the solids (N, P), weight) of the three terms."""
+        fused, shares = fuse(distances, self.neighbors, self.nu)
+        owner = nn.functional.one_hot(self.owners, len(self.solids)).to(distances)
+        dominating = nn.functional.one_hot(distances.argmin(-1), len(self.solids)).to(distances)
+        owned, nearest = (distances * owner).sum(-1), distances.amin(-1)
+        return [(fused, shares, 1.0), (owned, owner, _OWN_WEIGHT), (owned - nearest, owner - dominating, _RIVAL_WEIGHT)]
+
+    def _size_gradients(self, local: Tensor, sizes: Sequence[Tensor]) -> Tensor:
+        """Return (N, P, width - 6): derivatives of the distances by the logarithms of sizes, zero for exponents."""
+        with torch.enable_grad():
+            leaves = [size.expand(len(local), *size.shape).clone().requires_grad_() for size in sizes]
+            found = torch.autograd.grad(self.solids(local, leaves).sum(), leaves)
+        columns = [
+            nn.functional.pad(
+                gradient * size * self.solids.get_buffer(f"scalable_{kind}"), (0, self.width - 6 - size.shape[-1])
+            )
+            for kind, gradient, size in zip(self.solids.kinds, found, sizes, strict=True)
+        ]
+        return torch.cat(columns, dim=-2)[:, self.solids.kind_order]
+
+    def _pull(self, state: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return cost, gradient and Hessian of the pull to the start."""
+        rows = state.view(len(self.solids), self.width)
+        back = (rows[:, None, :3] @ rotations).squeeze(-2)
+        offset = torch.cat([back, rows[:, 3:]], dim=-1)
+        reach = self.solids.reaches(list(self.solids.sizes)) / _BALL_FACTOR
+        spread = torch.cat([reach.unsqueeze(-1).expand(-1, 3), torch.ones_like(rows[:, 3:])], dim=-1)
+        stiffness = (_REFINE_STIFFNESS * self.nu / spread).square()
+        return 0.5 * (stiffness * offset.square()).sum(), (stiffness * offset).flatten(), stiffness.flatten().diag()
 
 
 def _check_primitive(index: int, primitive: Primitive) -> None:

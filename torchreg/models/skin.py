@@ -60,8 +60,15 @@ class LinearBlendSkin(nn.Module):
         check_points(points, "points", batch=False)
         weights = as_float_tensor(weights, "weights", like=points).detach()
         check_shape(weights, "weights", (len(points), shape.num_parts))
-        if not torch.allclose(weights.sum(-1), torch.ones_like(weights[:, 0]), atol=1e-4) or bool((weights < 0).any()):
+        total = weights.sum(-1, keepdim=True)
+        if not torch.allclose(total, torch.ones_like(total), atol=1e-4) or bool((weights < 0).any()):
             raise InputError("weights must not be negative and every row must sum to one")
+        weights = weights / total
+        if normals is not None:
+            normals = as_float_tensor(normals, "normals", like=points).detach()
+            check_shape(normals, "normals", (len(points), 3))
+        if faces is not None:
+            faces = TriangleMesh(points, faces).faces
         reference_pose = shape.check_pose(reference_pose, "reference_pose").detach()
         self.register_buffer("reference_pose", reference_pose, persistent=False)
         self.register_buffer("points", points, persistent=False)
@@ -221,4 +228,4 @@ def sample_skin(shape: ArticulatedShape, count: int = 500, *, sharpness: float =
     if shape.surface is None:
         return BendingSkin(shape, points, shape.rest_pose(), sharpness, normals=normals)
     weights = interpolate(shape.surface.weights, shape.surface.faces, face, barycentric.to(shape.surface.weights))
-    return LinearBlendSkin(shape, points, weights, shape.rest_pose(), normals=normals)
+    return LinearBlendSkin(shape, points, weights, torch.zeros_like(shape.rest), normals=normals)
