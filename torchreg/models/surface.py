@@ -1,0 +1,123 @@
+"""Two surfaces of an articulated shape behind one interface: its fused solids, or a skin's tangent planes."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from torchreg.errors import InputError
+from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
+from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.skin import LinearBlendSkin
+
+# Entries of the distance table between data and skin held at a time.
+_CHUNK_ENTRIES = 4_000_000
+# Meshes with this many vertices carry their own sampling.
+_MIN_VERTICES, _MAX_VERTICES, _NUM_SAMPLES = 800, 6000, 4000
+
+
+class Surface(Protocol):
+    """What a surface fit needs: signed distances and their Jacobian with respect to the pose."""
+
+    def distance(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Return the signed distances (..., N) of points (..., N, 3) in poses (..., num_dofs), metres."""
+
+    def distance_jacobian(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Return distances (..., N) and their Jacobian (..., N, num_dofs) in tangent coordinates."""
+
+
+class FusedSurface:
+    """The fused surface of a shape's solids, eq. 2.
+
+    Args:
+        shape: the articulated shape.
+    """
+
+    def __init__(self, shape: ArticulatedShape) -> None:
+        self.shape = shape
+
+    def distance(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Return the signed distances (..., N) of points (..., N, 3) in poses (..., num_dofs), metres."""
+        return self.shape.distance(points, pose)
+
+    def distance_jacobian(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Return distances (..., N) and their Jacobian (..., N, num_dofs) in tangent coordinates."""
+        return self.shape.distance_jacobian(points, pose, chart="tangent")
+
+
+class SkinSurface:
+    """A surface given by a dense skin with normals: distance to the tangent plane of the nearest skin point.
+
+    For shapes whose file brings a mesh this is closer to the thing than its fused solids.
+
+    Args:
+        skin: a skin with normals, dense enough that its points' tangent planes follow the surface.
+    """
+
+    def __init__(self, skin: LinearBlendSkin) -> None:
+        self.skin = skin
+
+    def distance(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Return the signed distances (..., N) of points (..., N, 3) in poses (..., num_dofs), metres."""
+        posed, normals = self.skin(pose), self.skin.posed_normals(pose)
+        return self._plane_distance(points, posed, normals)[0]
+
+    def distance_jacobian(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Return distances (..., N) and their Jacobian (..., N, num_dofs) in tangent coordinates."""
+        rows, derivative = self.skin.shape.transform_jacobian(pose, chart="tangent")
+        posed, normals = self.skin.basis @ rows, self.skin.posed_normals(pose)
+        distance, nearest, normal = self._plane_distance(points, posed, normals)
+        basis = self.skin.basis[nearest]
+        moved = (basis @ derivative.flatten(-2)).unflatten(-1, derivative.shape[-2:])
+        return distance, -(normal.unsqueeze(-2) @ moved).squeeze(-2)
+
+    def _plane_distance(self, points: Tensor, posed: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        nearest = nearest_index(points, posed)
+        index = nearest.unsqueeze(-1).expand(*nearest.shape, 3)
+        offset = points - posed.expand(*nearest.shape[:-1], *posed.shape[-2:]).gather(-2, index)
+        normal = normals.expand(*nearest.shape[:-1], *normals.shape[-2:]).gather(-2, index)
+        along = (offset * normal).sum(-1)
+        # Far from the surface the tangent plane says little: the distance to the point takes over, with the plane's sign.
+        reach = offset.norm(dim=-1)
+        return torch.where(along.abs() < _PLANE_SHARE * reach, _signed(reach, along), along), nearest, normal
+
+
+# A datum whose offset is this oblique lies beside the tangent point rather than above it.
+_PLANE_SHARE = 0.2
+
+
+def _signed(size: Tensor, sign: Tensor) -> Tensor:
+    return torch.where(sign < 0, -size, size)
+
+
+def dense_file_skin(shape: ArticulatedShape) -> LinearBlendSkin:
+    """Return a dense skin with normals of the file's mesh: its vertices, or samples where there are too many or too few.
+
+    Raises:
+        InputError: if the shape was not read from a file with a mesh.
+    """
+    if shape.surface is None:
+        raise InputError("this shape has no file surface: it was not read from a file with a mesh")
+    mesh = TriangleMesh(shape.surface.vertices, shape.surface.faces)
+    used = mesh.faces.unique()
+    if _MIN_VERTICES <= len(used) <= _MAX_VERTICES:
+        points, normals, weights = mesh.vertices[used], mesh.vertex_normals()[used], shape.surface.weights[used]
+    else:
+        points, face, barycentric = sample_surface(mesh, _NUM_SAMPLES)
+        normals = mesh.face_normals()[face]
+        weights = interpolate(shape.surface.weights, mesh.faces, face, barycentric)
+    return LinearBlendSkin(
+        shape, points.to(shape.rest), weights.to(shape.rest), shape.rest_pose(), normals=normals.to(shape.rest)
+    )
+
+
+def nearest_index(points: Tensor, targets: Tensor) -> Tensor:
+    """Return the index (..., N) of the nearest of ``targets`` (..., K, 3) to each of ``points`` (..., N, 3)."""
+    center = targets.mean(-2, keepdim=True)
+    points, targets = points - center, targets - center
+    half_squares = 0.5 * targets.square().sum(-1).unsqueeze(-2)
+    size = max(1, _CHUNK_ENTRIES // (targets.shape[-2] * max(1, points[..., 0, 0].numel())))
+    parts = [(part @ targets.mT - half_squares).argmax(-1) for part in points.split(size, dim=-2)]
+    return torch.cat(parts, dim=-1)

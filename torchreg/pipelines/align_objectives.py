@@ -1,0 +1,102 @@
+"""The two objectives of an alignment as least-squares problems around a pose: eq. 20 and eqs. 21, 22."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg.correspondence.em import EStep
+from torchreg.models.skin import LinearBlendSkin
+from torchreg.models.surface import Surface
+from torchreg.solvers.levenberg_marquardt import Linearization
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """A Gaussian on the joints, ``sum_k precision_k (pose_k - mean_k)^2 / 2``; zero precision leaves one free.
+
+    Args:
+        mean: (B, num_dofs).
+        precision: (num_dofs,), 1 / std^2; zero for the base.
+    """
+
+    mean: Tensor
+    precision: Tensor
+
+    def add_to(self, problem: Linearization, pose: Tensor) -> Linearization:
+        """Return the problem with the prior added."""
+        offset = pose - self.mean
+        pull = self.precision * offset
+        return Linearization(
+            problem.cost + 0.5 * (pull * offset).sum(-1),
+            problem.gradient + pull,
+            problem.hessian + torch.diag(self.precision),
+        )
+
+    def cost(self, pose: Tensor) -> Tensor:
+        """Return the prior's cost (...) of poses (..., num_dofs); the mean's batch is the first dimension."""
+        mean = self.mean.reshape(self.mean.shape[0], *[1] * (pose.ndim - 2), -1)
+        return 0.5 * (self.precision * (pose - mean).square()).sum(-1)
+
+
+class RegistrationObjective:
+    """Eq. 20, ``sum_i lambda_i |T(X_i, pose) - G_i|^2 / 2 sigma^2``, over the model points only.
+
+    The skin is linear in the part transforms, so the curvature over all points collapses into one small matrix.
+
+    Args:
+        skin: the model points.
+        observed: lambda and G from the E-step.
+        sigma: (B,) metres.
+        prior: on the joints.
+    """
+
+    def __init__(self, skin: LinearBlendSkin, observed: EStep, sigma: Tensor, prior: PosePrior) -> None:
+        self.skin, self.prior, self.targets = skin, prior, observed.targets
+        weights = torch.where(observed.weights < 1e-12, 0.0, observed.weights)
+        self.weights = (weights / sigma.square().unsqueeze(-1)).unsqueeze(-1)
+        self.curvature = skin.basis.mT @ (self.weights * skin.basis)
+
+    def __call__(self, pose: Tensor) -> Linearization:
+        """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs)."""
+        rows, derivative = self.skin.shape.transform_jacobian(pose, chart="tangent")
+        residual = self.skin.basis @ rows - self.targets
+        weighted = self.weights * residual
+        flat = derivative.flatten(-3, -2)
+        gradient = (flat.mT @ (self.skin.basis.mT @ weighted).flatten(-2).unsqueeze(-1)).squeeze(-1)
+        curved = (self.curvature @ derivative.flatten(-2)).reshape(flat.shape)
+        problem = Linearization(0.5 * (weighted * residual).sum((-2, -1)), gradient, flat.mT @ curved)
+        return self.prior.add_to(problem, pose)
+
+
+class SurfaceObjective:
+    """Eqs. 21 and 22: squared surface distances of the data, each weighted by ``beta = exp(-d^2 / sigma_s^2)``.
+
+    With beta recomputed at every pose this is the Welsch function ``sigma_s^2 (1 - beta) / 2``, which never increases.
+
+    Args:
+        surface: the surface to fit.
+        data: (B, M, 3), metres.
+        valid: (B, M) one, or zero where padded.
+        sigma: (B,) kernel width sigma_s, metres.
+        noise: (B,) standard deviation of the distances, metres; weighs data against the prior.
+        prior: on the joints.
+    """
+
+    def __init__(
+        self, surface: Surface, data: Tensor, valid: Tensor, sigma: Tensor, noise: Tensor, prior: PosePrior
+    ) -> None:
+        self.surface, self.data, self.valid, self.prior = surface, data, valid, prior
+        self.inverse_square = sigma.square().reciprocal().unsqueeze(-1)
+        self.scale = noise.square().reciprocal()
+
+    def __call__(self, pose: Tensor) -> Linearization:
+        """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs)."""
+        distance, jacobian = self.surface.distance_jacobian(self.data, pose)
+        beta = (-distance.square() * self.inverse_square).exp()
+        cost = 0.5 * ((1 - beta) * self.valid).sum(-1) / self.inverse_square.squeeze(-1) * self.scale
+        weighted = jacobian * (beta * self.valid * self.scale.unsqueeze(-1)).unsqueeze(-1)
+        gradient = (weighted.mT @ distance.unsqueeze(-1)).squeeze(-1)
+        return self.prior.add_to(Linearization(cost, gradient, weighted.mT @ jacobian), pose)

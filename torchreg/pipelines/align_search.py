@@ -1,0 +1,224 @@
+"""Searching around a start when plain descent leaves part of the data unexplained.
+
+Candidates are scattered around the start, refined in one batch on few points, and recombined limb by limb: a finger that
+one candidate found is kept even if that candidate lost the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchreg.correspondence.sigma import SigmaSchedule
+from torchreg.geometry.rotation import compose_rotation_vectors
+from torchreg.geometry.sampling import farthest_points
+from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.skin import LinearBlendSkin
+from torchreg.pipelines.align_stages import AlignProblem, register, residual_noise, surface_steps
+
+# Shares of the model's size: sigmas of the candidates' EM, widths of their surface fit, width of their score.
+_EM_SIGMAS = ((0.075, 0.022), (0.055, 0.022))
+_SURFACE_SIGMAS = (0.05, 0.03, 0.018)
+_SCORE_SIGMA = 0.022
+_NOISE = 0.01
+# Scatter of the candidates per round: joints as a share of their range, base in radians, base as a share of the size.
+_JOINT_SCATTER = (0.2, 0.15, 0.1)
+_TURN_SCATTER = (0.17, 0.1, 0.07)
+_SHIFT_SCATTER = (0.035, 0.02, 0.015)
+_MAX_JOINT_SCATTER = 0.4
+# One limb in four of a candidate is placed anywhere within this many radians of the start and its limits.
+_FRESH_LIMBS = 0.25
+_FRESH_REACH = 1.2
+_NUM_MODEL, _NUM_DATA = 120, 250
+# Widths of the surface fit that follows a search, whose poses are near already.
+FINAL_SIGMAS = (0.022,)
+# How much the prior weighs in a score, in outliers per squared standard deviation.
+PRIOR_SHARE = 0.3
+# Unexplained data count as a cluster with this many others within four nearest-neighbor distances.
+_CLUSTER_NEIGHBORS = 5
+_CLUSTER_RADIUS = 4.0
+_FAR_NOISES = 3.0
+# A descent that turns a joint or the base further than this, radians, started outside its safe basin.
+_TRUSTED_MOTION = 0.25
+_CLUSTER_SHARE, _CLUSTER_MIN = 0.015, 5
+_MAX_CLUSTERED = 2000
+# Candidates times points times parts held at a time.
+_CHUNK_ENTRIES = 4_000_000
+
+
+def needs_search(problem: AlignProblem, start: Tensor, pose: Tensor) -> Tensor:
+    """Return which problems (B,) a single descent cannot be trusted with.
+
+    Either it went far from its start, where other minima are as near; or it leaves a dense cluster of data off the
+    surface: outliers are thin in space, a limb that was missed is as dense as the rest.
+    """
+    moved = (pose - start)[:, 6:].abs().amax(-1) if pose.shape[-1] > 6 else torch.zeros_like(pose[:, 0])
+    turned = compose_rotation_vectors(pose[:, 3:6], -start[:, 3:6]).norm(dim=-1)
+    return (torch.maximum(moved, turned) > _TRUSTED_MOTION) | _unexplained(problem, pose)
+
+
+def _unexplained(problem: AlignProblem, pose: Tensor) -> Tensor:
+    if problem.data.shape[-2] > _MAX_CLUSTERED:
+        problem = _thinned(problem, _MAX_CLUSTERED)
+    distance = problem.surface.distance(problem.data, pose).abs()
+    noise = residual_noise(problem, pose)
+    far = (distance > _FAR_NOISES * noise.unsqueeze(-1)) & problem.valid
+    squares = _squared_distances(problem.data)
+    squares.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
+    spacing = torch.where(~far & problem.valid, squares.amin(-1), torch.nan).nanmedian(-1).values.sqrt()
+    radius = torch.nan_to_num(_CLUSTER_RADIUS * spacing, nan=0.0).clamp_max(0.1 * problem.size)
+    close = (squares < radius.square()[:, None, None]) & far.unsqueeze(-2)
+    clustered = far & (close.sum(-1) >= _CLUSTER_NEIGHBORS)
+    near_count = (~far & problem.valid).sum(-1)
+    return clustered.sum(-1) > (_CLUSTER_SHARE * near_count).clamp_min(_CLUSTER_MIN)
+
+
+def _squared_distances(data: Tensor) -> Tensor:
+    norms = data.square().sum(-1)
+    return (norms.unsqueeze(-1) + norms.unsqueeze(-2) - 2 * data @ data.mT).clamp_min_(0)
+
+
+def _thinned(problem: AlignProblem, count: int) -> AlignProblem:
+    """Return the problem with every k-th datum, so that at most about ``count`` are left."""
+    stride = -(-problem.data.shape[-2] // count)
+    return replace(problem, data=problem.data[:, ::stride], valid=problem.valid[:, ::stride])
+
+
+def coarse_skin(skin: LinearBlendSkin) -> LinearBlendSkin:
+    """Return a skin of few points that cover the given one's."""
+    index = farthest_points(skin.points, min(_NUM_MODEL, len(skin)))
+    return LinearBlendSkin(skin.shape, skin.points[index], skin.weights[index], skin.reference_pose)
+
+
+def explore(
+    problem: AlignProblem,
+    coarse: AlignProblem,
+    start: Tensor,
+    *,
+    candidates: int,
+    rounds: int,
+    generator: torch.Generator,
+) -> Tensor:
+    """Return the best poses found around the starts; the problems of a batch are searched together.
+
+    Args:
+        problem: the batch.
+        coarse: the same batch with few model points.
+        start: (B, num_dofs).
+        candidates: per problem and round.
+        rounds: of scattering, refining and recombining.
+        generator: of the scatter.
+
+    Returns:
+        (B, num_dofs).
+    """
+    per_problem = candidates * _NUM_DATA * problem.skin.shape.num_parts
+    size = max(1, _CHUNK_ENTRIES // per_problem)
+    rows = torch.arange(len(start), device=start.device).split(size)
+    return torch.cat([_explore(coarse.rows(row), start[row], candidates, rounds, generator) for row in rows])
+
+
+def _explore(problem: AlignProblem, start: Tensor, candidates: int, rounds: int, generator: torch.Generator) -> Tensor:
+    limbs = limb_dofs(problem.skin.shape)
+    best = start
+    for number in range(rounds):
+        subset = _subset(problem, generator)
+        spread = [values[min(number, len(values) - 1)] for values in (_JOINT_SCATTER, _TURN_SCATTER, _SHIFT_SCATTER)]
+        scattered = _scatter(problem, best, limbs, candidates, spread, generator)
+        refined = _refine(subset, scattered, _EM_SIGMAS[min(number, len(_EM_SIGMAS) - 1)])
+        pool = torch.cat([refined, best.unsqueeze(1)], dim=1)
+        score = _score(subset, pool)
+        value, index = score.min(1)
+        best = _recombine(subset, _pick(pool, index), value, pool, limbs)
+    return best
+
+
+def limb_dofs(shape: ArticulatedShape) -> list[Tensor]:
+    """Return the degrees of freedom of every limb: a chain of parts that hangs on a part with several children."""
+    moved = (shape.chain.moves[shape.part_index] @ shape.chain.couplings.abs()) > 0
+    children = [[c for c, p in enumerate(shape.part_parents) if p == part] for part in range(shape.num_parts)]
+    limbs = []
+    for part, below in enumerate(children):
+        for child in below if len(below) > 1 else ():
+            chain = _descendants(children, child)
+            dofs = 6 + (moved[chain].any(0) & ~moved[part]).nonzero()[:, 0]
+            if len(dofs):
+                limbs.append(dofs)
+    return limbs
+
+
+def _descendants(children: list[list[int]], part: int) -> list[int]:
+    found = [part]
+    for member in found:
+        found.extend(children[member])
+    return found
+
+
+def _subset(problem: AlignProblem, generator: torch.Generator) -> AlignProblem:
+    """Return the problem with few data, drawn from the valid ones."""
+    draw = torch.rand(problem.valid.shape, generator=generator).to(problem.data)
+    keep = torch.where(problem.valid, draw, -1.0).topk(min(_NUM_DATA, draw.shape[-1]), dim=-1).indices
+    data = problem.data.gather(1, keep.unsqueeze(-1).expand(*keep.shape, 3))
+    return replace(problem, data=data, valid=problem.valid.gather(1, keep))
+
+
+def _scatter(
+    problem: AlignProblem,
+    center: Tensor,
+    limbs: list[Tensor],
+    count: int,
+    spread: list[float],
+    generator: torch.Generator,
+) -> Tensor:
+    """Return (B, count, num_dofs) candidates; the first is the center itself."""
+    shape = problem.skin.shape
+    scale = (spread[0] * (shape.upper - shape.lower)).clamp_max(_MAX_JOINT_SCATTER)
+    scale[:3], scale[3:6] = spread[2] * problem.size, spread[1]
+    noise = torch.randn(len(center), count, shape.num_dofs, generator=generator).to(center) * scale
+    noise[:, 0] = 0
+    around = shape.retract(center.unsqueeze(1).expand_as(noise), noise)
+    reach = (shape.upper - shape.lower).clamp_max(2 * _FRESH_REACH)
+    low = torch.maximum(center - _FRESH_REACH, shape.lower).clamp_max(shape.upper - reach)
+    fresh = low.unsqueeze(1) + reach * torch.rand(noise.shape, generator=generator).to(center)
+    for dofs in limbs:
+        redraw = torch.rand(*noise.shape[:2], 1, generator=generator).to(center) < _FRESH_LIMBS
+        redraw[:, 0] = False
+        around[..., dofs] = torch.where(redraw, fresh[..., dofs], around[..., dofs])
+    return problem.clamp(around.transpose(0, 1)).transpose(0, 1)
+
+
+def _refine(problem: AlignProblem, poses: Tensor, sigmas: tuple[float, float]) -> Tensor:
+    """Return candidates (B, K, num_dofs) after a short EM and surface fit, all in one batch."""
+    batch, count = poses.shape[:2]
+    wide = problem.rows(torch.arange(batch, device=poses.device).repeat_interleave(count))
+    schedule = SigmaSchedule.geometric(sigmas[0] * problem.size, sigmas[1] * problem.size, 3)
+    pose = register(wide, poses.flatten(0, 1), schedule, em_steps=2, m_steps=1).pose
+    noise = torch.full_like(pose[:, 0], _NOISE * problem.size)
+    for share in _SURFACE_SIGMAS:
+        pose = surface_steps(wide, pose, torch.full_like(noise, share * problem.size), noise, 2).state
+    return pose.reshape(poses.shape)
+
+
+def _score(problem: AlignProblem, poses: Tensor) -> Tensor:
+    """Return the score (B, K) of poses (B, K, num_dofs): outliers, softly counted, and the prior; lower is better."""
+    distance = problem.surface.distance(problem.data.unsqueeze(1), poses)
+    lost = 1 - (-(distance / (_SCORE_SIGMA * problem.size)).square()).exp()
+    return (lost * problem.valid.unsqueeze(1)).sum(-1) + PRIOR_SHARE * problem.prior.cost(poses)
+
+
+def _recombine(problem: AlignProblem, best: Tensor, value: Tensor, pool: Tensor, limbs: list[Tensor]) -> Tensor:
+    """Return the best poses with each limb taken from whichever candidate explains most with it."""
+    for dofs in limbs:
+        mixed = best.unsqueeze(1).repeat(1, pool.shape[1], 1)
+        mixed[..., dofs] = pool[..., dofs]
+        score, index = _score(problem, mixed).min(1)
+        better = score < value
+        best = torch.where(better.unsqueeze(-1), _pick(mixed, index), best)
+        value = torch.where(better, score, value)
+    return best
+
+
+def _pick(poses: Tensor, index: Tensor) -> Tensor:
+    return poses.gather(1, index[:, None, None].expand(-1, 1, poses.shape[-1])).squeeze(1)

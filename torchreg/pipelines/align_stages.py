@@ -1,0 +1,210 @@
+"""The stages of an alignment: annealed EM registration, then surface fitting."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchreg.correspondence.em import OUTLIER_CONSTANT, expectation, outlier_constant
+from torchreg.correspondence.sigma import SigmaSchedule
+from torchreg.models.skin import LinearBlendSkin
+from torchreg.models.surface import Surface
+from torchreg.pipelines.align_objectives import PosePrior, RegistrationObjective, SurfaceObjective
+from torchreg.results import AlignRecord
+from torchreg.solvers.levenberg_marquardt import Linearization, LMResult, levenberg_marquardt
+
+OnStep = Callable[[AlignRecord], None]
+
+# Widths of the surface fit as shares of the model's size; the last width follows from the residuals, within a range.
+SURFACE_SIGMAS = (0.045, 0.022)
+_FINAL_SIGMA_RANGE = (0.003, 0.02)
+# A Welsch kernel of 2.5 standard deviations keeps most of the efficiency of least squares on Gaussian noise.
+_SIGMA_PER_NOISE = 2.5
+_MAD_TO_STD = 1.4826
+
+
+@dataclass(frozen=True)
+class AlignProblem:
+    """A batch of alignments of one shape: what every stage works on.
+
+    Args:
+        skin: the model points.
+        surface: what the surface fit fits.
+        data: (B, M, 3), metres.
+        valid: (B, M) False where padded.
+        size: diagonal of the model in its rest pose, metres: the unit of all thresholds.
+        lower: limits of the pose, (num_dofs,) or (B, num_dofs).
+        upper: limits of the pose, (num_dofs,) or (B, num_dofs).
+        prior: on the joints.
+        pose_atol: largest change of a pose that counts as none.
+        outlier: "limit" or "volume".
+    """
+
+    skin: LinearBlendSkin
+    surface: Surface
+    data: Tensor
+    valid: Tensor
+    size: float
+    lower: Tensor
+    upper: Tensor
+    prior: PosePrior
+    pose_atol: float
+    outlier: str = "limit"
+
+    def rows(self, index: Tensor) -> AlignProblem:
+        """Return the problems of some rows of the batch, which may repeat."""
+        return replace(
+            self,
+            data=self.data[index],
+            valid=self.valid[index],
+            lower=_rows(self.lower, index),
+            upper=_rows(self.upper, index),
+            prior=replace(self.prior, mean=self.prior.mean[index]),
+        )
+
+    def solve(
+        self, objective: Callable[[Tensor], Linearization], pose: Tensor, max_steps: int, damping: Tensor | None = None
+    ) -> LMResult:
+        """Return what Levenberg-Marquardt within the joint limits makes of a pose."""
+        return levenberg_marquardt(
+            objective, pose, retract=self.skin.shape.retract, lower=self.lower, upper=self.upper,
+            damping=damping, max_steps=max_steps, atol=self.pose_atol * min(1.0, self.size),
+        )  # fmt: skip
+
+    def change(self, step: Tensor) -> Tensor:
+        """Return the largest change (B,) in a step, radians, or metres as a share of the size."""
+        return torch.cat([step[:, :3] / self.size, step[:, 3:]], dim=-1).abs().amax(-1)
+
+    def clamp(self, pose: Tensor) -> Tensor:
+        """Return poses (..., B, num_dofs) moved inside the limits."""
+        return torch.minimum(torch.maximum(pose, self.lower), self.upper)
+
+
+def _rows(limits: Tensor, index: Tensor) -> Tensor:
+    return limits if limits.ndim == 1 else limits[index]
+
+
+@dataclass(frozen=True)
+class StageResult:
+    """Where a stage ended.
+
+    Args:
+        pose: (B, num_dofs).
+        sigma: (B,) last width, metres.
+        change: (B,) of the last step.
+    """
+
+    pose: Tensor
+    sigma: Tensor
+    change: Tensor
+
+
+def register(
+    problem: AlignProblem,
+    pose: Tensor,
+    schedule: SigmaSchedule,
+    *,
+    em_steps: int,
+    m_steps: int,
+    on_step: OnStep | None = None,
+) -> StageResult:
+    """Return the pose after annealed EM: E-step (17, 18), M-step (20), a smaller sigma, and again.
+
+    Args:
+        problem: the batch.
+        pose: (B, num_dofs) to start from.
+        schedule: of sigma.
+        em_steps: EM iterations per sigma, at most; fewer when no pose changes any more.
+        m_steps: Levenberg-Marquardt steps per M-step.
+        on_step: called after each iteration.
+
+    Returns:
+        a `StageResult`.
+
+    References: Dewaele et al. 2006, sections 3.2 and 3.3.
+    """
+    sigma = torch.full_like(pose[:, 0], schedule.values[0])
+    change = torch.full_like(sigma, torch.inf)
+    damping = None
+    for step in range(schedule.steps):
+        if schedule.kind == "fixed":
+            sigma = torch.full_like(sigma, schedule.values[step])
+        for _ in range(em_steps):
+            posed = problem.skin(pose)
+            observed = expectation(posed, problem.data, sigma, _outlier(problem, posed, sigma), mask=problem.valid)
+            objective = RegistrationObjective(problem.skin, observed, sigma, problem.prior)
+            solved = problem.solve(objective, pose, m_steps, damping)
+            pose, damping, change = solved.state, solved.damping, problem.change(solved.last_step)
+            if on_step is not None:
+                on_step(AlignRecord("em", step, schedule.steps, sigma, solved.cost, pose, change))
+            if schedule.kind == "adaptive":
+                held = observed.weights.sum(-1).clamp_min(torch.finfo(sigma.dtype).eps)
+                estimated = (observed.squared_error / (3 * held)).sqrt()
+                sigma = estimated.clamp(schedule.values[-1], schedule.values[0])
+            if float(change.max()) <= problem.pose_atol:
+                break
+    return StageResult(pose, sigma, change)
+
+
+def _outlier(problem: AlignProblem, posed: Tensor, sigma: Tensor) -> Tensor | float:
+    if problem.outlier == "limit":
+        return OUTLIER_CONSTANT
+    # V: the bounding box of data and posed model, grown by 3 sigma.
+    data = torch.where(problem.valid.unsqueeze(-1), problem.data, posed.mean(-2, keepdim=True))
+    everything = torch.cat([data, posed], dim=-2)
+    box = everything.amax(-2) - everything.amin(-2) + 6 * sigma.unsqueeze(-1)
+    return outlier_constant(posed.shape[-2], sigma, box.prod(-1))
+
+
+def fit_surface(
+    problem: AlignProblem,
+    pose: Tensor,
+    *,
+    steps: int,
+    sigmas: Sequence[float] = SURFACE_SIGMAS,
+    on_step: OnStep | None = None,
+) -> StageResult:
+    """Return the pose after fitting the surface to the data, eqs. 21 and 22, with a kernel that narrows to the noise.
+
+    Args:
+        problem: the batch.
+        pose: (B, num_dofs) to start from.
+        steps: Levenberg-Marquardt steps per width; twice as many at the last.
+        sigmas: widths before the last, as shares of the model's size.
+        on_step: called after each width.
+
+    Returns:
+        a `StageResult`.
+
+    References: Dewaele et al. 2006, section 3.4.
+    """
+    noise = torch.full_like(pose[:, 0], _FINAL_SIGMA_RANGE[1] * problem.size / _SIGMA_PER_NOISE)
+    for number in range(len(sigmas) + 1):
+        if number < len(sigmas):
+            sigma = torch.full_like(noise, sigmas[number] * problem.size)
+        else:
+            noise = residual_noise(problem, pose)
+            sigma = _SIGMA_PER_NOISE * noise
+        solved = surface_steps(problem, pose, sigma, noise, steps if number < len(sigmas) else 2 * steps)
+        pose, change = solved.state, problem.change(solved.last_step)
+        if on_step is not None:
+            on_step(AlignRecord("surface", number, len(sigmas) + 1, sigma, solved.cost, pose, change))
+    return StageResult(pose, sigma, change)
+
+
+def surface_steps(problem: AlignProblem, pose: Tensor, sigma: Tensor, noise: Tensor, steps: int) -> LMResult:
+    """Return the result of Levenberg-Marquardt steps on the surface objective at one width."""
+    objective = SurfaceObjective(problem.surface, problem.data, problem.valid, sigma, noise, problem.prior)
+    return problem.solve(objective, pose, steps)
+
+
+def residual_noise(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return the robust standard deviation (B,) of the data near the surface, within a range of the model's size."""
+    distance = problem.surface.distance(problem.data, pose).abs()
+    near = (distance < SURFACE_SIGMAS[-1] * problem.size) & problem.valid
+    median = torch.where(near, distance, torch.nan).nanmedian(-1).values
+    low, high = (share * problem.size / _SIGMA_PER_NOISE for share in _FINAL_SIGMA_RANGE)
+    return torch.nan_to_num(_MAD_TO_STD * median, nan=high).clamp(low, high)
