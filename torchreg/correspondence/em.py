@@ -201,7 +201,7 @@ def _accumulate(
     inlier = torch.zeros_like(data[..., 0])
     for rows, columns in _chunks(model.shape[0], model.shape[1], data.shape[1]):
         part = data[rows, columns]
-        kernel = _kernel(model[rows], part, expand)
+        kernel = gaussian_kernel(model[rows], part, expand=expand)
         total = kernel.sum(-2)
         share = (total + outlier[rows, None]).reciprocal()
         if valid is not None:
@@ -224,23 +224,33 @@ def _chunks(batch: int, num_model: int, num_data: int) -> Iterator[tuple[slice, 
             yield slice(row, row + rows), slice(column, column + columns)
 
 
-def _kernel(model: Tensor, data: Tensor, expand: bool) -> Tensor:
-    """Return ``exp(-|x - y|^2)`` (B, N, M) of scaled points, zero below 1e-26.
+def gaussian_kernel(model: Tensor, data: Tensor, *, expand: bool) -> Tensor:
+    """Return ``exp(-|x - y|^2)`` of scaled points, zero below 1e-26.
 
-    With ``expand`` the exponent ``2 xy - |x|^2 - |y|^2`` comes from one matrix product.
+    Args:
+        model: (B, N, 3), in units of sqrt(2) sigma.
+        data: (B, M, 3), in the same units.
+        expand: take the exponent from one matrix product, ``2 xy - |x|^2 - |y|^2``: faster, and exact enough near the
+            origin only.
+
+    Returns:
+        (B, N, M).
+
+    Differentiable: no; it works in place.
     """
     if expand:
         left = torch.cat([2 * model, -model.square().sum(-1, keepdim=True), -torch.ones_like(model[..., :1])], dim=-1)
         right = torch.cat([data, torch.ones_like(data[..., :1]), data.square().sum(-1, keepdim=True)], dim=-1)
-        exponent = left @ right.mT
+        exponent = (left @ right.mT).clamp_(_MIN_EXPONENT, 0)
     else:
-        exponent = (model[..., 0:1] - data[..., 0].unsqueeze(-2)).square_()
+        exponent = model[..., 0:1] - data[..., 0].unsqueeze(-2)
+        exponent.mul_(exponent)
         for axis in (1, 2):
             difference = model[..., axis : axis + 1] - data[..., axis].unsqueeze(-2)
-            exponent.addcmul_(difference, difference)
-        exponent.neg_()
+            exponent.add_(difference.mul_(difference))
+        exponent.neg_().clamp_min_(_MIN_EXPONENT)
     # Where exp() underflows it takes ten times as long, and so does arithmetic on what it leaves.
-    return torch.threshold_(exponent.clamp_(_MIN_EXPONENT, 0).exp_(), _MIN_KERNEL, 0.0)
+    return torch.threshold_(exponent.exp_(), _MIN_KERNEL, 0.0)
 
 
 def _extent(model: Tensor, data: Tensor) -> Tensor:

@@ -11,14 +11,18 @@ from torch import Tensor, nn
 from torch.autograd import Function
 
 from torchreg._checks import check_choice, check_positive, check_same_kind, check_shape
-from torchreg.correspondence.em import OUTLIER_CONSTANT, expectation, outlier_constant, posterior, working_volume
+from torchreg.correspondence.em import (
+    OUTLIER_CONSTANT,
+    expectation,
+    gaussian_kernel,
+    outlier_constant,
+    posterior,
+    working_volume,
+)
 from torchreg.errors import InputError, InputTypeError
 
 # Entries of the kernel matrix held at a time.
 _CHUNK_ENTRIES = 2_000_000
-# exp(-60) = 9e-27 is nothing beside an outlier constant, while numbers that underflow are slow.
-_MAX_EXPONENT = 60.0
-_MIN_KERNEL = 1e-26
 
 
 class EMLoss(nn.Module):
@@ -192,15 +196,18 @@ def _check(posed_points: Tensor, data: Tensor, mask: Tensor | None) -> torch.Siz
 class _LogLikelihood(Function):
     """``log(sum_i exp(-|x_i - y_j|^2) + c)`` of points x (B, N, 3), data y (B, M, 3) and c (B,): (B, M).
 
-    Nothing of size N M is kept: each pass computes the kernel again, a chunk of data at a time.
+    Nothing of size N M is kept: each pass computes the kernel again, a chunk of data at a time. Every result is written
+    into one buffer, batched under vmap like all inputs together: a list of small results would fragment the heap.
     """
 
     generate_vmap_rule = True
 
     @staticmethod
     def forward(model: Tensor, data: Tensor, outlier: Tensor) -> Tensor:
-        parts = [(_kernel(model, data[:, part]).sum(-2) + outlier.unsqueeze(-1)).log() for part in _chunks(model, data)]
-        return torch.cat(parts, dim=-1)
+        levels = torch.zeros_like(data[..., 0] + model[:, :1, 0] + outlier.unsqueeze(-1))
+        for part in _chunks(model, data):
+            levels[:, part] = (_kernel(model, data[:, part]).sum(-2) + outlier.unsqueeze(-1)).log()
+        return levels
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, Tensor], output: Tensor) -> None:
@@ -210,31 +217,40 @@ class _LogLikelihood(Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
         model, data, outlier = ctx.saved_tensors
-        model_grad = torch.zeros_like(model)
-        data_grads = []
+        mixed = grad[:, :1, None] + model[:, :1] + data[:, :1] + outlier[:, None, None]
+        model_grad, data_grad = torch.zeros_like(model + mixed), torch.zeros_like(data + mixed)
+        sources = _with_one(model)
         for part in _chunks(model, data):
-            target = data[:, part]
-            pull = 2 * grad[:, None, part] * _alpha(model, target, outlier)
-            # The sum over j of a_ij (y_j - x_i), and the same over i.
-            model_grad = model_grad + pull @ target - pull.sum(-1, keepdim=True) * model
-            data_grads.append(pull.mT @ model - pull.sum(-2).unsqueeze(-1) * target)
-        return model_grad, torch.cat(data_grads, dim=-2), None
+            targets = _with_one(data[:, part])
+            kernel = _kernel(model, data[:, part])
+            seen = kernel.mT @ sources
+            share = (2 * grad[:, part] / (seen[..., 3] + outlier.unsqueeze(-1))).unsqueeze(-1)
+            held = kernel @ (share * targets)
+            # With a_ij the shares of the kernel: sum_j a_ij (y_j - x_i), and sum_i a_ij (x_i - y_j).
+            model_grad += held[..., :3] - held[..., 3:] * model
+            data_grad[:, part] = share * (seen[..., :3] - seen[..., 3:] * targets[..., :3])
+        return model_grad, data_grad, None
 
     @staticmethod
     def jvp(ctx: Any, model_t: Tensor | None, data_t: Tensor | None, outlier_t: Tensor | None) -> Tensor:
         model, data, outlier = ctx.saved_tensors
         model_t = torch.zeros_like(model) if model_t is None else model_t
         data_t = torch.zeros_like(data) if data_t is None else data_t
-        parts = []
+        mixed = (model + model_t)[:, :1, 0] + outlier.unsqueeze(-1)
+        levels_t = torch.zeros_like((data + data_t)[..., 0] + mixed)
+        sources = torch.cat([_with_one(model), model_t, (model * model_t).sum(-1, keepdim=True)], dim=-1)
         for part in _chunks(model, data):
             target, target_t = data[:, part], data_t[:, part]
-            alpha = _alpha(model, target, outlier)
+            seen = _kernel(model, target).mT @ sources
             # d(-|x - y|^2) = -2 (x - y) . (dx - dy), its four products summed over i.
-            own = alpha.mT @ (model * model_t).sum(-1, keepdim=True)
-            mixed = ((alpha.mT @ model_t) * target).sum(-1) + ((alpha.mT @ model) * target_t).sum(-1)
-            moved = alpha.sum(-2) * (target * target_t).sum(-1)
-            parts.append(2 * (mixed - own.squeeze(-1) - moved))
-        return torch.cat(parts, dim=-1)
+            total = seen[..., 3]
+            moved = (seen[..., 4:7] * target + (seen[..., :3] - total.unsqueeze(-1) * target) * target_t).sum(-1)
+            levels_t[:, part] = 2 * (moved - seen[..., 7]) / (total + outlier.unsqueeze(-1))
+        return levels_t
+
+
+def _with_one(points: Tensor) -> Tensor:
+    return torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
 
 
 def _chunks(model: Tensor, data: Tensor) -> Iterator[slice]:
@@ -245,13 +261,7 @@ def _chunks(model: Tensor, data: Tensor) -> Iterator[slice]:
 
 def _kernel(model: Tensor, data: Tensor) -> Tensor:
     """Return ``exp(-|x - y|^2)`` (B, N, m), by differences: exact however far the points are from each other."""
-    squares = (model[..., 0:1] - data[..., 0].unsqueeze(-2)).square()
-    for axis in (1, 2):
-        difference = model[..., axis : axis + 1] - data[..., axis].unsqueeze(-2)
-        squares = torch.addcmul(squares, difference, difference)
-    return torch.threshold(squares.clamp_max(_MAX_EXPONENT).neg().exp(), _MIN_KERNEL, 0.0)
-
-
-def _alpha(model: Tensor, data: Tensor, outlier: Tensor) -> Tensor:
-    kernel = _kernel(model, data)
-    return kernel / (kernel.sum(-2) + outlier.unsqueeze(-1)).unsqueeze(-2)
+    if not torch.is_grad_enabled():
+        return gaussian_kernel(model, data, expand=False)
+    squares = (model.unsqueeze(-2) - data.unsqueeze(-3)).square().sum(-1)
+    return squares.neg().exp()
