@@ -56,10 +56,7 @@ def fit_primitive(points: Tensor, kind: str = "auto") -> FittedPrimitive:
     check_choice(kind, "kind", ("auto", *PRIMITIVE_KINDS))
     check_points(points, "points", batch=False)
     points = points.detach().double()
-    if kind == "auto":
-        kinds = ("ellipsoid",) if _shapeless(points) else tuple(PRIMITIVE_KINDS)
-    else:
-        kinds = (kind,)
+    kinds = (kind,) if kind != "auto" else ("ellipsoid",) if _shapeless(points) else tuple(PRIMITIVE_KINDS)
     candidates = [
         (name, sizes, moved)
         for name in kinds

@@ -1,9 +1,9 @@
 """Signed distances to the solids that make up an articulated shape, with analytic gradients.
 
 Every function takes points in the solid's own frame (long axis z, center at the origin) and one row of sizes per solid,
-and returns a signed distance that is negative inside and zero on the surface. It is Euclidean for capsules and cones, to
-first order at the surface for ellipsoids, and measured along rays from the center for superquadrics. ``*_gradient``
-functions return the pair (distance, gradient) in closed form.
+and returns a signed distance that is negative inside and zero on the surface. It is Euclidean for capsules and cones,
+Euclidean to first order at the surface for ellipsoids, and measured along rays from the center for superquadrics.
+``*_gradient`` functions return the pair (distance, gradient) in closed form.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def cone_gradient(points: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class _ConeFaces:
-    """The distances of points to the faces and the rims of cones, in the half plane (radius, z), and which is nearest."""
+    """Distances of points to the faces and the rims of cones, in the half plane (radius, z), and which is nearest."""
 
     def __init__(self, points: Tensor, sizes: Tensor) -> None:
         half, bottom, top = sizes.unbind(-1)
