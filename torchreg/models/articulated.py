@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchreg._checks import as_float_tensor, check_positive, check_shape
+from torchreg._checks import as_float_tensor, check_choice, check_positive, check_shape
 from torchreg.errors import InputError, ModelError
 from torchreg.geometry.isosurface import isosurface
 from torchreg.geometry.kinematic_tree import KinematicTree
@@ -80,10 +80,13 @@ class ArticulatedShape(nn.Module):
             )
         if len(set(part_frames)) != len(part_frames):
             raise ModelError("two parts share a frame; give each part a frame of its own (a fixed joint will do)")
+        names = tuple(part_frames if part_names is None else part_names)
+        if len(names) != len(part_frames) or len(set(names)) != len(names):
+            raise ModelError(f"{len(part_frames)} parts need {len(part_frames)} different names, got {len(set(names))}")
         self.nu = float(nu)
         self.chain = KinematicChain(tree)
         self.primitives = PrimitiveSet(primitives)
-        self.part_names = tuple(part_names or part_frames)
+        self.part_names = names
         self.surface = surface
         frames = [tree.index(name) for name in part_frames]
         parents = part_parents(tree, frames)
@@ -492,6 +495,7 @@ def check_finite_dtype(points: Tensor, like: Tensor) -> None:
 
 
 def _base_twists(pose: Tensor, chart: str) -> Tensor:
+    check_choice(chart, "chart", ("pose", "tangent"))
     identity = torch.eye(3, dtype=pose.dtype, device=pose.device).expand(*pose.shape[:-1], 3, 3)
     angular = identity if chart == "tangent" else left_jacobian(pose[..., 3:6]).mT
     linear = torch.linalg.cross(pose[..., None, :3].expand_as(angular), angular)

@@ -34,7 +34,7 @@ class LinearBlendSkin(nn.Module):
         faces: (F, 3) triangles over the points, if any.
 
     Raises:
-        InputError: if sizes do not fit, or rows of weights do not sum to one.
+        InputError: if sizes do not fit, a point is not finite, or rows of weights do not sum to one.
     """
 
     basis: Tensor
@@ -70,6 +70,7 @@ class LinearBlendSkin(nn.Module):
         if faces is not None:
             faces = TriangleMesh(points, faces).faces
         reference_pose = shape.check_pose(reference_pose, "reference_pose").detach()
+        check_shape(reference_pose, "reference_pose", (shape.num_dofs,))
         self.register_buffer("reference_pose", reference_pose, persistent=False)
         self.register_buffer("points", points, persistent=False)
         self.register_buffer("weights", weights, persistent=False)
@@ -171,6 +172,7 @@ class BendingSkin(LinearBlendSkin):
         check_points(points, "points", batch=False)
         with torch.no_grad():
             pose = shape.check_pose(reference_pose, "reference_pose")
+            check_shape(pose, "reference_pose", (shape.num_dofs,))
             weights = bending_weights(shape, points, pose, sharpness)
         super().__init__(shape, points, weights, reference_pose, normals=normals, faces=faces)
         self.sharpness = sharpness
