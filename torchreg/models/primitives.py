@@ -22,6 +22,8 @@ _REFINE_SCALE = 1.5
 _OWN_WEIGHT = 0.3
 _RIVAL_WEIGHT = 0.3
 _REFINE_STIFFNESS = 2.0
+# Metres, radians and logarithms of sizes.
+_REFINE_ATOL = 1e-5
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,9 @@ def refine_primitives(
     solids = PrimitiveSet(primitives).requires_grad_(False)
     problem = _Refinement(solids, neighbors, nu, points.double(), owners)
     start = torch.zeros(1, len(primitives) * problem.width, dtype=torch.float64)
-    found = levenberg_marquardt(problem.linearize, start, retract=problem.retract, max_steps=max_steps)
+    found = levenberg_marquardt(
+        problem.linearize, start, retract=problem.retract, max_steps=max_steps, atol=_REFINE_ATOL
+    )
     rotations, centers, sizes = problem.solids_at(found.state)
     members = [int(part) for kind in solids.kinds for part in solids.get_buffer(f"members_{kind}")]
     rows = dict(zip(members, (row.tolist() for size in sizes for row in size), strict=True))

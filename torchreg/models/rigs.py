@@ -388,7 +388,7 @@ def solid_mesh(solid: UrdfPrimitive) -> TriangleMesh:
     """
     if solid.kind == "box":
         return TriangleMesh(
-            transform_points(solid.origin, _BOX_CORNERS * torch.tensor(solid.size).double()), _BOX_FACES
+            transform_points(solid.origin, _BOX_CORNERS * torch.tensor(solid.size, dtype=torch.float64)), _BOX_FACES
         )
     turn = torch.linspace(0, torch.pi, _SEGMENTS // 2 + 1, dtype=torch.float64)
     radius, half = solid.size[0], 0.5 * (solid.size[1] if len(solid.size) > 1 else 0.0)
