@@ -21,7 +21,7 @@ from torchreg.pipelines.align_stages import AlignProblem, OnStep, StageResult, f
 from torchreg.results import AlignRecord, AlignResult, Status
 
 # Shares of the model's size, the diagonal of its rest pose.
-_START_SIGMA, _STOP_SIGMA = 0.06, 0.02
+_START_SIGMA, _STOP_SIGMA = 0.08, 0.02
 _INLIER_SHARE = 0.02
 # Data and model that differ more than this in size are in different units.
 _UNITS_RATIO = 30.0
@@ -35,7 +35,7 @@ class AlignConfig:
     """How an alignment runs. Lengths default to shares of the model's size, so one configuration fits all shapes.
 
     Args:
-        schedule: sigma over the EM steps; by default geometric from 6 % to 2 % of the model's size in five steps.
+        schedule: sigma over the EM steps; by default geometric from 8 % to 2 % of the model's size in five steps.
         em_steps: EM iterations per sigma, at most.
         m_steps: Levenberg-Marquardt steps per M-step.
         surface_steps: Levenberg-Marquardt steps at each width of the surface fit; 0 leaves the surface fit out.
@@ -45,6 +45,8 @@ class AlignConfig:
         search_rounds: rounds of the search.
         inlier_distance: data nearer to the fitted surface are inliers, metres; 2 % of the model's size by default.
         outlier: "limit" for c = 3 sqrt(pi / 2), "volume" for eq. 18 with the working volume.
+        debias: share of the pull of a wide kernel on the model itself that is taken from the EM's targets; 0 is the
+            paper's EM, which shrinks the model while sigma is wide.
         prior_std: standard deviation of a weak prior that holds joints near the initial pose, radians (sliding joints:
             as a share of the model's size); None for no prior.
         num_model_points: points sampled on the shape when none are given.
@@ -63,7 +65,8 @@ class AlignConfig:
     search_rounds: int = 3
     inlier_distance: float | None = None
     outlier: str = "limit"
-    prior_std: float | None = 0.5
+    debias: float = 0.5
+    prior_std: float | None = 0.35
     num_model_points: int = 500
     sharpness: float = 2.0
     pose_atol: float = 1e-3
@@ -79,6 +82,7 @@ class AlignConfig:
         _check_count(self.surface_steps, "surface_steps", 0)
         check_positive(self.sharpness, "sharpness")
         check_positive(self.pose_atol, "pose_atol", allow_zero=True)
+        check_positive(self.debias, "debias", allow_zero=True)
         for name in ("inlier_distance", "prior_std"):
             if getattr(self, name) is not None:
                 check_positive(getattr(self, name), name)
@@ -182,10 +186,15 @@ def _search_where_needed(
     if len(rows) == 0:
         return final
     part = problem.rows(rows)
-    coarse = replace(part, skin=coarse_skin(problem.skin))
+    coarse = replace(part, skin=coarse_skin(problem.skin), surface=FusedSurface(problem.skin.shape))
     generator = torch.Generator().manual_seed(config.seed)
     found = explore(
-        part, coarse, start[rows], candidates=config.num_candidates, rounds=config.search_rounds, generator=generator
+        coarse,
+        start[rows],
+        final.pose[rows],
+        candidates=config.num_candidates,
+        rounds=config.search_rounds,
+        generator=generator,
     )
     refined = fit_surface(part, found, steps=max(config.surface_steps, 1), sigmas=FINAL_SIGMAS, on_step=record)
     better = alignment_cost(part, refined.pose) < alignment_cost(part, final.pose[rows])
@@ -329,6 +338,7 @@ def _centered_problem(
         prior=PosePrior(pose - shift, precision),
         pose_atol=config.pose_atol,
         outlier=config.outlier,
+        debias=config.debias,
     )
 
 

@@ -36,6 +36,8 @@ _NUM_MODEL, _NUM_DATA = 120, 250
 FINAL_SIGMAS = (0.022,)
 # How much the prior weighs in a score, in outliers per squared standard deviation.
 PRIOR_SHARE = 0.3
+# A round that explains no more than this many data more is the last.
+_MIN_GAIN = 1.0
 # Unexplained data count as a cluster with this many others within four nearest-neighbor distances.
 _CLUSTER_NEIGHBORS = 5
 _CLUSTER_RADIUS = 4.0
@@ -94,8 +96,8 @@ def coarse_skin(skin: LinearBlendSkin) -> LinearBlendSkin:
 
 def explore(
     problem: AlignProblem,
-    coarse: AlignProblem,
     start: Tensor,
+    descended: Tensor,
     *,
     candidates: int,
     rounds: int,
@@ -104,34 +106,43 @@ def explore(
     """Return the best poses found around the starts; the problems of a batch are searched together.
 
     Args:
-        problem: the batch.
-        coarse: the same batch with few model points.
+        problem: the batch, with few model points and a surface that is cheap to evaluate.
         start: (B, num_dofs).
+        descended: (B, num_dofs) what a single descent made of the starts.
         candidates: per problem and round.
-        rounds: of scattering, refining and recombining.
+        rounds: of scattering, refining and recombining, at most; a round without improvement is the last.
         generator: of the scatter.
 
     Returns:
         (B, num_dofs).
     """
     per_problem = candidates * _NUM_DATA * problem.skin.shape.num_parts
-    size = max(1, _CHUNK_ENTRIES // per_problem)
-    rows = torch.arange(len(start), device=start.device).split(size)
-    return torch.cat([_explore(coarse.rows(row), start[row], candidates, rounds, generator) for row in rows])
+    rows = torch.arange(len(start), device=start.device).split(max(1, _CHUNK_ENTRIES // per_problem))
+    best = [_explore(problem.rows(row), start[row], descended[row], candidates, rounds, generator) for row in rows]
+    return torch.cat(best)
 
 
-def _explore(problem: AlignProblem, start: Tensor, candidates: int, rounds: int, generator: torch.Generator) -> Tensor:
+def _explore(
+    problem: AlignProblem,
+    start: Tensor,
+    descended: Tensor,
+    candidates: int,
+    rounds: int,
+    generator: torch.Generator,
+) -> Tensor:
     limbs = limb_dofs(problem.skin.shape)
-    best = start
+    best, center = descended, start
     for number in range(rounds):
         subset = _subset(problem, generator)
-        spread = [values[min(number, len(values) - 1)] for values in (_JOINT_SCATTER, _TURN_SCATTER, _SHIFT_SCATTER)]
-        scattered = _scatter(problem, best, limbs, candidates, spread, generator)
-        refined = _refine(subset, scattered, _EM_SIGMAS[min(number, len(_EM_SIGMAS) - 1)])
-        pool = torch.cat([refined, best.unsqueeze(1)], dim=1)
+        scattered = _scatter(problem, center, limbs, candidates, number, generator)
+        pool = torch.cat([_refine(subset, scattered, number), best.unsqueeze(1)], dim=1)
         score = _score(subset, pool)
         value, index = score.min(1)
-        best = _recombine(subset, _pick(pool, index), value, pool, limbs)
+        before = score[:, -1]
+        best, value = _recombine(subset, _pick(pool, index), value, pool, limbs)
+        if not bool((value < before - _MIN_GAIN).any()):
+            break
+        center = best
     return best
 
 
@@ -165,15 +176,11 @@ def _subset(problem: AlignProblem, generator: torch.Generator) -> AlignProblem:
 
 
 def _scatter(
-    problem: AlignProblem,
-    center: Tensor,
-    limbs: list[Tensor],
-    count: int,
-    spread: list[float],
-    generator: torch.Generator,
+    problem: AlignProblem, center: Tensor, limbs: list[Tensor], count: int, number: int, generator: torch.Generator
 ) -> Tensor:
     """Return (B, count, num_dofs) candidates; the first is the center itself."""
     shape = problem.skin.shape
+    spread = [values[min(number, len(values) - 1)] for values in (_JOINT_SCATTER, _TURN_SCATTER, _SHIFT_SCATTER)]
     scale = (spread[0] * (shape.upper - shape.lower)).clamp_max(_MAX_JOINT_SCATTER)
     scale[:3], scale[3:6] = spread[2] * problem.size, spread[1]
     noise = torch.randn(len(center), count, shape.num_dofs, generator=generator).to(center) * scale
@@ -189,11 +196,12 @@ def _scatter(
     return problem.clamp(around.transpose(0, 1)).transpose(0, 1)
 
 
-def _refine(problem: AlignProblem, poses: Tensor, sigmas: tuple[float, float]) -> Tensor:
+def _refine(problem: AlignProblem, poses: Tensor, number: int) -> Tensor:
     """Return candidates (B, K, num_dofs) after a short EM and surface fit, all in one batch."""
     batch, count = poses.shape[:2]
     wide = problem.rows(torch.arange(batch, device=poses.device).repeat_interleave(count))
-    schedule = SigmaSchedule.geometric(sigmas[0] * problem.size, sigmas[1] * problem.size, 3)
+    first, last = _EM_SIGMAS[min(number, len(_EM_SIGMAS) - 1)]
+    schedule = SigmaSchedule.geometric(first * problem.size, last * problem.size, 3)
     pose = register(wide, poses.flatten(0, 1), schedule, em_steps=2, m_steps=1).pose
     noise = torch.full_like(pose[:, 0], _NOISE * problem.size)
     for share in _SURFACE_SIGMAS:
@@ -208,8 +216,10 @@ def _score(problem: AlignProblem, poses: Tensor) -> Tensor:
     return (lost * problem.valid.unsqueeze(1)).sum(-1) + PRIOR_SHARE * problem.prior.cost(poses)
 
 
-def _recombine(problem: AlignProblem, best: Tensor, value: Tensor, pool: Tensor, limbs: list[Tensor]) -> Tensor:
-    """Return the best poses with each limb taken from whichever candidate explains most with it."""
+def _recombine(
+    problem: AlignProblem, best: Tensor, value: Tensor, pool: Tensor, limbs: list[Tensor]
+) -> tuple[Tensor, Tensor]:
+    """Return the best poses, each limb taken from whichever candidate explains most with it, and their scores."""
     for dofs in limbs:
         mixed = best.unsqueeze(1).repeat(1, pool.shape[1], 1)
         mixed[..., dofs] = pool[..., dofs]
@@ -217,7 +227,7 @@ def _recombine(problem: AlignProblem, best: Tensor, value: Tensor, pool: Tensor,
         better = score < value
         best = torch.where(better.unsqueeze(-1), _pick(mixed, index), best)
         value = torch.where(better, score, value)
-    return best
+    return best, value
 
 
 def _pick(poses: Tensor, index: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg.correspondence.em import OUTLIER_CONSTANT, expectation, outlier_constant
+from torchreg.correspondence.em import OUTLIER_CONSTANT, EStep, expectation, outlier_constant
 from torchreg.correspondence.sigma import SigmaSchedule
 from torchreg.models.skin import LinearBlendSkin
 from torchreg.models.surface import Surface
@@ -41,6 +41,7 @@ class AlignProblem:
         prior: on the joints.
         pose_atol: largest change of a pose that counts as none.
         outlier: "limit" or "volume".
+        debias: share of the kernel's own pull that is taken from the targets of the EM.
     """
 
     skin: LinearBlendSkin
@@ -53,6 +54,7 @@ class AlignProblem:
     prior: PosePrior
     pose_atol: float
     outlier: str = "limit"
+    debias: float = 0.0
 
     def rows(self, index: Tensor) -> AlignProblem:
         """Return the problems of some rows of the batch, which may repeat."""
@@ -134,7 +136,10 @@ def register(
             sigma = torch.full_like(sigma, schedule.values[step])
         for _ in range(em_steps):
             posed = problem.skin(pose)
-            observed = expectation(posed, problem.data, sigma, _outlier(problem, posed, sigma), mask=problem.valid)
+            outlier = _outlier(problem, posed, sigma)
+            observed = expectation(posed, problem.data, sigma, outlier, mask=problem.valid)
+            if problem.debias > 0:
+                observed = _debiased(observed, posed, sigma, outlier, problem.debias)
             objective = RegistrationObjective(problem.skin, observed, sigma, problem.prior)
             solved = problem.solve(objective, pose, m_steps, damping)
             pose, damping, change = solved.state, solved.damping, problem.change(solved.last_step)
@@ -147,6 +152,17 @@ def register(
             if float(change.max()) <= problem.pose_atol:
                 break
     return StageResult(pose, sigma, change)
+
+
+def _debiased(observed: EStep, posed: Tensor, sigma: Tensor, outlier: Tensor | float, share: float) -> EStep:
+    """Return the E-step with targets moved by how far the kernel alone would pull each model point.
+
+    A wide kernel draws every point towards the mean of its surroundings even in the true pose, which shrinks and bends
+    the model. The model registered to itself shows that pull, ``S_i - X_i``; part of it is taken from ``G_i - X_i``.
+    It is only a part because hidden model points have no counterpart in the data.
+    """
+    itself = expectation(posed, posed, sigma, outlier)
+    return replace(observed, targets=observed.targets + share * (posed - itself.targets))
 
 
 def _outlier(problem: AlignProblem, posed: Tensor, sigma: Tensor) -> Tensor | float:
