@@ -28,6 +28,8 @@ _UNITS_RATIO = 30.0
 # Fewer inliers than this, or than this share of the data, and the pose means nothing.
 _MIN_INLIERS, _MIN_INLIER_SHARE = 10, 0.02
 _DENSE_SKIN_POINTS = 2500
+# Steps of the surface fit after a search, whose time they hardly add to.
+_SEARCHED_STEPS = 4
 
 
 @dataclass(frozen=True)
@@ -57,9 +59,9 @@ class AlignConfig:
     """
 
     schedule: SigmaSchedule | None = None
-    em_steps: int = 3
+    em_steps: int = 2
     m_steps: int = 1
-    surface_steps: int = 4
+    surface_steps: int = 2
     search: str = "auto"
     num_candidates: int = 24
     search_rounds: int = 3
@@ -196,7 +198,7 @@ def _search_where_needed(
         rounds=config.search_rounds,
         generator=generator,
     )
-    refined = fit_surface(part, found, steps=max(config.surface_steps, 1), sigmas=FINAL_SIGMAS, on_step=record)
+    refined = fit_surface(part, found, steps=max(config.surface_steps, _SEARCHED_STEPS), sigmas=FINAL_SIGMAS, on_step=record)
     better = alignment_cost(part, refined.pose) < alignment_cost(part, final.pose[rows])
     pose, change = final.pose.clone(), final.change.clone()
     pose[rows] = torch.where(better.unsqueeze(-1), refined.pose, final.pose[rows])
@@ -204,12 +206,11 @@ def _search_where_needed(
     return StageResult(pose, final.sigma, change)
 
 
-def alignment_cost(problem: AlignProblem, pose: Tensor) -> Tensor:
+def alignment_cost(problem: AlignProblem, pose: Tensor, distances: Tensor | None = None) -> Tensor:
     """Return the cost (B,) by which alignments of the same data are ranked: outliers, softly counted, and the prior."""
-    width = _INLIER_SHARE * problem.size
-    distance = problem.surface.distance(problem.data, pose)
-    lost = (1 - (-(distance / width).square()).exp()) * problem.valid
-    return lost.sum(-1) + PRIOR_SHARE * problem.prior.cost(pose)
+    distances = problem.surface.distance(problem.data, pose) if distances is None else distances
+    lost = 1 - (-(distances / (_INLIER_SHARE * problem.size)).square()).exp()
+    return (lost * problem.valid).sum(-1) + PRIOR_SHARE * problem.prior.cost(pose)
 
 
 def _inlier_distance(problem: AlignProblem, config: AlignConfig) -> float:
@@ -221,6 +222,7 @@ def _result(
 ) -> AlignResult:
     pose, shape = final.pose, problem.skin.shape
     distances = problem.surface.distance(problem.data, pose)
+    cost = alignment_cost(problem, pose, distances)
     distances = torch.where(problem.valid, distances, torch.nan)
     inliers = distances.abs() < _inlier_distance(problem, config)
     posed = problem.skin(pose)
@@ -235,7 +237,7 @@ def _result(
         inliers=inliers,
         posterior=observed.inlier_posterior,
         sigma=final.sigma,
-        cost=alignment_cost(problem, pose),
+        cost=cost,
         status=tuple(_status(near, count, change, config) for near, count, change in statuses),
         history=history,
     )

@@ -61,7 +61,10 @@ class RegistrationObjective:
 
     def __call__(self, pose: Tensor) -> Linearization:
         """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs)."""
-        rows, derivative = self.skin.shape.transform_jacobian(pose, chart="tangent")
+        return self.linearize(pose, *self.skin.shape.transform_jacobian(pose, chart="tangent"))
+
+    def linearize(self, pose: Tensor, rows: Tensor, derivative: Tensor) -> Linearization:
+        """Return the same, given the part transforms and their derivatives at the pose (see `transform_jacobian`)."""
         residual = self.skin.basis @ rows - self.targets
         weighted = self.weights * residual
         flat = derivative.flatten(-3, -2)

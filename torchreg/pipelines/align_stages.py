@@ -14,7 +14,13 @@ from torchreg.models.skin import LinearBlendSkin
 from torchreg.models.surface import Surface
 from torchreg.pipelines.align_objectives import PosePrior, RegistrationObjective, SurfaceObjective
 from torchreg.results import AlignRecord
-from torchreg.solvers.levenberg_marquardt import Linearization, LMResult, levenberg_marquardt
+from torchreg.solvers.levenberg_marquardt import (
+    Linearization,
+    LMResult,
+    damped_step,
+    held_at_limits,
+    levenberg_marquardt,
+)
 
 OnStep = Callable[[AlignRecord], None]
 
@@ -24,6 +30,10 @@ _FINAL_SIGMA_RANGE = (0.003, 0.02)
 # A Welsch kernel of 2.5 standard deviations keeps most of the efficiency of least squares on Gaussian noise.
 _SIGMA_PER_NOISE = 2.5
 _MAD_TO_STD = 1.4826
+# Damping of the single steps that an EM takes, whose objective changes with every E-step anyway.
+_EM_DAMPING = 1e-3
+# Below this share of the model's size the kernel's own pull is less than the noise.
+_NARROW_SIGMA = 0.035
 
 
 @dataclass(frozen=True)
@@ -76,6 +86,13 @@ class AlignProblem:
             damping=damping, max_steps=max_steps, atol=self.pose_atol * min(1.0, self.size),
         )  # fmt: skip
 
+    def step(self, around: Linearization, pose: Tensor) -> LMResult:
+        """Return the result of one damped step, without a test: what a generalized EM needs."""
+        damping = torch.full_like(pose[:, 0], _EM_DAMPING)
+        held = held_at_limits(around.gradient, pose, self.lower, self.upper)
+        step = damped_step(around, damping, frozen=held)
+        return LMResult(self.clamp(self.skin.shape.retract(pose, step)), around.cost, damping, step, 1)
+
     def change(self, step: Tensor) -> Tensor:
         """Return the largest change (B,) in a step, radians, or metres as a share of the size."""
         return torch.cat([step[:, :3] / self.size, step[:, 3:]], dim=-1).abs().amax(-1)
@@ -120,7 +137,7 @@ def register(
         pose: (B, num_dofs) to start from.
         schedule: of sigma.
         em_steps: EM iterations per sigma, at most; fewer when no pose changes any more.
-        m_steps: Levenberg-Marquardt steps per M-step.
+        m_steps: Levenberg-Marquardt steps per M-step; a single one is taken without testing it (generalized EM).
         on_step: called after each iteration.
 
     Returns:
@@ -135,16 +152,13 @@ def register(
         if schedule.kind == "fixed":
             sigma = torch.full_like(sigma, schedule.values[step])
         for _ in range(em_steps):
-            posed = problem.skin(pose)
-            outlier = _outlier(problem, posed, sigma)
-            observed = expectation(posed, problem.data, sigma, outlier, mask=problem.valid)
-            if problem.debias > 0:
-                observed = _debiased(observed, posed, sigma, outlier, problem.debias)
+            rows, derivative = problem.skin.shape.transform_jacobian(pose, chart="tangent")
+            observed = _expect(problem, problem.skin.basis @ rows, sigma)
             objective = RegistrationObjective(problem.skin, observed, sigma, problem.prior)
-            solved = problem.solve(objective, pose, m_steps, damping)
+            around = objective.linearize(pose, rows, derivative)
+            solved = problem.solve(objective, pose, m_steps, damping) if m_steps > 1 else problem.step(around, pose)
             pose, damping, change = solved.state, solved.damping, problem.change(solved.last_step)
-            if on_step is not None:
-                on_step(AlignRecord("em", step, schedule.steps, sigma, solved.cost, pose, change))
+            _report(on_step, "em", step, schedule.steps, sigma, solved, problem)
             if schedule.kind == "adaptive":
                 held = observed.weights.sum(-1).clamp_min(torch.finfo(sigma.dtype).eps)
                 estimated = (observed.squared_error / (3 * held)).sqrt()
@@ -152,6 +166,15 @@ def register(
             if float(change.max()) <= problem.pose_atol:
                 break
     return StageResult(pose, sigma, change)
+
+
+def _expect(problem: AlignProblem, posed: Tensor, sigma: Tensor) -> EStep:
+    """Return the E-step, without the kernel's own pull while the kernel is wide."""
+    outlier = _outlier(problem, posed, sigma)
+    observed = expectation(posed, problem.data, sigma, outlier, mask=problem.valid)
+    if problem.debias > 0 and float(sigma.max()) > _NARROW_SIGMA * problem.size:
+        return _debiased(observed, posed, sigma, outlier, problem.debias)
+    return observed
 
 
 def _debiased(observed: EStep, posed: Tensor, sigma: Tensor, outlier: Tensor | float, share: float) -> EStep:
@@ -188,7 +211,7 @@ def fit_surface(
     Args:
         problem: the batch.
         pose: (B, num_dofs) to start from.
-        steps: Levenberg-Marquardt steps per width; twice as many at the last.
+        steps: damped steps per width, at least one; the last width takes up to twice as many of Levenberg-Marquardt.
         sigmas: widths before the last, as shares of the model's size.
         on_step: called after each width.
 
@@ -198,23 +221,43 @@ def fit_surface(
     References: Dewaele et al. 2006, section 3.4.
     """
     noise = torch.full_like(pose[:, 0], _FINAL_SIGMA_RANGE[1] * problem.size / _SIGMA_PER_NOISE)
-    for number in range(len(sigmas) + 1):
-        if number < len(sigmas):
-            sigma = torch.full_like(noise, sigmas[number] * problem.size)
-        else:
-            noise = residual_noise(problem, pose)
-            sigma = _SIGMA_PER_NOISE * noise
-        solved = surface_steps(problem, pose, sigma, noise, steps if number < len(sigmas) else 2 * steps)
-        pose, change = solved.state, problem.change(solved.last_step)
-        if on_step is not None:
-            on_step(AlignRecord("surface", number, len(sigmas) + 1, sigma, solved.cost, pose, change))
-    return StageResult(pose, sigma, change)
+    for number, share in enumerate(sigmas):
+        sigma = torch.full_like(noise, share * problem.size)
+        solved = surface_steps(problem, pose, sigma, noise, steps)
+        pose = solved.state
+        _report(on_step, "surface", number, len(sigmas) + 1, sigma, solved, problem)
+    noise = residual_noise(problem, pose)
+    sigma = _SIGMA_PER_NOISE * noise
+    solved = problem.solve(_surface_objective(problem, sigma, noise), pose, 2 * steps)
+    _report(on_step, "surface", len(sigmas), len(sigmas) + 1, sigma, solved, problem)
+    return StageResult(solved.state, sigma, problem.change(solved.last_step))
 
 
 def surface_steps(problem: AlignProblem, pose: Tensor, sigma: Tensor, noise: Tensor, steps: int) -> LMResult:
-    """Return the result of Levenberg-Marquardt steps on the surface objective at one width."""
-    objective = SurfaceObjective(problem.surface, problem.data, problem.valid, sigma, noise, problem.prior)
-    return problem.solve(objective, pose, steps)
+    """Return the result of damped steps on the surface objective at one width, which a narrower one will correct."""
+    objective = _surface_objective(problem, sigma, noise)
+    solved = problem.step(objective(pose), pose)
+    for _ in range(steps - 1):
+        solved = problem.step(objective(solved.state), solved.state)
+    return solved
+
+
+def _surface_objective(problem: AlignProblem, sigma: Tensor, noise: Tensor) -> SurfaceObjective:
+    return SurfaceObjective(problem.surface, problem.data, problem.valid, sigma, noise, problem.prior)
+
+
+def _report(
+    on_step: OnStep | None,
+    stage: str,
+    step: int,
+    num_steps: int,
+    sigma: Tensor,
+    solved: LMResult,
+    problem: AlignProblem,
+) -> None:
+    if on_step is not None:
+        change = problem.change(solved.last_step)
+        on_step(AlignRecord(stage, step, num_steps, sigma, solved.cost, solved.state, change))
 
 
 def residual_noise(problem: AlignProblem, pose: Tensor) -> Tensor:

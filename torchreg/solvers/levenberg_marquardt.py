@@ -100,7 +100,7 @@ def levenberg_marquardt(
     num_steps = 0
     while num_steps < max_steps:
         num_steps += 1
-        step, sound = _solve(current, damping, _frozen(current.gradient, state, low, high))
+        step, sound = _solve(current, damping, held_at_limits(current.gradient, state, low, high))
         trial_state = torch.minimum(torch.maximum(retract(state, step), low), high)
         trial = linearize(trial_state)
         decrease = current.cost - trial.cost
@@ -164,5 +164,6 @@ def _solve(problem: Linearization, damping: Tensor, frozen: Tensor | None) -> tu
     return torch.where(torch.isfinite(step) & sound.unsqueeze(-1), step, 0.0), sound
 
 
-def _frozen(gradient: Tensor, state: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+def held_at_limits(gradient: Tensor, state: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """Return which variables (B, D) a descent must hold: at a limit with the gradient pushing outwards, or without range."""
     return ((state <= lower) & (gradient > 0)) | ((state >= upper) & (gradient < 0)) | (lower == upper)
