@@ -5,7 +5,9 @@ from dataclasses import FrozenInstanceError, fields, replace
 import pytest
 import torch
 
-from torchreg.results import AlignRecord, AlignResult, Status
+from torchreg import results
+from torchreg.errors import TorchregError
+from torchreg.results import AlignRecord, AlignResult, DemoResult, Status
 
 
 def result():
@@ -36,7 +38,7 @@ def test_history_is_empty_unless_given_and_fields_can_be_replaced():
 
 
 def test_every_field_is_documented():
-    for record in (AlignResult, AlignRecord):
+    for record in (AlignResult, AlignRecord, DemoResult):
         for field in fields(record):
             assert f"        {field.name}: " in record.__doc__, field.name
 
@@ -44,3 +46,14 @@ def test_every_field_is_documented():
 def test_a_status_has_one_spelling_in_files():
     assert [Status(status.value) for status in Status] == list(Status)
     assert {status.value for status in Status} >= {"converged", "max_steps", "few_inliers", "no_data"}
+
+
+def test_saving_needs_a_writer_and_hands_it_the_result(monkeypatch):
+    monkeypatch.setattr(results, "_writer", None)
+    with pytest.raises(TorchregError, match=r"import torchreg\.pipelines\.storage first"):
+        result().save("r.safetensors")
+    calls = []
+    results.register_writer(lambda *arguments: calls.append(arguments))
+    saved = result()
+    saved.save("r.safetensors")
+    assert calls == [(saved, "r.safetensors")]

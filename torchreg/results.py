@@ -2,10 +2,48 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 from torch import Tensor
+
+from torchreg.errors import TorchregError
+
+Writer = Callable[[Any, str | os.PathLike[str]], None]
+
+# Files belong to a layer above this one, which registers its function when it is imported.
+_writer: Writer | None = None
+
+
+def register_writer(writer: Writer) -> None:
+    """Make ``writer(result, path)`` what `Result.save` calls."""
+    global _writer
+    _writer = writer
+
+
+class Result:
+    """What a pipeline returns: a frozen record that can be saved."""
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result to ``path``, which ends in .safetensors, and a JSON file beside it.
+
+        `torchreg.load` reads it back with every field as it was, on the CPU and without gradients.
+
+        Args:
+            path: a local file ending in .safetensors; an existing pair is replaced, each file whole or not at all.
+
+        Raises:
+            InputError: if the ending is another.
+            InputTypeError: if a field holds something that cannot be stored.
+            FileNotFoundError: if the folder does not exist.
+            TorchregError: if nothing that writes files was imported.
+        """
+        if _writer is None:
+            raise TorchregError("nothing that writes results was imported; import torchreg.pipelines.storage first")
+        _writer(self, path)
 
 
 class Status(Enum):
@@ -41,7 +79,7 @@ class AlignRecord:
 
 
 @dataclass(frozen=True)
-class AlignResult:
+class AlignResult(Result):
     """An articulated shape aligned to data. With a batch of problems every tensor has a leading dimension B.
 
     Args:
@@ -67,3 +105,28 @@ class AlignResult:
     cost: Tensor
     status: Status | tuple[Status, ...]
     history: tuple[AlignRecord, ...] = ()
+
+
+@dataclass(frozen=True)
+class DemoResult(Result):
+    """A made-up sequence of hand clouds, aligned frame after frame, beside the truth; T frames were done.
+
+    Args:
+        poses: (T, num_dofs) found, metres and radians.
+        truths: (T, num_dofs) the poses behind the clouds.
+        tip_errors: (T, 5) distance of each fingertip, thumb to little finger, from its true place, metres.
+        tips_seen: (T, 5) True where the camera saw enough of the fingertip to measure it.
+        inlier_counts: (T,) int64 data near the aligned surface.
+        seconds: (T,) time that aligning the frame took.
+        status: how each alignment ended.
+        seed: of motion and measurements.
+    """
+
+    poses: Tensor
+    truths: Tensor
+    tip_errors: Tensor
+    tips_seen: Tensor
+    inlier_counts: Tensor
+    seconds: Tensor
+    status: tuple[Status, ...]
+    seed: int

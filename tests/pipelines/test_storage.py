@@ -1,0 +1,229 @@
+"""Results on disk: every field comes back as it was, damaged files are refused, poses are read from several formats."""
+
+import json
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import pytest
+import torch
+
+from torchreg.errors import FormatError, InputError, InputTypeError
+from torchreg.models.hand import Hand
+from torchreg.pipelines.align import AlignConfig, align
+from torchreg.pipelines.storage import load, load_pose, save_result
+from torchreg.results import AlignRecord, AlignResult, DemoResult, Result, Status
+
+
+def record(step, batch=1, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(step)
+    values = torch.randn(3 + 9, batch, generator=generator).to(dtype)
+    return AlignRecord("em", step, 5, values[0], values[1], values[3:].mT.contiguous(), values[2])
+
+
+def result(batch=(), dtype=torch.float32, history=()):
+    generator = torch.Generator().manual_seed(1)
+
+    def draw(*size):
+        return torch.randn((*batch, *size), generator=generator).to(dtype)
+
+    distances = draw(6)
+    distances[..., -1] = torch.nan
+    statuses = (Status.CONVERGED, Status.NO_DATA, Status.FEW_INLIERS)
+    return AlignResult(
+        pose=draw(9), registered=draw(5, 3), keypoints=draw(4, 3), distances=distances,
+        inliers=distances.abs() < 0.5, posterior=draw(6), sigma=draw(), cost=draw(),
+        status=tuple(statuses[k % 3] for k in range(batch[0])) if batch else Status.MAX_STEPS, history=history,
+    )  # fmt: skip
+
+
+def same(a, b):
+    """Return whether two values are alike to the last bit and type; an independent walk over what a result holds."""
+    if type(a) is not type(b):
+        return False
+    if isinstance(a, torch.Tensor):
+        return a.dtype == b.dtype and a.shape == b.shape and torch.equal(a.nan_to_num(777.0), b.nan_to_num(777.0))
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    if hasattr(a, "__dataclass_fields__"):
+        return all(same(getattr(a, item.name), getattr(b, item.name)) for item in fields(a))
+    return a is b or a == b
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_results_come_back_as_they_were(tmp_path, batch, dtype):
+    history = tuple(record(step, batch=3, dtype=dtype) for step in range(4))
+    saved = result(batch, dtype, history)
+    saved.save(tmp_path / "r.safetensors")
+    loaded = load(tmp_path / "r.safetensors")
+    assert same(saved, loaded)
+    assert not same(replace(saved, cost=saved.cost + 1), loaded)
+
+
+def test_records_of_different_batches_come_back_in_order(tmp_path):
+    """A search refines only some problems of a batch, so the steps of a history differ in size."""
+    saved = result((3,), history=(record(0, batch=3), record(1, batch=3), record(2, batch=1), record(3, batch=2)))
+    saved.save(tmp_path / "r.safetensors")
+    assert same(saved, load(tmp_path / "r.safetensors"))
+
+
+def test_a_history_is_few_tensors(tmp_path):
+    result(history=tuple(record(step) for step in range(50))).save(tmp_path / "r.safetensors")
+    description = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
+    assert description["tensors"]["history.pose"]["shape"] == [50, 1, 9]
+    assert len(description["tensors"]) == 8 + 4
+
+
+def test_what_align_returns_can_be_saved(tmp_path):
+    hand = Hand()
+    data = hand.keypoints(hand.rest_pose()).detach()
+    with_gradients = align(hand, data, config=AlignConfig(search="never", num_model_points=60))
+    with_gradients.save(tmp_path / "r.safetensors")
+    loaded = load(tmp_path / "r.safetensors")
+    assert same(replace(with_gradients, keypoints=with_gradients.keypoints.detach()), loaded)
+    assert len(loaded.history) > 3
+
+
+def test_demo_results_come_back(tmp_path):
+    saved = DemoResult(
+        poses=torch.zeros(2, 27), truths=torch.ones(2, 27), tip_errors=torch.zeros(2, 5),
+        tips_seen=torch.ones(2, 5, dtype=torch.bool), inlier_counts=torch.tensor([3, 4]),
+        seconds=torch.ones(2, dtype=torch.float64), status=(Status.CONVERGED, Status.MAX_STEPS), seed=7,
+    )  # fmt: skip
+    saved.save(tmp_path / "poses.safetensors")
+    assert same(saved, load(tmp_path / "poses.safetensors"))
+
+
+def test_unknown_results_are_neither_saved_nor_loaded(tmp_path):
+    @dataclass(frozen=True)
+    class Other(Result):
+        value: torch.Tensor
+
+    with pytest.raises(InputTypeError, match=r"result must be one of AlignResult, DemoResult, got Other"):
+        Other(torch.zeros(1)).save(tmp_path / "r.safetensors")
+    assert list(tmp_path.iterdir()) == []
+    result().save(tmp_path / "r.safetensors")
+    edit(tmp_path / "r.json", lambda metadata: metadata.update(kind="Other"))
+    with pytest.raises(FormatError, match=r"r\.safetensors: holds a result of kind 'Other'; this release reads Align"):
+        load(tmp_path / "r.safetensors")
+    edit(tmp_path / "r.json", lambda metadata: metadata.update(kind=["AlignResult"]))
+    with pytest.raises(FormatError, match="of kind"):
+        load(tmp_path / "r.safetensors")
+
+
+def test_fields_that_cannot_be_stored_are_named(tmp_path):
+    with pytest.raises(InputTypeError, match=r"sigma cannot be stored: list is not a tensor, record, tuple or number"):
+        save_result(replace(result(), sigma=[1.0]), tmp_path / "r.safetensors")
+    with pytest.raises(InputTypeError, match=r"history\.1\.cost cannot be stored: set"):
+        save_result(replace(result(), history=((), replace(record(0), cost={1}))), tmp_path / "r.safetensors")
+
+
+def edit(path, change):
+    description = json.loads(path.read_text(encoding="utf-8"))
+    change(description["metadata"])
+    path.write_text(json.dumps(description), encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: f.pop("pose"), "fields lacks or does not know pose"),
+        (lambda f: f.update(color=1), "lacks or does not know color"),
+        (lambda f: f.update(pose=3), r"fields\.pose must not be of type int"),
+        (lambda f: f.update(pose={"tensor": "poses"}), "names the tensor 'poses', which is not there"),
+        (lambda f: f.update(pose={"tensor": ["pose"]}), "which is not there"),
+        (lambda f: f.update(pose={"array": "pose"}), r"fields\.pose holds entries array"),
+        (lambda f: f.update(status={"enum": "Status", "value": "fine"}), "unknown Status 'fine'"),
+        (lambda f: f.update(status={"enum": "Status", "value": []}), r"unknown Status \[\]"),
+        (lambda f: f.update(status={"enum": "Path", "value": "/"}), "of the unknown kind 'Path'"),
+        (lambda f: f.update(status=["converged"]), r"fields\.status must not be of type tuple"),
+        (lambda f: f.update(history={"table": "AlignResult", "rows": 0, "columns": {}}), "unknown kind 'AlignResult'"),
+        (lambda f: f["history"].update(columns=[]), "has no columns"),
+        (lambda f: f["history"].update(rows=10**15), "does not have 1000000000000000 rows"),
+        (lambda f: f["history"]["columns"].update(sigma={"stack": "sigma"}), "does not have 2 rows"),
+        (lambda f: f["history"]["columns"].update(step=1), r"history\.step must be a list"),
+        (lambda f: f["history"]["columns"].update(step=["a", "b"]), r"history\[0\]\.step must not be of type str"),
+        (lambda f: f.update(history=[{"record": "AlignRecord", "fields": []}]), r"history\[0\] must be a dict"),
+    ],
+)
+def test_wrong_content_is_refused_with_its_place(tmp_path, change, message):
+    result(history=(record(0), record(1))).save(tmp_path / "r.safetensors")
+    edit(tmp_path / "r.json", lambda metadata: change(metadata["fields"]))
+    with pytest.raises(FormatError, match=rf"r\.safetensors: is not a complete AlignResult .*{message}"):
+        load(tmp_path / "r.safetensors")
+
+
+def test_other_tensors_are_no_result(tmp_path):
+    from torchreg.io.tensors import save_tensors
+
+    save_tensors(tmp_path / "t.safetensors", {"pose": torch.zeros(3)}, {})
+    with pytest.raises(FormatError, match="of kind None"):
+        load(tmp_path / "t.safetensors")
+    with pytest.raises(FileNotFoundError):
+        load(tmp_path / "none.safetensors")
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return Hand()
+
+
+def test_poses_are_read_from_every_format(tmp_path, hand):
+    pose = torch.linspace(-1, 1, hand.num_dofs)
+    named = dict(zip(hand.dof_names, pose.tolist(), strict=True))
+    (tmp_path / "list.json").write_text(json.dumps(pose.tolist()), encoding="utf-8")
+    (tmp_path / "named.json").write_text(json.dumps(named), encoding="utf-8")
+    np.savez(tmp_path / "named.npz", pose=pose.numpy(), other=np.zeros(2))
+    np.savez(tmp_path / "single.npz", pose.numpy())
+    replace(result(), pose=pose).save(tmp_path / "result.safetensors")
+    for name in ("list.json", "named.json", "named.npz", "single.npz", "result.safetensors", "result.json"):
+        assert torch.equal(load_pose(tmp_path / name, hand), pose), name
+
+
+def test_joints_that_are_not_named_stay_at_rest(tmp_path, hand):
+    (tmp_path / "p.json").write_text('{"base_z": 0.5, "index_pip_flexion": 1}', encoding="utf-8")
+    pose = load_pose(tmp_path / "p.json", hand)
+    assert pose[hand.dof_names.index("base_z")] == 0.5
+    assert pose[hand.dof_names.index("index_pip_flexion")] == 1
+    assert pose.count_nonzero() == 2
+    assert pose.dtype == hand.rest.dtype
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "error", "message"),
+    [
+        ("p.json", b'{"index": 1}', InputError, r"no degree of freedom 'index'; known: base_x, "),
+        ("p.json", b"[0, 1]", InputError, r"the pose in .*p\.json must have shape \(27\), got \(2,\)"),
+        ("p.json", b'{"base_x": NaN}', InputError, "must be finite"),
+        ("p.json", b'"flat"', FormatError, "a pose is a list of 27 numbers, or numbers by name"),
+        ("p.json", b'{"base_x": true}', FormatError, "a pose is a list"),
+        ("p.json", b"{", FormatError, "cannot be read as JSON"),
+        ("p.npz", b"PK", FormatError, r"p\.npz: is not a readable zip"),
+        ("p.csv", b"0,1", FormatError, r"has the ending '\.csv'; a pose is read from \.safetensors, \.json, \.npz"),
+    ],
+)
+def test_files_without_a_pose_are_refused(tmp_path, hand, name, content, error, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(error, match=message):
+        load_pose(tmp_path / name, hand)
+
+
+def test_archives_without_a_pose_are_refused(tmp_path, hand):
+    np.savez(tmp_path / "two.npz", a=np.zeros(27), b=np.zeros(27))
+    with pytest.raises(FormatError, match="holds the arrays a, b; call one of them pose"):
+        load_pose(tmp_path / "two.npz", hand)
+    np.savez(tmp_path / "objects.npz", pose=np.array([{}], dtype=object))
+    with pytest.raises(FormatError, match="cannot be read as NPZ"):
+        load_pose(tmp_path / "objects.npz", hand)
+    np.savez(tmp_path / "empty.npz")
+    with pytest.raises(FormatError, match="cannot be read as NPZ"):
+        load_pose(tmp_path / "empty.npz", hand)
+
+
+def test_only_alignments_hold_a_pose(tmp_path, hand):
+    values = {item.name: torch.zeros(1) for item in fields(DemoResult)}
+    DemoResult(**{**values, "status": (), "seed": 0}).save(tmp_path / "d.safetensors")
+    with pytest.raises(FormatError, match="holds a DemoResult; a pose is read from an AlignResult"):
+        load_pose(tmp_path / "d.safetensors", hand)
+    with pytest.raises(FileNotFoundError):
+        load_pose(tmp_path / "none.csv", hand)
