@@ -57,3 +57,12 @@ def test_saving_needs_a_writer_and_hands_it_the_result(monkeypatch):
     saved = result()
     saved.save("r.safetensors")
     assert calls == [(saved, "r.safetensors")]
+
+
+def test_statuses_are_a_tuple_for_one_problem_and_for_many():
+    assert result().statuses == (Status.CONVERGED,)
+    assert replace(result(), status=(Status.NO_DATA, Status.CONVERGED)).statuses == (Status.NO_DATA, Status.CONVERGED)
+
+
+def test_only_alignments_with_data_are_usable():
+    assert [status for status in Status if status.usable] == [Status.CONVERGED, Status.MAX_STEPS]

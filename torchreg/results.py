@@ -54,6 +54,11 @@ class Status(Enum):
     FEW_INLIERS = "few_inliers"
     NO_DATA = "no_data"
 
+    @property
+    def usable(self) -> bool:
+        """Whether the result rests on data, converged or not."""
+        return self in (Status.CONVERGED, Status.MAX_STEPS)
+
 
 @dataclass(frozen=True)
 class AlignRecord:
@@ -106,6 +111,11 @@ class AlignResult(Result):
     status: Status | tuple[Status, ...]
     history: tuple[AlignRecord, ...] = ()
 
+    @property
+    def statuses(self) -> tuple[Status, ...]:
+        """One status per problem, also where there is a single one."""
+        return (self.status,) if isinstance(self.status, Status) else self.status
+
 
 @dataclass(frozen=True)
 class DemoResult(Result):
@@ -114,9 +124,10 @@ class DemoResult(Result):
     Args:
         poses: (T, num_dofs) found, metres and radians.
         truths: (T, num_dofs) the poses behind the clouds.
+        clouds: (T, M, 3) data, metres.
+        inliers: (T, M) True where a datum is near the aligned surface.
         tip_errors: (T, 5) distance of each fingertip, thumb to little finger, from its true place, metres.
         tips_seen: (T, 5) True where the camera saw enough of the fingertip to measure it.
-        inlier_counts: (T,) int64 data near the aligned surface.
         seconds: (T,) time that aligning the frame took.
         status: how each alignment ended.
         seed: of motion and measurements.
@@ -124,9 +135,10 @@ class DemoResult(Result):
 
     poses: Tensor
     truths: Tensor
+    clouds: Tensor
+    inliers: Tensor
     tip_errors: Tensor
     tips_seen: Tensor
-    inlier_counts: Tensor
     seconds: Tensor
     status: tuple[Status, ...]
     seed: int

@@ -86,9 +86,10 @@ def test_what_align_returns_can_be_saved(tmp_path):
 
 def test_demo_results_come_back(tmp_path):
     saved = DemoResult(
-        poses=torch.zeros(2, 27), truths=torch.ones(2, 27), tip_errors=torch.zeros(2, 5),
-        tips_seen=torch.ones(2, 5, dtype=torch.bool), inlier_counts=torch.tensor([3, 4]),
-        seconds=torch.ones(2, dtype=torch.float64), status=(Status.CONVERGED, Status.MAX_STEPS), seed=7,
+        poses=torch.zeros(2, 27), truths=torch.ones(2, 27), clouds=torch.ones(2, 4, 3),
+        inliers=torch.tensor([[True, False, True, True]] * 2), tip_errors=torch.zeros(2, 5),
+        tips_seen=torch.ones(2, 5, dtype=torch.bool), seconds=torch.ones(2, dtype=torch.float64),
+        status=(Status.CONVERGED, Status.MAX_STEPS), seed=7,
     )  # fmt: skip
     saved.save(tmp_path / "poses.safetensors")
     assert same(saved, load(tmp_path / "poses.safetensors"))
