@@ -215,7 +215,7 @@ def align_command(
 
 
 def _show_stage(bar: Any, stage: str) -> None:
-    if bar.postfix != stage:
+    if not bar.disable and bar.postfix != stage:
         bar.set_postfix_str(stage)
 
 
