@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torchreg.losses.em import EMLoss
     from torchreg.models.articulated import ArticulatedShape
     from torchreg.models.hand import Hand
-    from torchreg.models.skin import BendingSkin
+    from torchreg.models.skin import BendingSkin, LinearBlendSkin, sample_skin
     from torchreg.pipelines.align import AlignConfig, align
     from torchreg.pipelines.calibrate import calibrate
     from torchreg.pipelines.storage import load
@@ -31,6 +31,7 @@ __all__ = [
     "BendingSkin",
     "EMLoss",
     "Hand",
+    "LinearBlendSkin",
     "SigmaSchedule",
     "Status",
     "TriangleMesh",
@@ -42,6 +43,7 @@ __all__ = [
     "load_mesh",
     "load_points",
     "metrics",
+    "sample_skin",
 ]
 
 _MODULES = frozenset({"errors", "metrics"})
@@ -53,6 +55,7 @@ _OWNERS = {
     "BendingSkin": "models.skin",
     "EMLoss": "losses.em",
     "Hand": "models.hand",
+    "LinearBlendSkin": "models.skin",
     "SigmaSchedule": "correspondence.sigma",
     "Status": "results",
     "TriangleMesh": "geometry.mesh",
@@ -61,6 +64,7 @@ _OWNERS = {
     "load": "pipelines.storage",
     "load_mesh": "io.points",
     "load_points": "io.points",
+    "sample_skin": "models.skin",
 }
 
 

@@ -58,6 +58,7 @@ class SkinSurface:
 
     def __init__(self, skin: LinearBlendSkin) -> None:
         self.skin = skin
+        self.gap = _GAP_SPACINGS * _spacing(skin.points)
 
     def distance(self, points: Tensor, pose: Tensor) -> Tensor:
         """Return the signed distances (..., N) of points (..., N, 3) in poses (..., num_dofs), metres."""
@@ -79,13 +80,24 @@ class SkinSurface:
         offset = points - posed.expand(*nearest.shape[:-1], *posed.shape[-2:]).gather(-2, index)
         normal = normals.expand(*nearest.shape[:-1], *normals.shape[-2:]).gather(-2, index)
         along = (offset * normal).sum(-1)
-        # Far from the surface the tangent plane says little: the distance to the point takes over, with the plane's sign.
+        # Beside the rim of a skin the tangent plane says little: the distance to the point takes over, with its sign.
         reach = offset.norm(dim=-1)
-        return torch.where(along.abs() < _PLANE_SHARE * reach, _signed(reach, along), along), nearest, normal
+        beside = (along.abs() < _PLANE_SHARE * reach) & (reach > self.gap)
+        return torch.where(beside, _signed(reach, along), along), nearest, normal
 
 
-# A datum whose offset is this oblique lies beside the tangent point rather than above it.
+# A datum whose offset is this oblique, and longer than this many distances between skin points, lies beside the rim.
 _PLANE_SHARE = 0.2
+_GAP_SPACINGS = 2.0
+_NUM_SPACINGS = 500
+
+
+def _spacing(points: Tensor) -> float:
+    """Return the median distance of points from their nearest neighbors elsewhere, zero for a single place."""
+    some = points[:: -(-len(points) // _NUM_SPACINGS)]
+    apart = torch.cdist(some, points, compute_mode="donot_use_mm_for_euclid_dist")
+    nearest = torch.where(apart > 0, apart, torch.inf).amin(-1)
+    return float(torch.where(nearest.isinf(), 0.0, nearest).median())
 
 
 def _signed(size: Tensor, sign: Tensor) -> Tensor:
@@ -93,7 +105,7 @@ def _signed(size: Tensor, sign: Tensor) -> Tensor:
 
 
 def dense_file_skin(shape: ArticulatedShape) -> LinearBlendSkin:
-    """Return a dense skin with normals of the file's mesh: its vertices, or samples where there are too many or too few.
+    """Return a dense skin with normals of the file's mesh: its vertices, or samples if they are too many or too few.
 
     Raises:
         InputError: if the shape was not read from a file with a mesh.

@@ -102,8 +102,8 @@ def align(
 ) -> AlignResult:
     """Return the pose in which an articulated shape lies on 3-D data, with what was found on the way.
 
-    Annealed EM registers model points to data points and rejects outliers; then the surface is fitted to the data. Where
-    that cannot be trusted, candidates around the start are refined in one batch and recombined limb by limb.
+    Annealed EM registers model points to data points and rejects outliers; then the surface is fitted to the data.
+    Where that cannot be trusted, candidates around the start are refined in one batch and recombined limb by limb.
 
     Args:
         shape: the articulated shape, in metres.
@@ -198,7 +198,9 @@ def _search_where_needed(
         rounds=config.search_rounds,
         generator=generator,
     )
-    refined = fit_surface(part, found, steps=max(config.surface_steps, _SEARCHED_STEPS), sigmas=FINAL_SIGMAS, on_step=record)
+    refined = fit_surface(
+        part, found, steps=max(config.surface_steps, _SEARCHED_STEPS), sigmas=FINAL_SIGMAS, on_step=record
+    )
     better = alignment_cost(part, refined.pose) < alignment_cost(part, final.pose[rows])
     pose, change = final.pose.clone(), final.change.clone()
     pose[rows] = torch.where(better.unsqueeze(-1), refined.pose, final.pose[rows])

@@ -19,7 +19,7 @@ class PosePrior:
 
     Args:
         mean: (B, num_dofs).
-        precision: (num_dofs,), 1 / std^2; zero for the base.
+        precision: (num_dofs,) or (B, num_dofs), 1 / std^2; zero for the base.
     """
 
     mean: Tensor
@@ -32,7 +32,7 @@ class PosePrior:
         return Linearization(
             problem.cost + 0.5 * (pull * offset).sum(-1),
             problem.gradient + pull,
-            problem.hessian + torch.diag(self.precision),
+            problem.hessian + torch.diag_embed(self.precision),
         )
 
     def cost(self, pose: Tensor) -> Tensor:

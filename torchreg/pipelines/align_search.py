@@ -1,7 +1,7 @@
 """Searching around a start when plain descent leaves part of the data unexplained.
 
-Candidates are scattered around the start, refined in one batch on few points, and recombined limb by limb: a finger that
-one candidate found is kept even if that candidate lost the others.
+Candidates are scattered around the start, refined in one batch on few points, and recombined limb by limb: a finger
+that one candidate found is kept even if that candidate lost the others.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ _MIN_GAIN = 1.0
 _CLUSTER_NEIGHBORS = 5
 _CLUSTER_RADIUS = 4.0
 _FAR_NOISES = 3.0
-# A descent that turns a joint or the base further than this, radians, started outside its safe basin.
-_TRUSTED_MOTION = 0.25
+# A descent that turns the joints (root mean square) or the base further than this, radians, started too far away.
+_TRUSTED_MOTION = 0.2
 _CLUSTER_SHARE, _CLUSTER_MIN = 0.015, 5
 _MAX_CLUSTERED = 2000
 # Candidates times points times parts held at a time.
@@ -56,7 +56,8 @@ def needs_search(problem: AlignProblem, start: Tensor, pose: Tensor) -> Tensor:
     Either it went far from its start, where other minima are as near; or it leaves a dense cluster of data off the
     surface: outliers are thin in space, a limb that was missed is as dense as the rest.
     """
-    moved = (pose - start)[:, 6:].abs().amax(-1) if pose.shape[-1] > 6 else torch.zeros_like(pose[:, 0])
+    joints = (pose - start)[:, 6:]
+    moved = joints.square().sum(-1).div(max(joints.shape[-1], 1)).sqrt()
     turned = compose_rotation_vectors(pose[:, 3:6], -start[:, 3:6]).norm(dim=-1)
     return (torch.maximum(moved, turned) > _TRUSTED_MOTION) | _unexplained(problem, pose)
 
@@ -202,7 +203,7 @@ def _refine(problem: AlignProblem, poses: Tensor, number: int) -> Tensor:
     wide = problem.rows(torch.arange(batch, device=poses.device).repeat_interleave(count))
     first, last = _EM_SIGMAS[min(number, len(_EM_SIGMAS) - 1)]
     schedule = SigmaSchedule.geometric(first * problem.size, last * problem.size, 3)
-    pose = register(wide, poses.flatten(0, 1), schedule, em_steps=2, m_steps=1).pose
+    pose = register(wide, poses.flatten(0, 1), schedule, em_steps=2, m_steps=1, tempered=False).pose
     noise = torch.full_like(pose[:, 0], _NOISE * problem.size)
     for share in _SURFACE_SIGMAS:
         pose = surface_steps(wide, pose, torch.full_like(noise, share * problem.size), noise, 2).state

@@ -30,6 +30,8 @@ _FINAL_SIGMA_RANGE = (0.003, 0.02)
 # A Welsch kernel of 2.5 standard deviations keeps most of the efficiency of least squares on Gaussian noise.
 _SIGMA_PER_NOISE = 2.5
 _MAD_TO_STD = 1.4826
+# Data that count when asking how many model points share a datum.
+_HELD_POSTERIOR, _MAX_POSTERIOR = 0.3, 1 - 1e-6
 # Damping of the single steps that an EM takes, whose objective changes with every E-step anyway.
 _EM_DAMPING = 1e-3
 # Below this share of the model's size the kernel's own pull is less than the noise.
@@ -128,6 +130,7 @@ def register(
     *,
     em_steps: int,
     m_steps: int,
+    tempered: bool = True,
     on_step: OnStep | None = None,
 ) -> StageResult:
     """Return the pose after annealed EM: E-step (17, 18), M-step (20), a smaller sigma, and again.
@@ -138,6 +141,7 @@ def register(
         schedule: of sigma.
         em_steps: EM iterations per sigma, at most; fewer when no pose changes any more.
         m_steps: Levenberg-Marquardt steps per M-step; a single one is taken without testing it (generalized EM).
+        tempered: weigh the prior as if data that share a wide kernel were one observation.
         on_step: called after each iteration.
 
     Returns:
@@ -154,7 +158,8 @@ def register(
         for _ in range(em_steps):
             rows, derivative = problem.skin.shape.transform_jacobian(pose, chart="tangent")
             observed = _expect(problem, problem.skin.basis @ rows, sigma)
-            objective = RegistrationObjective(problem.skin, observed, sigma, problem.prior)
+            prior = _tempered(problem.prior, observed) if tempered else problem.prior
+            objective = RegistrationObjective(problem.skin, observed, sigma, prior)
             around = objective.linearize(pose, rows, derivative)
             solved = problem.solve(objective, pose, m_steps, damping) if m_steps > 1 else problem.step(around, pose)
             pose, damping, change = solved.state, solved.damping, problem.change(solved.last_step)
@@ -166,6 +171,17 @@ def register(
             if float(change.max()) <= problem.pose_atol:
                 break
     return StageResult(pose, sigma, change)
+
+
+def _tempered(prior: PosePrior, observed: EStep) -> PosePrior:
+    """Return the prior weighed against data that are not independent while the kernel is wide.
+
+    A datum that n model points share counts n times in eq. 20; n follows from the inlier posterior n / (n + c).
+    """
+    posterior = observed.inlier_posterior.clamp_max(_MAX_POSTERIOR)
+    held = posterior > _HELD_POSTERIOR
+    shared = OUTLIER_CONSTANT * (posterior / (1 - posterior) * held).sum(-1) / held.sum(-1).clamp_min(1)
+    return replace(prior, precision=prior.precision * shared.clamp_min(1).unsqueeze(-1))
 
 
 def _expect(problem: AlignProblem, posed: Tensor, sigma: Tensor) -> EStep:

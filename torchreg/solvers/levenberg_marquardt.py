@@ -165,5 +165,5 @@ def _solve(problem: Linearization, damping: Tensor, frozen: Tensor | None) -> tu
 
 
 def held_at_limits(gradient: Tensor, state: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Return which variables (B, D) a descent must hold: at a limit with the gradient pushing outwards, or without range."""
+    """Return which variables (B, D) a descent must hold: pushed outwards at a limit, or without range."""
     return ((state <= lower) & (gradient > 0)) | ((state >= upper) & (gradient < 0)) | (lower == upper)
