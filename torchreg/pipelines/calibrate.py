@@ -25,6 +25,8 @@ _FINAL_SIGMA_RANGE = (0.003, 0.02)
 # A Welsch kernel of 2.5 standard deviations keeps most of the efficiency of least squares on Gaussian noise.
 _SIGMA_PER_NOISE = 2.5
 _MAD_TO_STD = 1.4826
+# Residuals near each other share what the model gets wrong: they weigh as if their noise were this much larger.
+_SHARED_ERROR = 1.5
 # No part shrinks or grows beyond this factor of what it was.
 _MAX_LOG_SCALE = 0.7
 
@@ -162,7 +164,9 @@ def calibrate(
             aligned = _aligned(found).to(valid.device)
             size = float((skin.points.amax(0) - skin.points.amin(0)).norm())
             problem = _JointProblem(fitted, data, valid & aligned.unsqueeze(-1), prior, size, config)
-            poses, cost, change = _fit(problem, found.pose, number, on_step)
+            better = problem.unexplained(found.pose) < problem.unexplained(poses)
+            poses = torch.where(better.unsqueeze(-1), found.pose, poses)
+            poses, cost, change = _fit(problem, poses, number, on_step)
     status = Status.CONVERGED if change <= config.align.pose_atol else Status.MAX_STEPS
     scales = fitted.log_length_scales.detach().clone(), fitted.log_radius_scales.detach().clone()
     for parameter, original in zip(fitted.parameters(), shape.parameters(), strict=True):
@@ -189,7 +193,7 @@ def _fit(
             noise = min(max(problem.noise(state), low / _SIGMA_PER_NOISE), high / _SIGMA_PER_NOISE)
             sigma = _SIGMA_PER_NOISE * noise
         solved = levenberg_marquardt(
-            partial(problem.linearize, sigma=sigma, noise=noise),
+            partial(problem.linearize, sigma=sigma, noise=_SHARED_ERROR * noise),
             state,
             retract=problem.retract,
             lower=problem.lower,
@@ -319,6 +323,11 @@ class _JointProblem:
         distance = self.shape.distance(self.data, poses).abs()
         near = distance[self.valid & (distance < _SIGMAS[-1] * self.size)]
         return _MAD_TO_STD * float(near.median()) if len(near) else _FINAL_SIGMA_RANGE[1] * self.size
+
+    def unexplained(self, poses: Tensor) -> Tensor:
+        """Return the number of data (T,), softly counted, that poses leave off the surface of the shape as it is."""
+        distance = self.shape.distance(self.data, poses - self.shift)
+        return ((1 - (-(distance / (_SIGMAS[-1] * self.size)).square()).exp()) * self.valid).sum(-1)
 
     def linearize(self, state: Tensor, sigma: float, noise: float) -> Linearization:
         """Return the Welsch cost of all distances and its Gauss-Newton approximation; the batch is one state."""
