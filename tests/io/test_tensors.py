@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from torchreg.errors import FormatError, InputError, InputTypeError
-from torchreg.io.atomic import write_atomic
 from torchreg.io.limits import FileLimits
 from torchreg.io.tensors import load_tensors, save_tensors
 
@@ -166,24 +165,3 @@ def test_what_cannot_be_saved_leaves_nothing(tmp_path, tensors, metadata, error,
     with pytest.raises(error, match=words):
         save_tensors(tmp_path / "r.safetensors", tensors, metadata)
     assert not list(tmp_path.iterdir())
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "f"
-    write_atomic(path, b"old")
-    path.chmod(0o640)
-
-    def fail(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "replace", fail)
-        with pytest.raises(KeyboardInterrupt):
-            write_atomic(path, b"new")
-    assert path.read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [path]
-    write_atomic(path, b"new")
-    assert path.read_bytes() == b"new"
-    assert path.stat().st_mode & 0o777 == 0o640
-    with pytest.raises(IsADirectoryError, match="is a folder"):
-        write_atomic(tmp_path, b"")

@@ -119,9 +119,11 @@ def dense_file_skin(shape: ArticulatedShape) -> LinearBlendSkin:
     else:
         points, face, barycentric = sample_surface(mesh, _NUM_SAMPLES)
         normals = mesh.face_normals()[face]
-        weights = interpolate(shape.surface.weights, mesh.faces, face, barycentric)
+        weights = interpolate(shape.surface.weights.to(barycentric), mesh.faces, face, barycentric)
+    # The file's vertices lie in the pose of all zeros, whether or not the joint limits allow it.
+    reference = torch.zeros_like(shape.rest)
     return LinearBlendSkin(
-        shape, points.to(shape.rest), weights.to(shape.rest), shape.rest_pose(), normals=normals.to(shape.rest)
+        shape, points.to(shape.rest), weights.to(shape.rest), reference, normals=normals.to(shape.rest)
     )
 
 

@@ -64,7 +64,7 @@ class AlignConfig:
     surface_steps: int = 2
     search: str = "auto"
     num_candidates: int = 24
-    search_rounds: int = 3
+    search_rounds: int = 4
     inlier_distance: float | None = None
     outlier: str = "limit"
     debias: float = 0.5

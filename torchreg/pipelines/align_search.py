@@ -6,7 +6,9 @@ that one candidate found is kept even if that candidate lost the others.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import torch
 from torch import Tensor
@@ -18,10 +20,14 @@ from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.align_stages import AlignProblem, register, residual_noise, surface_steps
 
-# Shares of the model's size: sigmas of the candidates' EM, widths of their surface fit, width of their score.
+_T = TypeVar("_T")
+
+# Per round, as shares of the model's size: sigmas of the candidates' EM, widths of their surface fit and score.
+# Later rounds look at more data, more closely: what is left to tell apart differs in a few data only.
 _EM_SIGMAS = ((0.075, 0.022), (0.055, 0.022))
-_SURFACE_SIGMAS = (0.05, 0.03, 0.018)
-_SCORE_SIGMA = 0.022
+_SURFACE_SIGMAS = ((0.05, 0.03, 0.018), (0.05, 0.03, 0.018), (0.03, 0.018, 0.014))
+_SCORE_SIGMA = (0.022, 0.018, 0.014)
+_NUM_DATA = (250, 350, 500)
 _NOISE = 0.01
 # Scatter of the candidates per round: joints as a share of their range, base in radians, base as a share of the size.
 _JOINT_SCATTER = (0.2, 0.15, 0.1)
@@ -31,13 +37,13 @@ _MAX_JOINT_SCATTER = 0.4
 # One limb in four of a candidate is placed anywhere within this many radians of the start and its limits.
 _FRESH_LIMBS = 0.25
 _FRESH_REACH = 1.2
-_NUM_MODEL, _NUM_DATA = 120, 250
+_NUM_MODEL = 120
 # Widths of the surface fit that follows a search, whose poses are near already.
 FINAL_SIGMAS = (0.022,)
 # How much the prior weighs in a score, in outliers per squared standard deviation.
 PRIOR_SHARE = 0.3
 # A round that explains no more than this many data more is the last.
-_MIN_GAIN = 1.0
+_MIN_GAIN = 0.5
 # Unexplained data count as a cluster with this many others within four nearest-neighbor distances.
 _CLUSTER_NEIGHBORS = 5
 _CLUSTER_RADIUS = 4.0
@@ -117,7 +123,7 @@ def explore(
     Returns:
         (B, num_dofs).
     """
-    per_problem = candidates * _NUM_DATA * problem.skin.shape.num_parts
+    per_problem = candidates * max(_NUM_DATA) * problem.skin.shape.num_parts
     rows = torch.arange(len(start), device=start.device).split(max(1, _CHUNK_ENTRIES // per_problem))
     best = [_explore(problem.rows(row), start[row], descended[row], candidates, rounds, generator) for row in rows]
     return torch.cat(best)
@@ -134,17 +140,23 @@ def _explore(
     limbs = limb_dofs(problem.skin.shape)
     best, center = descended, start
     for number in range(rounds):
-        subset = _subset(problem, generator)
+        subset = _subset(problem, _of(number, _NUM_DATA), generator)
         scattered = _scatter(problem, center, limbs, candidates, number, generator)
         pool = torch.cat([_refine(subset, scattered, number), best.unsqueeze(1)], dim=1)
-        score = _score(subset, pool)
+        width = _of(number, _SCORE_SIGMA) * problem.size
+        score = _score(subset, pool, width)
         value, index = score.min(1)
         before = score[:, -1]
-        best, value = _recombine(subset, _pick(pool, index), value, pool, limbs)
+        best, value = _recombine(subset, _pick(pool, index), value, pool, limbs, width)
         if not bool((value < before - _MIN_GAIN).any()):
             break
         center = best
     return best
+
+
+def _of(number: int, per_round: Sequence[_T]) -> _T:
+    """Return a round's value; the last one serves all later rounds."""
+    return per_round[min(number, len(per_round) - 1)]
 
 
 def limb_dofs(shape: ArticulatedShape) -> list[Tensor]:
@@ -168,10 +180,10 @@ def _descendants(children: list[list[int]], part: int) -> list[int]:
     return found
 
 
-def _subset(problem: AlignProblem, generator: torch.Generator) -> AlignProblem:
+def _subset(problem: AlignProblem, count: int, generator: torch.Generator) -> AlignProblem:
     """Return the problem with few data, drawn from the valid ones."""
     draw = torch.rand(problem.valid.shape, generator=generator).to(problem.data)
-    keep = torch.where(problem.valid, draw, -1.0).topk(min(_NUM_DATA, draw.shape[-1]), dim=-1).indices
+    keep = torch.where(problem.valid, draw, -1.0).topk(min(count, draw.shape[-1]), dim=-1).indices
     data = problem.data.gather(1, keep.unsqueeze(-1).expand(*keep.shape, 3))
     return replace(problem, data=data, valid=problem.valid.gather(1, keep))
 
@@ -181,9 +193,8 @@ def _scatter(
 ) -> Tensor:
     """Return (B, count, num_dofs) candidates; the first is the center itself."""
     shape = problem.skin.shape
-    spread = [values[min(number, len(values) - 1)] for values in (_JOINT_SCATTER, _TURN_SCATTER, _SHIFT_SCATTER)]
-    scale = (spread[0] * (shape.upper - shape.lower)).clamp_max(_MAX_JOINT_SCATTER)
-    scale[:3], scale[3:6] = spread[2] * problem.size, spread[1]
+    scale = (_of(number, _JOINT_SCATTER) * (shape.upper - shape.lower)).clamp_max(_MAX_JOINT_SCATTER)
+    scale[:3], scale[3:6] = _of(number, _SHIFT_SCATTER) * problem.size, _of(number, _TURN_SCATTER)
     noise = torch.randn(len(center), count, shape.num_dofs, generator=generator).to(center) * scale
     noise[:, 0] = 0
     around = shape.retract(center.unsqueeze(1).expand_as(noise), noise)
@@ -201,30 +212,30 @@ def _refine(problem: AlignProblem, poses: Tensor, number: int) -> Tensor:
     """Return candidates (B, K, num_dofs) after a short EM and surface fit, all in one batch."""
     batch, count = poses.shape[:2]
     wide = problem.rows(torch.arange(batch, device=poses.device).repeat_interleave(count))
-    first, last = _EM_SIGMAS[min(number, len(_EM_SIGMAS) - 1)]
+    first, last = _of(number, _EM_SIGMAS)
     schedule = SigmaSchedule.geometric(first * problem.size, last * problem.size, 3)
     pose = register(wide, poses.flatten(0, 1), schedule, em_steps=2, m_steps=1, tempered=False).pose
     noise = torch.full_like(pose[:, 0], _NOISE * problem.size)
-    for share in _SURFACE_SIGMAS:
+    for share in _of(number, _SURFACE_SIGMAS):
         pose = surface_steps(wide, pose, torch.full_like(noise, share * problem.size), noise, 2).state
     return pose.reshape(poses.shape)
 
 
-def _score(problem: AlignProblem, poses: Tensor) -> Tensor:
+def _score(problem: AlignProblem, poses: Tensor, width: float) -> Tensor:
     """Return the score (B, K) of poses (B, K, num_dofs): outliers, softly counted, and the prior; lower is better."""
     distance = problem.surface.distance(problem.data.unsqueeze(1), poses)
-    lost = 1 - (-(distance / (_SCORE_SIGMA * problem.size)).square()).exp()
+    lost = 1 - (-(distance / width).square()).exp()
     return (lost * problem.valid.unsqueeze(1)).sum(-1) + PRIOR_SHARE * problem.prior.cost(poses)
 
 
 def _recombine(
-    problem: AlignProblem, best: Tensor, value: Tensor, pool: Tensor, limbs: list[Tensor]
+    problem: AlignProblem, best: Tensor, value: Tensor, pool: Tensor, limbs: list[Tensor], width: float
 ) -> tuple[Tensor, Tensor]:
     """Return the best poses, each limb taken from whichever candidate explains most with it, and their scores."""
     for dofs in limbs:
         mixed = best.unsqueeze(1).repeat(1, pool.shape[1], 1)
         mixed[..., dofs] = pool[..., dofs]
-        score, index = _score(problem, mixed).min(1)
+        score, index = _score(problem, mixed, width).min(1)
         better = score < value
         best = torch.where(better.unsqueeze(-1), _pick(mixed, index), best)
         value = torch.where(better, score, value)
