@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import re
 import subprocess
 import sys
@@ -109,11 +110,14 @@ def test_every_command_explains_itself():
     assert run("algin").exit_code == 2
 
 
-def test_main_runs_the_application(monkeypatch):
+def test_main_runs_the_application_on_one_thread_unless_told_otherwise(monkeypatch):
     calls = []
-    monkeypatch.setattr(cli, "app", lambda **options: calls.append(options))
+    monkeypatch.setattr(cli, "app", lambda **options: calls.append((options, os.environ["OMP_NUM_THREADS"])))
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
     cli.main()
-    assert calls == [{"prog_name": "torchreg"}]
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    cli.main()
+    assert calls == [({"prog_name": "torchreg"}, "3"), ({"prog_name": "torchreg"}, "1")]
 
 
 def test_one_cloud_is_aligned_and_everything_asked_for_is_written(folder, tmp_path):
