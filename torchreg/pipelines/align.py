@@ -68,7 +68,7 @@ class AlignConfig:
     inlier_distance: float | None = None
     outlier: str = "limit"
     debias: float = 0.5
-    prior_std: float | None = 0.35
+    prior_std: float | None = 0.3
     num_model_points: int = 500
     sharpness: float = 2.0
     pose_atol: float = 1e-3

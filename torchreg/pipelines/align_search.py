@@ -138,11 +138,12 @@ def _explore(
     generator: torch.Generator,
 ) -> Tensor:
     limbs = limb_dofs(problem.skin.shape)
-    best, center = descended, start
+    best, centers = descended, [start, descended]
     for number in range(rounds):
         subset = _subset(problem, _of(number, _NUM_DATA), generator)
-        scattered = _scatter(problem, center, limbs, candidates, number, generator)
-        pool = torch.cat([_refine(subset, scattered, number), best.unsqueeze(1)], dim=1)
+        count = -(-candidates // len(centers))
+        scattered = [_scatter(problem, center, limbs, count, number, generator) for center in centers]
+        pool = torch.cat([_refine(subset, torch.cat(scattered, dim=1), number), best.unsqueeze(1)], dim=1)
         width = _of(number, _SCORE_SIGMA) * problem.size
         score = _score(subset, pool, width)
         value, index = score.min(1)
@@ -150,7 +151,7 @@ def _explore(
         best, value = _recombine(subset, _pick(pool, index), value, pool, limbs, width)
         if not bool((value < before - _MIN_GAIN).any()):
             break
-        center = best
+        centers = [best]
     return best
 
 
