@@ -71,7 +71,7 @@ class AlignConfig:
     prior_std: float | None = 0.3
     num_model_points: int = 500
     sharpness: float = 2.0
-    pose_atol: float = 1e-3
+    pose_atol: float = 3e-3
     nan_policy: str = "raise"
     seed: int = 0
 
@@ -229,7 +229,7 @@ def _result(
     inliers = distances.abs() < _inlier_distance(problem, config)
     posed = problem.skin(pose)
     observed = expectation(posed, problem.data, final.sigma, OUTLIER_CONSTANT, mask=problem.valid)
-    world = torch.cat([pose[:, :3] + origin, pose[:, 3:]], dim=-1)
+    world = problem.in_world(pose)
     statuses = zip(inliers.sum(-1).tolist(), problem.valid.sum(-1).tolist(), final.change.tolist(), strict=True)
     return AlignResult(
         pose=world,
@@ -343,6 +343,7 @@ def _centered_problem(
         pose_atol=config.pose_atol,
         outlier=config.outlier,
         debias=config.debias,
+        origin=origin,
     )
 
 

@@ -54,6 +54,7 @@ class AlignProblem:
         pose_atol: largest change of a pose that counts as none.
         outlier: "limit" or "volume".
         debias: share of the kernel's own pull that is taken from the targets of the EM.
+        origin: (B, 3) where the origin of data and poses lies in the world, for the records; there by default.
     """
 
     skin: LinearBlendSkin
@@ -67,6 +68,7 @@ class AlignProblem:
     pose_atol: float
     outlier: str = "limit"
     debias: float = 0.0
+    origin: Tensor | None = None
 
     def rows(self, index: Tensor) -> AlignProblem:
         """Return the problems of some rows of the batch, which may repeat."""
@@ -77,6 +79,7 @@ class AlignProblem:
             lower=_rows(self.lower, index),
             upper=_rows(self.upper, index),
             prior=replace(self.prior, mean=self.prior.mean[index]),
+            origin=None if self.origin is None else self.origin[index],
         )
 
     def solve(
@@ -94,6 +97,10 @@ class AlignProblem:
         held = held_at_limits(around.gradient, pose, self.lower, self.upper)
         step = damped_step(around, damping, frozen=held)
         return LMResult(self.clamp(self.skin.shape.retract(pose, step)), around.cost, damping, step, 1)
+
+    def in_world(self, pose: Tensor) -> Tensor:
+        """Return poses (B, num_dofs) in the coordinates of the world."""
+        return pose if self.origin is None else torch.cat([pose[:, :3] + self.origin, pose[:, 3:]], dim=-1)
 
     def change(self, step: Tensor) -> Tensor:
         """Return the largest change (B,) in a step, radians, or metres as a share of the size."""
@@ -273,7 +280,7 @@ def _report(
 ) -> None:
     if on_step is not None:
         change = problem.change(solved.last_step)
-        on_step(AlignRecord(stage, step, num_steps, sigma, solved.cost, solved.state, change))
+        on_step(AlignRecord(stage, step, num_steps, sigma, solved.cost, problem.in_world(solved.state), change))
 
 
 def residual_noise(problem: AlignProblem, pose: Tensor) -> Tensor:
