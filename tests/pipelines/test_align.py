@@ -392,6 +392,7 @@ def test_a_search_finds_what_a_descent_does_not(plain_hand, plain_hand_skin, cle
     for search in ("never", "auto", "always"):
         result = align(plain_hand, clean, misled, model_points=plain_hand_skin, config=AlignConfig(search=search))
         tips[search] = float(offsets(plain_hand, result.pose, truth)[8])
+        assert float((result.history[-1].pose[0, :3] - result.pose[:3]).norm()) < 0.02
         assert [record.stage for record in result.history][-1] == "surface"
     assert tips["auto"] < 0.003
     assert tips["always"] < 0.003
@@ -413,10 +414,18 @@ def test_only_the_problems_that_need_it_are_searched(plain_hand, plain_hand_skin
     near = truth.clone()
     near[6:] += 0.03
     starts, data = torch.stack([near, misled]), clean.repeat(2, 1, 1)
+    apart = torch.tensor([0.0, 0.7, 0.0])
+    starts[1, :3] += apart
+    data[1] += apart
     result = align(plain_hand, data, starts, model_points=plain_hand_skin)
+    # The records of the search are about the second problem alone.
+    assert result.history[-1].pose.shape == (1, 27)
+    assert float((result.history[-1].pose[0, :3] - result.pose[1, :3]).norm()) < 0.02
     plain = align(plain_hand, data, starts, model_points=plain_hand_skin, config=DESCENT)
     torch.testing.assert_close(result.pose[0], plain.pose[0], rtol=0, atol=0)
-    assert float(offsets(plain_hand, result.pose[1], truth)[8]) < 0.003
+    moved = truth.clone()
+    moved[:3] += apart
+    assert float(offsets(plain_hand, result.pose[1], moved)[8]) < 0.003
     assert float(result.cost[1]) <= float(plain.cost[1])
 
 

@@ -8,11 +8,13 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
+import torchreg.pipelines.storage  # noqa: F401  (results of an alignment can be saved)
 from torchreg._checks import as_float_tensor, check_choice, check_positive, check_shape
 from torchreg.correspondence.em import OUTLIER_CONSTANT, expectation
 from torchreg.correspondence.sigma import SigmaSchedule
 from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.kinematics import stack_sizes
 from torchreg.models.skin import BendingSkin, LinearBlendSkin, sample_skin
 from torchreg.models.surface import FusedSurface, SkinSurface, Surface, dense_file_skin
 from torchreg.pipelines.align_objectives import PosePrior
@@ -28,6 +30,7 @@ _UNITS_RATIO = 30.0
 # Fewer inliers than this, or than this share of the data, and the pose means nothing.
 _MIN_INLIERS, _MIN_INLIER_SHARE = 10, 0.02
 _DENSE_SKIN_POINTS = 2500
+_BALL = 3
 # Steps of the surface fit after a search, whose time they hardly add to.
 _SEARCHED_STEPS = 4
 
@@ -49,8 +52,8 @@ class AlignConfig:
         outlier: "limit" for c = 3 sqrt(pi / 2), "volume" for eq. 18 with the working volume.
         debias: share of the pull of a wide kernel on the model itself that is taken from the EM's targets; 0 is the
             paper's EM, which shrinks the model while sigma is wide.
-        prior_std: standard deviation of a weak prior that holds joints near the initial pose, radians (sliding joints:
-            as a share of the model's size); None for no prior.
+        prior_std: standard deviation of a weak prior that holds joints near the initial pose, radians (of the whole
+            rotation of a ball joint; sliding joints: as a share of the model's size); None for no prior.
         num_model_points: points sampled on the shape when none are given.
         sharpness: of the bending skin.
         pose_atol: a pose that changes by no more than this is final, radians (metres: as a share of the model's size).
@@ -68,7 +71,7 @@ class AlignConfig:
     inlier_distance: float | None = None
     outlier: str = "limit"
     debias: float = 0.5
-    prior_std: float | None = 0.3
+    prior_std: float | None = 0.35
     num_model_points: int = 500
     sharpness: float = 2.0
     pose_atol: float = 3e-3
@@ -133,13 +136,6 @@ def align(
     References: Dewaele et al. 2006, section 3.
     """
     config = config or AlignConfig()
-    history: list[AlignRecord] = []
-
-    def record(step: AlignRecord) -> None:
-        history.append(step)
-        if on_step is not None:
-            on_step(step)
-
     with torch.no_grad():
         data, valid = _check_data(shape, data, mask, config.nan_policy)
         pose = shape.rest_pose() if initial_pose is None else shape.check_pose(initial_pose, "initial_pose")
@@ -154,15 +150,38 @@ def align(
         origin = _masked_mean(batch_data, batch_valid)
         problem = _centered_problem(shape, skin, batch_data, batch_valid, pose, origin, config)
         _warn_about_units(problem)
-        pose = torch.cat([pose[:, :3] - origin, pose[:, 3:]], dim=-1)
+        pose = _shifted(pose, -origin)
+        record = _Recorder(on_step, origin)
         final = _descend(problem, pose, config, record)
         if starts:
             best = alignment_cost(problem, final.pose).argmin().unsqueeze(0)
-            problem, pose, origin = problem.rows(best), pose[best], origin[best]
+            problem, pose, origin, record = problem.rows(best), pose[best], origin[best], record.rows(best)
             final = StageResult(final.pose[best], final.sigma[best], final.change[best])
         final = _search_where_needed(problem, final, pose, config, record)
-        result = _result(problem, final, origin, config, tuple(history))
+        result = _result(problem, final, origin, config, tuple(record.history))
         return _unbatched(result, 0) if data.ndim == 2 else result
+
+
+class _Recorder:
+    """Keeps the records of all stages and passes them on, with poses in the coordinates of the data."""
+
+    def __init__(self, on_step: OnStep | None, origin: Tensor, history: list[AlignRecord] | None = None) -> None:
+        self.on_step, self.origin = on_step, origin
+        self.history: list[AlignRecord] = [] if history is None else history
+
+    def __call__(self, step: AlignRecord) -> None:
+        step = replace(step, pose=_shifted(step.pose, self.origin))
+        self.history.append(step)
+        if self.on_step is not None:
+            self.on_step(step)
+
+    def rows(self, index: Tensor) -> _Recorder:
+        """Return a recorder for some rows of the batch, which writes into the same history."""
+        return _Recorder(self.on_step, self.origin[index], self.history)
+
+
+def _shifted(pose: Tensor, offset: Tensor) -> Tensor:
+    return torch.cat([pose[:, :3] + offset, pose[:, 3:]], dim=-1)
 
 
 def _descend(problem: AlignProblem, pose: Tensor, config: AlignConfig, record: OnStep) -> StageResult:
@@ -176,7 +195,7 @@ def _descend(problem: AlignProblem, pose: Tensor, config: AlignConfig, record: O
 
 
 def _search_where_needed(
-    problem: AlignProblem, final: StageResult, start: Tensor, config: AlignConfig, record: OnStep
+    problem: AlignProblem, final: StageResult, start: Tensor, config: AlignConfig, record: _Recorder
 ) -> StageResult:
     """Return the result with better poses where a search found any."""
     if config.search == "never":
@@ -198,9 +217,8 @@ def _search_where_needed(
         rounds=config.search_rounds,
         generator=generator,
     )
-    refined = fit_surface(
-        part, found, steps=max(config.surface_steps, _SEARCHED_STEPS), sigmas=FINAL_SIGMAS, on_step=record
-    )
+    steps = max(config.surface_steps, _SEARCHED_STEPS)
+    refined = fit_surface(part, found, steps=steps, sigmas=FINAL_SIGMAS, on_step=record.rows(rows))
     better = alignment_cost(part, refined.pose) < alignment_cost(part, final.pose[rows])
     pose, change = final.pose.clone(), final.change.clone()
     pose[rows] = torch.where(better.unsqueeze(-1), refined.pose, final.pose[rows])
@@ -229,7 +247,7 @@ def _result(
     inliers = distances.abs() < _inlier_distance(problem, config)
     posed = problem.skin(pose)
     observed = expectation(posed, problem.data, final.sigma, OUTLIER_CONSTANT, mask=problem.valid)
-    world = problem.in_world(pose)
+    world = _shifted(pose, origin)
     statuses = zip(inliers.sum(-1).tolist(), problem.valid.sum(-1).tolist(), final.change.tolist(), strict=True)
     return AlignResult(
         pose=world,
@@ -331,6 +349,9 @@ def _centered_problem(
         slides = shape.chain.couplings.abs().mT @ (1 - shape.chain.is_revolute) > 0
         joints = torch.where(slides, config.prior_std * size, config.prior_std)
         precision[6:] = joints.square().reciprocal()
+        # The three axes of a ball joint share the deviation of its one rotation.
+        balls = [6 + dof for dof, size in enumerate(stack_sizes(shape.chain.tree)) if size >= _BALL]
+        precision[balls] *= _BALL
     return AlignProblem(
         skin=skin,
         surface=_surface(shape, skin),
@@ -343,7 +364,6 @@ def _centered_problem(
         pose_atol=config.pose_atol,
         outlier=config.outlier,
         debias=config.debias,
-        origin=origin,
     )
 
 

@@ -30,6 +30,8 @@ _FINAL_SIGMA_RANGE = (0.003, 0.02)
 # A Welsch kernel of 2.5 standard deviations keeps most of the efficiency of least squares on Gaussian noise.
 _SIGMA_PER_NOISE = 2.5
 _MAD_TO_STD = 1.4826
+# The last width of the surface fit takes this many times the steps of the others.
+_FINAL_STEPS = 3
 # Data that count when asking how many model points share a datum.
 _HELD_POSTERIOR, _MAX_POSTERIOR = 0.3, 1 - 1e-6
 # Damping of the single steps that an EM takes, whose objective changes with every E-step anyway.
@@ -54,7 +56,6 @@ class AlignProblem:
         pose_atol: largest change of a pose that counts as none.
         outlier: "limit" or "volume".
         debias: share of the kernel's own pull that is taken from the targets of the EM.
-        origin: (B, 3) where the origin of data and poses lies in the world, for the records; there by default.
     """
 
     skin: LinearBlendSkin
@@ -68,7 +69,6 @@ class AlignProblem:
     pose_atol: float
     outlier: str = "limit"
     debias: float = 0.0
-    origin: Tensor | None = None
 
     def rows(self, index: Tensor) -> AlignProblem:
         """Return the problems of some rows of the batch, which may repeat."""
@@ -79,7 +79,6 @@ class AlignProblem:
             lower=_rows(self.lower, index),
             upper=_rows(self.upper, index),
             prior=replace(self.prior, mean=self.prior.mean[index]),
-            origin=None if self.origin is None else self.origin[index],
         )
 
     def solve(
@@ -97,10 +96,6 @@ class AlignProblem:
         held = held_at_limits(around.gradient, pose, self.lower, self.upper)
         step = damped_step(around, damping, frozen=held)
         return LMResult(self.clamp(self.skin.shape.retract(pose, step)), around.cost, damping, step, 1)
-
-    def in_world(self, pose: Tensor) -> Tensor:
-        """Return poses (B, num_dofs) in the coordinates of the world."""
-        return pose if self.origin is None else torch.cat([pose[:, :3] + self.origin, pose[:, 3:]], dim=-1)
 
     def change(self, step: Tensor) -> Tensor:
         """Return the largest change (B,) in a step, radians, or metres as a share of the size."""
@@ -234,7 +229,7 @@ def fit_surface(
     Args:
         problem: the batch.
         pose: (B, num_dofs) to start from.
-        steps: damped steps per width, at least one; the last width takes up to twice as many of Levenberg-Marquardt.
+        steps: damped steps per width, at least one; the last width takes up to three times as many, tested.
         sigmas: widths before the last, as shares of the model's size.
         on_step: called after each width.
 
@@ -251,7 +246,7 @@ def fit_surface(
         _report(on_step, "surface", number, len(sigmas) + 1, sigma, solved, problem)
     noise = residual_noise(problem, pose)
     sigma = _SIGMA_PER_NOISE * noise
-    solved = problem.solve(_surface_objective(problem, sigma, noise), pose, 2 * steps)
+    solved = problem.solve(_surface_objective(problem, sigma, noise), pose, _FINAL_STEPS * steps)
     _report(on_step, "surface", len(sigmas), len(sigmas) + 1, sigma, solved, problem)
     return StageResult(solved.state, sigma, problem.change(solved.last_step))
 
@@ -280,7 +275,7 @@ def _report(
 ) -> None:
     if on_step is not None:
         change = problem.change(solved.last_step)
-        on_step(AlignRecord(stage, step, num_steps, sigma, solved.cost, problem.in_world(solved.state), change))
+        on_step(AlignRecord(stage, step, num_steps, sigma, solved.cost, solved.state, change))
 
 
 def residual_noise(problem: AlignProblem, pose: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.primitives import fuse
 from torchreg.models.skin import sample_skin
 from torchreg.pipelines.align import AlignConfig, align
-from torchreg.results import AlignResult, Status
+from torchreg.results import Status
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
 
 # Widths of the surface kernel and range of the last, shares of the shape's size; the last follows from the residuals.
@@ -157,12 +157,13 @@ def calibrate(
         data, valid = _padded(shape, frames, masks, config.align.nan_policy)
         poses = _start_poses(shape, initial_poses, len(data))
         fitted = copy.deepcopy(shape).requires_grad_(False)
-        prior = _Prior.of(shape, poses, config)
+        prior = None
         for number in range(config.rounds):
             skin = sample_skin(fitted, config.align.num_model_points, sharpness=config.align.sharpness)
-            found = align(fitted, data, poses, model_points=skin, mask=valid, config=config.align)
-            aligned = _aligned(found).to(valid.device)
             size = float((skin.points.amax(0) - skin.points.amin(0)).norm())
+            prior = _Prior.of(shape, poses, size, config) if prior is None else prior
+            found = align(fitted, data, poses, model_points=skin, mask=valid, config=config.align)
+            aligned = torch.tensor([status.usable for status in found.statuses], device=valid.device)
             problem = _JointProblem(fitted, data, valid & aligned.unsqueeze(-1), prior, size, config)
             better = problem.unexplained(found.pose) < problem.unexplained(poses)
             poses = torch.where(better.unsqueeze(-1), found.pose, poses)
@@ -172,12 +173,6 @@ def calibrate(
     for parameter, original in zip(fitted.parameters(), shape.parameters(), strict=True):
         parameter.requires_grad_(original.requires_grad)
     return Calibration(fitted, poses, *scales, cost, status if bool(aligned.all()) else Status.FEW_INLIERS)
-
-
-def _aligned(found: AlignResult) -> Tensor:
-    """Return which frames (T,) lie on the shape."""
-    statuses = found.status if isinstance(found.status, tuple) else (found.status,)
-    return torch.tensor([status not in (Status.NO_DATA, Status.FEW_INLIERS) for status in statuses])
 
 
 def _fit(
@@ -227,11 +222,12 @@ class _Prior:
     scale_precision: Tensor
 
     @classmethod
-    def of(cls, shape: ArticulatedShape, poses: Tensor, config: CalibrateConfig) -> _Prior:
-        """Return the prior about a shape and poses."""
+    def of(cls, shape: ArticulatedShape, poses: Tensor, size: float, config: CalibrateConfig) -> _Prior:
+        """Return the prior about a shape of some size and poses."""
         pose_precision = torch.zeros_like(shape.rest)
         if config.align.prior_std is not None:
-            pose_precision[6:] = config.align.prior_std**-2
+            slides = shape.chain.couplings.abs().mT @ (1 - shape.chain.is_revolute) > 0
+            pose_precision[6:] = torch.where(slides, size, 1.0).mul(config.align.prior_std).square().reciprocal()
         scales = torch.cat([shape.log_length_scales, shape.log_radius_scales]).detach()
         radial = torch.arange(len(scales)) >= shape.num_parts
         covariance = (
