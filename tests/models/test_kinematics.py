@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from torchreg.errors import InputError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.models.kinematics import KinematicChain
+from torchreg.models.kinematics import KinematicChain, stack_sizes
 
 ROBOT = """<?xml version="1.0"?>
 <robot name="sample">
@@ -235,3 +235,18 @@ def test_deep_trees_within_the_limit_work_and_deeper_ones_are_refused():
     assert chain(torch.ones(301))[-1, 2, 3] == 301.0
     with pytest.raises(ModelError, match="frame '301' lies 301 frames deep; at most 300 are supported"):
         KinematicChain(line(302))
+
+
+def test_stack_sizes_count_the_axes_of_a_joint():
+    eye = torch.eye(4, dtype=torch.float64)
+    away = eye.clone()
+    away[0, 3] = 0.1
+    joints = (
+        Joint("root", -1, eye),
+        Joint("ball_x", 0, away, "revolute", (1.0, 0.0, 0.0)),
+        Joint("ball_y", 1, eye, "revolute", (0.0, 1.0, 0.0)),
+        Joint("ball_z", 2, eye, "revolute"),
+        Joint("hinge", 3, away, "revolute"),
+        Joint("slide", 4, eye, "prismatic"),
+    )
+    assert stack_sizes(KinematicTree(joints)) == [3, 3, 3, 1, 1]

@@ -184,6 +184,24 @@ def _build_chain(tree: KinematicTree) -> pk.Chain:
     return pk.Chain(frames[0], dtype=torch.float64)
 
 
+def stack_sizes(tree: KinematicTree) -> list[int]:
+    """Return, per degree of freedom, how many revolute frames coincide in its joint: three for a ball joint."""
+    stacks: list[list[int]] = []
+    stack_of: dict[int, int] = {}
+    identity = torch.eye(4, dtype=torch.float64)
+    for index, joint in enumerate(tree.joints):
+        if joint.kind != "revolute":
+            continue
+        if joint.parent in stack_of and torch.equal(joint.offset.double(), identity):
+            stack_of[index] = stack_of[joint.parent]
+            stacks[stack_of[index]].append(index)
+        else:
+            stack_of[index] = len(stacks)
+            stacks.append([index])
+    free = [index for index, joint in enumerate(tree.joints) if joint.kind != "fixed" and joint.mimic is None]
+    return [len(stacks[stack_of[index]]) if index in stack_of else 1 for index in free]
+
+
 def _ancestor_matrix(tree: KinematicTree) -> Tensor:
     ancestors = torch.eye(len(tree), dtype=torch.float64)
     for index, joint in enumerate(tree.joints):

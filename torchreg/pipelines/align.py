@@ -70,8 +70,8 @@ class AlignConfig:
     search_rounds: int = 4
     inlier_distance: float | None = None
     outlier: str = "limit"
-    debias: float = 0.5
-    prior_std: float | None = 0.35
+    debias: float = 0.8
+    prior_std: float | None = 0.3
     num_model_points: int = 500
     sharpness: float = 2.0
     pose_atol: float = 3e-3

@@ -48,8 +48,9 @@ _MIN_GAIN = 0.5
 _CLUSTER_NEIGHBORS = 5
 _CLUSTER_RADIUS = 4.0
 _FAR_NOISES = 3.0
-# A descent that turns the joints (root mean square) or the base further than this, radians, started too far away.
-_TRUSTED_MOTION = 0.2
+# A descent that turns the base or the joints (root mean square), or any one joint, by more radians than this started
+# too far away.
+_TRUSTED_MOTION, _TRUSTED_JOINT = 0.2, 0.4
 _CLUSTER_SHARE, _CLUSTER_MIN = 0.015, 5
 _MAX_CLUSTERED = 2000
 # Candidates times points times parts held at a time.
@@ -62,8 +63,8 @@ def needs_search(problem: AlignProblem, start: Tensor, pose: Tensor) -> Tensor:
     Either it went far from its start, where other minima are as near; or it leaves a dense cluster of data off the
     surface: outliers are thin in space, a limb that was missed is as dense as the rest.
     """
-    joints = (pose - start)[:, 6:]
-    moved = joints.square().sum(-1).div(max(joints.shape[-1], 1)).sqrt()
+    joints = torch.nn.functional.pad((pose - start)[:, 6:].abs(), (0, 1))
+    moved = torch.maximum(joints.square().mean(-1).sqrt(), joints.amax(-1) * (_TRUSTED_MOTION / _TRUSTED_JOINT))
     turned = compose_rotation_vectors(pose[:, 3:6], -start[:, 3:6]).norm(dim=-1)
     return (torch.maximum(moved, turned) > _TRUSTED_MOTION) | _unexplained(problem, pose)
 
