@@ -128,3 +128,8 @@ def test_the_record_has_points_alone_unless_told():
     assert (cloud.normals, cloud.colors, cloud.faces) == (None, None, None)
     with pytest.raises(AttributeError):
         cloud.points = np.ones((2, 3))
+
+
+def test_a_row_without_numbers_is_refused():
+    with pytest.raises(FormatError, match="a vertex holds no numbers"):
+        parse_table([b" ", b""], 3, "vertex")

@@ -147,3 +147,10 @@ def test_the_limit_of_faces_applies(content):
     assert len(read_stl(content, FileLimits(max_faces=2)).faces) == 2
     with pytest.raises(FormatError, match=r"claims 2 faces, allowed are 0 to 1; .* FileLimits\(max_faces=\.\.\.\)"):
         read_stl(content, FileLimits(max_faces=1))
+
+
+def test_every_facet_needs_its_own_three_corners():
+    four = b"facet normal 0 0 1\nouter loop\n" + b"vertex 0 0 0\n" * 4 + b"endloop\nendfacet\n"
+    two = b"facet normal 0 0 1\nouter loop\n" + b"vertex 1 0 0\n" * 2 + b"endloop\nendfacet\n"
+    with pytest.raises(FormatError, match="cut off or damaged"):
+        read_stl(b"solid x\n" + four + two + b"endsolid x\n", DEFAULT_LIMITS)

@@ -33,17 +33,19 @@ def read_stl(content: bytes, limits: FileLimits) -> RawCloud:
 
 
 def _read_ascii(content: bytes, limits: FileLimits) -> Array:
-    rows, opened, closed, ended = list[bytes](), 0, 0, False
+    rows, opened, closed, whole, ended = list[bytes](), 0, 0, True, False
     for line in content.splitlines():
         words = line.split(None, 1)
         key = words[0].lower() if words else b""
         if key == b"vertex":
             rows.append(words[1] if len(words) > 1 else b"")
         opened += key == b"facet"
-        closed += key == b"endfacet"
+        if key == b"endfacet":
+            closed += 1
+            whole = whole and len(rows) == 3 * closed
         ended = key == b"endsolid" if key else ended
     check_count(opened, "faces", limits)
-    if not ended or opened != closed or len(rows) != 3 * opened:
+    if not (ended and whole) or opened != closed or len(rows) != 3 * opened:
         raise FormatError(
             f"holds {opened} facets, {closed} of them closed, with {len(rows)} corners and "
             f"{'an' if ended else 'no'} 'endsolid' at its end: it is cut off or damaged"
