@@ -131,5 +131,5 @@ def test_the_record_has_points_alone_unless_told():
 
 
 def test_a_row_without_numbers_is_refused():
-    with pytest.raises(FormatError, match="a vertex holds no numbers"):
+    with pytest.raises(FormatError, match="each vertex must hold 3 numbers"):
         parse_table([b" ", b""], 3, "vertex")

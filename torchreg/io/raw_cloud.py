@@ -48,7 +48,7 @@ def parse_table(lines: Sequence[bytes], columns: int | None, what: str) -> Array
     if not lines:
         return np.zeros((0, columns or 0))
     if not all(line.strip() for line in lines):
-        raise FormatError(f"a {what} holds no numbers")
+        raise FormatError(f"each {what} must hold {columns or 'equally many'} numbers, got a blank row")
     try:
         table = np.loadtxt([line.decode("ascii") for line in lines], dtype=np.float64, comments=None, ndmin=2)
     except ValueError as error:  # also what is not ASCII
