@@ -92,7 +92,9 @@ def expectation(
 
     References: Dewaele et al. 2006, eqs. 17, 18, 20.
     """
-    batch = torch.broadcast_shapes(model.shape[:-2], data.shape[:-2])
+    batch = model.shape[:-2]
+    if batch != data.shape[:-2]:  # broadcast_shapes is slow, and imports sympy when first called
+        batch = torch.broadcast_shapes(batch, data.shape[:-2])
     flat, num_model, num_data = math.prod(batch), model.shape[-2], data.shape[-2]
     with torch.no_grad():
         model = model.expand(*batch, num_model, 3).reshape(flat, num_model, 3)

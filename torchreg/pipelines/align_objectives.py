@@ -12,6 +12,9 @@ from torchreg.models.skin import LinearBlendSkin
 from torchreg.models.surface import Surface
 from torchreg.solvers.levenberg_marquardt import Linearization
 
+# The base is held, in the Hessian alone, as if by this many data.
+_ANCHOR_DATA = 1.0
+
 
 @dataclass(frozen=True)
 class PosePrior:
@@ -86,14 +89,26 @@ class SurfaceObjective:
         sigma: (B,) kernel width sigma_s, metres.
         noise: (B,) standard deviation of the distances, metres; weighs data against the prior.
         prior: on the joints.
+        lever: length by which a turn of the base moves the shape, metres.
     """
 
     def __init__(
-        self, surface: Surface, data: Tensor, valid: Tensor, sigma: Tensor, noise: Tensor, prior: PosePrior
+        self,
+        surface: Surface,
+        data: Tensor,
+        valid: Tensor,
+        sigma: Tensor,
+        noise: Tensor,
+        prior: PosePrior,
+        lever: float = 1.0,
     ) -> None:
         self.surface, self.data, self.valid, self.prior = surface, data, valid, prior
         self.inverse_square = sigma.square().reciprocal().unsqueeze(-1)
         self.scale = noise.square().reciprocal()
+        # As stiff as one datum: what the data leave free, as sliding along a cylinder, then stays where it is.
+        stiffness = _ANCHOR_DATA * self.inverse_square
+        turns = torch.nn.functional.pad((stiffness * lever**2).expand(-1, 3), (3, prior.mean.shape[-1] - 6))
+        self.anchor = turns + torch.nn.functional.pad(stiffness.expand(-1, 3), (0, prior.mean.shape[-1] - 3))
 
     def __call__(self, pose: Tensor) -> Linearization:
         """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs)."""
@@ -102,4 +117,5 @@ class SurfaceObjective:
         cost = 0.5 * ((1 - beta) * self.valid).sum(-1) / self.inverse_square.squeeze(-1) * self.scale
         weighted = jacobian * (beta * self.valid * self.scale.unsqueeze(-1)).unsqueeze(-1)
         gradient = (weighted.mT @ distance.unsqueeze(-1)).squeeze(-1)
-        return self.prior.add_to(Linearization(cost, gradient, weighted.mT @ jacobian), pose)
+        hessian = weighted.mT @ jacobian + torch.diag_embed(self.anchor)
+        return self.prior.add_to(Linearization(cost, gradient, hessian), pose)

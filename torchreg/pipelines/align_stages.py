@@ -32,6 +32,8 @@ _SIGMA_PER_NOISE = 2.5
 _MAD_TO_STD = 1.4826
 # The last width of the surface fit takes this many times the steps of the others.
 _FINAL_STEPS = 3
+# Typical distance of the surface from the base's axis of rotation, as a share of the model's size.
+_LEVER = 0.25
 # Data that count when asking how many model points share a datum.
 _HELD_POSTERIOR, _MAX_POSTERIOR = 0.3, 1 - 1e-6
 # Damping of the single steps that an EM takes, whose objective changes with every E-step anyway.
@@ -261,7 +263,8 @@ def surface_steps(problem: AlignProblem, pose: Tensor, sigma: Tensor, noise: Ten
 
 
 def _surface_objective(problem: AlignProblem, sigma: Tensor, noise: Tensor) -> SurfaceObjective:
-    return SurfaceObjective(problem.surface, problem.data, problem.valid, sigma, noise, problem.prior)
+    lever = _LEVER * problem.size
+    return SurfaceObjective(problem.surface, problem.data, problem.valid, sigma, noise, problem.prior, lever)
 
 
 def _report(
