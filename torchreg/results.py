@@ -69,7 +69,7 @@ class AlignRecord:
         step: number of the step in its stage.
         num_steps: steps planned in the stage.
         sigma: (B,) kernel width, metres.
-        cost: (B,) objective of the stage after the step.
+        cost: (B,) objective of the stage: after tested steps, before a single untested one.
         pose: (B, num_dofs) after the step.
         pose_change: (B,) largest change of a joint in the step, radians (or metres for sliding joints).
     """
