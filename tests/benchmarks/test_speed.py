@@ -12,5 +12,5 @@ def test_smoke_prints_rates_and_profile(capsys):
     spec.loader.exec_module(module)
     module.main(["--smoke", "--threads", str(torch.get_num_threads())])
     printed = capsys.readouterr().out
-    assert printed.count("alignments/s") == 4
+    assert printed.count("alignments/s") == 5
     assert "operations per alignment" in printed
