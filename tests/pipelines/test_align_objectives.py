@@ -185,8 +185,10 @@ def test_surface_hessian_is_j_transposed_beta_j(arm, surface_objective):
     jacobian = torch.stack(columns, dim=-1)
     sigma, noise = torch.tensor([[[0.02], [0.04]], [[0.004], [0.008]]], dtype=torch.float64)
     beta = (-(arm.distance(objective.data, pose) / sigma).square()).exp() * objective.valid / noise.square()
-    # The base is held by one datum's worth of stiffness: per metre, and per radian at the lever of one metre.
-    anchor = torch.cat([torch.ones(6), torch.zeros(DOFS - 6)]).double() / sigma[..., 0].flatten()[:2, None].square()
+    # The base is held by a tenth of one datum: per metre, and per radian at the lever of one metre.
+    anchor = (
+        torch.cat([torch.full((6,), 0.1), torch.zeros(DOFS - 6)]).double() / sigma[..., 0].flatten()[:2, None].square()
+    )
     expected = jacobian.mT @ (beta.unsqueeze(-1) * jacobian) + torch.diag(some_prior().precision)
     expected = expected + torch.diag_embed(anchor)
     torch.testing.assert_close(objective(pose).hessian, expected, rtol=1e-5, atol=1e-2)

@@ -220,7 +220,7 @@ def test_surface_steps_never_raise_the_cost(skin, truths):
     problem = make_problem(skin, skin(truths))
     width = torch.full((3,), 0.02).double()
     costs = [
-        surface_steps(problem, nudged(skin, truths, 0.1), width, 0.4 * width, steps).cost for steps in (0, 1, 2, 5, 60)
+        surface_steps(problem, nudged(skin, truths, 0.1), width, 0.4 * width, steps).cost for steps in (0, 1, 2, 5, 20)
     ]
     for earlier, later in pairwise(costs):
         assert bool((later <= earlier * (1 + 1e-9)).all())

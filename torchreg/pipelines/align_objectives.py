@@ -12,8 +12,8 @@ from torchreg.models.skin import LinearBlendSkin
 from torchreg.models.surface import Surface
 from torchreg.solvers.levenberg_marquardt import Linearization
 
-# The base is held, in the Hessian alone, as if by this many data.
-_ANCHOR_DATA = 1.0
+# The base is held, in the Hessian alone, as if by this share of a datum: more slows starts that few data reach.
+_ANCHOR_DATA = 0.1
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class SurfaceObjective:
         self.surface, self.data, self.valid, self.prior = surface, data, valid, prior
         self.inverse_square = sigma.square().reciprocal().unsqueeze(-1)
         self.scale = noise.square().reciprocal()
-        # As stiff as one datum: what the data leave free, as sliding along a cylinder, then stays where it is.
+        # What the data leave free, as sliding along a cylinder, then stays where it is.
         stiffness = _ANCHOR_DATA * self.inverse_square
         turns = torch.nn.functional.pad((stiffness * lever**2).expand(-1, 3), (3, prior.mean.shape[-1] - 6))
         self.anchor = turns + torch.nn.functional.pad(stiffness.expand(-1, 3), (0, prior.mean.shape[-1] - 3))
