@@ -4,10 +4,14 @@ import itertools
 import math
 
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchreg.correspondence.sigma import SigmaSchedule
+from torchreg.correspondence.closest import closest_point
+from torchreg.correspondence.em import EStep, expectation, posterior
+from torchreg.correspondence.sigma import SigmaSchedule, estimate_sigma
+from torchreg.correspondence.softassign import assignment, softassign
 from torchreg.errors import InputError, InputTypeError
 
 lengths = st.floats(1e-6, 1e3)
@@ -83,3 +87,51 @@ def test_bad_records_are_refused():
         SigmaSchedule((0.1,), "1")
     with pytest.raises(InputError, match="start must be positive"):
         SigmaSchedule.constant(0.0)
+
+
+def moved_cloud(seed=0):
+    """Model points, data, and the model points moved a little."""
+    generator = torch.Generator().manual_seed(seed)
+    model, data, step = (torch.rand(size, 3, generator=generator, dtype=torch.float64) for size in (12, 20, 12))
+    return model, data, model + 0.1 * step
+
+
+@pytest.mark.parametrize(("e_step", "matrix"), [(expectation, posterior), (softassign, assignment)])
+def test_the_estimate_is_the_maximum_of_the_expected_likelihood(e_step, matrix):
+    model, data, moved = moved_cloud()
+    sigma = torch.tensor(0.2, dtype=torch.float64)
+    alpha, squares = matrix(model, data, sigma), torch.cdist(moved, data).square()
+    found = float(estimate_sigma(e_step(model, data, sigma), model, moved))
+    tried = torch.linspace(0.5 * found, 2 * found, 30_001, dtype=torch.float64)
+    # Eq. 14 as a function of sigma alone: the logarithm of 3-D Gaussians, weighted by the matches.
+    likelihood = -(alpha * squares).sum() / (2 * tried.square()) - 3 * alpha.sum() * tried.log()
+    assert float(tried[likelihood.argmax()]) == pytest.approx(found, rel=1e-4 if e_step is expectation else 1e-2)
+
+
+def test_the_estimate_is_the_deviation_of_the_residuals():
+    generator = torch.Generator().manual_seed(1)
+    model = 10 * torch.rand(4000, 3, generator=generator, dtype=torch.float64)
+    data = model + 0.003 * torch.randn(4000, 3, generator=generator, dtype=torch.float64)
+    observed = closest_point(model, data, torch.tensor(1.0, dtype=torch.float64))
+    assert float(estimate_sigma(observed, model, model)) == pytest.approx(0.003, rel=0.02)
+    shifted = model + torch.tensor([0.004 * math.sqrt(3), 0.0, 0.0], dtype=torch.float64)
+    assert float(estimate_sigma(observed, model, shifted)) == pytest.approx(0.005, rel=0.02)
+
+
+def test_the_estimate_of_nothing_is_zero_and_a_batch_is_a_loop():
+    model, data, moved = moved_cloud()
+    far = expectation(model, data + 100, torch.tensor(0.1, dtype=torch.float64))
+    assert float(estimate_sigma(far, model, moved)) == 0
+    sigma = torch.tensor([0.1, 0.3], dtype=torch.float64)
+    models = torch.stack([model, model + 0.05])
+    together = estimate_sigma(expectation(models, data, sigma), models, models + 0.01)
+    for row in range(2):
+        alone = estimate_sigma(expectation(models[row], data, sigma[row]), models[row], models[row] + 0.01)
+        torch.testing.assert_close(together[row], alone)
+
+
+def test_rounding_cannot_make_the_estimate_negative():
+    nothing = torch.zeros(1)
+    observed = EStep(torch.ones(1), torch.zeros(1, 3), torch.ones(1), torch.tensor(1.0))
+    before = torch.tensor([[1.0, 1e-3, 0.0]])
+    assert float(estimate_sigma(observed, before, nothing.expand(1, 3))) == 0

@@ -6,7 +6,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
+import torch
+from torch import Tensor
+
 from torchreg._checks import check_choice, check_positive
+from torchreg.correspondence.em import EStep
 from torchreg.errors import InputError, InputTypeError
 
 
@@ -87,11 +91,36 @@ class SigmaSchedule:
     def adaptive(cls, start: float, stop: float, steps: int = 20) -> SigmaSchedule:
         """Return the conventional schedule: sigma is re-estimated from the residuals, never below ``stop``.
 
+        Each M-step ends with the sigma that maximizes eq. 19 (see `estimate_sigma`), between ``start`` and ``stop``.
         The paper observes that it falls too quickly and gets trapped; it is here for comparison. Arguments and errors
         are those of `geometric`.
         """
         _check_range(start, stop, steps)
         return cls((start, stop), steps, "adaptive")
+
+
+def estimate_sigma(observed: EStep, before: Tensor, after: Tensor) -> Tensor:
+    """Return the sigma that the M-step of a conventional EM estimates from the points that it moved.
+
+    ``sigma^2 = sum_ij alpha_ij |Y_j - T(X_i)|^2 / (3 sum_ij alpha_ij)`` with the matches of the E-step and the moved
+    points, as in Coherent Point Drift. Zero where no datum is held.
+
+    Args:
+        observed: the E-step at ``before``.
+        before: (..., N, 3) model points that the E-step saw, metres.
+        after: (..., N, 3) the same points after the M-step, metres.
+
+    Returns:
+        (...), metres.
+
+    Differentiable: in ``before`` and ``after``.
+
+    References: Dewaele et al. 2006, section 3.3; Myronenko and Song 2010.
+    """
+    nearer = (before - observed.targets).square().sum(-1) - (after - observed.targets).square().sum(-1)
+    squares = observed.squared_error - (observed.weights * nearer).sum(-1)
+    held = observed.weights.sum(-1).clamp_min(torch.finfo(squares.dtype).tiny)
+    return (squares.clamp_min(0) / (3 * held)).sqrt()
 
 
 def _check_range(start: float, stop: float, steps: int) -> None:
