@@ -17,9 +17,10 @@ _MIN_FREE_SHARE = 0.05
 _CHUNK_ENTRIES = 2_000_000
 # Below this ratio of extent to sigma the expanded square |x|^2 - 2 xy + |y|^2 moves no exponent by more than 0.02.
 _MAX_EXPANDED_RATIO = {torch.float32: 128.0, torch.float64: 3e6}
-# exp(-60) = 9e-27 is nothing beside any outlier constant; the kernel is zero from just above it.
-_MIN_EXPONENT = -60.0
-_MIN_KERNEL = 1e-26
+# The kernel is taken to base 2, whose power costs a quarter of exp() on a CPU.
+_LOG2_E = 1 / math.log(2)
+# A kernel of 1e-26 is nothing beside any outlier constant; from there it is zero.
+_MIN_EXPONENT = math.log2(1e-26)
 # Beyond this ratio squares may overflow; every sigma that small holds coincident points only.
 _MAX_RATIO = 1e15
 
@@ -109,11 +110,12 @@ def expectation(
         scale = (2**-0.5 / sigma)[:, None, None]
         scaled_model, scaled_data = offset * scale, data * scale
         weights, moments, inlier = _accumulate(scaled_model, scaled_data, outlier, valid, expand)
-        held = weights.unsqueeze(-1) > torch.finfo(weights.dtype).tiny
-        scaled_targets = torch.where(held, moments / weights.unsqueeze(-1), scaled_model)
-        targets = torch.where(held, scaled_targets / scale + center, model)
+        # G_i - X_i, zero where a model point holds nothing.
+        mass = weights.unsqueeze(-1)
+        pull = torch.addcmul(moments, mass, scaled_model, value=-1) / mass.clamp_min(torch.finfo(model.dtype).tiny)
+        targets = model + pull / scale
         # sum_j alpha |Y - X|^2 splits into the spread of the held data and their offset from the model point.
-        squares = _squared_error(scaled_model, scaled_data, scaled_targets, weights, inlier) / scale[:, 0, 0].square()
+        squares = _squared_error(scaled_data, scaled_model + pull, pull, weights, inlier) / scale[:, 0, 0].square()
     return EStep(
         weights.reshape(*batch, num_model),
         targets.reshape(*batch, num_model, 3),
@@ -191,16 +193,16 @@ def _centered(data: Tensor, valid: Tensor | None) -> tuple[Tensor, Tensor]:
         return data - center, center
     valid = valid.unsqueeze(-1)
     count = valid.sum(-2, keepdim=True).clamp_min(1)
-    center = torch.where(valid, data, 0.0).sum(-2, keepdim=True) / count
-    return torch.where(valid, data - center, 0.0), center
+    data = data.masked_fill(~valid, 0.0)
+    center = data.sum(-2, keepdim=True) / count
+    return (data - center) * valid, center
 
 
 def _accumulate(
     model: Tensor, data: Tensor, outlier: Tensor, valid: Tensor | None, expand: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return lambda (B, N), sum_j alpha_ij Y_j (B, N, 3) and the inlier posterior (B, M) of scaled points."""
-    weights, moments = torch.zeros_like(model[..., 0]), torch.zeros_like(model)
-    inlier = torch.zeros_like(data[..., 0])
+    gathered, inlier = model.new_zeros(model.shape[0], 4, model.shape[1]), torch.zeros_like(data[..., 0])
     for rows, columns in _chunks(model.shape[0], model.shape[1], data.shape[1]):
         part = data[rows, columns]
         kernel = gaussian_kernel(model[rows], part, expand=expand)
@@ -208,13 +210,11 @@ def _accumulate(
         share = (total + outlier[rows, None]).reciprocal()
         if valid is not None:
             share = share * valid[rows, columns]
-        inlier[rows, columns] = total * share
+        torch.mul(total, share, out=inlier[rows, columns])
         # With the data along the last dimension this product is five times as fast as with them along the first.
-        payload = torch.cat([torch.ones_like(part[..., :1]), part], dim=-1).mT * share.unsqueeze(-2)
-        gathered = payload.contiguous() @ kernel.mT
-        weights[rows] += gathered[:, 0]
-        moments[rows] += gathered[:, 1:].mT
-    return weights, moments, inlier
+        payload = torch.cat([part, torch.ones_like(part[..., :1])], dim=-1).mT * share.unsqueeze(-2)
+        gathered[rows] += payload.contiguous() @ kernel.mT
+    return gathered[:, 3], gathered[:, :3].mT, inlier
 
 
 def _chunks(batch: int, num_model: int, num_data: int) -> Iterator[tuple[slice, slice]]:
@@ -228,7 +228,7 @@ def _chunks(batch: int, num_model: int, num_data: int) -> Iterator[tuple[slice, 
 
 
 def gaussian_kernel(model: Tensor, data: Tensor, *, expand: bool) -> Tensor:
-    """Return ``exp(-|x - y|^2)`` of scaled points, zero below 1e-26.
+    """Return ``exp(-|x - y|^2)`` of scaled points, zero up to 1e-26.
 
     Args:
         model: (B, N, 3), in units of sqrt(2) sigma.
@@ -242,27 +242,27 @@ def gaussian_kernel(model: Tensor, data: Tensor, *, expand: bool) -> Tensor:
     Differentiable: no; it works in place.
     """
     if expand:
-        left = torch.cat([2 * model, -model.square().sum(-1, keepdim=True), -torch.ones_like(model[..., :1])], dim=-1)
+        square = model.square().sum(-1, keepdim=True)
+        left = torch.cat([2 * model, -square, -torch.ones_like(square)], dim=-1) * _LOG2_E
         right = torch.cat([data, torch.ones_like(data[..., :1]), data.square().sum(-1, keepdim=True)], dim=-1)
-        exponent = (left @ right.mT).clamp_(_MIN_EXPONENT, 0)
+        exponent = left @ right.mT
     else:
         exponent = model[..., 0:1] - data[..., 0].unsqueeze(-2)
         exponent.mul_(exponent)
         for axis in (1, 2):
             difference = model[..., axis : axis + 1] - data[..., axis].unsqueeze(-2)
             exponent.add_(difference.mul_(difference))
-        exponent.neg_().clamp_min_(_MIN_EXPONENT)
-    # Where exp() underflows it takes ten times as long, and so does arithmetic on what it leaves.
-    return torch.threshold_(exponent.exp_(), _MIN_KERNEL, 0.0)
+        exponent.mul_(-_LOG2_E)
+    # Where a power underflows it takes many times as long, and so does arithmetic on what it leaves.
+    return torch.threshold_(exponent, _MIN_EXPONENT, -math.inf).exp2_()
 
 
 def _extent(model: Tensor, data: Tensor) -> Tensor:
-    both = [points.abs().amax() for points in (model, data) if points.numel() > 0]
+    both = [torch.linalg.vector_norm(points, math.inf) for points in (model, data) if points.numel() > 0]
     return torch.stack(both).amax() if both else model.new_zeros(())
 
 
-def _squared_error(model: Tensor, data: Tensor, targets: Tensor, weights: Tensor, inlier: Tensor) -> Tensor:
+def _squared_error(data: Tensor, targets: Tensor, pull: Tensor, weights: Tensor, inlier: Tensor) -> Tensor:
     held_square = (inlier * data.square().sum(-1)).sum(-1)
     mean_square = (weights * targets.square().sum(-1)).sum(-1)
-    offset = (weights * (targets - model).square().sum(-1)).sum(-1)
-    return (held_square - mean_square).clamp_min(0) + offset
+    return (held_square - mean_square).clamp_min(0) + (weights * pull.square().sum(-1)).sum(-1)
