@@ -70,7 +70,7 @@ def test_the_version_is_the_installed_one():
 
 def test_running_the_package_runs_the_command_line(monkeypatch):
     calls = []
-    monkeypatch.setitem(sys.modules, "torchreg.cli", SimpleNamespace(main=lambda: calls.append("main")))
+    monkeypatch.setitem(sys.modules, "torchreg.cli.application", SimpleNamespace(main=lambda: calls.append("main")))
     runpy.run_module("torchreg", run_name="__main__")
     assert calls == ["main"]
     runpy.run_module("torchreg.__main__", run_name="imported")

@@ -41,8 +41,8 @@ OWNERS = {
     "matplotlib": {"viz"},
     "viser": {"viz"},
     "plotly": {"viz"},
-    "typer": {"cli", "cli.py"},
-    "tqdm": {"cli", "cli.py"},
+    "typer": {"cli"},
+    "tqdm": {"cli"},
 }
 LAZY = {"matplotlib", "viser", "plotly"}
 LOWEST_THIRD_PARTY = {"errors.py": set(), "results.py": {"torch"}, "metrics.py": {"torch"}, "_checks.py": {"torch"}}
@@ -188,7 +188,7 @@ def test_the_layer_check_finds_what_is_wrong(path, source):
         ),
         ("models/hand.py", "from torchreg.io.urdf import read\nfrom torchreg.errors import ModelError\nimport math"),
         ("models/hand.py", "from ..geometry.mesh import TriangleMesh"),
-        ("cli.py", "from torchreg import __version__\nfrom torchreg import metrics"),
+        ("cli/application.py", "from torchreg import __version__\nfrom torchreg import metrics"),
     ],
 )
 def test_the_layer_check_accepts_what_is_right(path, source):

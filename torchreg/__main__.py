@@ -1,6 +1,6 @@
 """``python -m torchreg``: the command line."""
 
-from torchreg.cli import main
+from torchreg.cli.application import main
 
 if __name__ == "__main__":
     main()

@@ -1,0 +1,171 @@
+"""Aligning from the command line: what is printed and written, options, errors, interruptions."""
+
+import json
+import math
+import warnings
+
+import pytest
+import torch
+
+import torchreg
+import torchreg.pipelines.align as align_module
+from torchreg.io.points import load_points, save_points
+from torchreg.models.hand import Hand
+from torchreg.pipelines.align import AlignConfig
+from torchreg.pipelines.storage import load
+from torchreg.results import Status
+
+QUICK = ("--search", "never")
+
+
+def watch_align(monkeypatch, interrupted=None):
+    """Let `align` note its starts, and be interrupted in the given call."""
+    original, starts = align_module.align, []
+
+    def watched(shape, data, initial_pose, **options):
+        if len(starts) == interrupted:
+            raise KeyboardInterrupt
+        starts.append(initial_pose)
+        return original(shape, data, initial_pose, **options)
+
+    monkeypatch.setattr(align_module, "align", watched)
+    return starts
+
+
+def test_one_cloud_is_aligned_and_everything_asked_for_is_written(run, folder, tmp_path):
+    answer = run(
+        "align", "hand", folder / "cloud0.ply", "-o", tmp_path / "r", "--start", folder / "truth0.json",
+        "--pose", tmp_path / "pose.json", "--ply", tmp_path / "skin.ply", "--picture", tmp_path / "p.png",
+        "--gltf", tmp_path / "hand.glb", *QUICK,
+    )  # fmt: skip
+    assert answer.exit_code == 0, answer.output
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "hand.glb", "p.png", "pose.json", "r.json", "r.safetensors", "skin.ply"
+    ]  # fmt: skip
+    result = load(tmp_path / "r.safetensors")
+    assert f"{int(result.inliers.sum())} of 375 points inliers, rms " in answer.output
+    near = result.distances[result.inliers]
+    assert f"rms {1000 * math.sqrt(sum(d * d for d in near.tolist()) / len(near)):.2f} mm" in answer.output
+    assert result.status.value in answer.output
+    named = json.loads((tmp_path / "pose.json").read_text(encoding="utf-8"))
+    assert list(named) == list(Hand().dof_names)
+    assert list(named.values()) == pytest.approx(result.pose.tolist())
+    assert torch.allclose(load_points(tmp_path / "skin.ply").points, result.registered, atol=1e-6)
+    truth = json.loads((folder / "truth0.json").read_text(encoding="utf-8"))
+    assert abs(named["index_mcp_flexion"] - truth["index_mcp_flexion"]) < 0.15
+
+
+def test_clouds_are_numbered_and_each_starts_from_the_pose_before(run, folder, tmp_path, monkeypatch):
+    starts = watch_align(monkeypatch)
+    clouds = [folder / f"cloud{index}.ply" for index in range(3)]
+    answer = run("align", "hand", *clouds, "-o", tmp_path / "r.safetensors", "--start", folder / "truth0.json", *QUICK)
+    assert answer.exit_code == 0, answer.output
+    assert sorted(path.name for path in tmp_path.glob("*.safetensors")) == [f"r_{k}.safetensors" for k in (1, 2, 3)]
+    poses = [load(tmp_path / f"r_{k}.safetensors").pose for k in (1, 2, 3)]
+    assert torch.equal(starts[1], poses[0])
+    assert torch.equal(starts[2], poses[1])
+
+
+def test_an_interruption_leaves_the_finished_clouds_on_disk(run, folder, tmp_path, monkeypatch):
+    watch_align(monkeypatch, interrupted=2)
+    clouds = [folder / f"cloud{index}.ply" for index in range(4)]
+    out = ("-o", tmp_path / "r", "--gltf", tmp_path / "hand.glb", "--start", folder / "truth0.json")
+    answer = run("align", "hand", *clouds, *out, *QUICK)
+    assert answer.exit_code == 130
+    assert "torchreg: interrupted; 2 of 4 clouds are done" in answer.output
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "hand.glb", "r_1.json", "r_1.safetensors", "r_2.json", "r_2.safetensors"
+    ]  # fmt: skip
+
+
+def test_a_result_is_a_start_and_quiet_is_quiet(run, folder, tmp_path, monkeypatch):
+    starts = watch_align(monkeypatch)
+    command = ("align", "hand", folder / "cloud0.ply", "--quiet", *QUICK)
+    answer = run(*command, "-o", tmp_path / "a", "--start", folder / "truth0.json")
+    assert (answer.exit_code, answer.output) == (0, "")
+    assert run(*command, "-o", tmp_path / "b", "--start", tmp_path / "a.safetensors").exit_code == 0
+    assert torch.equal(starts[1], load(tmp_path / "a.safetensors").pose)
+
+
+def test_the_unit_of_the_cloud_and_the_schedule_are_options(run, folder, tmp_path, monkeypatch):
+    meters = load_points(folder / "cloud0.ply").points
+    save_points(tmp_path / "mm.xyz", 1000 * meters)
+    seen = []
+
+    def noted(shape, data, initial_pose, *, config, model_points, on_step):
+        seen.append((data, initial_pose, config))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(align_module, "align", noted)
+    run(
+        "align", "hand-left", tmp_path / "mm.xyz", "--scale", "0.001", "--sigma", "0.02:0.005:3", "--outlier", "volume",
+        "--search", "always", "-o", tmp_path / "r",
+    )  # fmt: skip
+    ((data, start, config),) = seen
+    assert torch.allclose(data, meters, atol=1e-6)
+    assert config == AlignConfig(
+        schedule=torchreg.SigmaSchedule.geometric(0.02, 0.005, 3), outlier="volume", search="always"
+    )
+    # Without a start: at rest, in the middle of the cloud.
+    assert torch.equal(start[3:], torch.zeros(24))
+    hand = Hand("left")
+    assert (hand.keypoints(start).mean(0) - meters.mean(0)).norm() < 0.08
+
+
+def test_millimeters_taken_for_meters_are_warned_of(run, folder, tmp_path):
+    save_points(tmp_path / "mm.ply", 1000 * load_points(folder / "cloud0.ply").points)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        answer = run("align", "hand", tmp_path / "mm.ply", "-o", tmp_path / "r", *QUICK)
+    assert answer.exit_code == 1, answer.output
+    assert "torchreg: warning: the data spread over" in answer.output
+    assert load(tmp_path / "r.safetensors").status is Status.FEW_INLIERS
+
+
+def test_points_that_are_not_finite_are_refused_or_left_out(run, error_of, folder, tmp_path):
+    text = "nan 0 0\n" + "\n".join(" ".join(map(str, p)) for p in load_points(folder / "cloud0.ply").points.tolist())
+    (tmp_path / "c.xyz").write_text(text, encoding="utf-8")
+    command = ("align", "hand", tmp_path / "c.xyz", "-o", tmp_path / "r", "--start", folder / "truth0.json", *QUICK)
+    assert "1 of 376 points are not finite" in error_of(*command)
+    assert run(*command, "--nan-policy", "omit").exit_code == 0
+
+
+def test_a_robot_is_aligned(run, folder, tmp_path):
+    for options, base in (((), "free"), (("--fixed-base",), "fixed")):
+        out = tmp_path / base
+        answer = run("align", folder / "arm.urdf", folder / "arm.npz", "-o", out, *options, *QUICK)
+        assert answer.exit_code == 0, answer.output
+        pose = load(out.with_suffix(".safetensors")).pose
+        assert abs(pose[0].item() - (0.02 if base == "free" else 0.0)) < 0.005
+
+
+def test_a_rig_with_a_flat_hierarchy_is_aligned(run, error_of, folder, tmp_path):
+    assert "3 roots" in error_of("info", folder / "flat.glb")
+    command = ("align", folder / "flat.glb", folder / "flat.glb", "--parents", folder / "parents.json")
+    answer = run(*command, "-o", tmp_path / "r", *QUICK)
+    assert answer.exit_code == 0, answer.output
+    assert load(tmp_path / "r.safetensors").distances.abs().median() < 0.002
+
+
+def test_errors_are_one_line(error_of, folder, tmp_path):
+    cloud, out = folder / "cloud0.ply", ("-o", tmp_path / "r")
+    damaged = tmp_path / "damaged.ply"
+    damaged.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 5\n")
+    (tmp_path / "list.json").write_text("[1]", encoding="utf-8")
+    for arguments, message in [
+        ((cloud, tmp_path / "none.ply", *out), "none.ply: No such file or directory"),
+        ((damaged, *out), "damaged.ply: "),
+        ((cloud, *out, "--start", tmp_path / "none.json"), "none.json: No such file or directory"),
+        ((cloud, *out, "--start", tmp_path / "list.json"), "list.json must have shape (27)"),
+        ((cloud, *out, "--sigma", "0.02:0.005"), "--sigma must be START:STOP:STEPS as in 0.02:0.005:5"),
+        ((cloud, *out, "--sigma", "0.01:0.02:5"), "stop must not exceed start"),
+        ((cloud, *out, "--search", "maybe"), "search must be one of auto, always, never; got 'maybe'"),
+        ((cloud, *out, "--scale", "0"), "--scale must be positive and finite, got 0.0"),
+        ((cloud, *out, "--fixed-base"), "--free-base/--fixed-base has no meaning for hand"),
+        ((cloud, *out, "--parents", folder / "parents.json"), "--parents has no meaning for hand"),
+        ((cloud, "-o", tmp_path / "no" / "r"), "no does not exist; create it first"),
+        ((cloud, *out, "--picture", tmp_path / "p.bmp"), "p.bmp must end in .png, .pdf, .svg"),
+        ((cloud, *out, "--pose", tmp_path / "r.json"), "two outputs would be called"),
+    ]:
+        assert message in error_of("align", "hand", *arguments), arguments
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".json", ".ply"]

@@ -1,0 +1,40 @@
+"""The application: a quick help, every command in it, one thread unless told otherwise."""
+
+import os
+import subprocess
+import sys
+import time
+
+import torchreg
+from torchreg.cli import application
+
+
+def test_help_is_quick():
+    seconds = []
+    for _ in range(3):
+        started = time.perf_counter()
+        answer = subprocess.run(
+            [sys.executable, "-m", "torchreg", "--help"], capture_output=True, text=True, timeout=60
+        )
+        seconds.append(time.perf_counter() - started)
+        assert answer.returncode == 0
+        assert all(name in answer.stdout for name in ("align", "demo", "figure", "info"))
+    assert min(seconds) < 0.6
+
+
+def test_every_command_explains_itself(run):
+    for command in ("align", "demo", "figure", "info"):
+        assert "Usage:" in run(command, "--help").output
+    assert "poses are not searched" in " ".join(run("align", "--help").output.split())
+    assert run("--version").output == f"torchreg {torchreg.__version__}\n"
+    assert run("algin").exit_code == 2
+
+
+def test_main_runs_the_application_on_one_thread_unless_told_otherwise(monkeypatch):
+    calls = []
+    monkeypatch.setattr(application, "app", lambda **options: calls.append((options, os.environ["OMP_NUM_THREADS"])))
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    application.main()
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    application.main()
+    assert calls == [({"prog_name": "torchreg"}, "3"), ({"prog_name": "torchreg"}, "1")]

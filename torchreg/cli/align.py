@@ -1,0 +1,192 @@
+"""``torchreg align``: a shape to point clouds, one after another."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from torchreg.cli.align_options import (
+    NanPolicy,
+    Outlier,
+    Scale,
+    Search,
+    Sigma,
+    read_cloud,
+    read_schedule,
+    summary,
+    write_pose,
+)
+from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending
+from torchreg.cli.reporting import UNUSABLE, interruption, reporting
+from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, load_shape
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchreg.models.articulated import ArticulatedShape
+    from torchreg.models.skin import LinearBlendSkin
+    from torchreg.pipelines.align import AlignConfig
+    from torchreg.results import AlignResult
+
+
+@dataclass(frozen=True)
+class _Files:
+    """Where the outputs of one cloud go."""
+
+    result: Path
+    pose: Path | None
+    ply: Path | None
+    picture: Path | None
+
+    def all(self) -> Iterable[Path | None]:
+        yield from (self.result, self.result.with_suffix(".json"), self.pose, self.ply, self.picture)
+
+
+@reporting
+def align(
+    shape: Shape,
+    clouds: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="CLOUD",
+            help="Point clouds (.ply, .pcd, .xyz, .txt, .obj, .stl, .glb, .npz), metres; several are taken for the "
+            "frames of a motion, and each starts from the pose before.",
+        ),
+    ],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="RESULT", help="RESULT.safetensors and RESULT.json are written.")
+    ] = Path("result"),
+    start: Annotated[
+        Path | None,
+        typer.Option(
+            help="Pose to start from: a result, or .json with numbers or {degree of freedom: number}, or .npz. By "
+            "default the rest pose is moved to the mean of the cloud and not turned: poses are not searched for yet."
+        ),
+    ] = None,
+    sigma: Sigma = None,
+    outlier: Outlier = "limit",
+    search: Search = "auto",
+    nan_policy: NanPolicy = "raise",
+    scale: Scale = 1.0,
+    parents: Parents = None,
+    package_dir: PackageDir = None,
+    free_base: FreeBase = None,
+    pose: Annotated[Path | None, typer.Option(help="Also write the pose by name of degree of freedom (.json).")] = None,
+    ply: Annotated[Path | None, typer.Option(help="Also write the registered model points (.ply).")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Also draw shape and data (.png, .pdf, .svg).")] = None,
+    gltf: Annotated[
+        Path | None, typer.Option(help="Also write the moving shape, all clouds in one file (.glb).")
+    ] = None,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """Align a shape to point clouds.
+
+    With several clouds, the names of the outputs are numbered: RESULT_1, RESULT_2, ... Ctrl-C leaves those of the
+    finished clouds on disk.
+
+    Exit codes: 0; 1 if an alignment found too few inliers to mean anything; 2 for an error; 130 for Ctrl-C.
+    """
+    output = with_ending(output, (".safetensors",), add=True)
+    optional = with_ending(pose, (".json",)), with_ending(ply, (".ply",)), with_ending(picture, PICTURE_ENDINGS)
+    count = len(clouds)
+    files = [_Files(numbered(output, k, count), *(numbered(name, k, count) for name in optional)) for k in range(count)]
+    check_outputs([*(path for entry in files for path in entry.all()), with_ending(gltf, (".glb",))], force)
+    for place in clouds:
+        place.stat()  # a missing file is told before the first is aligned
+
+    from tqdm import tqdm
+
+    with tqdm(total=count, unit="cloud", desc="reading", leave=False, disable=quiet) as bar:
+        model = load_shape(shape, parents, package_dir, free_base)
+        from torchreg.models.skin import sample_skin
+        from torchreg.pipelines.align import AlignConfig
+        from torchreg.pipelines.storage import load_pose
+
+        config = AlignConfig(schedule=read_schedule(sigma), outlier=outlier, search=search, nan_policy=nan_policy)
+        first = None if start is None else load_pose(start, model)
+        skin = sample_skin(model, config.num_model_points, sharpness=config.sharpness)
+        run = _AlignRun(model, config, skin, scale, first)
+        interrupted = False
+        try:
+            for place, entry in zip(clouds, files, strict=True):
+                bar.set_description(place.name)
+                result = run.align(place, entry, on_step=lambda record: _show_stage(bar, record.stage))
+                bar.update()
+                if not quiet:
+                    bar.write(f"{place}: {summary(result)} -> {entry.result}")
+        except KeyboardInterrupt:
+            interrupted = True
+        if gltf is not None and run.results:
+            run.save_motion(gltf)
+    if interrupted:
+        raise interruption(f"{len(run.results)} of {count} clouds are done")
+    if not all(result.statuses[0].usable for result in run.results):
+        raise typer.Exit(UNUSABLE)
+
+
+def _show_stage(bar: Any, stage: str) -> None:
+    if not bar.disable and bar.postfix != stage:
+        bar.set_postfix_str(stage)
+
+
+@dataclass
+class _AlignRun:
+    """Aligns clouds one after another and writes what was asked for."""
+
+    shape: ArticulatedShape
+    config: AlignConfig
+    skin: LinearBlendSkin
+    scale: float
+    start: Tensor | None
+    results: list[AlignResult] = field(default_factory=list)
+
+    @functools.cached_property
+    def surface(self) -> LinearBlendSkin:
+        """The surface that pictures show, meshed once."""
+        from torchreg.datasets.hand import surface_skin
+
+        return surface_skin(self.shape)
+
+    def align(self, place: Path, files: _Files, on_step: Callable[[Any], None]) -> AlignResult:
+        """Return the alignment to one cloud, which is on disk then."""
+        from torchreg.pipelines.align import align
+        from torchreg.pipelines.demo import moved_to_mean
+
+        data = read_cloud(place, self.scale, self.config.nan_policy)
+        start = moved_to_mean(self.skin, self.shape.rest_pose(), data) if self.start is None else self.start
+        result = align(self.shape, data, start, model_points=self.skin, config=self.config, on_step=on_step)
+        self._write(result, data, files)
+        self.results.append(result)
+        if result.statuses[0].usable:
+            self.start = result.pose
+        return result
+
+    def _write(self, result: AlignResult, data: Tensor, files: _Files) -> None:
+        if files.pose is not None:
+            write_pose(files.pose, self.shape, result.pose)
+        if files.ply is not None:
+            from torchreg.io.points import save_points
+
+            save_points(files.ply, result.registered)
+        if files.picture is not None:
+            from torchreg.viz.figures import draw_alignment, save_picture
+
+            ax = draw_alignment(None, self.shape, result.pose, data, result.inliers, skin=self.surface)
+            save_picture(ax.get_figure(), files.picture)  # type: ignore[arg-type]
+        # The result comes last: where it is, the others are.
+        result.save(files.result)
+
+    def save_motion(self, path: Path) -> None:
+        """Write all poses found as an animation."""
+        import torch
+
+        from torchreg.viz.gltf import save_shape_animation
+
+        poses = torch.stack([result.pose for result in self.results])
+        save_shape_animation(path, self.shape, poses, skin=self.surface)

@@ -1,0 +1,66 @@
+"""What commands that fit a shape to point clouds have in common: their arguments, and how those are read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from torchreg.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchreg.correspondence.sigma import SigmaSchedule
+    from torchreg.models.articulated import ArticulatedShape
+    from torchreg.results import AlignResult
+
+Sigma = Annotated[
+    str | None, typer.Option(metavar="START:STOP:STEPS", help="Widths of the EM, metres, as in 0.02:0.005:5.")
+]
+Outlier = Annotated[str, typer.Option(help="Outlier class: limit, or volume for eq. 18 of the paper.")]
+Search = Annotated[str, typer.Option(help="Look for better poses around the start: auto, always or never.")]
+NanPolicy = Annotated[str, typer.Option(help="Non-finite points: raise, or omit.")]
+Scale = Annotated[float, typer.Option(help="Unit of the clouds in metres; 0.001 for millimeters.")]
+
+
+def read_schedule(text: str | None) -> SigmaSchedule | None:
+    """Return the schedule that START:STOP:STEPS describes, None for None."""
+    if text is None:
+        return None
+    from torchreg.correspondence.sigma import SigmaSchedule
+
+    try:
+        start, stop, steps = text.split(":")
+        values = float(start), float(stop), int(steps)
+    except ValueError:
+        raise InputError(f"--sigma must be START:STOP:STEPS as in 0.02:0.005:5, got {text!r}") from None
+    return SigmaSchedule.geometric(*values)
+
+
+def read_cloud(place: Path, scale: float, nan_policy: str) -> Tensor:
+    """Return the points (M, 3) of a file, metres."""
+    from torchreg._checks import check_positive
+    from torchreg.io.points import load_points
+
+    check_positive(scale, "--scale")
+    return load_points(place, nan_policy=nan_policy).points * scale
+
+
+def write_pose(path: Path, shape: ArticulatedShape, pose: Tensor) -> None:
+    """Write a pose (num_dofs,) as JSON, by name of degree of freedom."""
+    import json
+
+    from torchreg.io.atomic import write_atomic
+
+    named = dict(zip(shape.dof_names, pose.tolist(), strict=True))
+    write_atomic(path, (json.dumps(named, indent=2) + "\n").encode())
+
+
+def summary(result: AlignResult) -> str:
+    """Return what an alignment came to, in one line."""
+    near = result.distances[result.inliers]
+    rms = f"rms {1e3 * float(near.square().mean().sqrt()):.2f} mm, " if len(near) else ""
+    counts = f"{len(near)} of {len(result.distances)} points inliers"
+    return f"{result.statuses[0].value}, {counts}, {rms}cost {float(result.cost):.4g}"

@@ -1,0 +1,56 @@
+"""The files that a command writes: their endings, their numbers, and that nothing is overwritten unasked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, overload
+
+import typer
+
+from torchreg.errors import InputError
+
+PICTURE_ENDINGS = (".png", ".pdf", ".svg")
+
+Force = Annotated[bool, typer.Option("--force", help="Overwrite outputs that exist.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="Print nothing but errors.")]
+
+
+@overload
+def with_ending(path: Path, endings: Sequence[str], *, add: bool = ...) -> Path: ...
+@overload
+def with_ending(path: None, endings: Sequence[str], *, add: bool = ...) -> None: ...
+@overload
+def with_ending(path: Path | None, endings: Sequence[str], *, add: bool = ...) -> Path | None: ...
+def with_ending(path: Path | None, endings: Sequence[str], *, add: bool = False) -> Path | None:
+    """Return the path, its ending added where asked for; InputError if the ending is none of those allowed."""
+    if path is None or path.suffix.lower() in endings:
+        return path
+    if add:
+        return path.with_name(path.name + endings[0])
+    raise InputError(f"{path} must end in {', '.join(endings)}; rename the output")
+
+
+@overload
+def numbered(path: Path, index: int, count: int) -> Path: ...
+@overload
+def numbered(path: None, index: int, count: int) -> None: ...
+@overload
+def numbered(path: Path | None, index: int, count: int) -> Path | None: ...
+def numbered(path: Path | None, index: int, count: int) -> Path | None:
+    """Return the path for output number ``index`` of ``count``: itself if there is one only, else as in name_01.ply."""
+    if path is None or count == 1:
+        return path
+    return path.with_name(f"{path.stem}_{index + 1:0{len(str(count))}}{path.suffix}")
+
+
+def check_outputs(paths: Iterable[Path | None], force: bool) -> None:
+    """Raise before any work is done if an output cannot be written, or exists and may not be overwritten."""
+    wanted = [path for path in paths if path is not None]
+    for path in wanted:
+        if wanted.count(path) > 1:
+            raise InputError(f"two outputs would be called {path}; rename one")
+        if not path.parent.is_dir():
+            raise FileNotFoundError(f"the folder {path.parent} does not exist; create it first")
+        if path.exists() and not force:
+            raise InputError(f"{path} exists; pass --force to overwrite it, or name another output with -o")

@@ -1,0 +1,66 @@
+"""The argument SHAPE: a hand by name, or a robot or rigged character by file, with the options of its kind."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from torchreg.errors import FormatError, InputError
+
+if TYPE_CHECKING:
+    from torchreg.models.articulated import ArticulatedShape
+
+_HANDS = {"hand": "right", "hand-left": "left"}
+_HELP = "hand, hand-left, a robot (.urdf) or a rigged character (.glb, .gltf)."
+
+Shape = Annotated[str, typer.Argument(metavar="SHAPE", help=_HELP)]
+Parents = Annotated[
+    Path | None,
+    typer.Option(help="JSON file {joint: parent or null}, for glTF files whose hierarchy of nodes is flat."),
+]
+PackageDir = Annotated[list[Path] | None, typer.Option(help="Folder in which a URDF's package:// names are looked up.")]
+FreeBase = Annotated[
+    bool | None, typer.Option("--free-base/--fixed-base", help="Whether the base of a URDF moves; by default it does.")
+]
+
+
+def load_shape(
+    name: str,
+    parents: Path | None = None,
+    package_dirs: Sequence[Path] | None = None,
+    free_base: bool | None = None,
+) -> ArticulatedShape:
+    """Return the shape of a name or file; options that its kind has no use for are refused."""
+    ending = Path(name).suffix.lower()
+    uses = {".urdf": {"--package-dir", "--free-base/--fixed-base"}, ".glb": {"--parents"}, ".gltf": {"--parents"}}
+    given = {"--parents": parents, "--package-dir": package_dirs or None, "--free-base/--fixed-base": free_base}
+    if name not in _HANDS and ending not in uses:
+        raise InputError(f"SHAPE must be hand, hand-left or a file ending in .urdf, .glb or .gltf; got {name!r}")
+    for option, value in given.items():
+        if value is not None and option not in uses.get(ending, set()):
+            raise InputError(f"{option} has no meaning for {name}; leave it out")
+    if name in _HANDS:
+        from torchreg.models.hand import Hand
+
+        return Hand(_HANDS[name])
+    from torchreg.models.articulated import ArticulatedShape
+
+    if ending == ".urdf":
+        return ArticulatedShape.from_urdf(name, package_dirs=package_dirs or (), free_base=free_base is not False)
+    return ArticulatedShape.from_gltf(name, parents=None if parents is None else _read_parents(parents))
+
+
+def _read_parents(path: Path) -> dict[str, str | None]:
+    from torchreg.io.limits import read_bytes
+
+    try:
+        table = json.loads(read_bytes(path).decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{path}: cannot be read as JSON ({error})") from error
+    if not isinstance(table, dict) or not all(isinstance(parent, str | None) for parent in table.values()):
+        raise FormatError(f"{path}: must hold {{joint: parent or null}}, all of them names")
+    return table
