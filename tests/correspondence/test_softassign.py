@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchreg.correspondence.em import OUTLIER_CONSTANT, expectation
-from torchreg.correspondence.softassign import assignment, softassign
+from torchreg.correspondence.softassign import MODEL_OUTLIER, assignment, softassign
 from torchreg.errors import InputError, InputTypeError
 
 D = torch.float64
@@ -23,13 +23,13 @@ def cloud(*shape, seed=0, dtype=D):
     return torch.rand(*shape, 3, generator=torch.Generator().manual_seed(seed), dtype=D).to(dtype)
 
 
-def as_printed(model, data, sigma, c, sweeps=3000):
+def as_printed(model, data, sigma, b, c, sweeps=3000):
     """The extended matrix, its first N rows and first M columns normalized in turn, in plain numbers."""
     n, m = len(model), len(data)
     matrix = np.empty((n + 1, m + 1))
     for i, j in itertools.product(range(n), range(m)):
         matrix[i, j] = math.exp(-(math.dist(model[i], data[j]) ** 2) / (2 * sigma**2))
-    matrix[:n, m], matrix[n, :m], matrix[n, m] = 1.0, c, 0.0
+    matrix[:n, m], matrix[n, :m], matrix[n, m] = b, c, 0.0
     for _ in range(sweeps):
         matrix[:, :m] /= matrix[:, :m].sum(0, keepdims=True)
         matrix[:n] /= matrix[:n].sum(1, keepdims=True)
@@ -40,10 +40,11 @@ def as_printed(model, data, sigma, c, sweeps=3000):
 @pytest.mark.parametrize(("n", "m"), [(6, 9), (9, 6), (7, 7), (1, 5)])
 def test_the_matrix_is_the_one_of_the_printed_normalizations(n, m, sigma):
     model, data = cloud(n), cloud(m, seed=1)
-    expected = torch.from_numpy(as_printed(model.tolist(), data.tolist(), sigma, 2.5))
-    found = assignment(model, data, torch.tensor(sigma, dtype=D), 2.5, **EXACT)
+    expected = torch.from_numpy(as_printed(model.tolist(), data.tolist(), sigma, 0.7, 2.5))
+    options = {"model_outlier": 0.7, **EXACT}
+    found = assignment(model, data, torch.tensor(sigma, dtype=D), 2.5, **options)
     torch.testing.assert_close(found, expected, atol=1e-9, rtol=1e-7)
-    step = softassign(model, data, torch.tensor(sigma, dtype=D), 2.5, **EXACT)
+    step = softassign(model, data, torch.tensor(sigma, dtype=D), 2.5, **options)
     torch.testing.assert_close(step.weights, expected.sum(-1), atol=1e-9, rtol=1e-7)
     torch.testing.assert_close(step.inlier_posterior, expected.sum(-2), atol=1e-9, rtol=1e-7)
     torch.testing.assert_close(step.targets, expected @ data / expected.sum(-1, keepdim=True), atol=1e-7, rtol=1e-7)
@@ -53,13 +54,13 @@ def test_the_matrix_is_the_one_of_the_printed_normalizations(n, m, sigma):
 
 def test_the_matrix_solves_a_convex_problem():
     """The dual of entropic assignment with slack, minimized by another solver."""
-    model, data, sigma, c = cloud(5), cloud(8, seed=1), 0.3, OUTLIER_CONSTANT
+    model, data, sigma, b, c = cloud(5), cloud(8, seed=1), 0.3, MODEL_OUTLIER, OUTLIER_CONSTANT
     kernel = torch.exp(-torch.cdist(model, data).square() / (2 * sigma**2)).numpy()
 
     def dual(logs):
         u, v = np.exp(logs[:5]), np.exp(logs[5:])
-        value = u @ kernel @ v + u.sum() + c * v.sum() - logs.sum()
-        return value, np.concatenate([u * (kernel @ v + 1) - 1, v * (kernel.T @ u + c) - 1])
+        value = u @ kernel @ v + b * u.sum() + c * v.sum() - logs.sum()
+        return value, np.concatenate([u * (kernel @ v + b) - 1, v * (kernel.T @ u + c) - 1])
 
     best = scipy.optimize.minimize(dual, np.zeros(13), jac=True, method="BFGS", options={"gtol": 1e-10})
     u, v = np.exp(best.x[:5]), np.exp(best.x[5:])
@@ -77,7 +78,7 @@ def test_rows_and_columns_with_their_slack_sum_to_one(n, m, sigma, c, seed):
     assert column_slack.min() > 0
     # What remains of rows and columns is in the fixed ratio to the pairs that the kernel and c state.
     kernel = torch.exp(-torch.cdist(model, data).square() / (2 * sigma**2))
-    expected = row_slack.unsqueeze(-1) * kernel * column_slack / c
+    expected = row_slack.unsqueeze(-1) * kernel * column_slack / (MODEL_OUTLIER * c)
     torch.testing.assert_close(alpha, expected, atol=1e-9, rtol=1e-5)
 
 
@@ -103,7 +104,9 @@ def test_without_a_sweep_it_is_the_e_step():
 def test_one_pair_has_a_closed_form():
     model, data, sigma, c = torch.zeros(1, 3, dtype=D), torch.zeros(1, 3, dtype=D), torch.tensor(0.01, dtype=D), 2.0
     share = float(softassign(model, data, sigma, c, **EXACT).weights)
-    assert share / (1 - share) ** 2 == pytest.approx(1 / c)
+    assert share / (1 - share) ** 2 == pytest.approx(1 / (MODEL_OUTLIER * c))
+    share = float(softassign(model, data, sigma, c, model_outlier=0.3, **EXACT).weights)
+    assert share / (1 - share) ** 2 == pytest.approx(1 / (0.3 * c))
 
 
 def test_it_is_one_to_one_where_the_e_step_is_one_to_many():
@@ -130,7 +133,7 @@ def test_sweeps_stop_at_the_tolerance():
     off = [float((softassign(model, data, sigma, sweeps=n, tolerance=0.0).weights - exact).abs().max()) for n in (1, 9)]
     assert off[1] < 0.5 * off[0]
     assert float((softassign(model, data, sigma).weights - exact).abs().max()) < 0.02
-    assert float((softassign(model, data, sigma, tolerance=1e-8).weights - exact).abs().max()) < 1e-6
+    assert float((softassign(model, data, sigma, sweeps=1000, tolerance=1e-8).weights - exact).abs().max()) < 1e-6
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, D])
@@ -143,7 +146,9 @@ def test_sigma_may_vanish(dtype, sigma):
         assert torch.isfinite(getattr(step, field)).all()
     # Coincident points share the closed form of one pair, everything else is an outlier for certain.
     share = step.inlier_posterior[:5]
-    torch.testing.assert_close(share / (1 - share).square(), torch.full_like(share, 1 / OUTLIER_CONSTANT))
+    torch.testing.assert_close(
+        share / (1 - share).square(), torch.full_like(share, 1 / (MODEL_OUTLIER * OUTLIER_CONSTANT)), rtol=1e-4, atol=0
+    )
     torch.testing.assert_close(step.targets, model)
     assert step.inlier_posterior[5:].tolist() == [0] * 30
     assert step.weights[5:].tolist() == [0] * 35
@@ -267,6 +272,7 @@ def test_gradients_stay_finite_where_nothing_is_held():
         ({"sweeps": True}, InputTypeError, "sweeps must be an integer, got bool"),
         ({"sweeps": -1}, InputError, "sweeps must be zero or more, got -1"),
         ({"tolerance": -0.1}, InputError, "tolerance must be zero or positive and finite, got -0.1"),
+        ({"model_outlier": 0.0}, InputError, "model_outlier must be positive and finite, got 0.0"),
         ({"tolerance": "a"}, InputTypeError, "tolerance must be a number, got str"),
     ],
 )
