@@ -263,6 +263,14 @@ def test_a_schedule_is_followed(plain_hand, plain_hand_skin, clean, start, truth
     assert after < 0.8 * before
 
 
+@pytest.mark.parametrize("correspondence", ["em", "softassign", "closest"])
+def test_other_correspondences_align_too(plain_hand, plain_hand_skin, clean, start, truth, correspondence):
+    config = replace(DESCENT, correspondence=correspondence, em_steps=6, surface_steps=0)
+    result = align(plain_hand, clean, start, model_points=plain_hand_skin, config=config)
+    before, after = (float(offsets(plain_hand, pose, truth).mean()) for pose in (start, result.pose))
+    assert after < 0.6 * before
+
+
 def test_without_surface_steps_there_is_no_surface_fit(plain_hand, plain_hand_skin, clean, start, found):
     config = replace(DESCENT, surface_steps=0)
     result = align(plain_hand, clean, start, model_points=plain_hand_skin, config=config)
@@ -588,6 +596,7 @@ def test_a_skin_must_be_of_the_same_shape(plain_hand_skin, clean):
     ("options", "error", "message"),
     [
         ({"search": "often"}, InputError, "search must be one of auto, always, never; got 'often'"),
+        ({"correspondence": "icp"}, InputError, "correspondence must be one of em, softassign, closest; got 'icp'"),
         ({"outlier": "none"}, InputError, "outlier must be one of limit, volume"),
         ({"nan_policy": "drop"}, InputError, "nan_policy must be one of raise, omit"),
         ({"em_steps": 0}, InputError, "em_steps must be at least 1, got 0"),

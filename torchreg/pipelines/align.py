@@ -19,7 +19,7 @@ from torchreg.models.skin import BendingSkin, LinearBlendSkin, sample_skin
 from torchreg.models.surface import FusedSurface, SkinSurface, Surface, dense_file_skin
 from torchreg.pipelines.align_objectives import PosePrior
 from torchreg.pipelines.align_search import FINAL_SIGMAS, PRIOR_SHARE, coarse_skin, explore, needs_search
-from torchreg.pipelines.align_stages import AlignProblem, OnStep, StageResult, fit_surface, register
+from torchreg.pipelines.align_stages import CORRESPONDENCES, AlignProblem, OnStep, StageResult, fit_surface, register
 from torchreg.results import AlignRecord, AlignResult, Status
 
 # Shares of the model's size, the diagonal of its rest pose.
@@ -49,6 +49,8 @@ class AlignConfig:
         num_candidates: poses tried per round of the search.
         search_rounds: rounds of the search.
         inlier_distance: data nearer to the fitted surface are inliers, metres; 2 % of the model's size by default.
+        correspondence: who matches whom: "em", the posterior; for comparison "softassign", one to one, or "closest",
+            the closest point as in ICP, trimmed at 1.5 sigma.
         outlier: "limit" for c = 3 sqrt(pi / 2), "volume" for eq. 18 with the working volume.
         debias: share of the pull of a wide kernel on the model itself that is taken from the EM's targets; 0 is the
             paper's EM, which shrinks the model while sigma is wide.
@@ -69,6 +71,7 @@ class AlignConfig:
     num_candidates: int = 24
     search_rounds: int = 4
     inlier_distance: float | None = None
+    correspondence: str = "em"
     outlier: str = "limit"
     debias: float = 0.8
     prior_std: float | None = 0.3
@@ -80,6 +83,7 @@ class AlignConfig:
 
     def __post_init__(self) -> None:
         check_choice(self.search, "search", ("auto", "always", "never"))
+        check_choice(self.correspondence, "correspondence", tuple(CORRESPONDENCES))
         check_choice(self.outlier, "outlier", ("limit", "volume"))
         check_choice(self.nan_policy, "nan_policy", ("raise", "omit"))
         for name in ("em_steps", "m_steps", "num_candidates", "search_rounds", "num_model_points"):
@@ -364,6 +368,7 @@ def _centered_problem(
         pose_atol=config.pose_atol,
         outlier=config.outlier,
         debias=config.debias,
+        correspondence=config.correspondence,
     )
 
 

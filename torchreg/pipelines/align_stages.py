@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchreg.correspondence.closest import closest_point
 from torchreg.correspondence.em import OUTLIER_CONSTANT, EStep, expectation, outlier_constant
-from torchreg.correspondence.sigma import SigmaSchedule
+from torchreg.correspondence.sigma import SigmaSchedule, estimate_sigma
+from torchreg.correspondence.softassign import softassign
 from torchreg.models.skin import LinearBlendSkin
 from torchreg.models.surface import Surface
 from torchreg.pipelines.align_objectives import PosePrior, RegistrationObjective, SurfaceObjective
@@ -23,6 +25,13 @@ from torchreg.solvers.levenberg_marquardt import (
 )
 
 OnStep = Callable[[AlignRecord], None]
+
+# What may stand in the place of the E-step.
+CORRESPONDENCES: dict[str, Callable[..., EStep]] = {
+    "em": expectation,
+    "softassign": softassign,
+    "closest": closest_point,
+}
 
 # Widths of the surface fit as shares of the model's size; the last width follows from the residuals, within a range.
 SURFACE_SIGMAS = (0.045, 0.022)
@@ -58,6 +67,7 @@ class AlignProblem:
         pose_atol: largest change of a pose that counts as none.
         outlier: "limit" or "volume".
         debias: share of the kernel's own pull that is taken from the targets of the EM.
+        correspondence: one of `CORRESPONDENCES`.
     """
 
     skin: LinearBlendSkin
@@ -71,6 +81,7 @@ class AlignProblem:
     pose_atol: float
     outlier: str = "limit"
     debias: float = 0.0
+    correspondence: str = "em"
 
     def rows(self, index: Tensor) -> AlignProblem:
         """Return the problems of some rows of the batch, which may repeat."""
@@ -153,6 +164,9 @@ def register(
 
     References: Dewaele et al. 2006, sections 3.2 and 3.3.
     """
+    if schedule.kind == "adaptive":
+        # The estimate is that of a conventional EM, whose targets are the means of the data.
+        problem = replace(problem, debias=0.0)
     sigma = torch.full_like(pose[:, 0], schedule.values[0])
     change = torch.full_like(sigma, torch.inf)
     damping = None
@@ -162,15 +176,15 @@ def register(
         for _ in range(em_steps):
             rows, derivative = problem.skin.shape.transform_jacobian(pose, chart="tangent")
             observed = _expect(problem, problem.skin.basis @ rows, sigma)
-            prior = _tempered(problem.prior, observed) if tempered else problem.prior
+            shared = tempered and problem.correspondence == "em"
+            prior = _tempered(problem.prior, observed) if shared else problem.prior
             objective = RegistrationObjective(problem.skin, observed, sigma, prior)
             around = objective.linearize(pose, rows, derivative)
             solved = problem.solve(objective, pose, m_steps, damping) if m_steps > 1 else problem.step(around, pose)
             pose, damping, change = solved.state, solved.damping, problem.change(solved.last_step)
             _report(on_step, "em", step, schedule.steps, sigma, solved, problem)
             if schedule.kind == "adaptive":
-                held = observed.weights.sum(-1).clamp_min(torch.finfo(sigma.dtype).eps)
-                estimated = (observed.squared_error / (3 * held)).sqrt()
+                estimated = estimate_sigma(observed, problem.skin.basis @ rows, problem.skin(pose))
                 sigma = estimated.clamp(schedule.values[-1], schedule.values[0])
             if float(change.max()) <= problem.pose_atol:
                 break
@@ -191,20 +205,21 @@ def _tempered(prior: PosePrior, observed: EStep) -> PosePrior:
 def _expect(problem: AlignProblem, posed: Tensor, sigma: Tensor) -> EStep:
     """Return the E-step, without the kernel's own pull while the kernel is wide."""
     outlier = _outlier(problem, posed, sigma)
-    observed = expectation(posed, problem.data, sigma, outlier, mask=problem.valid)
+    match = CORRESPONDENCES[problem.correspondence]
+    observed = match(posed, problem.data, sigma, outlier, mask=problem.valid)
     if problem.debias > 0 and float(sigma.max()) > _NARROW_SIGMA * problem.size:
-        return _debiased(observed, posed, sigma, outlier, problem.debias)
+        itself = match(posed, posed, sigma, outlier)
+        return _debiased(observed, posed, itself, problem.debias)
     return observed
 
 
-def _debiased(observed: EStep, posed: Tensor, sigma: Tensor, outlier: Tensor | float, share: float) -> EStep:
+def _debiased(observed: EStep, posed: Tensor, itself: EStep, share: float) -> EStep:
     """Return the E-step with targets moved by how far the kernel alone would pull each model point.
 
     A wide kernel draws every point towards the mean of its surroundings even in the true pose, which shrinks and bends
     the model. The model registered to itself shows that pull, ``S_i - X_i``; part of it is taken from ``G_i - X_i``.
     It is only a part because hidden model points have no counterpart in the data.
     """
-    itself = expectation(posed, posed, sigma, outlier)
     return replace(observed, targets=observed.targets + share * (posed - itself.targets))
 
 
