@@ -361,6 +361,7 @@ def test_impossible_rigs(tmp_path: Path, edit: Any, message: str) -> None:
     ("edit", "message"),
     [
         (change("accessors.0.count", 10**12), "12|elements"),
+        (change("accessors.0.count", 0), "POSITION of primitive 0 of mesh 'body' has 0 elements"),
         (change("accessors.0.count", 5), r"POSITION of primitive 0 of mesh 'body' reaches beyond its buffer"),
         (change("accessors.0.count", 3), "float or normalized weights for each of its 3 vertices"),
         (change("accessors.0.byteOffset", -4), "byteOffset of POSITION"),
@@ -450,9 +451,9 @@ def test_damaged_containers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     cases = {
         b"glTF": "at least 20 bytes",
         whole[:200]: "expected glTF 2",
-        whole[:4] + struct.pack("<I", 1) + whole[8:]: "got version 1",
+        whole[:4] + struct.pack("<I", 1) + whole[8:]: "says version 1",
         whole[:12] + struct.pack("<I", 10**6) + whole[16:]: "chunk at byte 12 reaches beyond",
-        whole[:16] + b"ELSE" + whole[20:]: "no JSON chunk",
+        whole[:16] + b"ELSE" + whole[20:]: "must begin with a JSON chunk",
         whole.replace(b'"asset"', b'"asset ', 1): "not a readable glTF document",
         b"{}": "no node carries",
         b"[" * 100_000: "not a readable glTF document",

@@ -1,0 +1,350 @@
+"""glTF documents: entries, accessors of every kind, buffers, nodes, triangles; what is damaged is said, not read."""
+
+import base64
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from torchreg.errors import FormatError, ModelError
+from torchreg.io.gltf_document import FAN, STRIP, TRIANGLES, GltfDocument, parents_first, triangles
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
+
+COMPONENTS = {"<i1": 5120, "<u1": 5121, "<i2": 5122, "<u2": 5123, "<u4": 5125, "<f4": 5126}
+SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4", 9: "MAT3", 16: "MAT4"}
+
+
+def opened(content, path=Path("a.gltf"), limits=DEFAULT_LIMITS):
+    return GltfDocument(content if isinstance(content, bytes) else json.dumps(content).encode(), path, limits)
+
+
+def holding(values, *, stride=0, offset=0, **entries):
+    """Return the JSON of a document with one accessor for the rows of ``values``, which lie in the file itself."""
+    rows = b"".join(row.tobytes().ljust(stride, b"\xee") for row in values)
+    binary = b"\xdd" * offset + rows
+    view = {"buffer": 0, "byteLength": len(binary)} | ({"byteStride": stride} if stride else {})
+    accessor = {
+        "bufferView": 0, "byteOffset": offset, "componentType": COMPONENTS[values.dtype.str.replace("|", "<")],
+        "count": len(values), "type": SHAPES[values.shape[1]],
+    }  # fmt: skip
+    return {
+        "accessors": [accessor | entries],
+        "bufferViews": [view],
+        "buffers": [{"byteLength": len(binary), "uri": data_uri(binary)}],
+    }
+
+
+def data_uri(binary):
+    return "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+
+
+@pytest.mark.parametrize("kind", list(COMPONENTS))
+@pytest.mark.parametrize("width", list(SHAPES))
+@pytest.mark.parametrize(("stride", "offset"), [(0, 0), (0, 8), (68, 4)])
+def test_accessors_of_every_kind(kind, width, stride, offset):
+    values = np.arange(5 * width).reshape(5, width).astype(kind)
+    document = opened(holding(values, stride=stride, offset=offset))
+    read = document.accessor(0)
+    np.testing.assert_array_equal(read, values)
+    assert read.dtype == values.dtype
+    assert document.accessor_count(0) == 5
+
+
+def test_normalized_integers_span_their_range():
+    extremes = np.array([[-128, 0, 127]], "i1")
+    assert opened(holding(extremes, normalized=True)).accessor(0).tolist() == [[-1.0, 0.0, 1.0]]
+    assert opened(holding(np.array([[0, 255]], "u1"), normalized=True)).accessor(0).tolist() == [[0.0, 1.0]]
+    assert opened(holding(np.array([[0.5]], "<f4"), normalized=True)).accessor(0).tolist() == [[0.5]]
+
+
+def test_empty_accessors_are_empty():
+    assert opened(holding(np.zeros((0, 3), "<f4"))).accessor(0).shape == (0, 3)
+
+
+def sparse(values, rows, replacements, kind="<u2"):
+    """Return a document in which ``rows`` of the values are replaced."""
+    content = holding(values)
+    for part in (np.array(rows, kind), replacements):
+        content["bufferViews"].append({"buffer": len(content["buffers"]), "byteLength": part.nbytes})
+        content["buffers"].append({"byteLength": part.nbytes, "uri": data_uri(part.tobytes())})
+    content["accessors"][0]["sparse"] = {
+        "count": len(rows),
+        "indices": {"bufferView": 1, "componentType": COMPONENTS[kind]},
+        "values": {"bufferView": 2},
+    }
+    return content
+
+
+def test_sparse_accessors_replace_rows_of_a_buffer_or_of_zeros():
+    values, replacements = np.arange(12, dtype="<f4").reshape(4, 3), np.array([[7, 8, 9], [1, 1, 1]], "<f4")
+    want = values.copy()
+    want[[0, 3]] = replacements
+    for kind in ("<u1", "<u2", "<u4"):
+        content = sparse(values, [0, 3], replacements, kind)
+        document = opened(content)
+        for _ in range(2):  # the buffer itself is not changed
+            np.testing.assert_array_equal(document.accessor(0), want)
+        del content["accessors"][0]["bufferView"]
+        want_zeros = np.where(np.isin(np.arange(4), [0, 3])[:, None], want, 0)
+        np.testing.assert_array_equal(opened(content).accessor(0), want_zeros)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"count": 0}, "has 0 entries of unusable type or number"),
+        ({"count": 5}, "has 5 entries of unusable type or number"),
+        ({"indices": None}, r"accessors\[0\] of 4 elements is sparse, but lacks indices or values"),
+        ({"values": {}}, "lacks indices or values"),
+        ({"indices": {"bufferView": 1, "componentType": 5126}}, "unusable type"),
+        ({"indices": {"bufferView": 2, "componentType": 5125}}, "points at element 1090519040 of 4"),
+        ({"values": {"bufferView": 1}}, "reaches beyond its buffer"),
+        ({"values": {"bufferView": 9}}, "must be an index below 3"),
+    ],
+)
+def test_damaged_sparse_parts(change, words):
+    content = sparse(np.zeros((4, 3), "<f4"), [0, 3], np.array([[7, 8, 9]] * 2, "<f4"))
+    content["accessors"][0]["sparse"].update(change)
+    with pytest.raises(FormatError, match=words):
+        opened(content).accessor(0)
+
+
+@pytest.mark.parametrize(
+    ("collection", "change", "words"),
+    [
+        ("accessors", {"count": 6}, r"accessors\[0\] of 6 elements reaches beyond its buffer"),
+        ("accessors", {"count": -1}, r"accessors\[0\] claims -1 elements"),
+        ("accessors", {"count": True}, "'count' must be of type int, got bool"),
+        ("accessors", {"count": 10**30}, "more than the size limit allows"),
+        ("accessors", {"byteOffset": -4}, r"byteOffset of accessors\[0\] of 5 elements is -4"),
+        ("accessors", {"byteOffset": 4}, "reaches beyond its buffer"),
+        ("accessors", {"componentType": 5124}, "unknown type 5124"),
+        ("accessors", {"componentType": [5126]}, r"unknown type \[5126\]"),
+        ("accessors", {"type": "VEC5"}, "must be SCALAR or VEC2 .* got 'VEC5'"),
+        ("accessors", {"type": {}}, "got {}"),
+        ("accessors", {"bufferView": None}, "has no data"),
+        ("accessors", {"bufferView": True}, r"refers to bufferViews\[True\], but there are 1"),
+        ("bufferViews", {"byteLength": 61}, r"bufferViews\[0\] reaches beyond its buffer of 60 bytes"),
+        ("bufferViews", {"byteLength": 59}, "reaches beyond its buffer"),
+        ("bufferViews", {"byteOffset": -1}, r"byteOffset of bufferViews\[0\] is -1"),
+        ("bufferViews", {"byteStride": 13}, "reaches beyond its buffer"),
+        ("bufferViews", {"byteStride": -12}, "byteStride of .* is -12"),
+        ("bufferViews", {"buffer": 1}, "the buffer of .* must be an index below 1"),
+        ("buffers", {"byteLength": 61}, "buffer 0 should have 61 bytes, got 60"),
+        ("buffers", {"byteLength": -1}, "byteLength of buffer 0 is -1"),
+        ("buffers", {"uri": None}, "neither an address nor a binary chunk"),
+        ("buffers", {"uri": 5}, "'uri' must be of type str"),
+        ("buffers", {"uri": "data:text/plain,abcd"}, "must be base64: 'data:text/plain'"),
+        ("buffers", {"uri": "data:a;base64,%%%"}, "not valid base64"),
+    ],
+)
+def test_damaged_numbers(collection, change, words):
+    content = holding(np.arange(15, dtype="<f4").reshape(5, 3))
+    content[collection][0].update(change)
+    with pytest.raises(FormatError, match=words):
+        opened(content).accessor(0)
+
+
+def test_accessors_name_what_they_hold_and_must_be_of_the_types_asked_for():
+    document = opened(holding(np.zeros((2, 3), "<f4")))
+    assert document.accessor(0, "POSITION", ("VEC3",)).shape == (2, 3)
+    with pytest.raises(FormatError, match="JOINTS_0 must be VEC4, got 'VEC3'"):
+        document.accessor(0, "JOINTS_0", ("VEC4",))
+    with pytest.raises(FormatError, match="the accessor of JOINTS_0 must be an index below 1"):
+        document.accessor(None, "JOINTS_0")
+
+
+def test_sizes_are_limited():
+    content = holding(np.zeros((4, 3), "<f4"))
+    assert opened(content, limits=FileLimits(max_bytes=48)).accessor(0).shape == (4, 3)
+    with pytest.raises(FormatError, match="has 4 elements, more than the size limit allows"):
+        opened(content, limits=FileLimits(max_bytes=47)).accessor(0)
+
+
+def test_buffers_lie_in_the_folder_or_below(tmp_path):
+    folder = tmp_path / "in"
+    (folder / "sub").mkdir(parents=True)
+    values = np.arange(6, dtype="<f4").reshape(2, 3)
+    for place in (folder / "sub" / "my data.bin", tmp_path / "outside.bin"):
+        place.write_bytes(values.tobytes() + b"trailing")
+    (folder / "link.bin").symlink_to(tmp_path / "outside.bin")
+    content = holding(values)
+
+    def read(uri):
+        content["buffers"][0]["uri"] = uri
+        return opened(content, folder / "a.gltf").accessor(0)
+
+    np.testing.assert_array_equal(read("sub/my%20data.bin"), values)
+    np.testing.assert_array_equal(read("sub/../sub/my data.bin"), values)
+    for uri in (
+        "../outside.bin", "link.bin", str(tmp_path / "outside.bin"), "%2e%2e/outside.bin", "http://host/a.bin",
+        "http%3A//host/a", "file:///etc/passwd", "//host/a.bin", "s3:/b/c", "..\\outside.bin", "a%00b", "C:/a.bin",
+    ):  # fmt: skip
+        with pytest.raises(FormatError, match=r"refers to the buffer .* must lie in the file's folder"):
+            read(uri)
+    with pytest.raises(FormatError, match=r"'none\.bin' cannot be read: it is not there"):
+        read("none.bin")
+    with pytest.raises(FormatError, match=r"'sub' cannot be read \("):
+        read("sub")
+
+
+def container(*chunks, version=2, extra=0):
+    body = b"".join(struct.pack("<I4s", len(data), kind) + data for kind, data in chunks)
+    return struct.pack("<4sII", b"glTF", version, 12 + len(body) + extra) + body
+
+
+def test_containers_hold_json_and_one_binary_chunk():
+    values = np.arange(6, dtype="<f4").reshape(2, 3)
+    content = holding(values)
+    del content["buffers"][0]["uri"]
+    text = json.dumps(content).encode()
+    for chunks in (
+        [(b"JSON", text), (b"BIN\0", values.tobytes())],
+        [(b"JSON", text), (b"MINE", b"skipped"), (b"BIN\0", values.tobytes()), (b"BIN\0", b"second")],
+    ):
+        np.testing.assert_array_equal(opened(container(*chunks)).accessor(0), values)
+    for damaged, words in (
+        (b"glTF", "has at least 20 bytes, got 4"),
+        (container((b"JSON", text), version=1), "says version 1"),
+        (container((b"JSON", text), extra=1), "cut off or damaged"),
+        (container((b"JSON", text)) + b"\0", "cut off or damaged"),
+        (container((b"BIN\0", b"abcd"), (b"JSON", text)), r"must begin with a JSON chunk, got b'BIN\\x00'"),
+        (container((b"JSON", text))[:12] + struct.pack("<I", 10**6) + container((b"JSON", text))[16:], "byte 12"),
+    ):
+        with pytest.raises(FormatError, match=words):
+            opened(damaged)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"{", "not a readable glTF document"),
+        (b"\xff\xfe", "not a readable glTF document"),
+        (b"[" * 100_000, "not a readable glTF document"),
+        (b"1" * 10_000, "not a readable glTF document|must be glTF"),
+        (b"[]", "must be glTF of version 2, whose JSON is an object; got list"),
+        (b'{"extensionsRequired": 3}', "'extensionsRequired' must be of type list, got int"),
+        (b'{"extensionsRequired": ["EXT_meshopt_compression"]}', "needs the extension EXT_meshopt_compression"),
+    ],
+)
+def test_what_is_no_document(content, words):
+    with pytest.raises(FormatError, match=words):
+        opened(content)
+
+
+def test_entries_have_types_and_null_is_missing():
+    document = opened({"nodes": [{"a": 1, "b": None, "c": True}, 5]})
+    node = document.item("nodes", 0)
+    assert (document.entry(node, "a", int), document.entry(node, "b", int), document.entry(node, "b", int, 4)) == (
+        1,
+        0,
+        4,
+    )
+    with pytest.raises(FormatError, match="the entry 'c' must be of type int, got bool"):
+        document.entry(node, "c", int)
+    assert document.items("meshes") == []
+    with pytest.raises(FormatError, match=r"nodes\[1\] must be an object"):
+        document.item("nodes", 1)
+    with pytest.raises(FormatError, match="nodes must be a list of objects"):
+        document.items("nodes")
+    with pytest.raises(FormatError, match=r"a child must be an index below 2: it refers to nodes\[-1\]"):
+        document.index("nodes", -1, "a child")
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-3, 3), min_size=10, max_size=10))
+def test_node_transforms_are_those_of_an_independent_library(numbers):
+    rotation, scale, translation = numbers[:4], numbers[4:7], numbers[7:]
+    if np.linalg.norm(rotation) < 1e-3:
+        rotation = [0, 0, 1, 0]
+    node = {"rotation": rotation, "scale": scale, "translation": translation}
+    oracle = np.eye(4)
+    oracle[:3, :3] = Rotation.from_quat(rotation).as_matrix() @ np.diag(scale)
+    oracle[:3, 3] = translation
+    matrix = oracle.T.flatten().tolist()
+    document = opened({"nodes": [node, {"matrix": matrix}, {}]})
+    np.testing.assert_allclose(document.node_transform(0), oracle, atol=1e-14)
+    np.testing.assert_array_equal(document.node_transform(1), oracle)
+    np.testing.assert_array_equal(document.node_transform(2), np.eye(4))
+
+
+def test_nodes_move_their_children_in_any_order():
+    nodes = [
+        {"translation": [0, 0, 1]},
+        {"children": [0], "scale": [2, 2, 2]},
+        {"children": [1], "translation": [5, 0, 0]},
+    ]
+    document = opened({"nodes": nodes})
+    parents = document.node_parents()
+    assert parents == [1, 2, -1]
+    assert document.node_globals(parents)[0][:3, 3].tolist() == [5, 0, 2]
+    assert opened({}).node_globals([]).shape == (0, 4, 4)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "error", "words"),
+    [
+        ([{"children": [1]}, {"name": "tip", "children": [0]}], ModelError, "cyclic at 0, 'tip'"),
+        ([{"children": [0]}], ModelError, "cyclic at 0"),
+        ([{"children": [2]}, {"children": [2]}, {}], ModelError, "node 2 has two parents"),
+        ([{"children": [1]}], FormatError, "a child of node 0 must be an index below 1"),
+        ([{"rotation": [0, 0, 0, 0]}], ModelError, "the rotation of node 0 is a zero quaternion"),
+        ([{"scale": [1, 2]}], FormatError, r"the scale of node 0 must hold 3 numbers, got \[1, 2\]"),
+        ([{"scale": [1, 2, "3"]}], FormatError, "the scale of node 0 must hold 3 numbers"),
+        ([{"scale": [1, 2, True]}], FormatError, "the scale of node 0 must hold 3 numbers"),
+        ([{"matrix": [1]}], FormatError, "the matrix of node 0 must hold 16 numbers"),
+        ([{"name": "a", "translation": [0, 1e301, 0]}], ModelError, "the translation of node 'a' is not finite"),
+        ([{"translation": [0, float("nan"), 0]}], ModelError, "the translation of node 0 is not finite"),
+        ([{"translation": [0, 10**400, 0]}], ModelError, "the translation of node 0 is not finite"),
+    ],
+)
+def test_impossible_nodes(nodes, error, words):
+    document = opened({"nodes": nodes})
+    with pytest.raises(error, match=words):
+        document.node_globals(document.node_parents())
+
+
+@given(st.integers(0, 12).flatmap(lambda n: st.lists(st.integers(-1, n - 1), min_size=n, max_size=n)))
+def test_parents_come_first_and_cycles_are_left_out(parents):
+    order = parents_first(parents)
+    place = {index: at for at, index in enumerate(order)}
+    assert len(place) == len(order)
+    for index, parent in enumerate(parents):
+        above, steps = parent, 0
+        while above >= 0 and steps <= len(parents):
+            above, steps = parents[above], steps + 1
+        assert (index in place) == (above < 0)
+        if index in place and parent >= 0:
+            assert place[parent] < place[index]
+
+
+@pytest.mark.parametrize(
+    ("mode", "faces"),
+    [
+        (TRIANGLES, [[7, 1, 2], [3, 4, 5]]),
+        (STRIP, [[7, 1, 2], [2, 1, 3], [2, 3, 4], [4, 3, 5]]),
+        (FAN, [[7, 1, 2], [7, 2, 3], [7, 3, 4], [7, 4, 5]]),
+        (0, []),
+    ],
+)
+def test_triangles_of_every_mode(mode, faces):
+    corners = np.array([7, 1, 2, 3, 4, 5])
+    assert triangles(mode, corners, "a primitive").tolist() == faces
+    assert triangles(mode, corners[:0], "a primitive").shape == (0, 3)
+
+
+def test_a_strip_keeps_the_side_of_its_triangles():
+    zigzag = np.array([[k / 2, k % 2, 0] for k in range(8)])
+    corners = zigzag[triangles(STRIP, np.arange(8), "a strip")]
+    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2]
+    assert (sides < 0).all()
+
+
+def test_separate_triangles_have_three_corners():
+    with pytest.raises(FormatError, match="primitive 3 has 4 triangle corners, not a multiple of three"):
+        triangles(TRIANGLES, np.arange(4), "primitive 3")

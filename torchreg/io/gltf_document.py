@@ -1,0 +1,353 @@
+"""A glTF 2.0 document (.glb, or .gltf and its buffers): its entries, numbers and nodes, checked when they are used."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from torchreg.errors import FormatError, ModelError
+from torchreg.io.limits import FileLimits, read_bytes
+from torchreg.io.raw_cloud import Array
+
+TRIANGLES, STRIP, FAN = 4, 5, 6
+
+_COMPONENTS = {
+    number: np.dtype(name)
+    for number, name in {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}.items()
+}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+# Products of larger numbers overflow float64.
+_LARGEST_NUMBER = 1e300
+
+
+class GltfDocument:
+    """The JSON and the buffers of a glTF file, with every index, size and number checked when it is used.
+
+    Errors do not name the file: callers do.
+
+    Args:
+        content: bytes of the .glb or .gltf file.
+        path: where they came from; buffers in files of their own must lie in its folder or below.
+        limits: ``max_bytes`` applies to each buffer and each accessor.
+
+    Raises:
+        FormatError: if the container or its JSON is damaged, or the geometry is compressed.
+    """
+
+    def __init__(self, content: bytes, path: Path, limits: FileLimits) -> None:
+        text, self._binary = _open_container(content) if content[:4] == b"glTF" else (content, None)
+        self._path, self._limits = path, limits
+        self._buffers: dict[int, bytes] = {}
+        try:
+            self.json = json.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise FormatError(f"not a readable glTF document ({type(error).__name__}: {error})") from error
+        if not isinstance(self.json, dict):
+            raise FormatError(f"must be glTF of version 2, whose JSON is an object; got {type(self.json).__name__}")
+        compressed = [name for name in self.entry(self.json, "extensionsRequired", list) if name in _COMPRESSED]
+        if compressed:
+            raise FormatError(
+                f"needs the extension {compressed[0]}, which is not read; save it again without mesh compression"
+            )
+
+    @staticmethod
+    def entry(owner: dict[str, Any], key: str, kind: type, default: Any = None) -> Any:
+        """Return ``owner[key]``, an instance of ``kind``; ``default`` (or an empty ``kind``) if it is missing or null.
+
+        Raises:
+            FormatError: if it is of another type.
+        """
+        value = owner.get(key)
+        if value is None:
+            return kind() if default is None else default
+        if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+            raise FormatError(
+                f"not a readable glTF document: the entry {key!r} must be of type {kind.__name__}, "
+                f"got {type(value).__name__}"
+            )
+        return value
+
+    def items(self, collection: str) -> list[dict[str, Any]]:
+        """Return a top-level list such as "meshes", empty where it is missing; FormatError unless it holds objects."""
+        items = self.entry(self.json, collection, list)
+        for number, item in enumerate(items):
+            if not isinstance(item, dict):
+                raise FormatError(f"{collection}[{number}] must be an object: {collection} must be a list of objects")
+        return items
+
+    def index(self, collection: str, value: Any, what: str | None = None) -> int:
+        """Return ``value`` if it is an index into a top-level list; if not, FormatError says that of ``what``."""
+        count = len(self.entry(self.json, collection, list))
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < count:
+            raise FormatError(
+                f"{what or 'an entry'} must be an index below {count}: it refers to {collection}[{value!r}], but there "
+                f"are {count}"
+            )
+        return value
+
+    def item(self, collection: str, index: Any, what: str | None = None) -> dict[str, Any]:
+        """Return element ``index`` of a top-level list; FormatError, which names ``what`` refers to it, if none."""
+        found = self.entry(self.json, collection, list)[self.index(collection, index, what)]
+        if not isinstance(found, dict):
+            raise FormatError(f"{collection}[{index}] must be an object")
+        return found
+
+    def accessor_count(self, index: Any, what: str | None = None) -> int:
+        """Return how many elements an accessor claims, at least zero."""
+        item = self.item("accessors", index, what and f"the accessor of {what}")
+        count = self.entry(item, "count", int)
+        if count < 0:
+            raise FormatError(f"accessors[{index}] claims {count} elements")
+        return count
+
+    def accessor(self, index: Any, what: str | None = None, types: Sequence[str] = tuple(_WIDTHS)) -> Array:
+        """Return an accessor as (count, width) in its own type, normalized integers as float64.
+
+        Args:
+            index: of the accessor.
+            what: it holds, for messages.
+            types: names such as "VEC3", of which its type must be one.
+
+        Raises:
+            FormatError: if it is of another or an unknown type, without data or beyond its buffer or the size limit.
+        """
+        count = self.accessor_count(index, what)
+        item = self.item("accessors", index)
+        what = what or f"accessors[{index}] of {count} elements"
+        dtype, shape = self._component(item, what), item.get("type")
+        if not isinstance(shape, str) or shape not in types:
+            raise FormatError(f"{what} must be {' or '.join(types)}, got {shape!r}")
+        width, sparse = _WIDTHS[shape], item.get("sparse")
+        if count * width * dtype.itemsize > self._limits.max_bytes:
+            raise FormatError(f"{what} has {count} elements, more than the size limit allows")
+        if item.get("bufferView") is None and sparse is None:
+            raise FormatError(f"{what} has no data; save the file again without mesh compression")
+        if item.get("bufferView") is None:
+            values: Array = np.zeros((count, width), dtype)
+        else:
+            values = self._elements(item, count, width, dtype, what)
+        if sparse is not None:
+            values = self._with_sparse(values, self.entry(item, "sparse", dict), what)
+        if item.get("normalized") is True and dtype.kind in "iu":
+            return np.maximum(values / np.iinfo(dtype).max, -1.0)
+        return values
+
+    def _component(self, owner: dict[str, Any], what: str) -> np.dtype[Any]:
+        component = owner.get("componentType")
+        if not isinstance(component, int) or component not in _COMPONENTS:
+            raise FormatError(f"{what} has the unknown type {component!r}, not a known component type such as 5126")
+        return _COMPONENTS[component]
+
+    def _with_sparse(self, values: Array, sparse: dict[str, Any], what: str) -> Array:
+        """Return a copy of values in which those that a sparse accessor lists are replaced."""
+        places, replacements = self.entry(sparse, "indices", dict), self.entry(sparse, "values", dict)
+        if not places or not replacements:
+            raise FormatError(f"{what} is sparse, but lacks indices or values")
+        count, dtype = self.entry(sparse, "count", int), self._component(places, f"the sparse part of {what}")
+        if dtype.kind != "u" or not 0 < count <= len(values):
+            raise FormatError(f"the sparse part of {what} has {count} entries of unusable type or number")
+        rows = self._elements(places, count, 1, dtype, what)[:, 0]
+        if int(rows.max()) >= len(values):
+            raise FormatError(f"the sparse part of {what} points at element {rows.max()} of {len(values)}")
+        values = values.copy()
+        values[rows] = self._elements(replacements, count, values.shape[1], values.dtype, what)
+        return values
+
+    def _elements(self, owner: dict[str, Any], count: int, width: int, dtype: np.dtype[Any], what: str) -> Array:
+        """Return a read-only (count, width) window into the buffer view of ``owner``, seen to lie inside."""
+        index = owner.get("bufferView")
+        view = self.item("bufferViews", index, f"the bufferView of {what}")
+        data = self._buffer(self.index("buffers", view.get("buffer"), f"the buffer of {what}"))
+        start, length = (self._size(view, key, f"bufferViews[{index}]") for key in ("byteOffset", "byteLength"))
+        if start + length > len(data):
+            raise FormatError(
+                f"bufferViews[{index}] reaches beyond its buffer of {len(data)} bytes; the file is cut short or damaged"
+            )
+        if count == 0:
+            return np.zeros((0, width), dtype)
+        offset, size = self._size(owner, "byteOffset", what), width * dtype.itemsize
+        stride = self._size(view, "byteStride", what) or size
+        if offset + stride * (count - 1) + size > length:
+            raise FormatError(
+                f"{what} reaches beyond its buffer ({count} elements of {size} bytes, view of {length} bytes); "
+                f"the file is cut short or damaged"
+            )
+        return np.ndarray((count, width), dtype, data, start + offset, (stride, dtype.itemsize))
+
+    def _size(self, owner: dict[str, Any], key: str, what: str) -> int:
+        value: int = self.entry(owner, key, int)
+        if value < 0:
+            raise FormatError(f"the {key} of {what} is {value}: it reaches beyond its buffer")
+        return value
+
+    def _buffer(self, index: int) -> bytes:
+        if index not in self._buffers:
+            item = self.item("buffers", index)
+            uri = item.get("uri")
+            data = self._binary if uri is None else self._external(index, self.entry(item, "uri", str))
+            if data is None:
+                raise FormatError(f"buffer {index} has neither an address nor a binary chunk")
+            length = self._size(item, "byteLength", f"buffer {index}")
+            if length > len(data):
+                raise FormatError(
+                    f"buffer {index} should have {length} bytes, got {len(data)}: it is shorter than its byteLength"
+                )
+            self._buffers[index] = data
+        return self._buffers[index]
+
+    def _external(self, index: int, uri: str) -> bytes:
+        if uri.startswith("data:"):
+            head, _, packed = uri.partition(",")
+            if not head.endswith(";base64"):
+                raise FormatError(f"buffer {index} is not base64, as data inside a file must be base64: {head[:60]!r}")
+            try:
+                return base64.b64decode(packed, validate=True)
+            except ValueError as error:
+                raise FormatError(f"buffer {index} is damaged base64, not valid base64 ({error})") from error
+        name, folder = unquote(uri), self._path.parent.resolve()
+        place = (folder / name).resolve() if not {":", "\0", "\\"} & set(name) else None
+        if place is None or not place.is_relative_to(folder):
+            raise FormatError(f"refers to the buffer {uri[:100]!r}, which must lie in the file's folder or below")
+        try:
+            return read_bytes(place, self._limits)
+        except FileNotFoundError as error:
+            raise FormatError(f"its buffer {uri[:100]!r} cannot be read: it is not there") from error
+        except OSError as error:
+            raise FormatError(f"its buffer {uri[:100]!r} cannot be read ({error})") from error
+
+    def node_label(self, index: int) -> str:
+        """Return how messages call a node: by its name, by its number without one."""
+        name = self.item("nodes", index).get("name")
+        return repr(name) if name else str(index)
+
+    def node_parents(self) -> list[int]:
+        """Return the parent of each node, -1 for roots.
+
+        Raises:
+            FormatError: if a child is no node.
+            ModelError: if a node has two parents.
+        """
+        nodes = self.items("nodes")
+        parents = [-1] * len(nodes)
+        for number, node in enumerate(nodes):
+            for value in self.entry(node, "children", list):
+                child = self.index("nodes", value, f"a child of node {number}")
+                if parents[child] >= 0:
+                    raise ModelError(f"node {self.node_label(child)} has two parents; glTF allows one")
+                parents[child] = number
+        return parents
+
+    def node_transform(self, index: int) -> Array:
+        """Return the (4, 4) transform of a node in its parent.
+
+        Raises:
+            FormatError: if it is not made of numbers, as many as needed.
+            ModelError: if they are not finite, or a rotation is zero.
+        """
+        node, what = self.item("nodes", index), f"of node {self.node_label(index)}"
+        if node.get("matrix") is not None:
+            return self._numbers(node, "matrix", [0.0] * 16, what).reshape(4, 4).T
+        quaternion = self._numbers(node, "rotation", [0.0, 0.0, 0.0, 1.0], what)
+        length = np.linalg.norm(quaternion)
+        if not length > 0:
+            raise ModelError(f"the rotation {what} is a zero quaternion")
+        axis, w = quaternion[:3] / length, quaternion[3] / length
+        cross = np.cross(np.eye(3), axis)
+        transform = np.eye(4)
+        transform[:3, :3] = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+        transform[:3, :3] *= self._numbers(node, "scale", [1.0, 1.0, 1.0], what)
+        transform[:3, 3] = self._numbers(node, "translation", [0.0, 0.0, 0.0], what)
+        return transform
+
+    def node_globals(self, parents: Sequence[int]) -> Array:
+        """Return the (nodes, 4, 4) transforms of all nodes in the scene, infinite where they overflow.
+
+        Raises:
+            FormatError: as `node_transform`.
+            ModelError: as `node_transform`, and if ``parents`` are cyclic.
+        """
+        order = parents_first(parents)
+        if len(order) < len(parents):
+            stuck = sorted(set(range(len(parents))) - set(order))
+            raise ModelError(f"the node hierarchy is cyclic at {', '.join(map(self.node_label, stuck[:5]))}")
+        result = np.empty((len(parents), 4, 4))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for index in order:
+                local = self.node_transform(index)
+                result[index] = local if parents[index] < 0 else result[parents[index]] @ local
+        return result
+
+    def _numbers(self, node: dict[str, Any], key: str, default: list[float], what: str) -> Array:
+        values = self.entry(node, key, list, default)
+        if len(values) != len(default) or any(type(value) not in (int, float) for value in values):
+            raise FormatError(
+                f"not a readable glTF document: the {key} {what} must hold {len(default)} numbers, got {values!r}"[:300]
+            )
+        if not all(abs(value) < _LARGEST_NUMBER for value in values):
+            raise ModelError(f"the {key} {what} is not finite: {values!r}"[:300])
+        return np.array(values, dtype=np.float64)
+
+
+def _open_container(content: bytes) -> tuple[bytes, bytes | None]:
+    """Return the JSON and the binary chunk of a .glb file."""
+    if len(content) < 20:
+        raise FormatError(f"is cut off in its header: a .glb file has at least 20 bytes, got {len(content)}")
+    version, length = struct.unpack_from("<II", content, 4)
+    if version != 2 or length != len(content):
+        raise FormatError(
+            f"expected glTF 2 of {len(content)} bytes; the header says version {version} and {length} bytes: it is cut "
+            f"off or damaged"
+        )
+    chunks, place = list[tuple[bytes, bytes]](), 12
+    while place + 8 <= length:
+        size, kind = struct.unpack_from("<I4s", content, place)
+        if place + 8 + size > length:
+            raise FormatError(f"the chunk at byte {place} reaches beyond the end of the file: it is damaged")
+        chunks.append((kind, content[place + 8 : place + 8 + size]))
+        place += 8 + size
+    if chunks[0][0] != b"JSON":
+        raise FormatError(f"must begin with a JSON chunk, got {chunks[0][0]!r}")
+    return chunks[0][1], next((data for kind, data in chunks[1:] if kind == b"BIN\0"), None)
+
+
+def parents_first(parents: Sequence[int]) -> list[int]:
+    """Return indices with every parent before its children; those in a cycle are left out."""
+    children: dict[int, list[int]] = {}
+    for index, parent in enumerate(parents):
+        children.setdefault(parent, []).append(index)
+    order = list(children.get(-1, []))
+    for index in order:
+        order.extend(children.get(index, []))
+    return order
+
+
+def triangles(mode: int, corners: Array, what: str) -> Array:
+    """Return the (F, 3) triangles of a primitive, none where ``mode`` draws points or lines.
+
+    Args:
+        mode: `TRIANGLES`, `STRIP`, `FAN` or another mode of glTF.
+        corners: (C,) int64 vertices in the order of the file.
+        what: they are of, for messages.
+
+    Raises:
+        FormatError: if the corners of separate triangles are not a multiple of three.
+    """
+    if mode == TRIANGLES:
+        if len(corners) % 3:
+            raise FormatError(f"{what} has {len(corners)} triangle corners, not a multiple of three: it is damaged")
+        return corners.reshape(-1, 3)
+    if mode not in (STRIP, FAN) or len(corners) < 3:
+        return np.zeros((0, 3), dtype=np.int64)
+    first = np.full(len(corners) - 2, corners[0]) if mode == FAN else corners[:-2]
+    faces = np.stack((first, corners[1:-1], corners[2:]), axis=-1)
+    if mode == STRIP:
+        faces[1::2, :2] = faces[1::2, 1::-1]  # every second triangle of a strip is turned over
+    return faces
