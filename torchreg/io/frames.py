@@ -1,0 +1,312 @@
+"""Sequences of clouds: many files, a folder of them or one archive, read frame by frame; and their counterpart."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+import zipfile
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchreg._checks import as_float_tensor, check_choice, check_finite, check_shape
+from torchreg.errors import FormatError, InputError, InputTypeError
+from torchreg.io.atomic import write_atomic
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_count, local_path, open_zip, read_bytes
+from torchreg.io.points import PARSER_ERRORS, load_points, save_points
+from torchreg.io.raw_cloud import Array, as_indices
+
+ENDINGS = (".ply", ".pcd", ".xyz", ".txt", ".obj", ".stl", ".npz", ".glb", ".gltf")
+_DIGITS = re.compile(r"(\d+)")
+_NUMBERED = re.compile(r"frame_?(\d+)")
+PathLike = str | os.PathLike[str]
+
+
+class Frames(Sequence[Tensor]):
+    """Clouds in the order of time; each is read when it is asked for, and not kept.
+
+    Indexing and iterating give (M, 3) tensors on the CPU, a slice gives `Frames` again. M may be zero in archives.
+    Reading raises what `load_points` raises; every message names the file, and in an archive the frame. Made by
+    `load_frames`.
+
+    Args:
+        names: what each frame is called: the path of its file, in an archive also its number.
+        sources: per frame the path of its file, or its rows (M, 3).
+        nan_policy: see `load_points`.
+        limits: see `load_points`.
+        dtype: of the tensors.
+    """
+
+    def __init__(
+        self, names: Sequence[str], sources: Sequence[Path | Array], nan_policy: str, limits: FileLimits,
+        dtype: torch.dtype,
+    ) -> None:  # fmt: skip
+        self.names = tuple(names)
+        self._sources, self._nan_policy, self._limits, self._dtype = tuple(sources), nan_policy, limits, dtype
+
+    def __len__(self) -> int:
+        return len(self._sources)
+
+    @overload
+    def __getitem__(self, index: int) -> Tensor: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Frames: ...
+
+    def __getitem__(self, index: int | slice) -> Tensor | Frames:
+        if isinstance(index, slice):
+            return Frames(self.names[index], self._sources[index], self._nan_policy, self._limits, self._dtype)
+        source = self._sources[index]
+        if isinstance(source, Path):
+            return load_points(source, nan_policy=self._nan_policy, limits=self._limits, dtype=self._dtype).points
+        return self._rows(self.names[index], source)
+
+    def __iter__(self) -> Iterator[Tensor]:
+        return (self[index] for index in range(len(self)))
+
+    def _rows(self, name: str, rows: Array) -> Tensor:
+        with np.errstate(all="ignore"):  # what overflows becomes infinite and is judged as that
+            points = torch.from_numpy(rows.astype(np.float64 if self._dtype == torch.float64 else np.float32))
+        finite = torch.isfinite(points).all(dim=-1)
+        bad = len(points) - int(finite.sum())
+        if bad and self._nan_policy == "raise":
+            raise FormatError(f'{name}: {bad} of {len(points)} points are not finite; nan_policy="omit" drops them')
+        return points[finite] if bad else points
+
+
+def load_frames(
+    path: PathLike | Sequence[PathLike],
+    *,
+    sort: bool = True,
+    nan_policy: str = "raise",
+    limits: FileLimits = DEFAULT_LIMITS,
+    dtype: torch.dtype = torch.float32,
+) -> Frames:
+    """Return the clouds of a sequence, read one by one when asked for.
+
+    Args:
+        path: a folder whose files are frames, all of one format; a list of files; one file; or one NPZ of frames: an
+            array ``points`` (or ``vertices``, or the only one of three dimensions) of shape (T, M, 3), with ``counts``
+            (T,), the rows of each frame that count, or ``mask`` (T, M), or neither; or T arrays (M, 3) called
+            ``frame_0``, ``frame_1``, ... An archive is read at once, the rest is not.
+        sort: order files by their paths with numbers counted as numbers, so that frame2 comes before frame10, as they
+            rarely do where a shell wrote the list. False keeps the order of a list.
+        nan_policy: see `load_points`.
+        limits: see `load_points`; they hold for every file and frame.
+        dtype: torch.float32 or torch.float64.
+
+    Returns:
+        at least one frame; points keep the order and the unit of the file.
+
+    Raises:
+        FileNotFoundError: if a file is missing.
+        IsADirectoryError: if a list holds a folder.
+        FormatError: if there is nothing to read, a folder mixes formats, an ending is unknown or an archive is damaged
+            or holds no frames; files are otherwise looked at when they are read.
+        InputError: if ``nan_policy`` is unknown.
+        InputTypeError: if ``path`` or ``dtype`` is of another type.
+    """
+    check_choice(nan_policy, "nan_policy", ("raise", "omit"))
+    if dtype not in (torch.float32, torch.float64):
+        raise InputTypeError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+    if isinstance(path, (str, os.PathLike)):
+        place = local_path(path)
+        files = _files_of(place) if place.is_dir() else _checked([place])
+    else:
+        files = _listed(path)
+    if sort:
+        files = sorted(files, key=natural_key)
+    if len(files) == 1 and files[0].suffix.lower() == ".npz":
+        stacked = _read_archive(files[0], limits)
+        if stacked is not None:
+            names = [f"{files[0]}, frame {number}" for number in range(len(stacked))]
+            return Frames(names, stacked, nan_policy, limits, dtype)
+    return Frames([str(file) for file in files], files, nan_policy, limits, dtype)
+
+
+def save_frames(path: PathLike, frames: Sequence[Any]) -> list[Path]:
+    """Write a sequence of clouds and return the files: one NPZ of frames, or a folder with one PLY per frame.
+
+    Args:
+        path: an archive ending in .npz, which is replaced, or a folder, which is made if it does not exist; in there
+            files ``frame_0000.ply``, ``frame_0001.ply``, ... are replaced.
+        frames: T clouds (M_t, 3), finite; a folder cannot hold frames without points.
+
+    Returns:
+        the files, in order.
+
+    Raises:
+        InputError: if there are no frames, one is not finite, of the wrong shape or, for a folder, empty; or if the
+            folder holds other point files, which `load_frames` would take for frames.
+        FormatError: if the path is an address or has another ending than .npz.
+        FileNotFoundError: if the folder that shall hold ``path`` does not exist.
+    """
+    place = local_path(path)
+    clouds = [as_float_tensor(frame, f"frames[{number}]").detach().cpu() for number, frame in enumerate(frames)]
+    if not clouds:
+        raise InputError("frames must hold at least one cloud, got none")
+    for number, cloud in enumerate(clouds):
+        check_shape(cloud, f"frames[{number}]", ("M", 3))
+        check_finite(cloud, f"frames[{number}]")
+    if place.suffix.lower() == ".npz":
+        write_atomic(place, _archive(clouds))
+        return [place]
+    if place.suffix:
+        raise FormatError(f"{place} has the ending {place.suffix!r}; name an archive ending in .npz or a folder")
+    return _save_folder(place, clouds)
+
+
+def natural_key(path: PathLike) -> list[tuple[int, int | str, str]]:
+    """Return what sorts paths with the numbers in them counted as numbers: frame2 before frame10."""
+    pieces = _DIGITS.split(os.fspath(path))
+    # Digits of other scripts and leading zeros are told apart by the text itself.
+    return [(0, int(piece), piece) if number % 2 else (1, piece, piece) for number, piece in enumerate(pieces)]
+
+
+def _files_of(folder: Path) -> list[Path]:
+    files = [file for file in folder.iterdir() if file.suffix.lower() in ENDINGS and not file.name.startswith(".")]
+    kinds = Counter(file.suffix.lower() for file in files)
+    if not files:
+        raise FormatError(f"{folder} holds no frames: no file ends in one of {', '.join(ENDINGS)}")
+    if len(kinds) > 1:
+        found = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+        raise FormatError(f"{folder} holds files of several formats ({found}); pass a list of those that are frames")
+    return files
+
+
+def _listed(paths: Any) -> list[Path]:
+    if isinstance(paths, bytes) or not isinstance(paths, Sequence):
+        raise InputTypeError(f"path must be a path or a list of paths, got {type(paths).__name__}")
+    files = [local_path(path) for path in paths]
+    if not files:
+        raise FormatError("path is an empty list: there is nothing to read; does the pattern match any file?")
+    return _checked(files)
+
+
+def _checked(files: list[Path]) -> list[Path]:
+    """Return the files; raise unless each is there and ends like a cloud."""
+    for file in files:
+        file.stat()  # a missing file is the first thing to say
+        if file.is_dir():
+            raise IsADirectoryError(f"{file} is a folder; pass it alone, or the files in it")
+        if file.suffix.lower() not in ENDINGS:
+            raise FormatError(f"{file} has the unknown ending {file.suffix!r}; known: {', '.join(ENDINGS)}")
+    return files
+
+
+def _read_archive(place: Path, limits: FileLimits) -> list[Array] | None:
+    """Return the rows of each frame of an archive, None if it holds a single cloud or something else."""
+    content = read_bytes(place, limits)
+    try:
+        with open_zip(content, limits) as archive:
+            return _frames_in(archive, limits)
+    except FormatError as error:
+        raise FormatError(f"{place}: {error}") from error
+    except PARSER_ERRORS as error:
+        raise FormatError(f"{place}: cannot be read as NPZ ({type(error).__name__}: {error})") from error
+
+
+def _frames_in(archive: zipfile.ZipFile, limits: FileLimits) -> list[Array] | None:
+    shapes = {
+        info.filename.removesuffix(".npy"): _shape_of(archive, info)
+        for info in archive.infolist()
+        if info.filename.endswith(".npy")
+    }
+    numbered = {int(match[1]): key for key in shapes if (match := _NUMBERED.fullmatch(key))}
+    if numbered:
+        frames = [_array(archive, numbered[number], "iuf") for number in sorted(numbered)]
+    else:
+        named: list[str] = [key for key in ("points", "vertices") if key in shapes]
+        stacks = named[:1] or [key for key, shape in shapes.items() if len(shape) == 3 and shape[2] == 3]
+        if len(stacks) != 1 or len(shapes[stacks[0]]) != 3:
+            return None
+        frames = _cut(archive, _array(archive, stacks[0], "iuf"), stacks[0], shapes)
+    if not frames:
+        raise FormatError("holds no frames")
+    for number, frame in enumerate(frames):
+        if frame.ndim != 2 or frame.shape[1] != 3:
+            raise FormatError(f"frame {number} must have shape (M, 3), got {frame.shape}")
+        check_count(len(frame), "points", limits)
+    return frames
+
+
+def _cut(archive: zipfile.ZipFile, points: Array, name: str, shapes: dict[str, tuple[int, ...]]) -> list[Array]:
+    """Return the frames of a stack (T, M, 3) without their padding."""
+    count, most = points.shape[:2]
+    if "counts" in shapes and "mask" in shapes:
+        raise FormatError("must hold counts or mask, not both")
+    if "counts" in shapes:
+        counts = as_indices(_array(archive, "counts", "iuf"), "counts")
+        if counts.shape != (count,) or (count and not (counts.min() >= 0 and counts.max() <= most)):
+            raise FormatError(f"counts must be {count} numbers from 0 to {most}, one per frame of {name}")
+        return [frame[:rows] for frame, rows in zip(points, counts.tolist(), strict=True)]
+    if "mask" in shapes:
+        mask = _array(archive, "mask", "biu")
+        if mask.shape != (count, most):
+            raise FormatError(f"mask must have the shape {(count, most)}, got {mask.shape}")
+        return [frame[rows] for frame, rows in zip(points, mask.astype(bool), strict=True)]
+    return list(points)
+
+
+def _shape_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> tuple[int, ...]:
+    """Return the shape that a member claims, compared with the bytes behind it before anything is allocated."""
+    with archive.open(info) as stream:
+        version = np.lib.format.read_magic(stream)
+        if version not in ((1, 0), (2, 0)):
+            raise FormatError(f"member {info.filename!r} has the unknown array format {version}")
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(stream)
+        held = info.file_size - stream.tell()
+    if not dtype.hasobject and (any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != held):
+        raise FormatError(f"member {info.filename!r} claims the shape {shape} of {dtype} but holds {held} bytes")
+    return shape
+
+
+def _array(archive: zipfile.ZipFile, key: str, kinds: str) -> Array:
+    with archive.open(f"{key}.npy") as stream:
+        try:
+            array = np.lib.format.read_array(stream, allow_pickle=False)
+        except ValueError as error:  # objects among others
+            raise FormatError(
+                f"array {key!r} must hold numbers, and pickled objects are never loaded ({error})"
+            ) from error
+    if array.dtype.kind not in kinds:
+        raise FormatError(
+            f"array {key!r} must hold {'truth values' if 'b' in kinds else 'real numbers'}, got {array.dtype}"
+        )
+    return array
+
+
+def _archive(clouds: list[Tensor]) -> bytes:
+    dtype = np.float64 if any(cloud.dtype == torch.float64 for cloud in clouds) else np.float32
+    counts = np.array([len(cloud) for cloud in clouds], dtype=np.int64)
+    points = np.zeros((len(clouds), int(counts.max()), 3), dtype=dtype)
+    for frame, cloud in zip(points, clouds, strict=True):
+        frame[: len(cloud)] = cloud.to(torch.float64).numpy()
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, points=points, counts=counts)
+    return stream.getvalue()
+
+
+def _save_folder(folder: Path, clouds: list[Tensor]) -> list[Path]:
+    for number, cloud in enumerate(clouds):
+        if not len(cloud):
+            raise InputError(f"frames[{number}] has no points, which PLY files must have; write an archive (.npz)")
+    folder.mkdir(exist_ok=True)
+    files = [folder / f"frame_{number:04d}.ply" for number in range(len(clouds))]
+    others = {file for file in folder.iterdir() if file.suffix.lower() in ENDINGS} - set(files)
+    if others:
+        raise InputError(
+            f"path {folder} holds {len(others)} other point files, such as {min(others).name}, which would be taken "
+            f"for frames; name an empty folder"
+        )
+    for file, cloud in zip(files, clouds, strict=True):
+        save_points(file, cloud)
+    return files
