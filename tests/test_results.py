@@ -7,7 +7,7 @@ import torch
 
 from torchreg import results
 from torchreg.errors import TorchregError
-from torchreg.results import AlignRecord, AlignResult, DemoResult, Status
+from torchreg.results import AlignRecord, AlignResult, Calibration, DemoResult, Status
 
 
 def result():
@@ -38,7 +38,7 @@ def test_history_is_empty_unless_given_and_fields_can_be_replaced():
 
 
 def test_every_field_is_documented():
-    for record in (AlignResult, AlignRecord, DemoResult):
+    for record in (AlignResult, AlignRecord, Calibration, DemoResult):
         for field in fields(record):
             assert f"        {field.name}: " in record.__doc__, field.name
 

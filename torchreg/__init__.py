@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torchreg.pipelines.align import AlignConfig, align
     from torchreg.pipelines.calibrate import calibrate
     from torchreg.pipelines.storage import load
-    from torchreg.results import AlignResult, Status
+    from torchreg.results import AlignResult, Calibration, Status
 
 __version__ = "0.1.0"
 
@@ -29,6 +29,7 @@ __all__ = [
     "AlignResult",
     "ArticulatedShape",
     "BendingSkin",
+    "Calibration",
     "EMLoss",
     "Hand",
     "LinearBlendSkin",
@@ -53,6 +54,7 @@ _OWNERS = {
     "AlignResult": "results",
     "ArticulatedShape": "models.articulated",
     "BendingSkin": "models.skin",
+    "Calibration": "results",
     "EMLoss": "losses.em",
     "Hand": "models.hand",
     "LinearBlendSkin": "models.skin",

@@ -6,12 +6,14 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, Generic, TypeVar
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchreg.errors import TorchregError
 
+# The class of a shape: models belong to a layer above this one.
+Shape = TypeVar("Shape", bound=nn.Module)
 Writer = Callable[[Any, str | os.PathLike[str]], None]
 
 # Files belong to a layer above this one, which registers its function when it is imported.
@@ -115,6 +117,27 @@ class AlignResult(Result):
     def statuses(self) -> tuple[Status, ...]:
         """One status per problem, also where there is a single one."""
         return (self.status,) if isinstance(self.status, Status) else self.status
+
+
+@dataclass(frozen=True)
+class Calibration(Result, Generic[Shape]):
+    """A shape fitted to clouds of it in T poses.
+
+    Args:
+        shape: a copy of the shape with the fitted scales.
+        poses: (T, num_dofs) of the frames, metres and radians.
+        log_length_scales: (P,) of the fitted shape.
+        log_radius_scales: (P,) of the fitted shape.
+        cost: (), of the joint fit, lower is better.
+        status: how the calibration ended.
+    """
+
+    shape: Shape
+    poses: Tensor
+    log_length_scales: Tensor
+    log_radius_scales: Tensor
+    cost: Tensor
+    status: Status
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ from torchreg.models.primitives import Primitive
 from torchreg.models.skin import BendingSkin, sample_skin
 from torchreg.pipelines.align import AlignConfig, align
 from torchreg.pipelines.calibrate import CalibrateConfig, calibrate, scale_jacobian
-from torchreg.results import Status
+from torchreg.pipelines.storage import load
+from torchreg.results import Calibration, Status
 
 
 def offset(*place):
@@ -112,6 +113,18 @@ def test_lengths_radii_and_poses_come_back(arm_found, arm_truth, arm_poses):
     assert found.cost.shape == ()
     torch.testing.assert_close(found.shape.log_length_scales.detach(), found.log_length_scales)
     torch.testing.assert_close(found.shape.log_radius_scales.detach(), found.log_radius_scales)
+
+
+def test_what_was_found_comes_back_from_a_file(arm_found, arm_frames, tmp_path):
+    _, found, _ = arm_found
+    found.save(tmp_path / "arm.safetensors")
+    loaded = load(tmp_path / "arm.safetensors")
+    assert isinstance(loaded, Calibration)
+    assert loaded.status is found.status
+    for name in ("poses", "log_length_scales", "log_radius_scales", "cost"):
+        assert torch.equal(getattr(loaded, name), getattr(found, name)), name
+    expected = found.shape.distance(arm_frames, found.poses)
+    assert torch.equal(loaded.shape.distance(arm_frames, loaded.poses), expected)
 
 
 def test_the_given_shape_is_not_changed(arm_found, arm_frames, arm_starts):

@@ -8,10 +8,13 @@ import pytest
 import torch
 
 from torchreg.errors import FormatError, InputError, InputTypeError
+from torchreg.geometry.kinematic_tree import Joint, KinematicTree
+from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.hand import Hand
+from torchreg.models.primitives import Primitive
 from torchreg.pipelines.align import AlignConfig, align
 from torchreg.pipelines.storage import load, load_pose, save_result
-from torchreg.results import AlignRecord, AlignResult, DemoResult, Result, Status
+from torchreg.results import AlignRecord, AlignResult, Calibration, DemoResult, Result, Status
 
 
 def record(step, batch=1, dtype=torch.float32):
@@ -95,12 +98,90 @@ def test_demo_results_come_back(tmp_path):
     assert same(saved, load(tmp_path / "poses.safetensors"))
 
 
+def calibration(shape):
+    generator = torch.Generator().manual_seed(2)
+    with torch.no_grad():
+        for parameter in shape.parameters():
+            parameter.mul_(1 + 0.1 * torch.rand(parameter.shape, generator=generator).to(parameter))
+        shape.log_length_scales.add_(0.1)
+    scales = shape.log_length_scales.detach().clone(), shape.log_radius_scales.detach().clone()
+    poses = torch.randn(3, shape.num_dofs, generator=generator).to(shape.rest)
+    return Calibration(shape, poses, *scales, cost=torch.tensor(2.5), status=Status.CONVERGED)
+
+
+def make_arm():
+    eye = torch.eye(4, dtype=torch.float64)
+    joints = Joint("base", -1, eye), Joint("arm", 0, eye, "revolute", (0.0, 1.0, 0.0), -1.0, 2.0)
+    solids = Primitive("ellipsoid", (0.1, 0.1, 0.1), eye), Primitive("capsule", (0.3, 0.05), eye)
+    return ArticulatedShape(KinematicTree(joints), ["base", "arm"], solids, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("make", [Hand, make_arm])
+def test_calibrations_come_back_with_their_shape(tmp_path, make):
+    saved = calibration(make())
+    saved.save(tmp_path / "c.safetensors")
+    loaded = load(tmp_path / "c.safetensors")
+    assert type(loaded) is Calibration
+    assert type(loaded.shape) is type(saved.shape)
+    assert all(same(getattr(saved, item.name), getattr(loaded, item.name)) for item in fields(saved)[1:])
+    points = torch.rand(3, 40, 3, generator=torch.Generator().manual_seed(5)).to(saved.poses)
+    assert torch.equal(loaded.shape.distance(points, loaded.poses), saved.shape.distance(points, saved.poses))
+    assert torch.equal(loaded.shape.keypoints(loaded.poses), saved.shape.keypoints(saved.poses))
+    assert loaded.shape.dof_names == saved.shape.dof_names
+    loaded.save(tmp_path / "again.safetensors")
+    assert (tmp_path / "again.safetensors").read_bytes() == (tmp_path / "c.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s["spec"]["fields"].update(nu=-1.0), "nu must be positive"),
+        (lambda s: s["spec"]["fields"].update(part_frames=["base", "leg"]), "the tree does not have: leg"),
+        (lambda s: s["spec"]["fields"]["tree"]["fields"]["joints"]["columns"].update(parent=[-1, 1]), "arm"),
+        (lambda s: s["spec"]["fields"]["primitives"]["columns"].update(kind=["capsule", "box"]), "primitive 0 .*needs"),
+        (lambda s: s.update(parameters=s["parameters"][:-1]), "needs parameters of shapes"),
+        (lambda s: s.update(spec=None), r"fields\.shape\.spec must not be of type NoneType"),
+        (lambda s: s.update(learnable=[1] * 5), "must not be of type tuple"),
+    ],
+)
+def test_shapes_that_cannot_be_built_are_refused(tmp_path, change, message):
+    calibration(make_arm()).save(tmp_path / "c.safetensors")
+    edit(tmp_path / "c.json", lambda metadata: change(metadata["fields"]["shape"]["fields"]))
+    with pytest.raises(FormatError, match=rf"c\.safetensors: is not a complete Calibration .*{message}"):
+        load(tmp_path / "c.safetensors")
+
+
+def leaves(value, path=()):
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    return [path] * bool(path) + [leaf for key, inner in items for leaf in leaves(inner, (*path, key))]
+
+
+def test_any_damaged_entry_of_a_shape_is_refused_or_read(tmp_path):
+    """No damage of the JSON file gets past `load` as anything but a FormatError."""
+    calibration(make_arm()).save(tmp_path / "c.safetensors")
+    whole = (tmp_path / "c.json").read_text(encoding="utf-8")
+    refused = 0
+    for place in leaves(json.loads(whole)["metadata"]["fields"]["shape"]):
+        for value in (None, -1, 3.5, "x", [], {}, {"tensor": "poses"}, {"stack": "poses"}):
+            description = json.loads(whole)
+            owner = description["metadata"]["fields"]["shape"]
+            for key in place[:-1]:
+                owner = owner[key]
+            owner[place[-1]] = value
+            (tmp_path / "c.json").write_text(json.dumps(description), encoding="utf-8")
+            try:
+                load(tmp_path / "c.safetensors")
+            except FormatError:
+                refused += 1
+    assert refused > 300
+
+
 def test_unknown_results_are_neither_saved_nor_loaded(tmp_path):
     @dataclass(frozen=True)
     class Other(Result):
         value: torch.Tensor
 
-    with pytest.raises(InputTypeError, match=r"result must be one of AlignResult, DemoResult, got Other"):
+    with pytest.raises(InputTypeError, match=r"result must be one of AlignResult, Calibration, DemoResult, got Other"):
         Other(torch.zeros(1)).save(tmp_path / "r.safetensors")
     assert list(tmp_path.iterdir()) == []
     result().save(tmp_path / "r.safetensors")

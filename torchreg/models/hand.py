@@ -92,7 +92,7 @@ class Hand(ArticulatedShape):
     ) -> None:
         check_choice(side, "side", ("right", "left"))
         check_positive(scale, "scale")
-        self.side = side
+        self.side, self.scale = side, float(scale)
         unit = 1e-3 * scale
         mirror = 1.0 if side == "right" else -1.0
         joints, part_frames = [Joint("palm", -1, torch.eye(4, dtype=torch.float64))], ["palm"]

@@ -16,7 +16,7 @@ from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.primitives import fuse
 from torchreg.models.skin import sample_skin
 from torchreg.pipelines.align import AlignConfig, align
-from torchreg.results import Status
+from torchreg.results import Calibration, Status
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
 
 # Widths of the surface kernel and range of the last, shares of the shape's size; the last follows from the residuals.
@@ -90,27 +90,6 @@ class CalibrateRecord:
     log_radius_scales: Tensor
 
 
-@dataclass(frozen=True)
-class Calibration:
-    """A shape fitted to clouds.
-
-    Args:
-        shape: a copy of the shape with the fitted scales.
-        poses: (T, num_dofs) of the frames, metres and radians.
-        log_length_scales: (P,) of the fitted shape.
-        log_radius_scales: (P,) of the fitted shape.
-        cost: (), of the joint fit, lower is better.
-        status: how the calibration ended.
-    """
-
-    shape: ArticulatedShape
-    poses: Tensor
-    log_length_scales: Tensor
-    log_radius_scales: Tensor
-    cost: Tensor
-    status: Status
-
-
 def calibrate(
     shape: ArticulatedShape,
     frames: Tensor | Sequence[Tensor],
@@ -119,7 +98,7 @@ def calibrate(
     masks: Tensor | None = None,
     config: CalibrateConfig | None = None,
     on_step: Callable[[CalibrateRecord], None] | None = None,
-) -> Calibration:
+) -> Calibration[ArticulatedShape]:
     """Return a copy of a shape whose lengths and radii, part by part, fit a few clouds of it in different poses.
 
     Frames are first aligned one by one; then all poses and all scales are fitted together to the surface distances of

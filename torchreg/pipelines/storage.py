@@ -10,23 +10,28 @@ from dataclasses import MISSING, fields
 from enum import Enum
 from pathlib import Path
 from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_finite, check_shape
-from torchreg.errors import FormatError, InputError, InputTypeError
+from torchreg.errors import FormatError, InputError, InputTypeError, ModelError
+from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, open_zip, read_bytes
 from torchreg.io.points import PARSER_ERRORS
 from torchreg.io.tensors import FORMAT, load_tensors, save_tensors
 from torchreg.models.articulated import ArticulatedShape
-from torchreg.results import AlignRecord, AlignResult, DemoResult, Result, Status, register_writer
+from torchreg.models.primitives import Primitive
+from torchreg.models.rigs import RigSurface, ShapeSpec
+from torchreg.models.shape_record import HandSpec, ShapeRecord, build_shape, record_shape
+from torchreg.results import AlignRecord, AlignResult, Calibration, DemoResult, Result, Status, register_writer
 
 # What a file may name: nothing else is ever built from it.
-_RESULTS: dict[str, type[Result]] = {kind.__name__: kind for kind in (AlignResult, DemoResult)}
-_RECORDS: dict[str, type] = {kind.__name__: kind for kind in (AlignRecord,)}
+_RESULTS: dict[str, type[Result]] = {kind.__name__: kind for kind in (AlignResult, Calibration, DemoResult)}
+_SHAPE_RECORDS = (ShapeRecord, ShapeSpec, HandSpec, KinematicTree, Joint, Primitive, RigSurface)
+_RECORDS: dict[str, type] = {kind.__name__: kind for kind in (AlignRecord, *_SHAPE_RECORDS)}
 _ENUMS: dict[str, type[Enum]] = {kind.__name__: kind for kind in (Status,)}
 
 
@@ -61,7 +66,7 @@ def load(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -
         raise FormatError(f"{path}: holds a result of kind {kind!r}; this release reads {', '.join(_RESULTS)}")
     try:
         return _build(_RESULTS[kind], values, tensors, "fields")
-    except _WrongContentError as error:
+    except (_WrongContentError, ModelError, InputError) as error:
         raise FormatError(f"{path}: is not a complete {kind} ({error}): the file is damaged") from error
 
 
@@ -152,6 +157,8 @@ def _encode(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
         return value
     if type(value).__name__ in _ENUMS:
         return {"enum": type(value).__name__, "value": value.value}
+    if isinstance(value, ArticulatedShape):
+        value = record_shape(value)
     if type(value).__name__ in _RECORDS:
         columns = {
             item.name: _encode(getattr(value, item.name), f"{name}.{item.name}", tensors) for item in fields(value)
@@ -196,7 +203,8 @@ def _decode(value: Any, tensors: Mapping[str, Tensor], where: str) -> Any:
     if "enum" in value:
         return _member(_known(_ENUMS, value["enum"], where), value.get("value"), where)
     if "record" in value:
-        return _build(_known(_RECORDS, value["record"], where), value.get("fields"), tensors, where)
+        record = _build(_known(_RECORDS, value["record"], where), value.get("fields"), tensors, where)
+        return build_shape(record) if isinstance(record, ShapeRecord) else record
     if "table" in value:
         return _decode_table(value, tensors, where)
     raise _WrongContentError(f"{where} holds entries {', '.join(value)}")
@@ -253,6 +261,7 @@ def _make(kind: type, values: dict[str, Any], where: str) -> Any:
 
 def _fits(value: Any, hint: Any) -> bool:
     """Return whether a value has the type that a field declares."""
+    hint = hint.__bound__ if isinstance(hint, TypeVar) else hint
     origin, inner = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
         return any(_fits(value, option) for option in inner)
