@@ -21,7 +21,7 @@ def rigid_matrix(rotation: Tensor, translation: Tensor) -> Tensor:
     Differentiable: in both.
     """
     top = torch.cat([rotation, translation.unsqueeze(-1)], dim=-1)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 4)
+    bottom = torch.eye(4, dtype=top.dtype, device=top.device)[3:].expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, bottom], dim=-2)
 
 

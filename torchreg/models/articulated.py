@@ -15,6 +15,7 @@ from torchreg.errors import InputError, ModelError
 from torchreg.geometry.isosurface import isosurface
 from torchreg.geometry.kinematic_tree import KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.primitives import Planes
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import compose_rotation_vectors, left_jacobian, so3_exp, wrap_rotation_vector
 from torchreg.models.kinematics import KinematicChain, neighbor_matrix, part_parents
@@ -59,6 +60,8 @@ class ArticulatedShape(nn.Module):
     upper: Tensor
     _owners: Tensor
     _part_moves: Tensor
+    _row_moves: Tensor
+    _couplings: Tensor
 
     def __init__(
         self,
@@ -94,7 +97,11 @@ class ArticulatedShape(nn.Module):
         self.register_buffer("part_index", torch.tensor(frames), persistent=False)
         self.register_buffer("adjacency", neighbor_matrix(parents), persistent=False)
         self.register_buffer("_owners", torch.tensor(_offset_owners(tree, frames)), persistent=False)
-        self.register_buffer("_part_moves", self.chain.moves[frames].unsqueeze(-1), persistent=False)
+        moves = nn.functional.pad(self.chain.moves[frames], (6, 0), value=1.0)
+        self.register_buffer("_part_moves", moves, persistent=False)
+        self.register_buffer("_row_moves", moves.repeat_interleave(4, 0).unsqueeze(-2), persistent=False)
+        couplings = torch.block_diag(torch.eye(6, dtype=torch.float64), self.chain.couplings)
+        self.register_buffer("_couplings", couplings, persistent=False)
         base = torch.zeros(6, dtype=torch.float64) if not free_base else torch.full((6,), math.inf, dtype=torch.float64)
         self.register_buffer("lower", torch.cat([-base, self.chain.lower]), persistent=False)
         self.register_buffer("upper", torch.cat([base, self.chain.upper]), persistent=False)
@@ -304,7 +311,7 @@ class ArticulatedShape(nn.Module):
 
         Differentiable: in ``pose`` and `log_length_scales`.
         """
-        return self.frame_transforms(pose)[..., self.part_index, :, :]
+        return self.frame_transforms(pose).index_select(-3, self.part_index)
 
     def keypoints(self, pose: Tensor) -> Tensor:
         """Return the keypoints of the shape: the origins of the parts.
@@ -336,13 +343,17 @@ class ArticulatedShape(nn.Module):
 
         Differentiable: in ``pose``.
         """
+        transforms, linear, angular = self._twists(pose, chart)
+        twists = torch.cat([linear, angular], dim=-1).unsqueeze(-3) * self._part_moves.unsqueeze(-1)
+        return transforms, self._couplings.mT @ twists if self.chain.has_mimics else twists
+
+    def _twists(self, pose: Tensor, chart: str) -> tuple[Tensor, Tensor, Tensor]:
+        """Return part transforms and the twists of base and moving joints: linear and angular (..., 6 + J, 3)."""
         frames = self.frame_transforms(pose)
-        joints = self._part_moves * self.chain.joint_twists(frames)[0].unsqueeze(-3)
-        if self.chain.has_mimics:
-            joints = self.chain.couplings.mT @ joints
-        base = _base_twists(pose, chart)
-        base = base.unsqueeze(-3).expand(*base.shape[:-2], self.num_parts, 6, 6)
-        return frames[..., self.part_index, :, :], torch.cat([base, joints], dim=-2)
+        joints = self.chain.joint_twists(frames)[0]
+        linear, angular = _base_twists(pose, chart)
+        linear = torch.cat([linear, joints[..., :3]], dim=-2)
+        return frames.index_select(-3, self.part_index), linear, torch.cat([angular, joints[..., 3:]], dim=-2)
 
     def part_distances(self, points: Tensor, pose: Tensor) -> Tensor:
         """Return the distance of points to the solid of every part, before fusion.
@@ -356,8 +367,8 @@ class ArticulatedShape(nn.Module):
 
         Differentiable: in ``points``, ``pose`` and all shape parameters.
         """
-        local = self._local_points(points, self._solid_frames(self.part_transforms(pose)))
-        return self.primitives(local, self._scaled_sizes())
+        local = self._local_planes(points, self._solid_frames(self.part_transforms(pose)))
+        return self.primitives.plane_distance(local, self._scaled_sizes()).mT
 
     def distance(self, points: Tensor, pose: Tensor) -> Tensor:
         """Return the signed distance of points to the fused surface, ``d = -nu log phi``.
@@ -394,20 +405,25 @@ class ArticulatedShape(nn.Module):
 
         Differentiable: no; it is a derivative already.
         """
-        transforms, twists = self.part_twists(pose, chart=chart)
+        transforms, linear, angular = self._twists(pose, chart)
         solids = self._solid_frames(transforms)
-        local = self._local_points(points, solids)
-        distances, gradients = self.primitives.distance_and_gradient(local, self._scaled_sizes())
-        fused, shares = fuse(distances, self.adjacency, self.nu)
+        local = x, y, z = self._local_planes(points, solids)
+        distances, gradient = self.primitives.plane_gradient(local, self._scaled_sizes())
+        fused, shares = fuse(distances.mT, self.adjacency, self.nu)
         # A solid that moves by a twist leaves the point behind; force and moment are taken in the solid's own frame.
-        force = gradients * shares.unsqueeze(-1)
-        (x, y, z), (fx, fy, fz) = local.unbind(-1), force.unbind(-1)
-        # Three times as fast as a cross product over the last dimension.
-        wrench = torch.cat([force.flatten(-2), y * fz - z * fy, z * fx - x * fz, x * fy - y * fx], dim=-1)
-        linear, angular = twists[..., :3], twists[..., 3:]
-        linear = linear + torch.linalg.cross(angular, solids[..., None, :, 3].expand_as(angular))
-        linear, angular = (linear @ solids[..., :3]).transpose(-1, -2), (angular @ solids[..., :3]).movedim(-1, -3)
-        return fused, -(wrench @ torch.cat([linear.flatten(-3, -2), angular.flatten(-3, -2)], dim=-2))
+        fx, fy, fz = (plane * shares.mT for plane in gradient)
+        moment = (_minor(y, fz, z, fy), _minor(z, fx, x, fz), _minor(x, fy, y, fx))
+        wrench = torch.cat([fx, fy, fz, *moment], dim=-2)
+        return fused, (self._solid_twists(linear, angular, solids).mT @ wrench).mT
+
+    def _solid_twists(self, linear: Tensor, angular: Tensor, solids: Tensor) -> Tensor:
+        """Return (..., 6 P, num_dofs): what moves a solid backwards, in its own frame; a row per component and part."""
+        angular = angular.unsqueeze(-3)
+        linear = linear.unsqueeze(-3) + torch.linalg.cross(angular, solids[..., None, :, 3])
+        both = torch.cat([linear, angular.expand_as(linear)], dim=-2) @ -solids[..., :3]
+        moved = both.unflatten(-2, (2, -1)) * self._part_moves[:, None, :, None]
+        twists = moved.movedim((-3, -1), (-4, -3)).flatten(-4, -2)
+        return twists @ self._couplings if self.chain.has_mimics else twists
 
     def transform_jacobian(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
         """Return the stacked part transforms and their analytic derivatives, the rows that skins are linear in.
@@ -421,12 +437,16 @@ class ArticulatedShape(nn.Module):
 
         Differentiable: in ``pose``.
         """
-        transforms, twists = self.part_twists(pose, chart=chart)
-        rows = transforms[..., :3, :].mT
-        linear, angular = twists[..., :3], twists[..., 3:]
-        turn = torch.linalg.cross(angular.unsqueeze(-3), rows.unsqueeze(-2))
-        shift = nn.functional.pad(linear.unsqueeze(-3), (0, 0, 0, 0, 3, 0))
-        return rows.flatten(-3, -2), (turn + shift).transpose(-1, -2).flatten(-4, -3)
+        transforms, linear, angular = self._twists(pose, chart)
+        rows = transforms.mT
+        # An axis e turns by ``angular x e``; the row of a translation, whose fourth entry is one, also moves.
+        identity = torch.eye(3, dtype=pose.dtype, device=pose.device).unsqueeze(-2)
+        angular = angular.unsqueeze(-3)
+        turns = torch.linalg.cross(angular, identity.expand(*angular.shape[:-3], 3, 1, 3))
+        motions = torch.cat([turns, linear.unsqueeze(-3)], dim=-3).mT.flatten(-2)
+        derivative = (rows.flatten(-3, -2) @ motions).unflatten(-1, (3, -1)) * self._row_moves
+        derivative = derivative @ self._couplings if self.chain.has_mimics else derivative
+        return rows[..., :3].flatten(-3, -2), derivative
 
     def surface_mesh(self, pose: Tensor | None = None, spacing: float | None = None) -> TriangleMesh:
         """Return a mesh of the fused surface.
@@ -479,12 +499,19 @@ class ArticulatedShape(nn.Module):
         poses = torch.cat([self.primitives.rotations, centers.unsqueeze(-1)], dim=-1)
         return transforms[..., :3, :3] @ poses + nn.functional.pad(transforms[..., :3, 3:], (3, 0))
 
-    def _local_points(self, points: Tensor, solids: Tensor) -> Tensor:
-        """Return points (..., N, P, 3) in every solid's frame."""
+    def _local_planes(self, points: Tensor, solids: Tensor) -> Planes:
+        """Return points (..., N, 3) in every solid's frame, as planes (..., P, N)."""
         check_finite_dtype(points, self.rest)
-        rotations = solids[..., :3].transpose(-3, -2).flatten(-2)
-        offsets = (solids[..., None, :, 3] @ solids[..., :3]).flatten(-3)
-        return (points @ rotations - offsets.unsqueeze(-2)).unflatten(-1, (self.num_parts, 3))
+        rotations = solids[..., :3]
+        offsets = (solids[..., None, :, 3] @ rotations).movedim(-1, -3).flatten(-3, -2)
+        # In place of a sum, which would write all points once more.
+        local = (rotations.movedim(-1, -3).flatten(-3, -2) @ points.mT).sub_(offsets)
+        x, y, z = local.unflatten(-2, (3, self.num_parts)).unbind(-3)
+        return x, y, z
+
+
+def _minor(a: Tensor, d: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    return torch.addcmul(a * d, b, c, value=-1)
 
 
 def check_finite_dtype(points: Tensor, like: Tensor) -> None:
@@ -496,13 +523,13 @@ def check_finite_dtype(points: Tensor, like: Tensor) -> None:
         )
 
 
-def _base_twists(pose: Tensor, chart: str) -> Tensor:
+def _base_twists(pose: Tensor, chart: str) -> tuple[Tensor, Tensor]:
+    """Return the twists of the base's degrees of freedom: linear and angular (..., 6, 3)."""
     check_choice(chart, "chart", ("pose", "tangent"))
     identity = torch.eye(3, dtype=pose.dtype, device=pose.device).expand(*pose.shape[:-1], 3, 3)
     angular = identity if chart == "tangent" else left_jacobian(pose[..., 3:6]).mT
     linear = torch.linalg.cross(pose[..., None, :3].expand_as(angular), angular)
-    translation = torch.cat([identity, torch.zeros_like(identity)], dim=-1)
-    return torch.cat([translation, torch.cat([linear, angular], dim=-1)], dim=-2)
+    return torch.cat([identity, linear], dim=-2), torch.cat([torch.zeros_like(identity), angular], dim=-2)
 
 
 def _offset_owners(tree: KinematicTree, frames: list[int]) -> list[int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,13 +10,16 @@ import torch
 from torch import Tensor, nn
 
 from torchreg.errors import ModelError
-from torchreg.geometry.primitives import PRIMITIVE_KINDS
+from torchreg.geometry.primitives import PRIMITIVE_KINDS, Planes
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
 
 # Boxes reach their corners and capsules their round ends: the norm of the sizes and half as much again covers both.
 _BALL_FACTOR = 1.5
+_LOG2_E = 1 / math.log(2)
+# Nothing beside the dominating solid's field of one, in any precision.
+_MIN_EXPONENT = -120.0
 # Fitting solids to a surface: residuals beyond this many fusion lengths lose weight; weights of the terms beside the
 # fused distance; fusion lengths of residual that a change by the solid's own size is worth.
 _REFINE_SCALE = 1.5
@@ -140,6 +144,32 @@ class PrimitiveSet(nn.Module):
         distance = torch.cat([pair[0] for pair in pairs], dim=-1)[..., self.kind_order]
         return distance, torch.cat([pair[1] for pair in pairs], dim=-2)[..., self.kind_order, :]
 
+    def plane_distance(self, planes: Planes, sizes: Sequence[Tensor]) -> Tensor:
+        """Return what `forward` does for points given as planes x, y and z (..., P, N): distances (..., P, N)."""
+        columns = [
+            PRIMITIVE_KINDS[kind].plane_distance(self._of_kind(planes, kind), size.unsqueeze(-2))
+            for kind, size in zip(self.kinds, sizes, strict=True)
+        ]
+        return self._in_order(columns)
+
+    def plane_gradient(self, planes: Planes, sizes: Sequence[Tensor]) -> tuple[Tensor, Planes]:
+        """Return distances (..., P, N) and planes of their analytic gradients in the solids' frames."""
+        pairs = [
+            PRIMITIVE_KINDS[kind].plane_gradient(self._of_kind(planes, kind), size.unsqueeze(-2))
+            for kind, size in zip(self.kinds, sizes, strict=True)
+        ]
+        x, y, z = (self._in_order([pair[1][axis] for pair in pairs]) for axis in range(3))
+        return self._in_order([pair[0] for pair in pairs]), (x, y, z)
+
+    def _of_kind(self, planes: Planes, kind: str) -> Planes:
+        if len(self.kinds) == 1:
+            return planes
+        x, y, z = (plane.index_select(-2, self.get_buffer(f"members_{kind}")) for plane in planes)
+        return x, y, z
+
+    def _in_order(self, columns: list[Tensor]) -> Tensor:
+        return columns[0] if len(columns) == 1 else torch.cat(columns, dim=-2).index_select(-2, self.kind_order)
+
 
 def fuse(distances: Tensor, neighbors: Tensor, nu: float) -> tuple[Tensor, Tensor]:
     """Return the distance to the fused surface, ``-nu log phi``, and each solid's share in its gradient.
@@ -159,7 +189,11 @@ def fuse(distances: Tensor, neighbors: Tensor, nu: float) -> tuple[Tensor, Tenso
     References: Dewaele et al. 2006, eqs. 1 and 2.
     """
     nearest, dominating = distances.min(dim=-1, keepdim=True)
-    fields = torch.where(neighbors[dominating.squeeze(-1)], (nearest - distances) / nu, -torch.inf).exp()
+    # Zero or one for every datum and solid; in the memory order that distances of planes have.
+    fuses = neighbors.to(distances.dtype).index_select(-1, dominating.flatten())
+    fuses = fuses.unflatten(-1, dominating.shape[:-1]).movedim(0, -1)
+    # A power of two costs a quarter of exp() on a CPU, unless it underflows.
+    fields = ((nearest - distances) * (_LOG2_E / nu)).clamp_min(_MIN_EXPONENT).exp2() * fuses
     total = fields.sum(-1, keepdim=True)
     return (nearest - nu * total.log()).squeeze(-1), fields / total
 
