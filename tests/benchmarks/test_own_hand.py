@@ -1,7 +1,4 @@
-import importlib.util
 import math
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -10,17 +7,10 @@ import torchreg as tr
 from torchreg.datasets.hand import make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.geometry.rotation import so3_exp
 
-PATH = Path(__file__).resolve().parents[2] / "benchmarks" / "own_hand.py"
-
 
 @pytest.fixture(scope="module")
-def bench():
-    spec = importlib.util.spec_from_file_location("benchmark_own_hand", PATH)
-    module = importlib.util.module_from_spec(spec)
-    with pytest.MonkeyPatch.context() as patch:
-        # dataclasses look their module up by name.
-        patch.setitem(sys.modules, spec.name, module)
-        spec.loader.exec_module(module)
+def bench(loaded_benchmark):
+    with loaded_benchmark("own_hand") as module:
         yield module
 
 

@@ -1,7 +1,5 @@
-import importlib.util
 import math
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -11,14 +9,9 @@ from torchreg.models.articulated import ArticulatedShape
 
 
 @pytest.fixture(scope="module")
-def benchmark():
-    path = Path(__file__).parents[2] / "benchmarks" / "rig_hand.py"
-    spec = importlib.util.spec_from_file_location("benchmark_rig_hand", path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[spec.name]
+def benchmark(loaded_benchmark):
+    with loaded_benchmark("rig_hand") as module:
+        yield module
 
 
 @pytest.fixture(scope="module")

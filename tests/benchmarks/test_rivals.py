@@ -1,7 +1,4 @@
-import importlib.util
 import math
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -9,7 +6,6 @@ import torch
 import torchreg as tr
 from torchreg.pipelines import align, align_stages
 
-PATH = Path(__file__).resolve().parents[2] / "benchmarks" / "rivals.py"
 METHODS = [
     "EM", "EM c / 10", "EM own sigma", "SoftAssign", "ICP", "EM debiased", "SoftAssign debiased", "EM + surface fit",
     "default",
@@ -17,18 +13,14 @@ METHODS = [
 
 
 @pytest.fixture(scope="module")
-def bench():
-    spec = importlib.util.spec_from_file_location("benchmark_rivals", PATH)
-    module = importlib.util.module_from_spec(spec)
+def bench(loaded_benchmark):
     with pytest.MonkeyPatch.context() as patch:
         # The benchmark adds an E-step of its own, which other tests must not see.
         registry = dict(align_stages.CORRESPONDENCES)
         for user in (align, align_stages):
             patch.setattr(user, "CORRESPONDENCES", registry)
-        # dataclasses look their module up by name.
-        patch.setitem(sys.modules, spec.name, module)
-        spec.loader.exec_module(module)
-        yield module
+        with loaded_benchmark("rivals") as module:
+            yield module
 
 
 def make_row(bench, method, tips, **condition):

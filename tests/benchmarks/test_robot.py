@@ -1,7 +1,4 @@
-import importlib.util
 import math
-import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -25,14 +22,9 @@ URDF = """<?xml version="1.0"?><robot name="arm">
 
 
 @pytest.fixture(scope="module")
-def benchmark():
-    path = Path(__file__).parents[2] / "benchmarks" / "robot.py"
-    spec = importlib.util.spec_from_file_location("benchmark_robot", path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[spec.name]
+def benchmark(loaded_benchmark):
+    with loaded_benchmark("robot") as module:
+        yield module
 
 
 @pytest.fixture(scope="module")
