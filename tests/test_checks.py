@@ -10,6 +10,14 @@ from torchreg import _checks as checks
 from torchreg.errors import InputError, InputTypeError
 
 
+def test_tensors_pass_and_arrays_keep_their_dtype():
+    value = torch.zeros(2, dtype=torch.bool)
+    assert checks.as_tensor(value, "labels", "integers") is value
+    assert checks.as_tensor(np.arange(3), "labels", "integers").dtype == torch.int64
+    with pytest.raises(InputTypeError, match="labels must be a tensor or an array of integers, got str"):
+        checks.as_tensor("text", "labels", "integers")
+
+
 def test_floating_tensors_pass_unchanged():
     value = torch.zeros(2, 3, dtype=torch.float64)
     assert checks.as_float_tensor(value, "points") is value

@@ -12,19 +12,27 @@ from torch import Tensor
 from torchreg.errors import InputError, InputTypeError
 
 
+def as_tensor(value: Any, name: str, content: str) -> Tensor:
+    """Return ``value`` as a tensor of its own dtype; ``content`` says what it should hold, such as "integers".
+
+    Raises:
+        InputTypeError: if ``value`` cannot become a tensor.
+    """
+    if isinstance(value, Tensor):
+        return value
+    try:
+        return torch.as_tensor(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputTypeError(f"{name} must be a tensor or an array of {content}, got {type(value).__name__}") from error
+
+
 def as_float_tensor(value: Any, name: str, *, like: Tensor | None = None) -> Tensor:
     """Return ``value`` as a floating-point tensor, on the dtype and device of ``like`` when it is given.
 
     Raises:
         InputTypeError: if ``value`` cannot become a tensor of real numbers.
     """
-    if not isinstance(value, Tensor):
-        try:
-            value = torch.as_tensor(value)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise InputTypeError(
-                f"{name} must be a tensor or an array of numbers, got {type(value).__name__}"
-            ) from error
+    value = as_tensor(value, name, "numbers")
     if value.is_complex() or value.dtype == torch.bool:
         raise InputTypeError(f"{name} must hold real numbers, got dtype {value.dtype}")
     if like is not None:

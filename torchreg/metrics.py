@@ -7,7 +7,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_finite, check_points, check_positive, check_same_kind, check_shape
+from torchreg._checks import (
+    as_float_tensor,
+    as_tensor,
+    check_finite,
+    check_points,
+    check_positive,
+    check_same_kind,
+    check_shape,
+)
 from torchreg.errors import InputError, InputTypeError
 
 
@@ -222,13 +230,7 @@ def _to_closest(source: Tensor, target: Tensor, step: int) -> Tensor:
 
 
 def _as_labels(value: Any, name: str) -> Tensor:
-    if not isinstance(value, Tensor):
-        try:
-            value = torch.as_tensor(value)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise InputTypeError(
-                f"{name} must be a tensor or an array of integers, got {type(value).__name__}"
-            ) from error
+    value = as_tensor(value, name, "integers")
     if value.is_floating_point() or value.is_complex():
         raise InputTypeError(f"{name} must hold integer labels, got dtype {value.dtype}")
     check_shape(value, name, ("N",))

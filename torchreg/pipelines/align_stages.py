@@ -35,9 +35,9 @@ CORRESPONDENCES: dict[str, Callable[..., EStep]] = {
 
 # Widths of the surface fit as shares of the model's size; the last width follows from the residuals, within a range.
 SURFACE_SIGMAS = (0.045, 0.022)
-_FINAL_SIGMA_RANGE = (0.003, 0.02)
+FINAL_SIGMA_RANGE = (0.003, 0.02)
 # A Welsch kernel of 2.5 standard deviations keeps most of the efficiency of least squares on Gaussian noise.
-_SIGMA_PER_NOISE = 2.5
+SIGMA_PER_NOISE = 2.5
 _MAD_TO_STD = 1.4826
 # The last width of the surface fit takes this many times the steps of the others.
 _FINAL_STEPS = 3
@@ -255,14 +255,14 @@ def fit_surface(
 
     References: Dewaele et al. 2006, section 3.4.
     """
-    noise = torch.full_like(pose[:, 0], _FINAL_SIGMA_RANGE[1] * problem.size / _SIGMA_PER_NOISE)
+    noise = torch.full_like(pose[:, 0], FINAL_SIGMA_RANGE[1] * problem.size / SIGMA_PER_NOISE)
     for number, share in enumerate(sigmas):
         sigma = torch.full_like(noise, share * problem.size)
         solved = surface_steps(problem, pose, sigma, noise, steps)
         pose = solved.state
         _report(on_step, "surface", number, len(sigmas) + 1, sigma, solved, problem)
     noise = residual_noise(problem, pose)
-    sigma = _SIGMA_PER_NOISE * noise
+    sigma = SIGMA_PER_NOISE * noise
     solved = problem.solve(_surface_objective(problem, sigma, noise), pose, _FINAL_STEPS * steps)
     _report(on_step, "surface", len(sigmas), len(sigmas) + 1, sigma, solved, problem)
     return StageResult(solved.state, sigma, problem.change(solved.last_step))
@@ -298,8 +298,22 @@ def _report(
 
 def residual_noise(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return the robust standard deviation (B,) of the data near the surface, within a range of the model's size."""
-    distance = problem.surface.distance(problem.data, pose).abs()
-    near = (distance < SURFACE_SIGMAS[-1] * problem.size) & problem.valid
+    return surface_noise(problem.surface.distance(problem.data, pose), problem.valid, problem.size)
+
+
+def surface_noise(distance: Tensor, valid: Tensor, size: float) -> Tensor:
+    """Return the robust standard deviation (...) of distances (..., M) near the surface of a model of some size.
+
+    Args:
+        distance: (..., M), metres.
+        valid: (..., M) True where the distance counts.
+        size: of the model, metres; the answer lies within a range of it, at its upper end where nothing is near.
+
+    Returns:
+        (...), metres.
+    """
+    distance = distance.abs()
+    near = (distance < SURFACE_SIGMAS[-1] * size) & valid
     median = torch.where(near, distance, torch.nan).nanmedian(-1).values
-    low, high = (share * problem.size / _SIGMA_PER_NOISE for share in _FINAL_SIGMA_RANGE)
+    low, high = (share * size / SIGMA_PER_NOISE for share in FINAL_SIGMA_RANGE)
     return torch.nan_to_num(_MAD_TO_STD * median, nan=high).clamp(low, high)

@@ -16,15 +16,10 @@ from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.primitives import fuse
 from torchreg.models.skin import sample_skin
 from torchreg.pipelines.align import AlignConfig, align
+from torchreg.pipelines.align_stages import FINAL_SIGMA_RANGE, SIGMA_PER_NOISE, SURFACE_SIGMAS, surface_noise
 from torchreg.results import Calibration, Status
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
 
-# Widths of the surface kernel and range of the last, shares of the shape's size; the last follows from the residuals.
-_SIGMAS = (0.045, 0.022)
-_FINAL_SIGMA_RANGE = (0.003, 0.02)
-# A Welsch kernel of 2.5 standard deviations keeps most of the efficiency of least squares on Gaussian noise.
-_SIGMA_PER_NOISE = 2.5
-_MAD_TO_STD = 1.4826
 # Residuals near each other share what the model gets wrong: they weigh as if their noise were this much larger.
 _SHARED_ERROR = 1.5
 # No part shrinks or grows beyond this factor of what it was.
@@ -159,27 +154,30 @@ def _fit(
 ) -> tuple[Tensor, Tensor, float]:
     """Return poses, cost and last change of a joint fit with a kernel that narrows to the noise."""
     state = problem.state(poses)
-    low, high = (share * problem.size for share in _FINAL_SIGMA_RANGE)
-    for step in range(len(_SIGMAS) + 1):
-        if step < len(_SIGMAS):
-            sigma, noise = _SIGMAS[step] * problem.size, high / _SIGMA_PER_NOISE
+    for step in range(len(SURFACE_SIGMAS) + 1):
+        if step < len(SURFACE_SIGMAS):
+            sigma, noise = SURFACE_SIGMAS[step] * problem.size, FINAL_SIGMA_RANGE[1] * problem.size / SIGMA_PER_NOISE
         else:
-            noise = min(max(problem.noise(state), low / _SIGMA_PER_NOISE), high / _SIGMA_PER_NOISE)
-            sigma = _SIGMA_PER_NOISE * noise
+            noise = problem.noise(state)
+            sigma = SIGMA_PER_NOISE * noise
         solved = levenberg_marquardt(
             partial(problem.linearize, sigma=sigma, noise=_SHARED_ERROR * noise),
             state,
             retract=problem.retract,
             lower=problem.lower,
             upper=problem.upper,
-            max_steps=problem.config.steps * (1 if step < len(_SIGMAS) else 2),
+            max_steps=problem.config.steps * (1 if step < len(SURFACE_SIGMAS) else 2),
             atol=problem.config.align.pose_atol * min(1.0, problem.size),
         )
         state = solved.state
         poses, scales = problem.parts(state)
         poses = poses + problem.shift
         if on_step is not None:
-            on_step(CalibrateRecord(number, step, len(_SIGMAS) + 1, sigma, float(solved.cost), poses, *scales.chunk(2)))
+            on_step(
+                CalibrateRecord(
+                    number, step, len(SURFACE_SIGMAS) + 1, sigma, float(solved.cost), poses, *scales.chunk(2)
+                )
+            )
     problem.set_scales(scales)
     return poses, solved.cost[0], float(problem.change(solved.last_step))
 
@@ -292,17 +290,15 @@ class _JointProblem:
         return torch.cat([(move[:, :3] / self.size).flatten(), move[:, 3:].flatten(), growth]).abs().max()
 
     def noise(self, state: Tensor) -> float:
-        """Return the robust standard deviation of the data near the surface, metres."""
+        """Return the robust standard deviation of the data of all frames near the surface, metres."""
         poses, scales = self.parts(state)
         self.set_scales(scales)
-        distance = self.shape.distance(self.data, poses).abs()
-        near = distance[self.valid & (distance < _SIGMAS[-1] * self.size)]
-        return _MAD_TO_STD * float(near.median()) if len(near) else _FINAL_SIGMA_RANGE[1] * self.size
+        return float(surface_noise(self.shape.distance(self.data, poses).flatten(), self.valid.flatten(), self.size))
 
     def unexplained(self, poses: Tensor) -> Tensor:
         """Return the number of data (T,), softly counted, that poses leave off the surface of the shape as it is."""
         distance = self.shape.distance(self.data, poses - self.shift)
-        return ((1 - (-(distance / (_SIGMAS[-1] * self.size)).square()).exp()) * self.valid).sum(-1)
+        return ((1 - (-(distance / (SURFACE_SIGMAS[-1] * self.size)).square()).exp()) * self.valid).sum(-1)
 
     def linearize(self, state: Tensor, sigma: float, noise: float) -> Linearization:
         """Return the Welsch cost of all distances and its Gauss-Newton approximation; the batch is one state."""
