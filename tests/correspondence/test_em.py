@@ -117,36 +117,6 @@ def test_far_outliers_get_nothing_and_move_nothing(dtype):
     assert float(alone.squared_error) == 0
 
 
-def test_masking_is_removing():
-    model, data = cloud(8), cloud(12, seed=1)
-    mask = torch.rand(12, generator=torch.Generator().manual_seed(2)) > 0.4
-    sigma = torch.tensor(0.15, dtype=D)
-    removed = expectation(model, data[mask], sigma)
-    for padding in (0.0, 1e9, math.nan, math.inf):
-        padded = torch.where(mask[:, None], data, padding)
-        masked = expectation(model, padded, sigma, mask=mask)
-        for field in ("weights", "targets", "squared_error"):
-            torch.testing.assert_close(getattr(masked, field), getattr(removed, field))
-        torch.testing.assert_close(masked.inlier_posterior[mask], removed.inlier_posterior)
-        assert masked.inlier_posterior[~mask].eq(0).all()
-        alpha = posterior(model, padded, sigma, mask=mask)
-        assert alpha[:, ~mask].eq(0).all()
-        torch.testing.assert_close(alpha[:, mask], posterior(model, data[mask], sigma))
-
-
-def test_no_data_and_no_points_hold_nothing():
-    model, sigma = cloud(4), torch.tensor(0.1, dtype=D)
-    nothing = expectation(model, cloud(3), sigma, mask=torch.zeros(3, dtype=torch.bool))
-    empty = expectation(model, cloud(0), sigma)
-    for step in (nothing, empty):
-        assert step.weights.tolist() == [0] * 4
-        assert torch.equal(step.targets, model)
-        assert float(step.squared_error) == 0
-    assert empty.inlier_posterior.shape == (0,)
-    assert expectation(cloud(0), cloud(3), sigma).inlier_posterior.tolist() == [0] * 3
-    assert expectation(cloud(0, 4), cloud(0, 3), torch.zeros(0, dtype=D)).targets.shape == (0, 4, 3)
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, D])
 def test_a_batch_is_a_loop(dtype):
     model, data = cloud(2, 3, 5, dtype=dtype), cloud(2, 3, 7, seed=1, dtype=dtype)
@@ -161,26 +131,6 @@ def test_a_batch_is_a_loop(dtype):
             for field in FIELDS:
                 torch.testing.assert_close(getattr(together, field)[b, k], getattr(alone, field), rtol=1e-4, atol=1e-5)
             torch.testing.assert_close(dense[b, k].sum(-1), alone.weights, rtol=1e-4, atol=1e-5)
-
-
-def test_one_cloud_serves_many_poses():
-    models, data, sigma = cloud(4, 5), cloud(7, seed=1), torch.tensor(0.2, dtype=D)
-    mask = torch.arange(7) < 5
-    broadcast = expectation(models, data, sigma, mask=mask)
-    repeated = expectation(models, data.expand(4, 7, 3), sigma.expand(4), mask=mask.expand(4, 7))
-    assert_same(broadcast, repeated)
-    assert broadcast.inlier_posterior.shape == (4, 7)
-
-
-@settings(max_examples=15, deadline=None)
-@given(st.permutations(range(9)), st.permutations(range(6)))
-def test_order_does_not_matter(rows, columns):
-    model, data, sigma = cloud(9), cloud(6, seed=1), torch.tensor(0.2, dtype=D)
-    plain, shuffled = expectation(model, data, sigma), expectation(model[rows], data[columns], sigma)
-    torch.testing.assert_close(shuffled.weights, plain.weights[rows])
-    torch.testing.assert_close(shuffled.targets, plain.targets[rows])
-    torch.testing.assert_close(shuffled.inlier_posterior, plain.inlier_posterior[columns])
-    torch.testing.assert_close(shuffled.squared_error, plain.squared_error)
 
 
 def test_float32_is_right_far_from_the_origin():
