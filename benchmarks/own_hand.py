@@ -29,7 +29,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torchreg as tr
-from torchreg.datasets.hand import HandCloud, hand_sequence, make_hand_cloud, random_hand_pose, surface_skin
+from torchreg.datasets.hand import HandCloud, hand_motion, make_hand_cloud, random_hand_pose, surface_skin
+from torchreg.datasets.sequences import other_hand, range_clouds
 from torchreg.models.skin import sample_skin
 from torchreg.models.surface import FusedSurface
 from torchreg.pipelines.align_objectives import PosePrior, SurfaceObjective
@@ -38,7 +39,7 @@ from torchreg.solvers.levenberg_marquardt import levenberg_marquardt
 NOISE, OUTLIERS, NUM_POINTS = 0.0015, 0.33, 500
 JOINT_OFF, TURN_OFF, SHIFT_OFF = math.radians(20), math.radians(20), 0.02
 TIPS, MIN_SEEN = [4, 8, 12, 16, 20], 8
-SCALE_OFF, OTHER_SHARPNESS, OTHER_NU = math.log(1.05), 10.0, 0.002
+SCALE_OFF, OTHER_SHARPNESS, OTHER_NU = 0.05, 10.0, 0.002
 BARS_MM = {"exact": 1.5, "other": 3.0}
 VARIANTS = ("joints", "joints+base")
 # Slow enough that the frames of a calibration differ.
@@ -185,26 +186,18 @@ def exact_rows(num_trials: int, seed: int) -> list[Row]:
     return [*rows, bound_row("exact", [(hand, trial) for trial in trials], seed)]
 
 
-def other_hand(generator: torch.Generator) -> tr.Hand:
-    """Return a hand whose every bone length and radius is 5 % longer or shorter."""
-    hand = tr.Hand(nu=OTHER_NU)
-    with torch.no_grad():
-        hand.log_length_scales.copy_(SCALE_OFF * signs(hand.num_parts, generator))
-        hand.log_radius_scales.copy_(SCALE_OFF * signs(hand.num_parts, generator))
-    return hand
-
-
 def other_rows(num_sequences: int, num_frames: int, num_calibrated: int, seed: int) -> list[Row]:
     """Return the rows of a model calibrated on the first frames of sequences of other hands."""
     model = tr.Hand()
     sequences, pairs = [], []
     for number in range(num_sequences):
         generator = torch.Generator().manual_seed(seed + number)
-        truth = other_hand(generator)
+        truth = other_hand(generator, SCALE_OFF, nu=OTHER_NU)
         surface = surface_skin(truth, sharpness=OTHER_SHARPNESS)
-        clouds = hand_sequence(
-            "bend", num_calibrated + num_frames, FPS, shape=truth, num_points=NUM_POINTS, noise=NOISE,
-            outlier_ratio=OUTLIERS, camera=CAMERA, skin=surface, seed=seed + number,
+        poses = hand_motion(truth, "bend", num_calibrated + num_frames, FPS, seed=seed + number)
+        clouds = range_clouds(
+            truth, poses, num_points=NUM_POINTS, noise=NOISE, outlier_ratio=OUTLIERS, camera=CAMERA, skin=surface,
+            seed=seed + number,
         )  # fmt: skip
         trials = [make_trial(truth, cloud, generator) for cloud in clouds]
         sequences.append((trials[:num_calibrated], trials[num_calibrated:]))

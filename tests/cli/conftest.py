@@ -9,7 +9,8 @@ import torch
 from typer.testing import CliRunner
 
 from torchreg.cli.application import app
-from torchreg.datasets.hand import hand_sequence
+from torchreg.datasets.hand import hand_motion
+from torchreg.datasets.sequences import range_clouds
 from torchreg.io.gltf_write import save_animated_skin
 from torchreg.io.points import save_points
 from torchreg.models.articulated import ArticulatedShape
@@ -52,7 +53,9 @@ def error_of(run):
 def folder(tmp_path_factory):
     """Return a folder with four clouds of a moving hand, a start, a robot and a rig whose nodes are flat."""
     place = tmp_path_factory.mktemp("files")
-    for index, cloud in enumerate(hand_sequence("bend", 4, num_points=300, outlier_ratio=0.2, camera=torch.zeros(3))):
+    poses = hand_motion(Hand(), "bend", 4)
+    clouds = range_clouds(Hand(), poses, num_points=300, outlier_ratio=0.2, camera=torch.zeros(3))
+    for index, cloud in enumerate(clouds):
         save_points(place / f"cloud{index}.ply", cloud.points)
         truth = dict(zip(Hand().dof_names, cloud.pose.tolist(), strict=True))
         (place / f"truth{index}.json").write_text(json.dumps(truth), encoding="utf-8")

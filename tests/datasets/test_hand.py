@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchreg.datasets.hand import hand_motion, hand_sequence, make_hand_cloud, random_hand_pose, surface_skin
+from torchreg.datasets.hand import MOTIONS, hand_motion, make_hand_cloud, placed, random_hand_pose, surface_skin
 from torchreg.errors import InputError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
@@ -239,14 +239,107 @@ def test_frames_depend_on_time_alone_and_seeds_differ(hand):
     assert float(further[:, 2].min()) > 1.6
 
 
-def test_a_sequence_carries_the_poses_of_its_motion(hand, skin):
-    clouds = hand_sequence("rotate", 4, shape=hand, skin=skin, num_points=60, camera=torch.zeros(3), seed=3)
-    assert len(clouds) == 4
-    torch.testing.assert_close(torch.stack([c.pose for c in clouds]), hand_motion(hand, "rotate", 4, seed=3))
-    again = hand_sequence("rotate", 4, shape=hand, skin=skin, num_points=60, camera=torch.zeros(3), seed=3)
-    assert all(torch.equal(a.points, b.points) for a, b in zip(clouds, again, strict=True))
-    first, second = clouds[0].points[clouds[0].inliers], clouds[1].points[clouds[1].inliers]
-    assert not torch.equal(first, second)
+def facing(poses):
+    """Return how far the palm looks at the camera: cosines (T,)."""
+    return so3_exp(poses[:, 3:6])[:, 2, 1]
+
+
+@pytest.mark.parametrize("kind", MOTIONS)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_every_motion_stays_in_its_limits_and_is_smooth(hand, kind, seed):
+    poses = hand_motion(hand, kind, 100, distance=0.6, seed=seed)
+    assert poses.shape == (100, 27)
+    assert bool((poses >= hand.lower - 1e-6).all() and (poses <= hand.upper + 1e-6).all())
+    assert float(poses[:, 3:6].norm(dim=-1).max()) <= math.pi + 1e-5
+    # Halving the time step halves the change of velocity: the motion has a continuous derivative, at rest and flipping.
+    with torch.no_grad():
+        jumps = [
+            hand.keypoints(hand_motion(hand, kind, round(5 * fps), fps, distance=0.6, seed=seed)).diff(dim=0) * fps
+            for fps in (80.0, 160.0, 320.0)
+        ]
+    coarse, middle, fine = (float(velocity.diff(dim=0).norm(dim=-1).max()) for velocity in jumps)
+    assert middle < 0.65 * coarse
+    assert fine < 0.65 * middle
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_rotation_goes_to_and_fro_by_sixty_to_seventy_degrees(hand, seed):
+    poses = hand_motion(hand, "rotation", 90, seed=seed)
+    turns = so3_exp(poses[:, 3:6])
+    # At the quarters of the period the turn is widest; the sway adds three degrees to each axis at most.
+    apart = turns[67] @ turns[22].T
+    angle = math.degrees(math.acos((float(apart.trace()) - 1) / 2))
+    assert 2 * 55 < angle < 2 * 75
+    axis = torch.stack([apart[2, 1] - apart[1, 2], apart[0, 2] - apart[2, 0], apart[1, 0] - apart[0, 1]])
+    axis = axis / axis.norm()
+    assert abs(float(axis[2])) < 0.15
+    assert abs(float(axis[1])) > math.cos(math.radians(32))
+    flexions = [index for index, name in enumerate(hand.dof_names) if name.endswith("flexion")]
+    assert 0.05 < float((poses[:, flexions] / hand.upper[flexions]).mean()) < 0.25
+
+
+def test_bending_is_seen_from_both_sides(hand):
+    palm, back = (hand_motion(hand, f"bending_{side}", 100) for side in ("palm", "back"))
+    assert float(facing(palm).min()) > 0.8
+    assert float(facing(back).max()) < -0.8
+    torch.testing.assert_close(palm[:, 6:], back[:, 6:])
+    pip = [hand.dof_names.index(f"{finger}_pip_flexion") for finger in ("index", "middle", "ring", "little")]
+    closed = palm[:, pip] / palm[:, pip].amax(0)
+    # One after the other at first, all together after half of the time.
+    assert float((closed[:20].amax(1) - closed[:20].amin(1)).max()) > 0.5
+    assert float((closed[45:56].amax(1) - closed[45:56].amin(1)).max()) < 0.2
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_flip_hides_all_within_a_second_and_turns_back_later(hand, seed):
+    palm = facing(hand_motion(hand, "flip", 160, seed=seed))
+    assert float(palm[:35].min()) > 0.8
+    assert float(palm[65:110].max()) < -0.8
+    assert float(palm[-10:].min()) > 0.8
+    assert int(((palm < 0.7) & (palm > -0.7))[:100].sum()) < 15
+
+
+def test_fast_is_three_to_four_times_as_fast(hand):
+    for seed in range(4):
+        slow, fast = (hand_motion(hand, kind, 400, 80.0, seed=seed) for kind in ("bending_palm", "fast"))
+        ratio = fast[:, 6:].diff(dim=0).abs().max() / slow[:, 6:].diff(dim=0).abs().max()
+        assert 2.8 < float(ratio) < 4.2
+        ranges = [float((poses[:, :3].amax(0) - poses[:, :3].amin(0)).max()) for poses in (slow, fast)]
+        assert ranges[1] > 1.2 * ranges[0]
+
+
+def test_occlusion_passes_the_middle_and_returns(hand):
+    sides = set()
+    for seed in range(6):
+        poses = hand_motion(hand, "occlusion", 160, distance=0.6, seed=seed)
+        with torch.no_grad():
+            x = hand.part_transforms(poses)[..., 0, 3].mean(-1)
+        first, second, third = x[:30], x[70:110], x[-6:]
+        assert float(first.abs().min()) > 0.12
+        assert bool((first.sign() == -second.sign()[:30]).all() and (third.sign() == first.sign()[:6]).all())
+        sides.add(float(first[0].sign()))
+    assert sides == {-1.0, 1.0}
+
+
+def test_placed_moves_the_middle_and_clamps(hand):
+    pose = torch.randn(3, 27, generator=torch.Generator().manual_seed(0))
+    moved = placed(hand, pose, torch.tensor([0.1, 0.2, 0.3]))
+    with torch.no_grad():
+        middle = hand.part_transforms(moved)[..., :3, 3].mean(-2)
+    torch.testing.assert_close(middle, torch.tensor([0.1, 0.2, 0.3]).expand(3, 3), atol=1e-5, rtol=0)
+    assert bool((moved >= hand.lower).all() and (moved <= hand.upper).all())
+
+
+def test_clouds_carry_the_truth(hand, skin):
+    pose = random_hand_pose(hand, torch.Generator().manual_seed(4))
+    made = cloud(hand, skin, pose, num_points=300, camera=torch.zeros(3))
+    with torch.no_grad():
+        torch.testing.assert_close(made.keypoints, hand.keypoints(pose))
+        torch.testing.assert_close(made.vertices, skin(pose))
+    counts = [int((made.part_labels == part).sum()) for part in range(16)]
+    assert made.part_counts.tolist() == counts
+    assert made.seen_parts.tolist() == [count >= 8 for count in counts]
+    assert 0 < int(made.seen_parts.sum()) < 16
 
 
 @pytest.mark.parametrize(

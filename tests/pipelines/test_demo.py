@@ -4,7 +4,8 @@ import pytest
 import torch
 
 import torchreg.pipelines.demo as demo
-from torchreg.datasets.hand import hand_sequence
+from torchreg.datasets.hand import hand_motion
+from torchreg.datasets.sequences import range_clouds
 from torchreg.errors import InputError
 from torchreg.models.hand import Hand
 from torchreg.models.skin import sample_skin
@@ -24,7 +25,8 @@ def three():
 
 def test_frames_are_those_of_the_sequence_that_anyone_can_make(three):
     result, calls = three
-    sequence = hand_sequence("bend", 3, num_points=600, outlier_ratio=0.2, camera=torch.zeros(3), seed=1)
+    poses = hand_motion(Hand(), "bend", 3, seed=1)
+    sequence = range_clouds(Hand(), poses, num_points=600, outlier_ratio=0.2, camera=torch.zeros(3), seed=1)
     assert torch.equal(result.clouds, torch.stack([cloud.points for cloud in sequence]))
     assert torch.equal(result.truths, torch.stack([cloud.pose for cloud in sequence]))
     assert calls == [(1, 3), (2, 3), (3, 3)]

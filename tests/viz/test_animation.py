@@ -5,7 +5,8 @@ import pytest
 import torch
 from PIL import Image
 
-from torchreg.datasets.hand import hand_sequence, surface_skin
+from torchreg.datasets.hand import hand_motion, surface_skin
+from torchreg.datasets.sequences import range_clouds
 from torchreg.errors import InputError
 from torchreg.models.hand import Hand
 from torchreg.viz.animation import animate_alignment, save_animation
@@ -23,7 +24,8 @@ def skin(hand):
 
 @pytest.fixture(scope="module")
 def clouds(hand, skin):
-    return hand_sequence("bend", 4, 5.0, shape=hand, skin=skin, num_points=200, camera=torch.zeros(3))
+    poses = hand_motion(hand, "bend", 4, 5.0)
+    return range_clouds(hand, poses, skin=skin, num_points=200, camera=torch.zeros(3))
 
 
 def frames_of(path):

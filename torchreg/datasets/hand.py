@@ -1,4 +1,4 @@
-"""Made-up measurements of a hand, or of any articulated shape, with exact truth: single clouds and moving sequences."""
+"""Made-up hands, their poses and motions, and single clouds of them, or of any articulated shape, with exact truth."""
 
 from __future__ import annotations
 
@@ -22,8 +22,17 @@ _POSITION_SPREAD = 0.03
 _BOX_MARGIN = 0.05
 # Fingers up, palm to a camera that looks along +z with -y up.
 _FACING = (math.pi / 2, 0.0, 0.0)
+MOTIONS = ("bend", "rotate", "rotation", "bending_palm", "bending_back", "flip", "fast", "occlusion")
+# Points that a part must have at least to count as measured.
+MIN_SEEN_POINTS = 8
 _SECONDS_PER_BEND = 2.5
 _SECONDS_PER_TURN = 5.0
+_SECONDS_PER_ROTATION = 4.5
+# Flips and passages are undone after the second time, and all begins anew after the first.
+_SECONDS_PER_RETURN = (8.0, 4.0)
+_SECONDS_PER_FLIP, _SECONDS_PER_PASSAGE = 1.0, 1.5
+# To each side of the obstacle, at a distance of half a metre.
+_PASSAGE = 0.14
 # Joints without limits are moved within these, radians (metres for sliding joints).
 _OPEN_LIMIT = math.pi / 2
 
@@ -37,12 +46,23 @@ class HandCloud:
         inliers: (M,) bool, True for points of the shape.
         part_labels: (M,) int64 part of each point, -1 for outliers.
         pose: (num_dofs,) the true pose.
+        keypoints: (K, 3) true places of the shape's keypoints, metres.
+        vertices: (V, 3) true places of the vertices of the skin that was measured, metres.
+        part_counts: (P,) int64 points on each part.
     """
 
     points: Tensor
     inliers: Tensor
     part_labels: Tensor
     pose: Tensor
+    keypoints: Tensor
+    vertices: Tensor
+    part_counts: Tensor
+
+    @property
+    def seen_parts(self) -> Tensor:
+        """Which parts (P,) hold at least 8 points; of a hand, ``seen_parts[list(hand.fingertip_parts)]`` are tips."""
+        return self.part_counts >= MIN_SEEN_POINTS
 
 
 def surface_skin(shape: ArticulatedShape, *, spacing: float | None = None, sharpness: float = 2.0) -> LinearBlendSkin:
@@ -119,14 +139,45 @@ def make_hand_cloud(
         lower, upper = mesh.bounds()
         place = _uniform((num_outliers, 3), generator, surface)
         clutter = lower - _BOX_MARGIN + place * (upper - lower + 2 * _BOX_MARGIN)
-        order = torch.randperm(num_points + num_outliers, generator=generator, device=generator.device)
-        order = order.to(surface.device)
-        return HandCloud(
-            torch.cat([surface, clutter])[order],
-            order < num_points,
-            torch.cat([labels, labels.new_full((num_outliers,), -1)])[order],
-            pose,
-        )
+        return shuffled_cloud(shape, pose, mesh.vertices, surface, labels, clutter, generator)
+
+
+def shuffled_cloud(
+    shape: ArticulatedShape,
+    pose: Tensor,
+    vertices: Tensor,
+    surface: Tensor,
+    labels: Tensor,
+    outliers: Tensor,
+    generator: torch.Generator,
+) -> HandCloud:
+    """Return points of a shape and outliers as one cloud in random order, with the truth beside it.
+
+    Args:
+        shape: the true shape.
+        pose: (num_dofs,) the true pose.
+        vertices: (V, 3) the posed surface.
+        surface: (N, 3) measured points of the shape.
+        labels: (N,) int64 parts of those.
+        outliers: (O, 3) other points.
+        generator: of the order.
+
+    Returns:
+        the cloud of N + O points.
+    """
+    order = torch.randperm(len(surface) + len(outliers), generator=generator, device=generator.device)
+    order = order.to(surface.device)
+    with torch.no_grad():
+        keypoints = shape.keypoints(pose)
+    return HandCloud(
+        torch.cat([surface, outliers])[order],
+        order < len(surface),
+        torch.cat([labels, labels.new_full((len(outliers),), -1)])[order],
+        pose,
+        keypoints,
+        vertices,
+        torch.bincount(labels, minlength=shape.num_parts),
+    )
 
 
 def random_hand_pose(
@@ -173,7 +224,27 @@ def random_hand_pose(
     pose[3:6] = 2 * torch.atan2(axis_length, quaternion[0].abs()) * quaternion[1:] / axis_length * quaternion[0].sign()
     shift = distance / _DISTANCE * _POSITION_SPREAD * (2 * offset - 1)
     target = hand.rest.new_tensor([0.0, 0.0, distance]) + shift
-    return _placed(hand, pose, target)
+    return placed(hand, pose, target)
+
+
+def placed(shape: ArticulatedShape, pose: Tensor, target: Tensor) -> Tensor:
+    """Return the pose within its limits and with its base moved so that the middle of the parts lies at ``target``.
+
+    Args:
+        shape: the shape.
+        pose: (..., num_dofs).
+        target: (..., 3), metres.
+
+    Returns:
+        (..., num_dofs); a base that cannot move stays where it is.
+    """
+    pose = torch.maximum(torch.minimum(pose, shape.upper), shape.lower)
+    still = torch.cat([torch.zeros_like(pose[..., :6]), pose[..., 6:]], dim=-1)
+    with torch.no_grad():
+        middle = shape.part_transforms(still)[..., :3, 3].mean(-2)
+    turned = (so3_exp(pose[..., 3:6]) @ middle.unsqueeze(-1)).squeeze(-1)
+    moved = torch.cat([target - turned, pose[..., 3:]], dim=-1)
+    return torch.maximum(torch.minimum(moved, shape.upper), shape.lower)
 
 
 def hand_motion(
@@ -188,23 +259,38 @@ def hand_motion(
 ) -> Tensor:
     """Return the poses of a smooth motion before a camera at the origin that looks along +z with -y up.
 
+    In all of them the hand sways a little, upright with the palm to the camera unless said otherwise:
+
+    - "bend": the fingers close and open one after the other, every 2.5 s;
+    - "rotate": the fingers half bent, it turns around its own axis once in 5 s;
+    - "rotation": the fingers slightly bent, it turns to and fro by 60 to 70 degrees about an axis that is parallel to
+      the picture and at most 25 degrees from upright;
+    - "bending_palm", "bending_back": the fingers close and open one after the other and, by and by, all together, seen
+      from the palm or from the back;
+    - "flip": within a second, about 2 s after the start, it turns by 180 degrees: the surface seen before is hidden;
+      4 s later it turns back;
+    - "fast": as "bending_palm", swaying more, 3 to 4 times as fast;
+    - "occlusion": in 1.5 s, about 2 s after the start, it passes through the middle of the picture from one side to
+      the other, in `hand_sequence` behind a bar; 4 s later it returns.
+
     Args:
         shape: a hand, or any articulated shape.
-        kind: "bend": the fingers close and open one after the other, every 2.5 s, while the hand sways a little;
-            "rotate": the hand, its fingers half bent, turns around its own axis once in 5 s.
+        kind: one of the above.
         num_frames: number of frames.
         fps: frames per second.
         bend: share of the way to their limits that joints move at most, 0 to 1.
         distance: from the origin to the middle of the shape, metres.
-        seed: decides about how deep each joint bends and when.
+        seed: decides about how deep each joint bends and when, and about axes, amplitudes, speeds and times.
 
     Returns:
         (num_frames, num_dofs), metres and radians; the rotation vectors have angles of at most pi.
 
     Raises:
         InputError: if an argument is out of range.
+
+    References: Dewaele et al. 2006, section 5 ("rotation", "bending_palm", "bending_back", "flip").
     """
-    check_choice(kind, "kind", ("bend", "rotate"))
+    check_choice(kind, "kind", MOTIONS)
     if isinstance(num_frames, bool) or not isinstance(num_frames, int) or num_frames < 1:
         raise InputError(f"num_frames must be a positive integer, got {num_frames!r}")
     check_positive(fps, "fps")
@@ -213,74 +299,67 @@ def hand_motion(
     generator = torch.Generator().manual_seed(seed)
     draws = _uniform((3, shape.num_dofs - 6), generator, shape.rest)
     sway = _uniform((6,), generator, shape.rest)
+    own = _uniform((4,), generator, shape.rest)
     seconds = (torch.arange(num_frames, dtype=torch.float64) / fps).to(shape.rest)
-    curls = _curl_groups(shape)
-    wave = 0.5 - 0.5 * torch.cos(2 * math.pi * (seconds[:, None] / _SECONDS_PER_BEND - 0.1 * curls))
-    depth = 0.8 + 0.2 * draws[0]
-    share = bend * depth * (wave if kind == "bend" else 0.4 + 0.2 * wave)
+    seconds = seconds * (3 + own[0]) if kind == "fast" else seconds
+    share = bend * (0.8 + 0.2 * draws[0]) * _closing(kind, seconds, _curl_groups(shape))
     pose = shape.rest_pose().expand(num_frames, -1).clone()
     if isinstance(shape, Hand):
         pose[:, 6:] = _hand_joints(shape, share, 2 * draws[1] - 1, bend)
     else:
         lower, upper = _joint_ranges(shape)
         pose[:, 6:] = pose[:, 6:] + share * torch.where(draws[2] < 0.5, lower, upper)
-    angle = 0.2 * torch.sin(2 * math.pi * (seconds[:, None] / _SECONDS_PER_TURN + sway[:3]))
-    turn = compose_rotation_vectors(angle, shape.rest.new_tensor(_FACING).expand_as(angle))
+    tilts, shifts = torch.sin(2 * math.pi * (seconds[:, None] / _SECONDS_PER_TURN + sway.view(2, 1, 3)))
+    pose[:, 3:6] = _turns(kind, seconds, tilts, own)
+    drift = _POSITION_SPREAD * (1.6 if kind == "fast" else 1.0) * shifts
+    if kind == "occlusion":
+        passed = 2 * _there_and_back(seconds, 1.6 + 0.3 * own[3], _SECONDS_PER_PASSAGE) - 1
+        drift[:, 0] = 0.5 * drift[:, 0] + torch.where(own[2] < 0.5, _PASSAGE, -_PASSAGE) * passed
+    target = shape.rest.new_tensor([0.0, 0.0, distance]) + distance / _DISTANCE * drift
+    return placed(shape, pose, target)
+
+
+def _closing(kind: str, seconds: Tensor, fingers: Tensor) -> Tensor:
+    """Return how far each joint (..., D) is closed at each time, from 0 to 1."""
+    lag: float | Tensor = 0.1
+    if kind in ("bending_palm", "bending_back", "fast"):
+        lag = 0.075 * (1 + torch.cos(2 * math.pi * seconds[:, None] / _SECONDS_PER_TURN))
+    wave = 0.5 - 0.5 * torch.cos(2 * math.pi * (seconds[:, None] / _SECONDS_PER_BEND - lag * fingers))
+    if kind == "rotate":
+        return 0.4 + 0.2 * wave
+    return 0.15 + 0.2 * wave if kind in ("rotation", "flip", "occlusion") else wave
+
+
+def _turns(kind: str, seconds: Tensor, tilts: Tensor, own: Tensor) -> Tensor:
+    """Return rotation vectors (T, 3) of the base."""
+    sway = {"fast": 0.3, "rotation": 0.05}.get(kind, 0.2) * tilts
+    turn = compose_rotation_vectors(sway, sway.new_tensor(_FACING).expand_as(sway))
     if kind == "rotate":
         about = 2 * math.pi * seconds / _SECONDS_PER_TURN
-        turn = compose_rotation_vectors(turn, about[:, None] * shape.rest.new_tensor([0.0, 0.0, 1.0]))
-    pose[:, 3:6] = turn
-    drift = _POSITION_SPREAD * torch.sin(2 * math.pi * (seconds[:, None] / _SECONDS_PER_TURN + sway[3:]))
-    target = shape.rest.new_tensor([0.0, 0.0, distance]) + distance / _DISTANCE * drift
-    return _placed(shape, pose, target)
+        return compose_rotation_vectors(turn, about[:, None] * turn.new_tensor([0.0, 0.0, 1.0]))
+    tilt = torch.zeros_like(own[2])
+    if kind == "rotation":
+        tilt = math.radians(25) * (2 * own[2] - 1)
+        angle = torch.deg2rad(60 + 10 * own[1]) * torch.sin(2 * math.pi * seconds / _SECONDS_PER_ROTATION)
+    elif kind == "bending_back":
+        angle = torch.full_like(seconds, math.pi)
+    elif kind == "flip":
+        tilt = math.radians(10) * (2 * own[2] - 1)
+        angle = math.pi * _there_and_back(seconds, 1.8 + 0.4 * own[3], _SECONDS_PER_FLIP)
+    else:
+        return turn
+    angle = torch.where(own[0] < 0.5, angle, -angle)
+    axis = torch.stack([tilt.sin(), tilt.cos(), torch.zeros_like(tilt)])
+    return compose_rotation_vectors(angle[:, None] * axis, turn)
 
 
-def hand_sequence(
-    kind: str = "bend",
-    num_frames: int = 100,
-    fps: float = 20.0,
-    *,
-    shape: ArticulatedShape | None = None,
-    num_points: int = 500,
-    noise: float = 0.0015,
-    outlier_ratio: float = 0.33,
-    camera: Tensor | None = None,
-    skin: LinearBlendSkin | None = None,
-    bend: float = 0.6,
-    seed: int = 0,
-) -> tuple[HandCloud, ...]:
-    """Return the clouds of a moving hand, frame after frame, with the exact poses of `hand_motion`.
-
-    Args:
-        kind: "bend" or "rotate", see `hand_motion`.
-        num_frames: number of frames.
-        fps: frames per second.
-        shape: the true shape; an adult right hand by default.
-        num_points: see `make_hand_cloud`.
-        noise: see `make_hand_cloud`.
-        outlier_ratio: see `make_hand_cloud`.
-        camera: (3,) see `make_hand_cloud`; the motion passes before a camera at ``torch.zeros(3)``.
-        skin: see `make_hand_cloud`; made once for all frames.
-        bend: see `hand_motion`.
-        seed: of motion and measurements.
-
-    Returns:
-        num_frames clouds.
-
-    Raises:
-        InputError: if an argument is out of range.
-    """
-    shape = Hand() if shape is None else shape
-    poses = hand_motion(shape, kind, num_frames, fps, bend=bend, seed=seed)
-    skin = surface_skin(shape) if skin is None else skin
-    generator = torch.Generator().manual_seed(seed)
-    return tuple(
-        make_hand_cloud(
-            shape, pose, num_points=num_points, noise=noise, outlier_ratio=outlier_ratio, camera=camera, skin=skin,
-            generator=generator,
-        )
-        for pose in poses
-    )  # fmt: skip
+def _there_and_back(seconds: Tensor, start: Tensor, duration: float) -> Tensor:
+    """Return a smooth step from 0 to 1 that is undone later, again and again."""
+    period, pause = _SECONDS_PER_RETURN
+    since = torch.remainder(seconds, period) - start
+    share = torch.stack([since, since - pause]).div(duration).clamp(0, 1)
+    there, back = share**3 * (10 - 15 * share + 6 * share**2)
+    return there - back
 
 
 def _uniform(size: tuple[int, ...], generator: torch.Generator, like: Tensor) -> Tensor:
@@ -328,14 +407,3 @@ def _hand_joints(hand: Hand, share: Tensor, spread: Tensor, bend: float) -> Tens
     straight = 1 - share
     abduction = 0.4 * bend * straight * sideways * hand.upper[6:]
     return torch.where(flexion, share * hand.upper[6:], abduction)
-
-
-def _placed(shape: ArticulatedShape, pose: Tensor, target: Tensor) -> Tensor:
-    """Return the pose with its base moved so that the middle of the parts lies at ``target``."""
-    pose = torch.maximum(torch.minimum(pose, shape.upper), shape.lower)
-    still = torch.cat([torch.zeros_like(pose[..., :6]), pose[..., 6:]], dim=-1)
-    with torch.no_grad():
-        middle = shape.part_transforms(still)[..., :3, 3].mean(-2)
-    turned = (so3_exp(pose[..., 3:6]) @ middle.unsqueeze(-1)).squeeze(-1)
-    moved = torch.cat([target - turned, pose[..., 3:]], dim=-1)
-    return torch.maximum(torch.minimum(moved, shape.upper), shape.lower)
