@@ -59,13 +59,17 @@ def test_rivals_get_the_same_iterations_and_range_of_sigma(bench):
     assert configs["default"] == tr.AlignConfig()
 
 
-def test_starts_are_as_far_off_as_stated(bench, plain_hand, plain_hand_surface):
-    trial = bench.make_trial(plain_hand, plain_hand_surface, bench.Condition("one side", start_deg=10), 3)
+def test_starts_are_as_far_off_as_stated(bench, plain_hand, plain_hand_surface, plain_hand_skin):
+    def make_trial(condition):
+        return bench.make_trial(plain_hand, plain_hand_surface, plain_hand_skin, condition, 3)
+
+    trial = make_trial(bench.Condition("one side", start_deg=10))
     off = torch.rad2deg((trial.start - trial.cloud.pose).abs())
     assert float(off[6:].max()) == pytest.approx(10, abs=1e-3)
     assert float(off[:6].max()) < 1e-5
     assert 1 <= int(trial.seen.sum()) <= 5
-    again = bench.make_trial(plain_hand, plain_hand_surface, bench.Condition("whole", outliers=0.5), 3)
+    assert trial.skin is plain_hand_skin
+    again = make_trial(bench.Condition("whole", outliers=0.5))
     torch.testing.assert_close(again.cloud.pose, trial.cloud.pose)
     assert float(again.cloud.inliers.double().mean()) == pytest.approx(0.5)
 
@@ -88,7 +92,9 @@ def test_claims_follow_from_paired_alignments(bench):
     assert "a nearer in 9 of 12" in claim.figures
     assert "failures 25% against 25%" in claim.figures
     assert claim.verdict == "NOT DECIDED"
-    assert claim.figures.endswith("lower median in: none")
+    assert claim.figures.endswith("b has the lower median in 0 of 3 conditions")
+    worse = bench.better_claim(rows, "", "b", "a").figures
+    assert worse.endswith("a has the lower median in 3 of 3 conditions (1 points | 2 points | 3 points)")
     # Where both fail there is nothing to tell.
     lost = bench.better_claim([make_row(bench, "a", [0.02]), make_row(bench, "b", [0.03])], "", "a", "b")
     assert "in 0 of 0" in lost.figures
@@ -97,3 +103,15 @@ def test_claims_follow_from_paired_alignments(bench):
     assert bench.faster_claim(fast, "", "b", "a").verdict == "CONTRADICTED"
     assert bench.falls_claim(fast, "", "a", "b").verdict == "NOT DECIDED"
     assert math.isclose(rows[0].failures, 0.25)
+
+
+def test_tracked_model_points_lie_where_the_camera_saw_the_start(
+    bench, plain_hand, plain_hand_surface, plain_hand_skin
+):
+    trial = bench.make_trial(plain_hand, plain_hand_surface, plain_hand_skin, bench.Condition("tracked"), 3)
+    assert len(trial.skin.points) == 500
+    with torch.no_grad():
+        posed, every = trial.skin(trial.start), plain_hand_surface(trial.start)
+    assert float(plain_hand.distance(posed, trial.start).abs().mean()) < 0.003
+    # Toward the camera at the origin, which looks along z.
+    assert float(posed[:, 2].mean()) < float(every[:, 2].mean())
