@@ -1,6 +1,5 @@
 """Robot descriptions: numbers, order, limits, mimic joints, geometry and everything that is refused."""
 
-import importlib.util
 import math
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from torchreg.errors import FormatError, InputError, MissingExtraError, ModelError
+from torchreg.errors import FormatError, InputError, ModelError
 from torchreg.io.limits import FileLimits
 from torchreg.io.urdf import load_urdf
 
@@ -195,16 +194,6 @@ def test_packages_are_found(tmp_path: Path, scheme: str) -> None:
     assert load_urdf(outside, package_dirs=[tmp_path]).link_meshes[0] is not None
 
 
-def test_file_address_and_glb_scene(tmp_path: Path) -> None:
-    scene = trimesh.Scene()
-    scene.add_geometry(trimesh.creation.box(), transform=trimesh.transformations.translation_matrix([3, 0, 0]))
-    scene.add_geometry(trimesh.creation.box())
-    scene.export(tmp_path / "two.glb")
-    mesh = load_urdf(write(tmp_path, with_mesh(f"file://{tmp_path}/two.glb"))).link_meshes[0]
-    assert mesh is not None
-    np.testing.assert_allclose(mesh.bounds()[:, 0], [-0.5, 3.5], atol=1e-6)
-
-
 def test_missing_mesh_is_named_or_skipped(tmp_path: Path) -> None:
     path = write(tmp_path, with_mesh("gone.stl"))
     with pytest.raises(FormatError, match=r"visual of link 'a'.*'gone\.stl' was not found"):
@@ -214,51 +203,6 @@ def test_missing_mesh_is_named_or_skipped(tmp_path: Path) -> None:
         load_urdf(path, meshes="maybe")
     with pytest.raises(FormatError, match="was not found"):
         load_urdf(write(tmp_path, with_mesh("x" * 5000 + ".stl")))
-
-
-def test_collada_needs_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "box.dae").write_bytes(b"<COLLADA/>")
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    path = write(tmp_path, with_mesh("box.dae"))
-    with pytest.raises(MissingExtraError, match=r"torchreg\[urdf\]"):
-        load_urdf(path)
-    assert load_urdf(path, meshes="skip").link_meshes == (None,)
-
-
-def test_collada_unit_is_applied(tmp_path: Path) -> None:
-    pytest.importorskip("collada")
-    content = trimesh.exchange.dae.export_collada(trimesh.creation.box())
-    (tmp_path / "box.dae").write_bytes(content.replace(b"<up_axis>", b'<unit name="cm" meter="0.01"/><up_axis>', 1))
-    path = write(tmp_path, with_mesh("box.dae"))
-    mesh = load_urdf(path).link_meshes[0]
-    assert mesh is not None
-    np.testing.assert_allclose(mesh.bounds(), [[-0.005] * 3, [0.005] * 3], atol=1e-9)
-    (tmp_path / "box.dae").write_bytes(b'<!DOCTYPE a [<!ENTITY b "c">]>' + content)
-    with pytest.raises(FormatError, match=r"box\.dae.*document type"):
-        load_urdf(path)
-    broken = content.replace(b"<library_effects>", b"<library_effects><effect id='x'><profile_COMMON/></effect>", 1)
-    (tmp_path / "box.dae").write_bytes(b"\n" + broken.replace(b"#", b"#no", 1))
-    assert load_urdf(path).link_meshes[0] is not None
-    (tmp_path / "box.dae").write_bytes(b"not xml")
-    with pytest.raises(FormatError, match="not a readable dae mesh"):
-        load_urdf(path)
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("bad.stl", b"solid nothing", r"bad\.stl"),
-        ("bad.stl", b"\0" * 80 + b"\xff\xff\xff\x7f" + b"\0" * 50, r"bad\.stl: not a readable stl mesh"),
-        ("nan.obj", b"v nan 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n", r"nan\.obj: not a readable obj mesh"),
-        ("empty.obj", b"v 0 0 0\n", r"empty\.obj"),
-        ("bad.glb", b"glTF", r"bad\.glb: not a readable glb mesh"),
-        ("mesh.fbx", b"x", r"meshes of kind '\.fbx' are not read"),
-    ],
-)
-def test_damaged_meshes(tmp_path: Path, name: str, content: bytes, message: str) -> None:
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(FormatError, match=message):
-        load_urdf(write(tmp_path, with_mesh(name)))
 
 
 def test_mesh_requests_that_are_refused(tmp_path: Path) -> None:

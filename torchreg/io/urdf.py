@@ -2,32 +2,25 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import io
 import math
-import struct
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import unquote
 
-import numpy as np
 import torch
-import trimesh
 from torch import Tensor
-from trimesh.exchange.stl import HeaderError
 
 from torchreg._checks import check_choice
-from torchreg.errors import FormatError, MissingExtraError, ModelError
+from torchreg.errors import FormatError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh, concatenate
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_count, local_path, read_bytes
+from torchreg.io.mesh_files import MeshFiles
+from torchreg.io.strict_xml import parse_xml
 
 _MAX_LINKS = 2000
 _MAX_URDF_BYTES = 64 * 1024**2
-_MAX_DEPTH = 64
 _KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": "fixed"}
 _PRIMITIVES = {
     "box": ("size",),
@@ -35,22 +28,6 @@ _PRIMITIVES = {
     "capsule": ("radius", "length"),
     "sphere": ("radius",),
 }
-_MESH_SUFFIXES = (".stl", ".obj", ".dae", ".glb", ".ply", ".off")
-_DAE_LOOKS = ("library_images", "library_effects", "library_materials", "bind_material")
-_PARSER_ERRORS = (
-    ValueError,
-    TypeError,
-    LookupError,
-    AttributeError,
-    RuntimeError,
-    ArithmeticError,
-    AssertionError,
-    SyntaxError,
-    EOFError,
-    ImportError,  # trimesh asks for an encoding detector when text is not UTF-8
-    struct.error,
-    HeaderError,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,47 +109,13 @@ def load_urdf(
     )
 
 
-class _StrictBuilder(ET.TreeBuilder):
-    """Builds the element tree, but refuses document types (which bring entities) and absurd nesting."""
-
-    depth = 0
-
-    def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
-        raise FormatError(
-            f"has a document type declaration ({name!r}), which robot descriptions do not need; remove it"
-        )
-
-    def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:
-        self.depth += 1
-        if self.depth > _MAX_DEPTH:
-            raise FormatError(f"nests elements more than {_MAX_DEPTH} deep")
-        return super().start(tag, attrs)
-
-    def end(self, tag: str, /) -> ET.Element:
-        self.depth -= 1
-        return super().end(tag)
-
-
-def _parse_xml(content: bytes) -> ET.Element:
-    parser = ET.XMLParser(target=_StrictBuilder())
-    try:
-        # Blank lines before the declaration are common, harmless, and an error to the parser.
-        parser.feed(content.lstrip(b" \t\r\n"))
-        root: ET.Element = parser.close()
-    except (ET.ParseError, ValueError, LookupError) as error:
-        if isinstance(error, FormatError):
-            raise
-        raise FormatError(f"not well-formed XML ({error})") from error
-    return root
-
-
 def _parse(path: Path, limits: FileLimits) -> ET.Element:
     content = read_bytes(path, limits)
     if len(content) > _MAX_URDF_BYTES:
         raise FormatError(f"{path}: {len(content)} bytes of XML, at most {_MAX_URDF_BYTES} are read")
     expand = f"{path}: holds xacro macros; expand them first with `xacro {path.name} > robot.urdf`"
     try:
-        robot = _parse_xml(content)
+        robot = parse_xml(content)
     except FormatError as error:
         raise FormatError(expand if b"<xacro:" in content else f"{path}: {error}") from error
     if robot.tag != "robot":
@@ -350,12 +293,11 @@ def _origin(element: ET.Element, what: str) -> Tensor:
 
 
 class _Geometry:
-    """Finds and reads the geometry of links; every mesh file is read once."""
+    """Reads the geometry of links."""
 
     def __init__(self, path: Path, package_dirs: Sequence[Path], require: bool, limits: FileLimits) -> None:
-        self._path, self._require, self._limits = path, require, limits
-        self._folders = [*package_dirs, *path.resolve().parents]
-        self._cache: dict[Path, TriangleMesh] = {}
+        self._path, self._limits = path, limits
+        self._files = MeshFiles(path, package_dirs, require, limits)
         self._total = 0
 
     def of_link(self, name: str, link: ET.Element) -> tuple[TriangleMesh | None, tuple[UrdfPrimitive, ...]]:
@@ -383,7 +325,7 @@ class _Geometry:
         scale = torch.tensor(_floats(shape, "scale", 3, (1.0, 1.0, 1.0), what), dtype=torch.float64)
         if bool((scale == 0).any()):
             raise ModelError(f"{what} has a mesh scale of zero")
-        mesh = self._read(filename, what)
+        mesh = self._files.read(filename, what)
         if mesh is None:
             return []
         self._total += mesh.num_vertices
@@ -395,47 +337,6 @@ class _Geometry:
         # A mirrored mesh turns inside out unless its triangles turn around.
         return [TriangleMesh(vertices, mesh.faces.flip(1) if float(scale.prod()) < 0 else mesh.faces)]
 
-    def _read(self, filename: str, what: str) -> TriangleMesh | None:
-        tried = self._candidates(filename, what)
-        found = next((place for place in tried if _is_file(place)), None)
-        if found is None:
-            if not self._require:
-                return None
-            raise FormatError(
-                f"{what}: mesh file {filename!r} was not found (looked at {', '.join(map(str, tried[:3]))}, ...); pass "
-                f"package_dirs=, or meshes='skip' to go without"
-            )
-        if found.suffix.lower() == ".dae" and importlib.util.find_spec("collada") is None:
-            if not self._require:
-                return None
-            raise MissingExtraError(
-                f"{what}: reading COLLADA mesh {found} needs pycollada; install torchreg[urdf], or pass meshes='skip'"
-            )
-        if found not in self._cache:
-            self._cache[found] = _read_mesh(found, self._limits)
-        return self._cache[found]
-
-    def _candidates(self, filename: str, what: str) -> list[Path]:
-        """Return the places where a mesh may lie, likeliest first."""
-        scheme, separator, rest = filename.partition("://")
-        if not separator:
-            return [self._path.parent / filename]
-        if scheme == "file":
-            return [self._path.parent / unquote(rest)]
-        if scheme not in ("package", "model"):
-            raise FormatError(f"{what}: mesh {filename!r} is remote; save it beside the URDF and give a relative path")
-        package, _, inner = rest.partition("/")
-        places = [folder / package / inner for folder in self._folders]
-        named = [folder / inner for folder in self._folders if folder.name == package]
-        return [*named, *places]
-
-
-def _is_file(place: Path) -> bool:
-    try:
-        return place.is_file()
-    except OSError:  # a name that the file system cannot hold
-        return False
-
 
 def _primitive(shape: ET.Element, origin: Tensor, what: str) -> UrdfPrimitive:
     if shape.tag not in _PRIMITIVES:
@@ -446,50 +347,3 @@ def _primitive(shape: ET.Element, origin: Tensor, what: str) -> UrdfPrimitive:
     if len(size) < (3 if shape.tag == "box" else len(_PRIMITIVES[shape.tag])) or min(size) <= 0:
         raise ModelError(f"{what}: <{shape.tag}> needs a positive {' and '.join(_PRIMITIVES[shape.tag])}, got {size}")
     return UrdfPrimitive(shape.tag, size, origin)
-
-
-def _read_mesh(path: Path, limits: FileLimits) -> TriangleMesh:
-    """Return the triangles of a mesh file, in metres where the file knows its unit."""
-    kind = path.suffix.lower()
-    if kind not in _MESH_SUFFIXES:
-        raise FormatError(f"{path}: meshes of kind {kind!r} are not read; known: {', '.join(_MESH_SUFFIXES)}")
-    content = read_bytes(path, limits)
-    unit = 1.0
-    errors: tuple[type[BaseException], ...] = _PARSER_ERRORS
-    if kind == ".dae":
-        errors = (*errors, importlib.import_module("collada.common").DaeError)
-    try:
-        if kind == ".dae":
-            content, unit = _bare_collada(content)
-        # From memory and without a resolver, so that no material or texture file is opened.
-        scene = trimesh.load_scene(io.BytesIO(content), file_type=kind[1:], process=False, maintain_order=True)
-        parts = [
-            (
-                np.asarray(piece.vertices, dtype=np.float64),
-                np.asarray(piece.faces, dtype=np.int64),
-                scene.graph[node][0],
-            )
-            for node in scene.graph.nodes_geometry
-            if isinstance(piece := scene.geometry[scene.graph[node][1]], trimesh.Trimesh)
-        ]
-        pieces = [
-            TriangleMesh(torch.from_numpy((v @ matrix[:3, :3].T + matrix[:3, 3]) * unit), torch.from_numpy(f.copy()))
-            for v, f, matrix in parts
-            if len(f)
-        ]
-    except errors as error:
-        raise FormatError(f"{path}: not a readable {kind[1:]} mesh ({type(error).__name__}: {error})") from error
-    if not pieces:
-        raise FormatError(f"{path}: holds no triangles")
-    return concatenate(pieces)
-
-
-def _bare_collada(content: bytes) -> tuple[bytes, float]:
-    """Return a COLLADA document without materials, whose broken references would take the mesh along, and its unit."""
-    root = _parse_xml(content)
-    unit = root.find("{*}asset/{*}unit")
-    for parent in list(root.iter()):
-        for child in list(parent):
-            if child.tag.rpartition("}")[2] in _DAE_LOOKS:
-                parent.remove(child)
-    return ET.tostring(root), 1.0 if unit is None else float(unit.get("meter", "1"))
