@@ -42,6 +42,7 @@ class LinearBlendSkin(nn.Module):
     points: Tensor
     reference_pose: Tensor
     normals: Tensor | None
+    normal_basis: Tensor | None
     faces: Tensor | None
 
     def __init__(
@@ -79,8 +80,11 @@ class LinearBlendSkin(nn.Module):
         with torch.no_grad():
             inverse = invert_rigid(shape.part_transforms(reference_pose))
             local = transform_points(inverse, points.expand(shape.num_parts, -1, -1)).transpose(0, 1)
-        rows = nn.functional.pad(local, (0, 1), value=1.0) * weights.unsqueeze(-1)
-        self.register_buffer("basis", rows.flatten(-2).contiguous(), persistent=False)
+            turned = None if normals is None else (normals @ inverse[:, :3, :3].mT).transpose(0, 1)
+        self.register_buffer("basis", _weighted(local, weights, 1.0), persistent=False)
+        # Lengths of bones turn no part, so the normals in their parts' frames hold for all of them.
+        normal_basis = None if turned is None else _weighted(turned, weights, 0.0)
+        self.register_buffer("normal_basis", normal_basis, persistent=False)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -98,7 +102,21 @@ class LinearBlendSkin(nn.Module):
 
         References: Dewaele et al. 2006, eq. 3.
         """
-        return self.basis @ self.shape.part_transforms(pose)[..., :3, :].mT.flatten(-3, -2)
+        return self.place(self.shape.part_transforms(pose)[..., :3, :].mT.flatten(-3, -2))
+
+    def place(self, rows: Tensor) -> Tensor:
+        """Return the points for given part transforms.
+
+        Args:
+            rows: (..., 4 P, 3) as `ArticulatedShape.transform_jacobian` stacks the transforms.
+
+        Returns:
+            (..., N, 3), metres; in memory all x come first, then all y, then all z.
+
+        Differentiable: in ``rows``.
+        """
+        # With the three coordinates as the short side from the left, the product takes a fifth of the time or less.
+        return nn.functional.linear(rows.mT, self.basis).mT
 
     def jacobian(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
         """Return the posed points and their analytic Jacobian with respect to all degrees of freedom.
@@ -114,7 +132,7 @@ class LinearBlendSkin(nn.Module):
         """
         rows, derivative = self.shape.transform_jacobian(pose, chart=chart)
         jacobian = self.basis @ derivative.flatten(-2)
-        return self.basis @ rows, jacobian.unflatten(-1, derivative.shape[-2:])
+        return self.place(rows), jacobian.unflatten(-1, derivative.shape[-2:])
 
     def posed_normals(self, pose: Tensor) -> Tensor:
         """Return the unit normals in a pose, turned with the weighted mean of the part rotations.
@@ -128,12 +146,23 @@ class LinearBlendSkin(nn.Module):
         Raises:
             InputError: if the skin has no normals.
         """
-        if self.normals is None:
+        return self.turn_normals(self.shape.part_transforms(pose)[..., :3, :].mT.flatten(-3, -2))
+
+    def turn_normals(self, rows: Tensor) -> Tensor:
+        """Return the unit normals (..., N, 3) for given part transforms, see `place`.
+
+        Raises:
+            InputError: if the skin has no normals.
+        """
+        if self.normal_basis is None:
             raise InputError("this skin has no normals; pass normals= when building it")
-        rotations = self.shape.part_transforms(pose)[..., :3, :3]
-        reference = self.shape.part_transforms(self.reference_pose)[..., :3, :3]
-        motion = torch.einsum("np,...pij->...nij", self.weights, rotations @ reference.mT)
-        return nn.functional.normalize((motion @ self.normals.unsqueeze(-1)).squeeze(-1), dim=-1)
+        turned = nn.functional.linear(rows.mT, self.normal_basis)
+        return nn.functional.normalize(turned, dim=-2).mT
+
+
+def _weighted(local: Tensor, weights: Tensor, last: float) -> Tensor:
+    """Return (N, 4 P): coordinates (N, P, 3) in the parts' frames, made homogeneous, times weights (N, P)."""
+    return (nn.functional.pad(local, (0, 1), value=last) * weights.unsqueeze(-1)).flatten(-2).contiguous()
 
 
 class BendingSkin(LinearBlendSkin):

@@ -62,17 +62,17 @@ class SkinSurface:
 
     def distance(self, points: Tensor, pose: Tensor) -> Tensor:
         """Return the signed distances (..., N) of points (..., N, 3) in poses (..., num_dofs), metres."""
-        posed, normals = self.skin(pose), self.skin.posed_normals(pose)
-        return self._plane_distance(points, posed, normals)[0]
+        rows = self.skin.shape.part_transforms(pose)[..., :3, :].mT.flatten(-3, -2)
+        return self._plane_distance(points, self.skin.place(rows), self.skin.turn_normals(rows))[0]
 
     def distance_jacobian(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Return distances (..., N) and their Jacobian (..., N, num_dofs) in tangent coordinates."""
         rows, derivative = self.skin.shape.transform_jacobian(pose, chart="tangent")
-        posed, normals = self.skin.basis @ rows, self.skin.posed_normals(pose)
+        posed, normals = self.skin.place(rows), self.skin.turn_normals(rows)
         distance, nearest, normal = self._plane_distance(points, posed, normals)
-        basis = self.skin.basis[nearest]
-        moved = (basis @ derivative.flatten(-2)).unflatten(-1, derivative.shape[-2:])
-        return distance, -(normal.unsqueeze(-2) @ moved).squeeze(-2)
+        # Contracted with the normals first: their products with the basis are smaller than every point's motions.
+        along = (self.skin.basis[nearest].unsqueeze(-1) * normal.unsqueeze(-2)).flatten(-2)
+        return distance, -(along @ derivative.flatten(-3, -2))
 
     def _plane_distance(self, points: Tensor, posed: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         nearest = nearest_index(points, posed)

@@ -58,8 +58,8 @@ class RegistrationObjective:
 
     def __init__(self, skin: LinearBlendSkin, observed: EStep, sigma: Tensor, prior: PosePrior) -> None:
         self.skin, self.prior, self.targets = skin, prior, observed.targets
-        weights = torch.where(observed.weights < 1e-12, 0.0, observed.weights)
-        self.weights = (weights / sigma.square().unsqueeze(-1)).unsqueeze(-1)
+        weights = torch.threshold(observed.weights, 1e-12, 0.0)
+        self.weights = (weights / (sigma * sigma).unsqueeze(-1)).unsqueeze(-1)
         self.curvature = skin.basis.mT @ (self.weights * skin.basis)
 
     def __call__(self, pose: Tensor) -> Linearization:
@@ -68,10 +68,12 @@ class RegistrationObjective:
 
     def linearize(self, pose: Tensor, rows: Tensor, derivative: Tensor) -> Linearization:
         """Return the same, given the part transforms and their derivatives at the pose (see `transform_jacobian`)."""
-        residual = self.skin.basis @ rows - self.targets
+        residual = self.skin.place(rows) - self.targets
         weighted = self.weights * residual
         flat = derivative.flatten(-3, -2)
-        gradient = (flat.mT @ (self.skin.basis.mT @ weighted).flatten(-2).unsqueeze(-1)).squeeze(-1)
+        # Written with the three coordinates from the left, as in `place`.
+        pull = (weighted.mT @ self.skin.basis).mT.flatten(-2).unsqueeze(-1)
+        gradient = (flat.mT @ pull).squeeze(-1)
         curved = (self.curvature @ derivative.flatten(-2)).reshape(flat.shape)
         problem = Linearization(0.5 * (weighted * residual).sum((-2, -1)), gradient, flat.mT @ curved)
         return self.prior.add_to(problem, pose)
