@@ -108,14 +108,16 @@ def expectation(
         sigma = torch.maximum(sigma, extent / _MAX_RATIO)
         expand = flat > 0 and float(extent) < _MAX_EXPANDED_RATIO[model.dtype] * float(sigma.min())
         scale = (2**-0.5 / sigma)[:, None, None]
-        scaled_model, scaled_data = offset * scale, data * scale
+        scaled_model, scaled_data = offset * scale, _raised(data * scale)
         weights, moments, inlier = _accumulate(scaled_model, scaled_data, outlier, valid, expand)
         # G_i - X_i, zero where a model point holds nothing.
         mass = weights.unsqueeze(-1)
-        pull = torch.addcmul(moments, mass, scaled_model, value=-1) / mass.clamp_min(torch.finfo(model.dtype).tiny)
-        targets = model + pull / scale
+        total_pull = torch.addcmul(moments, mass, scaled_model, value=-1)
+        pull = total_pull / mass.clamp_min(torch.finfo(model.dtype).tiny)
+        targets = torch.addcdiv(model, pull, scale)
         # sum_j alpha |Y - X|^2 splits into the spread of the held data and their offset from the model point.
-        squares = _squared_error(scaled_data, scaled_model + pull, pull, weights, inlier) / scale[:, 0, 0].square()
+        spread = (inlier * scaled_data[..., 4]).sum(-1) - (moments * (scaled_model + pull)).sum((-2, -1))
+        squares = (spread.clamp_min(0) + (total_pull * pull).sum((-2, -1))) / scale[:, 0, 0].square()
     return EStep(
         weights.reshape(*batch, num_model),
         targets.reshape(*batch, num_model, 3),
@@ -198,21 +200,26 @@ def _centered(data: Tensor, valid: Tensor | None) -> tuple[Tensor, Tensor]:
     return (data - center) * valid, center
 
 
+def _raised(data: Tensor) -> Tensor:
+    """Return (B, M, 5): the data, one, and their squared norms, which the kernel and the moments are products with."""
+    return torch.cat([data, torch.ones_like(data[..., :1]), (data * data).sum(-1, keepdim=True)], dim=-1)
+
+
 def _accumulate(
     model: Tensor, data: Tensor, outlier: Tensor, valid: Tensor | None, expand: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return lambda (B, N), sum_j alpha_ij Y_j (B, N, 3) and the inlier posterior (B, M) of scaled points."""
+    """Return lambda (B, N), sum_j alpha_ij Y_j (B, N, 3) and the inlier posterior (B, M) of scaled, raised points."""
     gathered, inlier = model.new_zeros(model.shape[0], 4, model.shape[1]), torch.zeros_like(data[..., 0])
     for rows, columns in _chunks(model.shape[0], model.shape[1], data.shape[1]):
         part = data[rows, columns]
-        kernel = gaussian_kernel(model[rows], part, expand=expand)
+        kernel = _expanded_kernel(model[rows], part) if expand else _exact_kernel(model[rows], part[..., :3])
         total = kernel.sum(-2)
         share = (total + outlier[rows, None]).reciprocal()
         if valid is not None:
             share = share * valid[rows, columns]
         torch.mul(total, share, out=inlier[rows, columns])
         # With the data along the last dimension this product is five times as fast as with them along the first.
-        payload = torch.cat([part, torch.ones_like(part[..., :1])], dim=-1).mT * share.unsqueeze(-2)
+        payload = part[..., :4].mT * share.unsqueeze(-2)
         gathered[rows] += payload.contiguous() @ kernel.mT
     return gathered[:, 3], gathered[:, :3].mT, inlier
 
@@ -241,18 +248,25 @@ def gaussian_kernel(model: Tensor, data: Tensor, *, expand: bool) -> Tensor:
 
     Differentiable: no; it works in place.
     """
-    if expand:
-        square = model.square().sum(-1, keepdim=True)
-        left = torch.cat([2 * model, -square, -torch.ones_like(square)], dim=-1) * _LOG2_E
-        right = torch.cat([data, torch.ones_like(data[..., :1]), data.square().sum(-1, keepdim=True)], dim=-1)
-        exponent = left @ right.mT
-    else:
-        exponent = model[..., 0:1] - data[..., 0].unsqueeze(-2)
-        exponent.mul_(exponent)
-        for axis in (1, 2):
-            difference = model[..., axis : axis + 1] - data[..., axis].unsqueeze(-2)
-            exponent.add_(difference.mul_(difference))
-        exponent.mul_(-_LOG2_E)
+    return _expanded_kernel(model, _raised(data)) if expand else _exact_kernel(model, data)
+
+
+def _expanded_kernel(model: Tensor, raised: Tensor) -> Tensor:
+    square = (model * model).sum(-1, keepdim=True)
+    left = torch.cat([2 * model, -square, -torch.ones_like(square)], dim=-1) * _LOG2_E
+    return _power(left @ raised.mT)
+
+
+def _exact_kernel(model: Tensor, data: Tensor) -> Tensor:
+    exponent = model[..., 0:1] - data[..., 0].unsqueeze(-2)
+    exponent.mul_(exponent)
+    for axis in (1, 2):
+        difference = model[..., axis : axis + 1] - data[..., axis].unsqueeze(-2)
+        exponent.add_(difference.mul_(difference))
+    return _power(exponent.mul_(-_LOG2_E))
+
+
+def _power(exponent: Tensor) -> Tensor:
     # Where a power underflows it takes many times as long, and so does arithmetic on what it leaves.
     return torch.threshold_(exponent, _MIN_EXPONENT, -math.inf).exp2_()
 
@@ -260,9 +274,3 @@ def gaussian_kernel(model: Tensor, data: Tensor, *, expand: bool) -> Tensor:
 def _extent(model: Tensor, data: Tensor) -> Tensor:
     both = [torch.linalg.vector_norm(points, math.inf) for points in (model, data) if points.numel() > 0]
     return torch.stack(both).amax() if both else model.new_zeros(())
-
-
-def _squared_error(data: Tensor, targets: Tensor, pull: Tensor, weights: Tensor, inlier: Tensor) -> Tensor:
-    held_square = (inlier * data.square().sum(-1)).sum(-1)
-    mean_square = (weights * targets.square().sum(-1)).sum(-1)
-    return (held_square - mean_square).clamp_min(0) + (weights * pull.square().sum(-1)).sum(-1)

@@ -147,18 +147,14 @@ def _solve(problem: Linearization, damping: Tensor, frozen: Tensor | None) -> tu
     hessian, gradient = problem.hessian, problem.gradient
     diagonal = hessian.diagonal(dim1=-2, dim2=-1)
     # A variable without curvature keeps its place: unit diagonal, zero gradient. The floor bounds the repair.
-    floor = diagonal.amax(-1, keepdim=True) * torch.finfo(hessian.dtype).eps
-    idle = diagonal <= floor
+    idle = diagonal <= diagonal.amax(-1, keepdim=True) * torch.finfo(hessian.dtype).eps
     idle = idle if frozen is None else idle | frozen
-    free = (~idle).to(hessian.dtype)
     # Scaling by the root of the diagonal makes metres and radians alike, and the factorization sound in float32.
-    scale = torch.where(idle, 1.0, diagonal).rsqrt()
-    outer = (scale * free).unsqueeze(-1) * (scale * free).unsqueeze(-2)
-    scaled = hessian * outer
-    scaled.diagonal(dim1=-2, dim2=-1).copy_(1 + damping.unsqueeze(-1).expand_as(scale))
+    scale = diagonal.rsqrt().masked_fill_(idle, 0.0)
+    scaled = hessian * scale.unsqueeze(-1) * scale.unsqueeze(-2)
+    scaled.diagonal(dim1=-2, dim2=-1).copy_((1 + damping).unsqueeze(-1))
     factor, info = torch.linalg.cholesky_ex(scaled)
-    right = (-gradient * scale * free).unsqueeze(-1)
-    step = torch.cholesky_solve(right, factor).squeeze(-1) * scale * free
+    step = torch.cholesky_solve((gradient * scale).unsqueeze(-1), factor).squeeze(-1) * -scale
     sound = info == 0
     # A NaN in the gradient alone leaves the factor sound; its trial must not reach the caller's function.
     return torch.where(torch.isfinite(step) & sound.unsqueeze(-1), step, 0.0), sound
