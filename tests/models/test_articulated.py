@@ -208,6 +208,32 @@ def test_a_shape_of_mixed_solids_equals_shapes_of_one_kind():
         torch.testing.assert_close(alone.distance(points, alone.rest_pose()), distances[:, part], atol=1e-12, rtol=0)
 
 
+@pytest.mark.parametrize("parts", [[0], [1, 4], [4, 1, 2], [0, 1, 2, 3, 4]])
+def test_some_parts_alone_equal_a_shape_whose_other_parts_are_far_away(parts):
+    shape, pose = crane(), pose_with()
+    points = torch.randn(40, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    apart = crane()
+    with torch.no_grad():
+        for part in set(range(5)) - set(parts):
+            apart.primitives.centers[part] += 1e4
+    expected, expected_jacobian = apart.distance_jacobian(points, pose)
+    distance, jacobian = shape.distance_jacobian(points, pose, parts=parts)
+    torch.testing.assert_close(shape.distance(points, pose, parts=parts), expected)
+    torch.testing.assert_close(distance, expected)
+    torch.testing.assert_close(jacobian, expected_jacobian)
+
+
+def test_placed_parts_keep_their_distances_wherever_their_joints_are():
+    shape, pose, parts = crane(), pose_with(), [3, 1]
+    points = torch.randn(7, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    placed = shape.part_transforms(pose)[parts]
+    moved = torch.eye(4, dtype=torch.float64)
+    moved[:3, :3] = torch.from_numpy(Rotation.from_rotvec([0.3, 1.0, -0.4]).as_matrix())
+    moved[:3, 3] = torch.tensor([1.0, -2.0, 0.5])
+    distances = shape.placed_distances(points @ moved[:3, :3].mT + moved[:3, 3], moved @ placed, parts)
+    torch.testing.assert_close(distances, shape.part_distances(points, pose)[:, parts].mT)
+
+
 def test_keypoints_are_the_origins_of_the_parts():
     shape, pose = crane(), pose_with()
     assert torch.equal(shape.keypoints(pose), shape.part_transforms(pose)[:, :3, 3])

@@ -367,10 +367,25 @@ class ArticulatedShape(nn.Module):
 
         Differentiable: in ``points``, ``pose`` and all shape parameters.
         """
-        local = self._local_planes(points, self._solid_frames(self.part_transforms(pose)))
-        return self.primitives.plane_distance(local, self._scaled_sizes()).mT
+        return self.placed_distances(points, self.part_transforms(pose)).mT
 
-    def distance(self, points: Tensor, pose: Tensor) -> Tensor:
+    def placed_distances(self, points: Tensor, transforms: Tensor, parts: Sequence[int] | None = None) -> Tensor:
+        """Return the distance of points to the solids of parts that are placed anywhere, joints or no joints.
+
+        Args:
+            points: (..., N, 3), metres.
+            transforms: (..., P, 4, 4) ``T_world_part``, of the parts in ``parts``.
+            parts: indices of the parts; all by default.
+
+        Returns:
+            (..., P, N), metres, negative inside.
+
+        Differentiable: in all.
+        """
+        local = self._local_planes(points, self._solid_frames(transforms, parts))
+        return self.primitives.plane_distance(local, self._scaled_sizes(), parts)
+
+    def distance(self, points: Tensor, pose: Tensor, *, parts: Sequence[int] | None = None) -> Tensor:
         """Return the signed distance of points to the fused surface, ``d = -nu log phi``.
 
         phi sums the fields ``exp(-d_q / nu)`` of the dominating part and its neighbors only, in the log domain.
@@ -378,6 +393,7 @@ class ArticulatedShape(nn.Module):
         Args:
             points: (..., N, 3), metres.
             pose: (..., num_dofs).
+            parts: indices of the parts that count, as those of one limb; all by default.
 
         Returns:
             (..., N), metres, negative inside; first-order accurate near the surface.
@@ -390,15 +406,21 @@ class ArticulatedShape(nn.Module):
         References: Dewaele et al. 2006, eqs. 1 and 2.
         """
         check_shape(points, "points", ("N", 3), batch=True)
-        return fuse(self.part_distances(points, pose), self.adjacency, self.nu)[0]
+        transforms = self.part_transforms(pose)
+        if parts is not None:
+            transforms = transforms[..., list(parts), :, :]
+        return fuse(self.placed_distances(points, transforms, parts).mT, self._neighbors(parts), self.nu)[0]
 
-    def distance_jacobian(self, points: Tensor, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
+    def distance_jacobian(
+        self, points: Tensor, pose: Tensor, *, chart: str = "pose", parts: Sequence[int] | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Return the fused distance and its analytic Jacobian with respect to all degrees of freedom.
 
         Args:
             points: (..., N, 3), metres, fixed in the world.
             pose: (..., num_dofs).
             chart: see `part_twists`.
+            parts: indices of the parts that count, as those of one limb; all by default.
 
         Returns:
             distance (..., N) and Jacobian (..., N, num_dofs).
@@ -406,22 +428,25 @@ class ArticulatedShape(nn.Module):
         Differentiable: no; it is a derivative already.
         """
         transforms, linear, angular = self._twists(pose, chart)
-        solids = self._solid_frames(transforms)
+        moves = self._part_moves
+        if parts is not None:
+            transforms, moves = transforms[..., list(parts), :, :], moves[list(parts)]
+        solids = self._solid_frames(transforms, parts)
         local = x, y, z = self._local_planes(points, solids)
-        distances, gradient = self.primitives.plane_gradient(local, self._scaled_sizes())
-        fused, shares = fuse(distances.mT, self.adjacency, self.nu)
+        distances, gradient = self.primitives.plane_gradient(local, self._scaled_sizes(), parts)
+        fused, shares = fuse(distances.mT, self._neighbors(parts), self.nu)
         # A solid that moves by a twist leaves the point behind; force and moment are taken in the solid's own frame.
         fx, fy, fz = (plane * shares.mT for plane in gradient)
         moment = (_minor(y, fz, z, fy), _minor(z, fx, x, fz), _minor(x, fy, y, fx))
         wrench = torch.cat([fx, fy, fz, *moment], dim=-2)
-        return fused, (self._solid_twists(linear, angular, solids).mT @ wrench).mT
+        return fused, (self._solid_twists(linear, angular, solids, moves).mT @ wrench).mT
 
-    def _solid_twists(self, linear: Tensor, angular: Tensor, solids: Tensor) -> Tensor:
+    def _solid_twists(self, linear: Tensor, angular: Tensor, solids: Tensor, moves: Tensor) -> Tensor:
         """Return (..., 6 P, num_dofs): what moves a solid backwards, in its own frame; a row per component and part."""
         angular = angular.unsqueeze(-3)
         linear = linear.unsqueeze(-3) + torch.linalg.cross(angular, solids[..., None, :, 3])
         both = torch.cat([linear, angular.expand_as(linear)], dim=-2) @ -solids[..., :3]
-        moved = both.unflatten(-2, (2, -1)) * self._part_moves[:, None, :, None]
+        moved = both.unflatten(-2, (2, -1)) * moves[:, None, :, None]
         twists = moved.movedim((-3, -1), (-4, -3)).flatten(-4, -2)
         return twists @ self._couplings if self.chain.has_mimics else twists
 
@@ -493,10 +518,14 @@ class ArticulatedShape(nn.Module):
     def _scaled_sizes(self) -> list[Tensor]:
         return self.primitives.scaled_sizes(self.log_length_scales.exp(), self.log_radius_scales.exp())
 
-    def _solid_frames(self, transforms: Tensor) -> Tensor:
-        """Return ``[R | t]`` (..., P, 3, 4) of every solid in the world."""
+    def _neighbors(self, parts: Sequence[int] | None) -> Tensor:
+        return self.adjacency if parts is None else self.adjacency[list(parts)][:, list(parts)]
+
+    def _solid_frames(self, transforms: Tensor, parts: Sequence[int] | None = None) -> Tensor:
+        """Return ``[R | t]`` (..., P, 3, 4) of every solid in the world, or of those of some parts."""
         centers = self.primitives.centers * self.log_length_scales.exp().unsqueeze(-1)
         poses = torch.cat([self.primitives.rotations, centers.unsqueeze(-1)], dim=-1)
+        poses = poses if parts is None else poses[list(parts)]
         return transforms[..., :3, :3] @ poses + nn.functional.pad(transforms[..., :3, 3:], (3, 0))
 
     def _local_planes(self, points: Tensor, solids: Tensor) -> Planes:
@@ -506,7 +535,7 @@ class ArticulatedShape(nn.Module):
         offsets = (solids[..., None, :, 3] @ rotations).movedim(-1, -3).flatten(-3, -2)
         # In place of a sum, which would write all points once more.
         local = (rotations.movedim(-1, -3).flatten(-3, -2) @ points.mT).sub_(offsets)
-        x, y, z = local.unflatten(-2, (3, self.num_parts)).unbind(-3)
+        x, y, z = local.unflatten(-2, (3, -1)).unbind(-3)
         return x, y, z
 
 

@@ -144,31 +144,67 @@ class PrimitiveSet(nn.Module):
         distance = torch.cat([pair[0] for pair in pairs], dim=-1)[..., self.kind_order]
         return distance, torch.cat([pair[1] for pair in pairs], dim=-2)[..., self.kind_order, :]
 
-    def plane_distance(self, planes: Planes, sizes: Sequence[Tensor]) -> Tensor:
-        """Return what `forward` does for points given as planes x, y and z (..., P, N): distances (..., P, N)."""
+    def plane_distance(self, planes: Planes, sizes: Sequence[Tensor], parts: Sequence[int] | None = None) -> Tensor:
+        """Return what `forward` does for points given as planes x, y and z (..., P, N): distances (..., P, N).
+
+        Args:
+            planes: one row per part, or per member of ``parts``.
+            sizes: from `scaled_sizes`.
+            parts: the parts whose solids the rows belong to; all by default.
+        """
+        groups = self._by_kind(sizes, parts)
         columns = [
-            PRIMITIVE_KINDS[kind].plane_distance(self._of_kind(planes, kind), size.unsqueeze(-2))
-            for kind, size in zip(self.kinds, sizes, strict=True)
+            PRIMITIVE_KINDS[group.kind].plane_distance(group.pick(planes), group.sizes.unsqueeze(-2))
+            for group in groups
         ]
-        return self._in_order(columns)
+        return _in_order(groups, columns)
 
-    def plane_gradient(self, planes: Planes, sizes: Sequence[Tensor]) -> tuple[Tensor, Planes]:
+    def plane_gradient(
+        self, planes: Planes, sizes: Sequence[Tensor], parts: Sequence[int] | None = None
+    ) -> tuple[Tensor, Planes]:
         """Return distances (..., P, N) and planes of their analytic gradients in the solids' frames."""
+        groups = self._by_kind(sizes, parts)
         pairs = [
-            PRIMITIVE_KINDS[kind].plane_gradient(self._of_kind(planes, kind), size.unsqueeze(-2))
-            for kind, size in zip(self.kinds, sizes, strict=True)
+            PRIMITIVE_KINDS[group.kind].plane_gradient(group.pick(planes), group.sizes.unsqueeze(-2))
+            for group in groups
         ]
-        x, y, z = (self._in_order([pair[1][axis] for pair in pairs]) for axis in range(3))
-        return self._in_order([pair[0] for pair in pairs]), (x, y, z)
+        x, y, z = (_in_order(groups, [pair[1][axis] for pair in pairs]) for axis in range(3))
+        return _in_order(groups, [pair[0] for pair in pairs]), (x, y, z)
 
-    def _of_kind(self, planes: Planes, kind: str) -> Planes:
-        if len(self.kinds) == 1:
+    def _by_kind(self, sizes: Sequence[Tensor], parts: Sequence[int] | None) -> list[_KindRows]:
+        if parts is None and len(self.kinds) == 1:
+            return [_KindRows(self.kinds[0], None, sizes[0])]
+        chosen = range(len(self)) if parts is None else parts
+        groups = []
+        for kind, size in zip(self.kinds, sizes, strict=True):
+            rows = [row for row, part in enumerate(chosen) if self.part_kinds[part] == kind]
+            if rows:
+                members = self.get_buffer(f"members_{kind}").tolist()
+                place = torch.tensor([members.index(chosen[row]) for row in rows], device=size.device)
+                groups.append(_KindRows(kind, torch.tensor(rows, device=size.device), size[place]))
+        return groups
+
+
+@dataclass(frozen=True)
+class _KindRows:
+    """The rows of some planes that belong to solids of one kind (None: all), and the sizes of those solids."""
+
+    kind: str
+    rows: Tensor | None
+    sizes: Tensor
+
+    def pick(self, planes: Planes) -> Planes:
+        if self.rows is None:
             return planes
-        x, y, z = (plane.index_select(-2, self.get_buffer(f"members_{kind}")) for plane in planes)
+        x, y, z = (plane.index_select(-2, self.rows) for plane in planes)
         return x, y, z
 
-    def _in_order(self, columns: list[Tensor]) -> Tensor:
-        return columns[0] if len(columns) == 1 else torch.cat(columns, dim=-2).index_select(-2, self.kind_order)
+
+def _in_order(groups: Sequence[_KindRows], planes: Sequence[Tensor]) -> Tensor:
+    if len(groups) == 1:
+        return planes[0]
+    order = torch.cat([group.rows for group in groups if group.rows is not None]).argsort()
+    return torch.cat(list(planes), dim=-2).index_select(-2, order)
 
 
 def fuse(distances: Tensor, neighbors: Tensor, nu: float) -> tuple[Tensor, Tensor]:

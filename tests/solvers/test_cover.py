@@ -1,0 +1,93 @@
+"""Covers: the best choice of rows against trying them all, exchanges, permutations, refusals."""
+
+from itertools import product
+
+import pytest
+import torch
+
+from torchreg.errors import InputError
+from torchreg.solvers.cover import best_covers
+
+
+def problem(seed, rows=(4, 5, 3), columns=12, batch=2):
+    generator = torch.Generator().manual_seed(seed)
+    tables = [torch.rand(batch, count, columns, generator=generator, dtype=torch.float64) for count in rows]
+    costs = [torch.rand(batch, count, generator=generator, dtype=torch.float64) for count in rows]
+    return torch.rand(batch, columns, generator=generator, dtype=torch.float64), tables, costs
+
+
+def all_totals(uncovered, tables, costs, row):
+    """Return every choice with its cost, from the definition."""
+    found = {}
+    for choice in product(*[range(table.shape[1]) for table in tables]):
+        covered = [
+            min(
+                [float(uncovered[row, column])]
+                + [float(t[row, k, column]) for t, k in zip(tables, choice, strict=True)]
+            )
+            for column in range(uncovered.shape[1])
+        ]
+        found[choice] = sum(covered) + sum(float(c[row, k]) for c, k in zip(costs, choice, strict=True))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_wide_beam_finds_the_best_choices_in_order(seed):
+    uncovered, tables, costs = problem(seed)
+    index, total = best_covers(uncovered, tables, costs, count=6, beam=60, num_exchanged=0)
+    for row in range(2):
+        expected = all_totals(uncovered, tables, costs, row)
+        ranked = sorted(expected, key=expected.get)[:6]
+        assert [tuple(choice) for choice in index[row].tolist()] == ranked
+        torch.testing.assert_close(total[row], torch.tensor([expected[c] for c in ranked], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_exchanges_mend_what_a_beam_of_one_misses(seed):
+    uncovered, tables, costs = problem(seed, rows=(4, 4, 4))
+    greedy = best_covers(uncovered, tables, costs, count=1, beam=1, num_exchanged=0)[1]
+    index, total = best_covers(uncovered, tables, costs, count=1, beam=1, num_exchanged=1, sweeps=3)
+    assert (total <= greedy).all()
+    for row in range(2):
+        expected = all_totals(uncovered, tables, costs, row)
+        torch.testing.assert_close(float(total[row, 0]), expected[tuple(index[row, 0].tolist())])
+        # No exchange of two rows is left that would help.
+        best = tuple(index[row, 0].tolist())
+        near = [choice for choice in expected if sum(a != b for a, b in zip(choice, best, strict=True)) <= 2]
+        assert expected[best] <= min(expected[choice] for choice in near) + 1e-12
+
+
+def test_two_rows_that_must_change_together_are_found():
+    # Each limb alone prefers the columns of the other.
+    uncovered = torch.ones(1, 4)
+    first = torch.tensor([[[0.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0]]])
+    second = torch.tensor([[[1.0, 1.0, 1.0, 0.0], [0.0, 1.0, 1.0, 1.0]]])
+    index, total = best_covers(uncovered, [first, second], [torch.zeros(1, 2)] * 2, count=1, beam=1)
+    assert float(total) == 0.0
+    assert index.tolist() in ([[[0, 0]]], [[[1, 1]]])
+
+
+def test_batches_equal_single_problems_and_columns_may_be_permuted():
+    uncovered, tables, costs = problem(7, batch=3)
+    index, total = best_covers(uncovered, tables, costs)
+    order = torch.randperm(uncovered.shape[1], generator=torch.Generator().manual_seed(0))
+    for row in range(3):
+        alone = best_covers(uncovered[row : row + 1][:, order], [t[row : row + 1][..., order] for t in tables],
+                            [c[row : row + 1] for c in costs])  # fmt: skip
+        torch.testing.assert_close(alone[1][0], total[row])
+        assert alone[0][0].tolist() == index[row].tolist()
+
+
+def test_a_single_table_and_fewer_choices_than_asked_for():
+    uncovered, tables, costs = problem(1, rows=(3,))
+    index, total = best_covers(uncovered, tables, costs, count=10)
+    assert index.shape == (2, 3, 1)
+    assert (total.diff(dim=1) >= 0).all()
+
+
+def test_tables_without_costs_are_refused():
+    uncovered, tables, costs = problem(0)
+    with pytest.raises(InputError, match="one cost per table and at least one, got 3 and 2"):
+        best_covers(uncovered, tables, costs[:2])
+    with pytest.raises(InputError, match="got 0 and 0"):
+        best_covers(uncovered, [], [])

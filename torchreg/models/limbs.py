@@ -1,0 +1,103 @@
+"""The limbs of an articulated shape: its chains of bodies between branches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from torchreg.models.articulated import ArticulatedShape
+
+
+@dataclass(frozen=True)
+class Body:
+    """Parts that no joint separates.
+
+    Args:
+        parts: indices of the parts.
+        parent: index of a part of the body that this one hangs on, -1 for the base itself.
+        dofs: indices of the degrees of freedom between parent and body.
+    """
+
+    parts: tuple[int, ...]
+    parent: int
+    dofs: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Limb:
+    """A chain of bodies without branches, as a finger or an arm.
+
+    Args:
+        bodies: from the one nearest to the base outwards.
+        level: how many limbs lie between this one and the base.
+    """
+
+    bodies: tuple[Body, ...]
+    level: int
+
+    @property
+    def dofs(self) -> list[int]:
+        """Indices of the limb's degrees of freedom."""
+        return [dof for body in self.bodies for dof in body.dofs]
+
+    @property
+    def parts(self) -> list[int]:
+        """Indices of the limb's parts."""
+        return [part for body in self.bodies for part in body.parts]
+
+
+def find_limbs(shape: ArticulatedShape) -> tuple[list[Limb], list[int]]:
+    """Return the limbs of a shape, parents before children, and the parts of its trunk, which only the base moves.
+
+    A degree of freedom that moves several limbs, as of a gripper, belongs to the first of them.
+
+    Args:
+        shape: the articulated shape.
+    """
+    bodies = _find_bodies(shape)
+    owner = {part: number for number, body in enumerate(bodies) for part in body.parts}
+    above = [owner[body.parent] if body.parent >= 0 else -1 for body in bodies]
+    moved = shape.chain.moves[shape.part_index].any(-1).tolist()
+    trunk = [part for part in range(shape.num_parts) if not moved[part]]
+    limb_of: dict[int, int] = {}
+    chains: list[list[int]] = []
+    levels: list[int] = []
+    for number, body in enumerate(bodies):
+        if not moved[body.parts[0]]:
+            continue
+        parent = above[number]
+        if parent in limb_of and above.count(parent) == 1:
+            limb_of[number] = limb_of[parent]
+            chains[limb_of[number]].append(number)
+            continue
+        limb_of[number] = len(chains)
+        levels.append(levels[limb_of[parent]] + 1 if parent in limb_of else 0)
+        chains.append([number])
+    found = [Limb(tuple(bodies[body] for body in chain), level) for chain, level in zip(chains, levels, strict=True)]
+    return found, trunk
+
+
+def _find_bodies(shape: ArticulatedShape) -> list[Body]:
+    """Return the bodies of a shape, parents before children: parts below the same joints."""
+    joints: Tensor = shape.chain.moves[shape.part_index] > 0
+    drives = shape.chain.couplings != 0
+    rows = [tuple(row) for row in joints.tolist()]
+    groups: dict[tuple[bool, ...], list[int]] = {}
+    for part, row in enumerate(rows):
+        groups.setdefault(row, []).append(part)
+    taken: set[int] = set()
+    bodies = []
+    for row, parts in sorted(groups.items(), key=lambda group: (sum(group[0]), group[1])):
+        parent = next((above for above in _ancestors(shape, parts[0]) if rows[above] != row), -1)
+        driven = drives[joints[parts[0]]].any(0).nonzero()[:, 0].tolist()
+        bodies.append(Body(tuple(parts), parent, tuple(6 + dof for dof in driven if dof not in taken)))
+        taken.update(driven)
+    return bodies
+
+
+def _ancestors(shape: ArticulatedShape, part: int) -> list[int]:
+    found = []
+    while (part := shape.part_parents[part]) >= 0:
+        found.append(part)
+    return found
