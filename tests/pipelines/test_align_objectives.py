@@ -136,6 +136,20 @@ def test_registration_from_given_transforms_is_the_same(skin, registration):
         torch.testing.assert_close(getattr(given, name), getattr(objective(start), name), rtol=0, atol=0)
 
 
+def test_costs_alone_are_those_of_the_linearizations(arm, skin, registration, surface_objective):
+    _, sigma, observed = registration
+    for objective in (RegistrationObjective(skin, observed, sigma, some_prior()), surface_objective):
+        torch.testing.assert_close(objective.cost(poses(seed=6)), objective(poses(seed=6)).cost, rtol=1e-12, atol=0)
+
+
+def test_the_surface_from_given_distances_is_the_same(arm, surface_objective):
+    pose = poses(seed=6)
+    known = arm.distance_jacobian(surface_objective.data, pose, chart="tangent")
+    given, found = surface_objective.linearize(pose, *known), surface_objective(pose)
+    for name in ("cost", "gradient", "hessian"):
+        torch.testing.assert_close(getattr(given, name), getattr(found, name), rtol=0, atol=0)
+
+
 def test_model_points_without_data_do_not_count(skin, registration):
     start, sigma, observed = registration
     weights = observed.weights.clone()

@@ -260,6 +260,19 @@ def test_stopping():
     torch.testing.assert_close(none.cost, torch.full((2,), 1.5, dtype=D))
 
 
+@pytest.mark.parametrize("max_steps", [0, 1, 3, 8])
+def test_a_known_start_and_a_cheap_cost_save_linearizations_and_change_nothing(max_steps):
+    seen, bare = [], problem(rosenbrock)
+    start = torch.tensor([[-1.2, 1.0], [2.0, -3.0]], dtype=D)
+    expected = levenberg_marquardt(problem(rosenbrock), start, max_steps=max_steps)
+    found = levenberg_marquardt(
+        problem(rosenbrock, seen), start, max_steps=max_steps, start=bare(start), cost=lambda x: bare(x).cost
+    )
+    for name in ("state", "cost", "damping", "last_step"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0, atol=0)
+    assert len(seen) == max(max_steps - 1, 0)
+
+
 def test_an_empty_batch_is_no_problem():
     empty = Linearization(torch.zeros(0), torch.zeros(0, 2), torch.zeros(0, 2, 2))
     result = levenberg_marquardt(lambda _: empty, torch.zeros(0, 2), max_steps=2, atol=1e-3)

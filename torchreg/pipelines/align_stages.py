@@ -95,12 +95,18 @@ class AlignProblem:
         )
 
     def solve(
-        self, objective: Callable[[Tensor], Linearization], pose: Tensor, max_steps: int, damping: Tensor | None = None
+        self,
+        objective: RegistrationObjective | SurfaceObjective,
+        pose: Tensor,
+        max_steps: int,
+        around: Linearization,
+        damping: Tensor | None = None,
     ) -> LMResult:
-        """Return what Levenberg-Marquardt within the joint limits makes of a pose."""
+        """Return what Levenberg-Marquardt within the joint limits makes of a pose around which all is known."""
         return levenberg_marquardt(
             objective, pose, retract=self.skin.shape.retract, lower=self.lower, upper=self.upper,
             damping=damping, max_steps=max_steps, atol=self.pose_atol * min(1.0, self.size),
+            start=around, cost=objective.cost,
         )  # fmt: skip
 
     def step(self, around: Linearization, pose: Tensor) -> LMResult:
@@ -175,16 +181,20 @@ def register(
             sigma = torch.full_like(sigma, schedule.values[step])
         for _ in range(em_steps):
             rows, derivative = problem.skin.shape.transform_jacobian(pose, chart="tangent")
-            observed = _expect(problem, problem.skin.basis @ rows, sigma)
+            posed = problem.skin.place(rows)
+            observed = _expect(problem, posed, sigma)
             shared = tempered and problem.correspondence == "em"
             prior = _tempered(problem.prior, observed) if shared else problem.prior
             objective = RegistrationObjective(problem.skin, observed, sigma, prior)
             around = objective.linearize(pose, rows, derivative)
-            solved = problem.solve(objective, pose, m_steps, damping) if m_steps > 1 else problem.step(around, pose)
+            if m_steps > 1:
+                solved = problem.solve(objective, pose, m_steps, around, damping)
+            else:
+                solved = problem.step(around, pose)
             pose, damping, change = solved.state, solved.damping, problem.change(solved.last_step)
             _report(on_step, "em", step, schedule.steps, sigma, solved, problem)
             if schedule.kind == "adaptive":
-                estimated = estimate_sigma(observed, problem.skin.basis @ rows, problem.skin(pose))
+                estimated = estimate_sigma(observed, posed, problem.skin(pose))
                 sigma = estimated.clamp(schedule.values[-1], schedule.values[0])
             if float(change.max()) <= problem.pose_atol:
                 break
@@ -261,9 +271,11 @@ def fit_surface(
         solved = surface_steps(problem, pose, sigma, noise, steps)
         pose = solved.state
         _report(on_step, "surface", number, len(sigmas) + 1, sigma, solved, problem)
-    noise = residual_noise(problem, pose)
+    distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
+    noise = surface_noise(distance, problem.valid, problem.size)
     sigma = SIGMA_PER_NOISE * noise
-    solved = problem.solve(_surface_objective(problem, sigma, noise), pose, _FINAL_STEPS * steps)
+    objective = _surface_objective(problem, sigma, noise)
+    solved = problem.solve(objective, pose, _FINAL_STEPS * steps, objective.linearize(pose, distance, jacobian))
     _report(on_step, "surface", len(sigmas), len(sigmas) + 1, sigma, solved, problem)
     return StageResult(solved.state, sigma, problem.change(solved.last_step))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -63,6 +63,8 @@ def levenberg_marquardt(
     damping: Tensor | None = None,
     max_steps: int = 10,
     atol: float = 0.0,
+    start: Linearization | None = None,
+    cost: Callable[[Tensor], Tensor] | None = None,
 ) -> LMResult:
     """Return the state of lowest cost that the iteration finds; problems of a batch proceed independently.
 
@@ -80,6 +82,8 @@ def levenberg_marquardt(
         damping: (B,) relative damping to start with; 1e-3 by default.
         max_steps: number of linearizations after the first.
         atol: stop when every problem's largest step component is at most this.
+        start: what ``linearize`` returns at ``state``, which must lie within the limits, if it is known already.
+        cost: state (B, D) to cost (B,) like ``linearize``'s, if that is cheaper; the last trial needs no more.
 
     Returns:
         an `LMResult`; where the start has no finite cost, the start.
@@ -95,14 +99,17 @@ def levenberg_marquardt(
     min_damping = max(_MIN_DAMPING, _ROUNDING_COVER * state.shape[-1] * torch.finfo(state.dtype).eps)
     state = torch.minimum(torch.maximum(state, low), high)
     damping = state.new_full(state.shape[:1], 1e-3) if damping is None else damping
-    current = linearize(state)
+    current = linearize(state) if start is None else start
     last_step = torch.zeros_like(state)
     num_steps = 0
     while num_steps < max_steps:
         num_steps += 1
         step, sound = _solve(current, damping, held_at_limits(current.gradient, state, low, high))
         trial_state = torch.minimum(torch.maximum(retract(state, step), low), high)
-        trial = linearize(trial_state)
+        if cost is not None and num_steps == max_steps:
+            trial = replace(current, cost=cost(trial_state))
+        else:
+            trial = linearize(trial_state)
         decrease = current.cost - trial.cost
         better = (decrease >= 0) & sound
         # A quadratic falls by at least half of slope times step. Steps that overshoot almost to the same height would
