@@ -13,7 +13,7 @@ from torchreg.geometry.rotation import so3_exp
 from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.primitives import Primitive
 from torchreg.models.skin import LinearBlendSkin
-from torchreg.models.surface import FusedSurface, SkinSurface, dense_file_skin, nearest_index
+from torchreg.models.surface import FusedSurface, SkinSurface, dense_file_skin
 
 RADIUS = 0.05
 EYE = torch.eye(4, dtype=torch.float64)
@@ -173,14 +173,24 @@ def test_distances_move_with_the_base(two_balls, ball_skin):
         torch.testing.assert_close(surface.distance(moved, moved_pose), surface.distance(points, pose))
 
 
-@pytest.mark.parametrize("chunk", [1, 700, 4_000_000])
-def test_nearest_index_is_brute_force_far_from_the_origin_and_in_chunks(monkeypatch, chunk):
-    monkeypatch.setattr("torchreg.models.surface._CHUNK_ENTRIES", chunk)
-    generator = torch.Generator().manual_seed(4)
-    points, targets = torch.rand(2, 30, 3, generator=generator), torch.rand(2, 50, 3, generator=generator)
-    expected = [[min(range(50), key=lambda k: math.dist(x, y[k])) for x in p] for p, y in
-                zip(points.tolist(), targets.tolist(), strict=True)]  # fmt: skip
-    assert nearest_index(points + 100, targets + 100).tolist() == expected
+def test_of_copies_of_a_point_the_first_one_counts(two_balls, ball_skin):
+    """A copy that rides on another part is a point of its own."""
+    order = torch.cat([torch.arange(3000), torch.randperm(3000, generator=torch.Generator().manual_seed(5))])
+    points, normals, weights = ball_skin.points[order], ball_skin.normals[order].clone(), ball_skin.weights[order]
+    normals[3000:] *= -1
+    copied = LinearBlendSkin(two_balls, points, weights, two_balls.rest_pose(), normals=normals)
+    pose = random_pose(two_balls, 6)
+    data = around_balls(two_balls, pose, 60)
+    expected = SkinSurface(ball_skin)
+    torch.testing.assert_close(SkinSurface(copied).distance(data, pose), expected.distance(data, pose))
+    for found, wanted in zip(
+        SkinSurface(copied).distance_jacobian(data, pose), expected.distance_jacobian(data, pose), strict=True
+    ):
+        torch.testing.assert_close(found, wanted)
+    weights = weights.clone()
+    weights[3000:] = weights[3000:].flip(-1)
+    other = LinearBlendSkin(two_balls, points, weights, two_balls.rest_pose(), normals=normals)
+    assert torch.equal(SkinSurface(other).first, torch.arange(6000))
 
 
 def sphere_rig(rings):

@@ -9,11 +9,10 @@ from torch import Tensor
 
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
+from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.skin import LinearBlendSkin
 
-# Entries of the distance table between data and skin held at a time.
-_CHUNK_ENTRIES = 4_000_000
 # Meshes with this many vertices carry their own sampling.
 _MIN_VERTICES, _MAX_VERTICES, _NUM_SAMPLES = 800, 6000, 4000
 
@@ -59,6 +58,7 @@ class SkinSurface:
     def __init__(self, skin: LinearBlendSkin) -> None:
         self.skin = skin
         self.gap = _GAP_SPACINGS * _spacing(skin.points)
+        self.first = _first_copies(skin)
 
     def distance(self, points: Tensor, pose: Tensor) -> Tensor:
         """Return the signed distances (..., N) of points (..., N, 3) in poses (..., num_dofs), metres."""
@@ -75,7 +75,7 @@ class SkinSurface:
         return distance, -(along @ derivative.flatten(-3, -2))
 
     def _plane_distance(self, points: Tensor, posed: Tensor, normals: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        nearest = nearest_index(points, posed)
+        nearest = self.first[nearest_neighbor(points, posed)[0]]
         index = nearest.unsqueeze(-1).expand(*nearest.shape, 3)
         offset = points - posed.expand(*nearest.shape[:-1], *posed.shape[-2:]).gather(-2, index)
         normal = normals.expand(*nearest.shape[:-1], *normals.shape[-2:]).gather(-2, index)
@@ -98,6 +98,17 @@ def _spacing(points: Tensor) -> float:
     apart = torch.cdist(some, points, compute_mode="donot_use_mm_for_euclid_dist")
     nearest = torch.where(apart > 0, apart, torch.inf).amin(-1)
     return float(torch.where(nearest.isinf(), 0.0, nearest).median())
+
+
+def _first_copies(skin: LinearBlendSkin) -> Tensor:
+    """Return, per skin point, the first point that is everywhere where it is: files split vertices along seams.
+
+    Copies may have normals of their own, and which of them is nearest must not depend on how neighbors are searched.
+    """
+    group = torch.unique(skin.points, dim=0, return_inverse=True)[1]
+    index = torch.arange(len(skin), device=group.device)
+    first = torch.full_like(index, len(skin)).scatter_reduce(0, group, index, "amin")[group]
+    return torch.where((skin.weights[first] == skin.weights).all(-1), first, index)
 
 
 def _signed(size: Tensor, sign: Tensor) -> Tensor:
@@ -125,13 +136,3 @@ def dense_file_skin(shape: ArticulatedShape) -> LinearBlendSkin:
     return LinearBlendSkin(
         shape, points.to(shape.rest), weights.to(shape.rest), reference, normals=normals.to(shape.rest)
     )
-
-
-def nearest_index(points: Tensor, targets: Tensor) -> Tensor:
-    """Return the index (..., N) of the nearest of ``targets`` (..., K, 3) to each of ``points`` (..., N, 3)."""
-    center = targets.mean(-2, keepdim=True)
-    points, targets = points - center, targets - center
-    half_squares = 0.5 * targets.square().sum(-1).unsqueeze(-2)
-    size = max(1, _CHUNK_ENTRIES // (targets.shape[-2] * max(1, points[..., 0, 0].numel())))
-    parts = [(part @ targets.mT - half_squares).argmax(-1) for part in points.split(size, dim=-2)]
-    return torch.cat(parts, dim=-1)
