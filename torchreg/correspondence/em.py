@@ -272,5 +272,5 @@ def _power(exponent: Tensor) -> Tensor:
 
 
 def _extent(model: Tensor, data: Tensor) -> Tensor:
-    both = [torch.linalg.vector_norm(points, math.inf) for points in (model, data) if points.numel() > 0]
+    both = [points.abs().amax() for points in (model, data) if points.numel() > 0]
     return torch.stack(both).amax() if both else model.new_zeros(())

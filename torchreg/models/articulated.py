@@ -513,7 +513,7 @@ class ArticulatedShape(nn.Module):
         return LinearBlendSkin(self, vertices, self.surface.weights, torch.zeros_like(self.rest), faces=faces)
 
     def _offset_scales(self) -> Tensor:
-        return nn.functional.pad(self.log_length_scales, (1, 0))[self._owners].exp()
+        return nn.functional.pad(self.log_length_scales, (1, 0)).index_select(0, self._owners).exp()
 
     def _scaled_sizes(self) -> list[Tensor]:
         return self.primitives.scaled_sizes(self.log_length_scales.exp(), self.log_radius_scales.exp())

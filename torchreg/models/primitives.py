@@ -172,15 +172,15 @@ class PrimitiveSet(nn.Module):
         return _in_order(groups, [pair[0] for pair in pairs]), (x, y, z)
 
     def _by_kind(self, sizes: Sequence[Tensor], parts: Sequence[int] | None) -> list[_KindRows]:
-        if parts is None and len(self.kinds) == 1:
-            return [_KindRows(self.kinds[0], None, sizes[0])]
-        chosen = range(len(self)) if parts is None else parts
+        if parts is None:
+            every = [None] if len(self.kinds) == 1 else [self.get_buffer(f"members_{kind}") for kind in self.kinds]
+            return [_KindRows(*group) for group in zip(self.kinds, every, sizes, strict=True)]
         groups = []
         for kind, size in zip(self.kinds, sizes, strict=True):
-            rows = [row for row, part in enumerate(chosen) if self.part_kinds[part] == kind]
+            rows = [row for row, part in enumerate(parts) if self.part_kinds[part] == kind]
             if rows:
                 members = self.get_buffer(f"members_{kind}").tolist()
-                place = torch.tensor([members.index(chosen[row]) for row in rows], device=size.device)
+                place = torch.tensor([members.index(parts[row]) for row in rows], device=size.device)
                 groups.append(_KindRows(kind, torch.tensor(rows, device=size.device), size[place]))
         return groups
 
