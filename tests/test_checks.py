@@ -129,6 +129,23 @@ def test_what_is_no_number_is_refused(value):
         checks.check_positive(value, "sigma")
 
 
+def test_counts():
+    checks.check_count(3, "num_starts", 1)
+    checks.check_count(0, "num_starts", 0)
+
+
+@pytest.mark.parametrize(("value", "least"), [(0, 1), (-2, 0), (4, 5)])
+def test_counts_that_are_too_low_are_refused(value, least):
+    with pytest.raises(InputError, match=f"^num_starts must be at least {least}, got {value}$"):
+        checks.check_count(value, "num_starts", least)
+
+
+@pytest.mark.parametrize("value", [True, 2.0, "3", None, torch.tensor(2)])
+def test_what_is_no_integer_is_no_count(value):
+    with pytest.raises(InputTypeError, match=f"^num_starts must be an integer, got {type(value).__name__}$"):
+        checks.check_count(value, "num_starts", 1)
+
+
 def test_choices():
     checks.check_choice("mean", "reduction", ("mean", "sum"))
     with pytest.raises(InputError, match="reduction must be one of mean, sum; got 'max'"):

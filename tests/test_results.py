@@ -7,7 +7,7 @@ import torch
 
 from torchreg import results
 from torchreg.errors import TorchregError
-from torchreg.results import AlignRecord, AlignResult, Calibration, DemoResult, Status
+from torchreg.results import AlignRecord, AlignResult, Calibration, DemoResult, PoseStarts, Status
 
 
 def result():
@@ -38,7 +38,7 @@ def test_history_is_empty_unless_given_and_fields_can_be_replaced():
 
 
 def test_every_field_is_documented():
-    for record in (AlignResult, AlignRecord, Calibration, DemoResult):
+    for record in (AlignResult, AlignRecord, Calibration, DemoResult, PoseStarts):
         for field in fields(record):
             assert f"        {field.name}: " in record.__doc__, field.name
 
@@ -66,3 +66,13 @@ def test_statuses_are_a_tuple_for_one_problem_and_for_many():
 
 def test_only_alignments_with_data_are_usable():
     assert [status for status in Status if status.usable] == [Status.CONVERGED, Status.MAX_STEPS]
+
+
+def test_starts_give_their_best_and_one_cloud_of_a_batch():
+    poses = torch.arange(24.0).reshape(2, 3, 4)
+    starts = PoseStarts(poses, torch.arange(6.0).reshape(2, 3), torch.tensor([0.25, 0.75]))
+    torch.testing.assert_close(starts.best, poses[:, 0])
+    row = starts.row(1)
+    torch.testing.assert_close(row.best, torch.tensor([12.0, 13, 14, 15]))
+    assert row.costs.tolist() == [3.0, 4.0, 5.0]
+    assert float(row.confidence) == 0.75

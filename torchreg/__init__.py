@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from torchreg.models.skin import BendingSkin, LinearBlendSkin, sample_skin
     from torchreg.pipelines.align import AlignConfig, align
     from torchreg.pipelines.calibrate import calibrate
+    from torchreg.pipelines.find_pose import FindPoseConfig, find_pose
     from torchreg.pipelines.storage import load
-    from torchreg.results import AlignResult, Calibration, Status
+    from torchreg.results import AlignResult, Calibration, PoseStarts, Status
 
 __version__ = "0.1.0"
 
@@ -31,8 +32,10 @@ __all__ = [
     "BendingSkin",
     "Calibration",
     "EMLoss",
+    "FindPoseConfig",
     "Hand",
     "LinearBlendSkin",
+    "PoseStarts",
     "SigmaSchedule",
     "Status",
     "TriangleMesh",
@@ -40,6 +43,7 @@ __all__ = [
     "align",
     "calibrate",
     "errors",
+    "find_pose",
     "load",
     "load_mesh",
     "load_points",
@@ -56,13 +60,16 @@ _OWNERS = {
     "BendingSkin": "models.skin",
     "Calibration": "results",
     "EMLoss": "losses.em",
+    "FindPoseConfig": "pipelines.find_pose",
     "Hand": "models.hand",
     "LinearBlendSkin": "models.skin",
+    "PoseStarts": "results",
     "SigmaSchedule": "correspondence.sigma",
     "Status": "results",
     "TriangleMesh": "geometry.mesh",
     "align": "pipelines.align",
     "calibrate": "pipelines.calibrate",
+    "find_pose": "pipelines.find_pose",
     "load": "pipelines.storage",
     "load_mesh": "io.points",
     "load_points": "io.points",

@@ -83,6 +83,14 @@ def check_positive(value: float, name: str, *, allow_zero: bool = False) -> None
         raise InputError(f"{name} must be {'zero or ' if allow_zero else ''}positive and finite, got {value}")
 
 
+def check_count(value: int, name: str, least: int) -> None:
+    """Raise InputTypeError unless ``value`` is an integer, InputError if it is below ``least``."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise InputTypeError(f"{name} must be an integer, got {type(value).__name__}")
+    if value < least:
+        raise InputError(f"{name} must be at least {least}, got {value}")
+
+
 def check_choice(value: str, name: str, choices: Sequence[str]) -> None:
     """Raise InputError unless ``value`` is one of ``choices``."""
     if value not in choices:

@@ -141,6 +141,30 @@ class Calibration(Result, Generic[Shape]):
 
 
 @dataclass(frozen=True)
+class PoseStarts(Result):
+    """Poses in which an articulated shape may lie on data, best first. A batch adds a leading dimension B to all.
+
+    Args:
+        poses: (S, num_dofs), metres and radians; poses that fell together with a better one come last.
+        costs: (S,) data that a pose leaves unexplained, softly counted, and a weak prior; lower is better.
+        confidence: () from 0 to 1: how surely the first pose is the right one.
+    """
+
+    poses: Tensor
+    costs: Tensor
+    confidence: Tensor
+
+    @property
+    def best(self) -> Tensor:
+        """The first pose, (num_dofs,)."""
+        return self.poses[..., 0, :]
+
+    def row(self, index: int) -> PoseStarts:
+        """Return the starts of one cloud of a batch."""
+        return PoseStarts(self.poses[index], self.costs[index], self.confidence[index])
+
+
+@dataclass(frozen=True)
 class DemoResult(Result):
     """A made-up sequence of hand clouds, aligned frame after frame, beside the truth; T frames were done.
 

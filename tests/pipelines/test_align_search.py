@@ -1,4 +1,4 @@
-"""The search around a start: what a limb is, when a search is wanted, what candidates are, and what it finds."""
+"""The search around a start: when a search is wanted, what candidates are, and what it finds."""
 
 from dataclasses import replace
 
@@ -8,14 +8,14 @@ import torch
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
 from torchreg.models.primitives import Primitive
 from torchreg.models.skin import BendingSkin
 from torchreg.models.surface import FusedSurface
 from torchreg.pipelines import align_search
 from torchreg.pipelines.align_objectives import PosePrior
-from torchreg.pipelines.align_search import _scatter, coarse_skin, explore, limb_dofs, needs_search
-from torchreg.pipelines.align_stages import AlignProblem
+from torchreg.pipelines.align_problem import AlignProblem
+from torchreg.pipelines.align_search import _scatter, clustered_data, explore, leaves_clusters, needs_search
+from torchreg.pipelines.pose_search import PoseSearch
 
 
 def make_problem(skin, data, mean):
@@ -61,34 +61,8 @@ def finger(shape, name):
     return [index for index, dof in enumerate(shape.dof_names) if dof.startswith(name)]
 
 
-def test_the_limbs_of_a_hand_are_its_fingers(plain_hand):
-    found = [limb.tolist() for limb in limb_dofs(plain_hand)]
-    assert found == [finger(plain_hand, name) for name in ("thumb", "index", "middle", "ring", "little")]
-
-
 def offset(*place):
     return rigid_matrix(torch.eye(3, dtype=torch.float64), torch.tensor(place, dtype=torch.float64))
-
-
-def test_limbs_follow_mimic_joints_and_leave_out_stiff_and_single_chains():
-    """Two jaws on a forearm that hangs on a base: one moves the other, a third thing is rigid."""
-    hinge = ("revolute", (1.0, 0.0, 0.0), -1.0, 1.0)
-    tree = KinematicTree((
-        Joint("base", -1, offset(0, 0, 0)),
-        Joint("forearm", 0, offset(0, 0, 0.1), *hinge),
-        Joint("jaw", 1, offset(0.02, 0, 0.1), *hinge),
-        Joint("other_jaw", 1, offset(-0.02, 0, 0.1), *hinge, mimic=(2, -1.0, 0.0)),
-        Joint("camera", 1, offset(0, 0.03, 0.1)),
-        Joint("finger", 2, offset(0, 0, 0.1), *hinge),
-    ))  # fmt: skip
-    names = ["base", "forearm", "jaw", "other_jaw", "camera", "finger"]
-    shape = ArticulatedShape(tree, names, [Primitive("capsule", (0.04, 0.01), offset(0, 0, 0.05))] * 6)
-    assert shape.dof_names[6:] == ("forearm", "jaw", "finger")
-    assert [limb.tolist() for limb in limb_dofs(shape)] == [[7, 8], [7]]
-    chain = ArticulatedShape(
-        KinematicTree(tree.joints[:3]), names[:3], [Primitive("capsule", (0.04, 0.01), offset(0, 0, 0))] * 3
-    )
-    assert limb_dofs(chain) == []
 
 
 def test_a_descent_that_stayed_near_and_explains_all_is_trusted(problem, exact):
@@ -136,17 +110,36 @@ def test_a_cloud_without_inliers_is_searched_without_failing(problem, exact):
     assert needs_search(lost, exact, exact).shape == (2,)
 
 
+def test_clusters_are_counted_beside_the_data_on_the_surface(problem, exact, plain_hand):
+    clustered, near = clustered_data(problem, exact)
+    assert clustered.tolist() == [0, 0]
+    assert int(near.min()) > 380
+    missed = exact.clone()
+    missed[1, finger(plain_hand, "ring")[1]] += 1.0
+    clustered, near = clustered_data(problem, missed)
+    assert clustered[0] == 0
+    assert 15 < int(clustered[1]) < 60
+    assert int((clustered + near).max()) <= 400
+    assert leaves_clusters(problem, missed).tolist() == [False, True]
+
+
 def test_candidates_stay_within_limits_and_the_first_is_the_center(problem, exact, plain_hand):
-    limbs = limb_dofs(plain_hand)
-    generator = torch.Generator().manual_seed(2)
-    for number in (0, 1, 5):
-        found = _scatter(problem, exact, limbs, 40, number, generator)
-        assert found.shape == (2, 40, 27)
-        torch.testing.assert_close(found[:, 0], exact, rtol=0, atol=1e-6)
-        assert bool((found >= plain_hand.lower).all())
-        assert bool((found <= plain_hand.upper).all())
-        # Every degree of freedom is tried.
-        assert float((found[:, 1:] - exact.unsqueeze(1)).abs().amax(1).min()) > 1e-3
+    search = PoseSearch(problem, torch.Generator().manual_seed(1))
+    found = _scatter(search, exact, 40, torch.Generator().manual_seed(2))
+    assert found.shape == (2, 40, 27)
+    torch.testing.assert_close(found[:, 0], exact, rtol=0, atol=1e-6)
+    assert bool((found >= plain_hand.lower).all())
+    assert bool((found <= plain_hand.upper).all())
+    # Every degree of freedom is tried.
+    assert float((found[:, 1:] - exact.unsqueeze(1)).abs().amax(1).min()) > 1e-3
+
+
+def test_some_candidates_have_a_limb_far_from_the_center(problem, exact, plain_hand):
+    """Most fingers stay within a fraction of a radian; some are placed anew, the whole finger at once."""
+    search = PoseSearch(problem, torch.Generator().manual_seed(1))
+    found = _scatter(search, exact, 400, torch.Generator().manual_seed(3))
+    moved = (found - exact.unsqueeze(1))[..., finger(plain_hand, "index")[1:]].abs().amax(-1)
+    assert 0.1 < float((moved > 0.6).float().mean()) < 0.4
 
 
 def test_candidates_of_shapes_without_limits_stay_near(problem):
@@ -161,20 +154,10 @@ def test_candidates_of_shapes_without_limits_stay_near(problem):
     points = 0.05 * torch.randn(30, 3, generator=torch.Generator().manual_seed(0))
     center = torch.zeros(2, 8)
     alike = make_problem(BendingSkin(shape, points), problem.data, center)
-    found = _scatter(alike, center, limb_dofs(shape), 200, 0, torch.Generator().manual_seed(3))
+    generator = torch.Generator().manual_seed(3)
+    found = _scatter(PoseSearch(alike, generator), center, 200, generator)
     assert bool(torch.isfinite(found).all())
     assert 0.5 < float(found[..., 6:].abs().max()) < 3.0
-
-
-def test_coarse_skins_cover_the_fine_ones(plain_hand_skin, truths):
-    coarse = coarse_skin(plain_hand_skin)
-    assert len(coarse) < len(plain_hand_skin)
-    torch.testing.assert_close(coarse(plain_hand_skin.reference_pose), coarse.points)
-    fine, few = plain_hand_skin(truths[1]), coarse(truths[1])
-    gaps = torch.cdist(fine, few).amin(-1)
-    assert float(gaps.max()) < 0.025
-    assert float(torch.cdist(few, fine).amin(-1).max()) < 1e-4
-    assert len(coarse_skin(coarse)) == len(coarse)
 
 
 def misled(exact, shape):
@@ -188,12 +171,12 @@ def misled(exact, shape):
 @pytest.fixture(scope="module")
 def explored(problem, exact, plain_hand):
     start = misled(exact, plain_hand)
-    coarse = replace(problem, skin=coarse_skin(problem.skin), prior=replace(problem.prior, mean=start))
+    around = replace(problem, prior=replace(problem.prior, mean=start))
     generator = torch.Generator().manual_seed(4)
-    return start, coarse, explore(coarse, start, start, candidates=16, rounds=2, generator=generator)
+    return start, around, explore(around, start, start, candidates=16, rounds=2, generator=generator)
 
 
-def test_a_lost_finger_is_found(problem, exact, plain_hand, explored):
+def test_a_lost_finger_is_found(exact, plain_hand, explored):
     start, _, found = explored
     before, after = ((plain_hand.keypoints(each) - plain_hand.keypoints(exact)).norm(dim=-1) for each in (start, found))
     assert float(before.amax(-1).min()) > 0.05
@@ -202,29 +185,44 @@ def test_a_lost_finger_is_found(problem, exact, plain_hand, explored):
 
 
 def test_a_search_is_the_same_for_the_same_seed_and_leaves_the_global_state_alone(explored):
-    start, coarse, found = explored
+    start, around, found = explored
     torch.manual_seed(77)
     state = torch.get_rng_state()
-    again = explore(coarse, start, start, candidates=16, rounds=2, generator=torch.Generator().manual_seed(4))
+    again = explore(around, start, start, candidates=16, rounds=2, generator=torch.Generator().manual_seed(4))
     torch.testing.assert_close(again, found, rtol=0, atol=0)
     assert bool((torch.get_rng_state() == state).all())
 
 
 def test_a_search_that_improves_nothing_ends_and_returns_the_descent(problem, exact, monkeypatch):
     rounds = []
-    refine = align_search._refine
+    searched = PoseSearch._searched
 
     def counted(*arguments):
         rounds.append(1)
-        return refine(*arguments)
+        return searched(*arguments)
 
-    monkeypatch.setattr(align_search, "_refine", counted)
-    coarse = replace(problem, skin=coarse_skin(problem.skin))
+    monkeypatch.setattr(PoseSearch, "_searched", counted)
     generator = torch.Generator().manual_seed(5)
-    found = explore(coarse, exact, exact, candidates=3, rounds=4, generator=generator)
-    assert len(rounds) == 1
+    found = explore(problem, exact, exact, candidates=3, rounds=4, generator=generator)
+    assert len(rounds) <= 2
     off = (problem.skin.shape.keypoints(found) - problem.skin.shape.keypoints(exact)).norm(dim=-1)
     assert float(off.max()) < 0.008
+
+
+def test_only_lost_problems_are_searched_all_around(problem, exact, plain_hand, monkeypatch):
+    sizes = []
+
+    def spied(search, center, count, generator):
+        sizes.append(len(center))
+        return _scatter(search, center, count, generator)
+
+    monkeypatch.setattr(align_search, "_scatter", spied)
+    start = exact.clone()
+    start[1] = misled(exact, plain_hand)[1]
+    found = explore(problem, start, start, candidates=8, rounds=1, generator=torch.Generator().manual_seed(5))
+    assert set(sizes) == {1}
+    off = (plain_hand.keypoints(found) - plain_hand.keypoints(exact)).norm(dim=-1)
+    assert float(off.max()) < 0.015
 
 
 def test_large_batches_are_searched_in_parts(problem, exact, monkeypatch):
@@ -242,6 +240,9 @@ def test_large_batches_are_searched_in_parts(problem, exact, monkeypatch):
     torch.testing.assert_close(found, exact + 1)
 
 
-def test_hands_of_both_sides_have_the_same_limbs(plain_hand):
-    left = limb_dofs(Hand("left"))
-    assert [limb.tolist() for limb in left] == [limb.tolist() for limb in limb_dofs(plain_hand)]
+def test_searched_in_parts_a_batch_ends_where_it_ends_as_a_whole(problem, plain_hand, explored, exact, monkeypatch):
+    start, around, _ = explored
+    monkeypatch.setattr(align_search, "_CHUNK_ENTRIES", 1)
+    found = explore(around, start, start, candidates=16, rounds=2, generator=torch.Generator().manual_seed(4))
+    off = (plain_hand.keypoints(found) - plain_hand.keypoints(exact)).norm(dim=-1)
+    assert float(off.max()) < 0.015

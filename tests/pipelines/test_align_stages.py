@@ -15,9 +15,9 @@ from torchreg.models.primitives import Primitive
 from torchreg.models.skin import sample_skin
 from torchreg.models.surface import FusedSurface
 from torchreg.pipelines.align_objectives import PosePrior
+from torchreg.pipelines.align_problem import AlignProblem
 from torchreg.pipelines.align_stages import (
     SURFACE_SIGMAS,
-    AlignProblem,
     fit_surface,
     register,
     residual_noise,

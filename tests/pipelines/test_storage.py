@@ -181,7 +181,9 @@ def test_unknown_results_are_neither_saved_nor_loaded(tmp_path):
     class Other(Result):
         value: torch.Tensor
 
-    with pytest.raises(InputTypeError, match=r"result must be one of AlignResult, Calibration, DemoResult, got Other"):
+    with pytest.raises(
+        InputTypeError, match=r"result must be one of AlignResult, Calibration, .*PoseStarts.*, got Other"
+    ):
         Other(torch.zeros(1)).save(tmp_path / "r.safetensors")
     assert list(tmp_path.iterdir()) == []
     result().save(tmp_path / "r.safetensors")

@@ -2,35 +2,36 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
 import torchreg.pipelines.storage  # noqa: F401  (results of an alignment can be saved)
-from torchreg._checks import as_float_tensor, check_choice, check_positive, check_shape
+from torchreg._checks import as_float_tensor, check_choice, check_count, check_positive
 from torchreg.correspondence.em import OUTLIER_CONSTANT, expectation
 from torchreg.correspondence.sigma import SigmaSchedule
-from torchreg.errors import InputError, InputTypeError, UnitsWarning
+from torchreg.errors import InputError
 from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.kinematics import stack_sizes
 from torchreg.models.skin import BendingSkin, LinearBlendSkin, sample_skin
-from torchreg.models.surface import FusedSurface, SkinSurface, Surface, dense_file_skin
-from torchreg.pipelines.align_objectives import PosePrior
-from torchreg.pipelines.align_search import FINAL_SIGMAS, PRIOR_SHARE, coarse_skin, explore, needs_search
-from torchreg.pipelines.align_stages import CORRESPONDENCES, AlignProblem, OnStep, StageResult, fit_surface, register
+from torchreg.pipelines.align_problem import (
+    INLIER_SHARE,
+    AlignProblem,
+    alignment_cost,
+    centered_problem,
+    check_data,
+    masked_mean,
+    shifted,
+    warn_about_units,
+)
+from torchreg.pipelines.align_search import FINAL_SIGMAS, explore, needs_search
+from torchreg.pipelines.align_stages import CORRESPONDENCES, OnStep, StageResult, fit_surface, register
 from torchreg.results import AlignRecord, AlignResult, Status
 
 # Shares of the model's size, the diagonal of its rest pose.
 _START_SIGMA, _STOP_SIGMA = 0.08, 0.02
-_INLIER_SHARE = 0.02
-# Data and model that differ more than this in size are in different units.
-_UNITS_RATIO = 30.0
 # Fewer inliers than this, or than this share of the data, and the pose means nothing.
 _MIN_INLIERS, _MIN_INLIER_SHARE = 10, 0.02
-_DENSE_SKIN_POINTS = 2500
-_BALL = 3
 # Steps of the surface fit after a search, whose time they hardly add to.
 _SEARCHED_STEPS = 4
 
@@ -46,8 +47,8 @@ class AlignConfig:
         surface_steps: Levenberg-Marquardt steps at each width of the surface fit; 0 leaves the surface fit out.
         search: look for better poses around the start: "always", "never", or "auto": when the descent
             went far from its start or leaves a dense cluster of data unexplained.
-        num_candidates: poses tried per round of the search.
-        search_rounds: rounds of the search.
+        num_candidates: poses that a search starts from.
+        search_rounds: rounds of the search's last stage, which places every limb thoroughly.
         inlier_distance: data nearer to the fitted surface are inliers, metres; 2 % of the model's size by default.
         correspondence: who matches whom: "em", the posterior; for comparison "softassign", one to one, or "closest",
             the closest point as in ICP, trimmed at 1.5 sigma.
@@ -68,8 +69,8 @@ class AlignConfig:
     m_steps: int = 1
     surface_steps: int = 2
     search: str = "auto"
-    num_candidates: int = 24
-    search_rounds: int = 4
+    num_candidates: int = 32
+    search_rounds: int = 2
     inlier_distance: float | None = None
     correspondence: str = "em"
     outlier: str = "limit"
@@ -87,8 +88,8 @@ class AlignConfig:
         check_choice(self.outlier, "outlier", ("limit", "volume"))
         check_choice(self.nan_policy, "nan_policy", ("raise", "omit"))
         for name in ("em_steps", "m_steps", "num_candidates", "search_rounds", "num_model_points"):
-            _check_count(getattr(self, name), name, 1)
-        _check_count(self.surface_steps, "surface_steps", 0)
+            check_count(getattr(self, name), name, 1)
+        check_count(self.surface_steps, "surface_steps", 0)
         check_positive(self.sharpness, "sharpness")
         check_positive(self.pose_atol, "pose_atol", allow_zero=True)
         check_positive(self.debias, "debias", allow_zero=True)
@@ -141,7 +142,7 @@ def align(
     """
     config = config or AlignConfig()
     with torch.no_grad():
-        data, valid = _check_data(shape, data, mask, config.nan_policy)
+        data, valid = check_data(shape, data, mask, config.nan_policy)
         pose = shape.rest_pose() if initial_pose is None else shape.check_pose(initial_pose, "initial_pose")
         if not bool(torch.isfinite(pose).all()):
             raise InputError("initial_pose must be finite")
@@ -151,10 +152,13 @@ def align(
         skin = _model_skin(shape, model_points, pose, config)
         batch_data = data.expand(count, *data.shape[-2:])
         batch_valid = valid.expand(count, valid.shape[-1])
-        origin = _masked_mean(batch_data, batch_valid)
-        problem = _centered_problem(shape, skin, batch_data, batch_valid, pose, origin, config)
-        _warn_about_units(problem)
-        pose = _shifted(pose, -origin)
+        origin = masked_mean(batch_data, batch_valid)
+        problem = centered_problem(
+            skin, batch_data, batch_valid, pose, origin, prior_std=config.prior_std, pose_atol=config.pose_atol,
+            outlier=config.outlier, debias=config.debias, correspondence=config.correspondence,
+        )  # fmt: skip
+        warn_about_units(problem)
+        pose = shifted(pose, -origin)
         record = _Recorder(on_step, origin)
         final = _descend(problem, pose, config, record)
         if starts:
@@ -174,7 +178,7 @@ class _Recorder:
         self.history: list[AlignRecord] = [] if history is None else history
 
     def __call__(self, step: AlignRecord) -> None:
-        step = replace(step, pose=_shifted(step.pose, self.origin))
+        step = replace(step, pose=shifted(step.pose, self.origin))
         self.history.append(step)
         if self.on_step is not None:
             self.on_step(step)
@@ -182,10 +186,6 @@ class _Recorder:
     def rows(self, index: Tensor) -> _Recorder:
         """Return a recorder for some rows of the batch, which writes into the same history."""
         return _Recorder(self.on_step, self.origin[index], self.history)
-
-
-def _shifted(pose: Tensor, offset: Tensor) -> Tensor:
-    return torch.cat([pose[:, :3] + offset, pose[:, 3:]], dim=-1)
 
 
 def _descend(problem: AlignProblem, pose: Tensor, config: AlignConfig, record: OnStep) -> StageResult:
@@ -211,10 +211,9 @@ def _search_where_needed(
     if len(rows) == 0:
         return final
     part = problem.rows(rows)
-    coarse = replace(part, skin=coarse_skin(problem.skin), surface=FusedSurface(problem.skin.shape))
     generator = torch.Generator().manual_seed(config.seed)
     found = explore(
-        coarse,
+        part,
         start[rows],
         final.pose[rows],
         candidates=config.num_candidates,
@@ -230,15 +229,8 @@ def _search_where_needed(
     return StageResult(pose, final.sigma, change)
 
 
-def alignment_cost(problem: AlignProblem, pose: Tensor, distances: Tensor | None = None) -> Tensor:
-    """Return the cost (B,) by which alignments of the same data are ranked: outliers, softly counted, and the prior."""
-    distances = problem.surface.distance(problem.data, pose) if distances is None else distances
-    lost = 1 - (-(distances / (_INLIER_SHARE * problem.size)).square()).exp()
-    return (lost * problem.valid).sum(-1) + PRIOR_SHARE * problem.prior.cost(pose)
-
-
 def _inlier_distance(problem: AlignProblem, config: AlignConfig) -> float:
-    return config.inlier_distance or _INLIER_SHARE * problem.size
+    return config.inlier_distance or INLIER_SHARE * problem.size
 
 
 def _result(
@@ -251,7 +243,7 @@ def _result(
     inliers = distances.abs() < _inlier_distance(problem, config)
     posed = problem.skin(pose)
     observed = expectation(posed, problem.data, final.sigma, OUTLIER_CONSTANT, mask=problem.valid)
-    world = _shifted(pose, origin)
+    world = shifted(pose, origin)
     statuses = zip(inliers.sum(-1).tolist(), problem.valid.sum(-1).tolist(), final.change.tolist(), strict=True)
     return AlignResult(
         pose=world,
@@ -283,31 +275,6 @@ def _unbatched(result: AlignResult, row: int) -> AlignResult:
     return AlignResult(**tensors, status=status, history=result.history)
 
 
-def _check_data(shape: ArticulatedShape, data: Tensor, mask: Tensor | None, nan_policy: str) -> tuple[Tensor, Tensor]:
-    """Return the data in the shape's dtype and which of them count."""
-    data = as_float_tensor(data, "data", like=shape.rest)
-    if data.ndim not in (2, 3):
-        raise InputError(f"data must have shape (M, 3) or (B, M, 3), got {tuple(data.shape)}")
-    check_shape(data, "data", ("M", 3), batch=True)
-    if data.shape[-2] == 0 or data.shape[0] == 0:
-        raise InputError(f"data must hold at least one point, got shape {tuple(data.shape)}")
-    valid = torch.ones_like(data[..., 0], dtype=torch.bool)
-    if mask is not None:
-        if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
-            raise InputTypeError("mask must be a tensor of bool, False where data are padding")
-        if mask.shape != valid.shape:
-            raise InputError(f"mask must have shape {tuple(valid.shape)} like the data, got {tuple(mask.shape)}")
-        valid = mask.to(data.device)
-    finite = torch.isfinite(data).all(-1)
-    bad = int((valid & ~finite).sum())
-    if bad and nan_policy == "raise":
-        raise InputError(f"data hold {bad} points that are not finite; drop them or set nan_policy='omit'")
-    valid = valid & finite
-    if not bool(valid.any()):
-        raise InputError("data hold no point that is finite and not masked")
-    return torch.where(valid.unsqueeze(-1), data, 0.0), valid
-
-
 def _num_starts(data: Tensor, pose: Tensor) -> int:
     """Return how many starts one cloud has (0: not a multi-start problem); check that poses fit the clouds."""
     if pose.ndim > 2:
@@ -331,75 +298,3 @@ def _model_skin(
     if len(pose) != 1:
         raise InputError("model_points given as a tensor need a single initial_pose; pass a skin for several poses")
     return BendingSkin(shape, as_float_tensor(model_points, "model_points", like=shape.rest), pose[0], config.sharpness)
-
-
-def _centered_problem(
-    shape: ArticulatedShape,
-    skin: LinearBlendSkin,
-    data: Tensor,
-    valid: Tensor,
-    pose: Tensor,
-    origin: Tensor,
-    config: AlignConfig,
-) -> AlignProblem:
-    """Return the batch with every cloud's mean at the origin, where float32 is most precise."""
-    size = float((skin.points.amax(0) - skin.points.amin(0)).norm())
-    shift = torch.nn.functional.pad(origin, (0, shape.num_dofs - 3))
-    lower, upper = shape.lower, shape.upper
-    if not bool(torch.isinf(shape.lower[:3]).all()):
-        lower, upper = shape.lower - shift, shape.upper - shift
-    precision = torch.zeros_like(shape.rest)
-    if config.prior_std is not None:
-        slides = shape.chain.couplings.abs().mT @ (1 - shape.chain.is_revolute) > 0
-        joints = torch.where(slides, config.prior_std * size, config.prior_std)
-        precision[6:] = joints.square().reciprocal()
-        # The three axes of a ball joint share the deviation of its one rotation.
-        balls = [6 + dof for dof, size in enumerate(stack_sizes(shape.chain.tree)) if size >= _BALL]
-        precision[balls] *= _BALL
-    return AlignProblem(
-        skin=skin,
-        surface=_surface(shape, skin),
-        data=torch.where(valid.unsqueeze(-1), data - origin.unsqueeze(1), 0.0),
-        valid=valid,
-        size=size,
-        lower=lower,
-        upper=upper,
-        prior=PosePrior(pose - shift, precision),
-        pose_atol=config.pose_atol,
-        outlier=config.outlier,
-        debias=config.debias,
-        correspondence=config.correspondence,
-    )
-
-
-def _surface(shape: ArticulatedShape, skin: LinearBlendSkin) -> Surface:
-    """Return what is fitted: the file's own surface where there is one, else the fused solids."""
-    if shape.surface is None:
-        return FusedSurface(shape)
-    dense = skin if len(skin) >= _DENSE_SKIN_POINTS and skin.normals is not None else dense_file_skin(shape)
-    return SkinSurface(dense)
-
-
-def _masked_mean(data: Tensor, valid: Tensor) -> Tensor:
-    return (data * valid.unsqueeze(-1)).sum(-2) / valid.sum(-1, keepdim=True).clamp_min(1)
-
-
-def _warn_about_units(problem: AlignProblem) -> None:
-    """Warn if the spread of the data does not fit the size of the model, as with millimeters for metres."""
-    radius = problem.data.norm(dim=-1)
-    spread = 2 * torch.where(problem.valid, radius, torch.nan).nanmedian(-1).values
-    ratio = float(spread.nanmedian()) / problem.size
-    if int(problem.valid.sum(-1).max()) >= _MIN_INLIERS and not 1 / _UNITS_RATIO < ratio < _UNITS_RATIO:
-        warnings.warn(
-            f"the data spread over {ratio:.3g} times the model's size of {problem.size:.3g} m: are they in metres? "
-            f"Scale them, by 0.001 if they are in millimeters",
-            UnitsWarning,
-            stacklevel=3,
-        )
-
-
-def _check_count(value: int, name: str, least: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise InputTypeError(f"{name} must be an integer, got {type(value).__name__}")
-    if value < least:
-        raise InputError(f"{name} must be at least {least}, got {value}")

@@ -12,16 +12,11 @@ from torchreg.correspondence.closest import closest_point
 from torchreg.correspondence.em import OUTLIER_CONSTANT, EStep, expectation, outlier_constant
 from torchreg.correspondence.sigma import SigmaSchedule, estimate_sigma
 from torchreg.correspondence.softassign import softassign
-from torchreg.models.skin import LinearBlendSkin
-from torchreg.models.surface import Surface
 from torchreg.pipelines.align_objectives import PosePrior, RegistrationObjective, SurfaceObjective
+from torchreg.pipelines.align_problem import AlignProblem
 from torchreg.results import AlignRecord
 from torchreg.solvers.levenberg_marquardt import (
-    Linearization,
     LMResult,
-    damped_step,
-    held_at_limits,
-    levenberg_marquardt,
 )
 
 OnStep = Callable[[AlignRecord], None]
@@ -45,88 +40,8 @@ _FINAL_STEPS = 3
 _LEVER = 0.25
 # Data that count when asking how many model points share a datum.
 _HELD_POSTERIOR, _MAX_POSTERIOR = 0.3, 1 - 1e-6
-# Damping of the single steps that an EM takes, whose objective changes with every E-step anyway.
-_EM_DAMPING = 1e-3
 # Below this share of the model's size the kernel's own pull is less than the noise.
 _NARROW_SIGMA = 0.035
-
-
-@dataclass(frozen=True)
-class AlignProblem:
-    """A batch of alignments of one shape: what every stage works on.
-
-    Args:
-        skin: the model points.
-        surface: what the surface fit fits.
-        data: (B, M, 3), metres.
-        valid: (B, M) False where padded.
-        size: diagonal of the model in its rest pose, metres: the unit of all thresholds.
-        lower: limits of the pose, (num_dofs,) or (B, num_dofs).
-        upper: limits of the pose, (num_dofs,) or (B, num_dofs).
-        prior: on the joints.
-        pose_atol: largest change of a pose that counts as none.
-        outlier: "limit" or "volume".
-        debias: share of the kernel's own pull that is taken from the targets of the EM.
-        correspondence: one of `CORRESPONDENCES`.
-    """
-
-    skin: LinearBlendSkin
-    surface: Surface
-    data: Tensor
-    valid: Tensor
-    size: float
-    lower: Tensor
-    upper: Tensor
-    prior: PosePrior
-    pose_atol: float
-    outlier: str = "limit"
-    debias: float = 0.0
-    correspondence: str = "em"
-
-    def rows(self, index: Tensor) -> AlignProblem:
-        """Return the problems of some rows of the batch, which may repeat."""
-        return replace(
-            self,
-            data=self.data[index],
-            valid=self.valid[index],
-            lower=_rows(self.lower, index),
-            upper=_rows(self.upper, index),
-            prior=replace(self.prior, mean=self.prior.mean[index]),
-        )
-
-    def solve(
-        self,
-        objective: RegistrationObjective | SurfaceObjective,
-        pose: Tensor,
-        max_steps: int,
-        around: Linearization,
-        damping: Tensor | None = None,
-    ) -> LMResult:
-        """Return what Levenberg-Marquardt within the joint limits makes of a pose around which all is known."""
-        return levenberg_marquardt(
-            objective, pose, retract=self.skin.shape.retract, lower=self.lower, upper=self.upper,
-            damping=damping, max_steps=max_steps, atol=self.pose_atol * min(1.0, self.size),
-            start=around, cost=objective.cost,
-        )  # fmt: skip
-
-    def step(self, around: Linearization, pose: Tensor) -> LMResult:
-        """Return the result of one damped step, without a test: what a generalized EM needs."""
-        damping = torch.full_like(pose[:, 0], _EM_DAMPING)
-        held = held_at_limits(around.gradient, pose, self.lower, self.upper)
-        step = damped_step(around, damping, frozen=held)
-        return LMResult(self.clamp(self.skin.shape.retract(pose, step)), around.cost, damping, step, 1)
-
-    def change(self, step: Tensor) -> Tensor:
-        """Return the largest change (B,) in a step, radians, or metres as a share of the size."""
-        return torch.cat([step[:, :3] / self.size, step[:, 3:]], dim=-1).abs().amax(-1)
-
-    def clamp(self, pose: Tensor) -> Tensor:
-        """Return poses (..., B, num_dofs) moved inside the limits."""
-        return torch.minimum(torch.maximum(pose, self.lower), self.upper)
-
-
-def _rows(limits: Tensor, index: Tensor) -> Tensor:
-    return limits if limits.ndim == 1 else limits[index]
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,19 @@ from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.primitives import Primitive
 from torchreg.models.rigs import RigSurface, ShapeSpec
 from torchreg.models.shape_record import HandSpec, ShapeRecord, build_shape, record_shape
-from torchreg.results import AlignRecord, AlignResult, Calibration, DemoResult, Result, Status, register_writer
+from torchreg.results import (
+    AlignRecord,
+    AlignResult,
+    Calibration,
+    DemoResult,
+    PoseStarts,
+    Result,
+    Status,
+    register_writer,
+)
 
 # What a file may name: nothing else is ever built from it.
-_RESULTS: dict[str, type[Result]] = {kind.__name__: kind for kind in (AlignResult, Calibration, DemoResult)}
+_RESULTS: dict[str, type[Result]] = {kind.__name__: kind for kind in (AlignResult, Calibration, DemoResult, PoseStarts)}
 _SHAPE_RECORDS = (ShapeRecord, ShapeSpec, HandSpec, KinematicTree, Joint, Primitive, RigSurface)
 _RECORDS: dict[str, type] = {kind.__name__: kind for kind in (AlignRecord, *_SHAPE_RECORDS)}
 _ENUMS: dict[str, type[Enum]] = {kind.__name__: kind for kind in (Status,)}
