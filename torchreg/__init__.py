@@ -21,7 +21,16 @@ if TYPE_CHECKING:
     from torchreg.pipelines.calibrate import calibrate
     from torchreg.pipelines.find_pose import FindPoseConfig, find_pose
     from torchreg.pipelines.storage import load
-    from torchreg.results import AlignResult, Calibration, PoseStarts, Status
+    from torchreg.pipelines.track import TrackConfig, Tracker
+    from torchreg.results import (
+        AlignResult,
+        Calibration,
+        FrameResult,
+        PoseStarts,
+        Status,
+        TrackResult,
+        TrackState,
+    )
 
 __version__ = "0.1.0"
 
@@ -33,11 +42,16 @@ __all__ = [
     "Calibration",
     "EMLoss",
     "FindPoseConfig",
+    "FrameResult",
     "Hand",
     "LinearBlendSkin",
     "PoseStarts",
     "SigmaSchedule",
     "Status",
+    "TrackConfig",
+    "TrackResult",
+    "TrackState",
+    "Tracker",
     "TriangleMesh",
     "__version__",
     "align",
@@ -61,11 +75,16 @@ _OWNERS = {
     "Calibration": "results",
     "EMLoss": "losses.em",
     "FindPoseConfig": "pipelines.find_pose",
+    "FrameResult": "results",
     "Hand": "models.hand",
     "LinearBlendSkin": "models.skin",
     "PoseStarts": "results",
     "SigmaSchedule": "correspondence.sigma",
     "Status": "results",
+    "TrackConfig": "pipelines.track",
+    "TrackResult": "results",
+    "TrackState": "results",
+    "Tracker": "pipelines.track",
     "TriangleMesh": "geometry.mesh",
     "align": "pipelines.align",
     "calibrate": "pipelines.calibrate",

@@ -31,14 +31,20 @@ from torchreg.results import (
     AlignResult,
     Calibration,
     DemoResult,
+    FrameResult,
     PoseStarts,
     Result,
     Status,
+    TrackResult,
+    TrackState,
     register_writer,
 )
 
 # What a file may name: nothing else is ever built from it.
-_RESULTS: dict[str, type[Result]] = {kind.__name__: kind for kind in (AlignResult, Calibration, DemoResult, PoseStarts)}
+_RESULTS: dict[str, type[Result]] = {
+    kind.__name__: kind
+    for kind in (AlignResult, Calibration, DemoResult, FrameResult, PoseStarts, TrackResult, TrackState)
+}
 _SHAPE_RECORDS = (ShapeRecord, ShapeSpec, HandSpec, KinematicTree, Joint, Primitive, RigSurface)
 _RECORDS: dict[str, type] = {kind.__name__: kind for kind in (AlignRecord, *_SHAPE_RECORDS)}
 _ENUMS: dict[str, type[Enum]] = {kind.__name__: kind for kind in (Status,)}
