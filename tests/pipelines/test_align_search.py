@@ -225,6 +225,26 @@ def test_only_lost_problems_are_searched_all_around(problem, exact, plain_hand, 
     assert float(off.max()) < 0.015
 
 
+def test_further_candidates_are_searched_where_the_best_leaves_clusters(problem, exact, plain_hand, monkeypatch):
+    """The rows that do not need it stay as they are."""
+    sizes = []
+    settle = PoseSearch.settle
+
+    def spied(search, candidates, rounds):
+        sizes.append(tuple(candidates.shape[:2]))
+        return settle(search, candidates, rounds)
+
+    start = misled(exact, plain_hand)
+    monkeypatch.setattr(PoseSearch, "settle", spied)
+    monkeypatch.setattr(align_search, "leaves_clusters", lambda problem, pose: torch.arange(len(pose)) == 0)
+    search = PoseSearch(problem, torch.Generator().manual_seed(5))
+    poses, scores = align_search._search_around(search, start, start, 8, 1, torch.Generator().manual_seed(6))
+    assert sizes[0] == (2, 1)
+    assert [batch for batch, _ in sizes[1:]] == [1]
+    # What comes back with a pose is its score.
+    torch.testing.assert_close(search.settle(poses.unsqueeze(1), 1)[1][:, 0], scores, rtol=0.1, atol=3.0)
+
+
 def test_large_batches_are_searched_in_parts(problem, exact, monkeypatch):
     sizes = []
 

@@ -132,6 +132,15 @@ def test_a_few_data_and_no_polish_place_fingers_roughly(plain_hand, hand_limbs, 
     assert bool(((found >= plain_hand.lower) & (found <= plain_hand.upper)).all())
 
 
+def test_a_narrow_beam_finds_some_fingers(plain_hand, hand_limbs, hands, truths, stretched):
+    """Narrower than the samples of a finger's first joint, each of which would survive else."""
+    found = hand_limbs(hands, stretched, replace(THOROUGH, beam=8, configurations=4), generator())
+    before, after = (tip_errors(plain_hand, poses, truths) for poses in (stretched, found[:, 0]))
+    assert float(after.mean()) < 0.6 * float(before.mean())
+    assert float(after.median()) < 0.01
+    assert bool(((found >= plain_hand.lower) & (found <= plain_hand.upper)).all())
+
+
 def test_a_hidden_finger_stays_near_the_mean_of_the_prior(plain_hand, hand_limbs, hands, truths):
     little = [dof for dof, name in enumerate(plain_hand.dof_names) if name.startswith("little")]
     others = sorted(set(range(6, 27)) - set(little))
