@@ -57,6 +57,15 @@ def test_exchanges_mend_what_a_beam_of_one_misses(seed):
         assert expected[best] <= min(expected[choice] for choice in near) + 1e-12
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_no_choice_is_returned_twice(seed):
+    uncovered, tables, costs = problem(seed, rows=(4, 4, 4))
+    index, total = best_covers(uncovered, tables, costs, count=10, beam=10, num_exchanged=8)
+    for row in index.tolist():
+        assert len({tuple(choice) for choice in row}) == 10
+    assert (total.diff(dim=1) >= 0).all()
+
+
 def test_two_rows_that_must_change_together_are_found():
     # Each limb alone prefers the columns of the other.
     uncovered = torch.ones(1, 4)

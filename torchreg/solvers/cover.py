@@ -36,7 +36,8 @@ def best_covers(
         sweeps: over all pairs of tables.
 
     Returns:
-        index (B, C, F) int64 of the chosen rows and total cost (B, C), best first; C is at most ``count``.
+        index (B, C, F) int64 of the chosen rows and total cost (B, C), best first; C is at most ``count``. Where there
+        are fewer choices, repeats of them come last.
 
     Raises:
         InputError: if there is no table, or tables and costs do not match.
@@ -55,8 +56,16 @@ def best_covers(
                 chosen = _exchanged(uncovered, tables, costs, chosen, *pair)
         index = torch.cat([chosen, index], dim=1)
         total = torch.cat([_total(uncovered, tables, costs, chosen), total], dim=1)
-    total, order = total.sort(dim=1, stable=True)
-    return _take(index, order[:, :count]), total[:, :count]
+    order = total.argsort(dim=1, stable=True)
+    index, total = _take(index, order), total.gather(1, order)
+    order = _repeats(index).to(torch.uint8).argsort(dim=1, stable=True)[:, :count]
+    return _take(index, order), total.gather(1, order)
+
+
+def _repeats(index: Tensor) -> Tensor:
+    """Return which choices (B, C) equal an earlier one."""
+    same = (index.unsqueeze(2) == index.unsqueeze(1)).all(-1)
+    return same.tril(-1).any(-1)
 
 
 def _beam(uncovered: Tensor, tables: Sequence[Tensor], costs: Sequence[Tensor], width: int) -> tuple[Tensor, Tensor]:
