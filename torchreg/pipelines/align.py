@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -34,6 +35,9 @@ _START_SIGMA, _STOP_SIGMA = 0.08, 0.02
 _MIN_INLIERS, _MIN_INLIER_SHARE = 10, 0.02
 # Steps of the surface fit after a search, whose time they hardly add to.
 _SEARCHED_STEPS = 4
+
+
+_Record = TypeVar("_Record", AlignRecord, AlignResult)
 
 
 @dataclass(frozen=True)
@@ -141,7 +145,8 @@ def align(
     References: Dewaele et al. 2006, section 3.
     """
     config = config or AlignConfig()
-    with torch.no_grad():
+    # A sixth faster than without gradients alone, as most of the time goes to small operations.
+    with torch.inference_mode():
         data, valid = check_data(shape, data, mask, config.nan_policy)
         pose = shape.rest_pose() if initial_pose is None else shape.check_pose(initial_pose, "initial_pose")
         if not bool(torch.isfinite(pose).all()):
@@ -167,7 +172,15 @@ def align(
             final = StageResult(final.pose[best], final.sigma[best], final.change[best])
         final = _search_where_needed(problem, final, pose, config, record)
         result = _result(problem, final, origin, config, tuple(record.history))
-        return _unbatched(result, 0) if data.ndim == 2 else result
+        return _ordinary(_unbatched(result, 0) if data.ndim == 2 else result)
+
+
+def _ordinary(record: _Record) -> _Record:
+    """Return a copy whose tensors can take part in autograd, as those made in inference mode cannot."""
+    values = {item.name: getattr(record, item.name) for item in fields(record)}
+    with torch.inference_mode(False), torch.no_grad():
+        copies: dict[str, Any] = {name: value.clone() for name, value in values.items() if isinstance(value, Tensor)}
+    return replace(record, **copies)
 
 
 class _Recorder:
@@ -178,10 +191,11 @@ class _Recorder:
         self.history: list[AlignRecord] = [] if history is None else history
 
     def __call__(self, step: AlignRecord) -> None:
-        step = replace(step, pose=shifted(step.pose, self.origin))
+        step = _ordinary(replace(step, pose=shifted(step.pose, self.origin)))
         self.history.append(step)
         if self.on_step is not None:
-            self.on_step(step)
+            with torch.inference_mode(False), torch.no_grad():
+                self.on_step(step)
 
     def rows(self, index: Tensor) -> _Recorder:
         """Return a recorder for some rows of the batch, which writes into the same history."""
