@@ -19,6 +19,7 @@ from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.limbs import find_limbs
 from torchreg.models.skin import LinearBlendSkin, bending_weights, sample_skin
 from torchreg.pipelines.align import AlignConfig, align
 from torchreg.pipelines.align_objectives import PosePrior
@@ -43,9 +44,11 @@ _NEW_JOINT_ERROR, _NEW_ERROR = 0.15, 0.04
 # Kept from frame to frame of running means, and of the largest errors of the prediction.
 _MEMORY, _ERROR_MEMORY = 0.9, 0.9
 # Share of a surprise that the velocity takes over, and what is left of a velocity that data did not confirm.
-_VELOCITY_GAIN, _VELOCITY_DECAY = 0.5, 0.7
+_VELOCITY_GAIN, _FAST_GAIN, _VELOCITY_DECAY = 0.5, 0.8, 0.7
 # Frames ahead that a velocity is trusted, and that uncertainty grows.
 _MAX_AHEAD, _MAX_SPREAD = 3.0, 4.0
+# Where predictions are off by more than this share of the size, other paces are tried as well.
+_FAST, _PACES, _FAST_WIDTHS, _FAST_STEPS = 0.04, (0.0, 2.0), (0.06, 0.04, 0.03), 2
 # Data count that lie this near the bounds of the predicted model, as a share of its size.
 _REACH = 0.12
 # Data this near the surface, as a share of the size, are harvested (5 mm on a hand); they show model points this near.
@@ -59,11 +62,11 @@ _MIN_INLIERS, _LOST_COUNT, _LOST_RATIO, _LOST_COVERED = 10, 0.12, 0.5, 0.3
 # A doubt, beyond what is usual: novel dense data off the surface, so many or this share of the inliers; residuals, this
 # many times; model points without data or joints at limits, by these shares; points off the prediction, by this share
 # of the size.
-_DOUBT_NOVEL, _DOUBT_NOVEL_SHARE, _DOUBT_RESIDUAL = 5, 0.015, 1.5
+_DOUBT_NOVEL, _DOUBT_NOVEL_SHARE, _DOUBT_RESIDUAL = 8, 0.02, 1.5
 _DOUBT_COVERED, _DOUBT_HELD, _DOUBT_JUMP = 0.25, 0.3, 0.15
 # What did not help is tried again at once so many times, then after longer and longer rests, frames; strays that
 # stay after so many attempts are background.
-_FREE_FAILS, _LONGEST_REST, _LEARNED_AFTER = 1, 32, 4
+_FREE_FAILS, _SEARCH_FAILS, _LONGEST_REST, _LEARNED_AFTER = 1, 2, 32, 4
 # Frames after a loss before searching around the last pose, and everywhere.
 _SEARCH_AFTER, _FIND_AFTER = 2, 3
 _SURFACE_STARTS, _SURFACE_START_STEPS = (0.06, 0.04, 0.03), 2
@@ -253,6 +256,7 @@ class Tracker:
             count = self.config.num_model_points * (2 if self.config.model_points == "seen" else 1)
             self._skin = model_points or sample_skin(shape, count, sharpness=self.config.sharpness)
             self._parts = self._skin.weights.argmax(-1)
+            self._limbs = find_limbs(shape)[0]
             nowhere = torch.zeros_like(shape.rest[None, :3])
             self._template = centered_problem(
                 self._skin, nowhere[None], torch.ones_like(nowhere[:, :1], dtype=torch.bool), shape.rest[None], nowhere,
@@ -466,8 +470,36 @@ class Tracker:
         low, high = _START_RANGE
         start, stop = size * min(max(_START_PER_ERROR * spread * state.error / size, low), high), _STOP_SIGMA * size
         schedule = SigmaSchedule.geometric(start, stop, 2 if start < _SIGMA_RATIO * stop else 3)
-        moved = register(problem, problem.prior.mean, schedule, em_steps=self.config.em_steps, m_steps=1)
-        return self._fit(replace(view, problem=problem), state, "tracked", moved.pose)
+        starts = problem.prior.mean
+        if state.error > _FAST * size and self.config.prediction == "velocity":
+            # Joints that fast turn back or speed up within a frame, each at another time.
+            steps = starts.new_tensor(_PACES).unsqueeze(-1) * (min(gap, _MAX_AHEAD) * state.interval * state.velocity)
+            others = self.shape.retract(state.pose.expand_as(steps), steps)
+            starts = torch.cat([starts, view.local(others)[0]])
+        rows = replace(problem, prior=replace(problem.prior, mean=problem.prior.mean[:1]))
+        rows = rows.rows(torch.zeros(len(starts), dtype=torch.long, device=starts.device))
+        moved = register(rows, starts, schedule, em_steps=self.config.em_steps, m_steps=1).pose
+        if len(moved) > 1:
+            wide = fit_candidates(problem, starts[None], _FAST_WIDTHS, _FAST_STEPS)[0]
+            moved = torch.cat([moved, wide])
+        pose = moved if len(moved) == 1 else self._mixed(problem, moved)
+        return self._fit(replace(view, problem=problem), state, "tracked", pose)
+
+    def _mixed(self, problem: AlignProblem, poses: Tensor) -> Tensor:
+        """Return the best of poses (S, num_dofs), each limb as in the pose where it explains most data, (1, num_dofs)."""
+        scores = score_candidates(problem, poses[None], _STOP_SIGMA)[0]
+        best, least = poses[scores.argmin()], scores.min()
+        if not self._limbs:
+            return best[None]
+        hybrids = best.repeat(len(self._limbs), len(poses), 1)
+        for number, limb in enumerate(self._limbs):
+            hybrids[number][:, limb.dofs] = poses[:, limb.dofs]
+        scores = score_candidates(problem, hybrids.flatten(0, 1)[None], _STOP_SIGMA)[0].reshape(hybrids.shape[:2])
+        mixed = best.clone()
+        for limb, chosen in zip(self._limbs, scores.argmin(1).tolist(), strict=True):
+            mixed[limb.dofs] = poses[chosen, limb.dofs]
+        options = torch.stack([mixed, hybrids.flatten(0, 1)[scores.argmin()]])
+        return options[score_candidates(problem, options[None], _STOP_SIGMA)[0].argmin()][None]
 
     def _fit(self, view: _View, state: TrackState, how: str, pose: Tensor) -> _Fit:
         """Return the fit of the surface from a pose (1, num_dofs), and the evidence for it."""
@@ -548,7 +580,7 @@ class Tracker:
             search = PoseSearch(problem, _generator(state))
             narrowed = search.narrow(pool, _NUM_SEARCHED)
             yield self._fit(view, state, "starts", narrowed[:, 0])
-            if dear and (state.lost >= _SEARCH_AFTER if lost else state.fails > 0):
+            if dear and (state.lost >= _SEARCH_AFTER if lost else state.fails == _SEARCH_FAILS):
                 yield self._fit(view, state, "search", search.settle(narrowed, 1)[0][:, 0])
         if dear and lost and state.lost >= _FIND_AFTER and _may_show(state, frame):
             yield self._sought(state, frame)
@@ -573,7 +605,8 @@ class Tracker:
         surprise, velocity, jump = torch.full_like(pose, _NEW_JOINT_ERROR), torch.zeros_like(pose), self._new_error
         if known:
             surprise, jump = _difference(fit.view.problem.prior.mean[0], fit.pose[0]), fit.jump
-            went = state.velocity + _VELOCITY_GAIN / (frame.gap * (state.interval or 1.0)) * surprise
+            gain = _VELOCITY_GAIN if state.error < _FAST * self._template.size else _FAST_GAIN
+            went = state.velocity + gain / (frame.gap * (state.interval or 1.0)) * surprise
             velocity = share * went + (1 - share) * _VELOCITY_DECAY * state.velocity
         surprise = surprise[6:][share[6:] > _SURE_SHARE]
         joint_error = float(surprise.norm()) / max(1, len(surprise)) ** 0.5
