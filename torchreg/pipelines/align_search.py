@@ -25,7 +25,7 @@ _DATA_PER_CANDIDATE = 500
 _CHUNK_ENTRIES = 4_000_000
 # A thorough search from where the descent ended shows that it was lost if it gains more than this many data, or still
 # leaves more than this share of them in clusters.
-_DOUBTFUL_GAIN, _DOUBTFUL_CLUSTERS = 1.0, 0.04
+_DOUBTFUL_GAIN, _DOUBTFUL_CLUSTERS = 1.0, 0.06
 # Widths of the surface fit that follows a search, whose poses are near already.
 FINAL_SIGMAS = (0.022,)
 # Unexplained data count as a cluster with this many others within four nearest-neighbor distances.
