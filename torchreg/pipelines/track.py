@@ -44,7 +44,7 @@ _NEW_JOINT_ERROR, _NEW_ERROR = 0.15, 0.04
 # Kept from frame to frame of running means, and of the largest errors of the prediction.
 _MEMORY, _ERROR_MEMORY = 0.9, 0.9
 # Share of a surprise that the velocity takes over, and what is left of a velocity that data did not confirm.
-_VELOCITY_GAIN, _FAST_GAIN, _VELOCITY_DECAY = 0.5, 0.8, 0.7
+_VELOCITY_GAIN, _FAST_GAIN, _VELOCITY_DECAY, _HELD_DECAY = 0.5, 0.8, 0.7, 0.95
 # Frames ahead that a velocity is trusted, and that uncertainty grows.
 _MAX_AHEAD, _MAX_SPREAD = 3.0, 4.0
 # Where predictions are off by more than this share of the size, other paces are tried as well.
@@ -62,11 +62,13 @@ _MIN_INLIERS, _LOST_COUNT, _LOST_RATIO, _LOST_COVERED = 10, 0.12, 0.5, 0.3
 # A doubt, beyond what is usual: novel dense data off the surface, so many or this share of the inliers; residuals, this
 # many times; model points without data or joints at limits, by these shares; points off the prediction, by this share
 # of the size.
-_DOUBT_NOVEL, _DOUBT_NOVEL_SHARE, _DOUBT_RESIDUAL = 8, 0.02, 1.5
+_DOUBT_NOVEL, _DOUBT_NOVEL_SHARE, _DOUBT_RESIDUAL = 5, 0.012, 1.5
 _DOUBT_COVERED, _DOUBT_HELD, _DOUBT_JUMP = 0.25, 0.3, 0.15
 # What did not help is tried again at once so many times, then after longer and longer rests, frames; strays that
 # stay after so many attempts are background.
-_FREE_FAILS, _SEARCH_FAILS, _LONGEST_REST, _LEARNED_AFTER = 1, 2, 32, 4
+_FREE_FAILS, _STARTS_FAILS, _SEARCH_FAILS, _FIND_FAILS, _LONGEST_REST, _LEARNED_AFTER = 1, 1, 3, 5, 32, 6
+# Data that another pose must explain beyond those that the prediction led to.
+_MIN_GAIN = 4.0
 # Frames after a loss before searching around the last pose, and everywhere.
 _SEARCH_AFTER, _FIND_AFTER = 2, 3
 _SURFACE_STARTS, _SURFACE_START_STEPS = (0.06, 0.04, 0.03), 2
@@ -486,9 +488,8 @@ class Tracker:
         return self._fit(replace(view, problem=problem), state, "tracked", pose)
 
     def _mixed(self, problem: AlignProblem, poses: Tensor) -> Tensor:
-        """Return the best of poses (S, num_dofs), each limb as in the pose where it explains most data, (1, num_dofs)."""
-        scores = score_candidates(problem, poses[None], _STOP_SIGMA)[0]
-        best, least = poses[scores.argmin()], scores.min()
+        """Return the best of poses (S, num_dofs), (1, num_dofs), each limb as where it explains most data."""
+        best = poses[score_candidates(problem, poses[None], _STOP_SIGMA)[0].argmin()]
         if not self._limbs:
             return best[None]
         hybrids = best.repeat(len(self._limbs), len(poses), 1)
@@ -498,6 +499,7 @@ class Tracker:
         mixed = best.clone()
         for limb, chosen in zip(self._limbs, scores.argmin(1).tolist(), strict=True):
             mixed[limb.dofs] = poses[chosen, limb.dofs]
+        # Limbs chosen one by one may share their data.
         options = torch.stack([mixed, hybrids.flatten(0, 1)[scores.argmin()]])
         return options[score_candidates(problem, options[None], _STOP_SIGMA)[0].argmin()][None]
 
@@ -557,7 +559,8 @@ class Tracker:
             if attempt is None:
                 continue
             lost = best is None or _is_lost(state, best)
-            if best is None or (lost and not _is_lost(state, attempt)) or attempt.cost < best.cost:
+            # What is hidden may be anywhere; only what explains more data is worth a jump.
+            if best is None or (lost and not _is_lost(state, attempt)) or attempt.cost < best.cost - _MIN_GAIN:
                 best = attempt
             if not _is_lost(state, best) and not _is_doubtful(state, best):
                 break
@@ -575,14 +578,15 @@ class Tracker:
             known = known if fit is None else torch.cat([fit.pose[None], known], dim=1)
             wide = fit_candidates(problem, known, _SURFACE_STARTS, _SURFACE_START_STEPS)
             yield self._fit(view, state, "surface", wide[:, score_candidates(problem, wide, _STOP_SIGMA)[0].argmin()])
-            others = torch.cat([view.local(state.previous), view.local(_flipped(self._skin, state.pose))], dim=1)
-            pool = torch.cat([known, others], dim=1) if lost else known
-            search = PoseSearch(problem, _generator(state))
-            narrowed = search.narrow(pool, _NUM_SEARCHED)
-            yield self._fit(view, state, "starts", narrowed[:, 0])
-            if dear and (state.lost >= _SEARCH_AFTER if lost else state.fails == _SEARCH_FAILS):
-                yield self._fit(view, state, "search", search.settle(narrowed, 1)[0][:, 0])
-        if dear and lost and state.lost >= _FIND_AFTER and _may_show(state, frame):
+            if lost or state.fails >= _STARTS_FAILS:
+                others = torch.cat([view.local(state.previous), view.local(_flipped(self._skin, state.pose))], dim=1)
+                search = PoseSearch(problem, _generator(state))
+                narrowed = search.narrow(torch.cat([known, others], dim=1) if lost else known, _NUM_SEARCHED)
+                yield self._fit(view, state, "starts", narrowed[:, 0])
+                if dear and (state.lost >= _SEARCH_AFTER if lost else state.fails == _SEARCH_FAILS):
+                    yield self._fit(view, state, "search", search.settle(narrowed, 1)[0][:, 0])
+        overdue = state.lost >= _FIND_AFTER if lost else state.fails == _FIND_FAILS
+        if dear and overdue and _may_show(state, frame):
             yield self._sought(state, frame)
 
     def _sought(self, state: TrackState, frame: _Frame) -> _Fit | None:
@@ -636,7 +640,7 @@ class Tracker:
     def _hold(self, state: TrackState, frame: _Frame, status: Status) -> FrameResult:
         """Return the record of a frame without a fit; the prediction stands in for it and slows down."""
         pose = self._predicted(state, frame.gap)
-        velocity = state.velocity * _VELOCITY_DECAY ** min(frame.gap, _MAX_AHEAD)
+        velocity = state.velocity * _HELD_DECAY ** min(frame.gap, _MAX_AHEAD)
         self._state = replace(state, pose=pose, velocity=velocity, lost=state.lost + 1)
         unknown = torch.full((self.shape.num_dofs,) * 2, torch.nan).to(pose)
         how = "lost" if status is Status.LOST else "held"
