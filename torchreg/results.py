@@ -250,6 +250,7 @@ class TrackState(Result):
         lost: frames since the last fit.
         rest: frames before a search is tried again.
         fails: searches in a row that left doubts.
+        unsure: how often a pose that was found everywhere may still be checked.
         seed: of all that is drawn.
     """
 
@@ -274,6 +275,7 @@ class TrackState(Result):
     lost: int
     rest: int
     fails: int
+    unsure: int
     seed: int
 
     @property
@@ -289,26 +291,22 @@ class TrackState(Result):
 
 @dataclass(frozen=True)
 class DemoResult(Result):
-    """A made-up sequence of hand clouds, aligned frame after frame, beside the truth; T frames were done.
+    """A hand tracked through a made-up sequence, beside the truth; T frames were done.
 
     Args:
-        poses: (T, num_dofs) found, metres and radians.
+        track: what the tracker found.
         truths: (T, num_dofs) the poses behind the clouds.
-        clouds: (T, M, 3) data, metres.
-        inliers: (T, M) True where a datum is near the aligned surface.
+        clouds: T clouds (M_t, 3), metres.
+        inliers: T masks (M_t,), True where a datum is near the tracked surface.
         tip_errors: (T, 5) distance of each fingertip, thumb to little finger, from its true place, metres.
-        tips_seen: (T, 5) True where the camera saw enough of the fingertip to measure it.
-        seconds: (T,) time that aligning the frame took.
-        status: how each alignment ended.
+        tips_seen: (T, 5) True where the cameras saw enough of the fingertip to measure it.
         seed: of motion and measurements.
     """
 
-    poses: Tensor
+    track: TrackResult
     truths: Tensor
-    clouds: Tensor
-    inliers: Tensor
+    clouds: tuple[Tensor, ...]
+    inliers: tuple[Tensor, ...]
     tip_errors: Tensor
     tips_seen: Tensor
-    seconds: Tensor
-    status: tuple[Status, ...]
     seed: int

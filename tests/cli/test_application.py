@@ -5,25 +5,31 @@ import subprocess
 import sys
 import time
 
+import pytest
+
 import torchreg
 from torchreg.cli import application
 
 
-def test_help_is_quick():
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [(["--help"], ("align", "demo", "figure", "info", "track")), (["track", "--help"], ("--resume", "--overlay"))],
+)
+def test_help_is_quick(arguments, words):
     seconds = []
     for _ in range(3):
         started = time.perf_counter()
         answer = subprocess.run(
-            [sys.executable, "-m", "torchreg", "--help"], capture_output=True, text=True, timeout=60
+            [sys.executable, "-m", "torchreg", *arguments], capture_output=True, text=True, timeout=60
         )
         seconds.append(time.perf_counter() - started)
         assert answer.returncode == 0
-        assert all(name in answer.stdout for name in ("align", "demo", "figure", "info"))
+        assert all(name in answer.stdout for name in words)
     assert min(seconds) < 0.6
 
 
 def test_every_command_explains_itself(run):
-    for command in ("align", "demo", "figure", "info"):
+    for command in ("align", "demo", "figure", "info", "track"):
         assert "Usage:" in run(command, "--help").output
     assert "poses are not searched" in " ".join(run("align", "--help").output.split())
     assert run("--version").output == f"torchreg {torchreg.__version__}\n"

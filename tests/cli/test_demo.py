@@ -3,24 +3,31 @@
 import subprocess
 import sys
 
-import torchreg.pipelines.demo as demo_module
 from torchreg.models.articulated import ArticulatedShape
-from torchreg.pipelines.align import AlignConfig
 from torchreg.pipelines.storage import load
+from torchreg.pipelines.track import Tracker
 
 
 def test_the_demonstration_runs(run, tmp_path):
     out = tmp_path / "made" / "demo"
-    command = [sys.executable, "-m", "torchreg", "demo", "--frames", "2", "-o", str(out)]
+    command = [sys.executable, "-m", "torchreg", "demo", "--frames", "3", "-o", str(out)]
     answer = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path)
     assert answer.returncode == 0, answer.stderr
-    names = ["alignment.gif", "hand.glb", "poses.json", "poses.safetensors"]
+    names = ["hand.glb", "poses.json", "poses.safetensors", "tracking.gif"]
     assert sorted(path.name for path in out.iterdir()) == names
     result = load(out / "poses.safetensors")
     lines = answer.stdout.splitlines()
-    assert lines[0].startswith(f"2 frames of 750 points: {2 / float(result.seconds.sum()):.1f} frames/s")
-    mean, largest = 1000 * float(result.tip_errors.mean()), 1000 * float(result.tip_errors.max())
-    assert lines[1] == f"fingertip error, all: mean {mean:.1f} mm, max {largest:.1f} mm (10 fingertips)"
+    first, second, third = result.track.seconds.tolist()
+    sizes = [len(cloud) for cloud in result.clouds]
+    speed = f"{first:.1f} s to find the hand in the first, then {2 / (second + third):.1f} frames/s"
+    assert lines[0] == f"3 frames of {min(sizes)} to {max(sizes)} points: {speed}"
+    for line, which, errors in (
+        (lines[1], "all", result.tip_errors.flatten()),
+        (lines[2], "seen by the cameras", result.tip_errors[result.tips_seen]),
+    ):
+        mean, largest = 1000 * float(errors.mean()), 1000 * float(errors.max())
+        values = f"mean {mean:.1f} mm, max {largest:.1f} mm ({len(errors)} fingertips)"
+        assert line == f"fingertip error, {which}: {values}"
     assert all(name in lines[-1] for name in names)
     assert run("demo", "--frames", "1", "-o", out).exit_code == 2
     skin = ArticulatedShape.from_gltf(out / "hand.glb")
@@ -28,17 +35,16 @@ def test_the_demonstration_runs(run, tmp_path):
 
 
 def test_an_interrupted_demonstration_writes_what_is_done(run, tmp_path, monkeypatch):
-    original, calls = demo_module.align, []
+    step = Tracker.step
 
-    def interrupted(*arguments, **options):
-        if calls:
+    def interrupted(self, points, time=None):
+        if self.state.frame == 1:
             raise KeyboardInterrupt
-        calls.append(1)
-        return original(*arguments, **{**options, "config": AlignConfig(search="never")})
+        return step(self, points, time)
 
-    monkeypatch.setattr(demo_module, "align", interrupted)
-    answer = run("demo", "--frames", "3", "-o", tmp_path, "--no-picture")
+    monkeypatch.setattr(Tracker, "step", interrupted)
+    answer = run("demo", "--frames", "2", "-o", tmp_path, "--no-picture")
     assert answer.exit_code == 130
-    assert "torchreg: interrupted; 1 of 3 frames are done" in answer.output
+    assert "torchreg: interrupted; 1 of 2 frames are done" in answer.output
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hand.glb", "poses.json", "poses.safetensors"]
-    assert load(tmp_path / "poses.safetensors").poses.shape == (1, 27)
+    assert load(tmp_path / "poses.safetensors").track.poses.shape == (1, 27)

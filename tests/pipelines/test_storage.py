@@ -14,7 +14,7 @@ from torchreg.models.hand import Hand
 from torchreg.models.primitives import Primitive
 from torchreg.pipelines.align import AlignConfig, align
 from torchreg.pipelines.storage import load, load_pose, save_result
-from torchreg.results import AlignRecord, AlignResult, Calibration, DemoResult, Result, Status
+from torchreg.results import AlignRecord, AlignResult, Calibration, DemoResult, Result, Status, TrackResult
 
 
 def record(step, batch=1, dtype=torch.float32):
@@ -87,13 +87,25 @@ def test_what_align_returns_can_be_saved(tmp_path):
     assert len(loaded.history) > 3
 
 
-def test_demo_results_come_back(tmp_path):
-    saved = DemoResult(
-        poses=torch.zeros(2, 27), truths=torch.ones(2, 27), clouds=torch.ones(2, 4, 3),
-        inliers=torch.tensor([[True, False, True, True]] * 2), tip_errors=torch.zeros(2, 5),
-        tips_seen=torch.ones(2, 5, dtype=torch.bool), seconds=torch.ones(2, dtype=torch.float64),
-        status=(Status.CONVERGED, Status.MAX_STEPS), seed=7,
+def track(frames=2):
+    return TrackResult(
+        poses=torch.full((frames, 27), torch.nan), std=torch.zeros(frames, 27), keypoints=torch.ones(frames, 21, 3),
+        inlier_ratios=torch.ones(frames, dtype=torch.float64), residuals=torch.zeros(frames, dtype=torch.float64),
+        times=torch.arange(frames, dtype=torch.float64), seconds=torch.ones(frames, dtype=torch.float64),
+        statuses=(Status.CONVERGED, Status.LOST) * (frames // 2), acquired=("found", "lost") * (frames // 2),
     )  # fmt: skip
+
+
+def demonstration():
+    return DemoResult(
+        track=track(), truths=torch.ones(2, 27), clouds=(torch.ones(4, 3), torch.zeros(5, 3)),
+        inliers=(torch.tensor([True, False, True, True]), torch.ones(5, dtype=torch.bool)),
+        tip_errors=torch.zeros(2, 5), tips_seen=torch.ones(2, 5, dtype=torch.bool), seed=7,
+    )  # fmt: skip
+
+
+def test_demo_results_come_back_with_their_track(tmp_path):
+    saved = demonstration()
     saved.save(tmp_path / "poses.safetensors")
     assert same(saved, load(tmp_path / "poses.safetensors"))
 
@@ -305,8 +317,7 @@ def test_archives_without_a_pose_are_refused(tmp_path, hand):
 
 
 def test_only_alignments_hold_a_pose(tmp_path, hand):
-    values = {item.name: torch.zeros(1) for item in fields(DemoResult)}
-    DemoResult(**{**values, "status": (), "seed": 0}).save(tmp_path / "d.safetensors")
+    demonstration().save(tmp_path / "d.safetensors")
     with pytest.raises(FormatError, match="holds a DemoResult; a pose is read from an AlignResult"):
         load_pose(tmp_path / "d.safetensors", hand)
     with pytest.raises(FileNotFoundError):

@@ -1,3 +1,5 @@
+import os
+import sys
 import time
 
 import numpy as np
@@ -7,7 +9,7 @@ from PIL import Image
 
 from torchreg.datasets.hand import hand_motion, surface_skin
 from torchreg.datasets.sequences import range_clouds
-from torchreg.errors import InputError
+from torchreg.errors import InputError, MissingExtraError
 from torchreg.models.hand import Hand
 from torchreg.viz.animation import animate_alignment, save_animation
 
@@ -93,7 +95,7 @@ def test_a_failing_frame_leaves_no_file(tmp_path):
     ("frames", "name", "fps", "error", "message"),
     [
         ([], "a.gif", 20, InputError, "frames must hold at least one frame"),
-        ([plain(0)], "a.mp4", 20, InputError, r"path must end in \.gif, got 'a\.mp4'"),
+        ([plain(0)], "a.avi", 20, InputError, r"path must end in \.gif or \.mp4, got 'a\.avi'"),
         ([plain(0)], "none/a.gif", 20, FileNotFoundError, "does not exist"),
         ([plain(0)], "a.gif", 0.0, InputError, "fps must be positive"),
         ([np.zeros((4, 4))], "a.gif", 20, InputError, r"frames\[0\] must have shape \(H, W, 3\)"),
@@ -104,6 +106,59 @@ def test_a_failing_frame_leaves_no_file(tmp_path):
 def test_save_animation_refuses(tmp_path, frames, name, fps, error, message):
     with pytest.raises(error, match=message):
         save_animation(tmp_path / name, frames, fps)
+
+
+@pytest.fixture
+def encoder(tmp_path, monkeypatch):
+    """Put a stand-in for ffmpeg, which keeps what it is given, on the path; return the function that makes it."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    monkeypatch.setenv("PATH", str(folder), prepend=os.pathsep)
+
+    def make(code):
+        program = folder / "ffmpeg"
+        program.write_text(f"#!{sys.executable}\nimport sys\nraw = sys.stdin.buffer.read()\n{code}\n", encoding="utf-8")
+        program.chmod(0o755)
+
+    make("open(sys.argv[-1], 'wb').write(' '.join(sys.argv).encode() + b'|' + raw)")
+    return make
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the stand-in is a script")
+def test_mp4_is_encoded_by_ffmpeg(tmp_path, encoder):
+    frames = [plain((255, 0, 0)), plain((0, 90, 255))]
+    path = save_animation(tmp_path / "a.mp4", frames, 12.5)
+    command, _, raw = path.read_bytes().partition(b"|")
+    options = command.decode().split()
+    assert options[options.index("-s") + 1] == "40x30"
+    assert options[options.index("-framerate") + 1] == "12.5"
+    assert "h264" in options
+    given = np.frombuffer(raw, dtype=np.uint8).reshape(2, 30, 40, 4)[..., :3]
+    # Without the few tones of a GIF.
+    np.testing.assert_array_equal(given, np.stack(frames))
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the stand-in is a script")
+def test_an_encoder_that_fails_is_told_and_an_interrupted_one_leaves_what_is_drawn(tmp_path, encoder):
+    def stop(done, _):
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        save_animation(tmp_path / "a.mp4", [plain(0)] * 5, on_frame=stop)
+    assert len((tmp_path / "a.mp4").read_bytes().partition(b"|")[2]) == 2 * 30 * 40 * 4
+    encoder("print('Unknown encoder', file=sys.stderr); sys.exit(3)")
+    with pytest.raises(OSError, match=r"b\.mp4: ffmpeg failed \(Unknown encoder\); write a \.gif"):
+        save_animation(tmp_path / "b.mp4", [plain(0)])
+    with pytest.raises(InputError, match=r"frames\[1\]"):
+        save_animation(tmp_path / "b.mp4", [plain(0), plain(0, (9, 9))])
+    assert not (tmp_path / "b.mp4").exists()
+
+
+def test_mp4_needs_ffmpeg(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(MissingExtraError, match=r"a\.mp4 needs the program ffmpeg"):
+        save_animation(tmp_path / "a.mp4", [plain(0)])
 
 
 def test_an_alignment_plays_small_and_quickly(hand, skin, clouds, tmp_path):

@@ -13,6 +13,8 @@ from torchreg.cli.reporting import interruption, reporting
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from torchreg.results import DemoResult
+
 
 @reporting
 def demo(
@@ -24,13 +26,13 @@ def demo(
     picture: Annotated[bool, typer.Option("--picture/--no-picture", help="Whether to draw the animation.")] = True,
     force: Force = False,
 ) -> None:
-    """Run the main job on built-in data: follow a bending hand through noisy one-sided clouds with outliers.
+    """Run the main job on built-in data: find a hand and follow it, as a noisy pair of cameras sees it, with outliers.
 
-    Writes poses.safetensors (read it with torchreg.load), hand.glb and alignment.gif. Ctrl-C ends the sequence early;
+    Writes poses.safetensors (read it with torchreg.load), hand.glb and tracking.gif. Ctrl-C ends the sequence early;
     what was done is written.
     """
-    poses, scene, movie = output / "poses.safetensors", output / "hand.glb", output / "alignment.gif"
-    wanted = [poses, poses.with_suffix(".json"), scene, *([movie] if picture else [])]
+    poses, scene, movie = output / "poses.safetensors", output / "hand.glb", output / "tracking.gif"
+    wanted = [poses, poses.with_suffix(".json"), *([movie] if picture else []), scene]
     check_outputs([path for path in wanted if output.exists()], force)
     output.mkdir(parents=True, exist_ok=True)
 
@@ -38,22 +40,20 @@ def demo(
 
     from torchreg.models.hand import Hand
     from torchreg.pipelines.demo import DEMO_FPS, run_demo
-    from torchreg.viz.gltf import save_shape_animation
+    from torchreg.viz.tracking import animate_track, save_track_gltf
 
-    with tqdm(total=frames, unit="frame", desc="aligning", leave=False) as bar:
+    with tqdm(total=frames, unit="frame", desc="tracking", leave=False) as bar:
         result = run_demo(frames, seed, on_frame=lambda done, planned: bar.update())
-    count, hand = len(result.poses), Hand()
+    count, hand = len(result.clouds), Hand()
     result.save(poses)
-    typer.echo(f"{count} frames of {result.clouds.shape[1]} points: {count / float(result.seconds.sum()):.1f} frames/s")
+    typer.echo(_speed(result))
     _print_tip_errors("all", result.tip_errors.flatten())
-    _print_tip_errors("seen by the camera", result.tip_errors[result.tips_seen])
-    save_shape_animation(scene, hand, result.poses, fps=DEMO_FPS)
+    _print_tip_errors("seen by the cameras", result.tip_errors[result.tips_seen])
+    save_track_gltf(scene, hand, result.track)
     if picture:
-        from torchreg.viz.animation import animate_alignment
-
         with tqdm(total=count, unit="frame", desc="drawing", leave=False) as bar:
-            animate_alignment(
-                movie, hand, result.poses, list(result.clouds), inliers=list(result.inliers), fps=DEMO_FPS,
+            animate_track(
+                movie, hand, result.track, result.clouds, inliers=result.inliers, fps=DEMO_FPS,
                 on_frame=lambda done, planned: bar.update(),
             )  # fmt: skip
     typer.echo(f"wrote {', '.join(str(path) for path in wanted)}")
@@ -61,7 +61,15 @@ def demo(
         raise interruption(f"{count} of {frames} frames are done")
 
 
+def _speed(result: DemoResult) -> str:
+    sizes, seconds = sorted(len(cloud) for cloud in result.clouds), result.track.seconds
+    points = f"{sizes[0]} to {sizes[-1]} points" if sizes[0] < sizes[-1] else f"{sizes[0]} points"
+    text = f"{len(seconds)} frames of {points}: {float(seconds[0]):.1f} s to find the hand in the first"
+    return text if len(seconds) == 1 else f"{text}, then {1 / float(seconds[1:].mean()):.1f} frames/s"
+
+
 def _print_tip_errors(which: str, errors: Tensor) -> None:
+    errors = errors[errors.isfinite()]
     if len(errors):
         values = f"mean {1e3 * float(errors.mean()):.1f} mm, max {1e3 * float(errors.max()):.1f} mm"
         typer.echo(f"fingertip error, {which}: {values} ({len(errors)} fingertips)")

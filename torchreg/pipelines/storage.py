@@ -46,7 +46,7 @@ _RESULTS: dict[str, type[Result]] = {
     for kind in (AlignResult, Calibration, DemoResult, FrameResult, PoseStarts, TrackResult, TrackState)
 }
 _SHAPE_RECORDS = (ShapeRecord, ShapeSpec, HandSpec, KinematicTree, Joint, Primitive, RigSurface)
-_RECORDS: dict[str, type] = {kind.__name__: kind for kind in (AlignRecord, *_SHAPE_RECORDS)}
+_RECORDS: dict[str, type] = {kind.__name__: kind for kind in (AlignRecord, TrackResult, *_SHAPE_RECORDS)}
 _ENUMS: dict[str, type[Enum]] = {kind.__name__: kind for kind in (Status,)}
 
 

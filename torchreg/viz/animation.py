@@ -1,7 +1,10 @@
-"""Moving pictures: animated GIFs of shapes that follow clouds."""
+"""Moving pictures, animated GIFs or MP4s, of shapes that follow clouds."""
 
 from __future__ import annotations
 
+import contextlib
+import shutil
+import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,7 +17,7 @@ from torch import Tensor
 
 from torchreg._checks import check_positive, check_shape
 from torchreg.datasets.hand import surface_skin
-from torchreg.errors import InputError
+from torchreg.errors import InputError, MissingExtraError
 from torchreg.geometry.visibility import View
 from torchreg.io.atomic import write_atomic
 from torchreg.models.articulated import ArticulatedShape
@@ -24,6 +27,7 @@ from torchreg.viz.figures import draw_alignment, new_figure, watch
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+ANIMATION_ENDINGS = (".gif", ".mp4")
 # Tones of a color channel that are kept: GIFs compress runs of equal pixels.
 _TONES = 32
 # Poses that decide about the common view.
@@ -41,11 +45,11 @@ def save_animation(
     size: tuple[int, int] = (360, 360),
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Return the path of an animated GIF that plays the frames in a loop.
+    """Return the path of a moving picture: an animated GIF that plays in a loop, or an MP4.
 
     Args:
-        path: where to write; the suffix must be .gif. The file is written whole or not at all; an interruption by the
-            keyboard leaves the frames drawn so far in it.
+        path: where to write; the suffix must be .gif or .mp4, for which the program ffmpeg must be installed. The file
+            is written whole or not at all; an interruption by the keyboard leaves the frames drawn so far in it.
         frames: pictures (H, W, 3) of one size, uint8 or in [0, 1], or functions that draw on the matplotlib axes they
             are given.
         fps: frames per second; GIF rounds the time of a frame to 0.01 s.
@@ -56,36 +60,43 @@ def save_animation(
         The path written.
 
     Raises:
-        InputError: if there are no frames, sizes differ, or the suffix is not .gif.
+        InputError: if there are no frames, sizes differ, or the suffix is another.
         FileNotFoundError: if the folder does not exist.
+        MissingExtraError: if ffmpeg is needed and not found.
+        OSError: if ffmpeg fails.
     """
-    path = _checked_path(path)
+    path = check_animation_path(path)
     check_positive(fps, "fps")
     if not len(frames):
         raise InputError("frames must hold at least one frame, got none")
     first = _picture(frames[0], size, 0)
     height, width = first.shape[:2]
-    from matplotlib.animation import PillowWriter
-
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "animation.gif"
-        writer: Any = PillowWriter(fps=round(fps, 3))  # type: ignore[arg-type]
+        file = Path(folder) / f"animation{path.suffix.lower()}"
+        writer = _writer(path, fps)
         figure, (canvas,) = new_figure(width, height)
         shown = canvas.imshow(first, extent=(0, width, height, 0), aspect="auto", interpolation="nearest")
         writer.setup(figure, str(file), dpi=figure.dpi)
+        grabbed = 0
         try:
             for index, frame in enumerate(frames):
                 picture = _picture(frame, size, index) if index else first
                 if picture.shape != first.shape:
                     raise InputError(f"frames[{index}] must be {first.shape} like frames[0], got {picture.shape}")
-                shown.set_data(_few_tones(picture))
+                shown.set_data(_few_tones(picture) if file.suffix == ".gif" else picture)
                 writer.grab_frame()
+                grabbed = index + 1
                 if on_frame is not None:
-                    on_frame(index + 1, len(frames))
-        except KeyboardInterrupt:
-            _finish(writer, file, path)
+                    on_frame(grabbed, len(frames))
+        except BaseException as error:
+            # An encoder outside of this process is told to end in any case.
+            with contextlib.suppress(subprocess.CalledProcessError, IndexError):
+                writer.finish()
+                if isinstance(error, KeyboardInterrupt) and grabbed:
+                    write_atomic(path, file.read_bytes())
             raise
-        _finish(writer, file, path)
+        _finish(writer, path)
+        write_atomic(path, file.read_bytes())
     return path
 
 
@@ -103,16 +114,16 @@ def animate_alignment(
     size: tuple[int, int] = (360, 360),
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Return the path of an animated GIF of a shape that follows clouds.
+    """Return the path of a moving picture of a shape that follows clouds.
 
     Args:
-        path: where to write; the suffix must be .gif.
+        path: where to write; see `save_animation`.
         shape: the articulated shape.
         poses: (T, num_dofs), one per frame.
         clouds: T clouds (M, 3), metres.
         inliers: T masks (M,) bool; all by default.
         fps: frames per second.
-        skin: the surface to draw, with faces; by default a coarse `surface_skin`.
+        skin: the surface to draw, with faces; by default a coarse one.
         camera: (3,) position, see `watch`; it stays where it is.
         up: (3,) see `watch`.
         size: width and height, pixels.
@@ -126,15 +137,15 @@ def animate_alignment(
 
     Cost: about 0.1 s and 25 kB per frame.
     """
-    path = _checked_path(path)
+    path = check_animation_path(path)
     poses = shape.check_pose(poses, "poses").detach()
     check_shape(poses, "poses", (len(clouds), shape.num_dofs))
     if inliers is not None and len(inliers) != len(clouds):
         raise InputError(f"inliers must hold one mask per cloud ({len(clouds)}), got {len(inliers)}")
     if not len(clouds):
         raise InputError("clouds must hold at least one cloud, got none")
-    surface = surface_skin(shape, spacing=_coarse_spacing(shape)) if skin is None else skin
-    view = _common_view(surface, poses, camera, up, size)
+    surface = coarse_skin(shape) if skin is None else skin
+    view = common_view(surface, poses, camera, up, size)
 
     def draw(index: int) -> Callable[[Axes], object]:
         mask = None if inliers is None else inliers[index]
@@ -145,19 +156,23 @@ def animate_alignment(
     return save_animation(path, [draw(index) for index in range(len(clouds))], fps, size=size, on_frame=on_frame)
 
 
-def _common_view(
-    skin: LinearBlendSkin, poses: Tensor, camera: Tensor | None, up: Tensor | None, size: tuple[int, int]
+def common_view(
+    skin: LinearBlendSkin,
+    poses: Tensor,
+    camera: Tensor | None = None,
+    up: Tensor | None = None,
+    size: tuple[int, int] = (360, 360),
 ) -> View:
-    """Return the view that shows the surface in all poses."""
+    """Return the view that shows a surface in all poses (T, num_dofs); see `watch`."""
     few = poses[:: max(1, len(poses) // _VIEW_POSES)]
     with torch.no_grad():
         points = torch.cat([skin(pose) for pose in few]).cpu()
     return watch(points, camera=camera, up=up, size=size, margin=0.1)
 
 
-def _coarse_spacing(shape: ArticulatedShape) -> float | None:
-    """Return a grid of 1.5 fusion lengths for a fused surface, which small pictures cannot tell from a finer one."""
-    return None if shape.surface is not None else 1.5 * shape.nu
+def coarse_skin(shape: ArticulatedShape) -> LinearBlendSkin:
+    """Return the surface of a shape with a grid of 1.5 fusion lengths, which small pictures cannot tell from finer."""
+    return surface_skin(shape, spacing=None if shape.surface is not None else 1.5 * shape.nu)
 
 
 def _picture(frame: Frame, size: tuple[int, int], index: int) -> NDArray[np.uint8]:
@@ -182,16 +197,29 @@ def _few_tones(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.round(np.round(picture / step) * step).astype(np.uint8)
 
 
-def _checked_path(path: str | Path) -> Path:
+def check_animation_path(path: str | Path) -> Path:
+    """Return the path if a moving picture can be written there; raises what `save_animation` raises, but earlier."""
     path = Path(path)
-    if path.suffix.lower() != ".gif":
-        raise InputError(f"path must end in .gif, got {path.name!r}; rename the output file")
+    if path.suffix.lower() not in ANIMATION_ENDINGS:
+        raise InputError(f"path must end in .gif or .mp4, got {path.name!r}; rename the output file")
+    if path.suffix.lower() == ".mp4" and shutil.which("ffmpeg") is None:
+        raise MissingExtraError(f"{path.name} needs the program ffmpeg, which is not there; install it or write a .gif")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"the folder {path.parent} does not exist; create it first")
     return path
 
 
-def _finish(writer: Any, file: Path, path: Path) -> None:
-    if writer._frames:
+def _writer(path: Path, fps: float) -> Any:
+    from matplotlib.animation import FFMpegWriter, PillowWriter
+
+    if path.suffix.lower() == ".mp4":
+        return FFMpegWriter(fps=round(fps, 3), codec="h264", bitrate=-1)  # type: ignore[arg-type]
+    return PillowWriter(fps=round(fps, 3))  # type: ignore[arg-type]
+
+
+def _finish(writer: Any, path: Path) -> None:
+    try:
         writer.finish()
-        write_atomic(path, file.read_bytes())
+    except subprocess.CalledProcessError as error:
+        said = (error.stderr or "").strip().splitlines()
+        raise OSError(f"{path}: ffmpeg failed ({said[-1] if said else error.returncode}); write a .gif") from error

@@ -1,0 +1,310 @@
+"""Tracking from the command line: what is printed and written, resumed runs, frames of no use, errors."""
+
+import json
+from dataclasses import fields
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import torchreg.pipelines.track as track_module
+from torchreg.datasets.hand import hand_motion
+from torchreg.datasets.sequences import range_clouds
+from torchreg.io.frames import save_frames
+from torchreg.io.points import load_points, save_points
+from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.hand import Hand
+from torchreg.pipelines.storage import load
+from torchreg.pipelines.track import TrackConfig, Tracker
+from torchreg.results import PoseStarts, Status
+
+FRAMES = 6
+FAST = ("--movie", "none", "--no-gltf")
+
+
+@pytest.fixture(scope="module")
+def sequence(plain_hand, plain_hand_surface, tmp_path_factory):
+    """A folder with six frames in frames/, all of them in frames.npz, and the first pose in start.json."""
+    place = tmp_path_factory.mktemp("sequence")
+    poses = hand_motion(plain_hand, "bending_palm", FRAMES, seed=1)
+    clouds = range_clouds(plain_hand, poses, num_points=400, camera=torch.zeros(3), skin=plain_hand_surface)
+    save_frames(place / "frames", [cloud.points for cloud in clouds])
+    save_frames(place / "frames.npz", [cloud.points for cloud in clouds])
+    (place / "start.json").write_text(json.dumps(poses[0].tolist()), encoding="utf-8")
+    return place
+
+
+@pytest.fixture
+def command(sequence, tmp_path):
+    """Return the arguments that track the sequence, with other options after them."""
+    return lambda *options, frames=("frames",), out="r": (
+        "track", "hand", *(sequence / name for name in frames), "-o", tmp_path / out,
+        "--start", sequence / "start.json", *options,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def whole(sequence, plain_hand):
+    """What the library makes of the sequence."""
+    frames = [load_points(path).points for path in sorted((sequence / "frames").iterdir())]
+    start = torch.tensor(json.loads((sequence / "start.json").read_text(encoding="utf-8")))
+    return Tracker(plain_hand, start).run(frames, times=[k / 20 for k in range(FRAMES)])
+
+
+def same(first, second):
+    """Return whether two tracks agree to the last bit in all but the time they took."""
+    pairs = [(getattr(first, f.name), getattr(second, f.name)) for f in fields(first) if f.name != "seconds"]
+    return all(
+        torch.equal(a.nan_to_num(-1), b.nan_to_num(-1)) if isinstance(a, torch.Tensor) else a == b for a, b in pairs
+    )
+
+
+def stop_at(monkeypatch, frame, error=KeyboardInterrupt):
+    """Let the tracker be stopped while it works on a frame."""
+    step = Tracker.step
+
+    def stopped(self, points, time=None):
+        if self.state.frame == frame:
+            raise error
+        return step(self, points, time)
+
+    monkeypatch.setattr(Tracker, "step", stopped)
+
+
+def test_a_sequence_is_tracked_and_everything_asked_for_is_written(run, command, whole, tmp_path):
+    answer = run(*command("--overlay", tmp_path / "live"))
+    assert answer.exit_code == 0, answer.output
+    assert f"{FRAMES} frames: {FRAMES} tracked; " in answer.output
+    names = ["live", "r.gif", "r.glb", "r.json", "r.progress", "r.safetensors"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+    result = load(tmp_path / "r.safetensors")
+    assert same(result, whole)
+    assert result.times.tolist() == [k / 20 for k in range(FRAMES)]
+    assert sorted(path.name for path in (tmp_path / "live").iterdir()) == [f"frame_000{k}.png" for k in range(FRAMES)]
+    with Image.open(tmp_path / "r.gif") as file:
+        assert (file.n_frames, file.info["duration"]) == (FRAMES, 50)
+    assert ArticulatedShape.from_gltf(tmp_path / "r.glb").part_names[0] == "palm"
+
+
+def test_archives_and_lists_of_files_are_sequences_too(run, command, whole, tmp_path):
+    listed = [f"frames/frame_000{k}.ply" for k in (3, 0, 5, 2, 1, 4)]
+    for frames in (["frames.npz"], listed):
+        answer = run(*command("--force", "--quiet", *FAST, frames=frames))
+        assert (answer.exit_code, answer.output) == (0, "")
+        assert torch.allclose(load(tmp_path / "r.safetensors").poses, whole.poses, atol=1e-5)
+
+
+@pytest.mark.parametrize("frame", [1, 4, 5])
+def test_an_interrupted_run_goes_on_to_the_same_end(run, command, whole, tmp_path, monkeypatch, frame):
+    with monkeypatch.context() as patch:
+        stop_at(patch, frame)
+        answer = run(*command("--save-every", 2, *FAST))
+    assert answer.exit_code == 130
+    assert f"interrupted; {frame} of {FRAMES} frames are done; --resume goes on from there" in answer.output
+    part = load(tmp_path / "r.safetensors")
+    assert len(part.statuses) == len(part.poses) == frame
+    done = []
+    step = Tracker.step
+    monkeypatch.setattr(Tracker, "step", lambda self, points, time: done.append(time) or step(self, points, time))
+    answer = run(*command("--save-every", 2, "--resume", *FAST))
+    assert answer.exit_code == 0, answer.output
+    assert len(done) == FRAMES - frame
+    assert same(load(tmp_path / "r.safetensors"), whole)
+
+
+def test_a_killed_run_goes_on_from_what_was_saved_last(run, command, whole, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        stop_at(patch, 5, MemoryError)
+        assert isinstance(run(*command("--save-every", 2, *FAST)).exception, MemoryError)
+    assert [path.name for path in tmp_path.iterdir()] == ["r.progress"]
+    assert run(*command("--resume", *FAST)).exit_code == 0
+    assert same(load(tmp_path / "r.safetensors"), whole)
+
+
+def test_an_interruption_while_a_frame_is_drawn_leaves_no_hole(run, command, whole, tmp_path, monkeypatch):
+    from torchreg.viz.tracking import FrameOverlays
+
+    save = FrameOverlays.save
+
+    def interrupted(self, path, data, result):
+        if result.frame == 3:
+            raise KeyboardInterrupt
+        return save(self, path, data, result)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FrameOverlays, "save", interrupted)
+        answer = run(*command("--overlay", tmp_path / "live", *FAST))
+    assert "3 of 6 frames are done" in answer.output
+    assert run(*command("--overlay", tmp_path / "live", "--resume", *FAST)).exit_code == 0
+    assert len(list((tmp_path / "live").iterdir())) == FRAMES
+    assert same(load(tmp_path / "r.safetensors"), whole)
+
+
+def test_an_interruption_before_the_first_frame_leaves_nothing(run, command, tmp_path, monkeypatch):
+    stop_at(monkeypatch, 0)
+    assert run(*command()).exit_code == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_frames_that_came_later_are_added(run, command, whole, tmp_path, monkeypatch):
+    some = [f"frames/frame_000{k}.ply" for k in range(4)]
+    every = [*some, *(f"frames/frame_000{k}.ply" for k in (4, 5))]
+    assert run(*command("--resume", *FAST, frames=some)).exit_code == 0
+    assert run(*command("--resume", *FAST, frames=every)).exit_code == 0
+    assert same(load(tmp_path / "r.safetensors"), whole)
+    stop_at(monkeypatch, FRAMES)
+    # There is nothing left to do but to write.
+    assert run(*command("--resume", "--movie", "none", frames=every)).exit_code == 0
+    assert (tmp_path / "r.glb").exists()
+
+
+def test_earlier_runs_are_neither_overwritten_nor_continued_by_another_command(run, error_of, command, tmp_path):
+    frames = [f"frames/frame_000{k}.ply" for k in range(2)]
+    assert run(*command(*FAST, frames=frames)).exit_code == 0
+    assert "r.progress is how far an earlier run got; pass --resume to go on, or --force" in error_of(*command(*FAST))
+    message = error_of(*command("--resume", "--points", 300, "--fps", 10, *FAST, frames=frames))
+    assert "was written by another command: configuration, --fps differ" in message
+    assert "frames differ" in error_of(*command("--resume", *FAST, frames=["frames/frame_0001.ply"]))
+    assert run(*command("--force", "--points", 300, *FAST, frames=frames)).exit_code == 0
+    (tmp_path / "r.progress").write_bytes(b"PK")
+    assert "r.progress: is no progress of a tracker, or damaged" in error_of(*command("--resume", *FAST))
+    (tmp_path / "r.progress").unlink()
+    assert "r.safetensors exists; pass --force" in error_of(*command("--resume", *FAST))
+    (tmp_path / "live").mkdir()
+    (tmp_path / "live" / "frame_0007.png").touch()
+    assert "frame_0007.png exists" in error_of(*command("--overlay", tmp_path / "live", *FAST, out="other"))
+
+
+def test_frames_that_cannot_be_read_are_dropped(run, command, sequence, tmp_path):
+    folder = tmp_path / "damaged"
+    folder.mkdir()
+    for path in (sequence / "frames").iterdir():
+        (folder / path.name).write_bytes(path.read_bytes())
+    (folder / "frame_0003.ply").write_bytes(b"ply\nbroken")
+    answer = run(*command(*FAST, "--movie", "gif", frames=[folder]))
+    assert answer.exit_code == 1
+    assert answer.output.count("torchreg: warning: frame 3 is dropped: ") == 1
+    assert "frame_0003.ply: must start with 'ply'" in answer.output
+    assert "frame_0003.ply: no data" in answer.output
+    assert "frame_0004.ply: back (" in answer.output
+    assert "6 frames: 5 tracked, 1 no data" in answer.output
+    result = load(tmp_path / "r.safetensors")
+    assert [status.usable for status in result.statuses] == [True, True, True, False, True, True]
+    assert result.poses.shape == (FRAMES, 27)
+
+
+def test_points_that_are_not_finite_are_left_out_or_drop_the_frame(run, command, sequence, tmp_path):
+    frames = [load_points(path).points for path in sorted((sequence / "frames").iterdir())][:2]
+    stack = np.full((2, 1 + max(map(len, frames)), 3), np.nan, dtype=np.float32)
+    counts = [len(frame) + 1 for frame in frames]
+    for rows, frame in zip(stack, frames, strict=True):
+        rows[1 : 1 + len(frame)] = frame
+    np.savez(tmp_path / "f.npz", points=stack, counts=counts)
+    assert run(*command(*FAST, "--quiet", frames=[tmp_path / "f.npz"])).exit_code == 0
+    answer = run(*command(*FAST, "--quiet", "--force", "--nan-policy", "raise", frames=[tmp_path / "f.npz"]))
+    assert answer.exit_code == 1
+    assert "frame 0 is dropped: " in answer.output
+    assert "are not finite" in answer.output
+
+
+def test_millimeters_taken_for_meters_are_warned_of_once(run, command, sequence, whole, tmp_path):
+    (tmp_path / "mm").mkdir()
+    for path in (sequence / "frames").iterdir():
+        save_points(tmp_path / "mm" / path.name, 1000 * load_points(path).points)
+    answer = run(*command(*FAST, frames=[tmp_path / "mm"]))
+    assert answer.exit_code == 1
+    assert answer.output.count("torchreg: warning: the data spread over") == 1
+    assert "6 frames: 0 tracked, 6 other units" in answer.output
+    assert load(tmp_path / "r.safetensors").statuses == (Status.OTHER_UNITS,) * FRAMES
+    assert run(*command(*FAST, "--force", "--scale", "0.001", frames=[tmp_path / "mm"])).exit_code == 0
+    assert torch.allclose(load(tmp_path / "r.safetensors").poses, whole.poses, atol=1e-3)
+
+
+def test_options_reach_the_tracker(run, command, monkeypatch):
+    seen = []
+
+    def noted(shape, initial_pose=None, *, config=None):
+        seen.append((initial_pose, config))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(track_module, "Tracker", noted)
+    options = ("--prediction", "none", "--points", 300, "--model-points", "data", "--recovery", "starts", "--seed", 4)
+    run(*command(*options))
+    ((pose, config),) = seen
+    assert config == TrackConfig(
+        prediction="none", num_model_points=300, model_points="data", recovery="starts", seed=4
+    )
+    assert pose.shape == (27,)
+
+
+def test_without_a_start_the_shape_is_searched_for(run, sequence, tmp_path, monkeypatch):
+    start = torch.tensor(json.loads((sequence / "start.json").read_text(encoding="utf-8")))
+    asked = []
+
+    def found(shape, data, **options):
+        asked.append(len(data))
+        return PoseStarts(start[None], torch.zeros(1), torch.ones(()))
+
+    monkeypatch.setattr(track_module, "find_pose", found)
+    answer = run("track", "hand", sequence / "frames", "-o", tmp_path / "r", *FAST)
+    assert answer.exit_code == 0, answer.output
+    assert len(asked) == 1
+    assert load(tmp_path / "r.safetensors").acquired[0] == "found"
+
+
+def test_what_is_never_found_has_a_picture_and_no_gltf(run, sequence, tmp_path):
+    answer = run(
+        "track", "hand", sequence / "frames/frame_0000.ply", "-o", tmp_path / "r", "--recovery", "none",
+        "--overlay", tmp_path / "live",
+    )  # fmt: skip
+    assert answer.exit_code == 1, answer.output
+    assert "1 frame: 0 tracked, 1 lost" in answer.output
+    names = ["live", "r.gif", "r.json", "r.progress", "r.safetensors"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+    assert not load(tmp_path / "r.safetensors").poses.isfinite().any()
+    assert (tmp_path / "live" / "frame_0000.png").exists()
+
+
+def test_a_robot_is_tracked(run, folder, tmp_path):
+    pose = ArticulatedShape.from_urdf(folder / "arm.urdf", free_base=False).rest_pose()
+    (tmp_path / "start.json").write_text(json.dumps(pose.tolist()), encoding="utf-8")
+    answer = run(
+        "track", folder / "arm.urdf", folder / "arm.npz", "-o", tmp_path / "r", "--start", tmp_path / "start.json",
+        *FAST,
+    )  # fmt: skip
+    assert answer.exit_code == 0, answer.output
+    assert abs(load(tmp_path / "r.safetensors").poses[0, 0].item() - 0.02) < 0.005
+
+
+def test_errors_are_one_line(error_of, command, sequence, tmp_path):
+    for arguments, message in [
+        (command(frames=["none.ply"]), "none.ply: No such file or directory"),
+        (command(frames=["frames", "frames.npz"]), "frames is a folder; pass it alone"),
+        (command(frames=["start.json"]), "has the unknown ending '.json'"),
+        (command("--start", tmp_path / "none.json"), "none.json: No such file or directory"),
+        (command("--movie", "avi"), "--movie must be one of gif, mp4, none; got 'avi'"),
+        (command("--fps", 0), "--fps must be positive"),
+        (command("--scale", -1), "--scale must be positive"),
+        (command("--prediction", "maybe"), "prediction must be one of velocity, none"),
+        (command("--model-points", "few"), "model_points must be one of seen, data, shape"),
+        (command("--nan-policy", "keep"), "nan_policy must be one of raise, omit"),
+        (command("--points", 0), "num_model_points must be at least 1"),
+        (command("--fixed-base"), "--free-base/--fixed-base has no meaning for hand"),
+        (command(out="no/r"), "no does not exist; create it first"),
+        (command("--overlay", tmp_path / "no" / "live"), "live: No such file or directory"),
+    ]:
+        assert message in error_of(*arguments), arguments
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_movies_in_mp4_need_ffmpeg_before_anything_is_done(error_of, command, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert "r.mp4 needs the program ffmpeg, which is not there" in error_of(*command("--movie", "mp4"))
+
+
+def test_shapes_with_as_many_joints_are_told_apart(run, error_of, command, sequence, tmp_path):
+    assert run(*command(*FAST, frames=["frames/frame_0000.ply"])).exit_code == 0
+    other = ["hand-left" if argument == "hand" else argument for argument in command("--resume", *FAST)]
+    assert "was written by another command: shape differ" in error_of(*other)
+    assert Hand("left").num_dofs == Hand().num_dofs
