@@ -1,0 +1,47 @@
+"""Range scans from files."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import torch
+
+from torchreg.errors import FormatError
+from torchreg.geometry.normals import weld
+from torchreg.geometry.range_scan import RangeScan
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
+from torchreg.io.points import load_points
+
+
+def load_scan(
+    path: str | os.PathLike[str],
+    *,
+    viewpoint: Any = None,
+    nan_policy: str = "raise",
+    limits: FileLimits = DEFAULT_LIMITS,
+    dtype: torch.dtype = torch.float32,
+) -> RangeScan:
+    """Return the range scan that a file holds, with its faces and normals where it has them.
+
+    Points keep the order and the unit of the file. What it does not hold is computed, see `RangeScan`.
+
+    Args:
+        path: a local file; see `load_points` for the formats.
+        viewpoint: (3,) where the camera was, in the unit of the file; None if that is not known.
+        nan_policy: see `load_points`; ``"omit"`` drops what a scanner writes where it measured nothing.
+        limits: see `load_points`.
+        dtype: torch.float32 or torch.float64.
+
+    Returns:
+        the scan, on the CPU.
+
+    Raises:
+        FormatError: if there are too few points for a surface, and as `load_points`; names the file.
+        FileNotFoundError: if there is no such file.
+        InputError: if the viewpoint is not three finite numbers.
+    """
+    cloud = load_points(path, nan_policy=nan_policy, limits=limits, dtype=dtype)
+    if int(weld(cloud.points).max()) < 2:
+        raise FormatError(f"{os.fspath(path)}: a scan needs points at 3 places or more, it holds {len(cloud)} points")
+    return RangeScan(cloud.points, cloud.faces, cloud.normals, viewpoint=viewpoint)
