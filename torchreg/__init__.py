@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from torchreg import errors, metrics
     from torchreg.correspondence.sigma import SigmaSchedule
     from torchreg.geometry.mesh import TriangleMesh
+    from torchreg.geometry.range_scan import RangeScan
     from torchreg.io.points import load_mesh, load_points
     from torchreg.losses.em import EMLoss
     from torchreg.models.articulated import ArticulatedShape
@@ -46,6 +47,7 @@ __all__ = [
     "Hand",
     "LinearBlendSkin",
     "PoseStarts",
+    "RangeScan",
     "SigmaSchedule",
     "Status",
     "TrackConfig",
@@ -79,6 +81,7 @@ _OWNERS = {
     "Hand": "models.hand",
     "LinearBlendSkin": "models.skin",
     "PoseStarts": "results",
+    "RangeScan": "geometry.range_scan",
     "SigmaSchedule": "correspondence.sigma",
     "Status": "results",
     "TrackConfig": "pipelines.track",
