@@ -217,7 +217,7 @@ def test_subsample_by_count_or_spacing():
     for wrong in ({}, {"count": 3, "spacing": 1.0}):
         with pytest.raises(InputError, match="give either count or spacing"):
             scan.uniform_subsample(**wrong)
-    with pytest.raises(InputError, match="radius must be positive"):
+    with pytest.raises(InputError, match="spacing must be positive"):
         scan.uniform_subsample(spacing=0.0)
 
 

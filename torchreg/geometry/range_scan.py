@@ -202,9 +202,10 @@ class RangeScan:
         """
         if (count is None) == (spacing is None):
             raise InputError(f"give either count or spacing, got count={count} and spacing={spacing}")
-        if count is not None:
-            return poisson_disk_count(self.points, count, generator)
-        return poisson_disk(self.points, 0.0 if spacing is None else spacing, generator)
+        if spacing is not None:
+            check_positive(spacing, "spacing")
+            return poisson_disk(self.points, spacing, generator)
+        return poisson_disk_count(self.points, count or 0, generator)
 
     def subset(self, which: Any, *, mark_cut: bool = False) -> RangeScan:
         """Return the scan of some of the points: their normals and boundary as they are, and the faces among them.
