@@ -57,8 +57,10 @@ _HARVEST_SHARE, _SHOWN_SHARE = 0.022, 0.03
 _FEW_SHOWN, _PART_CAP = 4, 2.0
 # A model point whose share of the data is less has none.
 _COVERED = 0.05
-# A loss: fewer inliers than this, or than these shares of the running count and ratio; or model points without data.
+# A loss: fewer inliers than this, or than these shares of the running count and ratio; or model points without data;
+# or residuals so many times the usual ones, and not below a share of the size.
 _MIN_INLIERS, _LOST_COUNT, _LOST_RATIO, _LOST_COVERED = 10, 0.12, 0.5, 0.3
+_LOST_RESIDUAL, _FINE_RESIDUAL = 1.8, 0.006
 # A doubt, beyond what is usual: novel dense data off the surface, so many or this share of the inliers; residuals, this
 # many times; model points without data or joints at limits, by these shares; points off the prediction, by this share
 # of the size.
@@ -67,6 +69,8 @@ _DOUBT_COVERED, _DOUBT_HELD, _DOUBT_JUMP = 0.25, 0.3, 0.15
 # What did not help is tried again at once so many times, then after longer and longer rests, frames; strays that
 # stay after so many attempts are background.
 _FREE_FAILS, _STARTS_FAILS, _SEARCH_FAILS, _FIND_FAILS, _LONGEST_REST, _LEARNED_AFTER = 1, 1, 3, 5, 32, 6
+# A pose found everywhere is checked in as many frames at most, until it holds.
+_CHECKS = 3
 # Data that another pose must explain beyond those that the prediction led to.
 _MIN_GAIN = 4.0
 # Frames after a loss before searching around the last pose, and everywhere.
@@ -216,6 +220,11 @@ class _Fit:
     def ratio(self) -> float:
         """Inliers as a share of the data in reach."""
         return self.inliers / max(1, self.distance.shape[-1])
+
+    @property
+    def explained(self) -> float:
+        """How many data in reach lie on the surface, softly counted, less the prior's cost."""
+        return (1 - self.cost / max(1, self.distance.shape[-1])) * int(self.view.near.sum())
 
     @property
     def world(self) -> Tensor:
@@ -369,7 +378,7 @@ class Tracker:
             frame=0, time=0.0, interval=0.0, pose=pose, velocity=torch.zeros_like(pose), points=points,
             weights=self._skin.weights, reference_pose=self._skin.reference_pose, previous=pose[None][:0],
             strays=points[:0], error=0.0, joint_error=0.0, total=0.0, inliers=0.0, ratio=0.0, residual=0.0,
-            covered=0.0, held=0.0, lost=0, rest=0, fails=0, seed=self.config.seed,
+            covered=0.0, held=0.0, lost=0, rest=0, fails=0, unsure=0, seed=self.config.seed,
         )  # fmt: skip
 
     def _checked(self, points: Tensor) -> Tensor:
@@ -405,12 +414,23 @@ class Tracker:
         waits = state.rest > 0 or self.config.recovery != "full"
         if (fit is None or _is_lost(state, fit)) and not waits:
             fit = self._sought(state, frame)
-        if fit is not None and not _is_lost(state, fit):
-            return fit, _rested(state, True)
-        return None, _waited(state) if waits else _rested(state, False)
+        fit, state = _kept(state, fit)
+        return fit, _rested(state, fit is not None) if fit is not None or not waits else _waited(state)
 
     def _follow(self, state: TrackState, frame: _Frame) -> tuple[_Fit | None, TrackState]:
         """Return the fit of a later frame, if any is worth it, and what the search for it leaves of the state."""
+        checks = state.unsure
+        fit, state = self._continued(state, frame)
+        if checks == 0 or (fit is not None and fit.how == "found"):
+            return fit, state
+        # A pose that was found everywhere must hold against the same search in another frame.
+        rival = self._sought(state, frame)
+        if rival is None or (fit is not None and rival.explained < fit.explained + _MIN_GAIN):
+            return fit, replace(state, unsure=0)
+        return rival, replace(state, unsure=checks - 1)
+
+    def _continued(self, state: TrackState, frame: _Frame) -> tuple[_Fit | None, TrackState]:
+        """Return the same, from the frames before and what can be searched around them."""
         view = self._view(state, frame, self._predicted(state, frame.gap), self._seen_skin(state))
         fit = None if view is None else self._descended(view, state, frame.gap)
         if fit is not None and not _is_lost(state, fit) and not _is_doubtful(state, fit):
@@ -418,12 +438,12 @@ class Tracker:
         lost = fit is None or _is_lost(state, fit)
         if self.config.recovery != "none" and (lost or state.rest == 0):
             fit = self._recovered(state, frame, view, fit)
-            tried = state.rest == 0
+            tried = state.rest == 0 and (not lost or _may_show(state, frame))
             good = fit is not None and not _is_lost(state, fit) and not _is_doubtful(state, fit)
             state = _rested(state, good) if good or tried else _waited(state)
         else:
             state = _waited(state)
-        return (None if fit is None or _is_lost(state, fit) else fit), state
+        return _kept(state, fit)
 
     def _predicted(self, state: TrackState, gap: float) -> Tensor:
         """Return the pose (num_dofs,) expected after some intervals."""
@@ -536,7 +556,7 @@ class Tracker:
 
         Those of a doubtful fit may be what the fit missed, and are expected only after attempts to explain them.
         """
-        if _in_doubt(state):
+        if _in_doubt(state) and fit.how != "found":
             return state.strays
         trunk = self.shape.part_transforms(fit.pose[0])[0]
         strays = transform_points(invert_rigid(trunk), fit.strays)
@@ -555,14 +575,19 @@ class Tracker:
     def _recovered(self, state: TrackState, frame: _Frame, view: _View | None, fit: _Fit | None) -> _Fit | None:
         """Return the best fit of what is tried, from what is cheap to what is not, until none is in doubt."""
         best = fit
+        was_lost = fit is None or _is_lost(state, fit)
         for attempt in self._attempts(state, frame, view, fit):
             if attempt is None:
                 continue
-            lost = best is None or _is_lost(state, best)
             # What is hidden may be anywhere; only what explains more data is worth a jump.
-            if best is None or (lost and not _is_lost(state, attempt)) or attempt.cost < best.cost - _MIN_GAIN:
+            if (
+                best is None
+                or attempt.explained > best.explained + _MIN_GAIN
+                or (_is_lost(state, best) and not _is_lost(state, attempt))
+            ):
                 best = attempt
-            if not _is_lost(state, best) and not _is_doubtful(state, best):
+            # After a loss, doubts are left to the next frames.
+            if not _is_lost(state, best) and (was_lost or not _is_doubtful(state, best)):
                 break
         return best
 
@@ -571,7 +596,7 @@ class Tracker:
     ) -> Iterator[_Fit | None]:
         """Yield other fits of a frame, each costing more than the one before."""
         lost = fit is None or _is_lost(state, fit)
-        dear = self.config.recovery == "full" and state.rest == 0
+        dear = self.config.recovery == "full" and state.rest == 0 and (not lost or _may_show(state, frame))
         if view is not None:
             problem = view.problem
             known = torch.cat([problem.prior.mean[None], view.local(state.pose[None])], dim=1)
@@ -586,7 +611,7 @@ class Tracker:
                 if dear and (state.lost >= _SEARCH_AFTER if lost else state.fails == _SEARCH_FAILS):
                     yield self._fit(view, state, "search", search.settle(narrowed, 1)[0][:, 0])
         overdue = state.lost >= _FIND_AFTER if lost else state.fails == _FIND_FAILS
-        if dear and overdue and _may_show(state, frame):
+        if dear and overdue:
             yield self._sought(state, frame)
 
     def _sought(self, state: TrackState, frame: _Frame) -> _Fit | None:
@@ -594,7 +619,7 @@ class Tracker:
         data = _thinned(frame.data, _MAX_FOUND_DATA, _generator(state))
         starts = find_pose(self.shape, data, config=FindPoseConfig(seed=state.seed))
         poses = starts.poses
-        if state.tracked:
+        if state.lost:
             poses = poses[starts.costs <= starts.costs.min() + _AS_GOOD * len(data)]
             away = (self.shape.keypoints(poses) - self.shape.keypoints(state.pose)).norm(dim=-1).mean(-1)
             poses = poses[away.argsort()]
@@ -604,7 +629,8 @@ class Tracker:
         """Return the record of a frame that was fitted, and go on from it."""
         pose = fit.world
         covariance, share = self._covariance(fit)
-        known = state.tracked and state.lost == 0 and fit.how != "found" and not _is_far(state, fit)
+        anew = fit.how == "found"
+        known = state.tracked and state.lost == 0 and not anew and not _is_far(state, fit)
         # Where it goes after a beginning, nothing says yet.
         surprise, velocity, jump = torch.full_like(pose, _NEW_JOINT_ERROR), torch.zeros_like(pose), self._new_error
         if known:
@@ -791,7 +817,12 @@ def _is_lost(state: TrackState, fit: _Fit) -> bool:
     few = fit.inliers < max(_MIN_INLIERS, _LOST_COUNT * state.inliers)
     # What moved far must bring most of its data along.
     stray = _is_far(state, fit) and fit.inliers < _LOST_RATIO * state.inliers
-    return few or stray or fit.ratio < _LOST_RATIO * state.ratio or fit.covered < _LOST_COVERED * state.covered
+    # Data of something else lie beside a surface that was drawn to them.
+    loose = _DOUBT_RESIDUAL if state.lost else _LOST_RESIDUAL
+    usual = max(loose * state.residual, _FINE_RESIDUAL * fit.view.problem.size)
+    vague = state.tracked and float(fit.noise) > usual
+    bare = fit.covered < _LOST_COVERED * state.covered
+    return few or stray or vague or bare or fit.ratio < _LOST_RATIO * state.ratio
 
 
 def _is_far(state: TrackState, fit: _Fit) -> bool:
@@ -805,9 +836,10 @@ def _in_doubt(state: TrackState) -> bool:
 
 def _usual_after(state: TrackState, fit: _Fit, total: int) -> TrackState:
     """Return the state with running means that a fit has gone into."""
-    if _in_doubt(state):
+    anew = fit.how == "found" and state.lost == 0
+    if _in_doubt(state) and not anew:
         return state
-    keep = _MEMORY if state.tracked else 0.0
+    keep = 0.0 if anew or not state.tracked else _MEMORY
     pairs = (
         (state.total, total), (state.inliers, fit.inliers), (state.ratio, fit.ratio), (state.residual, fit.noise),
         (state.covered, fit.covered), (state.held, fit.held),
@@ -839,6 +871,13 @@ def _rested(state: TrackState, good: bool) -> TrackState:
     if good:
         return replace(state, rest=0, fails=0)
     return replace(state, rest=_rest_after(state.fails + 1), fails=state.fails + 1)
+
+
+def _kept(state: TrackState, fit: _Fit | None) -> tuple[_Fit | None, TrackState]:
+    """Return the fit if it is no loss, and the state, which is unsure of a fit that was found everywhere."""
+    if fit is None or _is_lost(state, fit):
+        return None, state
+    return fit, replace(state, unsure=_CHECKS) if fit.how == "found" else state
 
 
 def _waited(state: TrackState) -> TrackState:
