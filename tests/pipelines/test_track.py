@@ -310,7 +310,7 @@ def test_what_is_nowhere_stays_unknown_and_is_sought_ever_more_rarely(tracker, m
     assert result.poses.isnan().all()
     assert result.keypoints.isnan().all()
     assert not own.state.found
-    gaps = [later - earlier for earlier, later in pairwise(calls)]
+    gaps = [later - earlier for earlier, later in pairwise(sorted(set(calls)))]
     assert gaps == sorted(gaps)
     assert gaps[-1] >= 8
     unsought = tracker(None, recovery="none")
