@@ -1,0 +1,295 @@
+"""Rigid motions from mostly wrong matches: truth under outliers, several motions, groups, scores, refusals."""
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import torchreg.solvers.ransac as module
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.rigid import invert_rigid, se3_exp, transform_points
+from torchreg.solvers.ransac import ransac_rigid
+
+THRESHOLD = 0.01
+
+
+def matched(seed, shares=(0.1,), count=200, noise=0.002, batch=()):
+    """Return source, target, their normals, and the motions behind the first shares of the rows; the rest is random."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape):
+        return torch.randn(*batch, *shape, generator=generator, dtype=torch.float64)
+
+    source = 0.1 * normal(count, 3)
+    target = 0.3 * normal(count, 3)
+    source_normals = torch.nn.functional.normalize(normal(count, 3), dim=-1)
+    target_normals = torch.nn.functional.normalize(normal(count, 3), dim=-1)
+    motions, start = [], 0
+    for share in shares:
+        motion = se3_exp(normal(6) * torch.tensor([0.2, 0.2, 0.2, 1.0, 1.0, 1.0]))
+        rows = slice(start, start + round(share * count))
+        target[..., rows, :] = transform_points(motion, source[..., rows, :]) + noise * normal(rows.stop - start, 3)
+        turned = source_normals[..., rows, :] @ motion[..., :3, :3].mT + 0.1 * normal(rows.stop - start, 3)
+        target_normals[..., rows, :] = torch.nn.functional.normalize(turned, dim=-1)
+        motions.append(motion)
+        start = rows.stop
+    return source, target, {"source_normals": source_normals, "target_normals": target_normals}, motions
+
+
+def error(transform, motion, source):
+    """Return the mean distance of the points from their true places."""
+    return (transform_points(transform, source) - transform_points(motion, source)).norm(dim=-1).mean(-1)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.1])
+@pytest.mark.parametrize("with_normals", [False, True])
+def test_the_motion_is_found_under_80_and_90_percent_of_outliers(share, with_normals):
+    source, target, normals, (motion,) = matched(0, (share,), batch=(25,))
+    result = ransac_rigid(source, target, threshold=THRESHOLD, **(normals if with_normals else {}))
+    assert (error(result.transforms[:, 0], motion, source) < 0.004).all()
+    right = round(share * 200)
+    assert (result.inliers[:, 0, :right].double().mean(-1) > 0.9).all()
+    assert (result.inliers[:, 0, right:].sum(-1) <= 3).all()
+
+
+def test_few_samples_suffice():
+    source, target, _, (motion,) = matched(1, batch=(25,))
+    result = ransac_rigid(source, target, threshold=THRESHOLD, num_trials=60)
+    assert (error(result.transforms[:, 0], motion, source) < 0.004).sum() >= 23
+
+
+def test_several_motions_come_out_best_first():
+    source, target, normals, motions = matched(2, (0.25, 0.15, 0.1), batch=(8,))
+    for given_normals in ({}, normals):
+        result = ransac_rigid(source, target, threshold=THRESHOLD, **given_normals)
+        for place, motion in enumerate(motions):
+            assert (error(result.transforms[:, place], motion, source) < 0.004).all()
+        assert (result.scores.diff(dim=-1) <= 0).all()
+        assert (result.counts[:, :3] >= torch.tensor([45, 27, 17])).all()
+        assert (result.counts[:, 3] < result.counts[:, 2] / 2).all()
+
+
+def test_the_motion_is_the_best_fit_to_its_inliers():
+    source, target, _, _ = matched(3, (0.4,), noise=0.001)
+    result = ransac_rigid(source, target, threshold=THRESHOLD)
+    chosen = result.inliers[0]
+    a, b = source[chosen], target[chosen]
+    # The fit by unit quaternions (Horn), independent of the one by singular values.
+    cross = (a - a.mean(0)).T @ (b - b.mean(0))
+    skew = cross - cross.T
+    vector = torch.stack([skew[1, 2], skew[2, 0], skew[0, 1]])
+    table = torch.zeros(4, 4, dtype=torch.float64)
+    table[0, 0] = cross.trace()
+    table[0, 1:] = table[1:, 0] = vector
+    table[1:, 1:] = cross + cross.T - cross.trace() * torch.eye(3, dtype=torch.float64)
+    w, x, y, z = torch.linalg.eigh(table).eigenvectors[:, -1].tolist()
+    rotation = torch.tensor(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ],
+        dtype=torch.float64,
+    )
+    torch.testing.assert_close(result.transforms[0, :3, :3], rotation, atol=5e-3, rtol=0)
+
+
+def test_scores_counts_and_inliers_follow_their_definitions():
+    source, target, normals, _ = matched(4, (0.2,))
+    weights = torch.rand(200, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    result = ransac_rigid(source, target, threshold=THRESHOLD, weights=weights, max_angle=0.4, **normals)
+    for place in range(4):
+        motion = result.transforms[place]
+        distance = (transform_points(motion, source) - target).norm(dim=-1)
+        angle = torch.acos(((normals["source_normals"] @ motion[:3, :3].T) * normals["target_normals"]).sum(-1))
+        within = (distance < THRESHOLD) & (angle < 0.4)
+        assert torch.equal(result.inliers[place], within)
+        assert int(result.counts[place]) == int(within.sum())
+        score = (weights * (1 - (distance / THRESHOLD) ** 2))[within].sum()
+        torch.testing.assert_close(result.scores[place], score)
+
+
+@given(st.integers(0, 1000), st.booleans())
+@settings(max_examples=15, deadline=None)
+def test_motions_are_rigid_and_distinct(seed, with_normals):
+    source, target, normals, _ = matched(seed, (0.3, 0.2), count=60, noise=0.004)
+    result = ransac_rigid(source, target, threshold=THRESHOLD, num_trials=80, **(normals if with_normals else {}))
+    rotation = result.transforms[:, :3, :3]
+    eye = torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
+    torch.testing.assert_close(rotation @ rotation.mT, eye, atol=1e-9, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(4, dtype=torch.float64))
+    found = result.transforms[result.counts > 0]
+    for one in range(len(found)):
+        for other in range(one):
+            moved = transform_points(found[one], source) - transform_points(found[other], source)
+            assert moved.square().sum(-1).mean().sqrt() >= 3 * THRESHOLD * (1 - 1e-9)
+
+
+def test_a_generator_decides_all_and_global_randomness_is_left_alone():
+    source, target, _, _ = matched(5, (0.05,), count=60)
+    state = torch.random.get_rng_state()
+    runs = [
+        ransac_rigid(
+            source, target, threshold=THRESHOLD, num_trials=20, generator=torch.Generator().manual_seed(seed)
+        ).transforms
+        for seed in (0, 0, 1)
+    ]
+    assert torch.equal(runs[0], runs[1])
+    assert not torch.equal(runs[0], runs[2])
+    assert torch.equal(torch.random.get_rng_state(), state)
+    assert torch.equal(ransac_rigid(source, target, threshold=THRESHOLD, num_trials=20).transforms, runs[0])
+
+
+@pytest.mark.parametrize("with_normals", [False, True])
+def test_groups_padded_into_a_batch_equal_each_group_alone(with_normals):
+    sizes = [40, 75, 60]
+    groups = [matched(seed, (0.3,), count=size) for seed, size in enumerate(sizes)]
+    fill = torch.full((3, 75, 3), torch.nan, dtype=torch.float64)
+    tables = {name: fill.clone() for name in ("source", "target", "source_normals", "target_normals")}
+    mask = torch.arange(75) < torch.tensor(sizes)[:, None]
+    for row, (source, target, normals, _) in enumerate(groups):
+        for name, value in {"source": source, "target": target, **normals}.items():
+            tables[name][row, : sizes[row]] = value
+    names = list(tables) if with_normals else ["source", "target"]
+    batch = ransac_rigid(**{name: tables[name] for name in names}, mask=mask, threshold=THRESHOLD, num_trials=100)
+    for row, (source, target, normals, _) in enumerate(groups):
+        alone = ransac_rigid(source, target, threshold=THRESHOLD, num_trials=100, **(normals if with_normals else {}))
+        torch.testing.assert_close(batch.transforms[row], alone.transforms, atol=1e-8, rtol=0)
+        assert torch.equal(batch.inliers[row, :, : sizes[row]], alone.inliers)
+        assert not batch.inliers[row, :, sizes[row] :].any()
+
+
+def test_leading_dimensions_stay():
+    source, target, _, _ = matched(6, (0.5,), count=20, batch=(2, 3))
+    result = ransac_rigid(source, target, threshold=THRESHOLD, num_trials=10, num_hypotheses=2)
+    assert result.transforms.shape == (2, 3, 2, 4, 4)
+    assert result.inliers.shape == (2, 3, 2, 20)
+    assert result.counts.shape == result.scores.shape == (2, 3, 2)
+
+
+def test_chunks_change_nothing(monkeypatch):
+    source, target, _, _ = matched(7, (0.2,), count=50, batch=(3,))
+    whole = ransac_rigid(source, target, threshold=THRESHOLD, num_trials=70)
+    monkeypatch.setattr(module, "_CHUNK", 3 * 50 * 16)
+    parts = ransac_rigid(source, target, threshold=THRESHOLD, num_trials=70)
+    torch.testing.assert_close(parts.transforms, whole.transforms)
+    assert torch.equal(parts.inliers, whole.inliers)
+
+
+def test_moving_source_and_target_moves_the_motions_along():
+    source, target, normals, _ = matched(8, (0.3, 0.2))
+    generator = torch.Generator().manual_seed(0)
+    here, there = se3_exp(torch.randn(2, 6, generator=generator, dtype=torch.float64))
+    plain = ransac_rigid(source, target, threshold=THRESHOLD, num_hypotheses=2, **normals)
+    turned = {
+        "source_normals": normals["source_normals"] @ here[:3, :3].T,
+        "target_normals": normals["target_normals"] @ there[:3, :3].T,
+    }
+    moved = ransac_rigid(
+        transform_points(here, source),
+        transform_points(there, target),
+        threshold=THRESHOLD,
+        num_hypotheses=2,
+        **turned,
+    )
+    torch.testing.assert_close(moved.transforms, there @ plain.transforms @ invert_rigid(here), atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_the_unit_changes_nothing_but_the_unit(unit):
+    source, target, _, _ = matched(9, (0.3,))
+    plain = ransac_rigid(source, target, threshold=THRESHOLD, num_hypotheses=1)
+    scaled = ransac_rigid(unit * source, unit * target, threshold=unit * THRESHOLD, num_hypotheses=1)
+    assert torch.equal(scaled.inliers, plain.inliers)
+    torch.testing.assert_close(scaled.transforms[0, :3, 3] / unit, plain.transforms[0, :3, 3], atol=1e-7, rtol=0)
+
+
+def test_float32_far_from_the_origin_loses_little():
+    source, target, _, (motion,) = matched(10, (0.2,))
+    shift = torch.tensor([300.0, -500.0, 100.0], dtype=torch.float64)
+    result = ransac_rigid((source + shift).float(), (target + shift).float(), threshold=THRESHOLD)
+    assert result.transforms.dtype == torch.float32
+    assert (result.transforms[0, :3, :3] - motion[:3, :3]).abs().max() < 0.02
+    assert result.counts[0] >= 38
+
+
+def test_weights_choose_between_motions_and_weight_zero_is_no_inlier():
+    source, target, _, (first, second) = matched(11, (0.3, 0.3))
+    weights = torch.ones(200, dtype=torch.float64)
+    for low, motion in ((slice(0, 60), second), (slice(60, 120), first)):
+        result = ransac_rigid(
+            source, target, threshold=THRESHOLD, weights=weights.index_fill(0, torch.arange(200)[low], 0.1)
+        )
+        assert error(result.transforms[0], motion, source) < 0.004
+    result = ransac_rigid(source, target, threshold=THRESHOLD, weights=weights.index_fill(0, torch.arange(60), 0.0))
+    assert not result.inliers[:, :60].any()
+
+
+def test_normals_that_contradict_leave_nothing():
+    source, target, normals, _ = matched(12, (1.0,))
+    normals["target_normals"] = -normals["target_normals"]
+    result = ransac_rigid(source, target, threshold=THRESHOLD, **normals)
+    assert int(result.counts[0]) < 20
+    assert int(ransac_rigid(source, target, threshold=THRESHOLD).counts[0]) == 200
+
+
+def test_a_mirror_image_is_not_matched_by_a_mirror():
+    source, _, _, _ = matched(13)
+    result = ransac_rigid(source, source * torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64), threshold=THRESHOLD)
+    assert int(result.counts.max()) < 60
+    assert (torch.linalg.det(result.transforms[:, :3, :3]) > 0).all()
+
+
+@pytest.mark.parametrize("kind", ["one", "two", "line", "same", "masked", "weightless"])
+def test_too_little_gives_the_identity_and_no_inliers(kind):
+    line = torch.linspace(0, 1, 30, dtype=torch.float64)[:, None] * torch.tensor([[1.0, 2.0, 3.0]])
+    source = {"one": line[:1], "two": line[:2], "line": line, "same": 0 * line + 1}.get(
+        kind, torch.linalg.cross(line.sin(), line)
+    )
+    mask = torch.full(source.shape[:-1], kind != "masked")
+    weights = torch.full(source.shape[:-1], float(kind != "weightless"))
+    result = ransac_rigid(source, source, threshold=THRESHOLD, mask=mask, weights=weights, num_trials=40)
+    assert result.counts.tolist() == [0] * 4
+    assert result.scores.tolist() == [0] * 4
+    assert not result.inliers.any()
+    assert torch.equal(result.transforms, torch.eye(4, dtype=torch.float64).expand(4, 4, 4))
+
+
+def test_more_hypotheses_than_trials_are_filled_up():
+    source, target, _, _ = matched(14, (0.5,))
+    result = ransac_rigid(source, target, threshold=THRESHOLD, num_trials=2, num_hypotheses=5)
+    assert result.transforms.shape == (5, 4, 4)
+    assert result.counts[2:].tolist() == [0, 0, 0]
+    assert torch.equal(result.transforms[4], torch.eye(4, dtype=torch.float64))
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "message"),
+    [
+        ({"source": torch.zeros(5, 2)}, InputError, r"source must have shape \(..., N, 3\)"),
+        ({"source": torch.zeros(4, 3)}, InputError, "target must have one row per row of source"),
+        ({"target": torch.zeros(5, 3, dtype=torch.float64)}, InputTypeError, "convert one with .to"),
+        ({"target": torch.full((5, 3), torch.nan)}, InputError, "target must be finite"),
+        ({"source": torch.zeros(0, 3), "target": torch.zeros(0, 3)}, InputError, "source must hold at least 1"),
+        ({"source_normals": torch.ones(5, 3)}, InputError, "source_normals and target_normals must be given together"),
+        (
+            {"source_normals": torch.ones(5, 3), "target_normals": torch.ones(4, 3)},
+            InputError,
+            "target_normals must have one row per row of source",
+        ),
+        ({"weights": torch.ones(4)}, InputError, "weights must have one row per row of source"),
+        ({"weights": -torch.ones(5)}, InputError, "weights must not be negative"),
+        ({"weights": torch.full((5,), torch.inf)}, InputError, "weights must be finite"),
+        ({"mask": torch.ones(5)}, InputTypeError, "mask must be a Boolean tensor"),
+        ({"mask": torch.ones(4, dtype=torch.bool)}, InputError, "mask must have one row per row of source"),
+        ({"threshold": 0.0}, InputError, "threshold must be positive"),
+        ({"max_angle": -1.0}, InputError, "max_angle must be positive"),
+        ({"min_difference": -1.0}, InputError, "min_difference must be zero or positive"),
+        ({"num_trials": 0}, InputError, "num_trials must be at least 1"),
+        ({"num_hypotheses": 0}, InputError, "num_hypotheses must be at least 1"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(change, kind, message):
+    given_arguments = {"source": torch.zeros(5, 3), "target": torch.zeros(5, 3), "threshold": 1.0} | change
+    with pytest.raises(kind, match=message):
+        ransac_rigid(**given_arguments)
