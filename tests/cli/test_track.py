@@ -249,7 +249,8 @@ def test_without_a_start_the_shape_is_searched_for(run, sequence, tmp_path, monk
     monkeypatch.setattr(track_module, "find_pose", found)
     answer = run("track", "hand", sequence / "frames", "-o", tmp_path / "r", *FAST)
     assert answer.exit_code == 0, answer.output
-    assert len(asked) == 1
+    # What was found everywhere is checked by the same search in three more frames at most.
+    assert 1 <= len(asked) <= 4
     assert load(tmp_path / "r.safetensors").acquired[0] == "found"
 
 

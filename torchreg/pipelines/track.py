@@ -71,8 +71,6 @@ _DOUBT_COVERED, _DOUBT_HELD, _DOUBT_JUMP = 0.25, 0.3, 0.15
 _FREE_FAILS, _STARTS_FAILS, _SEARCH_FAILS, _FIND_FAILS, _LONGEST_REST, _LEARNED_AFTER = 1, 1, 3, 5, 32, 6
 # A pose found everywhere is checked in as many frames at most, until it holds.
 _CHECKS = 3
-# The first search is drawn anew, so often at most, where so few data in reach or such residuals remain.
-_FIRST_DRAWS, _SURE_RATIO = 3, 0.88
 # Data that another pose must explain beyond those that the prediction led to.
 _MIN_GAIN = 4.0
 # Frames after a loss before searching around the last pose, and everywhere.
@@ -415,15 +413,7 @@ class Tracker:
             fit = self._fit_at(state, frame, pose, "tracked")
         waits = state.rest > 0 or self.config.recovery != "full"
         if (fit is None or _is_lost(state, fit)) and not waits:
-            for draw in range(_FIRST_DRAWS):
-                rival = self._sought(state, frame, draw)
-                fit = rival if fit is None or (rival is not None and rival.explained > fit.explained) else fit
-                if (
-                    fit is not None
-                    and fit.ratio > _SURE_RATIO
-                    and float(fit.noise) < _FINE_RESIDUAL * self._template.size
-                ):
-                    break
+            fit = self._sought(state, frame)
         fit, state = _kept(state, fit)
         return fit, _rested(state, fit is not None) if fit is not None or not waits else _waited(state)
 
@@ -624,10 +614,10 @@ class Tracker:
         if dear and overdue:
             yield self._sought(state, frame)
 
-    def _sought(self, state: TrackState, frame: _Frame, draw: int = 0) -> _Fit | None:
+    def _sought(self, state: TrackState, frame: _Frame) -> _Fit | None:
         """Return the fit that a search everywhere leads to; among poses as good, the one nearest to the last."""
         data = _thinned(frame.data, _MAX_FOUND_DATA, _generator(state))
-        starts = find_pose(self.shape, data, config=FindPoseConfig(seed=state.seed + draw))
+        starts = find_pose(self.shape, data, config=FindPoseConfig(seed=state.seed))
         poses = starts.poses
         if state.lost:
             poses = poses[starts.costs <= starts.costs.min() + _AS_GOOD * len(data)]
