@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from torchreg.correspondence.sigma import SigmaSchedule
     from torchreg.geometry.mesh import TriangleMesh
     from torchreg.geometry.range_scan import RangeScan
+    from torchreg.geometry.skeleton import Skeleton
     from torchreg.io.points import load_mesh, load_points
     from torchreg.losses.em import EMLoss
     from torchreg.models.articulated import ArticulatedShape
@@ -49,6 +50,7 @@ __all__ = [
     "PoseStarts",
     "RangeScan",
     "SigmaSchedule",
+    "Skeleton",
     "Status",
     "TrackConfig",
     "TrackResult",
@@ -83,6 +85,7 @@ _OWNERS = {
     "PoseStarts": "results",
     "RangeScan": "geometry.range_scan",
     "SigmaSchedule": "correspondence.sigma",
+    "Skeleton": "geometry.skeleton",
     "Status": "results",
     "TrackConfig": "pipelines.track",
     "TrackResult": "results",

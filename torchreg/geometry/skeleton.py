@@ -1,0 +1,362 @@
+"""Skeletons: trees of nodes with radius and frame, and what one reads off them: tips, junctions, limbs, topology."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import (
+    as_float_tensor,
+    as_tensor,
+    check_count,
+    check_finite,
+    check_points,
+    check_same_kind,
+    check_shape,
+)
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.rigid import transform_points
+
+# Neighbors of every node, and how deep a frame may be from a rotation before it is refused.
+_Neighbors = list[list[int]]
+_ROTATION_SLACK = 1e-3
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Skeleton:
+    """A tree of curves in the middle of a body; its leaves are the tips, its branchings the junctions.
+
+    Convention: ``frames[n]`` is ``R_world_node``: its columns are the major and minor axis of the ring of surface
+    around the node and, right-handed to these, the direction of the limb; signs carry on along a limb, from its start
+    to its end.
+
+    Args:
+        nodes: (N, 3) finite coordinates in the unit of the surface, float32 or float64; at least one.
+        edges: (N - 1, 2) node indices; together they must join all nodes.
+        radii: (N,) distance from a node to the surface around it, in the unit of the surface.
+        frames: (N, 3, 3) rotations; identities by default.
+        confidence: (K,) from 0 to 1, how surely each of `tips` is the end of a limb; ones by default.
+        notes: what was done to the surface that the caller may want to know, such as fragments left out or loops cut.
+
+    Raises:
+        InputError: if a shape is wrong, a number is not finite, a frame is no rotation, or the graph is no tree.
+        InputTypeError: if coordinates are not real numbers or edges not integers.
+
+    Differentiable: `limb_lengths` and `resample`, in nodes and radii.
+
+    References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1.
+    """
+
+    nodes: Tensor
+    edges: Tensor
+    radii: Tensor
+    frames: Tensor = None  # type: ignore[assignment]
+    confidence: Tensor = None  # type: ignore[assignment]
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        nodes = as_float_tensor(self.nodes, "nodes")
+        check_points(nodes, "nodes", batch=False)
+        radii = as_float_tensor(self.radii, "radii", like=nodes)
+        check_shape(radii, "radii", (len(nodes),))
+        check_finite(radii, "radii")
+        for name, value in (("nodes", nodes), ("radii", radii), ("edges", _check_tree(self.edges, nodes))):
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "frames", _check_frames(self.frames, nodes))
+        confidence = nodes.new_ones(len(self.tips)) if self.confidence is None else self.confidence
+        confidence = as_float_tensor(confidence, "confidence", like=nodes)
+        check_shape(confidence, "confidence", (len(self.tips),))
+        object.__setattr__(self, "confidence", confidence)
+        object.__setattr__(self, "notes", tuple(self.notes))
+
+    def __len__(self) -> int:
+        return self.nodes.shape[0]
+
+    def __repr__(self) -> str:
+        return (
+            f"Skeleton({len(self)} nodes, {len(self.tips)} tips, {len(self.limbs)} limbs, "
+            f"junctions of degree {self.degrees[self.junctions].tolist()})"
+        )
+
+    @cached_property
+    def degrees(self) -> Tensor:
+        """How many edges end in each node, (N,)."""
+        return torch.bincount(self.edges.reshape(-1), minlength=len(self))
+
+    @cached_property
+    def tips(self) -> Tensor:
+        """Indices (K,) of the nodes in which one edge ends, ascending; the node itself where there is only one."""
+        return (self.degrees <= 1).nonzero()[:, 0]
+
+    @cached_property
+    def junctions(self) -> Tensor:
+        """Indices (J,) of the nodes in which three or more edges meet, ascending; ``degrees`` says how many."""
+        return (self.degrees >= 3).nonzero()[:, 0]
+
+    @cached_property
+    def limbs(self) -> tuple[Tensor, ...]:
+        """One (n,) tensor of node indices per limb, both ends included.
+
+        Limbs that end in tips come first, in the order of `tips`, and start there; a tree without junctions is a single
+        limb. Limbs between junctions follow, sorted by the indices of their ends, and start at the smaller one.
+        """
+        neighbors, stops = self._neighbors, set(self.tips.tolist()) | set(self.junctions.tolist())
+        chains: dict[frozenset[int], list[int]] = {}
+        for start in (*self.tips.tolist(), *self.junctions.tolist()):
+            for first in neighbors[start]:
+                chain = [start, first]
+                while chain[-1] not in stops:
+                    chain.append(next(n for n in neighbors[chain[-1]] if n != chain[-2]))
+                # Found again from its other end; a limb has its place where it was found first.
+                chains.setdefault(frozenset((start, chain[-1])), chain)
+        tips = set(self.tips.tolist())
+        ordered = sorted(chains.values(), key=lambda chain: (chain[0] not in tips, chain[0], chain[-1]))
+        return tuple(torch.tensor(chain, device=self.nodes.device) for chain in ordered)
+
+    @cached_property
+    def limb_ends(self) -> Tensor:
+        """Node indices (L, 2) in which the limbs start and end."""
+        ends = [torch.stack((limb[0], limb[-1])) for limb in self.limbs]
+        return torch.stack(ends) if ends else self.edges.new_zeros(0, 2)
+
+    @cached_property
+    def limb_lengths(self) -> Tensor:
+        """Lengths (L,) of the limbs along their edges, in the unit of the nodes."""
+        sides = [(self.nodes[limb[1:]] - self.nodes[limb[:-1]]).norm(dim=-1).sum() for limb in self.limbs]
+        return torch.stack(sides) if sides else self.nodes.new_zeros(0)
+
+    @property
+    def length(self) -> Tensor:
+        """Length () of all limbs together."""
+        return self.limb_lengths.sum()
+
+    @cached_property
+    def topology(self) -> str:
+        """Canonical form of the tree of tips and junctions: equal for two skeletons exactly if their trees are alike.
+
+        Nodes of degree two, lengths and the numbering have no part in it. Every node is a pair of brackets around its
+        branches, seen from the middle of the tree: ``(()()()()())`` is a junction with five tips.
+
+        References: Aho, Hopcroft and Ullman 1974, example 3.2; Jordan 1869 on the middle of a tree.
+        """
+        graph = _Neighbors()
+        number: dict[int, int] = {}
+        for node in (*self.tips.tolist(), *self.junctions.tolist()):
+            number[node] = len(graph)
+            graph.append([])
+        for start, end in self.limb_ends.tolist():
+            graph[number[start]].append(number[end])
+            graph[number[end]].append(number[start])
+        return min(_bracketed(graph, middle) for middle in _middles(graph))
+
+    def path(self, start: int, end: int) -> Tensor:
+        """Return the node indices (n,) from one node to another along the tree, both included.
+
+        Raises:
+            InputError: if there is no such node.
+        """
+        for name, node in (("start", start), ("end", end)):
+            if not 0 <= node < len(self):
+                raise InputError(f"{name} must be a node from 0 to {len(self) - 1}, got {node}")
+        towards = _parents(self._neighbors, int(end))
+        chain = [int(start)]
+        while chain[-1] != end:
+            chain.append(towards[chain[-1]])
+        return torch.tensor(chain, device=self.nodes.device)
+
+    def resample(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return every limb at equal steps of its own length.
+
+        Args:
+            count: samples per limb, both ends included; at least 2.
+
+        Returns:
+            curves (L, count, 3), radii (L, count) and frames (L, count, 3, 3); see `resample_curve`.
+
+        Raises:
+            InputError: if ``count`` is too small, or the skeleton is a single node.
+        """
+        if not self.limbs:
+            raise InputError("skeleton must have a limb to resample, got a single node")
+        parts = [resample_curve(self.nodes[limb], self.radii[limb], self.frames[limb], count) for limb in self.limbs]
+        curves, radii, frames = zip(*parts, strict=True)
+        return torch.stack(curves), torch.stack(radii), torch.stack(frames)
+
+    def transformed(self, transform: Tensor) -> Skeleton:
+        """Return the skeleton moved by a rigid motion with or without scale, (4, 4)."""
+        transform = as_float_tensor(transform, "transform", like=self.nodes)
+        check_shape(transform, "transform", (4, 4))
+        scale = torch.linalg.det(transform[:3, :3]).abs() ** (1 / 3)
+        return replace(
+            self,
+            nodes=transform_points(transform, self.nodes),
+            radii=self.radii * scale,
+            frames=transform[:3, :3] / scale @ self.frames,
+        )
+
+    @cached_property
+    def _neighbors(self) -> _Neighbors:
+        neighbors: _Neighbors = [[] for _ in range(len(self))]
+        for start, end in self.edges.tolist():
+            neighbors[start].append(end)
+            neighbors[end].append(start)
+        return [sorted(some) for some in neighbors]
+
+
+def resample_curve(points: Tensor, radii: Tensor, frames: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Return a polyline at equal steps of its length, with its radii and frames.
+
+    Args:
+        points: (n, 3) in order, at least two.
+        radii: (n,).
+        frames: (n, 3, 3) rotations.
+        count: samples, both ends included; at least 2.
+
+    Returns:
+        points (count, 3), radii (count,), both linear between the points, and frames (count, 3, 3), which are the
+        rotations nearest to the linear mean.
+
+    Raises:
+        InputError: if ``count`` or the number of points is too small.
+
+    Differentiable: in points and radii; the place along the polyline is held fixed.
+    """
+    check_count(count, "count", 2)
+    check_points(points, "points", min_count=2, batch=False)
+    with torch.no_grad():
+        along = torch.cat((points.new_zeros(1), (points[1:] - points[:-1]).norm(dim=-1).cumsum(0)))
+        wanted = torch.linspace(0, 1, count, dtype=points.dtype, device=points.device) * along[-1]
+        after = torch.searchsorted(along, wanted).clamp(1, len(points) - 1)
+        step = along[after] - along[after - 1]
+        share = torch.where(step > 0, (wanted - along[after - 1]) / torch.where(step > 0, step, 1.0), 0.0)
+        share = share.clamp(0, 1)
+
+    def mixed(values: Tensor) -> Tensor:
+        weight = share.reshape(-1, *(1,) * (values.ndim - 1))
+        return values[after - 1] + weight * (values[after] - values[after - 1])
+
+    return mixed(points), mixed(radii), nearest_rotation(mixed(frames.detach()))
+
+
+def nearest_rotation(matrices: Tensor) -> Tensor:
+    """Return the rotations (..., 3, 3) nearest to matrices (..., 3, 3) in the sum of squared differences.
+
+    References: Arun, Huang and Blostein 1987; Umeyama 1991 for the determinant.
+    """
+    left, _, right = torch.linalg.svd(matrices)
+    sign = torch.ones_like(matrices[..., 0])
+    sign[..., 2] = torch.linalg.det(left @ right)
+    return left * sign.unsqueeze(-2) @ right
+
+
+def build_skeleton(
+    limbs: Sequence[tuple[Tensor, Tensor, Tensor]], ends: Sequence[tuple[int, int]], notes: Sequence[str] = ()
+) -> Skeleton:
+    """Return the skeleton whose limbs are given as polylines that share their end nodes.
+
+    Args:
+        limbs: per limb points (n, 3), radii (n,) and frames (n, 3, 3), n >= 2, all of one dtype and device.
+        ends: per limb the numbers of its first and last node, any integers; limbs with the same number meet there. The
+            place, radius and frame of such a node come from the first limb that names it.
+        notes: see `Skeleton`.
+
+    Raises:
+        InputError: if the limbs do not make a tree.
+    """
+    if not limbs or len(limbs) != len(ends):
+        raise InputError(f"limbs must be at least one and as many as ends, got {len(limbs)} and {len(ends)}")
+    number: dict[int, int] = {}
+    values: list[tuple[Tensor, Tensor, Tensor]] = []
+    edges: list[tuple[int, int]] = []
+    for index, (limb, (first, last)) in enumerate(zip(limbs, ends, strict=True)):
+        check_same_kind(limb[0], f"limbs[{index}]", limbs[0][0], "limbs[0]")
+        names = [first, *[None] * (len(limb[0]) - 2), last]
+        if len(names) != len(limb[0]):
+            raise InputError(f"limbs[{index}] must have at least 2 points, got {len(limb[0])}")
+        chain = []
+        for name, *value in zip(names, *limb, strict=True):
+            if name is None or name not in number:
+                values.append(tuple(value))
+            chain.append(len(values) - 1 if name is None else number.setdefault(name, len(values) - 1))
+        edges += pairwise(chain)
+    nodes, radii, frames = (torch.stack(column) for column in zip(*values, strict=True))
+    return Skeleton(nodes, torch.tensor(edges, device=nodes.device), radii, frames, notes=tuple(notes))
+
+
+def _check_tree(edges: Any, nodes: Tensor) -> Tensor:
+    edges = as_tensor(edges, "edges", "integers")
+    if edges.numel() == 0:
+        edges = edges.reshape(0, 2).long()
+    if edges.is_floating_point() or edges.is_complex() or edges.dtype == torch.bool:
+        raise InputTypeError(f"edges must hold integers, got dtype {edges.dtype}; convert with .long()")
+    check_shape(edges, "edges", ("E", 2))
+    edges = edges.to(device=nodes.device, dtype=torch.int64)
+    if edges.numel() and not 0 <= int(edges.min()) <= int(edges.max()) < len(nodes):
+        raise InputError(f"edges must index the {len(nodes)} nodes, got {int(edges.min())} to {int(edges.max())}")
+    if len(edges) != len(nodes) - 1 or _count_reached(edges, len(nodes)) != len(nodes):
+        raise InputError(
+            f"edges must join the nodes in one tree: {len(nodes) - 1} edges that leave none out, got {len(edges)}, "
+            f"which reach {_count_reached(edges, len(nodes))} of {len(nodes)} nodes"
+        )
+    return edges
+
+
+def _count_reached(edges: Tensor, count: int) -> int:
+    """Return how many nodes the edges join with node 0, itself included."""
+    neighbors: _Neighbors = [[] for _ in range(count)]
+    for start, end in edges.tolist():
+        neighbors[start].append(end)
+        neighbors[end].append(start)
+    return len(_parents(neighbors, 0))
+
+
+def _check_frames(frames: Any, nodes: Tensor) -> Tensor:
+    eye = torch.eye(3, dtype=nodes.dtype, device=nodes.device).expand(len(nodes), 3, 3)
+    if frames is None:
+        return eye.clone()
+    frames = as_float_tensor(frames, "frames", like=nodes)
+    check_shape(frames, "frames", (len(nodes), 3, 3))
+    check_finite(frames, "frames")
+    off = float((frames @ frames.mT - eye).abs().max())
+    if off > _ROTATION_SLACK or bool((torch.linalg.det(frames) < 0).any()):
+        raise InputError(f"frames must be rotations, got matrices {off:.3g} from orthogonal or with determinant -1")
+    return frames
+
+
+def _parents(neighbors: _Neighbors, root: int) -> dict[int, int]:
+    """Return every node that the root reaches with the next node towards the root; in order of distance."""
+    parents = {root: root}
+    queue = [root]
+    for node in queue:
+        for other in neighbors[node]:
+            if other not in parents:
+                parents[other] = node
+                queue.append(other)
+    return parents
+
+
+def _middles(graph: _Neighbors) -> list[int]:
+    """Return the one or two nodes of a tree whose farthest node is nearest: in the middle of a longest path."""
+    far = list(_parents(graph, 0))[-1]
+    parents = _parents(graph, far)
+    chain = [list(parents)[-1]]
+    while chain[-1] != far:
+        chain.append(parents[chain[-1]])
+    return sorted({chain[(len(chain) - 1) // 2], chain[len(chain) // 2]})
+
+
+def _bracketed(graph: _Neighbors, root: int) -> str:
+    parents = _parents(graph, root)
+    branches: dict[int, list[str]] = {node: [] for node in parents}
+    for node in reversed(parents):
+        form = "(" + "".join(sorted(branches[node])) + ")"
+        if node == root:
+            return form
+        branches[parents[node]].append(form)
+    return "()"
