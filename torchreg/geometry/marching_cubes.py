@@ -1,0 +1,160 @@
+"""Meshing a sampled volume by marching cubes whose table of cases is derived, not copied: closed, without ambiguity."""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import combinations
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import as_float_tensor, check_finite, check_positive, check_shape
+from torchreg.errors import InputError
+from torchreg.geometry.mesh import TriangleMesh
+
+# Bit a of a corner's number is its step along axis a. An edge is its lower corner and its axis.
+_EDGES = tuple((corner, axis) for axis in range(3) for corner in range(8) if not corner >> axis & 1)
+# Crossings keep this share of an edge away from its ends, so that no triangle collapses.
+_MARGIN = 1e-3
+
+
+def marching_cubes(values: Tensor, origin: Tensor, spacing: float) -> TriangleMesh:
+    """Return the triangle mesh on which a sampled field is zero, oriented from negative to positive values.
+
+    The mesh is closed, without boundary and without edges of more than two triangles, if all samples on the faces of
+    the volume have one sign. Where the corners of a cube's face alternate in sign, negative ones are kept apart, by
+    the same rule in both cubes.
+
+    Args:
+        values: (X, Y, Z) samples on a cubic grid, at least two along each axis.
+        origin: (3,) where sample (0, 0, 0) lies.
+        spacing: between samples, in the unit of ``origin``.
+
+    Returns:
+        the mesh, in the dtype of ``values``; without faces if there is no change of sign.
+
+    Raises:
+        InputError: if a shape is wrong or a number not finite.
+
+    Differentiable: no.
+
+    Cost: 0.2 s for 128^3 samples on one CPU core.
+
+    References: Lorensen and Cline 1987.
+    """
+    values = as_float_tensor(values, "values")
+    check_shape(values, "values", ("X", "Y", "Z"))
+    if min(values.shape) < 2:
+        raise InputError(f"values must have at least two samples along each axis, got {tuple(values.shape)}")
+    check_finite(values, "values")
+    origin = as_float_tensor(origin, "origin", like=values)
+    check_shape(origin, "origin", (3,))
+    check_finite(origin, "origin")
+    check_positive(spacing, "spacing")
+    with torch.no_grad():
+        negative = values < 0
+        keys, vertices = _crossings(values, negative)
+        cubes, cases = _cut_cubes(negative)
+        faces = torch.searchsorted(keys, _triangles(cubes, cases, values.shape).reshape(-1)).reshape(-1, 3)
+        return TriangleMesh(origin + spacing * vertices, faces)
+
+
+def _crossings(values: Tensor, negative: Tensor) -> tuple[Tensor, Tensor]:
+    """Return sorted keys of the grid's edges on which the sign changes, and where (in steps of the grid)."""
+    count, keys, points = values.numel(), [], []
+    strides = torch.tensor([values.shape[1] * values.shape[2], values.shape[2], 1], device=values.device)
+    flat = values.reshape(-1)
+    for axis in range(3):
+        size = values.shape[axis] - 1
+        changes = negative.narrow(axis, 0, size) != negative.narrow(axis, 1, size)
+        steps = changes.nonzero()
+        lower = steps @ strides
+        start, end = flat[lower], flat[lower + int(strides[axis])]
+        place = steps.to(values)
+        place[:, axis] += (start / (start - end)).clamp(_MARGIN, 1 - _MARGIN)
+        keys.append(axis * count + lower)
+        points.append(place)
+    return torch.cat(keys), torch.cat(points)
+
+
+def _cut_cubes(negative: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the steps (C, 3) of the cubes in which the sign changes, and their case numbers (C,)."""
+    x, y, z = (size - 1 for size in negative.shape)
+    code = torch.zeros((x, y, z), dtype=torch.uint8, device=negative.device)
+    bits = negative.to(torch.uint8)
+    for corner in range(8):
+        a, b, c = corner & 1, corner >> 1 & 1, corner >> 2 & 1
+        code += bits[a : a + x, b : b + y, c : c + z] << corner
+    cubes = ((code > 0) & (code < 255)).nonzero()
+    return cubes, code[cubes[:, 0], cubes[:, 1], cubes[:, 2]].long()
+
+
+def _triangles(cubes: Tensor, cases: Tensor, shape: torch.Size) -> Tensor:
+    """Return the keys (F, 3) of the crossings that each triangle joins."""
+    table, first, count = (part.to(cases.device) for part in _table())
+    strides = torch.tensor([shape[1] * shape[2], shape[2], 1], device=cases.device)
+    corners = torch.tensor([[corner >> axis & 1 for axis in range(3)] for corner, _ in _EDGES], device=cases.device)
+    axes = torch.tensor([axis for _, axis in _EDGES], device=cases.device)
+    offsets = axes * shape.numel() + corners @ strides
+    number = count[cases]
+    owner = torch.arange(len(cases), device=cases.device).repeat_interleave(number)
+    within = torch.arange(len(owner), device=cases.device) - (number.cumsum(0) - number)[owner]
+    edges = table[first[cases][owner] + within]
+    return (cubes @ strides)[owner].unsqueeze(-1) + offsets[edges]
+
+
+@cache
+def _table() -> tuple[Tensor, Tensor, Tensor]:
+    """Return the triangles (N, 3) of all 256 cases as edges, and where each case's begin and how many they are."""
+    rows = [[triangle for loop in _loops(case) for triangle in _triangulated(loop)] for case in range(256)]
+    count = torch.tensor([len(row) for row in rows])
+    return torch.tensor([triangle for row in rows for triangle in row]), count.cumsum(0) - count, count
+
+
+def _loops(case: int) -> list[list[int]]:
+    """Return the closed polygons of crossed edges that part the negative corners of a cube from the others."""
+    follows: dict[int, int] = {}
+    for corners in _faces():
+        inside = [bool(case >> corner & 1) for corner in corners]
+        for k in range(4):
+            if inside[k] and not inside[k - 1]:  # a run of negative corners begins: cut it off where it ends
+                end = next(j for j in range(k + 1, k + 4) if not inside[j % 4])
+                entering = _edge(corners[k - 1], corners[k])
+                follows[entering] = _edge(corners[(end - 1) % 4], corners[end % 4])
+    loops = []
+    while follows:
+        loop = [next(iter(follows))]
+        while (after := follows.pop(loop[-1])) != loop[0]:
+            loop.append(after)
+        loops.append(loop)
+    return loops
+
+
+def _faces() -> list[list[int]]:
+    """Return the four corners of each face of a cube, counterclockwise as seen from outside."""
+    faces = []
+    for axis in range(3):
+        u, v = 1 << (axis + 1) % 3, 1 << (axis + 2) % 3
+        faces.append([1 << axis, 1 << axis | u, 1 << axis | u | v, 1 << axis | v])
+        faces.append([0, v, u | v, u])
+    return faces
+
+
+def _edge(corner: int, other: int) -> int:
+    return _EDGES.index((min(corner, other), (corner ^ other).bit_length() - 1))
+
+
+def _triangulated(loop: list[int]) -> list[tuple[int, int, int]]:
+    """Return triangles of a polygon no diagonal of which lies in a face, where the next cube could have one too."""
+    if len(loop) == 3:
+        return [(loop[0], loop[1], loop[2])]
+    count = len(loop)
+    start, end = next(
+        (k, m) for k, m in combinations(range(count), 2) if 1 < m - k < count - 1 and not _on_one_face(loop[k], loop[m])
+    )
+    return _triangulated(loop[start : end + 1]) + _triangulated(loop[end:] + loop[: start + 1])
+
+
+def _on_one_face(first: int, second: int) -> bool:
+    corners = {corner | bit for corner, axis in (_EDGES[first], _EDGES[second]) for bit in (0, 1 << axis)}
+    return any(corners <= set(face) for face in _faces())

@@ -1,0 +1,206 @@
+"""Meshes to voxels and back: filled volumes of surfaces that need not be closed, meshed anew."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import as_float_tensor, check_count, check_finite, check_positive, check_shape
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.marching_cubes import marching_cubes
+from torchreg.geometry.mesh import TriangleMesh
+
+# Rays pass this far beside the middles of voxels, in voxels: never through a vertex or along an edge on the grid.
+_ASIDE = (3.1415926535e-5, 2.7182818284e-5)
+_MAX_VOXELS = 50_000_000
+# More than this share of edges that two triangles run through in one direction: orientation tells nothing.
+_MAX_TWISTED = 0.01
+# A voxel's own sign is kept by this much when its neighbors smooth it.
+_KEEP = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelGrid:
+    """Cubic voxels, filled or empty.
+
+    Args:
+        filled: (X, Y, Z) bool.
+        origin: (3,) middle of voxel (0, 0, 0).
+        spacing: edge length of a voxel, in the unit of ``origin``.
+
+    Raises:
+        InputError: if a shape is wrong, a number not finite or the spacing not positive.
+        InputTypeError: if ``filled`` is not Boolean.
+    """
+
+    filled: Tensor
+    origin: Tensor
+    spacing: float
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.filled, Tensor) or self.filled.dtype != torch.bool:
+            kind = getattr(self.filled, "dtype", type(self.filled).__name__)
+            raise InputTypeError(f"filled must be a Boolean tensor, got {kind}")
+        check_shape(self.filled, "filled", ("X", "Y", "Z"))
+        origin = as_float_tensor(self.origin, "origin").to(self.filled.device)
+        check_shape(origin, "origin", (3,))
+        check_finite(origin, "origin")
+        check_positive(self.spacing, "spacing")
+        object.__setattr__(self, "origin", origin)
+
+    def centers(self) -> Tensor:
+        """Return the middles (N, 3) of the filled voxels."""
+        return self.origin + self.spacing * self.filled.nonzero().to(self.origin)
+
+    def contains(self, points: Tensor) -> Tensor:
+        """Return which of points (..., 3) lie in filled voxels, (...,) bool."""
+        steps = ((points - self.origin) / self.spacing).round().long()
+        sizes = torch.tensor(self.filled.shape, device=steps.device)
+        within = ((steps >= 0) & (steps < sizes)).all(-1)
+        x, y, z = torch.where(within.unsqueeze(-1), steps, 0).unbind(-1)
+        return within & self.filled[x, y, z]
+
+    def mesh(self, smoothing: int = 1) -> TriangleMesh:
+        """Return the closed surface of the filled voxels, triangulated anew and facing outwards.
+
+        Args:
+            smoothing: times that the volume is averaged over neighbors, 1-2-1 along each axis, before it is meshed.
+                The middle of every voxel stays on its side of the surface, however thin the shape; 0 gives the
+                staircase.
+
+        Raises:
+            InputError: if ``smoothing`` is negative.
+
+        Cost: 0.3 s for 128^3 voxels on one CPU core.
+        """
+        check_count(smoothing, "smoothing", 0)
+        # One more empty layer, so that the surface closes around what touches the border.
+        filled = torch.nn.functional.pad(self.filled, (1, 1, 1, 1, 1, 1))
+        field = 0.5 - filled.to(self.origin.dtype)
+        for _ in range(smoothing):
+            for axis in range(3):
+                field = _averaged(field, axis)
+        if smoothing:
+            field = torch.where(filled, field.clamp_max(-_KEEP), field.clamp_min(_KEEP))
+        return marching_cubes(field, self.origin - self.spacing, self.spacing)
+
+
+def voxelize(mesh: TriangleMesh, resolution: int = 128, *, touching: bool = False) -> VoxelGrid:
+    """Return the voxels inside a surface, which may have holes, overlap itself or face inwards.
+
+    A voxel is filled if most of the six rays from its middle along the axes leave the surface: of a ray, the crossings
+    outwards less those inwards count, or whether they are odd where the triangles are not oriented alike.
+
+    Args:
+        mesh: the surface.
+        resolution: number of voxels along the longest side of its box; one empty voxel is added on every side.
+        touching: also fill the voxels that the surface passes through, so that thin sheets and limbs stay whole.
+
+    Raises:
+        InputError: if the surface has no faces or no extent, or would need more than 50 million voxels.
+
+    Differentiable: no.
+
+    Cost: 0.2 s at 128 for 20,000 triangles on one CPU core.
+
+    References: Nooruddin and Turk 2003 (counting crossings along several axes).
+    """
+    if not isinstance(mesh, TriangleMesh):
+        raise InputTypeError(f"mesh must be a TriangleMesh, got {type(mesh).__name__}")
+    check_count(resolution, "resolution", 2)
+    if not mesh.num_faces:
+        raise InputError("mesh must have faces to enclose anything, got none")
+    corners = mesh.vertices.detach().double()[mesh.faces]
+    lower, upper = corners.amin((0, 1)), corners.amax((0, 1))
+    spacing = float((upper - lower).max()) / resolution
+    check_positive(spacing, "the longest side of mesh")
+    sizes = [math.ceil(side - 1e-6) + 2 for side in ((upper - lower) / spacing).tolist()]
+    if math.prod(sizes) > _MAX_VOXELS:
+        raise InputError(f"resolution {resolution} needs {sizes} voxels, over {_MAX_VOXELS}; choose a smaller one")
+    # The box sits in the middle of its voxels.
+    origin = 0.5 * (lower + upper) - 0.5 * spacing * (torch.tensor(sizes) - 1).to(lower)
+    steps = (corners - origin) / spacing
+    filled = _inside(steps, sizes, _are_oriented(mesh.faces))
+    if touching:
+        x, y, z = _samples(steps).round().long().unbind(-1)
+        filled[x, y, z] = True
+    return VoxelGrid(filled, origin.to(mesh.vertices), spacing)
+
+
+def _inside(steps: Tensor, sizes: list[int], oriented: bool) -> Tensor:
+    """Return the voxels (X, Y, Z) inside triangles (F, 3, 3) given in steps of the grid."""
+    volume = torch.linalg.det(steps - steps.mean((0, 1))).sum()
+    votes = torch.zeros(sizes, dtype=torch.int8, device=steps.device)
+    for axis in range(3):
+        turned = torch.roll(steps, -1 - axis, -1)  # the axis of the rays comes last
+        order = [(axis + 1) % 3, (axis + 2) % 3, axis]
+        below, total = _windings(turned, [sizes[k] for k in order])
+        if oriented:
+            side = -1 if volume < 0 else 1
+            cast = (side * below > 0).to(torch.int8) + (side * (below - total) > 0).to(torch.int8)
+        else:
+            cast = ((below & 1) + ((total - below) & 1)).to(torch.int8)
+        votes += cast.permute([order.index(k) for k in range(3)])
+    return votes > 3
+
+
+def _windings(steps: Tensor, sizes: list[int]) -> tuple[Tensor, Tensor]:
+    """Return how often rays along the last axis entered before each voxel (X, Y, Z), less leaving, and in all."""
+    counts = torch.zeros(sizes[0] * sizes[1] * (sizes[2] + 1), dtype=torch.int32, device=steps.device)
+    flat = steps[..., :2] - steps.new_tensor(_ASIDE)
+    first = flat.amin(1).ceil().long().clamp_min(0)
+    span = (flat.amax(1).floor().long() - first + 1).clamp_min(0)
+    number = span.prod(-1)
+    owner = torch.arange(len(steps), device=steps.device).repeat_interleave(number)
+    within = torch.arange(len(owner), device=steps.device) - (number.cumsum(0) - number)[owner]
+    width = span[owner, 1]
+    cell = first[owner] + torch.stack([within // width, within % width], -1)
+    a, b, c = (flat[owner] - cell.unsqueeze(1)).unbind(1)
+    areas = torch.stack([_cross(b, c), _cross(c, a), _cross(a, b)], -1)
+    hit = (areas > 0).all(-1) | (areas < 0).all(-1)
+    areas, owner, cell = areas[hit], owner[hit], cell[hit]
+    depth = (areas * steps[owner, :, 2]).sum(-1) / areas.sum(-1)
+    # Counted in the first voxel whose middle lies behind the crossing.
+    layer = depth.ceil().long().clamp(0, sizes[2])
+    place = (cell[:, 0] * sizes[1] + cell[:, 1]) * (sizes[2] + 1) + layer
+    # A triangle counterclockwise as seen from the end of the axis faces along it: the ray leaves there.
+    counts.index_add_(0, place, -areas.sum(-1).sign().to(torch.int32))
+    reached = counts.reshape(sizes[0], sizes[1], sizes[2] + 1).cumsum(-1, dtype=torch.int32)
+    return reached[..., :-1], reached[..., -1:]
+
+
+def _cross(first: Tensor, second: Tensor) -> Tensor:
+    return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+
+
+def _are_oriented(faces: Tensor) -> bool:
+    """Return whether almost no two triangles run through an edge in the same direction."""
+    edges = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    keys = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
+    return len(keys) - len(keys.unique()) <= _MAX_TWISTED * len(keys)
+
+
+def _samples(steps: Tensor) -> Tensor:
+    """Return points (N, 3) of triangles (F, 3, 3), at most half a step apart."""
+    sides = (steps - steps.roll(1, 1)).norm(dim=-1).amax(-1)
+    parts = (2 * sides).ceil().long().clamp_min(1)
+    number = (parts + 1) ** 2
+    owner = torch.arange(len(steps), device=steps.device).repeat_interleave(number)
+    within = torch.arange(len(owner), device=steps.device) - (number.cumsum(0) - number)[owner]
+    rows = parts[owner] + 1
+    u, v = (within // rows).to(steps) / parts[owner], (within % rows).to(steps) / parts[owner]
+    keep = u + v <= 1 + 1e-9
+    u, v, owner = u[keep].unsqueeze(-1), v[keep].unsqueeze(-1), owner[keep]
+    a, b, c = steps.unbind(1)
+    return a[owner] + u * (b - a)[owner] + v * (c - a)[owner]
+
+
+def _averaged(field: Tensor, axis: int) -> Tensor:
+    """Return a field averaged 1-2-1 along an axis; the border keeps its value."""
+    size = field.shape[axis]
+    step = torch.arange(size, device=field.device)
+    before, after = (field.index_select(axis, (step + side).clamp(0, size - 1)) for side in (-1, 1))
+    return 0.25 * (before + 2 * field + after)
