@@ -1,0 +1,153 @@
+import math
+
+import pytest
+import torch
+
+from torchreg.datasets.bodies import Proportions
+from torchreg.datasets.depth_scanner import DepthScanner
+from torchreg.datasets.scan_sequences import ScanSequence, jointed_toy, walking_animal, walking_figure
+from torchreg.datasets.toys import excavator
+from torchreg.errors import InputError
+from torchreg.geometry.range_scan import RangeScan
+from torchreg.geometry.rigid import transform_points
+from torchreg.metrics import adjusted_rand
+
+CLEAN = DepthScanner(noise=0.0, num_holes=0, num_points=2500)
+
+
+@pytest.fixture(scope="module")
+def walk():
+    return walking_figure(190, dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def toy():
+    return jointed_toy(8, missing=True, dtype=torch.float64, scanner=CLEAN)
+
+
+def test_the_walk_has_the_pairs_and_the_motion_it_promises(walk):
+    assert len(walk) == 190
+    turns = walk.transforms[..., :3, :3]
+    local = turns[:, list(walk.figure.parents[1:])].mT @ turns[:, 1:]
+    change = local[:-1].mT @ local[1:]
+    cosine = (change.diagonal(dim1=-2, dim2=-1).sum(-1) - 1) / 2
+    fastest = torch.acos(cosine.clamp(-1, 1)).amax(1).rad2deg()
+    assert 25 < float(fastest.max()) < 40
+    assert float(fastest.median()) > 12
+
+
+def test_a_pair_holds_what_fits_together(walk):
+    pair = walk.pair(20, 21)
+    count = len(pair.source)
+    assert 2000 < count < 6000
+    assert pair.truth.shape == (count, 3)
+    assert pair.labels.shape == pair.visible.shape == pair.missing.shape == (count,)
+    assert pair.target_labels.shape == (len(pair.target),)
+    parts = len(pair.part_names)
+    assert pair.joints.shape == pair.target_joints.shape == (parts - 1, 3)
+    assert pair.joint_parts.shape == (parts - 1, 2)
+    assert pair.transforms.shape == (parts, 4, 4)
+    assert 0.8 < float(pair.visible.double().mean()) <= 1.0
+    assert not bool(pair.missing.any())
+    # What the target's camera sees of the truth, it has measured nearby.
+    gap = torch.cdist(pair.truth[pair.visible], pair.target.points).amin(1)
+    assert float(gap.quantile(0.9)) < 2 * pair.target.spacing
+
+
+def test_a_frame_is_its_own_truth(walk):
+    pair = walk.pair(7, 7)
+    assert float((pair.truth - pair.source.points).norm(dim=-1).max()) < 0.02
+    torch.testing.assert_close(pair.transforms, torch.eye(4, dtype=torch.float64).expand_as(pair.transforms))
+    assert float(pair.error(pair.truth).max()) == 0
+    shares = pair.error(pair.truth + 0.3) * pair.source.diagonal
+    torch.testing.assert_close(shares, torch.full_like(shares, 0.3 * math.sqrt(3)))
+
+
+def test_rigid_parts_move_as_their_transforms_say(toy):
+    pair = toy.pair(0, 1)
+    for part in pair.labels.unique().tolist():
+        own = pair.labels == part
+        moved = transform_points(pair.transforms[part], pair.source.points[own])
+        torch.testing.assert_close(moved, pair.truth[own], atol=1e-9, rtol=0)
+    for number, (parent, child) in enumerate(pair.joint_parts.tolist()):
+        for part in (parent, child):
+            moved = transform_points(pair.transforms[part], pair.joints[number : number + 1])
+            torch.testing.assert_close(moved[0], pair.target_joints[number])
+
+
+def test_missing_parts_are_missing_in_every_other_frame(toy):
+    for frame in range(len(toy)):
+        off = toy.missing[frame]
+        assert (off >= 0) == (frame % 2 == 1)
+        assert off not in toy.labels(frame).tolist()
+    gone = [toy.pair(frame, frame + 1) for frame in range(0, 6, 2)]
+    for frame, pair in zip(range(0, 6, 2), gone, strict=True):
+        assert torch.equal(pair.missing, pair.labels == toy.missing[frame + 1])
+        assert not bool((pair.visible & pair.missing).any())
+    assert any(bool(pair.missing.any()) for pair in gone)
+    assert not bool(toy.pair(1, 2).missing.any())
+
+
+def test_parts_that_move_alike_get_one_moving_label(toy):
+    pair = toy.pair(0, 1)
+    assert pair.moving_labels(0.0).unique().numel() == pair.labels.unique().numel()
+    assert pair.moving_labels(10.0).unique().numel() == 1
+    assert adjusted_rand(pair.moving_labels(0.0), pair.labels) == pytest.approx(1.0)
+    assert toy.pair(2, 2).moving_labels().unique().numel() == 1
+    with pytest.raises(InputError, match="tolerance"):
+        pair.moving_labels(-1.0)
+
+
+def test_every_way_to_ask_gives_the_same(toy):
+    pairs = list(toy.pairs(2))
+    assert len(pairs) == 6
+    alone = toy.pair(3, 5)
+    for name in ("truth", "labels", "target_labels", "joints", "visible"):
+        assert torch.equal(getattr(pairs[3], name), getattr(alone, name))
+    assert torch.equal(alone.source.points, toy[3].points)
+    assert torch.equal(alone.target.points, toy[5].points)
+    assert torch.equal(alone.truth, toy.truth(3, 5))
+    assert torch.equal(alone.labels, toy.labels(3))
+    assert torch.equal(alone.joints, toy.joints(3))
+    assert torch.equal(toy[-1].points, toy[7].points)
+    assert all(isinstance(scan, RangeScan) for scan in toy)
+    with pytest.raises(IndexError):
+        toy[8]
+
+
+def test_seeds_decide_about_everything():
+    small = DepthScanner(num_points=800)
+    first, again, other = (walking_figure(3, seed, scanner=small) for seed in (4, 4, 5))
+    assert torch.equal(first[1].points, again[1].points)
+    assert not torch.equal(first.transforms, other.transforms)
+    assert first[1].points.dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    "sequence",
+    [
+        lambda: walking_animal(3, scanner=CLEAN, gait="gallop"),
+        lambda: walking_animal(3, scanner=CLEAN, proportions=Proportions.random(spread=0.2)),
+        lambda: walking_figure(3, scanner=CLEAN, proportions=Proportions(size=0.5), cycles_per_frame=0.15),
+        lambda: jointed_toy(3, toy=excavator(spacing=0.02), scanner=CLEAN, step=math.radians(10)),
+    ],
+)
+def test_other_figures_give_scans_too(sequence):
+    sequence = sequence()
+    for pair in sequence.pairs():
+        assert 1000 < len(pair.source) < 4000
+        assert float(pair.error(pair.source.points).max()) > 0.01
+        assert bool((pair.source.points[:, 2] > 0).all())
+
+
+def test_bad_arguments_are_named(toy):
+    with pytest.raises(InputError, match="frames"):
+        walking_figure(1)
+    with pytest.raises(InputError, match="cycles_per_frame"):
+        walking_animal(3, cycles_per_frame=0.0)
+    with pytest.raises(InputError, match="turn"):
+        jointed_toy(3, turn=-1.0)
+    with pytest.raises(InputError, match="step"):
+        list(toy.pairs(0))
+    with pytest.raises(InputError, match="missing must have one number per frame"):
+        ScanSequence(toy.figure, toy.transforms, CLEAN, (1, 2))

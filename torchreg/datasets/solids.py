@@ -1,0 +1,137 @@
+"""Simple solids as distance fields, and the smooth union that makes bodies of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import check_positive
+from torchreg.errors import InputError
+from torchreg.geometry.isosurface import isosurface
+from torchreg.geometry.mesh import TriangleMesh
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class RoundCone:
+    """A ball that moves along a segment while its radius changes; a sphere if the segment has no length.
+
+    Args:
+        start: center of the first ball.
+        end: center of the last ball.
+        start_radius: of the first ball, same unit.
+        end_radius: of the last ball.
+
+    Raises:
+        InputError: if a radius is not positive.
+    """
+
+    start: Vector
+    end: Vector
+    start_radius: float
+    end_radius: float
+
+    def __post_init__(self) -> None:
+        check_positive(self.start_radius, "start_radius")
+        check_positive(self.end_radius, "end_radius")
+
+    def distance(self, points: Tensor) -> Tensor:
+        """Return the distance (N,) of points (N, 3) to the ball that is nearest by its center, negative inside."""
+        start, end = points.new_tensor(self.start), points.new_tensor(self.end)
+        axis = end - start
+        squared = axis.square().sum()
+        along = (points - start) @ axis
+        share = (along / squared).clamp(0, 1) if float(squared) > 0 else torch.zeros_like(along)
+        radius = self.start_radius + share * (self.end_radius - self.start_radius)
+        return (points - start - share.unsqueeze(-1) * axis).norm(dim=-1) - radius
+
+    def bounds(self) -> tuple[Vector, Vector]:
+        """Return the lower and upper corner of a box that holds the solid."""
+        widest = max(self.start_radius, self.end_radius)
+        pairs = [*zip(self.start, self.end, strict=True)]
+        return _vector([min(pair) - widest for pair in pairs]), _vector([max(pair) + widest for pair in pairs])
+
+
+@dataclass(frozen=True)
+class RoundBox:
+    """A box along the axes with rounded edges.
+
+    Args:
+        center: its middle.
+        half: half of its sides, rounding included.
+        radius: of the edges.
+
+    Raises:
+        InputError: if a side is not positive, or the radius above half of the shortest one.
+    """
+
+    center: Vector
+    half: Vector
+    radius: float
+
+    def __post_init__(self) -> None:
+        check_positive(self.radius, "radius", allow_zero=True)
+        for side in self.half:
+            check_positive(side, "half")
+        if self.radius > min(self.half):
+            raise InputError(f"radius must be at most the shortest half side {min(self.half)}, got {self.radius}")
+
+    def distance(self, points: Tensor) -> Tensor:
+        """Return the exact distance (N,) of points (N, 3), negative inside."""
+        excess = (points - points.new_tensor(self.center)).abs() - points.new_tensor(self.half) + self.radius
+        return excess.clamp_min(0).norm(dim=-1) + excess.amax(-1).clamp_max(0) - self.radius
+
+    def bounds(self) -> tuple[Vector, Vector]:
+        """Return the lower and upper corner."""
+        pairs = [*zip(self.center, self.half, strict=True)]
+        return _vector([middle - half for middle, half in pairs]), _vector([middle + half for middle, half in pairs])
+
+
+Solid = RoundCone | RoundBox
+
+
+def union_distance(solids: Sequence[Solid], points: Tensor, blend: float) -> Tensor:
+    """Return the distance (N,) to a union whose seams are rounded: ``-b log sum_i exp(-d_i / b)``.
+
+    Args:
+        solids: at least one.
+        points: (N, 3).
+        blend: b, about the radius of the seams, same unit; zero for a sharp union.
+
+    Differentiable: in ``points``, almost everywhere.
+    """
+    distances = torch.stack([solid.distance(points) for solid in solids])
+    return distances.amin(0) if blend == 0 else -blend * torch.logsumexp(-distances / blend, dim=0)
+
+
+def mesh_of(solids: Sequence[Solid], spacing: float, blend: float = 0.0) -> TriangleMesh:
+    """Return the closed surface of a union of solids, facing outwards, in float64.
+
+    Args:
+        solids: at least one.
+        spacing: edge length of the grid on which the surface is found, same unit.
+        blend: see `union_distance`.
+
+    Raises:
+        InputError: if there is no solid, or a number is not positive.
+    """
+    if not solids:
+        raise InputError("solids must hold at least one solid, got none")
+    check_positive(spacing, "spacing")
+    check_positive(blend, "blend", allow_zero=True)
+    corners = [torch.tensor(corner, dtype=torch.float64) for solid in solids for corner in solid.bounds()]
+    lower, upper = torch.stack(corners).amin(0), torch.stack(corners).amax(0)
+    # A smooth union is a little larger than its solids.
+    margin = 1.5 * spacing + blend * len(solids) ** 0.5
+    field = partial(union_distance, solids, blend=blend)
+    return isosurface(field, lower - margin, upper + margin, spacing)
+
+
+def _vector(values: list[float]) -> Vector:
+    x, y, z = values
+    return x, y, z
