@@ -1,0 +1,104 @@
+"""Curves as rows of points: lengths, bends, directions, and frames that follow them without twist."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.rotation import skew
+
+# Below this share of the largest step a step has no direction; cosines this near to -1 turn by half.
+_NO_STEP, _OPPOSITE = 1e-6, 1e-6
+
+
+def curve_lengths(curves: Tensor) -> Tensor:
+    """Return the lengths (...,) of curves (..., S, 3), in their unit.
+
+    Differentiable: in the curves; a step of length zero has the gradient zero.
+    """
+    return _safe_norm(curves[..., 1:, :] - curves[..., :-1, :]).sum(-1)
+
+
+def bend_angles(curves: Tensor) -> Tensor:
+    """Return how far curves (..., S, 3) turn at their inner points, (..., S - 2) radians from 0 to pi.
+
+    Differentiable: in the curves; straight, turned back or without length, the gradient is zero.
+    """
+    steps = curves[..., 1:, :] - curves[..., :-1, :]
+    before, after = steps[..., :-1, :], steps[..., 1:, :]
+    cross = torch.linalg.cross(before, after, dim=-1)
+    dot = (before * after).sum(-1)
+    # atan2 has no gradient where both are zero.
+    empty = (before.square().sum(-1) == 0) | (after.square().sum(-1) == 0)
+    return torch.where(empty, 0.0, torch.atan2(_safe_norm(cross), torch.where(empty, 1.0, dot)))
+
+
+def tangents(curves: Tensor) -> Tensor:
+    """Return unit directions (..., S, 3) of curves (..., S, 3): central differences, one-sided at the ends.
+
+    Where points fall together the direction is that of the points around; along +x for a curve without length.
+
+    Differentiable: in the curves.
+    """
+    steps = curves[..., 1:, :] - curves[..., :-1, :]
+    padded = torch.cat((steps[..., :1, :], steps, steps[..., -1:, :]), dim=-2)
+    across = padded[..., 1:, :] + padded[..., :-1, :]
+    length = _safe_norm(across)
+    chord = curves[..., -1:, :] - curves[..., :1, :]
+    floor = _NO_STEP * length.detach().amax(-1, keepdim=True)
+    weak = (length <= floor).unsqueeze(-1)
+    whole = _safe_norm(chord).unsqueeze(-1)
+    axis = torch.zeros_like(chord)
+    axis[..., 0] = 1.0
+    stand_in = torch.where(whole > 0, chord / torch.where(whole > 0, whole, 1.0), axis)
+    return torch.where(weak, stand_in, across / torch.where(weak, 1.0, length.unsqueeze(-1)))
+
+
+def turn_between(start: Tensor, end: Tensor) -> Tensor:
+    """Return the rotations (..., 3, 3) of smallest angle that take unit vectors ``start`` (..., 3) to ``end`` (..., 3).
+
+    Opposite vectors are turned about an axis perpendicular to them that is otherwise arbitrary.
+
+    Differentiable: in both, away from opposite vectors.
+    """
+    start, end = torch.broadcast_tensors(start, end)
+    cosine = (start * end).sum(-1, keepdim=True).unsqueeze(-1)
+    opposite = cosine < _OPPOSITE - 1
+    cross = skew(torch.linalg.cross(start, end, dim=-1))
+    identity = torch.eye(3, dtype=start.dtype, device=start.device)
+    turn = identity + cross + cross @ cross / torch.where(opposite, 1.0, 1 + cosine)
+    smallest = torch.nn.functional.one_hot(start.detach().abs().argmin(-1), 3).to(start)
+    axis = torch.linalg.cross(start, smallest, dim=-1)
+    axis = axis / axis.norm(dim=-1, keepdim=True)
+    return torch.where(opposite, 2 * axis.unsqueeze(-1) * axis.unsqueeze(-2) - identity, turn)
+
+
+def follow(frames: Tensor, directions: Tensor) -> Tensor:
+    """Return frames (..., 3, 3) turned by the smallest angle so that their third columns are ``directions`` (..., 3).
+
+    Differentiable: in both.
+    """
+    return turn_between(frames[..., 2], directions) @ frames
+
+
+def curve_frames(curves: Tensor) -> Tensor:
+    """Return frames ``R_world_curve`` (..., S, 3, 3) along curves (..., S, 3) that turn with them but do not twist.
+
+    The third column is the direction of the curve. The first frame is the smallest turn of the axes.
+
+    Differentiable: in the curves.
+
+    References: Bishop 1975.
+    """
+    directions = tangents(curves)
+    eye = torch.eye(3, dtype=curves.dtype, device=curves.device).expand(*curves.shape[:-2], 3, 3)
+    frames = [follow(eye, directions[..., 0, :])]
+    for index in range(1, curves.shape[-2]):
+        frames.append(follow(frames[-1], directions[..., index, :]))
+    return torch.stack(frames, dim=-3)
+
+
+def _safe_norm(vectors: Tensor) -> Tensor:
+    """Return lengths (...,) whose gradient at zero is zero."""
+    square = vectors.square().sum(-1)
+    return torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0)
