@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from torchreg.io.points import load_mesh, load_points
     from torchreg.losses.em import EMLoss
     from torchreg.models.articulated import ArticulatedShape
+    from torchreg.models.grid_lbs import GridLBS
     from torchreg.models.hand import Hand
     from torchreg.models.skin import BendingSkin, LinearBlendSkin, sample_skin
     from torchreg.pipelines.align import AlignConfig, align
@@ -45,6 +46,7 @@ __all__ = [
     "EMLoss",
     "FindPoseConfig",
     "FrameResult",
+    "GridLBS",
     "Hand",
     "LinearBlendSkin",
     "PoseStarts",
@@ -80,6 +82,7 @@ _OWNERS = {
     "EMLoss": "losses.em",
     "FindPoseConfig": "pipelines.find_pose",
     "FrameResult": "results",
+    "GridLBS": "models.grid_lbs",
     "Hand": "models.hand",
     "LinearBlendSkin": "models.skin",
     "PoseStarts": "results",

@@ -49,7 +49,7 @@ def blend_linear(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
     References: Chang and Zwicker 2009, eq. 1.
     """
     rows = (weights @ transforms[..., :3, :].flatten(-2)).unflatten(-1, (3, 4))
-    return (rows[..., :3] * points.unsqueeze(-2)).sum(-1) + rows[..., 3]
+    return (rows[..., :3] @ points.unsqueeze(-1)).squeeze(-1) + rows[..., 3]
 
 
 def blend_dual_quaternion(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:

@@ -1,0 +1,104 @@
+"""Joints between bones: known hinges and balls are found again, free axes fall back, strongest joints make the tree."""
+
+import math
+
+import pytest
+import torch
+
+from torchreg.errors import InputError
+from torchreg.geometry.joint_moments import JointMoments
+from torchreg.geometry.joints import bone_tree, find_joints
+from torchreg.geometry.rigid import rigid_matrix, se3_exp
+from torchreg.geometry.rotation import so3_exp
+
+
+def moments_at(pairs, centers, masses=None):
+    count = len(pairs)
+    centers = torch.as_tensor(centers, dtype=torch.float64)
+    mass = torch.ones(count, dtype=torch.float64) if masses is None else torch.as_tensor(masses, dtype=torch.float64)
+    return JointMoments(
+        torch.tensor(pairs, dtype=torch.int64).reshape(-1, 2), mass, centers, torch.zeros(count, 3, 3).double()
+    )
+
+
+def turned_about(point, rotation_vector):
+    turn = so3_exp(torch.as_tensor(rotation_vector, dtype=torch.float64))
+    point = torch.as_tensor(point, dtype=torch.float64)
+    return rigid_matrix(turn, point - turn @ point)
+
+
+def test_a_hinge_is_found_and_its_axis_left_at_the_region():
+    whole = se3_exp(torch.tensor([1.0, -2, 3, 0.4, 0.2, -1], dtype=torch.float64))
+    hinge = turned_about([1.0, 2.0, 0.0], [0, 0, 1.2])
+    transforms = torch.stack([whole, whole @ hinge])
+    joints = find_joints(moments_at([[0, 1]], [[1.3, 1.8, 0.7]]), transforms, regularization=1e-8)
+    torch.testing.assert_close(joints.centers[0], torch.tensor([1.0, 2.0, 0.7], dtype=torch.float64))
+    assert float(joints.gaps[0]) < 1e-6
+
+
+def test_several_poses_find_a_ball_joint():
+    ball = torch.tensor([0.5, -1.0, 2.0], dtype=torch.float64)
+    poses = torch.stack(
+        [
+            torch.stack([torch.eye(4, dtype=torch.float64), turned_about(ball, vector)])
+            for vector in ([0.5, 0, 0], [0, 0.5, 0.1], [0, 0, 0.4])
+        ]
+    )
+    joints = find_joints(moments_at([[0, 1]], [[0.0, 0.0, 0.0]]), poses, regularization=1e-9)
+    torch.testing.assert_close(joints.centers[0], ball, atol=1e-6, rtol=0)
+    assert joints.gaps.shape == (3, 1)
+
+
+def test_bones_that_turn_alike_meet_at_the_region():
+    transforms = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    transforms[1, 0, 3] = 0.25
+    joints = find_joints(moments_at([[0, 1]], [[1.0, 2.0, 3.0]]), transforms)
+    assert joints.centers.tolist() == [[1.0, 2.0, 3.0]]
+    assert joints.gaps.tolist() == [0.25]
+
+
+def test_the_regularization_is_the_square_of_an_angle():
+    region = [0.0, 0.0, 0.0]
+    for angle in (0.1, 0.4):
+        hinge = torch.stack([torch.eye(4, dtype=torch.float64), turned_about([1.0, 0.0, 0.0], [0, 0, angle])])
+        found = find_joints(moments_at([[0, 1]], [region]), hinge, regularization=angle**2).centers[0]
+        assert float(found[0]) == pytest.approx(0.5, abs=0.01)
+
+
+def test_joints_move_with_the_space_and_have_gradients():
+    transforms = se3_exp(torch.randn(3, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64))
+    moments = moments_at([[0, 1], [1, 2]], [[0.1, 0.2, 0.3], [1.0, 0.0, -1.0]])
+    found = find_joints(moments, transforms).centers
+    start = se3_exp(torch.tensor([0.3, 2, 1, 1, -0.5, 0.2], dtype=torch.float64))
+    back = torch.linalg.inv(start)
+    moved = moments_at([[0, 1], [1, 2]], moments.center @ start[:3, :3].mT + start[:3, 3])
+    there = find_joints(moved, transforms @ back).centers
+    torch.testing.assert_close(there, found @ start[:3, :3].mT + start[:3, 3])
+    scaled = transforms.clone()
+    scaled[:, :3, 3] *= 50
+    wide = find_joints(moments_at([[0, 1], [1, 2]], 50 * moments.center), scaled).centers
+    torch.testing.assert_close(wide, 50 * found)
+    assert torch.autograd.gradcheck(lambda t: find_joints(moments, t).centers, (transforms.requires_grad_(),))
+
+
+def test_the_tree_takes_the_strongest_joints():
+    centers = [[1.0, 0, 0], [2.0, 0, 0], [3.0, 0, 0], [4.0, 0, 0]]
+    moments = moments_at([[0, 1], [0, 2], [1, 2], [3, 4]], centers, [5.0, 1.0, 4.0, 0.5])
+    joints = find_joints(moments, torch.eye(4, dtype=torch.float64).repeat(6, 1, 1))
+    middles = torch.full((6, 3), 9.0, dtype=torch.float64)
+    tree = bone_tree(joints, middles, [1.0, 3.0, 2.0, 1.0, 2.0, 0.0])
+    assert tree.parents == (1, -1, 1, 4, -1, -1)
+    assert tree.origins[:, 0].tolist() == [1.0, 9.0, 3.0, 4.0, 9.0, 9.0]
+
+
+def test_bones_without_joints_are_roots():
+    moments = moments_at([], torch.zeros(0, 3))
+    joints = find_joints(moments, torch.eye(4, dtype=torch.float64).repeat(2, 1, 1))
+    assert bone_tree(joints, torch.zeros(2, 3), torch.ones(2)).parents == (-1, -1)
+
+
+def test_bad_input_is_named():
+    with pytest.raises(InputError, match="regularization must be positive"):
+        find_joints(moments_at([[0, 1]], [[0.0, 0, 0]]), torch.eye(4).repeat(2, 1, 1), regularization=-math.pi)
+    with pytest.raises(InputError, match="transforms must have shape"):
+        find_joints(moments_at([[0, 1]], [[0.0, 0, 0]]), torch.eye(3).repeat(2, 1, 1))
