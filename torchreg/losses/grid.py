@@ -13,8 +13,8 @@ class JointEnergy(nn.Module):
     """How far apart bones move what they share.
 
     ``E = sum_{i < j} tau_ij int w_i w_j |T_i x - T_j x|^2 dx`` over the grid, ``tau_ij = 1 / int w_i w_j dx``, in
-    closed form: ``tr((A_i - A_j) M_ij (A_i - A_j)^T) tau_ij`` with ``A = [R t]``. Each pair counts once. It is zero when
-    all bones move alike.
+    closed form: ``tr((A_i - A_j) M_ij (A_i - A_j)^T) tau_ij`` with ``A = [R t]``. Each pair counts once. It is zero
+    when all bones move alike.
 
     The prediction is the bones' motions, the target what they share, so that the gradient in the weights comes through
     `joint_moments` with ``pairs`` given.
