@@ -213,7 +213,7 @@ def walking_figure(
     *,
     proportions: Proportions | None = None,
     cycles_per_frame: float = 0.08,
-    turn: float = 2 * math.pi,
+    turn: float = math.radians(2),
     scanner: DepthScanner | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> ScanSequence:
@@ -227,7 +227,7 @@ def walking_figure(
         seed: of the walk, of where it begins, and of the noise.
         proportions: of the `person`; all 1 by default.
         cycles_per_frame: share of two steps from frame to frame.
-        turn: how far the person turns altogether, radians.
+        turn: how far the person turns from frame to frame, radians: 2 degrees show every side in 180 frames.
         scanner: the camera; `DepthScanner` by default, 4,500 points.
         dtype: of scans and truth.
 
@@ -251,7 +251,7 @@ def walking_animal(
     gait: str = "trot",
     proportions: Proportions | None = None,
     cycles_per_frame: float = 0.08,
-    turn: float = 2 * math.pi,
+    turn: float = math.radians(2),
     scanner: DepthScanner | None = None,
     dtype: torch.dtype = torch.float32,
 ) -> ScanSequence:
@@ -345,10 +345,10 @@ def _before_camera(
     seed: int,
     dtype: torch.dtype,
 ) -> ScanSequence:
-    """Return the sequence of a figure that begins at a random angle to the camera and turns by ``turn`` in all."""
+    """Return the sequence of a figure that begins at a random angle to the camera and turns by ``turn`` a frame."""
     generator = torch.Generator().manual_seed(seed)
     begin = 2 * math.pi * torch.rand(1, generator=generator, dtype=torch.float64)
-    angle = begin + turn * torch.linspace(0, 1, len(rotations), dtype=torch.float64)
+    angle = begin + turn * torch.arange(len(rotations), dtype=torch.float64)
     base = _facing_camera(figure, angle, torch.zeros_like(angle), heights)
     return ScanSequence(figure, figure.transforms(rotations, base), scanner or DepthScanner(), seed=seed, dtype=dtype)
 
