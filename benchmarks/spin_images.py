@@ -1,0 +1,187 @@
+"""How many matches of spin images are right, on pairs of range scans whose truth is known.
+
+A match is right if it lies within 5 % of the diagonal of the true place of its source point. 1,000 source points are
+matched with 2,500 target points, all spread evenly; bins are shares of the longest side of the source's box, images
+15 x 15, the support angle 90 degrees. The first row is what closest points would give. Pairs are those of a folder of
+NPZ files (source_points, source_faces, target_points, target_faces, source_truth, diagonal), and made-up ones: a person
+walking, other animals of random proportions, a robot whose joints are turned, one and three frames apart.
+
+    python benchmarks/spin_images.py --data FOLDER
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchreg as tr
+from torchreg.correspondence.descriptor_matching import match_descriptors
+from torchreg.correspondence.spin_images import spin_images
+from torchreg.datasets.bodies import Proportions
+from torchreg.datasets.scan_sequences import ScanSequence, jointed_toy, walking_animal, walking_figure
+from torchreg.geometry.neighbors import nearest_neighbor
+
+RIGHT = 0.05
+NUM_SOURCE, NUM_TARGET, NUM_SCENE = 1000, 2500, 1500
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One problem: scans, the true places of the source's points, and the diagonal by which errors are divided."""
+
+    source: tr.RangeScan
+    target: tr.RangeScan
+    truth: Tensor
+    diagonal: float
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """One way to match; ``divisions`` is the number of bins along the longest side of the source."""
+
+    label: str
+    divisions: float = 50
+    similarity: str = "correlation"
+    num_candidates: int = 1
+    mutual: bool = False
+    max_ratio: float | None = None
+    max_distance: float | None = None
+
+
+RECIPES = (
+    Recipe("bin 1/100", 100),
+    Recipe("bin 1/50 (the paper)", 50),
+    Recipe("bin 1/15", 15),
+    Recipe("bin 1/25", 25),
+    Recipe("bin 1/25, l2", 25, "l2"),
+    Recipe("bin 1/25, overlap", 25, "overlap"),
+    Recipe("bin 1/25, 5 candidates", 25, num_candidates=5),
+    Recipe("bin 1/25, within 30 %", 25, max_distance=0.3),
+    Recipe("bin 1/25, mutual", 25, mutual=True),
+    Recipe("bin 1/25, ratio 0.8", 25, max_ratio=0.8),
+    Recipe("bin 1/25, mutual, ratio 0.8", 25, mutual=True, max_ratio=0.8),
+)
+
+
+def file_pairs(folder: Path) -> Iterator[Pair]:
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path) as file:
+            source = tr.RangeScan(file["source_points"], file["source_faces"])
+            target = tr.RangeScan(file["target_points"], file["target_faces"])
+            yield Pair(source, target, torch.from_numpy(file["source_truth"]), float(file["diagonal"]))
+
+
+def made_up_pairs(sequence: ScanSequence, count: int, apart: int) -> Iterator[Pair]:
+    """Yield pairs of frames ``apart``, spread over the sequence."""
+    for start in torch.linspace(0, len(sequence) - 1 - apart, count).long().tolist():
+        pair = sequence.pair(start, start + apart)
+        yield Pair(pair.source, pair.target, pair.truth, pair.source.diagonal)
+
+
+def groups(folder: Path | None, count: int) -> Iterator[tuple[str, list[Pair]]]:
+    """Yield names and pairs."""
+    if folder is not None and any(folder.glob("*.npz")):
+        yield folder.name, list(file_pairs(folder))[: 10 * count]
+    animal = Proportions.random(torch.Generator().manual_seed(1), 0.2)
+    for name, sequence in (
+        ("person", walking_figure(60)),
+        ("animal", walking_animal(60, gait="gallop", proportions=animal)),
+        ("robot", jointed_toy(30)),
+    ):
+        for apart in (1, 3):
+            yield f"{name}, {apart} apart", list(made_up_pairs(sequence, count, apart))
+
+
+@dataclass(frozen=True)
+class Described:
+    """Points ``here`` of the source and ``there`` of the target, their images, and the seconds these took."""
+
+    here: Tensor
+    there: Tensor
+    images: tuple[Tensor, Tensor]
+    seconds: float
+
+
+def described(pair: Pair, divisions: float) -> Described:
+    source, target = pair.source, pair.target
+    begin = time.perf_counter()
+    here, there = source.uniform_subsample(NUM_SOURCE), target.uniform_subsample(NUM_TARGET)
+    bin_size = float((source.points.amax(0) - source.points.amin(0)).max()) / divisions
+    images = []
+    for scan, which in ((source, here), (target, there)):
+        scene = scan.uniform_subsample(NUM_SCENE)
+        surface = (scan.points[scene], scan.normals[scene])
+        images.append(spin_images(scan.points[which], scan.normals[which], *surface, bin_size=bin_size))
+    return Described(here, there, (images[0], images[1]), time.perf_counter() - begin)
+
+
+def shares(pair: Pair, recipe: Recipe, found: Described) -> tuple[float, float, float]:
+    """Return the share of right matches, of source points with one that is right, and the seconds it took."""
+    source, target, truth = pair.source.points[found.here], pair.target.points[found.there], pair.truth[found.here]
+    begin = time.perf_counter()
+    matches = match_descriptors(
+        *found.images,
+        num_candidates=recipe.num_candidates,
+        similarity=recipe.similarity,
+        mutual=recipe.mutual,
+        max_ratio=recipe.max_ratio,
+        separation=RIGHT * pair.diagonal if recipe.max_ratio else 0.0,
+        source_points=source,
+        target_points=target,
+        max_distance=None if recipe.max_distance is None else recipe.max_distance * pair.diagonal,
+    )
+    seconds = found.seconds + time.perf_counter() - begin
+    row, match = matches.pairs()
+    right = (target[match] - truth[row]).norm(dim=-1) < RIGHT * pair.diagonal
+    return float(right.float().mean()), row[right].unique().numel() / len(source), seconds
+
+
+def closest_share(pair: Pair) -> float:
+    """Return the share of source points whose closest target point is right."""
+    found, _ = nearest_neighbor(pair.source.points, pair.target.points)
+    return float(((pair.target.points[found] - pair.truth).norm(dim=-1) < RIGHT * pair.diagonal).float().mean())
+
+
+def print_table(name: str, pairs: list[Pair], recipes: tuple[Recipe, ...]) -> None:
+    """Print one line per recipe."""
+    print(f"{name}: {len(pairs)} pairs")
+    print(f"  {'':30s} {'right':>6s} {'worst':>6s} {'points':>7s} {'s':>6s}")
+    closest = torch.tensor([closest_share(pair) for pair in pairs])
+    print(f"  {'closest points':30s} {closest.mean():6.1%} {closest.min():6.1%} {closest.mean():7.1%}")
+    for divisions, alike in itertools.groupby(recipes, key=lambda recipe: recipe.divisions):
+        images = [described(pair, divisions) for pair in pairs]
+        for recipe in alike:
+            rows = [shares(pair, recipe, found) for pair, found in zip(pairs, images, strict=True)]
+            right, reached, seconds = torch.tensor(rows).nan_to_num(0.0).unbind(-1)
+            line = f"  {recipe.label:30s} {right.mean():6.1%} {right.min():6.1%}"
+            print(f"{line} {reached.mean():7.1%} {seconds.median():6.2f}", flush=True)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print the tables; return 0."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, help="folder of NPZ pairs; without it, made-up pairs only")
+    parser.add_argument("--pairs", type=int, default=5, help="made-up pairs per group")
+    parser.add_argument("--smoke", action="store_true", help="two pairs and two recipes, for a quick look")
+    options = parser.parse_args(arguments)
+    if options.data is None or not options.data.is_dir():
+        print("skipped: pairs from files; name their folder with --data")
+    print(f"right: matches within {RIGHT:.0%} of the diagonal; points: source points with at least one right match")
+    for name, pairs in groups(options.data, options.pairs):
+        print_table(name, pairs[:2] if options.smoke else pairs, RECIPES[3:5] if options.smoke else RECIPES)
+        if options.smoke:
+            break
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
