@@ -23,12 +23,14 @@ if TYPE_CHECKING:
     from torchreg.pipelines.align import AlignConfig, align
     from torchreg.pipelines.calibrate import calibrate
     from torchreg.pipelines.find_pose import FindPoseConfig, find_pose
+    from torchreg.pipelines.solve_pose import solve_pose
     from torchreg.pipelines.storage import load
     from torchreg.pipelines.track import TrackConfig, Tracker
     from torchreg.results import (
         AlignResult,
         Calibration,
         FrameResult,
+        PoseSolution,
         PoseStarts,
         Status,
         TrackResult,
@@ -49,6 +51,7 @@ __all__ = [
     "GridLBS",
     "Hand",
     "LinearBlendSkin",
+    "PoseSolution",
     "PoseStarts",
     "RangeScan",
     "SigmaSchedule",
@@ -69,6 +72,7 @@ __all__ = [
     "load_points",
     "metrics",
     "sample_skin",
+    "solve_pose",
 ]
 
 _MODULES = frozenset({"errors", "metrics"})
@@ -85,6 +89,7 @@ _OWNERS = {
     "GridLBS": "models.grid_lbs",
     "Hand": "models.hand",
     "LinearBlendSkin": "models.skin",
+    "PoseSolution": "results",
     "PoseStarts": "results",
     "RangeScan": "geometry.range_scan",
     "SigmaSchedule": "correspondence.sigma",
@@ -102,6 +107,7 @@ _OWNERS = {
     "load_mesh": "io.points",
     "load_points": "io.points",
     "sample_skin": "models.skin",
+    "solve_pose": "pipelines.solve_pose",
 }
 
 

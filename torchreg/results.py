@@ -310,3 +310,24 @@ class DemoResult(Result):
     tip_errors: Tensor
     tips_seen: Tensor
     seed: int
+
+
+@dataclass(frozen=True)
+class PoseSolution(Result):
+    """A pose of a registered thing in which handles lie at targets. A batch adds leading dimensions to all tensors.
+
+    Args:
+        transforms: (B, 4, 4) of the bones.
+        placed: (H, 3) where the handles are.
+        misses: (H,) their distances from the targets.
+        gaps: (J,) how far apart the bones of each joint take its center.
+        num_steps: linear systems solved.
+        status: CONVERGED or MAX_STEPS; a tuple with one entry per problem for a batch.
+    """
+
+    transforms: Tensor
+    placed: Tensor
+    misses: Tensor
+    gaps: Tensor
+    num_steps: int
+    status: Status | tuple[Status, ...]

@@ -305,6 +305,12 @@ class GridLBS(nn.Module):
         Differentiable: in ``transforms`` and ``twists``.
         """
         moments = self.joint_moments(min_mass=min_mass)
+        return self.joints_of(moments, transforms, regularization=regularization)
+
+    def joints_of(
+        self, moments: JointMoments, transforms: Tensor | None = None, *, regularization: float = 0.01
+    ) -> Joints:
+        """Return what `joints` does, of moments that are known already."""
         return find_joints(
             moments, self.transforms if transforms is None else transforms, regularization=regularization
         )

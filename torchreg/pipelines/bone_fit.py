@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -80,6 +81,7 @@ def fit_bones(
     rtol: float = 1e-4,
     atol: float = 0.0,
     damping: float | Tensor = _DEFAULT_DAMPING,
+    retract: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> BoneFit:
     """Return the motions of least energy that damped Gauss-Newton steps find, each problem of a batch by itself.
 
@@ -94,6 +96,7 @@ def fit_bones(
         rtol: a problem is done when a step changes its energy by less than this share.
         atol: a problem is done when its energy is below the square of this length.
         damping: (...) to start with, as an earlier fit of the same kind returned; 1 for starts far off.
+        retract: motions and twists (..., B, 6) about the bones' middles to motions; `turn_about` by default.
 
     Returns:
         a `BoneFit`.
@@ -118,7 +121,10 @@ def fit_bones(
     while steps < max_steps and not bool(done.all()):
         steps += 1
         twists = _damped_twists(problem, transforms, current, level, fixed)
-        trial_transforms = turn_about(transforms, twists, problem.centers(transforms))
+        if retract is None:
+            trial_transforms = turn_about(transforms, twists, problem.centers(transforms))
+        else:
+            trial_transforms = retract(transforms, twists)
         trial = problem.linearize(trial_transforms)
         decrease = current.cost - trial.cost
         better = (decrease >= 0) & ~done

@@ -32,6 +32,7 @@ from torchreg.results import (
     Calibration,
     DemoResult,
     FrameResult,
+    PoseSolution,
     PoseStarts,
     Result,
     Status,
@@ -43,7 +44,7 @@ from torchreg.results import (
 # What a file may name: nothing else is ever built from it.
 _RESULTS: dict[str, type[Result]] = {
     kind.__name__: kind
-    for kind in (AlignResult, Calibration, DemoResult, FrameResult, PoseStarts, TrackResult, TrackState)
+    for kind in (AlignResult, Calibration, DemoResult, FrameResult, PoseSolution, PoseStarts, TrackResult, TrackState)
 }
 _SHAPE_RECORDS = (ShapeRecord, ShapeSpec, HandSpec, KinematicTree, Joint, Primitive, RigSurface)
 _RECORDS: dict[str, type] = {kind.__name__: kind for kind in (AlignRecord, TrackResult, *_SHAPE_RECORDS)}
