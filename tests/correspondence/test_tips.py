@@ -79,6 +79,17 @@ def test_lengths_tell_limbs_apart_that_places_do_not():
     assert torch.equal(order[match.index], torch.arange(4))
 
 
+def test_the_roots_of_limbs_tell_which_end_is_which_where_ends_have_passed_each_other():
+    roots = torch.tensor([[-1.0, 0, 0], [1, 0, 0], [0, 0, 4]], dtype=torch.float64)
+    before = torch.tensor([[-0.1, -3, 0.8], [0.1, -3, -0.8], [0, 0, 5]], dtype=torch.float64)
+    after = torch.tensor([[0.1, -3, -0.8], [-0.1, -3, 0.8], [0, 0, 5]], dtype=torch.float64)
+    share = torch.linspace(0, 1, 6, dtype=torch.float64)[:, None]
+    known, curves = (tip[:, None] + share * (roots - tip)[:, None] for tip in (before, after))
+    assert match_tips([TipReference(known[:, 0])], curves[:, 0]).index.tolist() == [1, 0, 2]
+    wide = torch.tensor([3.0, 1.0, 1.0], dtype=torch.float64)
+    assert match_tips([TipReference(known * wide)], curves * wide).index.tolist() == [0, 1, 2]
+
+
 def test_references_are_added_by_their_shares():
     first, second = random(5, 3), random(5, 3, seed=1)
     near = match_tips([TipReference(first), TipReference(second, share=1e-6)], first)
@@ -103,6 +114,7 @@ def test_no_tips_at_all_and_tips_in_one_place_are_answered():
             "same number of tips",
         ),
         (lambda: match_tips([TipReference(torch.zeros(3, 3))], torch.zeros(3)), "tips must have shape"),
+        (lambda: match_tips([TipReference(torch.zeros(3, 3))], torch.zeros(3, 2, 3)), "as many points each"),
         (lambda: match_tips([TipReference(torch.eye(3))], torch.eye(3), torch.zeros(2, 2)), "lengths must have shape"),
         (lambda: match_tips([TipReference(torch.eye(3))], torch.eye(3), missing=0.0), "missing must be positive"),
     ],

@@ -1,4 +1,4 @@
-"""Which tip is which: rigid fits of a few points to others, trying all mappings or, with many tips, good guesses."""
+"""Which limb is which: rigid fits of a few tips or curves, trying all mappings or, with many limbs, good guesses."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from itertools import combinations, permutations
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_points, check_positive, check_shape
+from torchreg._checks import as_float_tensor, check_finite, check_positive, check_shape
 from torchreg.errors import InputError
 from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.geometry.rotation import so3_exp
+from torchreg.geometry.skeleton import nearest_rotation
 from torchreg.solvers.assignment import assign
 
 # Up to so many mappings are tried one by one; above, guesses are refined by assignments.
@@ -25,10 +26,10 @@ _GUESSES = 24
 
 @dataclass(frozen=True, eq=False)
 class TipReference:
-    """Tips of a known frame, against which others are compared.
+    """Limbs of a known frame, against which others are compared.
 
     Args:
-        tips: (K, 3).
+        tips: (K, 3), or curves (K, S, 3) of the limbs, from the tip inwards.
         lengths: (K, K) along the skeleton from tip to tip; None: not compared.
         share: weight of this reference among several.
         turn: weight of the turn of the whole: near in time it should be small.
@@ -58,13 +59,15 @@ def match_tips(
     tips: Tensor,
     lengths: Tensor | None = None,
     *,
+    weights: Tensor | None = None,
     missing: float = 0.25,
     length_weight: float = 0.5,
 ) -> TipMatch:
     """Return which tip is which of the known ones, by the mapping of least error.
 
     A mapping m of K known tips A to tips B, or to none, costs, with ``s^2`` the mean squared distance of the A from
-    their middle and R, T the best rigid motion (det R = +1) of those that are mapped::
+    their middle and R, T the best rigid motion (det R = +1) of those that are mapped (for curves, squared errors are
+    means over their points: the roots of limbs stay apart where their ends pass each other)::
 
         1 / K [ sum_k |B_m(k) - R A_k - T|^2 / s^2  +  turn * sum_k |R A_k - A_k|^2 / s^2     (centered A)
                 + length_weight * sum_k mean_l (d(B_m(k), B_m(l)) - d(A_k, A_l))^2 / 2 s^2  +  missing * their number ]
@@ -76,8 +79,10 @@ def match_tips(
 
     Args:
         references: frames whose tips are known, all with the same K; their costs are added, by ``share``.
-        tips: (M, 3) to be named.
+        tips: (M, 3), or curves (M, S, 3), to be named; or (M, K, S, 3): curves that depend on what they are compared
+            with, so that limbs can be cut to the length of the known one.
         lengths: (M, M) along the skeleton from tip to tip; None: not compared.
+        weights: (S,) of the points of a curve; their mean should be one. All one by default.
         missing: cost of a known tip that is not found, a squared share of the size.
         length_weight: of the third term.
 
@@ -93,17 +98,27 @@ def match_tips(
     if not references:
         raise InputError("references must hold at least one known frame, got none")
     tips = as_float_tensor(tips, "tips")
-    check_points(tips, "tips", min_count=0, batch=False)
+    tips = _as_curves(tips, "tips") if tips.ndim < 4 else tips
+    check_finite(tips, "tips")
     check_positive(missing, "missing")
     check_positive(length_weight, "length_weight", allow_zero=True)
-    count = len(references[0].tips)
-    for number, reference in enumerate(references):
-        check_points(reference.tips, f"references[{number}].tips", batch=False)
-        if len(reference.tips) != count:
-            raise InputError(f"references must have the same number of tips, got {count} and {len(reference.tips)}")
+    known = [_as_curves(row.tips, f"references[{number}].tips") for number, row in enumerate(references)]
+    count = len(known[0])
+    for row in known:
+        if len(row) != count:
+            raise InputError(f"references must have the same number of tips, got {count} and {len(row)}")
+        if row.shape[1] != tips.shape[-2]:
+            raise InputError(
+                f"tips must have as many points each as the references, got {tips.shape[-2]} of {row.shape[1]}"
+            )
+    if tips.ndim == 3:
+        tips = tips.unsqueeze(1).expand(-1, count, -1, -1)
+    check_shape(tips, "tips", ("M", count, "S", 3))
     if lengths is not None:
         check_shape(lengths, "lengths", (len(tips), len(tips)))
-    problem = _Problem(references, tips.double(), lengths, missing, length_weight)
+    weights = tips.new_ones(tips.shape[2]) if weights is None else as_float_tensor(weights, "weights", like=tips)
+    check_shape(weights, "weights", (tips.shape[2],))
+    problem = _Problem(references, known, tips.double(), weights.double(), lengths, missing, length_weight)
     with torch.no_grad():
         fixed = _all_mappings(count, len(tips))
         maps = _guessed(problem) if fixed is None else fixed.to(tips.device)
@@ -112,42 +127,74 @@ def match_tips(
         return TipMatch(maps[best], float(costs[best]))
 
 
+def _as_curves(value: Tensor, name: str) -> Tensor:
+    """Return tips as curves (K, S, 3)."""
+    value = as_float_tensor(value, name)
+    value = value.unsqueeze(1) if value.ndim == 2 else value
+    check_shape(value, name, ("K", "S", 3))
+    check_finite(value, name)
+    return value
+
+
 class _Problem:
     """Tips to be named, and the cost of naming them; see `match_tips`."""
 
     def __init__(
-        self, references: list[TipReference], tips: Tensor, lengths: Tensor | None, missing: float, length_weight: float
+        self,
+        references: list[TipReference],
+        known: list[Tensor],
+        tips: Tensor,
+        weights: Tensor,
+        lengths: Tensor | None,
+        missing: float,
+        length_weight: float,
     ) -> None:
-        self.tips, self.missing, self.length_weight = tips, missing, length_weight
+        tips = tips - tips.mean((0, 1, 2)) if len(tips) else tips
+        self.tips, self.weights, self.missing, self.length_weight = tips, weights, missing, length_weight
         self.lengths = None if lengths is None else lengths.to(tips)
         self.references = references
-        self.known = [reference.tips.to(tips) for reference in references]
-        self.sizes = [_squared_size(known) for known in self.known]
+        # About the middle: the sums of products below would round far from the origin.
+        self.known = [row.to(tips) - row.to(tips).mean((0, 1)) for row in known]
+        self.sizes = [_squared_size(row[:, 0]) for row in self.known]
 
     def costs(self, maps: Tensor) -> Tensor:
         """Return the costs (P,) of mappings (P, K)."""
         found = maps >= 0
-        total = maps.new_zeros(len(maps), dtype=torch.float64)
+        total = torch.zeros(len(maps)).to(self.tips)
         for number, reference in enumerate(self.references):
-            error = (self._rigid_errors(number, maps) * found).sum(-1)
+            error = self._rigid_errors(number, maps)
             if self.lengths is not None and reference.lengths is not None:
-                error += self.length_weight * self._length_errors(number, maps)
+                error = error + self.length_weight * self._length_errors(number, maps)
             total += reference.share * error / self.sizes[number]
         share = sum(reference.share for reference in self.references)
         return (total / share + self.missing * (~found).sum(-1)) / maps.shape[1]
 
     def _rigid_errors(self, number: int, maps: Tensor) -> Tensor:
-        """Return the squared errors (P, K) of the rigid fit, the turn's included."""
-        found = (maps >= 0).to(self.tips)
-        known = self.known[number].expand(len(maps), -1, -1)
-        there = self.tips[maps.clamp_min(0)] if len(self.tips) else torch.zeros_like(known)
-        motion = fit_rigid(known, there, found)
-        error = (there - transform_points(motion, known)).square().sum(-1)
-        centered = (
-            known - (known * found.unsqueeze(-1)).sum(1, keepdim=True) / found.sum(-1).clamp_min(1)[:, None, None]
-        )
-        turned = (centered @ motion[:, :3, :3].mT - centered).square().sum(-1)
-        return error + self.references[number].turn * turned
+        """Return the squared errors (P,) of the rigid fits, those of the turns included.
+
+        Sums of products of coordinates are all that a fit needs, and they add up over the limbs of a mapping.
+        """
+        known, weights = self.known[number], self.weights
+        limb = torch.arange(len(known), device=maps.device)
+
+        def chosen(table: Tensor) -> Tensor:
+            """Return the sums over the limbs of a mapping of a table (M, K, ...); nothing for a missing one."""
+            return torch.cat((table, table.new_zeros(1, *table.shape[1:])))[maps, limb].sum(1)
+
+        spread = known.expand(len(self.tips), -1, -1, -1)
+        count = chosen(weights.sum().expand(len(self.tips), len(known))).clamp_min(1e-12)
+        middle = chosen((weights[:, None] * spread).sum(2))
+        middle_there = chosen((weights[:, None] * self.tips).sum(2))
+        own = chosen(torch.einsum("s,mksi,mksj->mkij", weights, spread, spread))
+        square = chosen((weights * self.tips.square().sum(-1)).sum(-1)) - middle_there.square().sum(-1) / count
+        moment = chosen(torch.einsum("s,mksi,mksj->mkij", weights, self.tips, spread))
+        moment = moment - middle_there.unsqueeze(-1) * middle.unsqueeze(-2) / count[:, None, None]
+        own = own - middle.unsqueeze(-1) * middle.unsqueeze(-2) / count[:, None, None]
+        rotation = nearest_rotation(moment)
+        size = own.diagonal(dim1=-2, dim2=-1).sum(-1)
+        error = square + size - 2 * (rotation * moment).sum((-2, -1))
+        turned = 2 * size - 2 * (rotation * own).sum((-2, -1))
+        return (error + self.references[number].turn * turned).clamp_min(0) / known.shape[1]
 
     def _length_errors(self, number: int, maps: Tensor) -> Tensor:
         """Return the squared errors (P,) of the lengths from tip to tip: per tip the mean over the others, summed."""
@@ -165,15 +212,17 @@ class _Problem:
     def refined(self, rotation: Tensor) -> Tensor:
         """Return the mapping (K,) that assignments and rigid fits agree on, from a turn (3, 3) of the known."""
         known, size = self.known[0], self.sizes[0]
-        moved = (known - known.mean(0)) @ rotation.mT + self.tips.mean(0)
+        moved = (known - known.mean((0, 1))) @ rotation.mT + self.tips.mean((0, 1, 2))
         mapping = torch.full((len(known),), -2)
         for _ in range(_MAX_ROUNDS):
-            costs = (moved.unsqueeze(1) - self.tips).square().sum(-1) / size
+            costs = ((moved - self.tips).square().sum(-1) * self.weights).mean(-1).mT / size
             before, mapping = mapping, assign(costs, self.missing)
             if torch.equal(before, mapping):
                 break
-            found = (mapping >= 0).to(known)
-            moved = transform_points(fit_rigid(known, self.tips[mapping.clamp_min(0)], found), known)
+            found = ((mapping >= 0).to(known).unsqueeze(-1) * self.weights).flatten()
+            there = self.tips[mapping.clamp_min(0), torch.arange(len(mapping))].flatten(0, 1)
+            motion = fit_rigid(known.flatten(0, 1), there, found)
+            moved = transform_points(motion, known.flatten(0, 1)).reshape(known.shape)
         return mapping
 
 

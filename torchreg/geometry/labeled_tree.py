@@ -90,6 +90,23 @@ class LimbGraph:
         return sorted(self.splits, key=lambda split: (-len(split), sorted(split)))
 
 
+def number_nodes(graph: Tensor, num_samples: int) -> Tensor:
+    """Return which node each sample of each limb is, (L, num_samples), for limbs (L, 2) that share their end nodes.
+
+    The nodes of the graph keep their numbers; the samples inside the limbs follow.
+    """
+    inner = len(graph) + 1 + torch.arange(len(graph) * (num_samples - 2), device=graph.device)
+    return torch.cat((graph[:, :1], inner.reshape(len(graph), num_samples - 2), graph[:, 1:]), dim=1)
+
+
+def gather_nodes(values: Tensor, limb_nodes: Tensor) -> Tensor:
+    """Return values (T, L, S, ...) along limbs per node (T, N, ...), each from the first limb that has it."""
+    flat = limb_nodes.reshape(-1)
+    place = torch.arange(len(flat), device=flat.device)
+    first = torch.full_like(place[: int(flat.max()) + 1], len(flat)).scatter_reduce(0, flat, place, "amin")
+    return values.flatten(1, 2)[:, first]
+
+
 def fit_together(split: Split, other: Split) -> bool:
     """Return whether two splits can be limbs of one tree: one holds the other, or they share no tip."""
     return split <= other or other <= split or not split & other

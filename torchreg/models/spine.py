@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchreg._checks import as_float_tensor, as_tensor, check_finite, check_shape
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.curves import bend_angles, curve_frames, curve_lengths, follow, tangents
+from torchreg.geometry.labeled_tree import gather_nodes, number_nodes
 from torchreg.geometry.skeleton import nearest_rotation
 
 # Limbs that share a node must agree on its place up to this share of the size.
@@ -74,11 +75,11 @@ class Spine(nn.Module):
         check_shape(frames, "frames", (count, limbs, samples, 3, 3))
         check_finite(frames, "frames")
         self.register_buffer("graph", graph)
-        self.register_buffer("limb_nodes", _number_nodes(graph, samples))
+        self.register_buffer("limb_nodes", number_nodes(graph, samples))
         self.register_buffer("times", _check_times(times, curves))
         self.register_buffer("rest_frames", frames.detach().clone())
-        self.nodes = nn.Parameter(_gathered(curves, self.limb_nodes))
-        self.node_radii = nn.Parameter(_gathered(radii.detach(), self.limb_nodes))
+        self.nodes = nn.Parameter(gather_nodes(curves, self.limb_nodes))
+        self.node_radii = nn.Parameter(gather_nodes(radii.detach(), self.limb_nodes))
         off = float((self.nodes.detach()[:, self.limb_nodes] - curves).abs().max())
         size = float((curves.amax((0, 1, 2)) - curves.amin((0, 1, 2))).max())
         if off > _MEETING_SLACK * size:
@@ -194,20 +195,6 @@ def _check_graph(graph: Tensor, limbs: int) -> Tensor:
     if any(one > 1 and other == 1 for one, other in pairwise(degrees)):
         raise InputError(f"graph must number its tips first, got the degrees {degrees} of nodes 0 to {limbs}")
     return graph
-
-
-def _number_nodes(graph: Tensor, samples: int) -> Tensor:
-    """Return which node each point of each limb is, (L, S)."""
-    inner = len(graph) + 1 + torch.arange(len(graph) * (samples - 2), device=graph.device)
-    return torch.cat((graph[:, :1], inner.reshape(len(graph), samples - 2), graph[:, 1:]), dim=1)
-
-
-def _gathered(values: Tensor, limb_nodes: Tensor) -> Tensor:
-    """Return values (T, L, S, ...) per node, (T, N, ...), from the first limb that has it."""
-    flat = limb_nodes.reshape(-1)
-    place = torch.arange(len(flat), device=flat.device)
-    first = torch.full_like(place[: int(flat.max()) + 1], len(flat)).scatter_reduce(0, flat, place, "amin")
-    return values.flatten(1, 2)[:, first]
 
 
 def _check_times(times: Tensor | None, curves: Tensor) -> Tensor:
