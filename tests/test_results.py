@@ -65,7 +65,11 @@ def test_statuses_are_a_tuple_for_one_problem_and_for_many():
 
 
 def test_only_alignments_with_data_are_usable():
-    assert [status for status in Status if status.usable] == [Status.CONVERGED, Status.MAX_STEPS]
+    assert [status for status in Status if status.usable] == [
+        Status.CONVERGED,
+        Status.MAX_STEPS,
+        Status.WITH_WARNINGS,
+    ]
 
 
 def test_starts_give_their_best_and_one_cloud_of_a_batch():

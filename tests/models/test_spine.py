@@ -153,3 +153,13 @@ def test_bad_input_is_named(change, error, message):
 def test_times_outside_are_refused(spine):
     with pytest.raises(InputError, match=r"t must lie within the times 0.0 to 4.0"):
         spine(4.5)
+
+
+def test_the_record_makes_the_same_spine_again_also_after_a_step(spine):
+    with torch.no_grad():
+        spine.nodes += 0.1
+        spine.node_radii *= 2
+    fields = spine.record()
+    again = Spine(fields.curves, fields.graph, fields.radii, fields.frames, fields.times)
+    for name in ("nodes", "node_radii", "rest_frames", "times", "graph"):
+        assert torch.equal(getattr(again, name), getattr(spine, name))

@@ -12,9 +12,19 @@ from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.hand import Hand
 from torchreg.models.primitives import Primitive
+from torchreg.models.spine import Spine
 from torchreg.pipelines.align import AlignConfig, align
 from torchreg.pipelines.storage import load, load_pose, save_result
-from torchreg.results import AlignRecord, AlignResult, Calibration, DemoResult, Result, Status, TrackResult
+from torchreg.results import (
+    AlignRecord,
+    AlignResult,
+    Calibration,
+    DemoResult,
+    Result,
+    SpineSequence,
+    Status,
+    TrackResult,
+)
 
 
 def record(step, batch=1, dtype=torch.float32):
@@ -322,3 +332,31 @@ def test_only_alignments_hold_a_pose(tmp_path, hand):
         load_pose(tmp_path / "d.safetensors", hand)
     with pytest.raises(FileNotFoundError):
         load_pose(tmp_path / "none.csv", hand)
+
+
+def test_spines_come_back_with_their_model(tmp_path):
+    generator = torch.Generator().manual_seed(0)
+    ends = torch.randn(3, 4, 1, 3, generator=generator, dtype=torch.float64)
+    share = torch.linspace(0, 1, 5, dtype=torch.float64)[:, None]
+    graph = torch.tensor([[0, 3], [1, 3], [2, 3]])
+    curves = ends[:, :3] + share * (ends[:, 3:] - ends[:, :3])
+    model = Spine(curves, graph, times=torch.tensor([0.0, 1.0, 4.0]))
+    sequence = SpineSequence(
+        model=model, graph=graph, curves=curves, radii=torch.ones(3, 3, 5), frames=model.rest_frames, times=model.times,
+        found=torch.ones(3, 3, dtype=torch.bool), own=torch.zeros(3, 3, dtype=torch.bool), reference=1,
+        topologies=("(()()())",) * 3, own_topologies=("(()())", "(()()())", "(()()())"),
+        statuses=(Status.WITH_WARNINGS, Status.CONVERGED, Status.CONVERGED), status=Status.WITH_WARNINGS,
+        warnings=("frame 0: tips 2 not found",),
+    )  # fmt: skip
+    with torch.no_grad():
+        model.nodes[0, 0] += 1.0  # refined after the extraction
+    sequence.save(tmp_path / "spine.safetensors")
+    again = load(tmp_path / "spine.safetensors")
+    assert isinstance(again, SpineSequence)
+    assert torch.equal(again.model(2.5), model(2.5))
+    assert torch.equal(again.tips, sequence.tips)
+    assert torch.equal(again.junctions, curves[:, :1, -1])
+    assert again.num_tips == 3
+    assert (again.warnings, again.own_topologies, again.statuses) == (
+        sequence.warnings, sequence.own_topologies, sequence.statuses
+    )  # fmt: skip

@@ -56,8 +56,8 @@ class LimbGraph:
         if self.num_tips == 2:
             return ()
         result = []
-        for below in [every - {0}, *self._ordered]:
-            inside = [split for split in self._ordered if split < below]
+        for below in [every - {0}, *self.ordered_splits]:
+            inside = [split for split in self.ordered_splits if split < below]
             children = [split for split in inside if not any(split < other for other in inside)]
             loose = below.difference(*children)
             parts = sorted([*children, *(frozenset({tip}) for tip in loose)], key=min)
@@ -75,7 +75,7 @@ class LimbGraph:
                 owner[part] = self.num_tips + number
         rows = [(0, self.num_tips)]
         rows += [(tip, owner[frozenset({tip})]) for tip in range(1, self.num_tips)]
-        rows += [(owner[split], self.num_tips + 1 + number) for number, split in enumerate(self._ordered)]
+        rows += [(owner[split], self.num_tips + 1 + number) for number, split in enumerate(self.ordered_splits)]
         return torch.tensor(rows)
 
     @cached_property
@@ -85,8 +85,8 @@ class LimbGraph:
         return Skeleton(torch.eye(3)[torch.zeros(count).long()], self.edges, torch.zeros(count)).topology
 
     @property
-    def _ordered(self) -> list[Split]:
-        """The splits from large to small, then by their tips."""
+    def ordered_splits(self) -> list[Split]:
+        """The splits, one per limb between junctions, in the order of `edges`: large ones first, then by their tips."""
         return sorted(self.splits, key=lambda split: (-len(split), sorted(split)))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -15,6 +16,17 @@ from torchreg.geometry.skeleton import nearest_rotation
 
 # Limbs that share a node must agree on its place up to this share of the size.
 _MEETING_SLACK = 1e-4
+
+
+@dataclass(frozen=True)
+class SpineFields:
+    """What makes a `Spine`; see there."""
+
+    curves: Tensor
+    graph: Tensor
+    radii: Tensor
+    frames: Tensor
+    times: Tensor
 
 
 class Spine(nn.Module):
@@ -84,6 +96,12 @@ class Spine(nn.Module):
         size = float((curves.amax((0, 1, 2)) - curves.amin((0, 1, 2))).max())
         if off > _MEETING_SLACK * size:
             raise InputError(f"curves must meet where graph says so, got limbs {off:.3g} off their common node")
+
+    def record(self) -> SpineFields:
+        """Return the fields that make this spine again, also after it was refined."""
+        curves = self.nodes.detach()[:, self.limb_nodes]
+        radii = self.node_radii.detach()[:, self.limb_nodes]
+        return SpineFields(curves, self.graph, radii, self.rest_frames, self.times)
 
     @property
     def num_tips(self) -> int:

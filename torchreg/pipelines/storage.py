@@ -26,6 +26,7 @@ from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.primitives import Primitive
 from torchreg.models.rigs import RigSurface, ShapeSpec
 from torchreg.models.shape_record import HandSpec, ShapeRecord, build_shape, record_shape
+from torchreg.models.spine import Spine, SpineFields
 from torchreg.results import (
     AlignRecord,
     AlignResult,
@@ -35,6 +36,7 @@ from torchreg.results import (
     PoseSolution,
     PoseStarts,
     Result,
+    SpineSequence,
     Status,
     TrackResult,
     TrackState,
@@ -44,10 +46,20 @@ from torchreg.results import (
 # What a file may name: nothing else is ever built from it.
 _RESULTS: dict[str, type[Result]] = {
     kind.__name__: kind
-    for kind in (AlignResult, Calibration, DemoResult, FrameResult, PoseSolution, PoseStarts, TrackResult, TrackState)
+    for kind in (
+        AlignResult,
+        Calibration,
+        DemoResult,
+        FrameResult,
+        PoseSolution,
+        PoseStarts,
+        SpineSequence,
+        TrackResult,
+        TrackState,
+    )
 }
 _SHAPE_RECORDS = (ShapeRecord, ShapeSpec, HandSpec, KinematicTree, Joint, Primitive, RigSurface)
-_RECORDS: dict[str, type] = {kind.__name__: kind for kind in (AlignRecord, TrackResult, *_SHAPE_RECORDS)}
+_RECORDS: dict[str, type] = {kind.__name__: kind for kind in (AlignRecord, SpineFields, TrackResult, *_SHAPE_RECORDS)}
 _ENUMS: dict[str, type[Enum]] = {kind.__name__: kind for kind in (Status,)}
 
 
@@ -175,6 +187,8 @@ def _encode(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
         return {"enum": type(value).__name__, "value": value.value}
     if isinstance(value, ArticulatedShape):
         value = record_shape(value)
+    if isinstance(value, Spine):
+        value = value.record()
     if type(value).__name__ in _RECORDS:
         columns = {
             item.name: _encode(getattr(value, item.name), f"{name}.{item.name}", tensors) for item in fields(value)
@@ -220,6 +234,8 @@ def _decode(value: Any, tensors: Mapping[str, Tensor], where: str) -> Any:
         return _member(_known(_ENUMS, value["enum"], where), value.get("value"), where)
     if "record" in value:
         record = _build(_known(_RECORDS, value["record"], where), value.get("fields"), tensors, where)
+        if isinstance(record, SpineFields):
+            return Spine(record.curves, record.graph, record.radii, record.frames, record.times)
         return build_shape(record) if isinstance(record, ShapeRecord) else record
     if "table" in value:
         return _decode_table(value, tensors, where)
