@@ -332,3 +332,14 @@ def test_khronos_validator_finds_no_errors(tmp_path: Path) -> None:
     for line in output.strip().splitlines():
         issues = json.loads(line)
         assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
+
+
+def test_four_weights_are_enough_where_they_are_asked_for(tmp_path: Path) -> None:
+    arguments = scene(joints=9, spread=6)
+    player = Player(save(tmp_path / "a.glb", arguments | {"most_weights": 4}))
+    assert not hasattr(player.gltf.meshes[0].primitives[0].attributes, "JOINTS_1")
+    kept = np.where(arguments["weights"] >= np.sort(arguments["weights"], axis=1)[:, -4:-3], arguments["weights"], 0)
+    expected = blend(arguments | {"weights": kept / kept.sum(1, keepdims=True)}, 2)
+    np.testing.assert_allclose(player.skinned(arguments["times"][2]), expected, atol=1e-5)
+    with pytest.raises(InputError, match="most_weights must be 4, 8 or None, got 5"):
+        save(tmp_path / "b.glb", arguments | {"most_weights": 5})

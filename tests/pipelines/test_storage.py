@@ -9,7 +9,9 @@ import torch
 
 from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
+from torchreg.geometry.sparse_grid import SparseGrid
 from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.grid_lbs import GridLBS
 from torchreg.models.hand import Hand
 from torchreg.models.primitives import Primitive
 from torchreg.models.spine import Spine
@@ -360,3 +362,19 @@ def test_spines_come_back_with_their_model(tmp_path):
     assert (again.warnings, again.own_topologies, again.statuses) == (
         sequence.warnings, sequence.own_topologies, sequence.statuses
     )  # fmt: skip
+
+
+def test_models_on_grids_come_back_as_they_were(tmp_path):
+    points = torch.rand(60, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    grid = SparseGrid.from_points(points, 5)
+    weights = torch.rand(grid.num_corners, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    motions = torch.eye(4, dtype=torch.float64).repeat(3, 2, 1, 1)
+    motions[:, 1, 2, 3] = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    model = GridLBS(grid, weights, motions, blend="dual_quaternion")
+    empty = torch.zeros(0)
+    Calibration(model, empty, empty, empty, empty, Status.CONVERGED).save(tmp_path / "m.safetensors")
+    again = load(tmp_path / "m.safetensors").shape
+    assert isinstance(again, GridLBS)
+    assert again.blend == "dual_quaternion"
+    assert torch.equal(again.weights, model.weights)
+    assert torch.equal(again(points), model(points))

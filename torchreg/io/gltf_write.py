@@ -46,11 +46,14 @@ def save_animated_skin(
     times: Tensor,
     normals: Tensor | None = None,
     colors: Tensor | None = None,
+    *,
+    most_weights: int | None = None,
 ) -> Path:
     """Return the path of a .glb file with a mesh that linear blend skinning moves over time.
 
     The file plays ``x(t) = sum_j w_j T_world_joint_j(t) T_world_joint_j(rest)^-1 x`` in any glTF viewer. glTF stores
-    weights by fours: the four largest are kept and renormalized, eight where any vertex has a fifth above 1e-4.
+    weights by fours: the four largest are kept and renormalized, eight where any vertex has a fifth above 1e-4 unless
+    ``most_weights`` is 4, all that many viewers look at.
 
     Convention: ``T_world_joint`` maps joint to world coordinates; between frames, translations are interpolated
     linearly and rotations along the shorter arc, each relative to the parent joint.
@@ -67,6 +70,7 @@ def save_animated_skin(
         times: (T,) seconds, not negative, strictly increasing.
         normals: (V, 3) at the vertices; zero rows become +z, which viewers need to be of unit length.
         colors: (V, 3) or (V, 4) in [0, 1].
+        most_weights: 4 or 8, or None to decide by the weights.
 
     Returns:
         The path written.
@@ -76,6 +80,8 @@ def save_animated_skin(
         InputTypeError: if an argument does not hold numbers of the right kind.
     """
     target = _checked_path(path)
+    if most_weights not in (None, 4, 8):
+        raise InputError(f"most_weights must be 4, 8 or None, got {most_weights}")
     points = _numbers(vertices, "vertices", ("V", 3))
     triangles = _triangles(faces, "faces", len(points))
     count = _checked_names(joint_names, "joint_names")
@@ -87,7 +93,7 @@ def save_animated_skin(
 
     document = _Document()
     attributes = document.mesh_attributes(points, normals, colors)
-    for number, (joints, values) in enumerate(_weight_sets(weight)):
+    for number, (joints, values) in enumerate(_weight_sets(weight, most_weights)):
         setattr(attributes, f"JOINTS_{number}", document.add(joints, target=pygltflib.ARRAY_BUFFER))
         setattr(attributes, f"WEIGHTS_{number}", document.add(values, target=pygltflib.ARRAY_BUFFER))
     mesh = document.add_mesh("skin", attributes, triangles, None if colors is not None else _DEFAULT_COLOR)
@@ -357,7 +363,7 @@ def _rgba(colors: Tensor, name: str, count: int) -> Array:
     return values if values.shape[1] == 4 else np.concatenate([values, np.ones((count, 1))], axis=1)
 
 
-def _weight_sets(weights: Array) -> list[tuple[Array, Array]]:
+def _weight_sets(weights: Array, most: int | None) -> list[tuple[Array, Array]]:
     """Return (joint indices, weights) of the four or eight largest weights per vertex, in sets of four."""
     if weights.min() < 0:
         raise InputError(f"weights must not be negative, got {weights.min()}")
@@ -367,7 +373,7 @@ def _weight_sets(weights: Array) -> list[tuple[Array, Array]]:
     weights = weights / total
     count = weights.shape[1]
     fifth = count > _WEIGHTS_PER_SET and np.sort(weights, axis=1)[:, -_WEIGHTS_PER_SET - 1].max() > _SMALLEST_WEIGHT
-    slots = _WEIGHTS_PER_SET * (2 if fifth else 1)
+    slots = _WEIGHTS_PER_SET * (2 if fifth and most != _WEIGHTS_PER_SET else 1)
     order = np.argsort(-weights, axis=1, kind="stable")[:, :slots]
     largest = np.take_along_axis(weights, order, axis=1)
     pad = ((0, 0), (0, slots - order.shape[1]))

@@ -23,6 +23,7 @@ from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, open_zip,
 from torchreg.io.points import PARSER_ERRORS
 from torchreg.io.tensors import FORMAT, load_tensors, save_tensors
 from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.grid_lbs import GridLBS, GridLBSRecord
 from torchreg.models.primitives import Primitive
 from torchreg.models.rigs import RigSurface, ShapeSpec
 from torchreg.models.shape_record import HandSpec, ShapeRecord, build_shape, record_shape
@@ -59,7 +60,9 @@ _RESULTS: dict[str, type[Result]] = {
     )
 }
 _SHAPE_RECORDS = (ShapeRecord, ShapeSpec, HandSpec, KinematicTree, Joint, Primitive, RigSurface)
-_RECORDS: dict[str, type] = {kind.__name__: kind for kind in (AlignRecord, SpineFields, TrackResult, *_SHAPE_RECORDS)}
+_RECORDS: dict[str, type] = {
+    kind.__name__: kind for kind in (AlignRecord, GridLBSRecord, SpineFields, TrackResult, *_SHAPE_RECORDS)
+}
 _ENUMS: dict[str, type[Enum]] = {kind.__name__: kind for kind in (Status,)}
 
 
@@ -187,6 +190,8 @@ def _encode(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
         return {"enum": type(value).__name__, "value": value.value}
     if isinstance(value, ArticulatedShape):
         value = record_shape(value)
+    if isinstance(value, GridLBS):
+        value = value.record()
     if isinstance(value, Spine):
         value = value.record()
     if type(value).__name__ in _RECORDS:
@@ -236,6 +241,8 @@ def _decode(value: Any, tensors: Mapping[str, Tensor], where: str) -> Any:
         record = _build(_known(_RECORDS, value["record"], where), value.get("fields"), tensors, where)
         if isinstance(record, SpineFields):
             return Spine(record.curves, record.graph, record.radii, record.frames, record.times)
+        if isinstance(record, GridLBSRecord):
+            return GridLBS.from_record(record)
         return build_shape(record) if isinstance(record, ShapeRecord) else record
     if "table" in value:
         return _decode_table(value, tensors, where)

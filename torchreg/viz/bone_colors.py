@@ -1,0 +1,140 @@
+"""Colors of bones and of errors, and PLY files painted with them."""
+
+from __future__ import annotations
+
+import os
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import as_float_tensor, check_count, check_finite, check_positive, check_shape
+from torchreg.errors import InputError
+from torchreg.io.points import save_points
+from torchreg.models.grid_lbs import GridLBS
+
+# Turns by this share of the circle never come back near an earlier hue.
+_GOLDEN = 0.61803398875
+_SATURATIONS, _VALUES = (0.65, 0.45, 0.85), (0.9, 0.7, 0.55)
+# From no error to the largest: blue, green, yellow, red, dark.
+_ERROR_COLORS = ((0.16, 0.31, 0.66), (0.18, 0.66, 0.44), (0.98, 0.86, 0.26), (0.86, 0.24, 0.16), (0.45, 0.05, 0.12))
+
+
+def bone_palette(count: int) -> Tensor:
+    """Return colors (count, 3) in [0, 1], the first ones as different as can be.
+
+    Raises:
+        InputError: if ``count`` is below one.
+    """
+    check_count(count, "count", 1)
+    number = torch.arange(count)
+    hue = (number * _GOLDEN) % 1.0
+    saturation = torch.tensor(_SATURATIONS)[number % 3]
+    value = torch.tensor(_VALUES)[number // 3 % 3]
+    # The usual piecewise linear hue circle: red at 0, green at 1/3, blue at 2/3.
+    wave = torch.stack([(hue * 6 + offset) % 6 for offset in (5.0, 3.0, 1.0)], dim=-1)
+    drop = torch.minimum(wave, 4 - wave).clamp(0, 1)
+    return value.unsqueeze(-1) * (1 - saturation.unsqueeze(-1) * drop)
+
+
+def weight_colors(weights: Tensor) -> Tensor:
+    """Return colors (..., N, 3) of weights (..., N, B): those of the bones, mixed as the weights are.
+
+    Raises:
+        InputError: if a number is not finite or weights are negative.
+
+    Differentiable: in ``weights``.
+    """
+    check_finite(weights, "weights")
+    if bool((weights < 0).any()):
+        raise InputError("weights must not be negative")
+    total = weights.sum(-1, keepdim=True).clamp_min(torch.finfo(weights.dtype).tiny)
+    return (weights / total) @ bone_palette(weights.shape[-1]).to(weights)
+
+
+def error_colors(errors: Tensor, largest: float) -> Tensor:
+    """Return colors (..., 3) of errors (...): blue where there is none, red to dark where it is the largest or more.
+
+    Args:
+        errors: (...) not negative.
+        largest: the error at the end of the scale, so that pictures can be compared.
+
+    Raises:
+        InputError: if a number is not finite or negative, or ``largest`` is not positive.
+
+    Differentiable: in ``errors``.
+    """
+    check_positive(largest, "largest")
+    check_finite(errors, "errors")
+    if bool((errors < 0).any()):
+        raise InputError("errors must not be negative; take their absolute values")
+    colors = torch.tensor(_ERROR_COLORS, dtype=errors.dtype, device=errors.device)
+    at = (errors / largest).clamp(0, 1) * (len(colors) - 1)
+    index = at.detach().floor().long().clamp(max=len(colors) - 2)
+    share = (at - index).unsqueeze(-1)
+    return (1 - share) * colors[index] + share * colors[index + 1]
+
+
+def save_weight_ply(
+    path: str | os.PathLike[str], model: GridLBS, points: Tensor, faces: Tensor | None = None, *, moved: bool = False
+) -> None:
+    """Write points painted with the weights of the bones to a PLY file.
+
+    Args:
+        path: a local file ending in .ply; an existing one is replaced.
+        model: whose bones they are.
+        points: (N, 3) before they are moved.
+        faces: (F, 3) over the points, if any.
+        moved: write the points where the model moves them, not where they are.
+
+    Raises:
+        InputError: if shapes do not fit, a number is not finite, the ending is another, or the model holds several
+            poses and points are to be moved.
+        FileNotFoundError: if the folder does not exist.
+    """
+    points = as_float_tensor(points, "points", like=model.weights)
+    check_shape(points, "points", ("N", 3))
+    check_finite(points, "points")
+    with torch.no_grad():
+        colors = weight_colors(model.weights_at(points)).clamp(0, 1)
+        if moved and model.base_transforms.ndim > 3:
+            raise InputError("the model holds several poses; call set_transforms_ with one, or leave moved False")
+        places = model(points) if moved else points
+    _save_ply(path, places, faces, colors)
+
+
+def save_error_ply(
+    path: str | os.PathLike[str],
+    points: Tensor,
+    errors: Tensor,
+    faces: Tensor | None = None,
+    *,
+    largest: float | None = None,
+) -> None:
+    """Write points painted with their errors to a PLY file.
+
+    Args:
+        path: a local file ending in .ply; an existing one is replaced.
+        points: (N, 3).
+        errors: (N,) not negative, such as distances from the other scan; those that are not finite are painted gray.
+        faces: (F, 3) over the points, if any.
+        largest: the error at the end of the scale; the largest one by default.
+
+    Raises:
+        InputError: if shapes do not fit, an error is negative, a coordinate not finite or the ending is another.
+        FileNotFoundError: if the folder does not exist.
+    """
+    points = as_float_tensor(points, "points")
+    check_shape(points, "points", ("N", 3))
+    errors = as_float_tensor(errors, "errors", like=points).detach()
+    check_shape(errors, "errors", (len(points),))
+    known = errors.isfinite()
+    if largest is None:
+        largest = float(errors[known].max()) if bool(known.any()) else 1.0
+    colors = error_colors(torch.where(known, errors, 0.0), largest or 1.0)
+    _save_ply(path, points.detach(), faces, torch.where(known.unsqueeze(-1), colors, 0.5))
+
+
+def _save_ply(path: str | os.PathLike[str], points: Tensor, faces: Tensor | None, colors: Tensor) -> None:
+    if not os.fspath(path).lower().endswith(".ply"):
+        raise InputError(f"path must end in .ply, got {os.fspath(path)!r}")
+    save_points(path, points, colors=colors, faces=faces)

@@ -1,0 +1,137 @@
+"""What was registered as a skinned, animated mesh for any glTF viewer."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import as_float_tensor, check_choice, check_count, check_finite, check_points, check_shape
+from torchreg.errors import InputError
+from torchreg.geometry.blend import blend_linear
+from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.rigid import rigid_matrix
+from torchreg.io.gltf_write import save_animated_skin
+from torchreg.models.grid_lbs import GridLBS, check_rigid
+from torchreg.viz.bone_colors import weight_colors
+
+_WEIGHTS = (4, 8)
+HIERARCHIES = ("tree", "flat")
+
+
+@dataclass(frozen=True)
+class GridAnimation:
+    """A file with a skinned mesh.
+
+    Args:
+        path: of the file.
+        residual: largest distance, over vertices and frames, of what the file shows from what the model gives: weights
+            beyond the fourth that were dropped, and blends that glTF does not know.
+        parents: of the bones' nodes, -1 for roots.
+    """
+
+    path: Path
+    residual: float
+    parents: tuple[int, ...]
+
+
+@torch.no_grad()
+def save_grid_animation(
+    path: str | os.PathLike[str],
+    model: GridLBS,
+    points: Tensor,
+    faces: Tensor,
+    poses: Tensor | None = None,
+    times: Tensor | None = None,
+    *,
+    normals: Tensor | None = None,
+    colors: Tensor | None = None,
+    most_weights: int = 4,
+    hierarchy: str = "tree",
+) -> GridAnimation:
+    """Return what was written: a .glb file in which the bones of a model move a mesh through poses.
+
+    Each bone is a node of the skeleton that the joints make, at its joint with its parent. Every node has a track of
+    rotations and one of translations relative to its parent: joints of scans open a little, and with both the file
+    shows every pose exactly, also where bones do not hang together at all.
+
+    Args:
+        path: where to write; the suffix must be .glb.
+        model: the bones and weights.
+        points: (V, 3) of the mesh before it is moved, such as the source scan's.
+        faces: (F, 3) over the points.
+        poses: (T, B, 4, 4) to play; by default the rest pose, then the model's own, one or several.
+        times: (T,) seconds, not negative, strictly increasing; a second apart by default.
+        normals: (V, 3) at the points; those of the faces by default.
+        colors: (V, 3) or (V, 4) in [0, 1]; those of the weights by default.
+        most_weights: weights kept per vertex, 4, or 8, which some viewers ignore.
+        hierarchy: "tree", or "flat" for nodes that all hang on the scene: between the poses bones then move on
+            straight lines instead of about their joints.
+
+    Returns:
+        a `GridAnimation`.
+
+    Raises:
+        InputError: if shapes do not fit, a number is not finite, a pose is not rigid or the suffix is not .glb.
+        FileNotFoundError: if the folder does not exist.
+
+    References: the glTF 2.0 specification, section 3.7.3, on skins.
+    """
+    check_choice(hierarchy, "hierarchy", HIERARCHIES)
+    check_count(most_weights, "most_weights", 1)
+    if most_weights not in _WEIGHTS:
+        raise InputError(f"most_weights must be 4 or 8, got {most_weights}")
+    points = as_float_tensor(points, "points", like=model.weights)
+    check_points(points, "points", batch=False)
+    mesh = TriangleMesh(points, faces)
+    moving = _poses(model, poses)
+    seconds = torch.arange(len(moving), dtype=torch.float64) if times is None else as_float_tensor(times, "times")
+    check_shape(seconds, "times", (len(moving),))
+    check_finite(seconds, "times")
+    tree = model.skeleton(moving)
+    parents = tree.parents if hierarchy == "tree" else (-1,) * model.num_bones
+    # In double precision: what is stored relative to a parent is put together again by the viewer.
+    identity = torch.eye(3, dtype=torch.float64).expand(model.num_bones, 3, 3)
+    rest = rigid_matrix(identity, tree.origins.double().cpu())
+    weights = model.vertex_weights(points, most=most_weights)
+    exact = weights.double().cpu()
+    file = save_animated_skin(
+        Path(path),
+        points,
+        mesh.faces,
+        exact / exact.sum(-1, keepdim=True),
+        [f"bone_{number}" for number in range(model.num_bones)],
+        parents,
+        rest,
+        _orthogonal(moving.double().cpu()) @ rest,
+        seconds,
+        mesh.vertex_normals() if normals is None else normals,
+        weight_colors(model.weights_at(points)).clamp(0, 1) if colors is None else colors,
+        most_weights=most_weights,
+    )
+    shown = blend_linear(points, weights, moving)
+    residual = torch.linalg.vector_norm(shown - model(points, moving), dim=-1).max()
+    return GridAnimation(file, float(residual), parents)
+
+
+def _poses(model: GridLBS, poses: Tensor | None) -> Tensor:
+    """Return the poses (T, B, 4, 4) to play."""
+    if poses is None:
+        own = model.transforms.reshape(-1, model.num_bones, 4, 4)
+        rest = torch.eye(4, dtype=own.dtype, device=own.device).expand(1, model.num_bones, 4, 4)
+        return torch.cat([rest, own])
+    poses = as_float_tensor(poses, "poses", like=model.weights)
+    check_shape(poses, "poses", ("T", model.num_bones, 4, 4))
+    check_rigid(poses, "poses")
+    if len(poses) == 0:
+        raise InputError("poses must hold at least one, got none")
+    return poses
+
+
+def _orthogonal(transforms: Tensor) -> Tensor:
+    """Return motions with the nearest rotations: what single precision leaves off adds up along chains of nodes."""
+    left, _, right = torch.linalg.svd(transforms[..., :3, :3])
+    return rigid_matrix(left @ right, transforms[..., :3, 3])
