@@ -17,7 +17,7 @@ from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.geometry.rotation import so3_exp
 
 # Parts that do not meet may overlap by this much before a pose is refused, metres, and vertices looked at for that.
-_OVERLAP, _LOOK_AT = 0.002, 400
+_OVERLAP, _LOOK_AT = 0.002, 4000
 _MAX_TRIALS = 200
 
 
@@ -69,16 +69,14 @@ class Toy:
             angles: (H,) of one pose.
         """
         transforms = self.figure.transforms(self.rotations(angles.double()))
-        owner, rest = self.figure.weights.argmax(-1), self.figure.mesh.vertices
+        some = slice(None, None, max(1, self.figure.mesh.num_vertices // _LOOK_AT))
+        vertices, owner = self.figure.vertices(transforms)[some], self.figure.weights[some].argmax(-1)
         deepest = 0.0
-        for first in range(self.figure.num_parts):
-            vertices = rest[owner == first]
-            vertices = vertices[:: max(1, len(vertices) // _LOOK_AT)]
-            for second, part in enumerate(self.parts):
-                if first != second and not self._meet(first, second):
-                    motion = invert_rigid(transforms[second]) @ transforms[first]
-                    inside = -union_distance(part.solids, transform_points(motion, vertices), 0.0)
-                    deepest = max(deepest, float(inside.max()))
+        for index, part in enumerate(self.parts):
+            strangers = torch.tensor([not self._meet(index, other) for other in range(len(self.parts))])[owner]
+            local = transform_points(invert_rigid(transforms[index]), vertices[strangers])
+            if len(local):
+                deepest = max(deepest, -float(union_distance(part.solids, local, 0.0).min()))
         return deepest
 
     def random_motion(
