@@ -34,6 +34,17 @@ def test_stricter_recipes_are_right_more_often(benchmark, pair):
     assert strict[1] < plain[1]
 
 
+def test_agreement_with_the_surroundings_is_right_most_often(benchmark, pair):
+    found = benchmark.described(pair, 25)
+    plain, ransac, isometry = (
+        benchmark.shares(pair, benchmark.Recipe("", 25, num_candidates=number, prune=prune), found)
+        for number, prune in ((1, ""), (1, "ransac"), (6, "isometry"))
+    )
+    assert plain[0] < ransac[0] <= 1
+    assert plain[0] < isometry[0] <= 1
+    assert isometry[1] > 0.2
+
+
 def test_tables_are_printed_for_files_and_without(benchmark, pair, capsys, tmp_path):
     assert torch.isfinite(torch.tensor(benchmark.closest_share(pair)))
     source, target = pair.source, pair.target
@@ -44,7 +55,7 @@ def test_tables_are_printed_for_files_and_without(benchmark, pair, capsys, tmp_p
     assert benchmark.main(["--data", str(tmp_path), "--smoke"]) == 0
     printed = capsys.readouterr().out
     assert f"{tmp_path.name}: 1 pairs" in printed
-    assert "bin 1/25" in printed
+    assert "bin 1/25, isometry" in printed
     assert "skipped" not in printed
     assert benchmark.main(["--smoke", "--pairs", "1"]) == 0
     printed = capsys.readouterr().out
