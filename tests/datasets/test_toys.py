@@ -5,14 +5,14 @@ import pytest
 import torch
 
 from torchreg.datasets.solids import union_distance
-from torchreg.datasets.toys import Hinge, excavator, robot
+from torchreg.datasets.toys import Hinge, excavator, random_toy, robot
 from torchreg.errors import InputError
 from torchreg.geometry.rigid import invert_rigid, transform_points
 
 COARSE = 0.02
 
 
-@pytest.fixture(scope="module", params=[robot, excavator])
+@pytest.fixture(scope="module", params=[robot, excavator, random_toy])
 def toy(request):
     return request.param(spacing=COARSE)
 
@@ -63,6 +63,22 @@ def test_overlap_is_seen():
     # The left arm swung inwards, so that the forearm is inside the body.
     angles[forearm - 1] = -0.8
     assert toy.overlap(angles) > 0.02
+
+
+@pytest.mark.parametrize("count", [2, 3, 6, 9])
+def test_random_toys_have_the_parts_asked_for_and_room_to_move(count):
+    toy = random_toy(torch.Generator().manual_seed(count), count, spacing=COARSE)
+    assert toy.figure.num_parts == count
+    assert toy.overlap(torch.zeros(len(toy.hinges), dtype=torch.float64)) == 0
+    assert toy.random_motion(3).shape == (3, len(toy.hinges))
+
+
+def test_random_toys_follow_their_generator():
+    first, again, other = (random_toy(torch.Generator().manual_seed(seed), spacing=COARSE) for seed in (1, 1, 2))
+    assert torch.equal(first.figure.mesh.vertices, again.figure.mesh.vertices)
+    assert first.parts != other.parts
+    with pytest.raises(InputError, match="num_parts must be at most 9"):
+        random_toy(num_parts=10)
 
 
 def test_a_toy_without_room_says_so():

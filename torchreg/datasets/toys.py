@@ -19,6 +19,8 @@ from torchreg.geometry.rotation import so3_exp
 # Parts that do not meet may overlap by this much before a pose is refused, metres, and vertices looked at for that.
 _OVERLAP, _LOOK_AT = 0.002, 4000
 _MAX_TRIALS = 200
+# Limbs of random toys: the sides, up, down and ahead, and behind.
+_DIRECTIONS: tuple[Vector, ...] = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 
 
 @dataclass(frozen=True)
@@ -225,6 +227,82 @@ def excavator(*, spacing: float = 0.01) -> Toy:
         Hinge("blade", (1, 0, 0), -0.5, 0.15),
     ]
     return _toy(parts, hinges, spacing)
+
+
+def random_toy(generator: torch.Generator | None = None, num_parts: int = 7, *, spacing: float = 0.008) -> Toy:
+    """Return a toy that nobody designed: a box, and limbs of boxes and cones in random directions, up to two in a row.
+
+    Args:
+        generator: source of randomness; None draws from a fresh generator with seed 0, the same toy at every call.
+        num_parts: 2 to 9, the box included.
+        spacing: of the mesh, metres.
+
+    Raises:
+        InputError: if ``num_parts`` is out of range.
+
+    Cost: 0.3 s.
+    """
+    check_count(num_parts, "num_parts", 2)
+    if num_parts > 2 * len(_DIRECTIONS) - 3:
+        raise InputError(f"num_parts must be at most {2 * len(_DIRECTIONS) - 3}, got {num_parts}")
+    draw = _Draw(torch.Generator().manual_seed(0) if generator is None else generator)
+    half = (draw(0.05, 0.08), draw(0.06, 0.1), draw(0.045, 0.07))
+    knob = RoundBox((draw(-0.02, 0.02), draw(-0.02, 0.02), half[2]), (0.02, draw(0.015, 0.03), 0.02), 0.006)
+    parts, hinges = [Part("body", None, (0, 0, 0), (RoundBox((0, 0, 0), half, 0.012), knob))], []
+    directions = [_DIRECTIONS[number] for number in draw.order(len(_DIRECTIONS))]
+    for number in range(num_parts - 1):
+        # First one limb in each of some directions, then a second one at the ends of those.
+        limb = number % ((num_parts + 1) // 2 if num_parts > 2 else 1)
+        direction, first = directions[limb], number == limb
+        parent = parts[0] if first else next(part for part in parts if part.name == f"limb {limb}")
+        reach = [side * abs(way) for side, way in zip(half, direction, strict=True)]
+        start = sum(reach) + 0.012 if first else _tip(parent, direction)
+        name = f"limb {limb}" if first else f"end {limb}"
+        parts.append(_random_limb(name, parent.name, direction, start, draw))
+        across = [
+            axis
+            for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+            if not any(map(math.prod, zip(axis, direction, strict=True)))
+        ]
+        hinges += [Hinge(name, axis, -0.9, 0.9) for axis in (across if first else across[:1])]
+    return _toy(parts, hinges, spacing)
+
+
+class _Draw:
+    """Random numbers and orders from one generator."""
+
+    def __init__(self, generator: torch.Generator) -> None:
+        self._generator = generator
+
+    def __call__(self, lower: float, upper: float) -> float:
+        return lower + (upper - lower) * float(torch.rand(1, generator=self._generator, dtype=torch.float64))
+
+    def order(self, count: int) -> list[int]:
+        return torch.randperm(count, generator=self._generator).tolist()
+
+
+def _random_limb(name: str, parent: str, direction: Vector, start: float, draw: _Draw) -> Part:
+    """Return a limb with a ball at its joint, ``start`` away from the origin, and a box or cone along ``direction``."""
+
+    def at(distance: float) -> Vector:
+        x, y, z = (distance * way for way in direction)
+        return x, y, z
+
+    ball, length = draw(0.022, 0.028), draw(0.09, 0.14)
+    thick, wide = draw(0.016, 0.024), draw(0.016, 0.03)
+    solids: tuple[Solid, ...] = (RoundCone(at(start), at(start), ball, ball),)
+    if draw(0, 1) < 0.5:
+        solids += (RoundCone(at(start), at(start + length), thick, draw(0.014, 0.03)),)
+    else:
+        sides = [length / 2 if way else side for way, side in zip(direction, (thick, wide, thick), strict=True)]
+        solids += (RoundBox(at(start + length / 2), (sides[0], sides[1], sides[2]), 0.006),)
+    return Part(name, parent, at(start), solids)
+
+
+def _tip(part: Part, direction: Vector) -> float:
+    """Return how far a limb reaches along its direction from the origin."""
+    corners = [corner for solid in part.solids for corner in solid.bounds()]
+    return max(sum(map(math.prod, zip(corner, direction, strict=True))) for corner in corners)
 
 
 def _toy(parts: list[Part], hinges: list[Hinge], spacing: float) -> Toy:
