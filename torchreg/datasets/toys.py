@@ -19,7 +19,7 @@ from torchreg.geometry.rotation import so3_exp
 # Parts that do not meet may overlap by this much before a pose is refused, metres, and vertices looked at for that.
 _OVERLAP, _LOOK_AT = 0.002, 4000
 _MAX_TRIALS = 200
-# Limbs of random toys: the sides, up, down and ahead, and behind.
+# Of the limbs of random toys; every other one is an axis.
 _DIRECTIONS: tuple[Vector, ...] = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 
 
@@ -259,11 +259,7 @@ def random_toy(generator: torch.Generator | None = None, num_parts: int = 7, *, 
         start = sum(reach) + 0.012 if first else _tip(parent, direction)
         name = f"limb {limb}" if first else f"end {limb}"
         parts.append(_random_limb(name, parent.name, direction, start, draw))
-        across = [
-            axis
-            for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
-            if not any(map(math.prod, zip(axis, direction, strict=True)))
-        ]
+        across = [axis for axis, way in zip(_DIRECTIONS[::2], direction, strict=True) if not way]
         hinges += [Hinge(name, axis, -0.9, 0.9) for axis in (across if first else across[:1])]
     return _toy(parts, hinges, spacing)
 
