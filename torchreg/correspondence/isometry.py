@@ -24,7 +24,7 @@ class ConsistentMatches:
     Args:
         index: (Q,) int64 target, -1 for points without a candidate.
         support: (Q,) how well the surroundings agree, 0 to 1. On pairs of scans of a dancer, a horse and a walking
-            person, of those above 0.5, which is every other match, 98 % were right, of those above 0.3 87 %.
+            person, of those above 0.5, which is nearly every other point, 98 % were right, of those above 0.3 87 %.
     """
 
     index: Tensor

@@ -66,7 +66,8 @@ def spin_images(
 
     Differentiable: no.
 
-    Cost: O(Q M) time, bounded memory; 0.1 s for 1,000 points and a scan of 4,500 on one core.
+    Cost: O(Q M) time, bounded memory; 0.2 to 0.3 s for 1,000 points and a scan of 4,500 on one core, a third of that
+    for 1,500 points spread over the scan, which describe as well.
 
     References: Johnson 1997, "Spin-images: a representation for 3-D surface matching", chapter 2.
     """
@@ -122,9 +123,12 @@ class _Scene:
         inside = (height.abs() < size / 2) & (square < size**2)
         if self._normals is not None:
             inside &= normals @ self._normals.mT > self._least_cosine
-        image, seen = inside.nonzero(as_tuple=True)
-        row = size / 2 - height[inside]
-        column = square[inside].clamp_min_(0).sqrt_()
+        # Flat indices: a mask would be searched anew for every tensor it picks from.
+        flat = inside.reshape(-1).nonzero()[:, 0]
+        image = flat.div(len(self._points), rounding_mode="floor")
+        seen = flat - image * len(self._points)
+        row = size / 2 - height.reshape(-1).index_select(0, flat)
+        column = square.reshape(-1).index_select(0, flat).clamp_min_(0).sqrt_()
         counts = points.new_zeros(len(points) * size * size)
         share = self._weights[seen]
         if self._interpolate:
