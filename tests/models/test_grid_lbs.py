@@ -46,6 +46,7 @@ def test_the_deformation_is_equation_1():
     weights = model.grid.interpolate(model.corner_weights(), points)
     torch.testing.assert_close(weights.sum(-1), torch.ones(20, dtype=torch.float64))
     torch.testing.assert_close(model.weights_at(points), weights)
+    torch.testing.assert_close(model.move(points, weights), model(points))
     for x, row, found in zip(points, weights, model(points), strict=True):
         expected = sum(w * (t[:3, :3] @ x + t[:3, 3]) for w, t in zip(row, model.transforms, strict=True))
         torch.testing.assert_close(found, expected)

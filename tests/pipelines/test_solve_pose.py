@@ -42,7 +42,7 @@ def test_poses_that_joints_allow_are_reached(bones, blend):
     model = bones.model_of(points, blend)
     model.set_transforms_(bones.bent(0.6))
     wanted = bones.bent(1.3)
-    handles = points[::40]
+    handles = points[::8]
     solution = solve_pose(model, handles, model(handles, wanted), config=PoseConfig(rtol=1e-4, atol=1e-5, max_steps=50))
     assert solution.status is Status.CONVERGED
     assert float(solution.misses.max()) < 0.01

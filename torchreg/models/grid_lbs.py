@@ -226,8 +226,14 @@ class GridLBS(nn.Module):
 
         References: Chang and Zwicker 2009, eq. 1.
         """
-        transforms = self.transforms if transforms is None else transforms
-        return _BLEND[self.blend](points, self.weights_at(points), transforms)
+        return self.move(points, self.weights_at(points), transforms)
+
+    def move(self, points: Tensor, weights: Tensor, transforms: Tensor | None = None) -> Tensor:
+        """Return what `forward` does, of points (..., N, 3) whose weights (..., N, B) are known already.
+
+        Differentiable: in all, and ``twists``.
+        """
+        return _BLEND[self.blend](points, weights, self.transforms if transforms is None else transforms)
 
     def weights_at(self, points: Tensor) -> Tensor:
         """Return the bones' weights (..., N, B) at points (..., N, 3); rows sum to one.
