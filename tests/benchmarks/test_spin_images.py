@@ -55,7 +55,7 @@ def test_tables_are_printed_for_files_and_without(benchmark, pair, capsys, tmp_p
     assert benchmark.main(["--data", str(tmp_path), "--smoke"]) == 0
     printed = capsys.readouterr().out
     assert f"{tmp_path.name}: 1 pairs" in printed
-    assert "bin 1/25, isometry" in printed
+    assert "within 30 %, isometry" in printed
     assert "skipped" not in printed
     assert benchmark.main(["--smoke", "--pairs", "1"]) == 0
     printed = capsys.readouterr().out
