@@ -318,12 +318,11 @@ class TrackState(Result):
         previous: (K, num_dofs) some earlier poses.
         strays: (S, 3) data off the surface as dense as those on it, in the frame of the first part, metres.
         error: running largest error of the prediction at the model points, metres.
-        joint_error: the same of the joints, radians.
+        surprise: (3,) the same of the base's place, metres, its turn and the joints, radians.
         total: running number of data.
         inliers: running number of inliers; zero before the first fit.
         ratio: running share of inliers in the data in reach.
         residual: running residual, metres.
-        covered: running share of the model points that have data.
         held: running share of the joints at a limit.
         lost: frames since the last fit.
         rest: frames before a search is tried again.
@@ -343,12 +342,11 @@ class TrackState(Result):
     previous: Tensor
     strays: Tensor
     error: float
-    joint_error: float
+    surprise: Tensor
     total: float
     inliers: float
     ratio: float
     residual: float
-    covered: float
     held: float
     lost: int
     rest: int

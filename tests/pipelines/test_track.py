@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-import torchreg.pipelines.track as track
+import torchreg.pipelines.track_recovery as recovery
 from torchreg.datasets.hand import hand_motion
 from torchreg.datasets.sequences import range_clouds
 from torchreg.errors import InputError, InputTypeError, UnitsWarning
@@ -18,7 +18,9 @@ from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.primitives import Primitive
 from torchreg.models.skin import sample_skin
 from torchreg.pipelines.storage import load
-from torchreg.pipelines.track import TrackConfig, Tracker, pose_covariance
+from torchreg.pipelines.track import TrackConfig, Tracker
+from torchreg.pipelines.track_evidence import pose_covariance
+from torchreg.pipelines.track_motion import difference
 from torchreg.results import PoseStarts, Status
 
 TIPS = [4, 8, 12, 16, 20]
@@ -98,7 +100,7 @@ def test_a_hand_is_followed(plain_hand, clouds, frames, followed):
 
 def test_records_say_what_they_promise(plain_hand, clouds, followed):
     own, _, records, result = followed
-    corners = own._skin.points.aminmax(dim=0)
+    corners = own._fitter.skin.points.aminmax(dim=0)
     size = (corners.max - corners.min).norm()
     for cloud, (_, record) in zip(clouds, records, strict=True):
         inside = record.distances.isfinite()
@@ -214,7 +216,7 @@ def test_velocity_predicts_what_goes_on_evenly(plain_hand, truths, tracker, fram
     _, states, _, _ = followed
     still = tracker(prediction="none")
     for state, truth in zip(states[3:6], truths[4:7], strict=True):
-        ahead, held = tracker()._predicted(state, 1.0), still._predicted(state, 1.0)
+        ahead, held = tracker()._fitter.predicted(state, 1.0), still._fitter.predicted(state, 1.0)
         true = plain_hand.keypoints(truth)
         near, far = ((plain_hand.keypoints(pose) - true).norm(dim=-1).mean() for pose in (ahead, held))
         assert near < 0.7 * far
@@ -282,13 +284,13 @@ def finder(monkeypatch, truths):
         poses = torch.stack([moved(truths[5], 0.3), truths[5], truths[5]])
         return PoseStarts(poses, torch.tensor([10.0, 11.0, 300.0]), torch.tensor(0.9))
 
-    monkeypatch.setattr(track, "find_pose", find)
+    monkeypatch.setattr(recovery, "find_pose", find)
     return calls
 
 
 def test_without_a_pose_the_first_frame_is_found(plain_hand, tracker, clouds, frames, monkeypatch, truths):
     starts = PoseStarts(truths[:1] + 0.004, torch.tensor([10.0]), torch.tensor(0.9))
-    monkeypatch.setattr(track, "find_pose", lambda *arguments, **options: starts)
+    monkeypatch.setattr(recovery, "find_pose", lambda *arguments, **options: starts)
     own = tracker(None)
     result = own.run(frames[:3])
     assert result.acquired[0] == "found"
@@ -303,7 +305,7 @@ def test_what_is_nowhere_stays_unknown_and_is_sought_ever_more_rarely(tracker, m
         calls.append(own.state.frame)
         return PoseStarts(truths[:1] + 2.0, torch.tensor([300.0]), torch.tensor(0.0))
 
-    monkeypatch.setattr(track, "find_pose", find)
+    monkeypatch.setattr(recovery, "find_pose", find)
     own = tracker(None)
     result = own.run([noise_frame(seed=k) for k in range(30)])
     assert set(result.statuses) == {Status.LOST}
@@ -352,7 +354,7 @@ def test_fingers_that_were_missed_are_repaired_within_frames(plain_hand, truths,
 
 
 def test_a_flipped_base_is_among_the_starts(plain_hand_skin, truths):
-    flipped = track._flipped(plain_hand_skin, truths[0])
+    flipped = recovery.flipped(plain_hand_skin, truths[0])
     points = plain_hand_skin(truths[0])
     center = points.mean(0)
     for pose in flipped:
@@ -360,7 +362,7 @@ def test_a_flipped_base_is_among_the_starts(plain_hand_skin, truths):
         torch.testing.assert_close(turned.mean(0), center, atol=1e-5, rtol=0)
         assert (turned - points).norm(dim=-1).max() > 0.02
     # Half turns: done twice, nothing happened.
-    again = torch.stack([plain_hand_skin(pose) for pose in track._flipped(plain_hand_skin, flipped[2])])
+    again = torch.stack([plain_hand_skin(pose) for pose in recovery.flipped(plain_hand_skin, flipped[2])])
     assert (again - points).norm(dim=-1).amax(-1).min() < 1e-4
 
 
@@ -399,7 +401,7 @@ def test_covariance_is_that_of_repeated_measurements():
         own.state = replace(start, pose=truth, velocity=0 * truth)
         noise = 0.002 * torch.randn(surface.shape, generator=generator, dtype=torch.float64)
         record = own.step(surface + noise)
-        poses.append(track._difference(truth, record.pose))
+        poses.append(difference(truth, record.pose))
         stds.append(record.std)
     scatter = torch.stack(poses).std(0)
     said = torch.stack(stds).mean(0)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchreg.correspondence.em import EStep
+from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.models.skin import LinearBlendSkin
 from torchreg.models.surface import Surface
 from torchreg.solvers.levenberg_marquardt import Linearization
@@ -18,19 +19,21 @@ _ANCHOR_DATA = 0.1
 
 @dataclass(frozen=True)
 class PosePrior:
-    """A Gaussian on the joints, ``sum_k precision_k (pose_k - mean_k)^2 / 2``; zero precision leaves one free.
+    """A Gaussian on the pose, ``sum_k precision_k (pose_k - mean_k)^2 / 2``; zero precision leaves one free.
 
     Args:
         mean: (B, num_dofs).
-        precision: (num_dofs,) or (B, num_dofs), 1 / std^2; zero for the base.
+        precision: (num_dofs,) or (B, num_dofs), 1 / std^2.
+        holds_base: whether the base's precision is not zero; its rotations then differ by composition.
     """
 
     mean: Tensor
     precision: Tensor
+    holds_base: bool = False
 
     def add_to(self, problem: Linearization, pose: Tensor) -> Linearization:
         """Return the problem with the prior added."""
-        offset = pose - self.mean
+        offset = self._offset(pose, self.mean)
         pull = self.precision * offset
         return Linearization(
             problem.cost + 0.5 * (pull * offset).sum(-1),
@@ -41,7 +44,13 @@ class PosePrior:
     def cost(self, pose: Tensor) -> Tensor:
         """Return the prior's cost (...) of poses (..., num_dofs); the mean's batch is the first dimension."""
         mean = self.mean.reshape(self.mean.shape[0], *[1] * (pose.ndim - 2), -1)
-        return 0.5 * (self.precision * (pose - mean).square()).sum(-1)
+        return 0.5 * (self.precision * self._offset(pose, mean).square()).sum(-1)
+
+    def _offset(self, pose: Tensor, mean: Tensor) -> Tensor:
+        if not self.holds_base:
+            return pose - mean
+        turned = compose_rotation_vectors(pose[..., 3:6], -mean[..., 3:6])
+        return torch.cat([pose[..., :3] - mean[..., :3], turned, pose[..., 6:] - mean[..., 6:]], dim=-1)
 
 
 class RegistrationObjective:

@@ -1,0 +1,230 @@
+"""Fitting a tracked shape to one frame: what is in reach, the descent from the prediction, the evidence for its end."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchreg.correspondence.sigma import SigmaSchedule
+from torchreg.geometry.rigid import invert_rigid, transform_points
+from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.limbs import find_limbs
+from torchreg.models.skin import LinearBlendSkin, sample_skin
+from torchreg.pipelines.align import AlignConfig
+from torchreg.pipelines.align_objectives import PosePrior
+from torchreg.pipelines.align_problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem, shifted
+from torchreg.pipelines.align_stages import SIGMA_PER_NOISE, fit_surface, register, surface_noise
+from torchreg.pipelines.pose_search import fit_candidates, score_candidates
+from torchreg.pipelines.track_config import Frame, FrameFit, FrameView, TrackConfig, thinned
+from torchreg.pipelines.track_evidence import (
+    LimbReach,
+    dense_strays,
+    in_doubt,
+    nearest_distance,
+    pose_covariance,
+    share_at_limits,
+)
+from torchreg.pipelines.track_motion import moves_fast, predicted, prior_std, spread
+from torchreg.results import TrackState
+
+# Less data are none.
+MIN_DATA = 10
+# Last kernel width of a frame's EM, near the noise, as a share of the size.
+STOP_SIGMA = 0.02
+# Range of the first, this many times the error of the prediction; two that differ by more have one between them.
+_START_RANGE, _START_PER_ERROR, _SIGMA_RATIO = (0.03, 0.08), 2.0, 2.2
+# Width of the surface fit before the last, which follows from the noise.
+_SURFACE_SIGMAS = (0.022,)
+# Joints about the last pose where nothing is sure, radians.
+_WIDE_PRIOR = 0.3
+# Paces at which fast joints go on instead: they stopped, or double; kernel widths of their surface fits, and steps.
+_PACES, _FAST_WIDTHS, _FAST_STEPS = (0.0, 2.0), (0.06, 0.04, 0.03), 2
+# Data that lie this near the bounds of the predicted model count, as a share of its size.
+_REACH = 0.12
+# A limb is shown by this many data at least, this far from its joints, as a share of the size.
+_MIN_SHOWN, _LEVER = 6.0, 0.05
+# Data farther from the surface are off it, standard deviations; strays this near are the same as before, share of size.
+_FAR_NOISES, _SAME_STRAY = 3.0, 0.05
+# Strays that are remembered: more tell no more.
+_MAX_STRAYS = 300
+# Most model points: the rest may be limbs that were missed.
+_MOST = 0.9
+
+
+class FrameFitter:
+    """What a tracker knows of its shape, and how it fits a frame.
+
+    Args:
+        shape: the articulated shape, in metres.
+        config: see `TrackConfig`.
+        skin: the model points; sampled by default.
+    """
+
+    def __init__(self, shape: ArticulatedShape, config: TrackConfig, skin: LinearBlendSkin | None) -> None:
+        self.shape, self.config = shape, config
+        # About half of the shape's points are seen at a time.
+        count = config.num_model_points * (2 if config.model_points == "seen" else 1)
+        self.skin = skin or sample_skin(shape, count, sharpness=config.sharpness)
+        self.limbs = find_limbs(shape)[0]
+        nowhere = torch.zeros_like(shape.rest[None, :3])
+        self._template = centered_problem(
+            self.skin, nowhere[None], torch.ones_like(nowhere[:, :1], dtype=torch.bool), shape.rest[None], nowhere,
+            prior_std=1.0, pose_atol=AlignConfig().pose_atol, debias=config.debias,
+        )  # fmt: skip
+        self.size = self._template.size
+        self.inlier_distance = config.inlier_distance or INLIER_SHARE * self.size
+        self._reach = LimbReach(self.skin, self.limbs, _SAME_STRAY * self.size)
+
+    def view(
+        self, state: TrackState, frame: Frame, pose: Tensor, skin: LinearBlendSkin | None = None
+    ) -> FrameView | None:
+        """Return the frame as seen from a pose (num_dofs,), if any data are in reach; the prior holds joints there."""
+        origin = pose[:3].clone()
+        local = shifted(pose, -origin)
+        posed, reach = self.skin(local), _REACH * self.size * spread(state, frame.gap)
+        data = frame.cloud - origin
+        near = ((data > posed.amin(0) - reach) & (data < posed.amax(0) + reach)).all(-1)
+        data = thinned(data[near], self.config.max_points, generator(state))
+        if len(data) < MIN_DATA:
+            return None
+        shift = torch.nn.functional.pad(origin, (0, self.shape.num_dofs - 3))
+        problem = replace(
+            self._template, skin=skin or self.skin, data=data[None],
+            valid=torch.ones_like(data[None, :, 0], dtype=torch.bool),
+            lower=self.shape.lower - shift, upper=self.shape.upper - shift,
+            prior=PosePrior(local[None], self._precision(_WIDE_PRIOR)),
+        )  # fmt: skip
+        return FrameView(problem, origin, near)
+
+    def view_ahead(self, state: TrackState, frame: Frame) -> FrameView | None:
+        """Return the frame as seen from the prediction, with the model points that were seen last."""
+        seen = LinearBlendSkin(self.shape, state.points, state.weights, state.reference_pose)
+        return self.view(state, frame, self.predicted(state, frame.gap), seen)
+
+    def predicted(self, state: TrackState, gap: float) -> Tensor:
+        """Return the pose (num_dofs,) expected after some intervals."""
+        return state.pose if self.config.prediction == "none" else predicted(self.shape, state, gap)
+
+    def fit_at(self, state: TrackState, frame: Frame, pose: Tensor, how: str) -> FrameFit | None:
+        """Return the fit from a pose (num_dofs,), if any data are in reach."""
+        view = self.view(state, frame, pose)
+        return None if view is None else self.fit(view, state, how, view.problem.prior.mean)
+
+    def descend(self, view: FrameView, state: TrackState, gap: float) -> FrameFit:
+        """Return the fit that descent from the prediction leads to: annealed EM, then the surface."""
+        problem = replace(view.problem, prior=self._tight_prior(view.problem.prior, state, gap))
+        starts = problem.prior.mean
+        fast = moves_fast(state, self.size) and self.config.prediction == "velocity"
+        if fast:
+            # Joints that fast turn back or speed up within a frame, each at another time.
+            others = predicted(self.shape, state, gap, starts.new_tensor(_PACES))
+            starts = torch.cat([starts, view.local(others)[0]])
+        rows = problem.rows(torch.zeros(len(starts), dtype=torch.long, device=starts.device))
+        moved = register(rows, starts, self._schedule(state, gap), em_steps=self.config.em_steps, m_steps=1).pose
+        if fast:
+            wide = fit_candidates(problem, starts[None], _FAST_WIDTHS, _FAST_STEPS)[0]
+            moved = self._mixed(problem, torch.cat([moved, wide]))
+        return self.fit(replace(view, problem=problem), state, "tracked", moved)
+
+    def fit(self, view: FrameView, state: TrackState, how: str, pose: Tensor) -> FrameFit:
+        """Return the fit of the surface from a pose (1, num_dofs), and the evidence for it."""
+        problem = view.problem
+        fitted = fit_surface(problem, pose, steps=self.config.surface_steps, sigmas=_SURFACE_SIGMAS)
+        distance, jacobian = problem.surface.distance_jacobian(problem.data, fitted.pose)
+        noise = surface_noise(distance, problem.valid, self.size)
+        pose = fitted.pose
+        if state.tracked:
+            pose = self._modest(problem, fitted.pose, distance, jacobian, noise)
+        if pose is not fitted.pose:
+            distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
+        strays = dense_strays(problem.data[0], distance[0].abs() < _FAR_NOISES * noise, self.size)
+        known = transform_points(self.shape.part_transforms(pose[0])[0], state.strays)
+        novel = (nearest_distance(strays, known) > _SAME_STRAY * self.size) & self._reach(strays, pose[0])
+        moved = (problem.skin(pose) - problem.skin(problem.prior.mean)).norm(dim=-1)
+        wide = replace(problem, prior=PosePrior(problem.prior.mean, self._precision(_WIDE_PRIOR)))
+        return FrameFit(
+            view, pose, distance, jacobian, noise=noise[0], change=float(fitted.change),
+            cost=float(alignment_cost(wide, pose, distance)),
+            inliers=int((distance.abs() < self.inlier_distance).sum()), strays=strays, novel=int(novel.sum()),
+            held=share_at_limits(problem, pose), jump=float(moved.quantile(_MOST)), how=how,
+        )  # fmt: skip
+
+    def covariance(self, fit: FrameFit) -> tuple[Tensor, Tensor]:
+        """Return the covariance of a fit, and which share (num_dofs,) of what is known then the data say."""
+        prior = fit.view.problem.prior
+        precision = prior.precision.clone()
+        if not prior.holds_base:
+            precision[:6] = precision.new_tensor([self.size] * 3 + [math.pi] * 3).square().reciprocal()
+        weights = (-(fit.distance[0] / (SIGMA_PER_NOISE * fit.noise)).square()).exp()
+        covariance = pose_covariance(fit.jacobian[0], weights, fit.noise, precision)
+        return covariance, (1 - covariance.diagonal() * precision).clamp(0, 1)
+
+    def strays_after(self, state: TrackState, fit: FrameFit) -> Tensor:
+        """Return the strays to be expected in the next frame, in the trunk's frame.
+
+        Those of a doubtful fit may be what the fit missed, and are expected only after attempts to explain them.
+        """
+        if in_doubt(state) and fit.how != "found":
+            return state.strays
+        trunk = self.shape.part_transforms(fit.pose[0])[0]
+        strays = transform_points(invert_rigid(trunk), fit.strays)
+        # Where there are some still, those of earlier frames show better how far they reach.
+        lasting = state.strays[nearest_distance(state.strays, strays) < _SAME_STRAY * self.size]
+        return torch.cat([strays, lasting])[:_MAX_STRAYS]
+
+    def _precision(self, joints: float) -> Tensor:
+        return self._template.prior.precision / joints**2
+
+    def _tight_prior(self, prior: PosePrior, state: TrackState, gap: float) -> PosePrior:
+        """Return the prior about the prediction, the base included: few data may not turn it away."""
+        shift, turn, bend = prior_std(state, gap, self.size, self.config.prior_std).tolist()
+        precision = self._precision(bend)
+        precision[:3], precision[3:6] = shift**-2, turn**-2
+        return PosePrior(prior.mean, precision, holds_base=True)
+
+    def _schedule(self, state: TrackState, gap: float) -> SigmaSchedule:
+        low, high = _START_RANGE
+        start = self.size * min(max(_START_PER_ERROR * spread(state, gap) * state.error / self.size, low), high)
+        stop = STOP_SIGMA * self.size
+        return SigmaSchedule.geometric(start, stop, 2 if start < _SIGMA_RATIO * stop else 3)
+
+    def _mixed(self, problem: AlignProblem, poses: Tensor) -> Tensor:
+        """Return the best of poses (S, num_dofs), (1, num_dofs), each limb as where it explains most data."""
+        best = poses[score_candidates(problem, poses[None], STOP_SIGMA)[0].argmin()]
+        if not self.limbs:
+            return best[None]
+        hybrids = best.repeat(len(self.limbs), len(poses), 1)
+        for number, limb in enumerate(self.limbs):
+            hybrids[number][:, limb.dofs] = poses[:, limb.dofs]
+        scores = score_candidates(problem, hybrids.flatten(0, 1)[None], STOP_SIGMA)[0].reshape(hybrids.shape[:2])
+        mixed = best.clone()
+        for limb, chosen in zip(self.limbs, scores.argmin(1).tolist(), strict=True):
+            mixed[limb.dofs] = poses[chosen, limb.dofs]
+        # Limbs chosen one by one may share their data.
+        options = torch.stack([mixed, hybrids.flatten(0, 1)[scores.argmin()]])
+        return options[score_candidates(problem, options[None], STOP_SIGMA)[0].argmin()][None]
+
+    def _modest(self, problem: AlignProblem, pose: Tensor, distance: Tensor, jacobian: Tensor, noise: Tensor) -> Tensor:
+        """Return a pose (1, num_dofs) with limbs where they are expected that hardly any data show.
+
+        What pulls at such a limb are single outliers and the rims of its neighbors.
+        """
+        near = (-(distance[0] / (SIGMA_PER_NOISE * noise)).square()).exp()
+        levers = [jacobian[0][:, limb.dofs].norm(dim=-1) > _LEVER * self.size for limb in self.limbs]
+        if not levers:
+            return pose
+        shown = (near * torch.stack(levers)).sum(-1).tolist()
+        hidden = [dof for limb, count in zip(self.limbs, shown, strict=True) if count < _MIN_SHOWN for dof in limb.dofs]
+        if not hidden:
+            return pose
+        modest = pose.clone()
+        modest[:, hidden] = problem.prior.mean[:, hidden]
+        return modest
+
+
+def generator(state: TrackState) -> torch.Generator:
+    """Return the randomness of a frame, the same whenever it is asked for."""
+    return torch.Generator().manual_seed(state.seed + state.frame)
