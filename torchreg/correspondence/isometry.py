@@ -47,7 +47,7 @@ def consistent_matches(
     ``d_ij <= radius`` supports a by its own most fitting candidate b, ``max_b s_jb exp(-(d_ab - d_ij)^2 / 2 w^2)`` with
     ``w = slack + 0.1 d_ij``. Beliefs are multiplied by the square of the mean support and scaled to sum to one, and so
     on. Ways over holes and to parts that look cut off in one scan spoil single votes; near voters are the safest ones.
-    Surroundings that look alike turned or mirrored, such as the sides of a box, agree on wrong matches just as well: let
+    Surroundings that look alike when turned, such as the sides of a box, agree on wrong matches just as well: let
     `match_descriptors` leave out candidates that are too far away (0.3 diagonals).
 
     Args:
