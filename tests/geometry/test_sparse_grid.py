@@ -40,7 +40,7 @@ def test_cells_are_those_that_hold_points():
 
 
 def test_corners_are_shared():
-    grid = SparseGrid.from_points(surface(), 12)
+    grid = SparseGrid.from_points(surface(), 6)
     table = {tuple(c): k for k, c in enumerate(grid.corners.tolist())}
     assert len(table) == grid.num_corners
     for cell, corners in zip(grid.cells.tolist(), grid.cell_corners.tolist(), strict=True):

@@ -23,9 +23,9 @@ def bar(count=300, seed=0):
     return torch.rand(count, 3, generator=generator, dtype=torch.float64) * torch.tensor([3.0, 0.5, 0.4])
 
 
-def random_model(blend="linear", num_bones=3, *batch, seed=0):
+def random_model(blend="linear", num_bones=3, *batch, seed=0, resolution=12):
     generator = torch.Generator().manual_seed(seed)
-    grid = SparseGrid.from_points(bar(), 12)
+    grid = SparseGrid.from_points(bar(), resolution)
     weights = torch.rand(grid.num_corners, num_bones, generator=generator, dtype=torch.float64)
     transforms = se3_exp(0.7 * torch.randn(*batch, num_bones, 6, generator=generator, dtype=torch.float64))
     return GridLBS(grid, weights, transforms, blend=blend)
@@ -98,7 +98,7 @@ def test_the_jacobian_equals_automatic_differentiation(blend):
 
 @BLENDS
 def test_gradients(blend):
-    model, points = random_model(blend), bar(4, 1)
+    model, points = random_model(blend, resolution=3), bar(3, 1)
     names = ("weights", "twists")
 
     def posed(points, transforms, *parameters):
