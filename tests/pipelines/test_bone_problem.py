@@ -124,6 +124,10 @@ def test_bad_input_is_named(bones):
         BoneProblem(points, binding, points.float(), normals)
     with pytest.raises(InputError, match="weights must have shape"):
         bind(torch.ones(3))
+    with pytest.raises(InputError, match="match_weights must not be negative, got -1"):
+        BoneProblem(points, binding, points, normals, -torch.ones(10))
+    with pytest.raises(InputError, match="anchor_weights must not be negative"):
+        BoneProblem(points, binding, points, normals, anchors=torch.eye(4)[None], anchor_weights=-0.5)
     problem = BoneProblem(points, binding, points, normals)
     with pytest.raises(InputError, match="transforms must have shape"):
         fit_bones(problem, torch.eye(4).double().repeat(2, 1, 1))
@@ -131,3 +135,35 @@ def test_bad_input_is_named(bones):
         bone_step(problem, torch.eye(4).double()[None], fixed=torch.ones(2).bool())
     with pytest.raises(InputError, match="max_steps must be at least 1"):
         fit_bones(problem, torch.eye(4).double()[None], max_steps=0)
+
+
+def test_weights_of_joints_and_anchors_differ_between_problems(bones):
+    problem, _ = bones.noisy_problem()
+    transforms = se3_exp(0.3 * bones.draw(2, bones.COUNT, 6, seed=5))
+    values = {name: getattr(problem, name) for name in problem.__dataclass_fields__}
+    pairs, anchors = problem.pair_weights, problem.anchor_weights
+    both = BoneProblem(
+        **{
+            **values,
+            "pair_weights": torch.stack([pairs, 2 * pairs]),
+            "anchor_weights": torch.stack([anchors, 3 * anchors]),
+        }
+    ).linearize(transforms)
+    other = BoneProblem(**{**values, "pair_weights": 2 * pairs, "anchor_weights": 3 * anchors}).linearize(transforms)
+    first = problem.linearize(transforms)
+    for name in ("cost", "gradient", "hessian"):
+        found = getattr(both, name)
+        torch.testing.assert_close(found[0], getattr(first, name)[0])
+        torch.testing.assert_close(found[1], getattr(other, name)[1])
+
+
+def test_the_inertia_is_the_mean_squared_shift(bones):
+    problem, _ = bones.noisy_problem()
+    start, twists = se3_exp(0.3 * bones.draw(bones.COUNT, 6, seed=5)), 1e-4 * bones.draw(bones.COUNT, 6, seed=6)
+    moved = turn_about(start, twists, problem.centers(start))
+    shares = problem.binding.weights / problem.binding.weights.sum(0)
+    for bone in range(bones.COUNT):
+        shift = transform_points(moved[bone], problem.points) - transform_points(start[bone], problem.points)
+        expected = (shares[:, bone] * shift.square().sum(-1)).sum()
+        found = twists[bone] @ problem.inertia(start)[bone] @ twists[bone]
+        torch.testing.assert_close(found, expected, rtol=1e-3, atol=0)

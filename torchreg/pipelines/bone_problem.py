@@ -165,6 +165,10 @@ class BoneProblem:
             check_shape(self.pair_weights, "pair_weights", (pairs,), batch=True)
         if self.anchors is not None:
             check_shape(self.anchors, "anchors", (size, 4, 4), batch=True)
+        for name in ("match_weights", "pair_weights", "anchor_weights"):
+            value = getattr(self, name)
+            if value is not None and bool((torch.as_tensor(value) < 0).any()):
+                raise InputError(f"{name} must not be negative, got {float(torch.as_tensor(value).min()):g}")
         if self.bodies is None:
             object.__setattr__(self, "bodies", bone_bodies(self.points, self.binding.weights))
 
@@ -234,9 +238,8 @@ class BoneProblem:
         targets, rows, entry_rows = self._matches
         if self.blend == "linear":
             table = system.transforms[..., :3, :].index_select(-3, bound.bone)
-            image = (table[..., :3] @ self.points.index_select(0, bound.point).unsqueeze(-1)).squeeze(-1) + table[
-                ..., 3
-            ]
+            places = self.points.index_select(0, bound.point)
+            image = (table[..., :3] @ places.unsqueeze(-1)).squeeze(-1) + table[..., 3]
             blank = image.new_zeros(*image.shape[:-2], len(self.points), 3)
             moved = blank.index_add_(-2, bound.point, bound.share.unsqueeze(-1) * image)
             arms = (image - system.centers.index_select(-2, bound.bone)).unsqueeze(-2)
@@ -266,14 +269,13 @@ class BoneProblem:
             centers.append(self.moments.center)
             spreads.append(self.moments.spread)
             scale = self.joint_weight * (1.0 if self.pair_weights is None else self.pair_weights)
-            weights.append(torch.as_tensor(scale, dtype=like.dtype, device=like.device).expand(num_joints))
+            weights.append(_per_spring(scale, num_joints, like))
         if self.anchors is not None:
             bones = torch.arange(size, device=like.device)
             pairs.append(torch.stack([bones, bones + size], dim=-1))
             centers.append(self.bodies.middle)
             spreads.append(self.bodies.spread)
-            scale = torch.as_tensor(self.anchor_weights, dtype=like.dtype, device=like.device)
-            weights.append(scale.expand(size) if scale.ndim == 0 else scale)
+            weights.append(_per_spring(self.anchor_weights, size, like))
         if not pairs:
             return None
         lead = torch.broadcast_shapes(*(weight.shape[:-1] for weight in weights))
@@ -298,9 +300,8 @@ class BoneProblem:
         moving, frames = springs.ends[: count + joints], springs.frames[: count + joints]
         scaled = torch.cat([root, root[..., :joints, :, :]], dim=-3)
         share = scaled * frames[..., 3:]
-        arms = scaled * image[..., : count + joints, :, :] - share * system.centers.index_select(-2, moving).unsqueeze(
-            -2
-        )
+        pivots = system.centers.index_select(-2, moving).unsqueeze(-2)
+        arms = scaled * image[..., : count + joints, :, :] - share * pivots
         identity = torch.eye(3, dtype=arms.dtype, device=arms.device)
         pushes = (share.unsqueeze(-1) * identity).expand(*arms.shape, 3)
         slopes = torch.cat([pushes, -skew(arms)], dim=-1).flatten(-3, -2)
@@ -327,6 +328,12 @@ class _Springs(NamedTuple):
     root: Tensor
     slots: Tensor
     num_joints: int
+
+
+def _per_spring(weight: float | Tensor, count: int, like: Tensor) -> Tensor:
+    """Return weights (..., count) of one for all or of one for each."""
+    weight = torch.as_tensor(weight, dtype=like.dtype, device=like.device)
+    return weight.expand(count) if weight.ndim == 0 else weight
 
 
 def _frames(center: Tensor, spread: Tensor) -> Tensor:
