@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from torchreg.geometry.blend import turn_about
+from torchreg.geometry.joint_moments import JointMoments
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.pipelines.bone_fit import bone_step, fit_bones
 from torchreg.pipelines.bone_problem import BoneProblem, bind
@@ -113,6 +114,38 @@ def test_turning_and_scaling_everything_changes_nothing_else(bones):
         }
     )
     torch.testing.assert_close(fit_bones(turned, motion @ start).transforms, motion @ found.transforms)
+    size = 1e3
+    moments = problem.moments
+    wide_moments = JointMoments(moments.pairs, size**3 * moments.mass, size * moments.center, size**2 * moments.spread)
+    wide = BoneProblem(
+        **{
+            **values,
+            "points": size * problem.points,
+            "targets": size * problem.targets,
+            "moments": wide_moments,
+            "bodies": None,
+            "anchors": scaled(problem.anchors, size),
+        }
+    )
+    torch.testing.assert_close(fit_bones(wide, scaled(start, size)).transforms, scaled(found.transforms, size))
+
+
+def scaled(motions, size):
+    motions = motions.clone()
+    motions[..., :3, 3] *= size
+    return motions
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_flat_matches_do_not_slide(bones, dtype):
+    plane = torch.cat([bones.draw(100, 2), torch.zeros(100, 1)], dim=-1).to(dtype)
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=dtype).expand(100, 3)
+    weights = torch.nn.functional.one_hot((plane[:, 0] > 0).long(), 2).to(dtype)
+    start = torch.eye(4, dtype=dtype).repeat(2, 1, 1)
+    tilted = plane + torch.tensor([0.3, 0.2, 0.1], dtype=dtype) + 0.05 * plane[:, :1] * up
+    fit = fit_bones(BoneProblem(plane, bind(weights), tilted, up), start, max_steps=20, rtol=0.0)
+    assert float(fit.energy) < 1e-8
+    assert float(fit.transforms[:, :2, 3].abs().max()) < 0.02
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

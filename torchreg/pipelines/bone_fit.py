@@ -13,7 +13,8 @@ from torchreg.geometry.blend import turn_about
 from torchreg.pipelines.bone_problem import BoneProblem
 from torchreg.solvers.levenberg_marquardt import Linearization, damped_step
 
-_DEFAULT_DAMPING = 1e-5
+# Nothing beside the pull of matches, of which a bone gets one part in B, but enough against rounding where none pulls.
+_DEFAULT_DAMPING = 1e-4
 # By how much of what the model promised a step must lower the energy for the damping to fall.
 _TRUSTED_SHARE = 0.5
 _DAMPING_DOWN, _DAMPING_UP = 0.25, 4.0
