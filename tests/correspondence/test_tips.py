@@ -59,7 +59,7 @@ def test_strangers_are_left_out_and_missing_tips_are_named(count):
     tips = torch.cat((strangers, known[keep] + 0.02))
     match = match_tips([TipReference(known)], tips)
     assert match.index.tolist() == [1, 2, -1, *range(3, count)]
-    assert match.cost == pytest.approx(0.25 / count, abs=1e-3)
+    assert match.cost == pytest.approx(0.5 / count, abs=1e-3)
 
 
 def test_a_symmetric_creature_has_not_turned_in_a_moment():

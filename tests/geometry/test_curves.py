@@ -5,7 +5,15 @@ import math
 import pytest
 import torch
 
-from torchreg.geometry.curves import bend_angles, curve_frames, curve_lengths, follow, tangents, turn_between
+from torchreg.geometry.curves import (
+    bend_angles,
+    curve_frames,
+    curve_lengths,
+    follow,
+    points_along,
+    tangents,
+    turn_between,
+)
 from torchreg.geometry.rotation import so3_exp
 
 
@@ -90,3 +98,11 @@ def test_gradients_are_right():
     curves = random(2, 6, 3).requires_grad_()
     for function in (curve_lengths, bend_angles, tangents, curve_frames):
         assert torch.autograd.gradcheck(function, (curves,))
+
+
+def test_points_along_a_curve_lie_at_their_lengths():
+    curve = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 0, 0], [1, 2, 0]], dtype=torch.float64)
+    found = points_along(curve, torch.tensor([[0.0, 0.5, 1.0], [2.0, 3.0, 9.0]], dtype=torch.float64))
+    right = torch.tensor([[[0.0, 0, 0], [0.5, 0, 0], [1, 0, 0]], [[1, 1, 0], [1, 2, 0], [1, 2, 0]]]).double()
+    torch.testing.assert_close(found, right)
+    torch.testing.assert_close(points_along(curve[:1], torch.tensor([0.0, 1.0]).double()), torch.zeros(2, 3).double())

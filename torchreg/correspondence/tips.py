@@ -60,7 +60,7 @@ def match_tips(
     lengths: Tensor | None = None,
     *,
     weights: Tensor | None = None,
-    missing: float = 0.25,
+    missing: float = 0.5,
     length_weight: float = 0.5,
 ) -> TipMatch:
     """Return which tip is which of the known ones, by the mapping of least error.
@@ -95,6 +95,22 @@ def match_tips(
 
     References: Brostow, Essa, Steedly and Kwatra 2004, eqs. 6-8; Arun, Huang and Blostein 1987.
     """
+    maps, costs = rank_mappings(
+        references, tips, lengths, weights=weights, missing=missing, length_weight=length_weight
+    )
+    return TipMatch(maps[0], float(costs[0]))
+
+
+def rank_mappings(
+    references: list[TipReference],
+    tips: Tensor,
+    lengths: Tensor | None = None,
+    *,
+    weights: Tensor | None = None,
+    missing: float = 0.5,
+    length_weight: float = 0.5,
+) -> tuple[Tensor, Tensor]:
+    """Return all mappings (P, K) that `match_tips` compares, and their costs (P,), the best first; see there."""
     if not references:
         raise InputError("references must hold at least one known frame, got none")
     tips = as_float_tensor(tips, "tips")
@@ -122,9 +138,8 @@ def match_tips(
     with torch.no_grad():
         fixed = _all_mappings(count, len(tips))
         maps = _guessed(problem) if fixed is None else fixed.to(tips.device)
-        costs = problem.costs(maps)
-        best = int(costs.argmin())
-        return TipMatch(maps[best], float(costs[best]))
+        costs, order = problem.costs(maps).sort(stable=True)
+        return maps[order], costs
 
 
 def _as_curves(value: Tensor, name: str) -> Tensor:

@@ -19,6 +19,20 @@ def curve_lengths(curves: Tensor) -> Tensor:
     return _safe_norm(curves[..., 1:, :] - curves[..., :-1, :]).sum(-1)
 
 
+def points_along(curve: Tensor, lengths: Tensor) -> Tensor:
+    """Return the points (..., 3) of a curve (n, 3) at lengths (...,) along it; its last point beyond the end.
+
+    Differentiable: in the curve, with the places along it held fixed.
+    """
+    along = torch.cat((curve.new_zeros(1), _safe_norm(curve[1:] - curve[:-1]).cumsum(0))).detach()
+    lengths = lengths.clamp(0, float(along[-1]))
+    after = torch.searchsorted(along, lengths).clamp(min(1, len(curve) - 1), len(curve) - 1)
+    before = (after - 1).clamp_min(0)
+    step = along[after] - along[before]
+    share = torch.where(step > 0, (lengths - along[before]) / torch.where(step > 0, step, 1.0), 0.0)
+    return curve[before] + share.unsqueeze(-1) * (curve[after] - curve[before])
+
+
 def bend_angles(curves: Tensor) -> Tensor:
     """Return how far curves (..., S, 3) turn at their inner points, (..., S - 2) radians from 0 to pi.
 
