@@ -27,7 +27,7 @@ from torchreg.pipelines.align_problem import (
 )
 from torchreg.pipelines.align_search import FINAL_SIGMAS, explore, needs_search
 from torchreg.pipelines.align_stages import CORRESPONDENCES, OnStep, StageResult, fit_surface, register
-from torchreg.results import AlignRecord, AlignResult, Status
+from torchreg.results import AlignRecord, AlignResult, FrameResult, Status, TrackState
 
 # Shares of the model's size, the diagonal of its rest pose.
 _START_SIGMA, _STOP_SIGMA = 0.08, 0.02
@@ -37,7 +37,7 @@ _MIN_INLIERS, _MIN_INLIER_SHARE = 10, 0.02
 _SEARCHED_STEPS = 4
 
 
-_Record = TypeVar("_Record", AlignRecord, AlignResult)
+_Record = TypeVar("_Record", AlignRecord, AlignResult, FrameResult, TrackState)
 
 
 @dataclass(frozen=True)
@@ -172,10 +172,10 @@ def align(
             final = StageResult(final.pose[best], final.sigma[best], final.change[best])
         final = _search_where_needed(problem, final, pose, config, record)
         result = _result(problem, final, origin, config, tuple(record.history))
-        return _ordinary(_unbatched(result, 0) if data.ndim == 2 else result)
+        return ordinary(_unbatched(result, 0) if data.ndim == 2 else result)
 
 
-def _ordinary(record: _Record) -> _Record:
+def ordinary(record: _Record) -> _Record:
     """Return a copy whose tensors can take part in autograd, as those made in inference mode cannot."""
     values = {item.name: getattr(record, item.name) for item in fields(record)}
     with torch.inference_mode(False), torch.no_grad():
@@ -191,7 +191,7 @@ class _Recorder:
         self.history: list[AlignRecord] = [] if history is None else history
 
     def __call__(self, step: AlignRecord) -> None:
-        step = _ordinary(replace(step, pose=shifted(step.pose, self.origin)))
+        step = ordinary(replace(step, pose=shifted(step.pose, self.origin)))
         self.history.append(step)
         if self.on_step is not None:
             with torch.inference_mode(False), torch.no_grad():

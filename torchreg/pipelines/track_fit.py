@@ -42,6 +42,8 @@ _SURFACE_SIGMAS = (0.022,)
 _WIDE_PRIOR = 0.3
 # Paces at which fast joints go on instead: they stopped, or double; kernel widths of their surface fits, and steps.
 _PACES, _FAST_WIDTHS, _FAST_STEPS = (0.0, 2.0), (0.06, 0.04, 0.03), 2
+# More data tell them apart no better.
+_FAST_DATA = 300
 # Data that lie this near the bounds of the predicted model count, as a share of its size.
 _REACH = 0.12
 # A limb is shown by this many data at least, this far from its joints, as a share of the size.
@@ -125,8 +127,11 @@ class FrameFitter:
         rows = problem.rows(torch.zeros(len(starts), dtype=torch.long, device=starts.device))
         moved = register(rows, starts, self._schedule(state, gap), em_steps=self.config.em_steps, m_steps=1).pose
         if fast:
-            wide = fit_candidates(problem, starts[None], _FAST_WIDTHS, _FAST_STEPS)[0]
-            moved = self._mixed(problem, torch.cat([moved, wide]))
+            free = problem.prior.precision.clone()
+            free[:6] = 0
+            few = replace(problem, prior=PosePrior(problem.prior.mean, free)).draw(_FAST_DATA, generator(state))
+            wide = fit_candidates(few, starts[None], _FAST_WIDTHS, _FAST_STEPS)[0]
+            moved = self._mixed(few, torch.cat([moved, wide]))
         return self.fit(replace(view, problem=problem), state, "tracked", moved)
 
     def fit(self, view: FrameView, state: TrackState, how: str, pose: Tensor) -> FrameFit:
