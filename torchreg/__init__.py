@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from torchreg.pipelines.align import AlignConfig, align
     from torchreg.pipelines.calibrate import calibrate
     from torchreg.pipelines.find_pose import FindPoseConfig, find_pose
+    from torchreg.pipelines.skeletonize import SkeletonizeConfig, skeletonize
     from torchreg.pipelines.solve_pose import solve_pose
     from torchreg.pipelines.storage import load
     from torchreg.pipelines.track import TrackConfig, Tracker
@@ -56,6 +57,7 @@ __all__ = [
     "RangeScan",
     "SigmaSchedule",
     "Skeleton",
+    "SkeletonizeConfig",
     "Status",
     "TrackConfig",
     "TrackResult",
@@ -72,6 +74,7 @@ __all__ = [
     "load_points",
     "metrics",
     "sample_skin",
+    "skeletonize",
     "solve_pose",
 ]
 
@@ -94,6 +97,7 @@ _OWNERS = {
     "RangeScan": "geometry.range_scan",
     "SigmaSchedule": "correspondence.sigma",
     "Skeleton": "geometry.skeleton",
+    "SkeletonizeConfig": "pipelines.skeletonize",
     "Status": "results",
     "TrackConfig": "pipelines.track",
     "TrackResult": "results",
@@ -107,6 +111,7 @@ _OWNERS = {
     "load_mesh": "io.points",
     "load_points": "io.points",
     "sample_skin": "models.skin",
+    "skeletonize": "pipelines.skeletonize",
     "solve_pose": "pipelines.solve_pose",
 }
 

@@ -1,0 +1,204 @@
+"""Surfaces as graphs: edges, pieces that hang together, holes closed, one piece made of several."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torchreg._checks import check_choice
+from torchreg.errors import InputError
+from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.normals import weld
+
+PIECES = ("largest", "bridge", "error")
+# Fragments with a smaller share of the faces are dust: never bridged to, and no reason for an error.
+_DUST = 1e-3
+# Edge of a cell in which vertices fall together, in square roots of the area per vertex wanted.
+_CELL = 1.15
+
+
+@dataclass(frozen=True, eq=False)
+class OnePiece:
+    """A surface without holes or loose parts, made from any triangles.
+
+    Args:
+        mesh: the surface; its vertices are float64 on the CPU, the middles of closed holes last.
+        vertex: (V,) vertex of the original mesh that each one comes from; -1 for the middle of a hole.
+        bridges: (B, 2) vertices to be thought of as joined, empty unless pieces were bridged.
+        notes: what was done, in words; empty for a clean surface.
+    """
+
+    mesh: TriangleMesh
+    vertex: Tensor
+    bridges: Tensor
+    notes: tuple[str, ...]
+
+
+def unique_edges(faces: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the edges (E, 2) of triangles, smaller index first, and the edges (F, 3) of each: 01, 12, 20.
+
+    Args:
+        faces: (F, 3) vertex indices.
+    """
+    if faces.numel() == 0:
+        return faces.new_zeros(0, 2), faces
+    sides = torch.stack((faces, faces.roll(-1, dims=1)), dim=-1)
+    count = int(faces.max()) + 1
+    keys, which = (sides.amin(-1) * count + sides.amax(-1)).unique(return_inverse=True)
+    return torch.stack((keys // count, keys % count), dim=-1), which
+
+
+def connected_labels(pairs: Tensor, count: int) -> Tensor:
+    """Return (count,) labels from 0, equal for nodes that pairs (P, 2) of nodes join directly or through others."""
+    first, second = pairs.numpy().T
+    graph = coo_array((np.ones(len(first), dtype=np.int8), (first, second)), shape=(count, count))
+    return torch.from_numpy(connected_components(graph, directed=False)[1].astype(np.int64))
+
+
+def one_piece(mesh: TriangleMesh, pieces: str = "largest") -> OnePiece:
+    """Return a surface with its duplicate vertices welded, its holes closed and its loose parts dealt with.
+
+    A hole is closed by triangles from its rim to the mean of the rim. Triangles that repeat a vertex and vertices that
+    no triangle uses are dropped. Edges with more than two triangles and any winding are fine.
+
+    Args:
+        mesh: at least one triangle with three different places.
+        pieces: ``"largest"`` keeps the piece with the largest area; ``"bridge"`` also joins the others to it, each by
+            the shortest segment between vertices; ``"error"`` raises. Dust, pieces with less than a thousandth of the
+            triangles, is left out by all three.
+
+    Raises:
+        InputError: if no triangle is left, or ``pieces`` is "error" and there are several.
+
+    Differentiable: no.
+    """
+    check_choice(pieces, "pieces", PIECES)
+    place = weld(mesh.vertices.detach().cpu().double())
+    faces = place[mesh.faces.cpu()]
+    faces = faces[(faces != faces.roll(1, dims=1)).all(1)]
+    if len(faces) == 0:
+        raise InputError(f"mesh must have a triangle with three different corners, got {mesh.num_faces} faces without")
+    # A face used twice would make its edges look shared.
+    faces = _distinct_faces(faces)
+    original = torch.zeros(int(place.max()) + 1, dtype=torch.int64).index_copy(0, place, torch.arange(len(place)))
+    vertices = mesh.vertices.detach().cpu().double()[original]
+    faces, kept, notes, labels = _choose(vertices, faces, pieces)
+    used, which = faces.unique(return_inverse=True)
+    faces, vertices, original = which, vertices[used], original[used]
+    bridges = _bridges(vertices, labels[used], kept) if kept > 1 else faces.new_zeros(0, 2)
+    if kept > 1:
+        notes += (f"{kept} pieces joined by {len(bridges)} bridges",)
+    vertices, faces, holes = close_holes(vertices, faces)
+    if holes:
+        notes += (f"{holes} hole(s) closed",)
+    original = torch.cat((original, original.new_full((holes,), -1)))
+    return OnePiece(TriangleMesh(vertices, faces), original, bridges, notes)
+
+
+def coarsened(mesh: TriangleMesh, count: int) -> TriangleMesh:
+    """Return a surface with about ``count`` vertices at most, each in the middle of a patch of the old ones.
+
+    A patch is what hangs together within a cubic cell, so that sheets and limbs that only come near each other stay
+    apart; where that is no disk, as where a limb is thinner than a cell, the vertices stay as they are.
+
+    Args:
+        mesh: returned as it is if it has no more vertices.
+        count: number of vertices to aim at; the triangles where patches meet at a point may leave small holes.
+
+    Differentiable: no.
+
+    Cost: 0.2 s for 100,000 vertices.
+
+    References: Rossignac and Borrel 1993, vertex clustering; here within connected patches.
+    """
+    if mesh.num_vertices <= count:
+        return mesh
+    vertices, faces = mesh.vertices, mesh.faces
+    size = _CELL * (mesh.face_areas().sum() / count).sqrt()
+    cells = ((vertices - vertices.amin(0)) / size).floor().long()
+    number = cells.amax(0) + 1
+    cell = (cells[:, 0] * number[1] + cells[:, 1]) * number[2] + cells[:, 2]
+    edges, _ = unique_edges(faces)
+    edges = edges[cell[edges[:, 0]] == cell[edges[:, 1]]]
+    patch = connected_labels(edges, len(vertices))
+    inner = patch[faces[(patch[faces] == patch[faces[:, :1]]).all(1), 0]]
+    most = int(patch.max()) + 1
+    euler = torch.bincount(patch) + torch.bincount(inner, minlength=most)
+    euler = euler - torch.bincount(patch[edges[:, 0]], minlength=most)
+    patch = torch.where(euler[patch] == 1, patch, most + torch.arange(len(vertices)))
+    patch = patch.unique(return_inverse=True)[1]
+    total = vertices.new_zeros(int(patch.max()) + 1, 3).index_add(0, patch, vertices)
+    faces = patch[faces]
+    faces = faces[(faces != faces.roll(1, dims=1)).all(1)]
+    return TriangleMesh(total / torch.bincount(patch)[:, None], faces)
+
+
+def _distinct_faces(faces: Tensor) -> Tensor:
+    """Return the faces (F, 3) without those that have the corners of another."""
+    low, middle, high = faces.sort(dim=1).values.unbind(1)
+    count = int(faces.max()) + 1
+    # Two numbers per face instead of three: three might not fit into 64 bits.
+    pair = (low * count + middle).unique(return_inverse=True)[1]
+    key, order = (pair * count + high).sort(stable=True)
+    first = torch.cat((key.new_ones(1, dtype=torch.bool), key[1:] != key[:-1]))
+    return faces[order[first].sort().values]
+
+
+def _choose(vertices: Tensor, faces: Tensor, pieces: str) -> tuple[Tensor, int, tuple[str, ...], Tensor]:
+    """Return the faces of the pieces to keep, their number, notes and the piece (V,) of each vertex."""
+    labels = connected_labels(torch.cat((faces[:, :2], faces[:, 1:])), len(vertices))
+    piece = labels[faces[:, 0]]
+    number = torch.bincount(piece)
+    areas = torch.bincount(piece, TriangleMesh(vertices, faces).face_areas(), minlength=len(number))
+    large = number >= _DUST * len(faces)
+    count = int(large.sum())
+    if count > 1 and pieces == "error":
+        shares = ", ".join(f"{share:.1%}" for share in (areas[large] / areas.sum()).sort(descending=True).values[:5])
+        raise InputError(f"mesh must be one piece, got {count} (area {shares}); choose pieces='largest' or 'bridge'")
+    keep = large if pieces == "bridge" else torch.arange(len(number)) == areas.argmax()
+    left_out = int((number > 0).sum()) - int(keep.sum())
+    notes = (f"{left_out} fragment(s) left out, {1 - float(number[keep].sum()) / len(faces):.2%} of the faces",)
+    return faces[keep[piece]], int(keep.sum()), notes if left_out else (), labels
+
+
+def _bridges(vertices: Tensor, labels: Tensor, count: int) -> Tensor:
+    """Return the vertex pairs (count - 1, 2) that join all pieces with the least total length."""
+    groups = [(labels == label).nonzero()[:, 0] for label in labels.unique().tolist()]
+    trees = [cKDTree(vertices[group].numpy()) for group in groups]
+    lengths, ends = np.zeros((count, count)), {}
+    for first in range(count):
+        for second in range(first + 1, count):
+            small, large = sorted((first, second), key=lambda piece: len(groups[piece]))
+            distance, nearest = trees[large].query(vertices[groups[small]].numpy())
+            start = int(distance.argmin())
+            # Zero would be no edge.
+            lengths[first, second] = distance[start] + np.finfo(np.float64).tiny
+            ends[first, second] = (int(groups[small][start]), int(groups[large][nearest[start]]))
+    chosen = zip(*minimum_spanning_tree(lengths).nonzero(), strict=True)
+    return torch.tensor([ends[int(first), int(second)] for first, second in chosen])
+
+
+def close_holes(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, int]:
+    """Return vertices and faces with every rim joined to its mean by triangles, and the number of rims.
+
+    The means come after the old vertices, in no particular order.
+    """
+    sides, which = unique_edges(faces)
+    rim = torch.bincount(which.reshape(-1), minlength=len(sides)) == 1
+    if not bool(rim.any()):
+        return vertices, faces, 0
+    corner = (rim[which]).nonzero()
+    edges = torch.stack((faces[corner[:, 0], corner[:, 1]], faces[corner[:, 0], (corner[:, 1] + 1) % 3]), dim=-1)
+    around, ends = edges.unique(return_inverse=True)
+    label = connected_labels(ends, len(around))
+    holes = int(label.max()) + 1
+    number = torch.bincount(label).unsqueeze(-1)
+    middles = vertices.new_zeros(holes, 3).index_add(0, label, vertices[around]) / number
+    fan = torch.cat((edges.flip(-1), len(vertices) + label[ends[:, :1]]), dim=-1)
+    return torch.cat((vertices, middles)), torch.cat((faces, fan)), holes
