@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from torchreg.errors import FormatError
+from torchreg.errors import FormatError, InputError
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
-from torchreg.io.npz import read_npz, write_npz
+from torchreg.io.npz import read_npz, save_arrays, write_npz
 from torchreg.io.raw_cloud import RawCloud
 
 POINTS = np.random.default_rng(0).normal(size=(4, 3))
@@ -140,3 +141,12 @@ def test_numpy_reads_what_is_written():
 
 def test_an_empty_cloud_comes_back_empty():
     assert read_npz(write_npz(RawCloud(np.zeros((0, 3)))), DEFAULT_LIMITS).points.shape == (0, 3)
+
+
+def test_tensors_are_saved_under_their_names(tmp_path):
+    save_arrays(tmp_path / "a.npz", {"x": torch.arange(6).reshape(2, 3), "flags": torch.tensor([True, False])})
+    with np.load(tmp_path / "a.npz") as archive:
+        assert archive["x"].tolist() == [[0, 1, 2], [3, 4, 5]]
+        assert archive["flags"].dtype == bool
+    with pytest.raises(InputError, match=r"must end in \.npz"):
+        save_arrays(tmp_path / "a.txt", {})

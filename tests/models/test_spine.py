@@ -163,3 +163,13 @@ def test_the_record_makes_the_same_spine_again_also_after_a_step(spine):
     again = Spine(fields.curves, fields.graph, fields.radii, fields.frames, fields.times)
     for name in ("nodes", "node_radii", "rest_frames", "times", "graph"):
         assert torch.equal(getattr(again, name), getattr(spine, name))
+
+
+def test_one_moment_is_a_skeleton(spine):
+    skeleton = spine.skeleton(1.5)
+    assert skeleton.tips.tolist() == [0, 1, 2, 3]
+    assert skeleton.junctions.tolist() == [4, 5]
+    curves = spine(1.5).detach()
+    for limb, curve in zip(skeleton.limbs[:4], curves, strict=False):
+        torch.testing.assert_close(skeleton.nodes[limb], curve)
+    torch.testing.assert_close(skeleton.radii[skeleton.limbs[4]], spine.radii(1.5).detach()[4])

@@ -97,6 +97,8 @@ def save_animated_skin(
         setattr(attributes, f"JOINTS_{number}", document.add(joints, target=pygltflib.ARRAY_BUFFER))
         setattr(attributes, f"WEIGHTS_{number}", document.add(values, target=pygltflib.ARRAY_BUFFER))
     mesh = document.add_mesh("skin", attributes, triangles, None if colors is not None else _DEFAULT_COLOR)
+    if colors is not None and tuple(colors.shape[1:]) == (4,) and bool((colors[:, 3] < 1).any()):
+        document.gltf.materials[-1].alphaMode = pygltflib.BLEND
     inverse_bind = np.linalg.inv(rest)
     inverse_bind[:, 3] = (0.0, 0.0, 0.0, 1.0)
     local_rest = _local(rest, parents)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import io
+import os
 import zipfile
+from collections.abc import Mapping
 from typing import IO
 
 import numpy as np
+from torch import Tensor
 
-from torchreg.errors import FormatError
-from torchreg.io.limits import FileLimits, check_count, open_zip
+from torchreg.errors import FormatError, InputError
+from torchreg.io.atomic import write_atomic
+from torchreg.io.limits import FileLimits, check_count, local_path, open_zip
 from torchreg.io.raw_cloud import Array, RawCloud, as_indices
 
 
@@ -80,3 +84,22 @@ def write_npz(cloud: RawCloud) -> bytes:
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, **{name: array for name, array in arrays.items() if array is not None})
     return stream.getvalue()
+
+
+def save_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Tensor]) -> None:
+    """Write tensors under their names to an archive that numpy reads.
+
+    Args:
+        path: a local file ending in .npz; an existing one is replaced, whole or not at all.
+        arrays: name to tensor.
+
+    Raises:
+        InputError: if the ending is another.
+        FileNotFoundError: if the folder does not exist.
+    """
+    place = local_path(path)
+    if place.suffix.lower() != ".npz":
+        raise InputError(f"path must end in .npz, got {place.name!r}; rename the output file")
+    stream = io.BytesIO()
+    np.savez(stream, allow_pickle=False, **{name: value.detach().cpu().numpy() for name, value in arrays.items()})
+    write_atomic(place, stream.getvalue())

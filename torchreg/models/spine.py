@@ -12,7 +12,7 @@ from torchreg._checks import as_float_tensor, as_tensor, check_finite, check_sha
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.curves import bend_angles, curve_frames, curve_lengths, follow, tangents
 from torchreg.geometry.labeled_tree import gather_nodes, number_nodes
-from torchreg.geometry.skeleton import nearest_rotation
+from torchreg.geometry.skeleton import Skeleton, nearest_rotation
 
 # Limbs that share a node must agree on its place up to this share of the size.
 _MEETING_SLACK = 1e-4
@@ -159,6 +159,14 @@ class Spine(nn.Module):
         share = share.detach()[..., None, None, None, None]
         mixed = self.rest_frames[index] + share * (self.rest_frames[after] - self.rest_frames[index])
         return follow(nearest_rotation(mixed), tangents(self(t)))
+
+    def skeleton(self, t: float) -> Skeleton:
+        """Return the curves at one time as a tree of nodes with radii and frames."""
+        with torch.no_grad():
+            nodes = self.nodes_at(t)
+            steps = torch.stack((self.limb_nodes[:, :-1], self.limb_nodes[:, 1:]), dim=-1).reshape(-1, 2)
+            radii = gather_nodes(self.radii(t)[None], self.limb_nodes)[0]
+            return Skeleton(nodes, steps, radii, gather_nodes(self.frames(t)[None], self.limb_nodes)[0])
 
     def lengths(self, t: float | Tensor) -> Tensor:
         """Return the lengths (..., L) of the limbs at times ``t`` (...,)."""

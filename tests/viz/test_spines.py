@@ -1,0 +1,57 @@
+"""Pictures of spines: limbs in colors that stay, what was carried over dashed, one picture per frame, a movie."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from PIL import Image
+
+from torchreg.errors import InputError
+from torchreg.geometry.mesh import unit_sphere
+from torchreg.viz.bone_colors import bone_palette
+from torchreg.viz.figures import new_figure
+from torchreg.viz.spines import draw_spine_frame, save_spine_movie, save_spine_pictures, spine_view
+
+SPHERE = unit_sphere(2)
+
+
+@pytest.fixture
+def spine():
+    ends = torch.eye(3)
+    curves = ends[:, None] * torch.linspace(0.9, 0, 5)[:, None]
+    turned = curves.roll(1, -1)
+    own = torch.tensor([[True, True, True], [True, False, True]])
+    return SimpleNamespace(curves=torch.stack((curves, turned)), num_tips=3, own=own)
+
+
+def test_limbs_keep_their_colors_and_carried_ones_are_dashed(spine):
+    view = spine_view([SPHERE], size=(160, 120))
+    for frame in range(2):
+        _, (ax,) = new_figure(80, 60)
+        draw_spine_frame(ax, SPHERE, spine.curves[frame], 3, view=view, own=spine.own[frame])
+        limbs = [line for line in ax.lines if len(line.get_xdata()) == 5]
+        assert [line.get_linestyle() for line in limbs] == ["-" if own else "--" for own in spine.own[frame].tolist()]
+        for line, color in zip(limbs, bone_palette(3).tolist(), strict=True):
+            assert line.get_color() == color
+        assert [text.get_text() for text in ax.texts] == ["0", "1", "2"]
+        assert ax.images[0].get_array()[..., 3].max() < 0.6
+
+
+def test_one_picture_per_frame_and_a_movie(spine, tmp_path):
+    view, told = spine_view([SPHERE], size=(160, 120)), []
+    paths = save_spine_pictures(
+        tmp_path / "frames", spine, [SPHERE, SPHERE], view=view, on_frame=lambda *n: told.append(n)
+    )
+    assert [path.name for path in paths] == ["frame_0000.png", "frame_0001.png"]
+    assert told == [(1, 2), (2, 2)]
+    with Image.open(paths[0]) as first, Image.open(paths[1]) as second:
+        assert first.size == second.size
+        assert first.tobytes() != second.tobytes()
+    movie = save_spine_movie(tmp_path / "a.gif", spine, [SPHERE, SPHERE], view=view)
+    with Image.open(movie) as image:
+        assert image.n_frames == 2
+
+
+def test_every_frame_needs_its_surface(spine, tmp_path):
+    with pytest.raises(InputError, match=r"one surface per frame \(2\), got 1"):
+        save_spine_movie(tmp_path / "a.gif", spine, [SPHERE])

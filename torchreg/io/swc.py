@@ -1,0 +1,95 @@
+"""SWC, the text format for branching tubes: one node per line, with its radius and its parent."""
+
+from __future__ import annotations
+
+import os
+
+import torch
+
+from torchreg.errors import FormatError, InputError
+from torchreg.geometry.skeleton import Skeleton
+from torchreg.io.atomic import write_atomic
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_count, local_path, read_bytes
+
+# Of nodes along limbs, of branchings and of ends; 0 is undefined in the format.
+_UNDEFINED, _BRANCHING, _END = 0, 5, 6
+
+
+def save_swc(path: str | os.PathLike[str], skeleton: Skeleton, comment: str = "") -> None:
+    """Write a skeleton; frames, confidence and notes have no place in the format.
+
+    The first tip is the root. Branchings have the type 5, ends 6, other nodes 0.
+
+    Args:
+        path: a local file ending in .swc; an existing one is replaced, whole or not at all.
+        skeleton: the tree.
+        comment: lines to begin with.
+
+    Raises:
+        InputError: if the ending is another.
+        FileNotFoundError: if the folder does not exist.
+    """
+    place = local_path(path)
+    if place.suffix.lower() != ".swc":
+        raise InputError(f"path must end in .swc, got {place.name!r}; rename the output file")
+    order, parents = _walk(skeleton)
+    number = {node: row + 1 for row, node in enumerate(order)}
+    degrees = skeleton.degrees.tolist()
+    nodes, radii = skeleton.nodes.detach().cpu().tolist(), skeleton.radii.detach().cpu().tolist()
+    lines = [f"# {line}" for line in (*comment.splitlines(), "number type x y z radius parent")]
+    for node in order:
+        kind = _END if degrees[node] <= 1 else _BRANCHING if degrees[node] > 2 else _UNDEFINED
+        x, y, z = nodes[node]
+        lines.append(f"{number[node]} {kind} {x:.9g} {y:.9g} {z:.9g} {radii[node]:.9g} {number.get(parents[node], -1)}")
+    write_atomic(place, ("\n".join(lines) + "\n").encode())
+
+
+def load_swc(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Skeleton:
+    """Return the skeleton that a file holds, float64.
+
+    Args:
+        path: a local file.
+        limits: on its size.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FormatError: if a line is damaged, or the nodes make no single tree; names the file.
+    """
+    place = local_path(path)
+    rows = []
+    for number, line in enumerate(read_bytes(place, limits).decode("utf-8", "replace").splitlines(), start=1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        try:
+            if len(words) != 7:
+                raise ValueError(f"{len(words)} columns instead of 7")
+            rows.append((int(words[0]), *(float(word) for word in words[2:6]), int(words[6])))
+        except ValueError as error:
+            raise FormatError(f"{place}: line {number} is no node ({error})") from error
+    check_count(len(rows), "nodes", limits)
+    index = {row[0]: place_ for place_, row in enumerate(rows)}
+    try:
+        edges = [(index[row[5]], index[row[0]]) for row in rows if row[5] >= 0]
+        values = torch.tensor([row[1:5] for row in rows], dtype=torch.float64).reshape(-1, 4)
+        return Skeleton(values[:, :3], torch.tensor(edges).reshape(-1, 2).long(), values[:, 3])
+    except (KeyError, InputError) as error:
+        raise FormatError(f"{place}: the nodes make no tree ({error})") from error
+
+
+def _walk(skeleton: Skeleton) -> tuple[list[int], dict[int, int]]:
+    """Return the nodes from the first tip outwards along the limbs, and the parent of each."""
+    neighbors: list[list[int]] = [[] for _ in range(len(skeleton))]
+    for start, end in skeleton.edges.tolist():
+        neighbors[start].append(end)
+        neighbors[end].append(start)
+    root = int(skeleton.tips[0])
+    order, parents, waiting = [], {root: -1}, [root]
+    while waiting:
+        node = waiting.pop()
+        order.append(node)
+        for other in neighbors[node]:
+            if other not in parents:
+                parents[other] = node
+                waiting.append(other)
+    return order, parents
