@@ -20,8 +20,10 @@ if TYPE_CHECKING:
     from torchreg.models.grid_lbs import GridLBS
     from torchreg.models.hand import Hand
     from torchreg.models.skin import BendingSkin, LinearBlendSkin, sample_skin
+    from torchreg.models.spine import Spine
     from torchreg.pipelines.align import AlignConfig, align
     from torchreg.pipelines.calibrate import calibrate
+    from torchreg.pipelines.extract_spine import SpineConfig, extract_spine
     from torchreg.pipelines.find_pose import FindPoseConfig, find_pose
     from torchreg.pipelines.skeletonize import SkeletonizeConfig, skeletonize
     from torchreg.pipelines.solve_pose import solve_pose
@@ -33,6 +35,7 @@ if TYPE_CHECKING:
         FrameResult,
         PoseSolution,
         PoseStarts,
+        SpineSequence,
         Status,
         TrackResult,
         TrackState,
@@ -58,6 +61,9 @@ __all__ = [
     "SigmaSchedule",
     "Skeleton",
     "SkeletonizeConfig",
+    "Spine",
+    "SpineConfig",
+    "SpineSequence",
     "Status",
     "TrackConfig",
     "TrackResult",
@@ -68,6 +74,7 @@ __all__ = [
     "align",
     "calibrate",
     "errors",
+    "extract_spine",
     "find_pose",
     "load",
     "load_mesh",
@@ -98,6 +105,9 @@ _OWNERS = {
     "SigmaSchedule": "correspondence.sigma",
     "Skeleton": "geometry.skeleton",
     "SkeletonizeConfig": "pipelines.skeletonize",
+    "Spine": "models.spine",
+    "SpineConfig": "pipelines.extract_spine",
+    "SpineSequence": "results",
     "Status": "results",
     "TrackConfig": "pipelines.track",
     "TrackResult": "results",
@@ -105,6 +115,7 @@ _OWNERS = {
     "Tracker": "pipelines.track",
     "TriangleMesh": "geometry.mesh",
     "align": "pipelines.align",
+    "extract_spine": "pipelines.extract_spine",
     "calibrate": "pipelines.calibrate",
     "find_pose": "pipelines.find_pose",
     "load": "pipelines.storage",

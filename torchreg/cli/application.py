@@ -12,6 +12,7 @@ from torchreg.cli.align import align
 from torchreg.cli.demo import demo
 from torchreg.cli.figure import figure
 from torchreg.cli.info import info
+from torchreg.cli.spine import spine
 from torchreg.cli.track import track
 
 app = typer.Typer(
@@ -53,4 +54,5 @@ app.command(short_help="Align a shape to point clouds.")(align)
 app.command(short_help="Run the main job on built-in data.")(demo)
 app.command(short_help="Draw the bending skin, or the picture of the README.")(figure)
 app.command(short_help="Show the degrees of freedom and the parts of a shape.")(info)
+app.command(short_help="Extract the moving skeleton of a sequence of meshes.")(spine)
 app.command(short_help="Follow a shape through a sequence of clouds.")(track)

@@ -1,0 +1,147 @@
+"""``torchreg spine``: one graph of curves for a sequence of meshes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from torchreg.cli.outputs import Force, Quiet, check_outputs, numbered, with_ending
+from torchreg.cli.reporting import reporting
+
+if TYPE_CHECKING:
+    from torchreg.geometry.mesh import TriangleMesh
+    from torchreg.models.spine import Spine
+    from torchreg.results import SpineSequence
+
+
+@reporting
+def spine(
+    frames: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FRAMES",
+            help="The meshes, in any unit: files, which are put in the order of the numbers in their names, or one "
+            "folder of them.",
+        ),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="OUT.glb", help="OUT.glb, OUT.safetensors and OUT.json are written."),
+    ] = Path("spine.glb"),
+    swc: Annotated[
+        Path | None, typer.Option(metavar="OUT.swc", help="Also write the curves as SWC, one numbered file per frame.")
+    ] = None,
+    npz: Annotated[
+        Path | None, typer.Option(metavar="OUT.npz", help="Also write tips, graph, curves, radii as arrays.")
+    ] = None,
+    movie: Annotated[
+        Path | None, typer.Option(metavar="OUT.gif", help="Also draw all frames as a moving picture, .gif or .mp4.")
+    ] = None,
+    pictures: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Also draw each frame (frame_0000.png).")
+    ] = None,
+    tips: Annotated[int | None, typer.Option(min=2, help="Number of tips; without it the most frequent one.")] = None,
+    samples: Annotated[int, typer.Option(min=3, help="Points along each limb.")] = 24,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,
+    fps: Annotated[float, typer.Option(help="Frames per second.")] = 20.0,
+    progress: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Keep what is done in a folder; the same command goes on from there."),
+    ] = None,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """Extract the spine of a creature that moves: limbs and tips that keep their identity, from unrelated meshes.
+
+    The glTF file shows the curves in the translucent surface of one frame, which they move. Everything is in the
+    .safetensors file, which `torchreg.load` reads.
+
+    Exit codes: 0; 2 for an error; 130 for Ctrl-C.
+    """
+    from torchreg._checks import check_positive
+
+    check_positive(fps, "--fps")
+    glb = with_ending(output, (".glb",), add=True)
+    result = glb.with_suffix(".safetensors")
+    swc = with_ending(swc, (".swc",))
+    npz = with_ending(npz, (".npz",))
+    meshes, names = _read(frames)
+    curves = [numbered(swc, frame, len(meshes)) for frame in range(len(meshes))] if swc is not None else []
+    check_outputs([glb, result, result.with_suffix(".json"), npz, movie, *curves], force)
+    if movie is not None:
+        from torchreg.viz.animation import check_animation_path
+
+        check_animation_path(movie)
+
+    from tqdm import tqdm
+
+    from torchreg.pipelines.extract_spine import SpineConfig, extract_spine
+
+    with tqdm(total=len(meshes), unit="frame", desc="skeletons", leave=False, disable=quiet) as bar:
+        config = SpineConfig(num_tips=tips, num_samples=samples)
+        found = extract_spine(meshes, config=config, workers=workers, on_step=lambda _: bar.update(), progress=progress)
+    found.save(result)
+    _write(found, meshes, glb, curves, npz, fps)
+    _draw(found, meshes, movie, pictures, fps)
+    if not quiet:
+        for warning in found.warnings:
+            typer.echo(f"torchreg: warning: {_named(warning, names)}", err=True)
+        typer.echo(_summary(found, glb))
+
+
+def _read(frames: list[Path]) -> tuple[list[TriangleMesh], tuple[str, ...]]:
+    """Return the meshes in the order of time, and what they are called."""
+    from torchreg.errors import InputError
+    from torchreg.io.frames import load_frames
+    from torchreg.io.points import load_mesh
+
+    if any(frame.suffix.lower() == ".npz" for frame in frames):
+        raise InputError("FRAMES must be files of meshes, not of arrays; give a folder, or files such as *.ply")
+    names = load_frames(frames[0] if len(frames) == 1 else frames).names
+    return [load_mesh(name) for name in names], names
+
+
+def _write(
+    found: SpineSequence[Spine], meshes: list[TriangleMesh], glb: Path, swc: Sequence[Path | None], npz: Path | None,
+    fps: float,
+) -> None:  # fmt: skip
+    from torchreg.io.npz import save_arrays
+    from torchreg.io.swc import save_swc
+    from torchreg.viz.spine_gltf import save_spine_animation
+
+    save_spine_animation(glb, found.model, meshes[found.reference], found.reference, fps=fps)
+    for frame, path in enumerate(swc):
+        if path is not None:
+            save_swc(path, found.model.skeleton(float(found.times[frame])), f"frame {frame}")
+    if npz is not None:
+        names = ("tips", "junctions", "graph", "curves", "radii", "frames", "times", "found", "own")
+        save_arrays(npz, {name: getattr(found, name) for name in names})
+
+
+def _draw(
+    found: SpineSequence[Spine], meshes: list[TriangleMesh], movie: Path | None, pictures: Path | None, fps: float
+) -> None:
+    from torchreg.viz.spines import save_spine_movie, save_spine_pictures
+
+    if pictures is not None:
+        save_spine_pictures(pictures, found, meshes)
+    if movie is not None:
+        save_spine_movie(movie, found, meshes, fps=fps)
+
+
+def _named(warning: str, names: tuple[str, ...]) -> str:
+    """Return a warning with the file of its frame in the place of its number."""
+    frame, _, text = warning.removeprefix("frame ").partition(": ")
+    return f"{names[int(frame)]}: {text}"
+
+
+def _summary(found: SpineSequence[Spine], glb: Path) -> str:
+    share = sum(own == same for own, same in zip(found.own_topologies, found.topologies, strict=True))
+    limbs, frames = len(found.graph), len(found.curves)
+    return (
+        f"{found.num_tips} tips, {found.junctions.shape[1]} junctions, {limbs} limbs; {share} of {frames} frames have "
+        f"this tree by themselves -> {glb}"
+    )
