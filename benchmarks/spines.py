@@ -1,0 +1,289 @@
+"""How well one spine holds a whole sequence: topology, identity of tips, time, what is borne, and poses of hands.
+
+    python benchmarks/spines.py --data FOLDER     # every figure
+    python benchmarks/spines.py --smoke           # small ones, to see that it runs
+
+- captured: sequences of meshes from FOLDER (NPZ with vertices (T, V, 3) and faces), each frame voxelized (128 along the
+  longest side), filled and meshed anew, so that frames share nothing. "own": the share of frames whose tree is the
+  final one before the graph is imposed (bar: 70 %). "after": different trees afterwards (bar: 1). "named": the share of
+  frames in which each tip is nearest to the place of its own vertex, the one that it is nearest to in the reference
+  frame, of all tips' vertices (bar: 99 %). "inside": curve points inside the surface (bar: 99.5 %).
+- creatures: starfish and octopuses of known tips, with noise and with two arms that touch side by side or end to end.
+  Bars: all arms and one junction in every frame, every name right. Where tips of arms touch end to end names are
+  judged by the whole arm.
+- time: CPU seconds of all processes for the captured sequences, and what two cores need at best (bar for 44 frames of
+  about 14,000 vertices: 60 s).
+- borne: noise, holes, thin limbs, fragments, wrong winding, one frame, a missing limb: the result, or the error.
+- hands: surfaces of hands, each joint bent by up to half its range, turned in any way. `find_pose` with candidates from
+  the skeleton alone, and as it comes. Right: fingertips within 10 mm on average (bar: 90 %). The time of the skeleton
+  is counted in (bar: below that without).
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+import torchreg as tr
+from torchreg.datasets.creatures import OCTOPUS, STARFISH, CreatureForm, CreatureSequence, creature_sequence
+from torchreg.geometry.clearance import Inside
+from torchreg.geometry.mesh import concatenate, sample_surface, unit_sphere
+from torchreg.geometry.voxels import VoxelGrid, voxelize
+from torchreg.models.skin import sample_skin
+from torchreg.pipelines.spine_source import SpineLimbs
+from torchreg.solvers.assignment import assign
+
+BAR_OWN, BAR_NAMED, BAR_INSIDE, BAR_SECONDS, BAR_HANDS = 0.7, 0.99, 0.995, 60.0, 0.9
+TIPS, RIGHT, NUM_POINTS, BEND = [4, 8, 12, 16, 20], 0.01, 500, 0.5
+CREATURES: dict[str, tuple[CreatureForm, str, float]] = {
+    "starfish": (STARFISH, "none", 0.0),
+    "starfish, noise": (STARFISH, "none", 0.5),
+    "starfish, flanks touch": (STARFISH, "flanks", 0.0),
+    "starfish, tips touch": (STARFISH, "tips", 0.0),
+    "starfish, both": (STARFISH, "flanks", 0.5),
+    "octopus": (OCTOPUS, "none", 0.0),
+    "octopus, flanks touch": (OCTOPUS, "flanks", 0.0),
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One sequence.
+
+    Args:
+        name: of it.
+        tips: K.
+        junctions: number of them.
+        own: share of frames whose own tree is the final one.
+        trees: different trees before and after.
+        named: share of frames with all names right.
+        inside: share of curve points.
+        seconds: of CPU, all processes.
+        frames: number of them.
+        vertices: of a frame, on average.
+    """
+
+    name: str
+    tips: int
+    junctions: int
+    own: float
+    trees: tuple[int, int]
+    named: float
+    inside: float
+    seconds: float
+    frames: int
+    vertices: int
+
+
+def cpu_seconds() -> float:
+    return sum(sum(resource.getrusage(who)[:2]) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+
+
+def judged(name: str, meshes: Sequence[tr.TriangleMesh], named: object, *, workers: int | None = None) -> Row:
+    """Return the figures of a sequence; ``named(spine)`` says in which frames (T,) all names are right."""
+    start = cpu_seconds()
+    with tqdm(total=len(meshes), desc=name, leave=False, disable=None) as bar:
+        spine = tr.extract_spine(meshes, workers=workers, on_step=lambda _: bar.update())
+    seconds = cpu_seconds() - start
+    final = max(set(spine.topologies), key=spine.topologies.count)
+    inside = [Inside(mesh)(curves.flatten(0, 1)) for mesh, curves in zip(meshes, spine.curves, strict=True)]
+    return Row(
+        name,
+        spine.num_tips,
+        spine.junctions.shape[1],
+        sum(own == final for own in spine.own_topologies) / len(meshes),
+        (len(set(spine.own_topologies)), len(set(spine.topologies))),
+        float(named(spine).double().mean()),
+        float(torch.stack(inside).double().mean()),
+        seconds,
+        len(meshes),
+        sum(mesh.num_vertices for mesh in meshes) // len(meshes),
+    )
+
+
+def captured(path: Path, resolution: int, every: int, *, touching: bool, smoothing: int) -> Row:
+    """Return the figures of a sequence of one file, meshed anew from voxels."""
+    with np.load(path, allow_pickle=False) as archive:
+        vertices = torch.from_numpy(archive["vertices"][::every])
+        faces = torch.from_numpy(archive["faces"].astype(np.int64))
+    grids: list[VoxelGrid] = [
+        voxelize(tr.TriangleMesh(frame, faces), resolution, touching=touching) for frame in vertices
+    ]
+
+    def named(spine: tr.SpineSequence) -> Tensor:
+        tips, places = spine.tips.double(), vertices.double()
+        own = torch.cdist(tips[spine.reference], places[spine.reference]).argmin(-1)
+        return (torch.cdist(tips, places[:, own]).argmin(-1) == torch.arange(spine.num_tips)).all(-1)
+
+    return judged(path.stem, [grid.mesh(smoothing) for grid in grids], named)
+
+
+def creature(name: str, num_frames: int, resolution: int) -> Row:
+    form, touching, noise = CREATURES[name]
+    sequence = creature_sequence(form, num_frames, touching=touching, noise=noise, resolution=resolution)
+    return judged(name, sequence.meshes, lambda spine: named_arms(spine, sequence))
+
+
+def named_arms(spine: tr.SpineSequence, sequence: CreatureSequence) -> Tensor:
+    """Return in which frames (T,) every limb is nearest to the axis of its own arm."""
+    curves, axes = spine.curves[:, : spine.num_tips].double(), sequence.curves.double().flip(2)
+    few = torch.linspace(0, axes.shape[2] - 1, curves.shape[2]).round().long()
+    apart = (curves.unsqueeze(2) - axes[:, None, :, few]).norm(dim=-1).mean(-1)
+    own = assign(apart.mean(0))
+    return (apart.argmin(-1) == own).all(-1)
+
+
+def borne(resolution: int) -> Iterator[tuple[str, str]]:
+    """Yield what is done to a starfish, and what comes of it."""
+    plain = creature_sequence(STARFISH, 4, resolution=resolution)
+    noisy = creature_sequence(STARFISH, 4, resolution=resolution, noise=1.0)
+    thin = creature_sequence(CreatureForm(5, 0.25, 0.06, 0.03, 0.5, 0.5), 4, resolution=resolution)
+    first, *rest = plain.meshes
+    ball = unit_sphere(2)
+    dust = tr.TriangleMesh(0.04 * ball.vertices + 1.5, ball.faces)
+    generator = torch.Generator().manual_seed(0)
+    loose = torch.rand(first.num_faces, generator=generator) > 0.02
+    arm, root = plain.curves[0, 1, 20], plain.curves[0, 1, 0]
+    lost = ((first.vertices - arm) @ (arm - root) > 0) & ((first.vertices - plain.curves[0, 1, 32]).norm(dim=-1) < 0.5)
+    empty = tr.TriangleMesh(torch.zeros(0, 3), torch.zeros(0, 3).long())
+    cases = {
+        "noise of a voxel": (noisy.meshes, noisy),
+        "2 % of the faces missing": ([tr.TriangleMesh(first.vertices, first.faces[loose]), *rest], plain),
+        "thin limbs": (thin.meshes, thin),
+        "isolated fragment": ([concatenate([first, dust]), *rest], plain),
+        "wrong winding": ([tr.TriangleMesh(first.vertices, first.faces.flip(1)), *rest], plain),
+        "one frame": ([first], plain),
+        "a missing limb": ([tr.TriangleMesh(first.vertices, first.faces[~lost[first.faces].any(-1)]), *rest], plain),
+        "a frame without a surface": ([first, empty], plain),
+    }
+    for name, (meshes, truth) in cases.items():
+        try:
+            spine = tr.extract_spine(meshes)
+        except tr.errors.TorchregError as error:
+            yield name, f"error: {error}"
+            continue
+        apart = torch.cdist(spine.tips, truth.tips[: len(meshes)]).argmin(-1)
+        good = spine.num_tips == 5 and bool((apart == apart[0]).all()) and set(spine.topologies) == {truth.topology}
+        told = next((warning for warning in spine.warnings if warning.startswith("frame 0")), "no warning")
+        yield name, f"{'sound' if good else 'WRONG'}, {spine.status.value}: {told}"
+
+
+def random_pose(hand: tr.Hand, generator: torch.Generator) -> Tensor:
+    """Return a pose of any rotation, with each joint bent by up to half its range."""
+    pose = hand.rest_pose()
+    pose[6:] = BEND * torch.rand(hand.num_dofs - 6, generator=generator) * hand.upper[6:].clamp_min(0)
+    quaternion = torch.nn.functional.normalize(torch.randn(4, generator=generator, dtype=torch.float64), dim=0)
+    angle = 2 * torch.atan2(quaternion[1:].norm(), quaternion[0])
+    pose[3:6] = (angle * torch.nn.functional.normalize(quaternion[1:], dim=0)).to(pose)
+    return hand.clamp(pose)
+
+
+def hands(count: int, seed: int) -> Tensor:
+    """Return per hand the error of the fingertips, metres, and CPU seconds, with skeleton and without, (N, 2, 2)."""
+    hand, generator = tr.Hand().requires_grad_(False), torch.Generator().manual_seed(seed)
+    skin, rows = sample_skin(hand), []
+    for _ in tqdm(range(count), desc="hands", leave=False, disable=None):
+        pose = random_pose(hand, generator)
+        mesh = hand.surface_mesh(pose)
+        data = sample_surface(mesh, NUM_POINTS, generator)[0]
+        row = []
+        for with_spine in (True, False):
+            start = time.process_time()
+            sources = {"sources": [SpineLimbs(tr.skeletonize(mesh), data.mean(0))]} if with_spine else {}
+            starts = tr.find_pose(hand, data, model_points=skin, **sources)
+            seconds = time.process_time() - start
+            error = (hand.keypoints(starts.best) - hand.keypoints(pose))[TIPS].norm(dim=-1).mean()
+            row.append([float(error), seconds])
+        rows.append(row)
+    return torch.tensor(rows)
+
+
+def verdict(passed: bool) -> str:
+    return "pass" if passed else "FAIL"
+
+
+def render(rows: Sequence[Row], *, bars: bool) -> str:
+    lines = [f"{'sequence':24} {'frames':>6} {'K':>2} {'junc.':>5} {'own':>6} {'trees':>7} {'named':>6} {'inside':>7}"]
+    for row in rows:
+        line = f"{row.name:24} {row.frames:6} {row.tips:2} {row.junctions:5} {row.own:6.1%} "
+        line += f"{row.trees[0]:3} > {row.trees[1]} {row.named:6.1%} {row.inside:7.2%}"
+        passed = row.trees[1] == 1 and row.named >= BAR_NAMED and row.inside >= BAR_INSIDE
+        lines.append(f"{line}  {verdict(passed and (row.own >= BAR_OWN or not bars))}")
+    return "\n".join(lines)
+
+
+def render_time(rows: Sequence[Row]) -> str:
+    return "\n".join(
+        f"{row.name:24} {row.frames} frames of {row.vertices} vertices: {row.seconds:.1f} s of CPU, "
+        f"{row.seconds / 2:.1f} s on two cores: {verdict(row.seconds / 2 < BAR_SECONDS)}"
+        for row in rows
+    )
+
+
+def render_hands(rows: Tensor) -> str:
+    right = (rows[..., 0] <= RIGHT).double().mean(0).tolist()
+    errors, seconds = (1e3 * rows[..., 0]).median(0).values.tolist(), rows[..., 1].mean(0).tolist()
+    lines = [
+        f"{name:18} {share:6.1%} right, median {error:.1f} mm, {spent:.2f} s of CPU"
+        for name, share, error, spent in zip(("with the skeleton", "without"), right, errors, seconds, strict=True)
+    ]
+    return "\n".join([*lines, f"right: {verdict(right[0] >= BAR_HANDS)}, faster: {verdict(seconds[0] < seconds[1])}"])
+
+
+def main(arguments: Sequence[str] | None = None) -> list[Row]:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, help="folder of NPZ files; without it captured sequences are left out")
+    parser.add_argument("--part", choices=("captured", "creatures", "borne", "hands"), help="this one only")
+    parser.add_argument("--resolution", type=int, default=128, help="voxels along the longest side (default 128)")
+    parser.add_argument("--touching", action="store_true", help="also fill voxels that the surface touches")
+    parser.add_argument("--staircase", action="store_true", help="mesh the voxels without smoothing")
+    parser.add_argument("--frames", type=int, default=24, help="of each creature (default 24)")
+    parser.add_argument("--hands", type=int, default=50, help="number of hands (default 50)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--smoke", action="store_true", help="few, coarse frames and one hand")
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(1)
+    parts = (options.part,) if options.part else ("captured", "creatures", "borne", "hands")
+    rows: list[Row] = []
+    if "captured" in parts:
+        rows += run_captured(options)
+    if "creatures" in parts:
+        names = ["starfish"] if options.smoke else list(CREATURES)
+        made = [creature(name, 3 if options.smoke else options.frames, 32 if options.smoke else 96) for name in names]
+        print(f"creatures\n{render(made, bars=False)}")
+        rows += made
+    if "borne" in parts and not options.smoke:
+        print("borne")
+        for name, outcome in borne(64):
+            print(f"{name:26} {outcome}")
+    if "hands" in parts:
+        print(f"hands\n{render_hands(hands(1 if options.smoke else options.hands, options.seed))}")
+    return rows
+
+
+def run_captured(options: argparse.Namespace) -> list[Row]:
+    # A sequence of meshes has vertices of several frames; other files of the folder are left alone.
+    paths = sorted(options.data.glob("*.npz")) if options.data else []
+    if not paths:
+        print("captured: left out, as there is no --data FOLDER with NPZ files")
+        return []
+    resolution, every = (40, 6) if options.smoke else (options.resolution, 1)
+    rows = [
+        captured(path, resolution, every, touching=options.touching, smoothing=0 if options.staircase else 1)
+        for path in paths
+    ]
+    print(f"captured, {resolution} voxels\n{render(rows, bars=True)}\ntime\n{render_time(rows)}")
+    return rows
+
+
+if __name__ == "__main__":
+    main()
