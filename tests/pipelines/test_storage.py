@@ -328,7 +328,17 @@ def test_archives_without_a_pose_are_refused(tmp_path, hand):
         load_pose(tmp_path / "empty.npz", hand)
 
 
-def test_only_alignments_hold_a_pose(tmp_path, hand):
+def test_the_last_known_pose_of_a_track_is_read(tmp_path, hand):
+    poses = torch.arange(3.0).unsqueeze(-1).repeat(1, hand.num_dofs)
+    poses[2] = torch.nan
+    replace(track(3), poses=poses).save(tmp_path / "t.safetensors")
+    assert torch.equal(load_pose(tmp_path / "t.json", hand), poses[1])
+    replace(track(3), poses=poses * torch.nan).save(tmp_path / "n.safetensors")
+    with pytest.raises(FormatError, match="in which the shape was never found"):
+        load_pose(tmp_path / "n.safetensors", hand)
+
+
+def test_only_alignments_and_tracks_hold_a_pose(tmp_path, hand):
     demonstration().save(tmp_path / "d.safetensors")
     with pytest.raises(FormatError, match="holds a DemoResult; a pose is read from an AlignResult"):
         load_pose(tmp_path / "d.safetensors", hand)

@@ -105,8 +105,9 @@ def load_pose(path: str | os.PathLike[str], shape: ArticulatedShape, *, limits: 
     """Return a pose (num_dofs,) of a shape from a file.
 
     Args:
-        path: a saved `AlignResult` (.safetensors or its .json); or .json with a list of num_dofs numbers, or with
-            values by name of degree of freedom, the others at rest; or .npz with an array ``pose``, or a single array.
+        path: a saved `AlignResult`, or `TrackResult` for its last pose (.safetensors or its .json); or .json with a
+            list of num_dofs numbers, or with values by name of degree of freedom, the others at rest; or .npz with an
+            array ``pose``, or a single array.
         shape: whose pose it is.
         limits: on the size of the file.
 
@@ -132,8 +133,13 @@ def load_pose(path: str | os.PathLike[str], shape: ArticulatedShape, *, limits: 
 
 def _pose_of_result(place: Path, shape: ArticulatedShape, limits: FileLimits) -> Tensor:
     result = load(place, limits=limits)
+    if isinstance(result, TrackResult):
+        known = result.poses[result.poses.isfinite().all(-1)]
+        if not len(known):
+            raise FormatError(f"{place} holds a TrackResult in which the shape was never found")
+        return known[-1]
     if not isinstance(result, AlignResult):
-        raise FormatError(f"{place} holds a {type(result).__name__}; a pose is read from an AlignResult")
+        raise FormatError(f"{place} holds a {type(result).__name__}; a pose is read from an AlignResult or TrackResult")
     return result.pose
 
 

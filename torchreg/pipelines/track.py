@@ -32,6 +32,8 @@ OnFrame = Callable[[Tensor, FrameResult], None]
 _UNITS_RATIO = 30.0
 # Frames in which a pose that was found everywhere is checked against another search.
 _CHECKS = 1
+# After so many intervals without a frame, a limb may be anywhere, and other starts than the prediction are tried too.
+_LONG_GAP = 2.0
 # Earlier poses that a lost shape is looked for in, a second and a half of them.
 _NUM_PREVIOUS, _PREVIOUS_EVERY = 3, 10
 
@@ -236,7 +238,8 @@ class Tracker:
         """Return the same, from the frames before and what can be searched around them."""
         view = self._fitter.view_ahead(state, frame)
         fit = None if view is None else self._fitter.descend(view, state, frame.gap)
-        if fit is not None and not is_lost(state, fit) and not is_doubtful(state, fit):
+        sure = frame.gap < _LONG_GAP
+        if fit is not None and sure and not is_lost(state, fit) and not is_doubtful(state, fit):
             return fit, rested(state, True)
         fit, state = self._recover(state, frame, view, fit)
         return _kept(state, fit)
