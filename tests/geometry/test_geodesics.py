@@ -110,6 +110,16 @@ def test_pieces_by_policy():
         geodesic_distances(mesh, [0], "error")
 
 
+def test_more_steps_may_join_places():
+    sheet = grid(4, 4)
+    graph = GeodesicGraph.from_mesh(sheet)
+    before = graph.distances([0])[0]
+    after = graph.joined(torch.tensor([[0, 15]]), torch.tensor([0.25])).distances([0])[0]
+    assert float(after[15]) == 0.25
+    assert torch.equal(after[:3], before[:3])
+    assert bool((after <= before).all())
+
+
 def test_open_and_non_manifold_meshes_are_accepted():
     sheet = grid(5, 5)
     fin = TriangleMesh(

@@ -67,6 +67,17 @@ def test_pieces_by_policy():
         one_piece(mesh, "all")
 
 
+def test_many_pieces_are_bridged_one_to_the_next():
+    places = torch.rand(60, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 20
+    places[:, 0] += 3 * torch.arange(60)
+    mesh = concatenate([ball(1, 0.3, place) for place in places.tolist()])
+    bridges = one_piece(mesh, "bridge").bridges
+    assert bridges.shape == (59, 2)
+    assert len(connected_labels(torch.cat((bridges // 42, torch.zeros(0, 2, dtype=torch.int64))), 60).unique()) == 1
+    apart = torch.cdist(places, places).fill_diagonal_(torch.inf).amin(1)
+    assert (mesh.vertices[bridges].diff(dim=1).norm(dim=-1)).min() < apart.min()
+
+
 def test_dust_is_no_reason_for_an_error():
     mesh = concatenate([ball(4), TriangleMesh(torch.eye(3, dtype=torch.float64) + 5, torch.tensor([[0, 1, 2]]))])
     assert one_piece(mesh, "error").mesh.num_faces == 5120
@@ -90,6 +101,8 @@ def test_holes_are_closed():
 def test_a_surface_without_triangles_is_refused():
     with pytest.raises(InputError, match="three different corners"):
         one_piece(TriangleMesh(torch.zeros(3, 3), torch.tensor([[0, 1, 2]])))
+    with pytest.raises(InputError, match="without area"):
+        one_piece(TriangleMesh(torch.arange(9.0).reshape(3, 3), torch.tensor([[0, 1, 2]])))
 
 
 def test_coarse_surfaces_keep_place_and_topology():

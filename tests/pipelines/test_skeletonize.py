@@ -140,6 +140,15 @@ def test_a_limb_in_two_pieces_is_bridged():
     assert float(skeletonize(concatenate(parts)).length) < 2.5
 
 
+def test_loops_of_bridged_surfaces_are_bypassed():
+    turn = torch.linspace(0, 2 * math.pi, 100).double()
+    ring = torch.stack((turn.cos(), turn.sin(), 0 * turn), dim=1)
+    both = concatenate([tube(ring + torch.tensor([x, 0.0, 0.0]), 0.2, 0.1) for x in (0.0, 2.8)])
+    skeleton = skeletonize(both, SkeletonizeConfig(pieces="bridge"))
+    assert skeleton.notes[0] == "2 pieces joined by 1 bridges"
+    assert float(skeleton.nodes[:, 0].max() - skeleton.nodes[:, 0].min()) > 4
+
+
 def test_a_thin_limb_is_found():
     ball = torch.zeros(1, 3).double()
     arm = torch.stack((torch.linspace(0, 2, 200), torch.zeros(200), torch.zeros(200)), dim=1).double()

@@ -129,6 +129,13 @@ class GeodesicGraph:
         from_ = np.repeat(np.arange(len(points)), num_neighbors)
         return cls._joined([(from_, index.numpy().reshape(-1), distance.numpy().reshape(-1))], len(points))
 
+    def joined(self, pairs: Tensor, lengths: Tensor) -> GeodesicGraph:
+        """Return the graph with more steps, between pairs (P, 2) of places, of given lengths (P,)."""
+        from_ = np.repeat(np.arange(len(self)), np.diff(self.starts.numpy()))
+        once = from_ < self.ends.numpy()
+        old = (from_[once], self.ends.numpy()[once], self.lengths.numpy()[once])
+        return self._joined([old, (*pairs.numpy().T, lengths.double().numpy())], len(self))
+
     @classmethod
     def _joined(cls, pairs: list[_Steps], count: int) -> GeodesicGraph:
         """Return the graph of steps that lead both ways; the same step may occur twice."""

@@ -19,6 +19,7 @@ from torchreg.geometry.normals import weld
 PIECES = ("largest", "bridge", "error")
 # Fragments with a smaller share of the faces are dust: never bridged to, and no reason for an error.
 _DUST = 1e-3
+_NEAR_PIECES = 12
 # Edge of a cell in which vertices fall together, in square roots of the area per vertex wanted.
 _CELL = 1.15
 
@@ -74,7 +75,7 @@ def one_piece(mesh: TriangleMesh, pieces: str = "largest") -> OnePiece:
             triangles, is left out by all three.
 
     Raises:
-        InputError: if no triangle is left, or ``pieces`` is "error" and there are several.
+        InputError: if no triangle is left, all are without area, or ``pieces`` is "error" and there are several.
 
     Differentiable: no.
     """
@@ -84,6 +85,8 @@ def one_piece(mesh: TriangleMesh, pieces: str = "largest") -> OnePiece:
     faces = faces[(faces != faces.roll(1, dims=1)).all(1)]
     if len(faces) == 0:
         raise InputError(f"mesh must have a triangle with three different corners, got {mesh.num_faces} faces without")
+    if not float(TriangleMesh(mesh.vertices.detach().cpu().double(), mesh.faces.cpu()).face_areas().sum()) > 0:
+        raise InputError("mesh must have a surface, got triangles without area")
     # A face used twice would make its edges look shared.
     faces = _distinct_faces(faces)
     original = torch.zeros(int(place.max()) + 1, dtype=torch.int64).index_copy(0, place, torch.arange(len(place)))
@@ -168,20 +171,33 @@ def _choose(vertices: Tensor, faces: Tensor, pieces: str) -> tuple[Tensor, int, 
 
 
 def _bridges(vertices: Tensor, labels: Tensor, count: int) -> Tensor:
-    """Return the vertex pairs (count - 1, 2) that join all pieces with the least total length."""
+    """Return the vertex pairs (count - 1, 2) that join all pieces with the least total length.
+
+    Of many pieces each is compared with those whose boxes are nearest.
+    """
     groups = [(labels == label).nonzero()[:, 0] for label in labels.unique().tolist()]
     trees = [cKDTree(vertices[group].numpy()) for group in groups]
     lengths, ends = np.zeros((count, count)), {}
-    for first in range(count):
-        for second in range(first + 1, count):
-            small, large = sorted((first, second), key=lambda piece: len(groups[piece]))
-            distance, nearest = trees[large].query(vertices[groups[small]].numpy())
-            start = int(distance.argmin())
-            # Zero would be no edge.
-            lengths[first, second] = distance[start] + np.finfo(np.float64).tiny
-            ends[first, second] = (int(groups[small][start]), int(groups[large][nearest[start]]))
+    for first, second in _near_pairs([vertices[group] for group in groups]):
+        small, large = sorted((first, second), key=lambda piece: len(groups[piece]))
+        distance, nearest = trees[large].query(vertices[groups[small]].numpy())
+        start = int(distance.argmin())
+        # Zero would be no edge.
+        lengths[first, second] = distance[start] + np.finfo(np.float64).tiny
+        ends[first, second] = (int(groups[small][start]), int(groups[large][nearest[start]]))
     chosen = zip(*minimum_spanning_tree(lengths).nonzero(), strict=True)
     return torch.tensor([ends[int(first), int(second)] for first, second in chosen])
+
+
+def _near_pairs(pieces: list[Tensor]) -> list[tuple[int, int]]:
+    """Return pairs of pieces, the first before the second, that join all of them: all, or those with near boxes."""
+    low = torch.stack([piece.amin(0) for piece in pieces])
+    high = torch.stack([piece.amax(0) for piece in pieces])
+    gaps = (torch.maximum(low[:, None], low) - torch.minimum(high[:, None], high)).clamp(min=0).norm(dim=-1)
+    near = gaps <= gaps.sort(dim=1).values[:, min(_NEAR_PIECES, len(pieces) - 1), None]
+    shortest = minimum_spanning_tree(gaps.numpy() + 1.0).nonzero()
+    near[shortest] = True
+    return [(first, second) for first, second in (near | near.mT).nonzero().tolist() if first < second]
 
 
 def close_holes(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, int]:
