@@ -8,9 +8,16 @@ from PIL import Image
 
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import unit_sphere
+from torchreg.geometry.skeleton import Skeleton
 from torchreg.viz.bone_colors import bone_palette
 from torchreg.viz.figures import new_figure
-from torchreg.viz.spines import draw_spine_frame, save_spine_movie, save_spine_pictures, spine_view
+from torchreg.viz.spines import (
+    draw_spine_frame,
+    save_skeleton_picture,
+    save_spine_movie,
+    save_spine_pictures,
+    spine_view,
+)
 
 SPHERE = unit_sphere(2)
 
@@ -50,6 +57,20 @@ def test_one_picture_per_frame_and_a_movie(spine, tmp_path):
     movie = save_spine_movie(tmp_path / "a.gif", spine, [SPHERE, SPHERE], view=view)
     with Image.open(movie) as image:
         assert image.n_frames == 2
+
+
+def test_a_single_skeleton_is_drawn_in_its_surface(tmp_path):
+    ends = torch.tensor([[0.0, 0, 0], [0.9, 0, 0], [0, 0.9, 0], [0, 0, 0.9]])
+    skeleton = Skeleton(ends, [[0, 1], [0, 2], [0, 3]], torch.ones(4))
+    view = spine_view([SPHERE], size=(160, 120))
+    with Image.open(save_skeleton_picture(tmp_path / "a.png", SPHERE, skeleton, view=view)) as image:
+        shown = image.convert("RGB")
+    assert shown.size == (160, 120)
+    # Colors of limbs in a gray body.
+    pixels = torch.tensor(list(shown.getdata()))
+    assert int((pixels.amax(1) - pixels.amin(1) > 60).sum()) > 20
+    with pytest.raises(InputError, match="single node"):
+        save_skeleton_picture(tmp_path / "b.png", SPHERE, Skeleton(ends[:1], [], torch.ones(1)))
 
 
 def test_every_frame_needs_its_surface(spine, tmp_path):

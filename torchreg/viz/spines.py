@@ -12,6 +12,7 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_shape
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.skeleton import Skeleton
 from torchreg.geometry.visibility import View
 from torchreg.results import SpineSequence
 from torchreg.viz.animation import save_animation
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 _OVERSAMPLING, _OPACITY, _GRAY = 2, 0.45, 0.82
 _FEW_POINTS = 2000
+# Points per limb of a single skeleton.
+_SAMPLES = 64
 
 
 def draw_spine_frame(
@@ -65,6 +68,20 @@ def spine_view(
     """Return the view that shows the surfaces of all frames; see `watch`."""
     points = [mesh.vertices[:: max(1, mesh.num_vertices // _FEW_POINTS)].detach().cpu() for mesh in meshes]
     return watch(torch.cat(points), camera=camera, up=up, size=size)
+
+
+def save_skeleton_picture(
+    path: str | Path, mesh: TriangleMesh, skeleton: Skeleton, *, view: View | None = None
+) -> Path:
+    """Return the path of a picture of a skeleton in its translucent surface, each limb in a color of its own.
+
+    Raises:
+        InputError: if the skeleton is a single node.
+    """
+    shown = spine_view([mesh]) if view is None else view
+    figure, (ax,) = new_figure(shown.width // _OVERSAMPLING, shown.height // _OVERSAMPLING)
+    draw_spine_frame(ax, mesh, skeleton.resample(_SAMPLES)[0], len(skeleton.tips), view=shown)
+    return save_picture(figure, Path(path))
 
 
 def save_spine_pictures(
