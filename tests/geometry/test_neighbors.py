@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from torchreg.errors import InputError
 from torchreg.geometry import neighbors
-from torchreg.geometry.neighbors import nearest_neighbor
+from torchreg.geometry.neighbors import nearest_few, nearest_neighbor
 
 
 def clouds(seed, count, size, batch=(), dtype=torch.float64):
@@ -122,3 +122,17 @@ def test_the_distance_is_differentiable():
 def test_what_does_not_fit_is_refused(points, targets, message):
     with pytest.raises(InputError, match=message):
         nearest_neighbor(points, targets)
+
+
+def test_the_nearest_few_are_those_of_a_sorted_table():
+    generator = torch.Generator().manual_seed(0)
+    points, targets = (torch.randn(count, 5, generator=generator) for count in (30, 40))
+    index, distance = nearest_few(points, targets, 3)
+    expected = torch.cdist(points.double(), targets.double()).topk(3, largest=False)
+    assert torch.equal(index, expected.indices)
+    torch.testing.assert_close(distance, expected.values)
+    assert nearest_few(points, targets[:1], 1)[0].shape == (30, 1)
+    with pytest.raises(InputError, match="count must be between 1 and the number of targets 40, got 41"):
+        nearest_few(points, targets, 41)
+    with pytest.raises(InputError, match="targets must have shape"):
+        nearest_few(points, targets[:, :3], 1)

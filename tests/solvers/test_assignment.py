@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchreg.errors import InputError
-from torchreg.solvers.assignment import assign
+from torchreg.solvers.assignment import assign, assign_within
 
 
 def random(*size, seed=0):
@@ -45,3 +45,20 @@ def test_bad_input_is_named():
         assign(torch.zeros(3))
     with pytest.raises(InputError, match="alone must be finite"):
         assign(torch.zeros(1, 1), torch.nan)
+
+
+def test_no_assignment_within_a_limit_is_cheaper():
+    costs = random(5, 4, seed=3)
+    found = assign_within(costs, 0.3)
+    paid = sum(float(costs[row, column]) if column >= 0 else 0.3 for row, column in enumerate(found.tolist()))
+    table = torch.cat((costs.clamp(max=0.3), torch.full((5, 1), 0.3, dtype=torch.float64)), dim=1)
+    best = min(sum(float(table[row, column]) for row, column in enumerate(way)) for way in permutations(range(5)))
+    assert paid == pytest.approx(best)
+    assert bool((costs[found >= 0, found[found >= 0]] < 0.3).all())
+
+
+def test_limits_are_checked():
+    assert assign_within(random(3, 2), 1e-9).tolist() == [-1, -1, -1]
+    assert assign_within(torch.zeros(0, 2), 1.0).tolist() == []
+    with pytest.raises(InputError, match="limit must be positive"):
+        assign_within(random(3, 2), 0.0)

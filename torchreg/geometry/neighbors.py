@@ -78,3 +78,29 @@ def _by_table(points: Tensor, targets: Tensor) -> Tensor:
         for part in points.split(size, dim=-2)
     ]
     return torch.cat(parts, dim=-1)
+
+
+def nearest_few(points: Tensor, targets: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the ``count`` targets nearest to each point, nearest first, in any number of dimensions.
+
+    Args:
+        points: (N, D) finite.
+        targets: (K, D) finite, at least ``count``.
+        count: how many.
+
+    Returns:
+        index (N, count) int64, and distance (N, count) float64, both on the CPU.
+
+    Raises:
+        InputError: if a shape does not fit or there are too few targets.
+
+    Differentiable: no.
+
+    Cost: O((N + K) log K) where D is small or targets are near.
+    """
+    check_shape(targets, "targets", ("K", points.shape[-1]))
+    if not 1 <= count <= len(targets):
+        raise InputError(f"count must be between 1 and the number of targets {len(targets)}, got {count}")
+    tree = cKDTree(targets.detach().cpu().double().numpy())
+    distance, index = tree.query(points.detach().cpu().double().numpy(), list(range(1, count + 1)))
+    return torch.from_numpy(index.astype(np.int64)), torch.from_numpy(distance)

@@ -1,0 +1,76 @@
+import pytest
+import torch
+
+from torchreg.errors import InputError
+from torchreg.geometry.node_graph import build_node_graph, spread_weights
+from torchreg.geometry.sample_graph import SampleGraph
+
+
+def line(count):
+    """Return a chain of samples, one apart."""
+    edges = torch.stack((torch.arange(count - 1), torch.arange(1, count)), dim=1)
+    return SampleGraph(count, edges, torch.ones(count - 1, dtype=torch.float64))
+
+
+def test_nodes_spread_along_the_surface():
+    graph = build_node_graph(line(17), 0, 5, 2)
+    assert sorted(graph.nodes.tolist()) == [0, 4, 8, 12, 16]
+
+
+def test_weights_fall_with_distance():
+    graph = build_node_graph(line(17), 0, 5, 2)
+    torch.testing.assert_close(graph.weights.sum(1), torch.ones(17, dtype=torch.float64))
+    # Sample 5 is 1, 3 and 5 from the nodes at 4, 8 and 0.
+    assert graph.nodes[graph.nearest[5]].tolist() == [4, 8]
+    shares = torch.tensor([(1 - 1 / 5) ** 2, (1 - 3 / 5) ** 2], dtype=torch.float64)
+    torch.testing.assert_close(graph.weights[5], shares / shares.sum())
+    dense = graph.dense_weights()
+    torch.testing.assert_close(dense[5, graph.nearest[5]], graph.weights[5])
+    torch.testing.assert_close(dense.sum(1), torch.ones(17, dtype=torch.float64))
+
+
+def test_neighbors_share_samples():
+    graph = build_node_graph(line(33), 0, 9, 2)
+    places = graph.nodes[graph.edges]
+    assert bool((graph.edges[:, 0] < graph.edges[:, 1]).all())
+    gap = (places[:, 0] - places[:, 1]).abs()
+    assert {4} <= set(gap.tolist()) <= {4, 8}
+    assert float(graph.edge_weights.mean()) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(("count", "nodes"), [(1, 4), (2, 4), (3, 1)])
+def test_few_samples_have_few_nodes(count, nodes):
+    graph = build_node_graph(line(count), 0, nodes, 4)
+    assert len(graph.nodes) == min(count, nodes)
+    torch.testing.assert_close(graph.weights.sum(1), torch.ones(count, dtype=torch.float64))
+    assert bool(graph.weights.isfinite().all())
+
+
+def test_bad_input_is_named():
+    with pytest.raises(InputError, match="start must be one of 3"):
+        build_node_graph(line(3), 3, 2)
+    with pytest.raises(InputError, match="num_nodes must be at least 1"):
+        build_node_graph(line(3), 0, 0)
+
+
+def test_points_at_samples_take_over_their_weights():
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(20, 3, generator=generator, dtype=torch.float64)
+    normals = torch.nn.functional.normalize(points, dim=-1)
+    weights = torch.rand(20, 6, generator=generator, dtype=torch.float64).softmax(1)
+    torch.testing.assert_close(
+        spread_weights(points, normals, points, normals, weights, 0.1), weights, rtol=0, atol=1e-6
+    )
+    between = spread_weights((points[:1] + points[1:2]) / 2, normals[:1], points[:2], normals[:2], weights[:2], 0.0)
+    torch.testing.assert_close(between[0], weights[:2].mean(0))
+
+
+def test_normals_tell_front_from_back():
+    weights = torch.eye(2, dtype=torch.float64)
+    samples = torch.tensor([[0.0, 0, 0], [0.0, 0, 0.02]], dtype=torch.float64)
+    normals = torch.tensor([[0.0, 0, -1], [0.0, 0, 1]], dtype=torch.float64)
+    point = torch.tensor([[0.0, 0, 0.008]], dtype=torch.float64)
+    near = spread_weights(point, normals[1:], samples, normals, weights, 0.0)[0]
+    assert float(near[0]) > 0.5
+    same_side = spread_weights(point, normals[1:], samples, normals, weights, 0.1)[0]
+    assert float(same_side[1]) > 0.5

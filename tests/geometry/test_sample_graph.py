@@ -1,0 +1,102 @@
+import pytest
+import torch
+
+from torchreg.errors import InputError
+from torchreg.geometry.sample_graph import neighbor_graph, sample_graph
+
+
+def sheet(count, spacing=1.0):
+    """Return the points and triangles of a flat square grid."""
+    line = torch.arange(count, dtype=torch.float64) * spacing
+    points = torch.stack((*torch.meshgrid(line, line, indexing="ij"), torch.zeros(count, count)), dim=-1).reshape(-1, 3)
+    corner = torch.arange(count * count).reshape(count, count)
+    a, b, c, d = (part.reshape(-1) for part in (corner[:-1, :-1], corner[1:, :-1], corner[:-1, 1:], corner[1:, 1:]))
+    return points, torch.cat((torch.stack((a, b, c), 1), torch.stack((b, d, c), 1)))
+
+
+def test_steps_join_neighbors_alone():
+    points, faces = sheet(9)
+    samples = torch.arange(81).reshape(9, 9)[::2, ::2].reshape(-1)
+    graph = sample_graph(points, samples, faces)
+    length = (points[samples][graph.edges[:, 0]] - points[samples][graph.edges[:, 1]]).norm(dim=-1)
+    torch.testing.assert_close(graph.lengths, length)
+    assert float(length.max()) < 3
+    ways = graph.distances()
+    straight = torch.cdist(points[samples], points[samples])
+    assert bool((ways >= straight - 1e-9).all())
+    assert bool((ways <= 1.45 * straight + 1e-9).all())
+    torch.testing.assert_close(ways, ways.mT)
+
+
+def test_all_points_as_samples_give_the_edges_of_the_mesh():
+    points, faces = sheet(4)
+    graph = sample_graph(points, torch.arange(16), faces)
+    sides = torch.cat((faces[:, :2], faces[:, 1:], faces[:, ::2])).sort(dim=1).values.unique(dim=0)
+    assert torch.equal(graph.edges, sides)
+
+
+def test_limits_leave_far_samples_out():
+    points, faces = sheet(5)
+    graph = sample_graph(points, torch.arange(25), faces)
+    near = graph.distances(torch.tensor([0, 24]), limit=1.5)
+    assert near.shape == (2, 25)
+    full = graph.distances(torch.tensor([0, 24]))
+    assert torch.equal(near.isfinite(), full <= 1.5)
+
+
+def test_parts_are_bridged_where_they_are_nearest():
+    points, faces = sheet(4)
+    far = points + torch.tensor([0.0, 0.0, 5.0], dtype=torch.float64)
+    both, triangles = torch.cat((points, far)), torch.cat((faces, faces + 16))
+    apart = sample_graph(both, torch.arange(32), triangles, bridge=None)
+    assert not bool(apart.distances(torch.tensor([0]))[0, 16:].isfinite().any())
+    joined = sample_graph(both, torch.arange(32), triangles, bridge=3.0)
+    assert len(joined.edges) == len(apart.edges) + 3
+    assert float(joined.distances(torch.tensor([0]))[0, 16]) >= 15
+    assert bool(joined.distances().isfinite().all())
+
+
+def test_points_without_faces_are_joined_to_neighbors():
+    points, _ = sheet(6)
+    twice = torch.cat((points, points[:7]))
+    graph = sample_graph(twice, torch.arange(36), None)
+    ways = graph.distances()
+    assert bool(ways.isfinite().all())
+    assert float(ways[0, 35]) == pytest.approx(5 * 2**0.5, rel=0.2)
+
+
+def test_motion_and_order_change_nothing():
+    points, faces = sheet(5)
+    # No point is equally near to two samples.
+    points = points + 0.2 * torch.rand(points.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))[0]
+    samples = torch.tensor([0, 4, 12, 20, 24, 7])
+    graph = sample_graph(points, samples, faces)
+    other = sample_graph(points @ turn.mT + 3, samples.flip(0), faces)
+    torch.testing.assert_close(other.distances().flip(0, 1), graph.distances())
+
+
+def test_neighbor_graph_is_symmetric_and_short():
+    points, _ = sheet(6)
+    graph = neighbor_graph(points, 4)
+    torch.testing.assert_close(graph.distances(), graph.distances().mT)
+    assert float(graph.lengths.max()) <= 2
+
+
+def test_one_sample_has_no_steps():
+    points, faces = sheet(3)
+    graph = sample_graph(points, torch.tensor([4]), faces)
+    assert graph.edges.shape == (0, 2)
+    assert graph.distances().tolist() == [[0.0]]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"samples": torch.zeros(0, dtype=torch.long)}, "samples must be"), ({"bridge": 0.0}, "bridge must be"),
+     ({"num_neighbors": 0}, "num_neighbors must be"), ({"points": torch.zeros(3, 2)}, "points must have shape")],
+)  # fmt: skip
+def test_bad_input_is_named(change, message):
+    points, faces = sheet(3)
+    arguments = {"points": points, "samples": torch.arange(9), "faces": faces, **change}
+    with pytest.raises(InputError, match=message):
+        sample_graph(**arguments)

@@ -1,0 +1,117 @@
+import pytest
+import torch
+
+from torchreg.errors import InputError
+from torchreg.geometry.blend import turn_about
+from torchreg.geometry.node_graph import build_node_graph
+from torchreg.geometry.rigid import se3_exp, transform_points
+from torchreg.geometry.sample_graph import neighbor_graph
+from torchreg.models.deformation_graph import DeformationGraph
+from torchreg.pipelines.graph_fit import GraphMatches, fit_graph
+
+F64 = torch.float64
+
+
+@pytest.fixture
+def graph():
+    points = torch.rand(80, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
+    normals = torch.nn.functional.normalize(points - 0.5, dim=-1)
+    return DeformationGraph(points, normals, build_node_graph(neighbor_graph(points, 8), 0, 6, 3))
+
+
+def problem(graph, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(*size):
+        return torch.randn(*size, generator=generator, dtype=F64)
+
+    normals = torch.nn.functional.normalize(random(40, 3), dim=-1)
+    targets = graph.points[20:60] + 0.1 * random(40, 3)
+    return se3_exp(0.2 * random(6, 6)), GraphMatches(torch.arange(20, 60), targets, random(40).abs(), normals, 0.3)
+
+
+def energy(graph, transforms, matches, stiffness):
+    """Return the energy as the docstring has it, for autograd."""
+    miss = graph(transforms, matches.which) - matches.targets
+    metric = matches.normals.unsqueeze(-1) * matches.normals.unsqueeze(-2) + matches.slide * torch.eye(3, dtype=F64)
+    misses = (matches.weights * (miss.unsqueeze(-2) @ metric @ miss.unsqueeze(-1))[:, 0, 0]).mean()
+    gaps = (graph.edge_weights * graph.edge_gaps(transforms).square().sum((-1, -2))).sum() / graph.num_nodes
+    return misses, gaps, misses + stiffness * gaps
+
+
+def test_steps_are_those_of_a_dense_gauss_newton(graph):
+    transforms, matches = problem(graph)
+    middles = transform_points(transforms, graph.centers.unsqueeze(1)).squeeze(1)
+
+    def residuals(twists):
+        moved = turn_about(transforms, twists.view(-1, 6), middles)
+        miss = graph(moved, matches.which) - matches.targets
+        root = (matches.weights / 40).sqrt().unsqueeze(-1)
+        across = root * (miss * matches.normals).sum(-1, keepdim=True)
+        gap = graph.edge_gaps(moved).flatten(1) * (0.7 / 6 * graph.edge_weights).sqrt().unsqueeze(-1)
+        return torch.cat([across.reshape(-1), (root * 0.3**0.5 * miss).reshape(-1), gap.reshape(-1)])
+
+    zero = torch.zeros(36, dtype=F64)
+    jacobian = torch.autograd.functional.jacobian(residuals, zero)
+    twists = torch.linalg.lstsq(jacobian, -residuals(zero)[:, None]).solution.view(6, 6)
+    expected = turn_about(transforms, twists, middles)
+    torch.testing.assert_close(fit_graph(graph, transforms, matches, 0.7).transforms, expected, rtol=1e-6, atol=1e-7)
+
+
+def test_energies_are_those_reported(graph):
+    transforms, matches = problem(graph)
+    fit = fit_graph(graph, transforms, matches, 0.7)
+    misses, gaps, _ = energy(graph, transforms, matches, 0.7)
+    assert fit.misses == pytest.approx(float(misses))
+    assert fit.gaps == pytest.approx(float(gaps))
+
+
+def test_steps_end_where_the_gradient_vanishes(graph):
+    transforms, matches = problem(graph)
+    fitted = fit_graph(graph, transforms, matches, 0.05, num_steps=30).transforms
+    middles = transform_points(fitted, graph.centers.unsqueeze(1)).squeeze(1)
+    twists = torch.zeros(6, 6, dtype=F64, requires_grad=True)
+    total = energy(graph, turn_about(fitted, twists, middles), matches, 0.05)[2]
+    (slope,) = torch.autograd.grad(total, twists)
+    assert float(slope.abs().max()) < 1e-7
+    assert float(total.detach()) < float(energy(graph, transforms, matches, 0.05)[2])
+
+
+def test_rigid_motions_are_found_whatever_the_stiffness(graph):
+    whole = se3_exp(torch.tensor([0.2, -0.1, 0.3, 0.4, 0.2, -0.3], dtype=F64))
+    targets = transform_points(whole, graph.points)
+    matches = GraphMatches(slice(None), targets, torch.ones(80, dtype=F64))
+    fitted = fit_graph(graph, graph.rest(), matches, 100.0, num_steps=15).transforms
+    torch.testing.assert_close(graph(fitted), targets, rtol=0, atol=1e-6)
+
+
+def test_turning_everything_turns_the_answer(graph):
+    transforms, matches = problem(graph)
+    whole = se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.4, 0.8, -0.3], dtype=F64))
+    nodes = build_node_graph(neighbor_graph(graph.points, 8), 0, 6, 3)
+    turned = DeformationGraph(transform_points(whole, graph.points), graph.normals @ whole[:3, :3].mT, nodes)
+    moved = GraphMatches(
+        matches.which, transform_points(whole, matches.targets), matches.weights,
+        matches.normals @ whole[:3, :3].mT, matches.slide,
+    )  # fmt: skip
+    start = whole @ transforms @ torch.linalg.inv(whole)
+    expected = transform_points(whole, graph(fit_graph(graph, transforms, matches, 0.3, 3).transforms))
+    torch.testing.assert_close(turned(fit_graph(turned, start, moved, 0.3, 3).transforms), expected, rtol=0, atol=1e-8)
+
+
+def test_samples_without_weight_leave_nodes_with_their_neighbors(graph):
+    targets = graph.points + torch.tensor([0.1, 0.0, 0.0], dtype=F64)
+    weights = torch.zeros(80, dtype=F64)
+    weights[:10] = 1
+    fitted = fit_graph(graph, graph.rest(), GraphMatches(slice(None), targets, weights), 1.0, 5).transforms
+    torch.testing.assert_close(graph(fitted), targets, rtol=0, atol=1e-4)
+    none = fit_graph(graph, graph.rest(), GraphMatches(slice(None), targets, torch.zeros(80, dtype=F64)), 0.0)
+    torch.testing.assert_close(none.transforms, graph.rest())
+
+
+def test_bad_input_is_named(graph):
+    transforms, matches = problem(graph)
+    with pytest.raises(InputError, match="stiffness must be"):
+        fit_graph(graph, transforms, matches, -1.0)
+    with pytest.raises(InputError, match="num_steps must be at least 1"):
+        fit_graph(graph, transforms, matches, 1.0, 0)

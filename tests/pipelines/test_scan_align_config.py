@@ -1,0 +1,53 @@
+import pytest
+
+from torchreg.correspondence.scan_em import ScanEMConfig
+from torchreg.errors import InputError
+from torchreg.pipelines.scan_align_config import (
+    AssignConfig,
+    ChoiceConfig,
+    MatchConfig,
+    RefineConfig,
+    ScanAlignConfig,
+    ScanAlignRecord,
+    between,
+)
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "message"),
+    [
+        (MatchConfig, {"num_points": 0}, "num_points must be at least 1"),
+        (MatchConfig, {"radius": 0.0}, "radius must be positive"),
+        (MatchConfig, {"stiffness": ()}, "stiffness must hold"),
+        (MatchConfig, {"stiffness": (1.0, -1.0)}, "stiffness must be positive"),
+        (AssignConfig, {"reach": (0.1, 0.0)}, "reach must be positive"),
+        (AssignConfig, {"stiffness": (0.1,)}, "stiffness must be two numbers"),
+        (AssignConfig, {"feature_weight": -0.1}, "feature_weight must be"),
+        (RefineConfig, {"final_steps": -1}, "final_steps must be at least 0"),
+        (RefineConfig, {"slide": (1.0, 0.0)}, "slide must be positive"),
+        (RefineConfig, {"density": -1.0}, "density must be"),
+        (ChoiceConfig, {"cap": 0.0}, "cap must be positive"),
+        (ChoiceConfig, {"bend": -1.0}, "bend must be"),
+        (ScanAlignConfig, {"num_nodes": 0}, "num_nodes must be at least 1"),
+        (ScanAlignConfig, {"curvature_radii": ()}, "curvature_radii must hold"),
+        (ScanAlignConfig, {"curvature_radii": (-0.1,)}, "curvature_radii must be positive"),
+        (ScanAlignConfig, {"num_restarts": -1}, "num_restarts must be at least 0"),
+    ],
+)
+def test_values_out_of_range_are_named(kind, arguments, message):
+    with pytest.raises(InputError, match=message):
+        kind(**arguments)
+
+
+def test_defaults_are_shared_by_nobody():
+    assert ScanAlignConfig().refine == ScanAlignConfig().refine == RefineConfig()
+    assert RefineConfig().compatible == ScanEMConfig()
+
+
+def test_values_between_ends_are_in_even_ratios():
+    assert [between((8.0, 0.5), share) for share in (0, 0.5, 1, 2)] == pytest.approx([8, 2, 0.5, 0.5])
+
+
+def test_the_energy_of_a_record_is_that_of_its_terms():
+    record = ScanAlignRecord("again", "refine", 0, 5, 0.1, 2.0, 3.0, 0.5, 0.9)
+    assert record.energy == 3.5

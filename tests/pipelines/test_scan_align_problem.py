@@ -1,0 +1,66 @@
+import pytest
+import torch
+
+from torchreg.datasets.depth_scanner import DepthScanner
+from torchreg.datasets.scan_sequences import walking_figure
+from torchreg.geometry.rigid import se3_exp
+from torchreg.pipelines.scan_align_config import MatchConfig, ScanAlignConfig
+from torchreg.pipelines.scan_align_problem import describe, first_matches, spread_samples
+
+CONFIG = ScanAlignConfig(num_samples=400, num_target_samples=800, num_nodes=30)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return walking_figure(3, scanner=DepthScanner(num_points=1500)).pair(0, 1)
+
+
+@pytest.fixture(scope="module")
+def problem(pair):
+    return describe(pair.source, pair.target, CONFIG)
+
+
+def test_samples_are_normalized_and_belong_to_the_scans(pair, problem):
+    assert problem.size == pytest.approx(pair.source.diagonal, rel=0.3)
+    assert float(problem.source.points.mean(0).norm()) < 1e-6
+    torch.testing.assert_close(problem.normalized(pair.source.points[problem.samples]), problem.graph.points)
+    torch.testing.assert_close(problem.graph.points[0], problem.source.points[0])
+    assert len(problem.nodes) == problem.graph.num_nodes == 30
+    torch.testing.assert_close(problem.normalized(pair.source.points[problem.nodes]), problem.graph.centers)
+    assert len(problem.target) == 800
+
+
+def test_frames_and_units_change_nothing(pair, problem):
+    motion = se3_exp(torch.tensor([0.3, 2.0, -1.0, 0.5, 1.0, 2.0], dtype=torch.float64))
+    motion[:3] = 7 * motion[:3]
+    source, target = (scan.to(torch.float64).transformed(motion) for scan in (pair.source, pair.target))
+    moved = describe(source, target, CONFIG)
+    assert moved.size == pytest.approx(7 * problem.size, rel=1e-5)
+    assert torch.equal(moved.samples, problem.samples)
+    assert torch.equal(moved.nodes, problem.nodes)
+    torch.testing.assert_close(moved.target.features, problem.target.features, rtol=0, atol=1e-3)
+
+
+def test_moved_samples_are_those_of_the_graph(problem):
+    rest = problem.moved(problem.graph.rest(), 7)
+    torch.testing.assert_close(rest.points, problem.source.points[:7])
+    torch.testing.assert_close(rest.features, problem.source.features[:7])
+    assert len(problem.moved(problem.graph.rest())) == len(problem.moved(problem.graph.rest(), 9999)) == 400
+
+
+def test_first_samples_are_even_too():
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0))
+    which = torch.arange(0, 300, 2)
+    order = spread_samples(points, which)
+    assert torch.equal(order.sort().values, which)
+    near = torch.cdist(points[order[:20]], points[order[:20]]).fill_diagonal_(9).amin(1)
+    assert float(near.min()) > 0.3 * float(near.max())
+
+
+def test_most_first_matches_are_right(pair, problem):
+    matches = first_matches(problem, MatchConfig(num_points=400))
+    truth = problem.normalized(pair.truth[problem.samples])[matches.which]
+    near = (matches.targets - truth).norm(dim=-1) < 0.05
+    assert len(near) > 50
+    assert float(near.double().mean()) > 0.9
+    assert float(matches.weights.min()) > 0.5

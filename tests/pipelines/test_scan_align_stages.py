@@ -1,0 +1,107 @@
+import pytest
+import torch
+
+from torchreg.datasets.depth_scanner import DepthScanner
+from torchreg.datasets.scan_sequences import walking_figure
+from torchreg.geometry.rigid import se3_exp
+from torchreg.pipelines.graph_fit import GraphMatches
+from torchreg.pipelines.scan_align_config import (
+    AssignConfig,
+    ChoiceConfig,
+    MatchConfig,
+    RefineConfig,
+    ScanAlignConfig,
+)
+from torchreg.pipelines.scan_align_problem import describe
+from torchreg.pipelines.scan_align_stages import (
+    Reporter,
+    agree,
+    fit_first_matches,
+    judge,
+    pull_one_to_one,
+    refine,
+    soft_matches,
+)
+
+CONFIG = ScanAlignConfig(num_samples=400, num_target_samples=800, num_nodes=30)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return walking_figure(3, scanner=DepthScanner(num_points=1500)).pair(0, 1)
+
+
+@pytest.fixture(scope="module")
+def problem(pair):
+    return describe(pair.source, pair.target, CONFIG)
+
+
+@pytest.fixture
+def reporter():
+    records = []
+    return Reporter("some", 2.0, records.append), records
+
+
+def misses(pair, problem, transforms):
+    truth = problem.normalized(pair.truth[problem.samples])
+    return (problem.graph(transforms) - truth).norm(dim=-1)
+
+
+def test_wrong_ones_among_the_first_matches_are_ignored(pair, problem, reporter):
+    truth = problem.normalized(pair.truth[problem.samples])
+    targets = truth[:200].clone()
+    targets[::10] += 0.3
+    matches = GraphMatches(torch.arange(200), targets, torch.ones(200, dtype=torch.float64))
+    fitted = fit_first_matches(problem, matches, MatchConfig(), reporter[0])
+    assert float(misses(pair, problem, fitted).median()) < 0.5 * float(
+        misses(pair, problem, problem.graph.rest()).median()
+    )
+    kept = [record.matched for record in reporter[1]]
+    assert kept[-1] < 0.95 * kept[0]
+
+
+@pytest.mark.parametrize("stage", ["assign", "refine"])
+def test_stages_come_nearer_and_report(pair, problem, reporter, stage):
+    rest = problem.graph.rest()
+    if stage == "assign":
+        moved = pull_one_to_one(problem, rest, AssignConfig(num_steps=4, num_points=200), reporter[0])
+    else:
+        moved = refine(problem, rest, RefineConfig(num_steps=3, final_steps=1), reporter[0])
+    assert float(misses(pair, problem, moved).mean()) < float(misses(pair, problem, rest).mean())
+    assert len(reporter[1]) == 4
+    widths = [record.width for record in reporter[1]]
+    assert widths == sorted(widths, reverse=True)
+    ends = {"assign": (0.35, 0.08), "refine": (0.025, 0.006)}[stage]
+    assert (widths[0], widths[-1]) == pytest.approx([2 * end for end in ends])
+    assert all(record.hypothesis == "some" and record.stage == stage for record in reporter[1])
+
+
+def test_small_sigmas_use_more_samples(problem):
+    config = RefineConfig(density=0.1, least_samples=50)
+    assert len(soft_matches(problem, problem.graph.rest(), 0.1, config).weights) == 50
+    assert len(soft_matches(problem, problem.graph.rest(), 0.02, config).weights) == 250
+    assert len(soft_matches(problem, problem.graph.rest(), 0.001, config).weights) == 400
+
+
+def test_better_hypotheses_are_judged_better(problem, reporter):
+    rest = problem.graph.rest()
+    moved = refine(problem, rest, RefineConfig(num_steps=3, final_steps=1), reporter[0])
+    config = ChoiceConfig()
+    still, better = judge(problem, "still", rest, config), judge(problem, "better", moved, config)
+    assert better.energy < still.energy
+    assert still.bend == 0
+    assert still.energy == pytest.approx(still.forward + still.backward)
+    far = rest.clone()
+    far[:, :3, 3] += 10
+    lost = judge(problem, "lost", far, config)
+    assert (lost.forward, lost.backward) == (1, 1)
+
+
+def test_hypotheses_agree_where_nearly_all_samples_do(problem):
+    rest, config = problem.graph.rest(), ChoiceConfig()
+    whole = se3_exp(torch.tensor([0.005, 0, 0, 0, 0, 0], dtype=torch.float64)).expand_as(rest)
+    assert agree(problem, rest, whole, config)
+    one = rest.clone()
+    one[3, 0, 3] += 0.05
+    assert not agree(problem, rest, one, ChoiceConfig(same_share=1.0))
+    assert not agree(problem, rest, 3 * whole - 2 * rest, config)

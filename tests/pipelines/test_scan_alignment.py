@@ -1,0 +1,116 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchreg.datasets.depth_scanner import DepthScanner
+from torchreg.datasets.scan_sequences import jointed_toy, walking_animal, walking_figure
+from torchreg.geometry.blend import blend_linear
+from torchreg.geometry.range_scan import RangeScan
+from torchreg.geometry.rigid import se3_exp, transform_points
+from torchreg.pipelines.scan_align_config import RefineConfig, ScanAlignConfig
+from torchreg.pipelines.scan_alignment import align_scans
+
+SCANNER = DepthScanner(num_points=1500)
+QUICK = ScanAlignConfig(num_samples=500, num_target_samples=1000, num_nodes=40, num_restarts=0)
+QUICK = replace(
+    QUICK,
+    match=replace(QUICK.match, num_points=400),
+    assign=replace(QUICK.assign, num_points=250, num_steps=6),
+    refine=RefineConfig(num_steps=5, final_steps=1),
+)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return walking_figure(3, scanner=SCANNER).pair(0, 1)
+
+
+@pytest.fixture(scope="module")
+def aligned(pair):
+    return align_scans(pair.source, pair.target, QUICK)
+
+
+def share_near(pair, points):
+    return float((pair.error(points) < 0.025).float().mean())
+
+
+@pytest.mark.parametrize("sequence", [walking_figure, walking_animal, jointed_toy])
+def test_small_steps_of_anything_are_followed(sequence):
+    pair = sequence(3, scanner=SCANNER).pair(0, 1)
+    before, after = share_near(pair, pair.source.points), share_near(pair, align_scans(*scans(pair), QUICK).points)
+    assert after > 0.9
+    assert after > before
+
+
+def scans(pair):
+    return pair.source, pair.target
+
+
+def test_the_result_is_what_its_parts_say(pair, aligned):
+    assert aligned.points.dtype == aligned.confidence.dtype == torch.float32
+    assert aligned.points.shape == pair.source.points.shape
+    moved = blend_linear(pair.source.points, aligned.weights, aligned.transforms)
+    torch.testing.assert_close(moved, aligned.points, rtol=0, atol=1e-3 * pair.source.diagonal)
+    torch.testing.assert_close(aligned.weights.sum(1), torch.ones(len(moved)))
+    assert bool(torch.isin(aligned.nodes, aligned.samples).all())
+    assert aligned.chosen == aligned.hypotheses[0]
+    assert [each.energy for each in aligned.hypotheses] == sorted(each.energy for each in aligned.hypotheses)
+    assert aligned.chosen.energy == pytest.approx(
+        aligned.chosen.forward + aligned.chosen.backward + aligned.chosen.bend
+    )
+
+
+def test_confidence_tells_the_seen_from_the_hidden(pair, aligned):
+    assert 0 <= float(aligned.confidence.min()) <= float(aligned.confidence.max()) <= 1
+    seen = aligned.confidence[pair.visible].mean()
+    assert float(seen) > float(aligned.confidence[~pair.visible].mean()) + 0.1
+
+
+def test_steps_are_reported(pair):
+    records = []
+    result = align_scans(pair.source, pair.target, QUICK, on_step=records.append)
+    assert tuple(records) == result.history
+    assert {record.stage for record in records} == {"match", "assign", "refine"}
+    assert {record.hypothesis for record in records} == {each.name for each in result.hypotheses}
+    for record in records:
+        assert 0 <= record.step < record.num_steps
+        assert record.width > 0
+        assert record.matched >= 0
+        assert record.energy == pytest.approx(record.misses + record.stiffness * record.gaps)
+
+
+def test_the_same_call_gives_the_same_bits(pair, aligned):
+    again = align_scans(pair.source, pair.target, QUICK)
+    assert torch.equal(again.points, aligned.points)
+    seeded = [align_scans(*scans(pair), QUICK, generator=torch.Generator().manual_seed(5)) for _ in range(2)]
+    assert torch.equal(seeded[0].points, seeded[1].points)
+
+
+def test_other_frames_and_units_give_the_same_motion(pair, aligned):
+    motion = se3_exp(torch.tensor([3.0, -8.0, 5.0, 1.0, 2.0, -0.5], dtype=torch.float64))
+    motion[:3] = 100 * motion[:3]
+    source, target = (scan.to(torch.float64).transformed(motion) for scan in scans(pair))
+    moved = align_scans(source, target, QUICK)
+    plain = align_scans(*(scan.to(torch.float64) for scan in scans(pair)), QUICK)
+    expected = transform_points(motion, plain.points)
+    apart = (moved.points - expected).norm(dim=-1) / source.diagonal
+    assert float(apart.median()) < 1e-4
+    assert moved.chosen.energy == pytest.approx(plain.chosen.energy, rel=0.05)
+
+
+def test_scans_without_faces_align(pair):
+    source, target = (RangeScan(scan.points, normals=scan.normals) for scan in scans(pair))
+    assert share_near(pair, align_scans(source, target, QUICK).points) > 0.85
+
+
+def test_tiny_and_disjoint_scans_have_sound_results(pair):
+    tiny = RangeScan(torch.rand(6, 3, generator=torch.Generator().manual_seed(0)))
+    assert bool(align_scans(tiny, tiny, QUICK).points.isfinite().all())
+    flat = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 1.0, 0.0])
+    plane = align_scans(RangeScan(flat), RangeScan(flat + 0.01), QUICK)
+    assert float((plane.points - flat).norm(dim=-1).max()) < 0.2
+    far = pair.target.transformed(se3_exp(torch.tensor([1000.0, 0, 0, 0, 0, 0])))
+    apart = align_scans(pair.source, far, QUICK)
+    assert float(apart.confidence.max()) == 0
+    torch.testing.assert_close(apart.points, pair.source.points)

@@ -1,0 +1,164 @@
+"""Samples of a scan joined along its surface: what is near on the skin, not in space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from torchreg._checks import as_tensor, check_count, check_points, check_positive
+from torchreg.errors import InputError
+from torchreg.geometry.normals import distinct_places, k_nearest
+
+# Links between two parts of a scan that no surface joins.
+_BRIDGE_LINKS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class SampleGraph:
+    """Samples and the steps between them.
+
+    Args:
+        count: number of samples.
+        edges: (E, 2) int64, each once.
+        lengths: (E,) float64, in the unit of the points.
+    """
+
+    count: int
+    edges: Tensor
+    lengths: Tensor
+
+    def distances(self, sources: Tensor | None = None, limit: float = float("inf")) -> Tensor:
+        """Return how far all samples are from some, (S, count) float64; infinite where no way leads within the limit.
+
+        Args:
+            sources: (S,) samples; all by default.
+            limit: ways longer than this are not looked for.
+
+        Cost: O(E log E) per source, far less with a small limit.
+        """
+        index = None if sources is None else sources.cpu().numpy()
+        return torch.from_numpy(dijkstra(self._matrix(), directed=False, indices=index, limit=limit))
+
+    def _matrix(self) -> csr_array:
+        start, end = self.edges.cpu().numpy().T
+        return csr_array((self.lengths.cpu().numpy(), (start, end)), shape=(self.count, self.count))
+
+
+def sample_graph(
+    points: Tensor,
+    samples: Tensor,
+    faces: Tensor | None = None,
+    *,
+    num_neighbors: int = 8,
+    bridge: float | None = 3.0,
+) -> SampleGraph:
+    """Return the graph of samples of a surface, joined where their surroundings meet.
+
+    The surroundings of a sample are the points that are nearer to it than to any other sample; they meet where an edge
+    leads from one to the other. Edges are those of the
+    triangles, or without faces those between points and their nearest neighbors; limbs that touch in space alone are
+    not joined by triangles. What does not hang together is bridged where it is nearest, by few and costly links.
+
+    Args:
+        points: (N, 3) all of the surface, any unit.
+        samples: (S,) indices of some, at different places.
+        faces: (F, 3), or None.
+        num_neighbors: of each point, where there are no faces.
+        bridge: lengths of the links between parts are multiplied by this; None leaves the parts apart.
+
+    Returns:
+        a `SampleGraph`, its steps as long as the straight way.
+
+    Raises:
+        InputError: if a shape does not fit or there are no samples.
+
+    Differentiable: no.
+
+    Cost: O(N log N); 20 ms for 8,000 points.
+    """
+    check_points(points, "points", batch=False)
+    samples = as_tensor(samples, "samples", "integers")
+    if samples.ndim != 1 or len(samples) == 0:
+        raise InputError(f"samples must be a list of at least one index, got shape {tuple(samples.shape)}")
+    check_count(num_neighbors, "num_neighbors", 1)
+    if bridge is not None:
+        check_positive(bridge, "bridge")
+    places = points.detach().cpu().double().numpy()
+    centers = places[samples.cpu().numpy()]
+    if len(centers) == 1:
+        return SampleGraph(1, torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.float64))
+    owner = cKDTree(centers).query(places)[1]
+    steps = _steps_of_points(points, num_neighbors) if faces is None else _steps_of_faces(faces)
+    edges = _distinct(owner[steps], len(centers))
+    lengths = _lengths(centers, edges)
+    if bridge is not None:
+        edges, lengths = _bridged(centers, edges, lengths, bridge)
+    return SampleGraph(len(centers), torch.from_numpy(edges), torch.from_numpy(lengths))
+
+
+def neighbor_graph(points: Tensor, num_neighbors: int = 8) -> SampleGraph:
+    """Return the graph in which every point is joined to its nearest others.
+
+    Args:
+        points: (N, 3), at least two, no two at one place.
+        num_neighbors: see above.
+    """
+    places = points.detach().cpu().double().numpy()
+    index, _ = k_nearest(points, num_neighbors)
+    start = np.repeat(np.arange(len(places)), index.shape[1])
+    edges = _distinct(np.stack((start, index.numpy().reshape(-1)), axis=1), len(places))
+    return SampleGraph(len(places), torch.from_numpy(edges), torch.from_numpy(_lengths(places, edges)))
+
+
+def _steps_of_faces(faces: Tensor) -> np.ndarray:
+    corners = faces.cpu().numpy()
+    return np.concatenate((corners[:, :2], corners[:, 1:], corners[:, ::2]))
+
+
+def _steps_of_points(points: Tensor, num_neighbors: int) -> np.ndarray:
+    places, place = distinct_places(points)
+    index, _ = k_nearest(places, num_neighbors)
+    # One point of each place, and all others of it through that one.
+    one = np.zeros(len(places), dtype=np.int64)
+    one[place.numpy()] = np.arange(len(place))
+    start = np.repeat(one, index.shape[1])
+    return np.stack((start, one[index.numpy().reshape(-1)]), axis=1)
+
+
+def _distinct(edges: np.ndarray, count: int) -> np.ndarray:
+    """Return edges (E, 2), the smaller index first, without loops and repetitions."""
+    low, high = edges.min(axis=1).astype(np.int64), edges.max(axis=1).astype(np.int64)
+    key = np.unique((low * count + high)[low != high])
+    return np.stack((key // count, key % count), axis=1)
+
+
+def _lengths(places: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return the lengths of edges, none of them zero, which would be no edge."""
+    length = np.linalg.norm(places[edges[:, 0]] - places[edges[:, 1]], axis=1)
+    return np.maximum(length, np.finfo(np.float64).tiny)
+
+
+def _bridged(places: np.ndarray, edges: np.ndarray, lengths: np.ndarray, cost: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return edges and lengths with each part linked to what has grown from the largest, the nearest part first."""
+    count = len(places)
+    matrix = coo_array((lengths, tuple(edges.T)), shape=(count, count))
+    number, label = connected_components(matrix, directed=False)
+    joined = label == np.bincount(label).argmax()
+    for _ in range(number - 1):
+        inside, outside = np.flatnonzero(joined), np.flatnonzero(~joined)
+        tree = cKDTree(places[inside])
+        nearest = outside[tree.query(places[outside])[0].argmin()]
+        part = np.flatnonzero(label == label[nearest])
+        distance, other = tree.query(places[part])
+        few = np.argsort(distance, kind="stable")[:_BRIDGE_LINKS]
+        links = np.stack((part[few], inside[other[few]]), axis=1)
+        edges = np.concatenate((edges, np.sort(links, axis=1)))
+        lengths = np.concatenate((lengths, np.maximum(distance[few] * cost, np.finfo(np.float64).tiny)))
+        joined[part] = True
+    return edges, lengths

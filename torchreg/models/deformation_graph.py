@@ -1,0 +1,110 @@
+"""Surfaces that follow many small nodes, each moving rigidly: how a scan moves before it has bones."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from torchreg._checks import as_float_tensor, check_finite, check_points, check_shape
+from torchreg.errors import InputError
+from torchreg.geometry.blend import blend_linear
+from torchreg.geometry.node_graph import NodeGraph
+from torchreg.geometry.rigid import transform_points
+
+
+class DeformationGraph(nn.Module):
+    """A surface that follows nodes: ``D(x_i) = sum_k w_ik (R_k x_i + t_k)`` over the few nodes each sample hangs on.
+
+    Args:
+        points: (S, 3) samples of the surface.
+        normals: (S, 3) unit vectors.
+        graph: nodes among the samples, and weights; see `build_node_graph`.
+
+    Attributes:
+        centers: (J, 3) places of the nodes.
+        nearest: (S, K) nodes of each sample.
+        weights: (S, K) of those, rows sum to one.
+        edges: (E, 2) nodes that are neighbors.
+        edge_weights: (E,) how much the neighbors hold each other.
+
+    Raises:
+        InputError: if a shape does not fit or a number is not finite.
+
+    References: Sumner, Schmid and Pauly 2007, section 3.
+    """
+
+    points: Tensor
+    normals: Tensor
+    centers: Tensor
+    nearest: Tensor
+    weights: Tensor
+    dense_weights: Tensor
+    edges: Tensor
+    edge_weights: Tensor
+
+    def __init__(self, points: Tensor, normals: Tensor, graph: NodeGraph) -> None:
+        super().__init__()
+        points = as_float_tensor(points, "points").detach()
+        check_points(points, "points", batch=False)
+        normals = as_float_tensor(normals, "normals", like=points).detach()
+        check_shape(normals, "normals", tuple(points.shape))
+        check_finite(normals, "normals")
+        if len(points) != len(graph.nearest):
+            raise InputError(f"points must be the {len(graph.nearest)} samples of the graph, got {len(points)}")
+        values = {
+            "points": points,
+            "normals": normals,
+            "centers": points[graph.nodes],
+            "nearest": graph.nearest,
+            "weights": graph.weights.to(points),
+            "dense_weights": graph.dense_weights().to(points),
+            "edges": graph.edges,
+            "edge_weights": graph.edge_weights.to(points),
+        }
+        for name, value in values.items():
+            self.register_buffer(name, value.to(points.device).clone())
+
+    @property
+    def num_nodes(self) -> int:
+        """How many nodes there are."""
+        return len(self.centers)
+
+    def rest(self) -> Tensor:
+        """Return the motions (J, 4, 4) that move nothing."""
+        return torch.eye(4).to(self.points).repeat(self.num_nodes, 1, 1)
+
+    def forward(self, transforms: Tensor, which: Tensor | slice = slice(None)) -> Tensor:
+        """Return moved samples (..., n, 3).
+
+        Args:
+            transforms: (..., J, 4, 4) motions of the nodes, world to world.
+            which: (n,) indices of samples; all by default.
+
+        Differentiable: in ``transforms``.
+        """
+        return blend_linear(self.points[which], self.dense_weights[which], transforms)
+
+    def move_with_normals(self, transforms: Tensor, which: Tensor | slice = slice(None)) -> tuple[Tensor, Tensor]:
+        """Return moved samples and their turned unit normals, (..., n, 3) each; see `forward`."""
+        rows = (self.dense_weights[which] @ transforms[..., :3, :].flatten(-2)).unflatten(-1, (3, 4))
+        ends = torch.stack((self.points[which], self.normals[which]), dim=-1)
+        moved, turned = (rows[..., :3] @ ends).unbind(-1)
+        return moved + rows[..., 3], nn.functional.normalize(turned, dim=-1)
+
+    def edge_gaps(self, transforms: Tensor) -> Tensor:
+        """Return how far neighbors disagree about where each of the two nodes goes, (..., E, 2, 3).
+
+        The regularizer of the graph is the weighted sum of their squares.
+
+        Differentiable: in ``transforms``.
+        """
+        one, other = (transforms[..., ends, :, :] for ends in self.edges.unbind(-1))
+        both = self.centers[self.edges]
+        return transform_points(one, both) - transform_points(other, both)
+
+    def bend(self, transforms: Tensor) -> Tensor:
+        """Return the weighted mean of the gaps' lengths, (...), in the unit of the points."""
+        if len(self.edges) == 0:
+            return transforms.new_zeros(transforms.shape[:-3])
+        gap = torch.linalg.vector_norm(self.edge_gaps(transforms), dim=-1).sum(-1)
+        return (gap * self.edge_weights).sum(-1) / len(self.edges)

@@ -1,0 +1,150 @@
+"""Gauss-Newton steps of a deformation graph towards matches, all nodes at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import check_count, check_positive
+from torchreg.geometry.blend import turn_about
+from torchreg.geometry.rigid import transform_points
+from torchreg.geometry.rotation import skew
+from torchreg.models.deformation_graph import DeformationGraph
+from torchreg.solvers.levenberg_marquardt import Linearization
+
+# Relative damping: nodes that carry no match follow their neighbors; alone they stay.
+_DAMPING = 1e-9
+
+
+@dataclass(frozen=True)
+class GraphMatches:
+    """Where samples should go.
+
+    Args:
+        which: (n,) samples of the graph, or a slice of them.
+        targets: (n, 3).
+        weights: (n,) how much each counts, not negative.
+        normals: (n, 3) of the targets, or None for targets that hold in all directions alike.
+        slide: how much a miss along the surface counts against one across it, squared; 1 without normals.
+    """
+
+    which: Tensor | slice
+    targets: Tensor
+    weights: Tensor
+    normals: Tensor | None = None
+    slide: float = 1.0
+
+
+@dataclass(frozen=True)
+class GraphFit:
+    """Where steps have led.
+
+    Args:
+        transforms: (J, 4, 4).
+        misses: weighted mean squared miss before the last step.
+        gaps: weighted sum of squared gaps between neighbors, over the number of nodes, before the last step.
+    """
+
+    transforms: Tensor
+    misses: float
+    gaps: float
+
+
+def fit_graph(
+    graph: DeformationGraph, transforms: Tensor, matches: GraphMatches, stiffness: float, num_steps: int = 1
+) -> GraphFit:
+    """Return the motions after Gauss-Newton steps on matches and stiffness.
+
+    ``E = mean_i w_i (d_i^T (n_i n_i^T + slide I) d_i) + stiffness / J sum_e w_e |gap_e|^2``, d_i a sample's miss and
+    gap_e how far neighboring nodes disagree about each other, see `DeformationGraph.edge_gaps`.
+
+    Args:
+        graph: what is moved, float64.
+        transforms: (J, 4, 4) to start from.
+        matches: see `GraphMatches`.
+        stiffness: see above.
+        num_steps: linear systems, at least one, none of them tested: the caller finds new matches before long.
+
+    Returns:
+        a `GraphFit`.
+
+    Differentiable: no.
+
+    Cost: 4 ms a step for 1,200 samples on 4 of 60 nodes each, on one core.
+
+    References: Sumner, Schmid and Pauly 2007, section 4; Chang and Zwicker 2009, eq. 5, for the steps on twists.
+    """
+    check_count(num_steps, "num_steps", 1)
+    check_positive(stiffness, "stiffness", allow_zero=True)
+    misses = gaps = 0.0
+    for _ in range(num_steps):
+        middles = transform_points(transforms, graph.centers.unsqueeze(1)).squeeze(1)
+        one, other = _of_matches(graph, transforms, middles, matches), _of_edges(graph, transforms, middles)
+        misses, gaps = 2 * float(one.cost), 2 * float(other.cost) / graph.num_nodes
+        share = stiffness / graph.num_nodes
+        twists = _solved(one.hessian + share * other.hessian, one.gradient + share * other.gradient)
+        transforms = turn_about(transforms, twists, middles)
+    return GraphFit(transforms, misses, gaps)
+
+
+def _of_matches(graph: DeformationGraph, transforms: Tensor, middles: Tensor, matches: GraphMatches) -> Linearization:
+    """Return the first term, its gradient (J, 6) and Hessian (J, J, 6, 6)."""
+    nearest, weights = graph.nearest[matches.which], graph.weights[matches.which]
+    points = graph.points[matches.which]
+    count, few = nearest.shape
+    # Where each node alone would take the sample.
+    rows = transforms[:, :3].flatten(1)[nearest].unflatten(-1, (3, 4))
+    ends = (rows[..., :3] * points[:, None, None]).sum(-1) + rows[..., 3]
+    miss = (weights.unsqueeze(-1) * ends).sum(1) - matches.targets
+    # Derivatives by twists (n, 3, K, 6): shift by v, turn about the node's middle by w.
+    identity = torch.eye(3).to(points).expand(count, few, 3, 3)
+    blocks = torch.cat((identity, -skew(ends - middles[nearest])), dim=-1) * weights[..., None, None]
+    blocks = blocks.transpose(1, 2).flatten(2)
+    pulled = matches.slide * blocks
+    pull = matches.slide * miss
+    if matches.normals is not None:
+        normal = matches.normals.unsqueeze(-1)
+        pulled = pulled + normal * (normal.mT @ blocks)
+        pull = pull + matches.normals * (matches.normals * miss).sum(-1, keepdim=True)
+    share = (matches.weights / count)[:, None, None]
+    square = ((share * blocks).mT @ pulled).unflatten(2, (few, 6)).unflatten(1, (few, 6)).transpose(2, 3)
+    slope = ((share * blocks).mT @ pull.unsqueeze(-1)).reshape(-1, 6)
+    size = graph.num_nodes
+    pair = (nearest.unsqueeze(2) * size + nearest.unsqueeze(1)).reshape(-1)
+    hessian = points.new_zeros(size * size, 36).index_add_(0, pair, square.reshape(-1, 36))
+    gradient = points.new_zeros(size, 6).index_add_(0, nearest.reshape(-1), slope)
+    cost = 0.5 * (share[:, 0] * miss * pull).sum()
+    return Linearization(cost, gradient, hessian.view(size, size, 6, 6))
+
+
+def _of_edges(graph: DeformationGraph, transforms: Tensor, middles: Tensor) -> Linearization:
+    """Return the sum of squared gaps, its gradient (J, 6) and Hessian (J, J, 6, 6)."""
+    size = graph.num_nodes
+    hessian, gradient = transforms.new_zeros(size * size, 6, 6), transforms.new_zeros(size, 6)
+    both, gap = graph.centers[graph.edges], graph.edge_gaps(transforms)
+    weight = graph.edge_weights[:, None, None]
+    identity = torch.eye(3).to(both).expand(*both.shape, 3)
+    ends, sides = graph.edges.unbind(-1), []
+    for node, sign in zip(ends, (1.0, -1.0), strict=True):
+        arm = transform_points(transforms[node], both) - middles[node].unsqueeze(1)
+        sides.append(sign * torch.cat((identity, -skew(arm)), dim=-1).flatten(1, 2))
+    for first, one in zip(ends, sides, strict=True):
+        gradient.index_add_(0, first, (weight * (one.mT @ gap.flatten(1).unsqueeze(-1))).squeeze(-1))
+        for second, other in zip(ends, sides, strict=True):
+            hessian.index_add_(0, first * size + second, weight * (one.mT @ other))
+    cost = 0.5 * (weight * gap.square()).sum()
+    return Linearization(cost, gradient, hessian.view(size, size, 6, 6))
+
+
+def _solved(hessian: Tensor, gradient: Tensor) -> Tensor:
+    """Return the twists (J, 6) of a step; none where the system has no Cholesky factor."""
+    size = len(gradient)
+    matrix = hessian.transpose(1, 2).reshape(6 * size, 6 * size)
+    diagonal = matrix.diagonal()
+    diagonal += _DAMPING * diagonal.mean() + torch.finfo(matrix.dtype).tiny
+    factor, info = torch.linalg.cholesky_ex(matrix)
+    if int(info):
+        return torch.zeros_like(gradient)
+    return -torch.cholesky_solve(gradient.reshape(-1, 1), factor).view(size, 6)

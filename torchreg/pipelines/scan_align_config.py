@@ -1,0 +1,290 @@
+"""What decides how two scans are aligned, and what is reported. Lengths are shares of the source's size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from torchreg._checks import check_count, check_positive
+from torchreg.correspondence.scan_em import ScanEMConfig
+from torchreg.errors import InputError
+
+
+@dataclass(frozen=True)
+class MatchConfig:
+    """How first matches are found, by spin images, and kept, by distances along the surface.
+
+    Args:
+        num_points: of each scan that are described.
+        bin_size: of the images, length.
+        num_candidates: most similar targets of each point.
+        max_distance: targets farther away are no candidates, length.
+        radius: within which points vote on each other's candidates, length.
+        slack: by which distances may differ, length.
+        min_support: of the votes that a match needs.
+        min_matches: with fewer the motion is not known from them.
+        stiffness: of the graph, one fit after the other.
+        scale: misses beyond this count ever less in all fits but the first, length.
+    """
+
+    num_points: int = 800
+    bin_size: float = 0.034
+    num_candidates: int = 6
+    max_distance: float = 0.35
+    radius: float = 0.2
+    slack: float = 0.02
+    min_support: float = 0.5
+    min_matches: int = 20
+    stiffness: tuple[float, ...] = (0.2, 0.06, 0.02, 0.02, 0.02)
+    scale: float = 0.03
+
+    def __post_init__(self) -> None:
+        for name in ("num_points", "num_candidates", "min_matches"):
+            check_count(getattr(self, name), name, 1)
+        for name in ("bin_size", "max_distance", "radius", "slack", "min_support", "scale"):
+            check_positive(getattr(self, name), name)
+        if not self.stiffness:
+            raise InputError("stiffness must hold at least one value, got none")
+        for value in self.stiffness:
+            check_positive(value, "stiffness")
+
+
+@dataclass(frozen=True)
+class AssignConfig:
+    """How a graph is pulled by one-to-one matches, from far to near.
+
+    Args:
+        num_steps: rounds of matching and fitting.
+        reach: beyond which there is no match, first and last, length.
+        stiffness: of the graph, first and last.
+        num_points: of the target; as many of the source as make it as dense.
+        normal_weight: see `match_one_to_one`.
+        feature_weight: see `match_one_to_one`.
+        fits_per_step: Gauss-Newton steps on the same matches.
+    """
+
+    num_steps: int = 12
+    reach: tuple[float, float] = (0.35, 0.08)
+    stiffness: tuple[float, float] = (2.0, 0.2)
+    num_points: int = 400
+    normal_weight: float = 0.01
+    feature_weight: float = 0.02
+    fits_per_step: int = 2
+
+    def __post_init__(self) -> None:
+        for name in ("num_steps", "num_points", "fits_per_step"):
+            check_count(getattr(self, name), name, 1)
+        for name in ("reach", "stiffness"):
+            _check_ends(getattr(self, name), name)
+        for name in ("normal_weight", "feature_weight"):
+            check_positive(getattr(self, name), name, allow_zero=True)
+
+
+@dataclass(frozen=True)
+class RefineConfig:
+    """How a graph is pulled by soft matches, annealed.
+
+    Args:
+        num_steps: while sigma shrinks.
+        final_steps: at the last sigma.
+        sigma: first and last, length.
+        stiffness: of the graph, first and last.
+        slide: how much misses along the surface count, squared, first and last.
+        fits_per_step: rounds of matching and fitting at each sigma.
+        both_ways_above: sigma from which targets choose among sources too, length.
+        boundary_above: sigma from which targets on a boundary may be matched, length.
+        density: samples used per squared sigma.
+        least_samples: used of each scan, where there are as many.
+        compatible: see `ScanEMConfig`.
+    """
+
+    num_steps: int = 8
+    final_steps: int = 3
+    sigma: tuple[float, float] = (0.025, 0.006)
+    stiffness: tuple[float, float] = (0.1, 0.001)
+    slide: tuple[float, float] = (1.0, 0.1)
+    fits_per_step: int = 2
+    both_ways_above: float = 0.012
+    boundary_above: float = 0.02
+    density: float = 0.3
+    least_samples: int = 300
+    compatible: ScanEMConfig = field(default_factory=ScanEMConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("num_steps", "fits_per_step", "least_samples"):
+            check_count(getattr(self, name), name, 1)
+        check_count(self.final_steps, "final_steps", 0)
+        for name in ("sigma", "stiffness", "slide"):
+            _check_ends(getattr(self, name), name)
+        for name in ("both_ways_above", "boundary_above", "density"):
+            check_positive(getattr(self, name), name, allow_zero=True)
+
+
+@dataclass(frozen=True)
+class ChoiceConfig:
+    """How the hypotheses are compared.
+
+    Args:
+        cap: distances count up to this, length.
+        normal_scale: what normals at right angles count as, a share of sqrt(2) caps.
+        bend: what it costs that neighboring nodes disagree by one size in the mean.
+        same: hypotheses whose samples are this near each other are one, length,
+        same_share: for at least this share of the samples.
+    """
+
+    cap: float = 0.03
+    normal_scale: float = 0.5
+    bend: float = 3.0
+    same: float = 0.01
+    same_share: float = 0.95
+
+    def __post_init__(self) -> None:
+        for name in ("cap", "same", "same_share"):
+            check_positive(getattr(self, name), name)
+        for name in ("normal_scale", "bend"):
+            check_positive(getattr(self, name), name, allow_zero=True)
+
+
+@dataclass(frozen=True)
+class ScanAlignConfig:
+    """How two scans are aligned. The size of the source, on which all lengths rest, is about its diagonal.
+
+    Args:
+        num_samples: of the source, which hang on the graph.
+        num_target_samples: of the target.
+        num_nodes: of the graph.
+        num_nearest: nodes that each sample hangs on.
+        curvature_radii: of the features, lengths.
+        match: the first matches.
+        assign: matches one to one from the unmoved source.
+        reassign: the same from the first matches.
+        again: the same from the best hypothesis.
+        refine: the EM that ends every hypothesis.
+        choice: among the hypotheses.
+        num_restarts: most further hypotheses that start from the best.
+
+    Raises:
+        InputError: if a value is out of range.
+    """
+
+    num_samples: int = 1200
+    num_target_samples: int = 2500
+    num_nodes: int = 60
+    num_nearest: int = 4
+    curvature_radii: tuple[float, ...] = (0.02, 0.035, 0.06)
+    match: MatchConfig = field(default_factory=MatchConfig)
+    assign: AssignConfig = field(default_factory=AssignConfig)
+    reassign: AssignConfig = field(
+        default_factory=lambda: AssignConfig(num_steps=6, reach=(0.15, 0.08), stiffness=(0.6, 0.2))
+    )
+    again: AssignConfig = field(
+        default_factory=lambda: AssignConfig(num_steps=6, reach=(0.12, 0.06), stiffness=(0.6, 0.2))
+    )
+    refine: RefineConfig = field(default_factory=RefineConfig)
+    choice: ChoiceConfig = field(default_factory=ChoiceConfig)
+    num_restarts: int = 1
+
+    def __post_init__(self) -> None:
+        for name in ("num_samples", "num_target_samples", "num_nodes", "num_nearest"):
+            check_count(getattr(self, name), name, 1)
+        check_count(self.num_restarts, "num_restarts", 0)
+        if not self.curvature_radii:
+            raise InputError("curvature_radii must hold at least one radius, got none")
+        for radius in self.curvature_radii:
+            check_positive(radius, "curvature_radii")
+
+
+@dataclass(frozen=True)
+class ScanAlignRecord:
+    """One step of an alignment, as given to ``on_step``.
+
+    Args:
+        hypothesis: name of what is being followed, such as "matches" or "again".
+        stage: "match", "assign" or "refine".
+        step: number of the step in its stage.
+        num_steps: steps planned in the stage.
+        width: reach or sigma, in the user's unit.
+        misses: weighted mean squared miss of the matches, squared shares of the size.
+        gaps: disagreement of neighboring nodes, squared shares of the size.
+        stiffness: weight of the latter.
+        matched: weight of the matches over the number of samples.
+    """
+
+    hypothesis: str
+    stage: str
+    step: int
+    num_steps: int
+    width: float
+    misses: float
+    gaps: float
+    stiffness: float
+    matched: float
+
+    @property
+    def energy(self) -> float:
+        """Both terms together."""
+        return self.misses + self.stiffness * self.gaps
+
+
+OnStep = Callable[[ScanAlignRecord], None]
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One way in which the source may have moved.
+
+    Args:
+        name: what it started from.
+        energy: ``forward + backward + bend``, by which hypotheses are compared; lower is better.
+        forward: mean squared distance of moved samples to the target, capped at one.
+        backward: mean squared distance of target samples to the moved source, capped at one.
+        bend: weighted disagreement of neighboring nodes.
+    """
+
+    name: str
+    energy: float
+    forward: float
+    backward: float
+    bend: float
+
+
+@dataclass(frozen=True, eq=False)
+class ScanAlignment:
+    """A source scan moved onto a target.
+
+    Args:
+        points: (N, 3) all source points where they went, in the unit, frame and dtype of the source.
+        confidence: (N,) in [0, 1], posterior mass of each point's match at the last sigma; low where the target shows
+            nothing, and where points follow what is around them.
+        samples: (S,) source points that hang on the nodes.
+        nodes: (J,) source points that are nodes.
+        weights: (N, J) of the nodes at all points, rows sum to one.
+        transforms: (J, 4, 4) motions of the nodes, in the unit and frame of the scans.
+        chosen: the best hypothesis.
+        hypotheses: all of them, the best first.
+        history: one `ScanAlignRecord` per step.
+    """
+
+    points: Tensor
+    confidence: Tensor
+    samples: Tensor
+    nodes: Tensor
+    weights: Tensor
+    transforms: Tensor
+    chosen: Hypothesis
+    hypotheses: tuple[Hypothesis, ...]
+    history: tuple[ScanAlignRecord, ...]
+
+
+def between(ends: tuple[float, float], share: float) -> float:
+    """Return the value a share of the way from the first to the last, in even ratios."""
+    return float(ends[0] * (ends[1] / ends[0]) ** min(share, 1.0))
+
+
+def _check_ends(ends: tuple[float, float], name: str) -> None:
+    if len(ends) != 2:
+        raise InputError(f"{name} must be two numbers, first and last, got {len(ends)}")
+    for value in ends:
+        check_positive(value, name)

@@ -1,0 +1,136 @@
+"""The stages that pull a deformation graph onto a target: by few sure matches, by one-to-one matches, by EM."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchreg.correspondence.one_to_one import count_of_spacing, match_one_to_one, typical_spacing
+from torchreg.correspondence.scan_em import SoftMatches, match_softly
+from torchreg.geometry.neighbors import nearest_few
+from torchreg.pipelines.graph_fit import GraphFit, GraphMatches, fit_graph
+from torchreg.pipelines.scan_align_config import (
+    AssignConfig,
+    ChoiceConfig,
+    Hypothesis,
+    MatchConfig,
+    OnStep,
+    RefineConfig,
+    ScanAlignRecord,
+    between,
+)
+from torchreg.pipelines.scan_align_problem import ScanAlignProblem
+
+
+@dataclass(frozen=True)
+class Reporter:
+    """Where records of one hypothesis go.
+
+    Args:
+        name: of the hypothesis.
+        size: by which widths are multiplied.
+        on_step: what takes the records.
+    """
+
+    name: str
+    size: float
+    on_step: OnStep
+
+    def report(
+        self, stage: str, step: int, num_steps: int, width: float, fit: GraphFit, stiffness: float, matched: float
+    ) -> None:
+        """Hand on one record."""
+        self.on_step(
+            ScanAlignRecord(
+                self.name, stage, step, num_steps, width * self.size, fit.misses, fit.gaps, stiffness, matched
+            )
+        )
+
+
+def fit_first_matches(
+    problem: ScanAlignProblem, matches: GraphMatches, config: MatchConfig, reporter: Reporter
+) -> Tensor:
+    """Return motions fitted to few sure matches, of which those that do not fit count less and less."""
+    transforms = problem.graph.rest()
+    for step, stiffness in enumerate(config.stiffness):
+        weighted = matches
+        if step > 0:
+            miss = (problem.graph(transforms, matches.which) - matches.targets).square().sum(-1)
+            weighted = replace(matches, weights=matches.weights / (1 + miss / config.scale**2).square())
+        fit = fit_graph(problem.graph, transforms, weighted, stiffness, num_steps=2)
+        transforms = fit.transforms
+        kept = float(weighted.weights.sum()) / len(problem.samples)
+        reporter.report("match", step, len(config.stiffness), config.scale, fit, stiffness, kept)
+    return transforms
+
+
+def pull_one_to_one(problem: ScanAlignProblem, transforms: Tensor, config: AssignConfig, reporter: Reporter) -> Tensor:
+    """Return motions pulled by one-to-one matches of even samples, whose reach shrinks while the graph softens."""
+    target = problem.target.first(config.num_points)
+    count = count_of_spacing(problem.graph.points, typical_spacing(target.points))
+    for step in range(config.num_steps):
+        share = step / max(config.num_steps - 1, 1)
+        reach, stiffness = between(config.reach, share), between(config.stiffness, share)
+        found = match_one_to_one(
+            problem.moved(transforms, count),
+            target,
+            reach,
+            normal_weight=config.normal_weight,
+            feature_weight=config.feature_weight,
+        )
+        weights = (found >= 0).to(transforms)
+        matches = GraphMatches(slice(0, count), target.points[found.clamp(min=0)], weights)
+        fit = fit_graph(problem.graph, transforms, matches, stiffness, config.fits_per_step)
+        transforms = fit.transforms
+        reporter.report("assign", step, config.num_steps, reach, fit, stiffness, float(weights.mean()))
+    return transforms
+
+
+def refine(problem: ScanAlignProblem, transforms: Tensor, config: RefineConfig, reporter: Reporter) -> Tensor:
+    """Return motions refined by EM: sigma shrinks, the graph softens, matches may slide along the surface ever more."""
+    number = config.num_steps + config.final_steps
+    for step in range(number):
+        share = step / max(config.num_steps - 1, 1)
+        sigma, stiffness, slide = (between(ends, share) for ends in (config.sigma, config.stiffness, config.slide))
+        for _ in range(config.fits_per_step):
+            found = soft_matches(problem, transforms, sigma, config)
+            matches = GraphMatches(slice(0, len(found.weights)), found.targets, found.weights, found.normals, slide)
+            fit = fit_graph(problem.graph, transforms, matches, stiffness)
+            transforms = fit.transforms
+        reporter.report("refine", step, number, sigma, fit, stiffness, float(found.weights.mean()))
+    return transforms
+
+
+def soft_matches(problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: RefineConfig) -> SoftMatches:
+    """Return the matches of an E-step on as many samples as the sigma asks for."""
+    count = max(round(config.density / sigma**2), config.least_samples)
+    return match_softly(
+        problem.moved(transforms, count),
+        problem.target.first(count),
+        sigma,
+        config.compatible,
+        both_ways=sigma > config.both_ways_above,
+        boundary=sigma >= config.boundary_above,
+    )
+
+
+def judge(problem: ScanAlignProblem, name: str, transforms: Tensor, config: ChoiceConfig) -> Hypothesis:
+    """Return how well the moved source and the target cover each other, and how much the graph bends for that."""
+    scale = config.normal_scale * config.cap
+    moved = problem.moved(transforms)
+    here = torch.cat((moved.points, scale * moved.normals), dim=1)
+    there = torch.cat((problem.target.points, scale * problem.target.normals), dim=1)
+    forward, backward = (
+        float((nearest_few(one, other, 1)[1] / config.cap).clamp(max=1).square().mean())
+        for one, other in ((here, there), (there, here))
+    )
+    bend = config.bend * float(problem.graph.bend(transforms))
+    return Hypothesis(name, forward + backward + bend, forward, backward, bend)
+
+
+def agree(problem: ScanAlignProblem, one: Tensor, other: Tensor, config: ChoiceConfig) -> bool:
+    """Return whether two hypotheses take nearly all samples to nearly the same places."""
+    apart = (problem.graph(one) - problem.graph(other)).norm(dim=-1)
+    return float((apart < config.same).double().mean()) >= config.same_share
