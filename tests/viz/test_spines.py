@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -67,7 +68,7 @@ def test_a_single_skeleton_is_drawn_in_its_surface(tmp_path):
         shown = image.convert("RGB")
     assert shown.size == (160, 120)
     # Colors of limbs in a gray body.
-    pixels = torch.tensor(list(shown.getdata()))
+    pixels = torch.from_numpy(np.array(shown)).reshape(-1, 3).int()
     assert int((pixels.amax(1) - pixels.amin(1) > 60).sum()) > 20
     with pytest.raises(InputError, match="single node"):
         save_skeleton_picture(tmp_path / "b.png", SPHERE, Skeleton(ends[:1], [], torch.ones(1)))
