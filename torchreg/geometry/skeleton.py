@@ -23,7 +23,7 @@ from torchreg._checks import (
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.rigid import transform_points
 
-# Neighbors of every node, and how deep a frame may be from a rotation before it is refused.
+# Neighbors of every node; how far a frame may be from a rotation before it is refused.
 _Neighbors = list[list[int]]
 _ROTATION_SLACK = 1e-3
 
