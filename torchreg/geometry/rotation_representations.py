@@ -1,0 +1,224 @@
+"""Rotations as networks give them: six numbers or a quaternion of any length, and the way to rotation vectors.
+
+Three numbers cannot describe all rotations without a jump; six, or four up to a sign, can. What a network gives is made
+a rotation here, and a rotation a rotation vector, so that the way from the numbers to the rotation that the vector
+stands for is smooth at every angle: the vector itself changes its sign at a half turn, the rotation does not.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import check_shape
+from torchreg.geometry.rotation import so3_exp
+
+# Columns shorter than this, and columns whose sine to each other is below the second, point nowhere.
+_SHORT, _COLLINEAR = 1e-12, 1e-6
+# Below this squared angle the series to fourth order is exact to float64 rounding.
+_SMALL_SQUARE = 1e-4 / 4
+
+
+def rotation_from_6d(columns: Tensor) -> Tensor:
+    """Return the rotation matrix of two columns made orthonormal, ``b1 = a1 / |a1|``, ``b2 ~ a2 - (b1 . a2) b1``.
+
+    The third column is ``b1 x b2``. Where a column is zero or both are collinear no rotation is nearer than another: a
+    first column of zero length becomes x, a second one that points nowhere the coordinate axis that lies most across
+    the first. The numbers so replaced get no gradient.
+
+    Args:
+        columns: (..., 6), the first column and then the second, of any length.
+
+    Returns:
+        (..., 3, 3) rotation matrices.
+
+    Raises:
+        InputError: if the last size is not 6.
+
+    Differentiable: in ``columns``; finite everywhere, and smooth where the columns are not collinear.
+
+    References: Zhou et al. 2019, On the continuity of rotation representations in neural networks, eq. 15.
+    """
+    check_shape(columns, "columns", (6,), batch=True)
+    axes = torch.eye(3, dtype=columns.dtype, device=columns.device)
+    first, second = columns[..., :3], columns[..., 3:]
+    first = _unit(torch.where(_length(first) < _SHORT, axes[0], first))
+    length = _length(second)
+    direction = second / length.clamp_min(_SHORT)
+    across = direction - (first * direction).sum(-1, keepdim=True) * first
+    lost = (length < _SHORT) | (_length(across) < _COLLINEAR)
+    spare = axes[first.detach().abs().argmin(-1)]
+    spare = spare - (first * spare).sum(-1, keepdim=True) * first
+    second = _unit(torch.where(lost, spare, across))
+    # Once more: nearly collinear columns leave a difference of mostly rounding.
+    second = _unit(second - (first * second).sum(-1, keepdim=True) * first)
+    return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)
+
+
+def rotation_to_6d(rotation: Tensor) -> Tensor:
+    """Return the first two columns (..., 6) of rotation matrices (..., 3, 3), see `rotation_from_6d`.
+
+    Raises:
+        InputError: if the last sizes are not 3 x 3.
+
+    Differentiable: in ``rotation``.
+    """
+    check_shape(rotation, "rotation", (3, 3), batch=True)
+    return rotation[..., :2].mT.flatten(-2)
+
+
+def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
+    """Return the rotation matrix of a quaternion of any length but zero, which gives the identity and no gradient.
+
+    Convention: scalar first, ``(w, x, y, z)``; a quaternion and its negative are the same rotation.
+
+    Args:
+        quaternion: (..., 4).
+
+    Returns:
+        (..., 3, 3) rotation matrices.
+
+    Raises:
+        InputError: if the last size is not 4.
+
+    Differentiable: in ``quaternion``; finite everywhere, and smooth away from zero.
+    """
+    w, x, y, z = _unit_quaternion(quaternion).unbind(-1)
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)
+
+
+def quaternion_from_rotation(rotation: Tensor) -> Tensor:
+    """Return the unit quaternion of a rotation matrix whose scalar is not negative.
+
+    The column of ``4 q q^T`` with the largest diagonal, so no rotation is special.
+
+    Args:
+        rotation: (..., 3, 3) rotation matrices.
+
+    Returns:
+        (..., 4), scalar first.
+
+    Raises:
+        InputError: if the last sizes are not 3 x 3.
+
+    Differentiable: in ``rotation``, also at zero; at half turns up to the sign, which may change there.
+
+    References: Shepperd 1978.
+    """
+    check_shape(rotation, "rotation", (3, 3), batch=True)
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in rotation.unbind(-2))
+    outer = (
+        (1 + xx + yy + zz, zy - yz, xz - zx, yx - xy),
+        (zy - yz, 1 + xx - yy - zz, yx + xy, xz + zx),
+        (xz - zx, yx + xy, 1 - xx + yy - zz, zy + yz),
+        (yx - xy, xz + zx, zy + yz, 1 - xx - yy + zz),
+    )
+    table = torch.stack([torch.stack(row, dim=-1) for row in outer], dim=-2)
+    largest = table.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)
+    index = largest[..., None, None].expand(*largest.shape, 1, 4)
+    return _upper(_unit(table.gather(-2, index).squeeze(-2)))
+
+
+def rotation_vector_from_quaternion(quaternion: Tensor) -> Tensor:
+    """Return the rotation vector, of an angle of at most pi, of a quaternion of any length; zero gives no rotation.
+
+    Args:
+        quaternion: (..., 4), scalar first.
+
+    Returns:
+        (..., 3), radians.
+
+    Raises:
+        InputError: if the last size is not 4.
+
+    Differentiable: in ``quaternion``, also at zero rotation and, as a rotation, at half turns: there the vector jumps
+        to its negative, and ``so3_exp`` of it stays smooth.
+    """
+    unit = _upper(_unit_quaternion(quaternion))
+    scalar, vector = unit[..., :1], unit[..., 1:]
+    square = (vector * vector).sum(-1, keepdim=True)
+    small = square < _SMALL_SQUARE
+    sine = square.masked_fill(small, 1.0).sqrt()
+    # Both branches depend on the scalar as atan2 does; atan(t) / t with t = sine / scalar where that is small.
+    ratio = (square / scalar.masked_fill(~small, 1.0).square()).masked_fill(~small, 0.0)
+    series = (1 - ratio / 3 + ratio * ratio / 5) / scalar.masked_fill(~small, 1.0)
+    return 2 * torch.where(small, series, torch.atan2(sine, scalar) / sine) * vector
+
+
+def quaternion_from_rotation_vector(rotation_vector: Tensor) -> Tensor:
+    """Return the unit quaternion (..., 4), scalar first and not negative, of rotation vectors (..., 3), radians.
+
+    Raises:
+        InputError: if the last size is not 3.
+
+    Differentiable: in ``rotation_vector``, also at zero.
+    """
+    check_shape(rotation_vector, "rotation_vector", (3,), batch=True)
+    return quaternion_from_rotation(so3_exp(rotation_vector))
+
+
+def rotation_vector_from_rotation(rotation: Tensor) -> Tensor:
+    """Return the rotation vector, of an angle of at most pi, of a rotation matrix.
+
+    Unlike the logarithm `so3_log` its gradient is right at half turns too, see `rotation_vector_from_quaternion`.
+
+    Args:
+        rotation: (..., 3, 3) rotation matrices.
+
+    Returns:
+        (..., 3), radians.
+
+    Raises:
+        InputError: if the last sizes are not 3 x 3.
+
+    Differentiable: in ``rotation``, at every angle.
+    """
+    return rotation_vector_from_quaternion(quaternion_from_rotation(rotation))
+
+
+def rotation_vector_from_6d(columns: Tensor) -> Tensor:
+    """Return the rotation vectors (..., 3), radians, of six numbers (..., 6), see `rotation_from_6d`.
+
+    Raises:
+        InputError: if the last size is not 6.
+
+    Differentiable: in ``columns``, see `rotation_from_6d`.
+    """
+    return rotation_vector_from_rotation(rotation_from_6d(columns))
+
+
+def rotation_vector_to_6d(rotation_vector: Tensor) -> Tensor:
+    """Return the six numbers (..., 6) of rotation vectors (..., 3), radians, see `rotation_to_6d`.
+
+    Raises:
+        InputError: if the last size is not 3.
+
+    Differentiable: in ``rotation_vector``, also at zero.
+    """
+    check_shape(rotation_vector, "rotation_vector", (3,), batch=True)
+    return rotation_to_6d(so3_exp(rotation_vector))
+
+
+def _unit_quaternion(quaternion: Tensor) -> Tensor:
+    check_shape(quaternion, "quaternion", (4,), batch=True)
+    identity = quaternion.new_tensor([1.0, 0.0, 0.0, 0.0])
+    return _unit(torch.where(_length(quaternion) < _SHORT, identity, quaternion))
+
+
+def _upper(quaternion: Tensor) -> Tensor:
+    return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+
+
+def _length(vector: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(vector.detach(), dim=-1, keepdim=True)
+
+
+def _unit(vector: Tensor) -> Tensor:
+    # By the largest entry first, so that the squares of short vectors do not vanish.
+    scaled = vector / vector.detach().abs().amax(-1, keepdim=True)
+    return scaled * (scaled * scaled).sum(-1, keepdim=True).rsqrt()
