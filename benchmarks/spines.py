@@ -198,7 +198,7 @@ def hands(count: int, seed: int) -> Tensor:
         row = []
         for with_spine in (True, False):
             start = time.process_time()
-            sources = {"sources": [SpineLimbs(tr.skeletonize(mesh), data.mean(0))]} if with_spine else {}
+            sources = {"sources": [SpineLimbs.of_surface(mesh, data)]} if with_spine else {}
             starts = tr.find_pose(hand, data, model_points=skin, **sources)
             seconds = time.process_time() - start
             error = (hand.keypoints(starts.best) - hand.keypoints(pose))[TIPS].norm(dim=-1).mean()

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton, build_skeleton
 from torchreg.pipelines.find_pose import find_pose
 from torchreg.pipelines.spine_source import SpineLimbs
@@ -42,6 +43,19 @@ def test_the_pose_is_found_from_the_limbs_alone(plain_hand, plain_hand_skin, pla
     starts = find_pose(plain_hand, data, sources=[source], model_points=plain_hand_skin)
     error = (plain_hand.keypoints(starts.best) - plain_hand.keypoints(pose))[TIPS].norm(dim=-1)
     assert float(error.mean()) < 0.003
+
+
+def test_the_skeleton_of_a_surface_will_do(plain_hand, plain_hand_skin, plain_hand_surface):
+    pose = bent_pose(plain_hand, 4)
+    data = plain_hand_surface(pose)[::7]
+    mesh = TriangleMesh(plain_hand_surface(pose), plain_hand_surface.faces)
+    source = SpineLimbs.of_surface(mesh, data, count=1)
+    assert len(source.skeleton.tips) == 6
+    starts = find_pose(plain_hand, data, sources=[source], model_points=plain_hand_skin)
+    error = (plain_hand.keypoints(starts.best) - plain_hand.keypoints(pose))[TIPS].norm(dim=-1)
+    assert float(error.mean()) < 0.003
+    with pytest.raises(InputError, match="data must hold at least 1"):
+        SpineLimbs.of_surface(mesh, data[:0])
 
 
 def test_bad_input_is_named(plain_hand):

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_count, check_finite, check_shape
+from torchreg._checks import as_float_tensor, check_count, check_finite, check_points, check_shape
 from torchreg.correspondence.tips import TipReference, rank_mappings
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.curves import points_along
+from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.skeleton import Skeleton
@@ -19,10 +20,12 @@ from torchreg.models.limbs import find_limbs
 from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.align_problem import AlignProblem
 from torchreg.pipelines.find_pose import typical_poses
+from torchreg.pipelines.skeletonize import SkeletonizeConfig, skeletonize
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
 
 # Mappings of limbs to chains whose poses are fitted, per typical pose, and steps of the fit.
 _MAPPINGS, _FIT_STEPS = 6, 15
+_FEW_VERTICES = 6000
 # Joints lie this near to the curves, as a share of the size of the shape; joints bend freely by so much, radians.
 _JOINT_STD, _BEND_STD = 0.02, 1.0
 
@@ -57,6 +60,22 @@ class SpineLimbs:
         check_shape(middle, "middle", (3,))
         check_finite(middle, "middle")
         check_count(self.count, "count", 1)
+
+    @classmethod
+    def of_surface(cls, mesh: TriangleMesh, data: Tensor, count: int = 2) -> SpineLimbs:
+        """Return the source of the skeleton of a surface, which is made of few vertices: limbs need no more.
+
+        Args:
+            mesh: the surface of the shape.
+            data: (M, 3) what is given to `find_pose`, such as points of that surface.
+            count: poses proposed.
+
+        Raises:
+            InputError: as `skeletonize`, or if the data are empty or not finite.
+        """
+        data = as_float_tensor(data, "data")
+        check_points(data, "data", batch=False)
+        return cls(skeletonize(mesh, SkeletonizeConfig(max_vertices=_FEW_VERTICES)), data.mean(0), count)
 
     def __call__(self, problem: AlignProblem, generator: torch.Generator) -> Tensor:
         """Return (B, K, num_dofs) poses, see `PoseSource`; every cloud of a batch is taken for the skeleton's."""
