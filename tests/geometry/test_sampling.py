@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchreg.errors import InputError
-from torchreg.geometry.sampling import farthest_points
+from torchreg.geometry.sampling import even_order, farthest_points
 
 
 def cloud(count, seed=0):
@@ -60,3 +60,21 @@ def test_bad_input_is_refused():
         farthest_points(cloud(5) * torch.nan, 2)
     with pytest.raises(InputError, match="points must have shape"):
         farthest_points(cloud(5)[:, :2], 2)
+
+
+def test_the_even_order_chooses_the_farthest_each_time():
+    points = cloud(60)
+    order = even_order(points)
+    assert torch.equal(order.sort().values, torch.arange(60))
+    assert int(order[0]) == int((points - points.mean(0)).norm(dim=-1).argmax())
+    assert torch.equal(order, farthest_points(points, 60, int(order[0])))
+    shifted = even_order((points + 1000).float())
+    assert torch.equal(shifted.sort().values, torch.arange(60))
+
+
+def test_the_even_order_holds_duplicates_once():
+    points = cloud(5).repeat(4, 1)
+    order = even_order(points)
+    assert torch.equal(order.sort().values, torch.arange(20))
+    assert len((order[:5] % 5).unique()) == 5
+    assert even_order(cloud(1)).tolist() == [0]

@@ -51,6 +51,15 @@ def test_rigid_motions_turn_normals_and_bend_nothing(graph):
     assert float(graph.bend(motions(graph))) > 0.1
 
 
+def test_slack_forgives_small_gaps(graph):
+    transforms = motions(graph, 1e-3)
+    gap = torch.linalg.vector_norm(graph.edge_gaps(transforms), dim=-1)
+    expected = (graph.edge_weights * gap.sum(-1)).sum() / len(graph.edges)
+    torch.testing.assert_close(graph.bend(transforms), expected)
+    assert float(graph.bend(transforms, 0.1)) < 0.1 * float(expected)
+    assert float(graph.bend(graph.rest(), 0.1)) == 0
+
+
 def test_gaps_are_where_neighbors_disagree(graph):
     transforms = motions(graph)
     first, second = graph.edges[2].tolist()

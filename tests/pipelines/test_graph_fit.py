@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -109,9 +111,25 @@ def test_samples_without_weight_leave_nodes_with_their_neighbors(graph):
     torch.testing.assert_close(none.transforms, graph.rest())
 
 
+def test_edges_that_give_count_less(graph):
+    transforms, matches = problem(graph)
+    gap = graph.edge_gaps(transforms).square().sum(-1).mean(-1)
+    fit = fit_graph(graph, transforms, matches, 0.7, give=0.05)
+    expected = (graph.edge_weights / (1 + gap / 0.05**2) * 2 * gap).sum() / graph.num_nodes
+    assert fit.gaps == pytest.approx(float(expected))
+    # A weight fixed before the step, as if the graph had it from the start.
+    nodes = build_node_graph(neighbor_graph(graph.points, 8), 0, 6, 3)
+    softer = DeformationGraph(
+        graph.points, graph.normals, replace(nodes, edge_weights=nodes.edge_weights / (1 + gap / 0.05**2))
+    )
+    torch.testing.assert_close(fit.transforms, fit_graph(softer, transforms, matches, 0.7).transforms)
+
+
 def test_bad_input_is_named(graph):
     transforms, matches = problem(graph)
     with pytest.raises(InputError, match="stiffness must be"):
         fit_graph(graph, transforms, matches, -1.0)
+    with pytest.raises(InputError, match="give must be positive"):
+        fit_graph(graph, transforms, matches, 1.0, give=0.0)
     with pytest.raises(InputError, match="num_steps must be at least 1"):
         fit_graph(graph, transforms, matches, 1.0, 0)

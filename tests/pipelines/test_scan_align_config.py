@@ -31,7 +31,9 @@ from torchreg.pipelines.scan_align_config import (
         (ScanAlignConfig, {"num_nodes": 0}, "num_nodes must be at least 1"),
         (ScanAlignConfig, {"curvature_radii": ()}, "curvature_radii must hold"),
         (ScanAlignConfig, {"curvature_radii": (-0.1,)}, "curvature_radii must be positive"),
-        (ScanAlignConfig, {"num_restarts": -1}, "num_restarts must be at least 0"),
+        (ScanAlignConfig, {"shrink": (-0.5,)}, "shrink must be"),
+        (RefineConfig, {"near_sigma": 0.0}, "near_sigma must be positive"),
+        (MatchConfig, {"stiffer": ()}, "stiffer must hold"),
     ],
 )
 def test_values_out_of_range_are_named(kind, arguments, message):

@@ -5,7 +5,7 @@ from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.geometry.rigid import se3_exp
 from torchreg.pipelines.scan_align_config import MatchConfig, ScanAlignConfig
-from torchreg.pipelines.scan_align_problem import describe, first_matches, spread_samples
+from torchreg.pipelines.scan_align_problem import describe, first_matches
 
 CONFIG = ScanAlignConfig(num_samples=400, num_target_samples=800, num_nodes=30)
 
@@ -46,15 +46,6 @@ def test_moved_samples_are_those_of_the_graph(problem):
     torch.testing.assert_close(rest.points, problem.source.points[:7])
     torch.testing.assert_close(rest.features, problem.source.features[:7])
     assert len(problem.moved(problem.graph.rest())) == len(problem.moved(problem.graph.rest(), 9999)) == 400
-
-
-def test_first_samples_are_even_too():
-    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(0))
-    which = torch.arange(0, 300, 2)
-    order = spread_samples(points, which)
-    assert torch.equal(order.sort().values, which)
-    near = torch.cdist(points[order[:20]], points[order[:20]]).fill_diagonal_(9).amin(1)
-    assert float(near.min()) > 0.3 * float(near.max())
 
 
 def test_most_first_matches_are_right(pair, problem):

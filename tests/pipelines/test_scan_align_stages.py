@@ -3,7 +3,8 @@ import torch
 
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import walking_figure
-from torchreg.geometry.rigid import se3_exp
+from torchreg.geometry.blend import turn_about
+from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.pipelines.graph_fit import GraphMatches
 from torchreg.pipelines.scan_align_config import (
     AssignConfig,
@@ -20,6 +21,7 @@ from torchreg.pipelines.scan_align_stages import (
     judge,
     pull_one_to_one,
     refine,
+    shrunk,
     soft_matches,
 )
 
@@ -52,7 +54,7 @@ def test_wrong_ones_among_the_first_matches_are_ignored(pair, problem, reporter)
     targets = truth[:200].clone()
     targets[::10] += 0.3
     matches = GraphMatches(torch.arange(200), targets, torch.ones(200, dtype=torch.float64))
-    fitted = fit_first_matches(problem, matches, MatchConfig(), reporter[0])
+    fitted = fit_first_matches(problem, matches, (0.2, 0.06, 0.02, 0.02), MatchConfig(), reporter[0])
     assert float(misses(pair, problem, fitted).median()) < 0.5 * float(
         misses(pair, problem, problem.graph.rest()).median()
     )
@@ -81,6 +83,23 @@ def test_small_sigmas_use_more_samples(problem):
     assert len(soft_matches(problem, problem.graph.rest(), 0.1, config).weights) == 50
     assert len(soft_matches(problem, problem.graph.rest(), 0.02, config).weights) == 250
     assert len(soft_matches(problem, problem.graph.rest(), 0.001, config).weights) == 400
+
+
+def test_a_near_start_begins_with_a_smaller_sigma(problem, reporter):
+    refine(problem, problem.graph.rest(), RefineConfig(num_steps=2, final_steps=1), reporter[0], 0.01)
+    assert [record.width for record in reporter[1]] == pytest.approx([0.02, 0.012, 0.012])
+
+
+def test_shrunk_motions_are_shares(problem):
+    rest = problem.graph.rest()
+    moved = turn_about(rest, torch.tensor([0.1, 0.2, 0.3, 0.5, -0.6, 0.7], dtype=torch.float64), problem.graph.centers)
+    half = shrunk(problem, moved, 0.5)
+    centers = problem.graph.centers.unsqueeze(1)
+    shift = transform_points(half, centers) - centers
+    torch.testing.assert_close(shift, torch.tensor([0.05, 0.1, 0.15], dtype=torch.float64).expand_as(shift))
+    torch.testing.assert_close(half[:, :3, :3] @ half[:, :3, :3], moved[:, :3, :3])
+    torch.testing.assert_close(shrunk(problem, moved, 1.0), moved)
+    torch.testing.assert_close(shrunk(problem, moved, 0.0), rest)
 
 
 def test_better_hypotheses_are_judged_better(problem, reporter):

@@ -12,7 +12,7 @@ from torchreg.pipelines.scan_align_config import RefineConfig, ScanAlignConfig
 from torchreg.pipelines.scan_alignment import align_scans
 
 SCANNER = DepthScanner(num_points=1500)
-QUICK = ScanAlignConfig(num_samples=500, num_target_samples=1000, num_nodes=40, num_restarts=0)
+QUICK = ScanAlignConfig(num_samples=500, num_target_samples=1000, num_nodes=40, shrink=(0.5,))
 QUICK = replace(
     QUICK,
     match=replace(QUICK.match, num_points=400),

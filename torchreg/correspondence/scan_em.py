@@ -32,7 +32,7 @@ class ScanEMConfig:
         InputError: if a value is out of range.
     """
 
-    normal_weight: float = 3.0
+    normal_weight: float = 5.0
     feature_weight: float = 8.0
     outliers: float = 0.3
     num_candidates: int = 10

@@ -53,12 +53,20 @@ class GraphFit:
 
 
 def fit_graph(
-    graph: DeformationGraph, transforms: Tensor, matches: GraphMatches, stiffness: float, num_steps: int = 1
+    graph: DeformationGraph,
+    transforms: Tensor,
+    matches: GraphMatches,
+    stiffness: float,
+    num_steps: int = 1,
+    *,
+    give: float | None = None,
 ) -> GraphFit:
     """Return the motions after Gauss-Newton steps on matches and stiffness.
 
     ``E = mean_i w_i (d_i^T (n_i n_i^T + slide I) d_i) + stiffness / J sum_e w_e |gap_e|^2``, d_i a sample's miss and
-    gap_e how far neighboring nodes disagree about each other, see `DeformationGraph.edge_gaps`.
+    gap_e how far neighboring nodes disagree about each other, see `DeformationGraph.edge_gaps`. With a ``give``, w_e is
+    divided by ``1 + r_e^2 / give^2`` before each step, r_e the root mean square of the edge's two gaps: parts stay
+    rigid, and what they do not share, joints take up.
 
     Args:
         graph: what is moved, float64.
@@ -66,6 +74,7 @@ def fit_graph(
         matches: see `GraphMatches`.
         stiffness: see above.
         num_steps: linear systems, at least one, none of them tested: the caller finds new matches before long.
+        give: see above, in the unit of the points; None for edges that never give.
 
     Returns:
         a `GraphFit`.
@@ -78,10 +87,12 @@ def fit_graph(
     """
     check_count(num_steps, "num_steps", 1)
     check_positive(stiffness, "stiffness", allow_zero=True)
+    if give is not None:
+        check_positive(give, "give")
     misses = gaps = 0.0
     for _ in range(num_steps):
         middles = transform_points(transforms, graph.centers.unsqueeze(1)).squeeze(1)
-        one, other = _of_matches(graph, transforms, middles, matches), _of_edges(graph, transforms, middles)
+        one, other = _of_matches(graph, transforms, middles, matches), _of_edges(graph, transforms, middles, give)
         misses, gaps = 2 * float(one.cost), 2 * float(other.cost) / graph.num_nodes
         share = stiffness / graph.num_nodes
         twists = _solved(one.hessian + share * other.hessian, one.gradient + share * other.gradient)
@@ -96,7 +107,9 @@ def _of_matches(graph: DeformationGraph, transforms: Tensor, middles: Tensor, ma
     count, few = nearest.shape
     # Where each node alone would take the sample.
     rows = transforms[:, :3].flatten(1)[nearest].unflatten(-1, (3, 4))
-    ends = (rows[..., :3] * points[:, None, None]).sum(-1) + rows[..., 3]
+    ends = rows[..., 3]
+    for axis in range(3):  # sums over three numbers are slow
+        ends = torch.addcmul(ends, rows[..., axis], points[:, axis, None, None])
     miss = (weights.unsqueeze(-1) * ends).sum(1) - matches.targets
     # Derivatives by twists (n, 3, K, 6): shift by v, turn about the node's middle by w.
     identity = torch.eye(3).to(points).expand(count, few, 3, 3)
@@ -119,12 +132,14 @@ def _of_matches(graph: DeformationGraph, transforms: Tensor, middles: Tensor, ma
     return Linearization(cost, gradient, hessian.view(size, size, 6, 6))
 
 
-def _of_edges(graph: DeformationGraph, transforms: Tensor, middles: Tensor) -> Linearization:
+def _of_edges(graph: DeformationGraph, transforms: Tensor, middles: Tensor, give: float | None) -> Linearization:
     """Return the sum of squared gaps, its gradient (J, 6) and Hessian (J, J, 6, 6)."""
     size = graph.num_nodes
     hessian, gradient = transforms.new_zeros(size * size, 6, 6), transforms.new_zeros(size, 6)
     both, gap = graph.centers[graph.edges], graph.edge_gaps(transforms)
     weight = graph.edge_weights[:, None, None]
+    if give is not None:
+        weight = weight / (1 + gap.square().sum((1, 2), keepdim=True) / (2 * give**2))
     identity = torch.eye(3).to(both).expand(*both.shape, 3)
     ends, sides = graph.edges.unbind(-1), []
     for node, sign in zip(ends, (1.0, -1.0), strict=True):

@@ -26,6 +26,7 @@ class MatchConfig:
         min_support: of the votes that a match needs.
         min_matches: with fewer the motion is not known from them.
         stiffness: of the graph, one fit after the other.
+        stiffer: the same for a second hypothesis, of parts that hardly bend.
         scale: misses beyond this count ever less in all fits but the first, length.
     """
 
@@ -38,6 +39,7 @@ class MatchConfig:
     min_support: float = 0.5
     min_matches: int = 20
     stiffness: tuple[float, ...] = (0.2, 0.06, 0.02, 0.02, 0.02)
+    stiffer: tuple[float, ...] = (6.0, 2.0, 2.0, 2.0)
     scale: float = 0.03
 
     def __post_init__(self) -> None:
@@ -45,10 +47,8 @@ class MatchConfig:
             check_count(getattr(self, name), name, 1)
         for name in ("bin_size", "max_distance", "radius", "slack", "min_support", "scale"):
             check_positive(getattr(self, name), name)
-        if not self.stiffness:
-            raise InputError("stiffness must hold at least one value, got none")
-        for value in self.stiffness:
-            check_positive(value, "stiffness")
+        for name in ("stiffness", "stiffer"):
+            _check_values(getattr(self, name), name)
 
 
 @dataclass(frozen=True)
@@ -89,8 +89,11 @@ class RefineConfig:
     Args:
         num_steps: while sigma shrinks.
         final_steps: at the last sigma.
-        sigma: first and last, length.
+        sigma: first and last, length; the first from a rough start, and
+        near_sigma: from one that should be near.
         stiffness: of the graph, first and last.
+        give: nodes that disagree by more than this hold each other less, length.
+        feature_weight: see `ScanEMConfig`, first and last: bending and hidden surroundings change features a little.
         slide: how much misses along the surface count, squared, first and last.
         fits_per_step: rounds of matching and fitting at each sigma.
         both_ways_above: sigma from which targets choose among sources too, length.
@@ -103,7 +106,10 @@ class RefineConfig:
     num_steps: int = 8
     final_steps: int = 3
     sigma: tuple[float, float] = (0.025, 0.006)
-    stiffness: tuple[float, float] = (0.1, 0.001)
+    near_sigma: float = 0.02
+    stiffness: tuple[float, float] = (0.2, 0.006)
+    give: float = 0.01
+    feature_weight: tuple[float, float] = (8.0, 1.0)
     slide: tuple[float, float] = (1.0, 0.1)
     fits_per_step: int = 2
     both_ways_above: float = 0.012
@@ -116,8 +122,10 @@ class RefineConfig:
         for name in ("num_steps", "fits_per_step", "least_samples"):
             check_count(getattr(self, name), name, 1)
         check_count(self.final_steps, "final_steps", 0)
-        for name in ("sigma", "stiffness", "slide"):
+        for name in ("sigma", "stiffness", "slide", "feature_weight"):
             _check_ends(getattr(self, name), name)
+        for name in ("near_sigma", "give"):
+            check_positive(getattr(self, name), name)
         for name in ("both_ways_above", "boundary_above", "density"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
@@ -129,21 +137,23 @@ class ChoiceConfig:
     Args:
         cap: distances count up to this, length.
         normal_scale: what normals at right angles count as, a share of sqrt(2) caps.
-        bend: what it costs that neighboring nodes disagree by one size in the mean.
+        bend: what it costs that neighboring nodes disagree by one size in the mean,
+        slack: of which less than this hardly counts, length.
         same: hypotheses whose samples are this near each other are one, length,
         same_share: for at least this share of the samples.
     """
 
     cap: float = 0.03
     normal_scale: float = 0.5
-    bend: float = 3.0
+    bend: float = 20.0
+    slack: float = 1e-3
     same: float = 0.01
     same_share: float = 0.95
 
     def __post_init__(self) -> None:
         for name in ("cap", "same", "same_share"):
             check_positive(getattr(self, name), name)
-        for name in ("normal_scale", "bend"):
+        for name in ("normal_scale", "bend", "slack"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
 
@@ -163,7 +173,7 @@ class ScanAlignConfig:
         again: the same from the best hypothesis.
         refine: the EM that ends every hypothesis.
         choice: among the hypotheses.
-        num_restarts: most further hypotheses that start from the best.
+        shrink: from the best hypothesis, motions that are these shares of its own.
 
     Raises:
         InputError: if a value is out of range.
@@ -184,16 +194,14 @@ class ScanAlignConfig:
     )
     refine: RefineConfig = field(default_factory=RefineConfig)
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
-    num_restarts: int = 1
+    shrink: tuple[float, ...] = (0.4, 0.7)
 
     def __post_init__(self) -> None:
         for name in ("num_samples", "num_target_samples", "num_nodes", "num_nearest"):
             check_count(getattr(self, name), name, 1)
-        check_count(self.num_restarts, "num_restarts", 0)
-        if not self.curvature_radii:
-            raise InputError("curvature_radii must hold at least one radius, got none")
-        for radius in self.curvature_radii:
-            check_positive(radius, "curvature_radii")
+        for share in self.shrink:
+            check_positive(share, "shrink", allow_zero=True)
+        _check_values(self.curvature_radii, "curvature_radii")
 
 
 @dataclass(frozen=True)
@@ -281,6 +289,13 @@ class ScanAlignment:
 def between(ends: tuple[float, float], share: float) -> float:
     """Return the value a share of the way from the first to the last, in even ratios."""
     return float(ends[0] * (ends[1] / ends[0]) ** min(share, 1.0))
+
+
+def _check_values(values: tuple[float, ...], name: str) -> None:
+    if not values:
+        raise InputError(f"{name} must hold at least one number, got none")
+    for value in values:
+        check_positive(value, name)
 
 
 def _check_ends(ends: tuple[float, float], name: str) -> None:

@@ -15,7 +15,7 @@ from torchreg.geometry.curvature import curvature_features
 from torchreg.geometry.node_graph import build_node_graph
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.sample_graph import neighbor_graph, sample_graph
-from torchreg.geometry.sampling import farthest_points
+from torchreg.geometry.sampling import even_order
 from torchreg.models.deformation_graph import DeformationGraph
 from torchreg.pipelines.graph_fit import GraphMatches
 from torchreg.pipelines.scan_align_config import MatchConfig, ScanAlignConfig
@@ -75,8 +75,9 @@ def describe(
     Cost: 0.3 s for scans of 8,000 points.
     """
     count = max(config.num_samples, config.num_target_samples)
-    here = spread_samples(source.points, source.uniform_subsample(count, generator=generator))
-    there = spread_samples(target.points, target.uniform_subsample(config.num_target_samples, generator=generator))
+    here = source.uniform_subsample(count, generator=generator)
+    there = target.uniform_subsample(config.num_target_samples, generator=generator)
+    here, there = here[even_order(source.points[here])], there[even_order(target.points[there])]
     middle, size = _frame(source.points[here])
     places = [
         ((scan.points[which].detach().cpu().double() - middle) / size, scan.normals[which].detach().cpu().double())
@@ -95,13 +96,6 @@ def describe(
     nodes = build_node_graph(ways, 0, config.num_nodes, config.num_nearest)
     graph = DeformationGraph(one.points[: len(samples)], one.normals[: len(samples)], nodes)
     return ScanAlignProblem(graph, one, other, samples, samples[nodes.nodes], middle, size)
-
-
-def spread_samples(points: Tensor, which: Tensor) -> Tensor:
-    """Return indices in an order in which each first few are spread evenly; the first is farthest from the middle."""
-    places = points[which].detach().cpu().double()
-    start = int((places - places.mean(0)).square().sum(-1).argmax())
-    return which[farthest_points(places, len(places), start).to(which.device)]
 
 
 def _frame(points: Tensor) -> tuple[Tensor, float]:

@@ -9,7 +9,10 @@ from torch import Tensor
 
 from torchreg.correspondence.one_to_one import count_of_spacing, match_one_to_one, typical_spacing
 from torchreg.correspondence.scan_em import SoftMatches, match_softly
+from torchreg.geometry.blend import turn_about
 from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.rigid import transform_points
+from torchreg.geometry.rotation import so3_log
 from torchreg.pipelines.graph_fit import GraphFit, GraphMatches, fit_graph
 from torchreg.pipelines.scan_align_config import (
     AssignConfig,
@@ -50,11 +53,15 @@ class Reporter:
 
 
 def fit_first_matches(
-    problem: ScanAlignProblem, matches: GraphMatches, config: MatchConfig, reporter: Reporter
+    problem: ScanAlignProblem,
+    matches: GraphMatches,
+    stiffnesses: tuple[float, ...],
+    config: MatchConfig,
+    reporter: Reporter,
 ) -> Tensor:
     """Return motions fitted to few sure matches, of which those that do not fit count less and less."""
     transforms = problem.graph.rest()
-    for step, stiffness in enumerate(config.stiffness):
+    for step, stiffness in enumerate(stiffnesses):
         weighted = matches
         if step > 0:
             miss = (problem.graph(transforms, matches.which) - matches.targets).square().sum(-1)
@@ -62,7 +69,7 @@ def fit_first_matches(
         fit = fit_graph(problem.graph, transforms, weighted, stiffness, num_steps=2)
         transforms = fit.transforms
         kept = float(weighted.weights.sum()) / len(problem.samples)
-        reporter.report("match", step, len(config.stiffness), config.scale, fit, stiffness, kept)
+        reporter.report("match", step, len(stiffnesses), config.scale, fit, stiffness, kept)
     return transforms
 
 
@@ -88,29 +95,40 @@ def pull_one_to_one(problem: ScanAlignProblem, transforms: Tensor, config: Assig
     return transforms
 
 
-def refine(problem: ScanAlignProblem, transforms: Tensor, config: RefineConfig, reporter: Reporter) -> Tensor:
+def refine(
+    problem: ScanAlignProblem,
+    transforms: Tensor,
+    config: RefineConfig,
+    reporter: Reporter,
+    first_sigma: float | None = None,
+) -> Tensor:
     """Return motions refined by EM: sigma shrinks, the graph softens, matches may slide along the surface ever more."""
     number = config.num_steps + config.final_steps
+    widths = (config.sigma[0] if first_sigma is None else first_sigma, config.sigma[1])
     for step in range(number):
         share = step / max(config.num_steps - 1, 1)
-        sigma, stiffness, slide = (between(ends, share) for ends in (config.sigma, config.stiffness, config.slide))
+        sigma, stiffness, slide = (between(ends, share) for ends in (widths, config.stiffness, config.slide))
         for _ in range(config.fits_per_step):
-            found = soft_matches(problem, transforms, sigma, config)
+            found = soft_matches(problem, transforms, sigma, config, share)
             matches = GraphMatches(slice(0, len(found.weights)), found.targets, found.weights, found.normals, slide)
-            fit = fit_graph(problem.graph, transforms, matches, stiffness)
+            fit = fit_graph(problem.graph, transforms, matches, stiffness, give=config.give)
             transforms = fit.transforms
         reporter.report("refine", step, number, sigma, fit, stiffness, float(found.weights.mean()))
     return transforms
 
 
-def soft_matches(problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: RefineConfig) -> SoftMatches:
-    """Return the matches of an E-step on as many samples as the sigma asks for."""
+def soft_matches(
+    problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: RefineConfig, share: float = 1.0
+) -> SoftMatches:
+    """Return the matches of an E-step, a share of the way through, on as many samples as the sigma asks for."""
+    first, last = config.feature_weight
+    compatible = replace(config.compatible, feature_weight=first + (last - first) * min(share, 1.0))
     count = max(round(config.density / sigma**2), config.least_samples)
     return match_softly(
         problem.moved(transforms, count),
         problem.target.first(count),
         sigma,
-        config.compatible,
+        compatible,
         both_ways=sigma > config.both_ways_above,
         boundary=sigma >= config.boundary_above,
     )
@@ -126,7 +144,7 @@ def judge(problem: ScanAlignProblem, name: str, transforms: Tensor, config: Choi
         float((nearest_few(one, other, 1)[1] / config.cap).clamp(max=1).square().mean())
         for one, other in ((here, there), (there, here))
     )
-    bend = config.bend * float(problem.graph.bend(transforms))
+    bend = config.bend * float(problem.graph.bend(transforms, config.slack))
     return Hypothesis(name, forward + backward + bend, forward, backward, bend)
 
 
@@ -134,3 +152,11 @@ def agree(problem: ScanAlignProblem, one: Tensor, other: Tensor, config: ChoiceC
     """Return whether two hypotheses take nearly all samples to nearly the same places."""
     apart = (problem.graph(one) - problem.graph(other)).norm(dim=-1)
     return float((apart < config.same).double().mean()) >= config.same_share
+
+
+def shrunk(problem: ScanAlignProblem, transforms: Tensor, share: float) -> Tensor:
+    """Return motions that turn and shift every node by a share of what it did."""
+    centers = problem.graph.centers
+    shift = transform_points(transforms, centers.unsqueeze(1)).squeeze(1) - centers
+    twists = share * torch.cat((shift, so3_log(transforms[:, :3, :3])), dim=-1)
+    return turn_about(problem.graph.rest(), twists, centers)

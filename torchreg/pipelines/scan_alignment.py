@@ -12,6 +12,7 @@ from torchreg.geometry.neighbors import nearest_few
 from torchreg.geometry.node_graph import spread_weights
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.pipelines.scan_align_config import (
+    AssignConfig,
     Hypothesis,
     OnStep,
     ScanAlignConfig,
@@ -21,11 +22,11 @@ from torchreg.pipelines.scan_align_config import (
 from torchreg.pipelines.scan_align_problem import ScanAlignProblem, describe, first_matches
 from torchreg.pipelines.scan_align_stages import (
     Reporter,
-    agree,
     fit_first_matches,
     judge,
     pull_one_to_one,
     refine,
+    shrunk,
     soft_matches,
 )
 
@@ -79,7 +80,7 @@ def align_scans(
             on_step(record)
 
     problem = describe(source, target, config, generator)
-    found = sorted(_hypotheses(problem, config, report), key=lambda pair: pair[0].energy)
+    found = sorted(_hypotheses(problem, config, report), key=_energy)
     chosen, transforms = found[0]
     weights = spread_weights(
         problem.normalized(source.points),
@@ -111,29 +112,37 @@ def _hypotheses(
 ) -> Iterator[tuple[Hypothesis, Tensor]]:
     """Yield hypotheses and their motions."""
     found: list[tuple[Hypothesis, Tensor]] = []
-
-    def finish(transforms: Tensor, reporter: Reporter) -> tuple[Hypothesis, Tensor]:
-        transforms = refine(problem, transforms, config.refine, reporter)
-        found.append((judge(problem, reporter.name, transforms, config.choice), transforms))
-        return found[-1]
+    rest = problem.graph.rest()
+    far, near = config.refine.sigma[0], config.refine.near_sigma
 
     def reporter(name: str) -> Reporter:
         return Reporter(name, problem.size, on_step)
 
+    def refined(name: str, transforms: Tensor, sigma: float) -> tuple[Hypothesis, Tensor]:
+        transforms = refine(problem, transforms, config.refine, reporter(name), sigma)
+        found.append((judge(problem, name, transforms, config.choice), transforms))
+        return found[-1]
+
+    def pulled(name: str, transforms: Tensor, stage: AssignConfig) -> tuple[Hypothesis, Tensor]:
+        return refined(name, pull_one_to_one(problem, transforms, stage, reporter(name)), far)
+
+    yield refined("rest", rest, near)
     matches = first_matches(problem, config.match)
     if len(matches.weights) >= config.match.min_matches:
-        fitted = fit_first_matches(problem, matches, config.match, reporter("matches"))
-        yield finish(fitted, reporter("matches"))
-        pulled = reporter("matches, one to one")
-        yield finish(pull_one_to_one(problem, fitted, config.reassign, pulled), pulled)
-    alone = reporter("one to one")
-    yield finish(pull_one_to_one(problem, problem.graph.rest(), config.assign, alone), alone)
-    for _ in range(config.num_restarts):
-        best = min(found, key=lambda pair: pair[0].energy)
-        if all(agree(problem, best[1], other, config.choice) for _, other in found):
-            return
-        again = reporter("again")
-        yield finish(pull_one_to_one(problem, best[1], config.again, again), again)
+        for name, stiffness in (("matches", config.match.stiffness), ("stiff matches", config.match.stiffer)):
+            fitted = fit_first_matches(problem, matches, stiffness, config.match, reporter(name))
+            yield refined(name, fitted, near)
+            if name == "matches":
+                yield pulled("matches, one to one", fitted, config.reassign)
+    yield pulled("one to one", rest, config.assign)
+    yield pulled("again", min(found, key=_energy)[1], config.again)
+    _, best = min(found, key=_energy)
+    for share in config.shrink:
+        yield refined(f"{share:g} of it", shrunk(problem, best, share), near)
+
+
+def _energy(found: tuple[Hypothesis, Tensor]) -> float:
+    return found[0].energy
 
 
 def _in_user_frame(problem: ScanAlignProblem, transforms: Tensor) -> Tensor:
