@@ -66,8 +66,8 @@ def test_descent_finds_a_half_turn_from_none(hand):
     start = hand.rest_pose()
     start[3:6] = torch.tensor([0.1, 0.05, 0.2], dtype=D)
     place, turn, joints = head.features(start).split([3, 6, 21])
-    optimizer = torch.optim.Adam([turn.requires_grad_()], 0.1)
-    for _ in range(80):
+    optimizer = torch.optim.SGD([turn.requires_grad_()], 0.1)
+    for _ in range(200):
         optimizer.zero_grad()
         pose = head(torch.cat([place, turn, joints]))
         loss = (so3_exp(pose[3:6]) - so3_exp(target[3:6])).square().sum()
