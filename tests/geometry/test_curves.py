@@ -11,6 +11,7 @@ from torchreg.geometry.curves import (
     curve_lengths,
     follow,
     points_along,
+    smooth_curve,
     tangents,
     turn_between,
 )
@@ -106,3 +107,14 @@ def test_points_along_a_curve_lie_at_their_lengths():
     right = torch.tensor([[[0.0, 0, 0], [0.5, 0, 0], [1, 0, 0]], [[1, 1, 0], [1, 2, 0], [1, 2, 0]]]).double()
     torch.testing.assert_close(found, right)
     torch.testing.assert_close(points_along(curve[:1], torch.tensor([0.0, 1.0]).double()), torch.zeros(2, 3).double())
+
+
+def test_smoothing_keeps_ends_and_straight_lines_and_takes_the_zigzag_out():
+    line = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None] * torch.tensor([1.0, 2.0, -1.0])
+    smooth = smooth_curve(line, 0.3)
+    assert torch.equal(smooth[[0, -1]], line[[0, -1]])
+    torch.testing.assert_close(smooth, torch.linspace(0, 1, 65, dtype=torch.float64)[:, None] * line[-1])
+    zigzag = line + 0.1 * torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=torch.float64).repeat(20, 1)
+    assert float(curve_lengths(zigzag)) > 2 * float(curve_lengths(line))
+    assert float(curve_lengths(smooth_curve(zigzag, 0.3))) < 1.15 * float(curve_lengths(line))
+    torch.testing.assert_close(smooth_curve(circle(), 0.05), circle(), rtol=0, atol=0.02)

@@ -11,6 +11,7 @@ from torchreg.pipelines.spine_imposing import (
     complete,
     doubt_lengths,
     own_limbs,
+    steadied,
     travelling_frames,
     usual_lengths,
 )
@@ -116,3 +117,16 @@ def test_frames_travel_with_a_body_that_turns(creature):
     rigid = torch.stack((curves[0], curves[0] @ turn.mT))
     moved = travelling_frames(rigid, 0)
     torch.testing.assert_close(moved[1], turn @ moved[0], atol=1e-6, rtol=0)
+
+
+def test_only_limbs_that_zigzag_are_smoothed(creature):
+    plain = star(creature.curves[1], creature.radii)
+    assert steadied(plain) is plain
+    rough = creature.curves[1].clone()
+    rough[2, 1:-1] += 0.05 * torch.randn(46, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    calm = steadied(star(rough, creature.radii))
+    tips = creature.curves[1, :, -1]
+    torch.testing.assert_close(calm.nodes[calm.tips], tips)
+    assert calm.topology == plain.topology
+    torch.testing.assert_close(calm.limb_lengths, plain.limb_lengths, rtol=0.12, atol=0)
+    assert torch.equal(calm.nodes[calm.limbs[0]], plain.nodes[plain.limbs[0]])

@@ -33,6 +33,22 @@ def points_along(curve: Tensor, lengths: Tensor) -> Tensor:
     return curve[before] + share.unsqueeze(-1) * (curve[after] - curve[before])
 
 
+def smooth_curve(curve: Tensor, share: float, count: int = 65) -> Tensor:
+    """Return a curve (n, 3) as ``count`` points at equal intervals, averaged over a share of its length; its ends stay.
+
+    Differentiable: in the curve, with the places along it held fixed.
+    """
+    whole = float(curve_lengths(curve.detach()))
+    even = points_along(curve, torch.linspace(0, whole, count, dtype=curve.dtype, device=curve.device))
+    half = min(round(0.5 * share * (count - 1)), count - 1)
+    # Turned about its ends: a straight curve stays what it is.
+    before, after = (
+        2 * even[:1] - even[1 : half + 1].flip(0),
+        2 * even[-1:] - even[count - 1 - half : count - 1].flip(0),
+    )
+    return torch.cat((before, even, after)).unfold(0, 2 * half + 1, 1).mean(-1)
+
+
 def bend_angles(curves: Tensor) -> Tensor:
     """Return how far curves (..., S, 3) turn at their inner points, (..., S - 2) radians from 0 to pi.
 

@@ -24,6 +24,7 @@ from torchreg.pipelines.spine_imposing import (
     complete,
     doubt_lengths,
     own_limbs,
+    steadied,
     travelling_frames,
     usual_lengths,
 )
@@ -101,6 +102,7 @@ def extract_spine(
         check_count(workers, "workers", 1)
     with torch.no_grad():
         skeletons = skeletonize_frames(meshes, config.skeletons, workers=workers, on_step=on_step, progress=progress)
+        skeletons = [steadied(skeleton) for skeleton in skeletons]
         names = name_tips(skeletons, config.num_tips)
         graph = _graph(skeletons, names)
         own = _own(skeletons, names, graph, config.num_samples)

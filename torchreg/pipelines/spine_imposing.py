@@ -10,17 +10,19 @@ import torch
 from torch import Tensor
 
 from torchreg.correspondence.local_icp import carry_nodes
-from torchreg.geometry.curves import curve_frames, curve_lengths, follow, tangents
+from torchreg.geometry.curves import curve_frames, curve_lengths, follow, smooth_curve, tangents
 from torchreg.geometry.depth_field import DepthField, draw_inside
 from torchreg.geometry.labeled_tree import LimbGraph, gather_nodes, number_nodes, path_lengths, place_junctions
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import fit_rigid
-from torchreg.geometry.skeleton import Skeleton, resample_curve
+from torchreg.geometry.skeleton import Skeleton, build_skeleton, resample_curve
 
 # A limb of a frame is its own if its length is within these shares of its usual one.
 _LENGTHS, _LENGTHS_TOUCHING = (0.65, 1.5), (0.9, 1.1)
 # Limbs that have more than this share of the shorter one's way in common hold each other.
 _COMMON = 0.15
+# A limb that is longer by this factor than its mean over this share of its length zigzags.
+_ZIGZAG, _WINDOW = 1.1, 0.25
 # Surface points that carry limbs from frame to frame, and how far along the skeleton they act, in shares of its extent.
 _SURFACE_POINTS, _WIDTHS = 1200, (0.5, 0.25, 0.12, 0.06)
 
@@ -42,6 +44,25 @@ class FrameLimbs:
     own: Tensor
     placed: Tensor
     nodes: Tensor
+
+
+def steadied(skeleton: Skeleton) -> Skeleton:
+    """Return the skeleton with those limbs smoothed that zigzag, as in a surface full of noise; tips keep their order.
+
+    A limb zigzags if it is much longer than the same limb averaged over a share of its length.
+    """
+    rows, zigzag = [], False
+    for limb in skeleton.limbs:
+        nodes, radii = skeleton.nodes[limb], skeleton.radii[limb]
+        smooth = smooth_curve(nodes, _WINDOW)
+        if curve_lengths(nodes) > _ZIGZAG * curve_lengths(smooth):
+            zigzag = True
+            nodes = smooth
+            radii = radii.mean().expand(len(smooth))
+        rows.append((nodes, radii, torch.eye(3).to(nodes).expand(len(nodes), 3, 3)))
+    if not zigzag:
+        return skeleton
+    return build_skeleton(rows, [(first, last) for first, last in skeleton.limb_ends.tolist()], skeleton.notes)
 
 
 def own_limbs(skeleton: Skeleton, named: Sequence[int], graph: LimbGraph, num_samples: int) -> FrameLimbs:
