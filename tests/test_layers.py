@@ -35,6 +35,9 @@ OWNERS = {
     "kornia": {"geometry/rotation.py", "geometry/rigid.py", "capture"},
     "scipy": {"solvers", "geometry"},
     "skimage": {"capture"},
+    "cv2": {"capture"},
+    "PIL": {"io", "viz"},
+    "OpenEXR": {"io"},
     "trimesh": {"io", "viz"},
     "pygltflib": {"io", "viz"},
     "safetensors": {"io", "pipelines"},
@@ -44,9 +47,14 @@ OWNERS = {
     "typer": {"cli"},
     "tqdm": {"cli"},
 }
-LAZY = {"matplotlib", "viser", "plotly"}
+LAZY = {"matplotlib", "viser", "plotly", "cv2", "PIL", "OpenEXR"}
 LOWEST_THIRD_PARTY = {"errors.py": set(), "results.py": {"torch"}, "metrics.py": {"torch"}, "_checks.py": {"torch"}}
-IMPORT_NAMES = {"pytorch-kinematics": "pytorch_kinematics", "scikit-image": "skimage"}
+IMPORT_NAMES = {
+    "pytorch-kinematics": "pytorch_kinematics",
+    "scikit-image": "skimage",
+    "pillow": "PIL",
+    "opencv-python-headless": "cv2",
+}
 
 
 @dataclass(frozen=True)

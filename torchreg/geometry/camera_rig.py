@@ -1,0 +1,180 @@
+"""Several calibrated cameras: a rig of named ones, and two side by side that measure depth by disparity."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.camera import Camera
+
+# Rows of a rectified pair may differ by this many pixels.
+_ROW_SLACK = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class CameraRig:
+    """Cameras in one world, each under a name of its own.
+
+    Args:
+        cameras: at least one; those without a name get their number.
+
+    Raises:
+        InputError: if there is none or two share a name.
+        InputTypeError: if something else than a camera is among them.
+    """
+
+    cameras: tuple[Camera, ...]
+
+    def __post_init__(self) -> None:
+        for camera in self.cameras:
+            if not isinstance(camera, Camera):
+                raise InputTypeError(f"cameras must be Camera records, got {type(camera).__name__}")
+        named = tuple(
+            camera if camera.name else replace(camera, name=f"camera{number}")
+            for number, camera in enumerate(self.cameras)
+        )
+        if not named:
+            raise InputError("cameras must hold at least one camera, got none")
+        names = [camera.name for camera in named]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise InputError(f"cameras must have different names, got {', '.join(twice)} more than once")
+        object.__setattr__(self, "cameras", named)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The cameras' names, in order."""
+        return tuple(camera.name for camera in self.cameras)
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __iter__(self) -> Iterator[Camera]:
+        return iter(self.cameras)
+
+    def __getitem__(self, which: int | str) -> Camera:
+        """Return a camera by its place or name.
+
+        Raises:
+            InputError: if there is none of that name.
+        """
+        if isinstance(which, int):
+            return self.cameras[which]
+        if which not in self.names:
+            raise InputError(f"the rig has no camera {which!r}, it has {', '.join(self.names)}")
+        return self.cameras[self.names.index(which)]
+
+    def stereo(self, left: int | str = 0, right: int | str = 1) -> StereoPair:
+        """Return two of the cameras as a pair.
+
+        Raises:
+            InputError: as `StereoPair`, and if there are not two.
+        """
+        if len(self) < 2:
+            raise InputError(f"a stereo pair takes two cameras, the rig has {len(self)}")
+        return StereoPair(self[left], self[right])
+
+
+@dataclass(frozen=True, eq=False)
+class StereoPair:
+    """Two cameras side by side.
+
+    In a rectified pair a point at depth z is at ``x_left - x_right = fx baseline / z + cx_left - cx_right`` in the same
+    row of both pictures.
+
+    Args:
+        left: the camera on the left, seen from behind.
+        right: the camera on the right.
+
+    Raises:
+        InputError: if the cameras stand at one place, look away from each other by more than 60 degrees, or are
+            swapped: the right one on the left of the left one.
+    """
+
+    left: Camera
+    right: Camera
+
+    def __post_init__(self) -> None:
+        step, turn = self.displacement, self.rotation
+        if not float(step.norm()) > 0:
+            raise InputError("left and right must stand at different places, got both at one")
+        if float(turn[2, 2]) < 0.5:
+            raise InputError("left and right must look the same way, got more than 60 degrees between them")
+        if float(step[0]) <= 0:
+            raise InputError(
+                f"left and right are swapped: the right camera stands {-float(step[0]):.4g} to the left of the left "
+                f"one; exchange the cameras, and the pictures with them"
+            )
+
+    @property
+    def displacement(self) -> Tensor:
+        """Where the right camera stands in the coordinates of the left one, (3,) float64."""
+        motion = (
+            self.left.world_to_camera.double() @ self.right.camera_to_world.to(self.left.intrinsics.device).double()
+        )
+        return motion[:3, 3]
+
+    @property
+    def rotation(self) -> Tensor:
+        """How the right camera is turned against the left one, ``R_left_right`` (3, 3) float64."""
+        motion = (
+            self.left.world_to_camera.double() @ self.right.camera_to_world.to(self.left.intrinsics.device).double()
+        )
+        return motion[:3, :3]
+
+    @property
+    def baseline(self) -> float:
+        """Distance between the cameras, metres."""
+        return float(self.displacement.norm())
+
+    def row_error(self) -> float:
+        """Return the largest distance in pixels between rows or scales of the pictures that should be the same."""
+        left, right = self.left, self.right
+        if left.is_distorted or right.is_distorted or (left.width, left.height) != (right.width, right.height):
+            return torch.inf
+        edge = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
+        pixels = edge * edge.new_tensor([left.width - 1, left.height - 1])
+        left, right = left.to(device="cpu", dtype=torch.float64), right.to(device="cpu", dtype=torch.float64)
+        far = left.unproject(pixels, torch.full((4,), 1e6 * self.baseline, dtype=torch.float64))
+        near = left.unproject(pixels, torch.full((4,), 10 * self.baseline, dtype=torch.float64))
+        (there, _), (here, _) = right.project(far), right.project(near)
+        rows = torch.stack((there[:, 1], here[:, 1])) - pixels[:, 1]
+        # Far away there is no disparity but that of the principal points, the same all over the picture.
+        shift = there[:, 0] - pixels[:, 0] - (right.intrinsics[2] - left.intrinsics[2])
+        return float(torch.cat((rows.flatten(), shift)).abs().nan_to_num(torch.inf).max())
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether a point appears in the same row of both pictures, to a tenth of a pixel."""
+        return self.row_error() <= _ROW_SLACK
+
+    def check_rectified(self) -> None:
+        """Raise InputError unless the pair is rectified."""
+        if not self.is_rectified:
+            raise InputError(
+                f"the pair is not rectified: rows or scales differ by up to {self.row_error():.3g} pixels, or the "
+                f"lenses distort; pass pictures and cameras through torchreg.capture.rectify first"
+            )
+
+    def disparity(self, depth: Tensor) -> Tensor:
+        """Return the disparities (...,) in pixels of depths (...,) before a rectified pair."""
+        return self._scale() / depth + self._shift()
+
+    def depth(self, disparity: Tensor) -> Tensor:
+        """Return the depths (...,) of disparities (...,) of a rectified pair; NaN where there is no such depth."""
+        parallax = disparity - self._shift()
+        return torch.where(parallax > 0, self._scale() / torch.where(parallax > 0, parallax, 1.0), torch.nan)
+
+    def depth_std(self, depth: Tensor, disparity_std: Tensor | float) -> Tensor:
+        """Return the standard deviations (...,) of depths from those s of disparities, ``z^2 s / (fx baseline)``."""
+        return depth**2 * disparity_std / self._scale()
+
+    def _scale(self) -> float:
+        return float(self.left.intrinsics[0]) * self.baseline
+
+    def _shift(self) -> float:
+        return float(self.left.intrinsics[2] - self.right.intrinsics[2])
