@@ -5,6 +5,7 @@ import torch
 
 from torchreg.datasets.creatures import STARFISH, creature_sequence
 from torchreg.geometry.labeled_tree import LimbGraph
+from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import build_skeleton
 from torchreg.pipelines.spine_imposing import (
     FrameLimbs,
@@ -91,7 +92,9 @@ def test_lost_limbs_are_carried_over_and_lie_on_the_true_axes(creature, lost):
         skeleton = star(creature.curves[frame], creature.radii, arms=(0, 1, 2, 4))
         frames[frame] = own_limbs(skeleton, [0, 1, 2, -1, 3], STAR, SAMPLES)
         assert frames[frame].own.tolist() == [True, True, True, False, True]
-    done = complete(frames, STAR, creature.meshes)
+    meshes = list(creature.meshes)
+    meshes[1] = TriangleMesh(meshes[1].vertices, meshes[1].faces.flip(1))  # the winding does not matter
+    done = complete(frames, STAR, meshes)
     for frame in range(FRAMES):
         if frame not in lost:
             assert done[frame] is frames[frame]

@@ -143,11 +143,7 @@ def doubt_lengths(frame: FrameLimbs, usual: Tensor, graph: LimbGraph, *, touchin
     return replace(frame, own=frame.own & ~odd, placed=placed)
 
 
-def complete(
-    frames: Sequence[FrameLimbs],
-    graph: LimbGraph,
-    meshes: Sequence[TriangleMesh],
-) -> list[FrameLimbs]:
+def complete(frames: Sequence[FrameLimbs], graph: LimbGraph, meshes: Sequence[TriangleMesh]) -> list[FrameLimbs]:
     """Return the frames with all limbs: those that a frame lacks are carried over from the frames around it.
 
     A limb is carried from frame to frame: moved with what is known there, and drawn into the body to its own depth.
@@ -230,10 +226,11 @@ def _carry(
 
 
 def _surface_points(mesh: TriangleMesh) -> tuple[Tensor, Tensor]:
-    """Return the vertices (V, 3) that faces use, and their normals, float64."""
+    """Return the vertices (V, 3) that faces use, and their normals, outwards, float64."""
     mesh = TriangleMesh(mesh.vertices.detach().cpu().double(), mesh.faces.cpu())
     used = mesh.faces.reshape(-1).unique()
-    return mesh.vertices[used], mesh.vertex_normals()[used]
+    volume = torch.linalg.det((mesh.vertices - mesh.vertices[used].mean(0))[mesh.faces]).sum()
+    return mesh.vertices[used], mesh.vertex_normals()[used] * (-1 if volume < 0 else 1)
 
 
 def _sure_nodes(frame: FrameLimbs, graph: LimbGraph) -> Tensor:
@@ -261,12 +258,7 @@ def _settled(limbs: FrameLimbs, frame: FrameLimbs, graph: LimbGraph, field: Dept
     width[ends[:, 0]], width[ends[:, 1]] = limbs.radii[:, 0], limbs.radii[:, -1]
     free = ~sure
     if bool(free.any()):
-        nodes[free] = draw_inside(
-            field,
-            nodes[free].unsqueeze(1).expand(-1, 2, -1),
-            width[free, None].expand(-1, 2),
-            torch.ones(int(free.sum()), 2, dtype=torch.bool),
-        )[:, 0]
+        nodes[free] = draw_inside(field, nodes[free], width[free], free[free], stiffness=0.0)
     share = torch.linspace(0, 1, curves.shape[1], dtype=curves.dtype)[None, :, None]
     start, end = nodes[ends[:, 0]] - curves[:, 0], nodes[ends[:, 1]] - curves[:, -1]
     curves = curves + (1 - share) * start[:, None] + share * end[:, None]
