@@ -80,3 +80,24 @@ def test_starts_give_their_best_and_one_cloud_of_a_batch():
     torch.testing.assert_close(row.best, torch.tensor([12.0, 13, 14, 15]))
     assert row.costs.tolist() == [3.0, 4.0, 5.0]
     assert float(row.confidence) == 0.75
+
+
+def bones(*shifts, weights):
+    """Four points in a row on two bones or more, shifted along x by so much each."""
+    motions = torch.eye(4).repeat(len(shifts), 1, 1)
+    motions[:, 0, 3] = torch.tensor(shifts)
+    labels = weights.argmax(-1)
+    deformed = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]) + motions[labels, :3, 3]
+    empty = torch.zeros(4)
+    return results.ScanRegistration(
+        torch.nn.Identity(), deformed, labels, motions, weights, empty, empty > 0, Status.CONVERGED, empty
+    )
+
+
+def test_bones_that_meet_and_move_alike_are_one_part():
+    blend = torch.tensor([[1, 0, 0], [0.6, 0.4, 0], [0, 0.6, 0.4], [0, 0, 1]])
+    assert bones(0.0, 0.01, 1.0, weights=blend).parts().tolist() == [0, 0, 0, 1]
+    assert bones(0.0, 0.5, 1.0, weights=blend).parts().tolist() == [0, 0, 1, 2]
+    assert bones(0.0, 0.5, 1.0, weights=blend).parts(0.2).tolist() == [0, 0, 0, 0]
+    apart = torch.tensor([[1.0, 0, 0], [1, 0, 0], [0, 0, 1], [0, 0, 1]])
+    assert bones(0.0, 0.0, 0.0, weights=apart).parts().tolist() == [0, 0, 1, 1]

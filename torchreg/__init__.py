@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from torchreg.pipelines.calibrate import calibrate
     from torchreg.pipelines.extract_spine import SpineConfig, extract_spine
     from torchreg.pipelines.find_pose import FindPoseConfig, find_pose
+    from torchreg.pipelines.register import register
+    from torchreg.pipelines.register_config import RegisterConfig
     from torchreg.pipelines.skeletonize import SkeletonizeConfig, skeletonize
     from torchreg.pipelines.solve_pose import solve_pose
     from torchreg.pipelines.storage import load
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
         FrameResult,
         PoseSolution,
         PoseStarts,
+        ScanRegistration,
         SpineSequence,
         Status,
         TrackResult,
@@ -58,6 +61,8 @@ __all__ = [
     "PoseSolution",
     "PoseStarts",
     "RangeScan",
+    "RegisterConfig",
+    "ScanRegistration",
     "SigmaSchedule",
     "Skeleton",
     "SkeletonizeConfig",
@@ -80,6 +85,7 @@ __all__ = [
     "load_mesh",
     "load_points",
     "metrics",
+    "register",
     "sample_skin",
     "skeletonize",
     "solve_pose",
@@ -102,6 +108,8 @@ _OWNERS = {
     "PoseSolution": "results",
     "PoseStarts": "results",
     "RangeScan": "geometry.range_scan",
+    "RegisterConfig": "pipelines.register_config",
+    "ScanRegistration": "results",
     "SigmaSchedule": "correspondence.sigma",
     "Skeleton": "geometry.skeleton",
     "SkeletonizeConfig": "pipelines.skeletonize",
@@ -121,6 +129,7 @@ _OWNERS = {
     "load": "pipelines.storage",
     "load_mesh": "io.points",
     "load_points": "io.points",
+    "register": "pipelines.register",
     "sample_skin": "models.skin",
     "skeletonize": "pipelines.skeletonize",
     "solve_pose": "pipelines.solve_pose",

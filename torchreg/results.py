@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Generic, TypeVar
 
+import torch
 from torch import Tensor, nn
 
 from torchreg.errors import TorchregError
@@ -24,6 +25,10 @@ def register_writer(writer: Writer) -> None:
     """Make ``writer(result, path)`` what `Result.save` calls."""
     global _writer
     _writer = writer
+
+
+# Shared weight, as a share of all points, from which two bones meet.
+_MEETING = 1e-3
 
 
 class Result:
@@ -407,3 +412,88 @@ class PoseSolution(Result):
     gaps: Tensor
     num_steps: int
     status: Status | tuple[Status, ...]
+
+
+@dataclass(frozen=True)
+class RegisterRecord:
+    """One step of a scan registration, as given to ``on_step``. Counts of matches are sums over the frames.
+
+    Args:
+        stage: "initialize", of which only the first five fields tell; "align", labels and motions in turn; or "refine",
+            weights and motions in turn.
+        step: number of the step in its stage.
+        num_steps: steps planned in the stage.
+        distance: weighted mean squared distance of the matches, squared shares of the source's diagonal.
+        joint: sum of the squared gaps of the joints that are held, squared shares of the diagonal.
+        smoothness: pairs of neighboring cells with different labels.
+        num_labels: bones alive.
+        kept: matches that hold.
+        boundary: matches dropped because the target is on a boundary.
+        far: matches dropped because of their distance.
+        turned: matches dropped because normals differ.
+    """
+
+    stage: str
+    step: int
+    num_steps: int
+    distance: float
+    joint: float
+    smoothness: int
+    num_labels: int
+    kept: int
+    boundary: int
+    far: int
+    turned: int
+
+
+@dataclass(frozen=True)
+class ScanRegistration(Result, Generic[Shape]):
+    """A range scan taken onto another by B bones, in the unit and frame of the scans.
+
+    Args:
+        model: the `GridLBS`: ``model(points)`` deforms any points, ``model(points, transforms)`` poses them anew.
+        deformed: (N, 3) source points moved onto the target.
+        labels: (N,) int64, the bone with the largest weight at each source point.
+        transforms: (B, 4, 4) of the bones.
+        weights: (N, B) of the bones at the source points, rows sum to one.
+        distances: (N,) from moved points to the nearest point of the target, seen there or not.
+        matched: (N,) True where a moved point has a compatible counterpart in the target.
+        status: how the registration ended.
+        seconds: (4,) setup, initialization, alignment, refinement.
+        history: one `RegisterRecord` per step of the last two stages.
+    """
+
+    model: Shape
+    deformed: Tensor
+    labels: Tensor
+    transforms: Tensor
+    weights: Tensor
+    distances: Tensor
+    matched: Tensor
+    status: Status
+    seconds: Tensor
+    history: tuple[RegisterRecord, ...] = ()
+
+    def parts(self, tolerance: float = 0.01) -> Tensor:
+        """Return labels (N,) int64 in which bones that meet and moved as one are one part, numbered from 0.
+
+        Bones outnumber parts where a surface stretches, or where two scans do not tell parts apart: two bones moved as
+        one if the motion of either takes the other's points within ``tolerance`` of where they went, in the mean.
+
+        Args:
+            tolerance: share of the diagonal of the moved points.
+        """
+        points, motions = self.deformed.double(), self.transforms.double()
+        size = float((points.amax(0) - points.amin(0)).norm())
+        own = nn.functional.one_hot(self.labels, len(motions)).double()
+        # Of every bone's points, how far the motion of every other bone takes them from where they went.
+        between = motions.unsqueeze(1) @ torch.linalg.inv(motions).unsqueeze(0)
+        places = torch.einsum("abij,nj->abni", between[..., :3, :3], points) + between[..., None, :3, 3]
+        apart = torch.einsum("abn,nb->ab", (places - points).norm(dim=-1), own) / own.sum(0)
+        weights = self.weights.double()
+        meet = weights.mT @ weights > _MEETING * len(points)
+        one = meet & (apart.nan_to_num(torch.inf) <= tolerance * size)
+        reach = (one | one.mT | torch.eye(len(motions), dtype=torch.bool, device=one.device)).double()
+        for _ in range(len(motions)):
+            reach = ((reach @ reach) > 0).double()
+        return reach.argmax(1)[self.labels].unique(return_inverse=True)[1]

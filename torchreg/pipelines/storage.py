@@ -36,7 +36,9 @@ from torchreg.results import (
     FrameResult,
     PoseSolution,
     PoseStarts,
+    RegisterRecord,
     Result,
+    ScanRegistration,
     SpineSequence,
     Status,
     TrackResult,
@@ -54,6 +56,7 @@ _RESULTS: dict[str, type[Result]] = {
         FrameResult,
         PoseSolution,
         PoseStarts,
+        ScanRegistration,
         SpineSequence,
         TrackResult,
         TrackState,
@@ -61,7 +64,8 @@ _RESULTS: dict[str, type[Result]] = {
 }
 _SHAPE_RECORDS = (ShapeRecord, ShapeSpec, HandSpec, KinematicTree, Joint, Primitive, RigSurface)
 _RECORDS: dict[str, type] = {
-    kind.__name__: kind for kind in (AlignRecord, GridLBSRecord, SpineFields, TrackResult, *_SHAPE_RECORDS)
+    kind.__name__: kind
+    for kind in (AlignRecord, GridLBSRecord, RegisterRecord, SpineFields, TrackResult, *_SHAPE_RECORDS)
 }
 _ENUMS: dict[str, type[Enum]] = {kind.__name__: kind for kind in (Status,)}
 

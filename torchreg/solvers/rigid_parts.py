@@ -20,8 +20,8 @@ def merge_rigid(moments: RigidMoments, edges: Tensor, num_parts: int, *, toleran
         moments: of G patches.
         edges: (E, 2) pairs of patches that touch; parts that nothing joins never merge, however many are left.
         num_parts: merging stops when so many are left and
-        tolerance: the next merger would cost more than this share of the mass of both (squared units); with the
-            default, mergers that cost nothing but rounding are all that happens below ``num_parts``.
+        tolerance: no merger is left that costs at most this, in the unit of `RigidMoments.cost`: fewer parts are left
+            where more say little.
 
     Returns:
         (G,) int64 parts from 0, numbered by their first patches.
@@ -51,8 +51,8 @@ def merge_rigid(moments: RigidMoments, edges: Tensor, num_parts: int, *, toleran
     left = size
     while left > 1:
         first, second = divmod(int(price.argmin()), size)
-        cost, mass = float(price[first, second]), float(sums[:, [first, second], 0].sum())
-        if cost == float("inf") or (left <= num_parts and cost > tolerance * mass):
+        cost = float(price[first, second])
+        if cost == float("inf") or (left <= num_parts and cost > tolerance):
             break
         left -= 1
         sums[:, first] += sums[:, second]

@@ -1,0 +1,227 @@
+"""Fitting bones, labels and weights to a scan in several frames at once: the steps of scan registration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchreg.correspondence.compatible import CompatibleMatcher
+from torchreg.geometry.joint_moments import JointMoments
+from torchreg.geometry.range_scan import RangeScan
+from torchreg.losses.grid import JointEnergy
+from torchreg.models.grid_lbs import GridLBS
+from torchreg.pipelines.bone_fit import fit_bones
+from torchreg.pipelines.bone_labels import CellData, LabelCosts, Pull, first_labels, relabel, reuse_labels
+from torchreg.pipelines.bone_problem import BoneProblem, bind
+from torchreg.pipelines.refine_weights import refine_weights
+from torchreg.pipelines.register_config import OnRegisterStep, RegisterConfig
+from torchreg.pipelines.scan_align_config import between
+from torchreg.results import RegisterRecord
+
+# Sampling distances of the target below which the threshold for matches never falls.
+_LEAST_REACH = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Source points that are matched, and where a dense alignment takes them.
+
+    Args:
+        points: (n, 3) before they are moved.
+        normals: (n, 3) there.
+        moved: (F, n, 3) in every frame.
+        confidence: (F, n) how far that can be trusted, positive.
+    """
+
+    points: Tensor
+    normals: Tensor
+    moved: Tensor
+    confidence: Tensor
+
+
+class ReducedFit:
+    """A registration under way: F frames of one source.
+
+    Args:
+        data: the grid and the samples in it.
+        samples: the samples.
+        targets: F scans.
+        num_bones: most bones.
+        config: see `RegisterConfig`; the source's diagonal is the unit of all lengths here.
+        on_step: called with a `RegisterRecord` after each step.
+
+    Attributes:
+        labels: (C,) bone of each cell, from 0 without gaps.
+        model: the bones and weights, its poses the F frames.
+        pull: where the samples should go.
+        history: records so far.
+    """
+
+    def __init__(
+        self,
+        data: CellData,
+        samples: Samples,
+        targets: Sequence[RangeScan],
+        num_bones: int,
+        config: RegisterConfig,
+        on_step: OnRegisterStep | None = None,
+    ) -> None:
+        self.data, self.samples, self.targets = data, samples, targets
+        self.num_bones, self.config, self._on_step = num_bones, config, on_step
+        self.history: list[RegisterRecord] = []
+        self.matchers = [CompatibleMatcher(target, config.normal_scale) for target in targets]
+        self.pull = Pull(samples.moved, None, samples.confidence)
+        per_label = data.grid.num_cells * (config.label_cost / data.grid.spacing) ** 2
+        self._costs = LabelCosts(config.smoothness, per_label, config.truncation)
+        self.labels = first_labels(data, samples.moved, samples.confidence, num_bones, self._costs)
+        self.model = self._labeled(data.moments(samples.moved, samples.confidence).joined(*self._parts()).motions())
+        self._counts = (0, 0, 0, 0)
+
+    def fit_labels(self) -> bool:
+        """Alternate T-step, correspondences and W-step, and return whether the energy settled."""
+        energy, steps = float("inf"), self.config.label_steps
+        for step in range(steps):
+            self.solve_motions()
+            self.update_matches(0.5 * step / max(1, steps - 1))
+            labels, found = relabel(self.data, self.pull, self.model.transforms.detach(), self.labels, self._costs)
+            self._use(labels)
+            settled = found >= (1 - self.config.rtol) * energy
+            if self.config.reuse and not settled and step + 1 < steps:
+                self._reuse()
+            self._report("align", step, steps)
+            if settled:
+                return True
+            energy = min(energy, found)
+        return False
+
+    def refine(self) -> bool:
+        """Make weights continuous, alternating with motions and correspondences; return whether the fit settled."""
+        base, steps = self.model.weights.detach(), self.config.refine_steps
+        settings = replace(self.config.refine, point_to_point=self.pull.point_to_point)
+        energy = float("inf")
+        self.solve_motions()
+        for step in range(steps):
+            labeled = GridLBS(self.data.grid, base, self.model.transforms.detach())
+            pull = self.pull
+            found = refine_weights(
+                labeled, self.samples.points, pull.targets, pull.normals, pull.weights, config=settings
+            )
+            self.model = self._weighted(found.weights, self.model.transforms.detach())
+            last, energy = energy, self.solve_motions()
+            self.update_matches(0.5 + 0.5 * (step + 1) / steps)
+            self._report("refine", step, steps)
+            if energy >= (1 - self.config.rtol) * last:
+                return True
+        return steps == 0
+
+    def solve_motions(self) -> float:
+        """Fit the bones' motions to the targets of the samples: the T-step, eq. 5; return the mean energy."""
+        pull = self.pull
+        problem = BoneProblem(
+            self.samples.points,
+            bind(self.model.weights_at(self.samples.points).detach()),
+            pull.targets,
+            pull.normals,
+            pull.weights,
+            pull.point_to_point,
+            moments=self._joints(),
+            joint_weight=self.config.joint_weight,
+            blend=self.config.blend,
+        )
+        fit = fit_bones(problem, self.model.transforms.detach(), max_steps=self.config.motion_steps, rtol=1e-3)
+        self.model.set_transforms_(fit.transforms)
+        return float(fit.energy.mean())
+
+    def update_matches(self, progress: float) -> None:
+        """Match the moved samples anew, with thresholds that tighten as ``progress`` goes from 0 to 1.
+
+        A matched sample is pulled to the target's surface along its normal, and weakly to where the dense alignment
+        takes it along the surface; others to the latter alone.
+        """
+        moved, normals = self.moved(self.samples.points, self.samples.normals)
+        share = self.config.point_to_point
+        pulls, counts = [], torch.zeros(4, dtype=torch.int64)
+        for frame, (target, matcher) in enumerate(zip(self.targets, self.matchers, strict=True)):
+            found = matcher.match(
+                moved[frame],
+                normals[frame],
+                max_distance=max(between(self.config.max_distance, progress), _LEAST_REACH * target.spacing),
+                max_angle=between(self.config.max_angle, progress),
+            )
+            kept, base = found.kept.unsqueeze(-1), self.samples.moved[frame]
+            drop = ((found.targets - base) * found.normals).sum(-1, keepdim=True) * found.normals
+            weight = torch.where(found.kept, 1.0, self.config.unmatched * self.samples.confidence[frame])
+            normal = torch.where(kept, found.normals, normals[frame])
+            pulls.append((torch.where(kept, base + drop, base), normal, weight))
+            counts += torch.tensor([found.counts.kept, found.counts.boundary, found.counts.far, found.counts.turned])
+        targets, there, weights = (torch.stack(part) for part in zip(*pulls, strict=True))
+        self.pull = Pull(targets, there, weights, share)
+        kept_count, boundary, far, turned = counts.tolist()
+        self._counts = (kept_count, boundary, far, turned)
+
+    def moved(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+        """Return where points (N, 3) and their unit normals go in every frame, (F, N, 3) each."""
+        with torch.no_grad():
+            weights, transforms = self.model.weights_at(points), self.model.transforms
+            turned = torch.einsum("nb,fbij,nj->fni", weights, transforms[..., :3, :3], normals)
+            return self.model.move(points, weights), torch.nn.functional.normalize(turned, dim=-1)
+
+    def _parts(self) -> tuple[Tensor, int]:
+        """Return the label of each patch, and the number of labels, while labels do not cut patches."""
+        patches = self.data.patches
+        part = torch.zeros(int(patches.max()) + 1, dtype=torch.int64, device=patches.device)
+        return part.scatter(0, patches, self.labels), int(self.labels.max()) + 1
+
+    def _labeled(self, transforms: Tensor) -> GridLBS:
+        """Return the model of the labels."""
+        return GridLBS.from_labels(
+            self.data.grid, self.labels, transforms.shape[-3], transforms, blend=self.config.blend
+        )
+
+    def _weighted(self, weights: Tensor, transforms: Tensor) -> GridLBS:
+        return GridLBS(self.data.grid, weights, transforms, blend=self.config.blend)
+
+    def _use(self, labels: Tensor) -> None:
+        """Take over labels (C,), dropping bones without a cell."""
+        kept, self.labels = labels.unique(return_inverse=True)
+        self.model = self._labeled(self.model.transforms.detach()[:, kept])
+
+    def _reuse(self) -> None:
+        """Bring lost labels back; a bone that takes over half of another's region starts from that one's motion."""
+        before = self.labels
+        self.labels = reuse_labels(self.data, self.pull, before, self.num_bones, self._costs)
+        used = int(self.labels.max()) + 1
+        origin = torch.stack([before[self.labels == label][0] for label in range(used)])
+        self.model = self._labeled(self.model.transforms.detach()[:, origin])
+
+    def _joints(self) -> JointMoments | None:
+        """Return the joints that hold: points, not the regions that bones share, within which they must bend."""
+        if self.config.joint_weight == 0:
+            return None
+        moments = self.model.joint_moments()
+        centers = self.model.joints_of(moments).centers.detach()
+        return JointMoments(moments.pairs, moments.mass, centers, torch.zeros_like(moments.spread))
+
+    def _report(self, stage: str, step: int, num_steps: int) -> None:
+        with torch.no_grad():
+            transforms, points = self.model.transforms, self.samples.points
+            squares = self.pull.squares(self.model(points))
+            weights, neighbors = self.pull.weights, self.data.neighbors
+            joints = self._joints()
+            gap = 0.0 if joints is None else float(JointEnergy()(transforms, joints).mean())
+            record = RegisterRecord(
+                stage,
+                step,
+                num_steps,
+                float((weights * squares).sum() / weights.sum().clamp_min(1e-300)),
+                gap,
+                int((self.labels[neighbors[:, 0]] != self.labels[neighbors[:, 1]]).sum()),
+                transforms.shape[-3],
+                *self._counts,
+            )
+        self.history.append(record)
+        if self._on_step is not None:
+            self._on_step(record)

@@ -1,0 +1,99 @@
+"""What decides how scans are registered. Lengths are shares of the source's diagonal, unless said otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from torchreg._checks import check_choice, check_count, check_positive
+from torchreg.errors import InputError
+from torchreg.losses.scan import check_share
+from torchreg.models.grid_lbs import BLENDS
+from torchreg.pipelines.refine_weights import RefineConfig
+from torchreg.pipelines.scan_align_config import ScanAlignConfig
+from torchreg.results import RegisterRecord
+
+OnRegisterStep = Callable[[RegisterRecord], None]
+
+
+def _refinement() -> RefineConfig:
+    """Return the refinement of weights: where limbs bend, the surface stretches over several cells."""
+    return RefineConfig(smoothness=0.05, closeness=0.02, reach=4)
+
+
+@dataclass(frozen=True)
+class RegisterConfig:
+    """How a reduced deformable model is fitted to two scans or more.
+
+    Args:
+        align: the dense alignment from which parts are found.
+        num_samples: source points that are matched, evenly spread.
+        num_patches: of the grid, from which parts are merged.
+        label_steps: most rounds of T-step, correspondences and W-step.
+        refine_steps: rounds of refining weights, T-step and correspondences.
+        motion_steps: most linear systems of a T-step.
+        smoothness: mu of the W-step: of neighboring cells with different labels, in squared cells.
+        label_cost: of each label in use: its square is what it must take from the mean squared distance. ``num_bones``
+            is a cap.
+        truncation: samples are never farther off in the W-step, in cells.
+        reuse: give labels that lost all their cells to the regions that fit worst.
+        joint_weight: beta, of the joints against the mean squared distance. It holds bones together where matches do
+            not; the dense alignment does so already, and joints that are no points resist it.
+        max_distance: of a match, first and last; never below two sampling distances of the target.
+        max_angle: between normals of a match, first and last, radians.
+        normal_scale: distance that counts as much as normals 60 degrees apart.
+        point_to_point: share of the distance to where the dense alignment takes a sample, in that along the normal.
+        unmatched: how much samples without a match count, which stay with the dense alignment.
+        min_matched: with a smaller share of matches the scans count as not registered.
+        rtol: steps end when a round lowers the energy by less than this share.
+        refine: the weights' refinement; its point-to-point share is this one's.
+        blend: of the bones, see `GridLBS`. Weights are refined as if it were linear.
+
+    Raises:
+        InputError: if a value is out of range.
+
+    References: Chang and Zwicker 2009, section 5, for the paper's values.
+    """
+
+    align: ScanAlignConfig = field(default_factory=ScanAlignConfig)
+    num_samples: int = 2500
+    num_patches: int = 100
+    label_steps: int = 4
+    refine_steps: int = 3
+    motion_steps: int = 5
+    smoothness: float = 0.2
+    label_cost: float = 0.001
+    truncation: float = 4.0
+    reuse: bool = True
+    joint_weight: float = 0.0
+    max_distance: tuple[float, float] = (0.03, 0.01)
+    max_angle: tuple[float, float] = (1.05, 0.52)
+    normal_scale: float = 0.025
+    point_to_point: float = 0.1
+    unmatched: float = 0.3
+    min_matched: float = 0.1
+    rtol: float = 0.01
+    refine: RefineConfig = field(default_factory=_refinement)
+    blend: str = "linear"
+
+    def __post_init__(self) -> None:
+        for name in ("num_samples", "num_patches", "label_steps", "motion_steps"):
+            check_count(getattr(self, name), name, 1)
+        check_count(self.refine_steps, "refine_steps", 0)
+        for name in ("truncation", "unmatched"):
+            check_positive(getattr(self, name), name)
+        for name in ("smoothness", "label_cost", "joint_weight", "normal_scale", "rtol"):
+            check_positive(getattr(self, name), name, allow_zero=True)
+        for name in ("point_to_point", "min_matched"):
+            check_share(getattr(self, name), name)
+        if self.point_to_point == 0:
+            raise InputError("point_to_point must be positive: along flat parts nothing else holds samples")
+        for name in ("max_distance", "max_angle"):
+            ends = getattr(self, name)
+            if len(ends) != 2:
+                raise InputError(f"{name} must be two numbers, first and last, got {len(ends)}")
+            for value in ends:
+                check_positive(value, name)
+        if max(self.max_angle) > 3.1416:
+            raise InputError(f"max_angle must be at most pi radians, got {max(self.max_angle)}")
+        check_choice(self.blend, "blend", BLENDS)
