@@ -1,0 +1,192 @@
+"""Pictures and depth images from files, their size and bit depth looked at before they are decoded."""
+
+from __future__ import annotations
+
+import io
+import os
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchreg.errors import FormatError, MissingExtraError
+from torchreg.geometry.camera import MAX_PIXELS, Camera
+from torchreg.io.atomic import write_atomic
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
+
+_DEPTH_KINDS = {"I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
+_COLOR_KINDS = {"1": "L", "L": "L", "P": "RGB", "RGB": "RGB", "RGBA": "RGB", "LA": "L"}
+# The channel of an EXR file that holds depth, by what renderers call it.
+_EXR_CHANNELS = ("Z", "depth.Z", "Depth.Z", "Y", "V", "R", "RGB")
+
+
+def load_image(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Tensor:
+    """Return a picture of 8 bits per channel, (H, W) gray or (H, W, 3) color, as float32 from 0 to 1.
+
+    Args:
+        path: a PNG, JPEG, TIFF or BMP file; transparency is left out.
+        limits: ``max_bytes`` applies; pictures have at most 64 megapixels.
+
+    Raises:
+        FormatError: if it is cut off, too large, no picture or of another bit depth; names the file.
+        FileNotFoundError: if there is no such file.
+    """
+    place = local_path(path)
+    kind, pixels = _decoded(read_bytes(place, limits), place)
+    if kind not in _COLOR_KINDS:
+        raise FormatError(f"{place}: pictures must have 8 bits per channel, gray or color; got PIL mode {kind}")
+    return torch.from_numpy(pixels.astype(np.float32) / 255)
+
+
+def load_mask(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Tensor:
+    """Return which pixels of a mask are set, (H, W) bool: at least half as bright as white, or in ``.npy`` not zero.
+
+    Raises:
+        FormatError: as `load_image`.
+        FileNotFoundError: if there is no such file.
+    """
+    place = local_path(path)
+    if place.suffix.lower() == ".npy":
+        return torch.from_numpy(_array(read_bytes(place, limits), place) != 0)
+    image = load_image(place, limits=limits)
+    return (image if image.ndim == 2 else image.amax(-1)) >= 0.5
+
+
+def load_depth(
+    path: str | os.PathLike[str],
+    scale: float = 1e-3,
+    *,
+    camera: Camera | None = None,
+    limits: FileLimits = DEFAULT_LIMITS,
+) -> Tensor:
+    """Return a depth image (H, W) in metres, float32, zero where nothing was measured.
+
+    Args:
+        path: a PNG or TIFF file of 16 bits, a TIFF or EXR file of floating-point numbers, or a ``.npy`` array (H, W) of
+            16-bit integers or floating-point numbers.
+        scale: metres per unit of the file.
+        camera: its picture must have that size.
+        limits: ``max_bytes`` applies; pictures have at most 64 megapixels.
+
+    Raises:
+        FormatError: if it is cut off, too large, of another size or bit depth, or without any depth; names the file.
+        FileNotFoundError: if there is no such file.
+        MissingExtraError: if it is an EXR file and the extra ``exr`` is not installed.
+    """
+    place = local_path(path)
+    content = read_bytes(place, limits)
+    suffix = place.suffix.lower()
+    if suffix == ".npy":
+        values = _array(content, place)
+    elif suffix == ".exr":
+        values = _exr(content, place)
+    else:
+        kind, values = _decoded(content, place)
+        if kind not in _DEPTH_KINDS:
+            raise FormatError(f"{place}: depth takes 16 bits or floating-point numbers, got PIL mode {kind} of 8 bits")
+    if values.dtype.kind not in "fiu" or values.dtype.itemsize < 2:
+        raise FormatError(f"{place}: depth takes 16 bits or floating-point numbers, got {values.dtype}")
+    if camera is not None and values.shape != (camera.height, camera.width):
+        raise FormatError(
+            f"{place}: is {values.shape[1]} x {values.shape[0]} pixels, the camera's pictures are "
+            f"{camera.width} x {camera.height}"
+        )
+    depth = values.astype(np.float32) * np.float32(scale)
+    # Sensors mark what they did not measure by zero, NaN, infinity or a negative number.
+    depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+    if not depth.any():
+        raise FormatError(f"{place}: holds no depth, all of {depth.size} pixels are zero, negative or not finite")
+    return torch.from_numpy(depth)
+
+
+def save_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1e-3) -> None:
+    """Write a depth image (H, W) in metres as 16-bit PNG, rounded to ``scale``; what does not fit becomes zero."""
+    from PIL import Image
+
+    steps = (depth.detach().cpu().double() / scale).round().nan_to_num(0, 0, 0)
+    steps = torch.where((steps > 0) & (steps <= 65535), steps, 0.0)
+    _save_png(path, Image.fromarray(steps.numpy().astype(np.uint16)))
+
+
+def save_image(path: str | os.PathLike[str], image: Tensor) -> None:
+    """Write a picture (H, W), (H, W, 3) from 0 to 1, or a mask (H, W) bool, as 8-bit PNG."""
+    from PIL import Image
+
+    values = (image.detach().cpu().double().clamp(0, 1) * 255).round().numpy().astype(np.uint8)
+    _save_png(path, Image.fromarray(values))
+
+
+def _save_png(path: str | os.PathLike[str], image: Any) -> None:
+    place = local_path(path)
+    if place.suffix.lower() != ".png":
+        raise FormatError(f"{place}: must end in .png")
+    stream = io.BytesIO()
+    image.save(stream, format="PNG")
+    write_atomic(place, stream.getvalue())
+
+
+def _check_pixels(shape: tuple[int, ...], place: Path) -> None:
+    pixels = shape[0] * shape[1] if len(shape) == 2 else 0
+    if not 0 < pixels <= MAX_PIXELS:
+        raise FormatError(f"{place}: must be (H, W) with 1 to 64 million pixels, got shape {shape}")
+
+
+def _decoded(content: bytes, place: Path) -> tuple[str, Any]:
+    """Return the mode in which PIL sees a picture and its pixels."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with warnings.catch_warnings():
+            # The size is checked here, before anything is decoded; damage raises.
+            warnings.simplefilter("ignore")
+            with Image.open(io.BytesIO(content), formats=("PNG", "TIFF", "JPEG", "BMP")) as image:
+                _check_pixels(image.size, place)
+                kind = str(image.mode)
+                plain = image.convert(_COLOR_KINDS[kind]) if kind in _COLOR_KINDS else image
+                return kind, np.array(plain)
+    except FormatError:
+        raise
+    except Image.DecompressionBombError as error:
+        raise FormatError(f"{place}: has more than 64 megapixels") from error
+    except UnidentifiedImageError as error:
+        raise FormatError(f"{place}: is no PNG, TIFF, JPEG or BMP picture") from error
+    except (OSError, SyntaxError, ValueError, EOFError, IndexError, KeyError, TypeError) as error:
+        raise FormatError(f"{place}: is cut off or damaged ({error})") from error
+
+
+def _array(content: bytes, place: Path) -> Any:
+    stream = io.BytesIO(content)
+    try:
+        version = np.lib.format.read_magic(stream)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(stream)
+    except (ValueError, EOFError) as error:
+        raise FormatError(f"{place}: is no .npy file ({error})") from error
+    _check_pixels(shape, place)
+    if dtype.hasobject or len(content) - stream.tell() != shape[0] * shape[1] * dtype.itemsize:
+        raise FormatError(
+            f"{place}: holds {len(content) - stream.tell()} bytes, not {shape} numbers of {dtype}: cut off?"
+        )
+    return np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+
+
+def _exr(content: bytes, place: Path) -> Any:
+    try:
+        import OpenEXR
+    except ImportError as error:
+        raise MissingExtraError(f"{place}: EXR files take the extra exr: pip install 'torchreg[exr]'") from error
+    try:
+        with OpenEXR.File(str(place), header_only=True) as file:
+            (left, top), (right, bottom) = (corner.tolist() for corner in file.header()["dataWindow"])
+            _check_pixels((bottom - top + 1, right - left + 1), place)
+        with OpenEXR.File(str(place)) as file:
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    except (RuntimeError, ValueError, OSError) as error:
+        raise FormatError(f"{place}: is cut off or damaged, {len(content)} bytes ({error})") from error
+    name = next((name for name in _EXR_CHANNELS if name in channels), None)
+    if name is None:
+        raise FormatError(f"{place}: has none of the channels {', '.join(_EXR_CHANNELS)}, but {', '.join(channels)}")
+    return channels[name] if channels[name].ndim == 2 else channels[name][..., 0]
