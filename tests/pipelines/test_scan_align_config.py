@@ -31,7 +31,6 @@ from torchreg.pipelines.scan_align_config import (
         (ScanAlignConfig, {"num_nodes": 0}, "num_nodes must be at least 1"),
         (ScanAlignConfig, {"curvature_radii": ()}, "curvature_radii must hold"),
         (ScanAlignConfig, {"curvature_radii": (-0.1,)}, "curvature_radii must be positive"),
-        (ScanAlignConfig, {"shrink": (-0.5,)}, "shrink must be"),
         (RefineConfig, {"near_sigma": 0.0}, "near_sigma must be positive"),
         (MatchConfig, {"stiffer": ()}, "stiffer must hold"),
     ],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -43,11 +44,13 @@ class SampleGraph:
         Cost: O(E log E) per source, far less with a small limit.
         """
         index = None if sources is None else sources.cpu().numpy()
-        return torch.from_numpy(dijkstra(self._matrix(), directed=False, indices=index, limit=limit))
+        return torch.from_numpy(dijkstra(self._matrix, indices=index, limit=limit))
 
+    @cached_property
     def _matrix(self) -> csr_array:
         start, end = self.edges.cpu().numpy().T
-        return csr_array((self.lengths.cpu().numpy(), (start, end)), shape=(self.count, self.count))
+        both = (np.concatenate((start, end)), np.concatenate((end, start)))
+        return csr_array((np.tile(self.lengths.cpu().numpy(), 2), both), shape=(self.count, self.count))
 
 
 def sample_graph(

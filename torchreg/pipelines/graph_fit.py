@@ -16,6 +16,8 @@ from torchreg.solvers.levenberg_marquardt import Linearization
 
 # Relative damping: nodes that carry no match follow their neighbors; alone they stay.
 _DAMPING = 1e-9
+# Samples whose blocks are added in one go: in cache.
+_CHUNK = 200
 
 
 @dataclass(frozen=True)
@@ -122,11 +124,15 @@ def _of_matches(graph: DeformationGraph, transforms: Tensor, middles: Tensor, ma
         pulled = pulled + normal * (normal.mT @ blocks)
         pull = pull + matches.normals * (matches.normals * miss).sum(-1, keepdim=True)
     share = (matches.weights / count)[:, None, None]
-    square = ((share * blocks).mT @ pulled).unflatten(2, (few, 6)).unflatten(1, (few, 6)).transpose(2, 3)
-    slope = ((share * blocks).mT @ pull.unsqueeze(-1)).reshape(-1, 6)
+    blocks = share * blocks
+    slope = (blocks.mT @ pull.unsqueeze(-1)).reshape(-1, 6)
     size = graph.num_nodes
-    pair = (nearest.unsqueeze(2) * size + nearest.unsqueeze(1)).reshape(-1)
-    hessian = points.new_zeros(size * size, 36).index_add_(0, pair, square.reshape(-1, 36))
+    pair = nearest.unsqueeze(2) * size + nearest.unsqueeze(1)
+    hessian = points.new_zeros(size * size, 36)
+    for start in range(0, count, _CHUNK):
+        part = slice(start, start + _CHUNK)
+        square = (blocks[part].mT @ pulled[part]).unflatten(2, (few, 6)).unflatten(1, (few, 6)).transpose(2, 3)
+        hessian.index_add_(0, pair[part].reshape(-1), square.reshape(-1, 36))
     gradient = points.new_zeros(size, 6).index_add_(0, nearest.reshape(-1), slope)
     cost = 0.5 * (share[:, 0] * miss * pull).sum()
     return Linearization(cost, gradient, hessian.view(size, size, 6, 6))

@@ -25,8 +25,8 @@ class MatchConfig:
         slack: by which distances may differ, length.
         min_support: of the votes that a match needs.
         min_matches: with fewer the motion is not known from them.
-        stiffness: of the graph, one fit after the other.
-        stiffer: the same for a second hypothesis, of parts that hardly bend.
+        stiffness: of the graph, one fit after the other, before one-to-one matches pull it.
+        stiffer: the same for a hypothesis of parts that hardly bend.
         scale: misses beyond this count ever less in all fits but the first, length.
     """
 
@@ -139,7 +139,7 @@ class ChoiceConfig:
         normal_scale: what normals at right angles count as, a share of sqrt(2) caps.
         bend: what it costs that neighboring nodes disagree by one size in the mean,
         slack: of which less than this hardly counts, length.
-        same: hypotheses whose samples are this near each other are one, length,
+        same: hypotheses agree where their samples are this near each other, length,
         same_share: for at least this share of the samples.
     """
 
@@ -147,7 +147,7 @@ class ChoiceConfig:
     normal_scale: float = 0.5
     bend: float = 20.0
     slack: float = 1e-3
-    same: float = 0.01
+    same: float = 0.005
     same_share: float = 0.95
 
     def __post_init__(self) -> None:
@@ -170,10 +170,8 @@ class ScanAlignConfig:
         match: the first matches.
         assign: matches one to one from the unmoved source.
         reassign: the same from the first matches.
-        again: the same from the best hypothesis.
         refine: the EM that ends every hypothesis.
         choice: among the hypotheses.
-        shrink: from the best hypothesis, motions that are these shares of its own.
 
     Raises:
         InputError: if a value is out of range.
@@ -189,18 +187,12 @@ class ScanAlignConfig:
     reassign: AssignConfig = field(
         default_factory=lambda: AssignConfig(num_steps=6, reach=(0.15, 0.08), stiffness=(0.6, 0.2))
     )
-    again: AssignConfig = field(
-        default_factory=lambda: AssignConfig(num_steps=6, reach=(0.12, 0.06), stiffness=(0.6, 0.2))
-    )
     refine: RefineConfig = field(default_factory=RefineConfig)
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
-    shrink: tuple[float, ...] = (0.4, 0.7)
 
     def __post_init__(self) -> None:
         for name in ("num_samples", "num_target_samples", "num_nodes", "num_nearest"):
             check_count(getattr(self, name), name, 1)
-        for share in self.shrink:
-            check_positive(share, "shrink", allow_zero=True)
         _check_values(self.curvature_radii, "curvature_radii")
 
 
@@ -209,7 +201,7 @@ class ScanAlignRecord:
     """One step of an alignment, as given to ``on_step``.
 
     Args:
-        hypothesis: name of what is being followed, such as "matches" or "again".
+        hypothesis: name of what is being followed, such as "rest" or "matches".
         stage: "match", "assign" or "refine".
         step: number of the step in its stage.
         num_steps: steps planned in the stage.

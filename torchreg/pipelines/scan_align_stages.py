@@ -9,10 +9,7 @@ from torch import Tensor
 
 from torchreg.correspondence.one_to_one import count_of_spacing, match_one_to_one, typical_spacing
 from torchreg.correspondence.scan_em import SoftMatches, match_softly
-from torchreg.geometry.blend import turn_about
 from torchreg.geometry.neighbors import nearest_few
-from torchreg.geometry.rigid import transform_points
-from torchreg.geometry.rotation import so3_log
 from torchreg.pipelines.graph_fit import GraphFit, GraphMatches, fit_graph
 from torchreg.pipelines.scan_align_config import (
     AssignConfig,
@@ -152,11 +149,3 @@ def agree(problem: ScanAlignProblem, one: Tensor, other: Tensor, config: ChoiceC
     """Return whether two hypotheses take nearly all samples to nearly the same places."""
     apart = (problem.graph(one) - problem.graph(other)).norm(dim=-1)
     return float((apart < config.same).double().mean()) >= config.same_share
-
-
-def shrunk(problem: ScanAlignProblem, transforms: Tensor, share: float) -> Tensor:
-    """Return motions that turn and shift every node by a share of what it did."""
-    centers = problem.graph.centers
-    shift = transform_points(transforms, centers.unsqueeze(1)).squeeze(1) - centers
-    twists = share * torch.cat((shift, so3_log(transforms[:, :3, :3])), dim=-1)
-    return turn_about(problem.graph.rest(), twists, centers)

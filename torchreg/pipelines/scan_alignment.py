@@ -12,7 +12,6 @@ from torchreg.geometry.neighbors import nearest_few
 from torchreg.geometry.node_graph import spread_weights
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.pipelines.scan_align_config import (
-    AssignConfig,
     Hypothesis,
     OnStep,
     ScanAlignConfig,
@@ -22,11 +21,11 @@ from torchreg.pipelines.scan_align_config import (
 from torchreg.pipelines.scan_align_problem import ScanAlignProblem, describe, first_matches
 from torchreg.pipelines.scan_align_stages import (
     Reporter,
+    agree,
     fit_first_matches,
     judge,
     pull_one_to_one,
     refine,
-    shrunk,
     soft_matches,
 )
 
@@ -45,11 +44,11 @@ def align_scans(
 ) -> ScanAlignment:
     """Return the source moved onto the target: a deformation graph of many small nodes, without bones yet.
 
-    Both scans are described by even samples, their curvature at several sizes and spin images. Hypotheses of the motion
-    come from matches of spin images that agree on distances along the surface, with and without a pull by one-to-one
-    matches, and from one-to-one matches alone. Each is refined by EM with an outlier class; the best covers the target
-    and is covered by it, and bends least. From there one-to-one matches may find what was missed, unless the hypotheses
-    agree with each other.
+    Both scans are described by even samples, their curvature at several sizes and spin images. Hypotheses start from
+    rest; from matches of spin images that agree on distances along the surface, fitted stiffly, or softly and then
+    pulled by one-to-one matches; and from one-to-one matches alone. Each ends by an EM with an outlier class, while
+    edges of the graph give where its parts disagree. The best covers the target, is covered by it, and bends least.
+    Where the first two agree, the others are left out.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -110,35 +109,31 @@ def align_scans(
 def _hypotheses(
     problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep
 ) -> Iterator[tuple[Hypothesis, Tensor]]:
-    """Yield hypotheses and their motions."""
-    found: list[tuple[Hypothesis, Tensor]] = []
+    """Yield hypotheses and their motions, until two that started apart agree."""
     rest = problem.graph.rest()
     far, near = config.refine.sigma[0], config.refine.near_sigma
+
+    def refined(transforms: Tensor, sigma: float, reporter: Reporter) -> tuple[Hypothesis, Tensor]:
+        transforms = refine(problem, transforms, config.refine, reporter, sigma)
+        return judge(problem, reporter.name, transforms, config.choice), transforms
 
     def reporter(name: str) -> Reporter:
         return Reporter(name, problem.size, on_step)
 
-    def refined(name: str, transforms: Tensor, sigma: float) -> tuple[Hypothesis, Tensor]:
-        transforms = refine(problem, transforms, config.refine, reporter(name), sigma)
-        found.append((judge(problem, name, transforms, config.choice), transforms))
-        return found[-1]
-
-    def pulled(name: str, transforms: Tensor, stage: AssignConfig) -> tuple[Hypothesis, Tensor]:
-        return refined(name, pull_one_to_one(problem, transforms, stage, reporter(name)), far)
-
-    yield refined("rest", rest, near)
+    still = refined(rest, near, reporter("rest"))
+    yield still
     matches = first_matches(problem, config.match)
     if len(matches.weights) >= config.match.min_matches:
-        for name, stiffness in (("matches", config.match.stiffness), ("stiff matches", config.match.stiffer)):
-            fitted = fit_first_matches(problem, matches, stiffness, config.match, reporter(name))
-            yield refined(name, fitted, near)
-            if name == "matches":
-                yield pulled("matches, one to one", fitted, config.reassign)
-    yield pulled("one to one", rest, config.assign)
-    yield pulled("again", min(found, key=_energy)[1], config.again)
-    _, best = min(found, key=_energy)
-    for share in config.shrink:
-        yield refined(f"{share:g} of it", shrunk(problem, best, share), near)
+        stiff = reporter("stiff matches")
+        other = refined(fit_first_matches(problem, matches, config.match.stiffer, config.match, stiff), near, stiff)
+        yield other
+        if agree(problem, still[1], other[1], config.choice):
+            return
+        soft = reporter("matches")
+        fitted = fit_first_matches(problem, matches, config.match.stiffness, config.match, soft)
+        yield refined(pull_one_to_one(problem, fitted, config.reassign, soft), far, soft)
+    alone = reporter("one to one")
+    yield refined(pull_one_to_one(problem, rest, config.assign, alone), far, alone)
 
 
 def _energy(found: tuple[Hypothesis, Tensor]) -> float:
