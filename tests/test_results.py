@@ -90,7 +90,17 @@ def bones(*shifts, weights):
     deformed = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]) + motions[labels, :3, 3]
     empty = torch.zeros(4)
     return results.ScanRegistration(
-        torch.nn.Identity(), deformed, labels, motions, weights, empty, empty > 0, Status.CONVERGED, empty
+        torch.nn.Identity(),
+        deformed,
+        None,
+        deformed,
+        labels,
+        motions,
+        weights,
+        empty,
+        empty > 0,
+        Status.CONVERGED,
+        empty,
     )
 
 

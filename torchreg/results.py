@@ -452,6 +452,8 @@ class ScanRegistration(Result, Generic[Shape]):
 
     Args:
         model: the `GridLBS`: ``model(points)`` deforms any points, ``model(points, transforms)`` poses them anew.
+        points: (N, 3) of the source, before they are moved.
+        faces: (F, 3) of the source, or None.
         deformed: (N, 3) source points moved onto the target.
         labels: (N,) int64, the bone with the largest weight at each source point.
         transforms: (B, 4, 4) of the bones.
@@ -464,6 +466,8 @@ class ScanRegistration(Result, Generic[Shape]):
     """
 
     model: Shape
+    points: Tensor
+    faces: Tensor | None
     deformed: Tensor
     labels: Tensor
     transforms: Tensor

@@ -14,24 +14,11 @@ from torchreg.geometry.rotation import so3_exp
 from torchreg.metrics import adjusted_rand
 from torchreg.pipelines.register import register
 from torchreg.pipelines.register_config import RegisterConfig
-from torchreg.pipelines.scan_align_config import AssignConfig, ScanAlignConfig
+from torchreg.pipelines.scan_align_config import ScanAlignConfig
 from torchreg.results import ScanRegistration, Status
 
-QUICK = RegisterConfig(
-    align=ScanAlignConfig(num_samples=400, num_target_samples=600, assign=AssignConfig(num_points=150)),
-    num_samples=800,
-)
-
-
-FEW = RegisterConfig(
-    align=ScanAlignConfig(
-        num_samples=150,
-        num_target_samples=200,
-        num_nodes=15,
-        assign=AssignConfig(num_steps=3, num_points=50),
-        shrink=(),
-    )
-)
+QUICK = RegisterConfig(align=ScanAlignConfig(num_samples=400, num_target_samples=600), num_samples=800)
+FEW = RegisterConfig(align=ScanAlignConfig(num_samples=150, num_target_samples=200, num_nodes=15))
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +72,7 @@ def test_results_are_the_same_on_disk(known, tmp_path):
     found.save(tmp_path / "pair.safetensors")
     back = tr.load(tmp_path / "pair.safetensors")
     assert isinstance(back, ScanRegistration)
-    for name in ("deformed", "labels", "transforms", "weights", "distances", "matched", "seconds"):
+    for name in ("points", "faces", "deformed", "labels", "transforms", "weights", "distances", "matched", "seconds"):
         assert torch.equal(getattr(back, name), getattr(found, name))
     assert back.history == found.history
     assert back.status is found.status

@@ -123,6 +123,8 @@ def _result(
     model = unit.model_back(fit.model, like)
     return ScanRegistration(
         model,
+        like.detach(),
+        source.faces,
         unit.points_back(moved, like),
         weights.argmax(-1).to(like.device),
         model.transforms.detach(),

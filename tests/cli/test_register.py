@@ -1,0 +1,65 @@
+"""Registration from the command line: files, their contents, exit codes, refusals."""
+
+import functools
+import math
+
+import pytest
+import torch
+
+import torchreg as tr
+from torchreg.datasets.depth_scanner import DepthScanner
+from torchreg.datasets.scan_sequences import jointed_toy
+from torchreg.io.points import load_points, save_points
+from torchreg.pipelines import register as pipeline
+
+
+@pytest.fixture(scope="module")
+def scans(tmp_path_factory):
+    """Return two scans on disk, and a registration that starts from the truth."""
+    folder = tmp_path_factory.mktemp("scans")
+    pair = jointed_toy(2, seed=2, scanner=DepthScanner(num_points=800), step=math.radians(20)).pair(0, 1)
+    for name, scan in (("source", pair.source), ("target", pair.target)):
+        save_points(folder / f"{name}.ply", scan.points, faces=scan.faces)
+    save_points(folder / "bare.ply", pair.source.points)
+    return folder, functools.partial(pipeline.register, start=pair.truth)
+
+
+def test_a_pair_becomes_a_scene_a_result_and_pictures(run, scans, tmp_path, monkeypatch):
+    folder, known = scans
+    monkeypatch.setattr(pipeline, "register", known)
+    answer = run(
+        "register", folder / "source.ply", folder / "target.ply", "-o", tmp_path / "out.glb", "--bones", 6,
+        "--grid", 25, "--weights", tmp_path / "bones.ply", "--errors", tmp_path / "errors.ply",
+    )  # fmt: skip
+    assert answer.exit_code == 0, answer.output
+    assert "bones" in answer.output
+    assert "refine" in answer.output
+    assert (tmp_path / "out.glb").read_bytes()[:4] == b"glTF"
+    found = tr.load(tmp_path / "out.safetensors")
+    assert 1 < found.model.num_bones <= 6
+    for name in ("bones.ply", "errors.ply"):
+        torch.testing.assert_close(load_points(tmp_path / name).points, found.deformed, atol=1e-5, rtol=0)
+
+
+def test_what_cannot_be_written_is_told_first(run, error_of, scans, tmp_path, monkeypatch):
+    folder, known = scans
+    monkeypatch.setattr(pipeline, "register", known)
+    pair = folder / "bare.ply", folder / "target.ply"
+    assert "has no triangles" in error_of("register", *pair, "-o", tmp_path / "out.glb")
+    assert "must end in" in error_of("register", *pair, "-o", tmp_path / "out.obj")
+    answer = run("register", *pair, "-o", tmp_path / "out.safetensors", "--quiet", "--grid", 25)
+    assert answer.exit_code == 0, answer.output
+    assert answer.output == ""
+    assert "exists" in error_of("register", *pair, "-o", tmp_path / "out.safetensors")
+    assert "num_bones" in error_of("register", *pair, "-o", tmp_path / "no.safetensors", "--bones", 0)
+    assert not (tmp_path / "no.safetensors").exists()
+
+
+def test_scans_that_have_nothing_in_common_end_with_one(run, scans, tmp_path, monkeypatch):
+    folder, known = scans
+    monkeypatch.setattr(pipeline, "register", known)
+    far = load_points(folder / "target.ply")
+    save_points(tmp_path / "far.ply", far.points + 100.0)
+    answer = run("register", folder / "source.ply", tmp_path / "far.ply", "-o", tmp_path / "far.safetensors")
+    assert answer.exit_code == 1, answer.output
+    assert "no data" in answer.output
