@@ -1,16 +1,25 @@
 """What the tests of several pipelines share."""
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 import torch
 
+from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import rigid_matrix, se3_exp
 from torchreg.geometry.rotation import so3_exp
+from torchreg.geometry.sampling import farthest_points
 from torchreg.geometry.sparse_grid import SparseGrid
+from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.grid_lbs import GridLBS
+from torchreg.models.primitives import Primitive
+from torchreg.models.skin import sample_skin
 from torchreg.pipelines.bone_problem import BoneProblem, bind
+from torchreg.pipelines.track import Tracker
+from torchreg.pipelines.track_config import Frame, TrackConfig
+from torchreg.pipelines.track_fit import FrameFitter
 
 BONES = 3
 
@@ -75,3 +84,39 @@ def bones():
     """A limb of three bones: how to make it, its model, poses and noisy matches."""
     makers = (draw, limb, model_of, bent, noisy_problem)
     return SimpleNamespace(COUNT=BONES, **{maker.__name__: maker for maker in makers})
+
+
+@pytest.fixture(scope="session")
+def arm():
+    """A body with an arm on one hinge, in float64, that takes no gradients; not to be changed."""
+    eye = torch.eye(4, dtype=torch.float64)
+    joints = Joint("base", -1, eye), Joint("arm", 0, eye, "revolute", (0.0, 1.0, 0.0), -2.0, 2.0)
+    center = eye.clone()
+    center[0, 3] = 0.15
+    solids = Primitive("ellipsoid", (0.06, 0.09, 0.05), eye), Primitive("ellipsoid", (0.15, 0.03, 0.04), center)
+    tree = KinematicTree(joints)
+    shape = ArticulatedShape(tree, ["base", "arm"], solids, nu=0.01, dtype=torch.float64)
+    return shape.requires_grad_(False)
+
+
+@pytest.fixture(scope="session")
+def arm_tracking(arm):
+    """A pose of the arm, 300 points of its surface there, and how to make a fitter and a state of a tracker of it."""
+    pose = torch.tensor([0.3, -0.2, 0.8, 0.4, 0.2, -0.5, 0.7], dtype=torch.float64)
+    vertices = arm.surface_mesh(pose, spacing=0.01).vertices
+    cloud = vertices[farthest_points(vertices, 300)]
+    skin = sample_skin(arm, 200)
+    new = Tracker(arm, pose, model_points=skin).state
+
+    def fitter(**options):
+        return FrameFitter(arm, TrackConfig(**options), skin)
+
+    def state(**changes):
+        tracked = {"frame": 1, "inliers": 300.0, "ratio": 1.0, "residual": 0.001, "total": 300.0, "interval": 1.0}
+        motion = {"error": 0.005, "surprise": pose.new_tensor([0.005, 0.04, 0.04])}
+        return replace(new, **tracked | motion | changes)
+
+    def frame(points=cloud, gap=1.0):
+        return Frame(points, points.isfinite().all(-1), gap)
+
+    return SimpleNamespace(pose=pose, cloud=cloud, skin=skin, fitter=fitter, state=state, frame=frame)

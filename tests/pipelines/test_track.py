@@ -11,15 +11,9 @@ import torchreg.pipelines.track_recovery as recovery
 from torchreg.datasets.hand import hand_motion
 from torchreg.datasets.sequences import range_clouds
 from torchreg.errors import InputError, InputTypeError, UnitsWarning
-from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rotation import compose_rotation_vectors
-from torchreg.geometry.sampling import farthest_points
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import sample_skin
 from torchreg.pipelines.storage import load
 from torchreg.pipelines.track import TrackConfig, Tracker
-from torchreg.pipelines.track_evidence import pose_covariance
 from torchreg.pipelines.track_motion import difference
 from torchreg.results import PoseStarts, Status
 
@@ -353,19 +347,6 @@ def test_fingers_that_were_missed_are_repaired_within_frames(plain_hand, truths,
     assert blind.step(frames[5]).acquired in ("tracked", "lost")
 
 
-def test_a_flipped_base_is_among_the_starts(plain_hand_skin, truths):
-    flipped = recovery.flipped(plain_hand_skin, truths[0])
-    points = plain_hand_skin(truths[0])
-    center = points.mean(0)
-    for pose in flipped:
-        turned = plain_hand_skin(pose)
-        torch.testing.assert_close(turned.mean(0), center, atol=1e-5, rtol=0)
-        assert (turned - points).norm(dim=-1).max() > 0.02
-    # Half turns: done twice, nothing happened.
-    again = torch.stack([plain_hand_skin(pose) for pose in recovery.flipped(plain_hand_skin, flipped[2])])
-    assert (again - points).norm(dim=-1).amax(-1).min() < 1e-4
-
-
 def test_more_points_than_wanted_are_thinned_but_all_are_measured(plain_hand, tracker, clouds, frames):
     own = tracker(max_points=150)
     result = [own.step(frame) for frame in frames[:3]]
@@ -375,26 +356,11 @@ def test_more_points_than_wanted_are_thinned_but_all_are_measured(plain_hand, tr
     assert result[2].posterior[clouds[2].inliers].mean() > 0.2
 
 
-def make_arm():
-    eye = torch.eye(4, dtype=torch.float64)
-    joints = Joint("base", -1, eye), Joint("arm", 0, eye, "revolute", (0.0, 1.0, 0.0), -2.0, 2.0)
-    center = eye.clone()
-    center[0, 3] = 0.15
-    along = eye.clone()
-    along[:3, :3] = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-    solids = Primitive("ellipsoid", (0.06, 0.09, 0.05), eye), Primitive("ellipsoid", (0.15, 0.03, 0.04), center)
-    return ArticulatedShape(KinematicTree(joints), ["base", "arm"], solids, nu=0.01, dtype=torch.float64)
-
-
-def test_covariance_is_that_of_repeated_measurements():
+def test_covariance_is_that_of_repeated_measurements(arm, arm_tracking):
     """What scatters when only the noise is drawn anew, pose after pose, is what the record says."""
-    arm = make_arm().requires_grad_(False)
-    skin = sample_skin(arm, 300)
-    truth = torch.tensor([0.3, -0.2, 0.8, 0.4, 0.2, -0.5, 0.7], dtype=torch.float64)
-    surface = arm.surface_mesh(truth, spacing=0.01).vertices
-    surface = surface[farthest_points(surface, 300)]
+    truth, surface = arm_tracking.pose, arm_tracking.cloud
     config = TrackConfig(model_points="shape", recovery="none", surface_steps=3, prior_std=5.0)
-    own = Tracker(arm, truth, config=config, model_points=skin)
+    own = Tracker(arm, truth, config=config, model_points=arm_tracking.skin)
     own.step(surface)
     start, generator, poses, stds = own.state, torch.Generator().manual_seed(4), [], []
     for _ in range(60):
@@ -408,20 +374,6 @@ def test_covariance_is_that_of_repeated_measurements():
     ratio = said / scatter
     assert ratio.min() > 0.75
     assert ratio.max() < 1.35
-
-
-def test_covariance_of_linear_problems_is_exact():
-    generator = torch.Generator().manual_seed(2)
-    jacobian = torch.randn(40, 5, generator=generator, dtype=torch.float64)
-    jacobian[:, 4] = 0
-    weights = torch.rand(40, generator=generator, dtype=torch.float64)
-    precision = torch.tensor([0.0, 1.0, 0.0, 0.0, 4.0], dtype=torch.float64)
-    noise = torch.tensor(0.1, dtype=torch.float64)
-    covariance = pose_covariance(jacobian, weights, noise, precision)
-    expected = torch.linalg.inv(jacobian.T @ weights.diag() @ jacobian / 0.01 + precision.diag())
-    torch.testing.assert_close(covariance, expected)
-    # What no datum says is what the prior says.
-    assert covariance[4, 4].sqrt() == pytest.approx(0.5)
 
 
 def test_covariances_are_tighter_with_more_data_and_wide_where_nothing_is_seen(followed, plain_hand):
@@ -460,13 +412,6 @@ def test_an_interruption_keeps_what_was_done(tracker, frames):
         (lambda t: t(torch.zeros(26)), InputError, "initial_pose"),
         (lambda t: t(torch.full((27,), torch.nan)), InputError, "initial_pose must be finite"),
         (lambda t: setattr(t(), "state", None), InputTypeError, "state must be a TrackState, got NoneType"),
-        (lambda t: TrackConfig(model_points="texture"), InputError, "model_points must be one of seen, data, shape"),
-        (lambda t: TrackConfig(prediction="kalman"), InputError, "prediction must be one of"),
-        (lambda t: TrackConfig(recovery="some"), InputError, "recovery must be one of"),
-        (lambda t: TrackConfig(nan_policy="drop"), InputError, "nan_policy must be one of"),
-        (lambda t: TrackConfig(em_steps=0), InputError, "em_steps must be at least 1"),
-        (lambda t: TrackConfig(prior_std=-1.0), InputError, "prior_std must be positive"),
-        (lambda t: TrackConfig(inlier_distance=0.0), InputError, "inlier_distance must be positive"),
     ],
 )
 def test_what_cannot_be_used_is_refused(tracker, call, error, message):
@@ -483,8 +428,7 @@ def test_time_must_go_on(tracker):
         own.step(torch.zeros(0, 3), 2.0)
 
 
-def test_skins_and_states_of_other_shapes_are_refused(plain_hand, plain_hand_skin, tracker):
-    arm = make_arm()
+def test_skins_and_states_of_other_shapes_are_refused(arm, plain_hand_skin, tracker):
     with pytest.raises(InputError, match="model_points is a skin of another shape"):
         Tracker(arm, model_points=plain_hand_skin)
     other = Tracker(arm, config=TrackConfig(num_model_points=40))
