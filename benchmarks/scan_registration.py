@@ -1,0 +1,215 @@
+"""Range scans registered by a reduced deformable model: how many, how well, how fast, and what each step adds.
+
+A pair counts as registered when at least 90 % of its source points end within 2.5 % of the diagonal of their true
+place, visible in the target or not; "seen" leaves out points on parts that were taken off before the target was
+scanned, whose place nothing tells. Seconds are those of the paper's table 1: setup, initialization (here the dense
+alignment), align (labels and motions) and refine (weights and motions).
+
+Sets are a folder of NPZ files (source_points, source_faces, target_points, target_faces, source_truth, diagonal); the
+walking figure's adjacent frames; a toy, one part of which is missing in one scan of every pair. For the last two the
+adjusted Rand index compares parts found with parts that moved apart, and joints are right within 5 % of the diagonal.
+
+    python benchmarks/scan_registration.py --data FOLDER --pairs 189 --ablations --growth
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchreg as tr
+from torchreg.datasets.depth_scanner import DepthScanner
+from torchreg.datasets.scan_sequences import ScanPair, jointed_toy, walking_figure
+from torchreg.metrics import adjusted_rand
+
+NEAR, REGISTERED, JOINT = 0.025, 0.9, 0.05
+STAGES = ("setup", "initialization", "align", "refine")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Scans, the true places of the source's points, what errors are divided by, and all the truth if it is made up."""
+
+    name: str
+    source: tr.RangeScan
+    target: tr.RangeScan
+    truth: Tensor
+    diagonal: float
+    pair: ScanPair | None = None
+
+
+@dataclass(frozen=True)
+class Score:
+    """How one pair went.
+
+    Args:
+        near: share of points near their true place.
+        near_seen: the same of points whose part is there in the target.
+        error: mean distance from it, share of the diagonal.
+        rand: adjusted Rand index of the parts, NaN if they are not known.
+        joints: distances of true joints from the nearest found one, shares of the diagonal.
+        seconds: of the four stages.
+        bones: found.
+    """
+
+    near: float
+    near_seen: float
+    error: float
+    rand: float
+    joints: tuple[float, ...]
+    seconds: tuple[float, ...]
+    bones: int
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How pairs are registered."""
+
+    name: str
+    bones: int = 10
+    grid: int = 50
+    config: tr.RegisterConfig = field(default_factory=tr.RegisterConfig)
+
+
+def _ablations() -> list[Recipe]:
+    plain = tr.RegisterConfig()
+    return [
+        Recipe("default"),
+        Recipe("with joint term 0.01", config=replace(plain, joint_weight=0.01)),
+        Recipe("without label reuse", config=replace(plain, reuse=False)),
+        Recipe("without refinement", config=replace(plain, refine_steps=0)),
+        Recipe("without descriptors", config=replace(plain, align=replace(plain.align, match=_no_matches(plain)))),
+        *(Recipe(f"grid {size}", grid=size) for size in (20, 35, 65, 80)),
+        *(Recipe(f"bones {size}", bones=size) for size in (4, 6, 15, 20)),
+    ]
+
+
+def _no_matches(config: tr.RegisterConfig):
+    """Return settings under which there are never enough matches of descriptors to start from."""
+    return replace(config.align.match, min_matches=10**9)
+
+
+def file_problems(folder: Path) -> Iterator[Problem]:
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path) as file:
+            source = tr.RangeScan(file["source_points"], file["source_faces"])
+            target = tr.RangeScan(file["target_points"], file["target_faces"])
+            truth, diagonal = torch.from_numpy(file["source_truth"]), float(file["diagonal"])
+        yield Problem(path.stem, source, target, truth, diagonal)
+
+
+def made_up_problems(kind: str, count: int, num_points: int = 4500) -> Iterator[Problem]:
+    """Yield pairs of adjacent frames of the figure or the toy."""
+    scanner = DepthScanner(num_points=num_points)
+    frames = count + 1
+    sequence = (
+        walking_figure(frames, scanner=scanner)
+        if kind == "figure"
+        else jointed_toy(frames, missing=True, scanner=scanner)
+    )
+    for number, pair in enumerate(sequence.pairs()):
+        yield Problem(f"{kind} {number}", pair.source, pair.target, pair.truth, pair.source.diagonal, pair)
+
+
+def score(problem: Problem, recipe: Recipe) -> Score:
+    """Register one pair and return how it went."""
+    found = tr.register(problem.source, problem.target, recipe.bones, recipe.grid, recipe.config)
+    errors = (found.deformed - problem.truth).norm(dim=-1) / problem.diagonal
+    near, pair = (errors < NEAR).double(), problem.pair
+    rand, joints, seen = float("nan"), (), near
+    if pair is not None:
+        seen = near[~pair.missing]
+        rand = float(adjusted_rand(found.parts(), pair.moving_labels()))
+        joints = joint_errors(found, pair)
+    seconds = tuple(found.seconds.tolist())
+    return Score(
+        float(near.mean()), float(seen.mean()), float(errors.mean()), rand, joints, seconds, len(found.transforms)
+    )
+
+
+@torch.no_grad()
+def joint_errors(found: tr.ScanRegistration, pair: ScanPair) -> tuple[float, ...]:
+    """Return how far the true joints, of parts that moved apart, are from the nearest found joint."""
+    moving, labels = pair.moving_labels(), pair.labels
+    part = {int(label): int(moving[labels == label][0]) for label in labels.unique()}
+    centers, errors = found.model.joints().centers, []
+    for (parent, child), place in zip(pair.joint_parts.tolist(), pair.joints, strict=True):
+        if parent in part and child in part and part[parent] != part[child]:
+            near = (centers - place).norm(dim=-1).min() if len(centers) else torch.tensor(torch.inf)
+            errors.append(float(near) / pair.source.diagonal)
+    return tuple(errors)
+
+
+def print_row(name: str, scores: list[Score]) -> None:
+    """Print one line of a table."""
+    ok = sum(one.near >= REGISTERED for one in scores)
+    seen = sum(one.near_seen >= REGISTERED for one in scores)
+    error = 100 * np.mean([one.error for one in scores])
+    seconds = np.median([one.seconds for one in scores], axis=0)
+    total = np.median([sum(one.seconds) for one in scores])
+    bones = np.mean([one.bones for one in scores])
+    stages = " ".join(f"{value:6.2f}" for value in (*seconds, total))
+    print(f"{name:24s} {ok:4d} {seen:4d} /{len(scores):4d} {error:7.2f} {bones:6.1f} {stages}", end="")
+    known = [one.rand for one in scores if not np.isnan(one.rand)]
+    if known:
+        joints = np.array([error for one in scores for error in one.joints])
+        right = np.mean(joints < JOINT) if len(joints) else float("nan")
+        print(f" {np.mean(known):6.2f} {np.mean(np.array(known) >= 0.8):6.0%} {right:6.0%}", end="")
+    print(flush=True)
+
+
+def print_header(title: str) -> None:
+    columns = " ".join(f"{name[:6]:>6s}" for name in (*STAGES, "total"))
+    print(f"\n{title}\n{'':24s}   ok seen / all  mean %  bones {columns}   rand  >= .8 joints", flush=True)
+
+
+def print_set(title: str, problems: list[Problem], recipes: list[Recipe], verbose: bool = False) -> None:
+    """Print a line per recipe, and with ``verbose`` one per pair."""
+    print_header(title)
+    for recipe in recipes:
+        scores = []
+        for problem in problems:
+            scores.append(score(problem, recipe))
+            if verbose:
+                print_row(f"  {problem.name}", scores[-1:])
+        print_row(recipe.name, scores)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Print the tables; return 0."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, help="folder of NPZ pairs; without it, made-up pairs only")
+    parser.add_argument("--pairs", type=int, default=20, help="made-up pairs per set; 189 as in the paper; 0 for none")
+    parser.add_argument("--ablations", action="store_true", help="leave out one step after the other")
+    parser.add_argument("--growth", action="store_true", help="seconds from 2,000 to 100,000 points")
+    parser.add_argument("--verbose", action="store_true", help="a line per pair")
+    parser.add_argument("--smoke", action="store_true", help="one small pair, for a quick look")
+    options = parser.parse_args(arguments)
+    if options.smoke:
+        small = [Recipe("default", 6, 20, tr.RegisterConfig(num_samples=500))]
+        print_set("toy", list(made_up_problems("toy", 1, 600)), small, options.verbose)
+        return 0
+    sets: dict[str, list[Problem]] = {}
+    if options.data is None or not options.data.is_dir():
+        print("skipped: pairs from files; name their folder with --data")
+    else:
+        sets[options.data.name] = list(file_problems(options.data))
+    if options.pairs:
+        sets |= {kind: list(made_up_problems(kind, options.pairs)) for kind in ("figure", "toy")}
+    for title, problems in sets.items():
+        print_set(title, problems, _ablations() if options.ablations else _ablations()[:1], options.verbose)
+    if options.growth:
+        for count in (2000, 5000, 10_000, 20_000, 50_000, 100_000):
+            print_set(f"figure, {count} points", list(made_up_problems("figure", 1, count)), _ablations()[:1])
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,50 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import torchreg as tr
+
+
+@pytest.fixture(scope="module")
+def benchmark(loaded_benchmark):
+    with loaded_benchmark("scan_registration") as module:
+        yield module
+
+
+@pytest.fixture(scope="module")
+def problem(benchmark):
+    return next(benchmark.made_up_problems("toy", 1, 600))
+
+
+def test_truth_is_scored_as_such(benchmark, problem):
+    found = tr.register(problem.source, problem.target, 6, 20, start=problem.truth)
+    errors = benchmark.joint_errors(found, problem.pair)
+    assert errors
+    assert min(errors) < 0.1
+    assert all(0 <= error <= math.inf for error in errors)
+    benchmark.print_row("", [benchmark.Score(1.0, 1.0, 0.0, math.nan, (), (0.0,) * 4, 1)])
+
+
+def test_tables_are_printed_for_files_and_without(benchmark, problem, capsys, tmp_path, monkeypatch):
+    assert benchmark.main(["--smoke", "--verbose"]) == 0
+    assert "default" in capsys.readouterr().out
+    np.savez(
+        tmp_path / "one.npz", source_points=problem.source.points, source_faces=problem.source.faces,
+        target_points=problem.target.points, target_faces=problem.target.faces, source_truth=problem.truth,
+        diagonal=problem.diagonal,
+    )  # fmt: skip
+
+    def known(source, target, bones, grid, config):
+        return real(source, target, bones, 20, config, start=problem.truth)
+
+    real = tr.register
+    monkeypatch.setattr(benchmark.tr, "register", known)
+    assert benchmark.main(["--data", str(tmp_path), "--pairs", "0", "--ablations"]) == 0
+    printed = capsys.readouterr().out
+    assert "without label reuse" in printed
+    assert "bones 20" in printed
+    assert benchmark.main(["--pairs", "0"]) == 0
+    assert "skipped: pairs from files" in capsys.readouterr().out
+    assert torch.isfinite(problem.truth).all()
