@@ -19,12 +19,15 @@ if TYPE_CHECKING:
     from torchreg.models.articulated import ArticulatedShape
     from torchreg.models.grid_lbs import GridLBS
     from torchreg.models.hand import Hand
+    from torchreg.models.pose_head import PoseHead
+    from torchreg.models.pose_prior import PosePrior
     from torchreg.models.skin import BendingSkin, LinearBlendSkin, sample_skin
     from torchreg.models.spine import Spine
     from torchreg.pipelines.align import AlignConfig, align
     from torchreg.pipelines.calibrate import calibrate
     from torchreg.pipelines.extract_spine import SpineConfig, extract_spine
     from torchreg.pipelines.find_pose import FindPoseConfig, find_pose
+    from torchreg.pipelines.pose_initializer import InitialPose, PoseInitializer, PoseInitializerConfig
     from torchreg.pipelines.register import register
     from torchreg.pipelines.register_config import RegisterConfig
     from torchreg.pipelines.skeletonize import SkeletonizeConfig, skeletonize
@@ -57,7 +60,12 @@ __all__ = [
     "FrameResult",
     "GridLBS",
     "Hand",
+    "InitialPose",
     "LinearBlendSkin",
+    "PoseHead",
+    "PoseInitializer",
+    "PoseInitializerConfig",
+    "PosePrior",
     "PoseSolution",
     "PoseStarts",
     "RangeScan",
@@ -104,7 +112,12 @@ _OWNERS = {
     "FrameResult": "results",
     "GridLBS": "models.grid_lbs",
     "Hand": "models.hand",
+    "InitialPose": "pipelines.pose_initializer",
     "LinearBlendSkin": "models.skin",
+    "PoseHead": "models.pose_head",
+    "PoseInitializer": "pipelines.pose_initializer",
+    "PoseInitializerConfig": "pipelines.pose_initializer",
+    "PosePrior": "models.pose_prior",
     "PoseSolution": "results",
     "PoseStarts": "results",
     "RangeScan": "geometry.range_scan",

@@ -1,0 +1,205 @@
+"""The end of an alignment as a fixed point: its energy, exact Newton steps, and gradients by the implicit function."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from torchreg.geometry.rotation import compose_rotation_vectors, left_jacobian, so3_exp
+from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.surface import Surface
+from torchreg.solvers.levenberg_marquardt import held_at_limits
+
+_BASE = 6
+# Curvatures below this share of the largest, once every variable has its own scale, are rounding.
+_FLAT = {torch.float32: 1e-6, torch.float64: 1e-12}
+
+
+@dataclass(frozen=True)
+class FixedPoint:
+    """What the surface fit of a batch of clouds minimizes at its last width, about a start.
+
+    ``E(pose) = sum_j s^2 (1 - exp(-d(Y_j, pose)^2 / s^2)) / (2 noise^2) + sum_k p_k (pose - start)_k^2 / 2``, where the
+    base's rotation differs from the start's by composition. Its stationary point inside the joint limits is the pose.
+
+    Args:
+        shape: the articulated shape.
+        surface: of the shape, twice differentiable in points, pose and, where wanted, the shape's parameters.
+        valid: (B, M) False where data are padding.
+        sigma: (B,) s, metres.
+        noise: (B,) metres.
+        precision: (num_dofs,) p.
+        lower: limits of the pose, (num_dofs,) or (B, num_dofs).
+        upper: limits of the pose, (num_dofs,) or (B, num_dofs).
+
+    References: Dewaele et al. 2006, eqs. 21 and 22.
+    """
+
+    shape: ArticulatedShape
+    surface: Surface
+    valid: Tensor
+    sigma: Tensor
+    noise: Tensor
+    precision: Tensor
+    lower: Tensor
+    upper: Tensor
+
+    @property
+    def parameters(self) -> list[Tensor]:
+        """The parameters of the shape that take gradients."""
+        return [value for value in self.shape.parameters() if value.requires_grad]
+
+    def energy(self, step: Tensor, pose: Tensor, data: Tensor, start: Tensor) -> Tensor:
+        """Return the energy (B,) at poses moved by tangent steps, see `ArticulatedShape.retract`.
+
+        Args:
+            step: (B, num_dofs).
+            pose: (B, num_dofs).
+            data: (B, M, 3), metres.
+            start: (B, num_dofs).
+
+        Differentiable: in all but ``pose``'s rotation at half turns from the start, and the shape's parameters.
+        """
+        turn = step[:, 3:_BASE]
+        joints = pose[:, _BASE:] + step[:, _BASE:]
+        # The step of the base is taken by the data, backwards: then no rotation of the pose is special.
+        seen = (data - (pose[:, :3] + step[:, :3]).unsqueeze(1)) @ so3_exp(turn)
+        there = torch.cat([torch.zeros_like(turn), pose[:, 3:_BASE], joints], dim=-1)
+        width = self.sigma.unsqueeze(-1)
+        distance = self.surface.distance(seen, there)
+        lost = -torch.expm1(-(distance / width).square())
+        cost = 0.5 * (lost * self.valid).sum(-1) * (self.sigma / self.noise).square()
+        away = compose_rotation_vectors(turn, compose_rotation_vectors(pose[:, 3:_BASE], -start[:, 3:_BASE]))
+        offset = torch.cat([pose[:, :3] + step[:, :3] - start[:, :3], away, joints - start[:, _BASE:]], dim=-1)
+        return cost + 0.5 * (self.precision * offset.square()).sum(-1)
+
+    def derivatives(self, pose: Tensor, data: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the gradient (B, num_dofs), still differentiable in data, start and parameters, and the Hessian.
+
+        The Hessian (B, num_dofs, num_dofs) is exact, without a graph of its own.
+
+        Cost: num_dofs + 1 backward passes.
+        """
+        with torch.enable_grad():
+            step = torch.zeros_like(pose, requires_grad=True)
+            energy = self.energy(step, pose.detach(), data, start)
+            (gradient,) = torch.autograd.grad(energy.sum(), step, create_graph=True)
+            rows = [
+                torch.autograd.grad(gradient[:, k].sum(), step, retain_graph=True)[0] for k in range(pose.shape[-1])
+            ]
+        hessian = torch.stack(rows, dim=-2)
+        return gradient, 0.5 * (hessian + hessian.mT)
+
+    def free(self, pose: Tensor, gradient: Tensor) -> Tensor:
+        """Return which variables (B, num_dofs) may move: not pushed against a limit."""
+        return ~held_at_limits(gradient, pose, self.lower, self.upper)
+
+    def polish(self, pose: Tensor, data: Tensor, start: Tensor, steps: int) -> Tensor:
+        """Return the pose (B, num_dofs) after exact Newton steps, each kept where it lowers the gradient's size.
+
+        Differentiable: no.
+        """
+        pose, data, start = pose.detach(), data.detach(), start.detach()
+        best = torch.full_like(pose[:, 0], torch.inf)
+        kept, trial = pose, pose
+        for number in range(steps + 1):
+            gradient, hessian = self.derivatives(trial, data, start)
+            gradient = gradient.detach()
+            free = self.free(trial, gradient)
+            scale = hessian.diagonal(dim1=-2, dim2=-1).abs().clamp_min(torch.finfo(pose.dtype).tiny).rsqrt()
+            size = (gradient * scale * free).norm(dim=-1)
+            better = (size < best).unsqueeze(-1)
+            kept, best = torch.where(better, trial, kept), torch.minimum(size, best)
+            if number == steps:
+                break
+            step = -solve_symmetric(hessian, gradient, free)
+            moved = self.shape.retract(kept, torch.where(better, step, 0.0))
+            trial = torch.minimum(torch.maximum(moved, self.lower), self.upper).detach()
+        return kept
+
+
+def solve_symmetric(matrix: Tensor, right: Tensor, free: Tensor) -> Tensor:
+    """Return ``x`` with ``matrix x = right`` over the free variables, in float64; zero in the others.
+
+    Directions without curvature get nothing, as a pseudoinverse gives it once every variable has its own scale.
+
+    Args:
+        matrix: (B, D, D), symmetric.
+        right: (B, D).
+        free: (B, D) booleans.
+
+    Returns:
+        (B, D), in the dtype of ``right``.
+    """
+    flat = _FLAT[right.dtype]
+    matrix, wanted = matrix.double(), right.double() * free
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1).abs()
+    idle = ~free | (diagonal <= torch.finfo(torch.float64).tiny)
+    scale = diagonal.masked_fill(idle, 1.0).rsqrt().masked_fill(idle, 0.0)
+    values, vectors = torch.linalg.eigh(matrix * scale.unsqueeze(-1) * scale.unsqueeze(-2))
+    steep = values.abs() > flat * values.abs().amax(-1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
+    inverse = torch.where(steep, 1 / values.masked_fill(~steep, 1.0), 0.0)
+    inner = (vectors.mT @ (wanted * scale).unsqueeze(-1)) * inverse.unsqueeze(-1)
+    return ((vectors @ inner).squeeze(-1) * scale).to(right.dtype)
+
+
+def attach_gradients(problem: FixedPoint, pose: Tensor, data: Tensor, start: Tensor) -> Tensor:
+    """Return the pose of a fixed point with its gradients in data, start and the shape's parameters.
+
+    Where ``g(pose, p) = 0`` is the stationarity of the energy over the variables that no limit holds, the implicit
+    function gives ``d pose / d p = -H^-1 dg / dp``: one solve per cloud, however many iterations found the pose, and as
+    exact as the pose is stationary. Correspondences and widths are held.
+
+    Args:
+        problem: what the pose minimizes.
+        pose: (B, num_dofs), stationary.
+        data: (B, M, 3), metres.
+        start: (B, num_dofs).
+
+    Returns:
+        (B, num_dofs), equal to ``pose``.
+
+    Differentiable: once, in ``data``, ``start`` and the parameters of ``problem``.
+
+    Cost: of the backward pass, num_dofs + 2 backward passes of the energy; memory of one double backward pass.
+
+    References: Krantz and Parks 2003, The implicit function theorem; Gould et al. 2016 for argmin layers.
+    """
+    return _Implicit.apply(problem, pose.detach(), data, start, *problem.parameters)
+
+
+class _Implicit(torch.autograd.Function):
+    """The identity on a stationary pose, with the implicit function's gradients."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, problem: FixedPoint, pose: Tensor, data: Tensor, start: Tensor, *parameters: Tensor
+    ) -> Tensor:
+        ctx.problem = problem
+        # Also the parameters, so that autograd notices if they are changed before the backward pass.
+        ctx.save_for_backward(pose, data, start, *parameters)
+        return pose.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
+        problem: FixedPoint = ctx.problem
+        pose, data, start = ctx.saved_tensors[:3]
+        data, start = data.detach().requires_grad_(), start.detach().requires_grad_()
+        gradient, hessian = problem.derivatives(pose, data, start)
+        free = problem.free(pose, gradient.detach())
+        adjoint = solve_symmetric(hessian, _to_tangent(upstream, pose), free)
+        inputs = [data, start, *problem.parameters]
+        grads = torch.autograd.grad(gradient, inputs, -adjoint, allow_unused=True)
+        wanted = ctx.needs_input_grad[2:]
+        return (None, None, *(grad if needed else None for grad, needed in zip(grads, wanted, strict=True)))
+
+
+def _to_tangent(upstream: Tensor, pose: Tensor) -> Tensor:
+    """Return gradients in pose vectors as gradients in tangent steps: the base's rotation vector moves by J^-1 step."""
+    turn = torch.linalg.solve(left_jacobian(pose[:, 3:_BASE]).mT, upstream[:, 3:_BASE].unsqueeze(-1)).squeeze(-1)
+    return torch.cat([upstream[:, :3], turn, upstream[:, _BASE:]], dim=-1)
