@@ -1,0 +1,7 @@
+def test_smoke_prints_every_figure(loaded_benchmark, capsys):
+    with loaded_benchmark("visual_hull") as bench:
+        figures = bench.main(["--smoke"])
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in figures)
+    assert 0.93 < figures["volume over exact hull"] < 1.07
+    assert figures["exact hull over body"] > 1

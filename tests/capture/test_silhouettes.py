@@ -1,0 +1,166 @@
+import math
+
+import pytest
+import torch
+
+from torchreg.capture.silhouettes import chroma_key, visual_hull
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.camera import Camera
+from torchreg.geometry.camera_rig import CameraRig
+from torchreg.geometry.mesh import TriangleMesh, unit_sphere
+from torchreg.geometry.visibility import rasterize
+
+CENTER = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
+RADII = torch.tensor([0.3, 0.2, 0.15], dtype=torch.float64)
+
+
+def ring(count=16, size=120, focal=140.0, lens=()):
+    """Cameras on a tilted ring and two rings above and below it, two metres away."""
+    cameras = []
+    for k in range(count):
+        turn, tilt = 2 * math.pi * k / count, (-0.5, 0.0, 0.5)[k % 3]
+        away = torch.tensor([math.sin(turn) * math.cos(tilt), math.sin(tilt), math.cos(turn) * math.cos(tilt)])
+        one = Camera.looking_at(CENTER + 1.2 * away, CENTER, focal=focal, width=size, height=size, name=f"c{k}")
+        cameras.append(Camera(size, size, one.intrinsics, one.world_to_camera, lens, one.name))
+    return cameras
+
+
+def ellipsoid_mask(camera):
+    """Exact: a ray hits the ellipsoid if the discriminant of the quadratic is positive."""
+    rays = camera.directions(camera.pixel_grid()) / RADII
+    start = (camera.position - CENTER) / RADII
+    b = rays @ start
+    return b**2 - (rays**2).sum(-1) * ((start**2).sum() - 1) > 0
+
+
+def box_mesh(half):
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 3) * half
+    quads = torch.tensor([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
+    return TriangleMesh(CENTER + corners, torch.cat((quads[:, [0, 1, 2]], quads[:, [0, 2, 3]])))
+
+
+def edges_used(mesh):
+    sides = torch.cat([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    return (sides[:, 0] * mesh.num_vertices + sides[:, 1]).unique(return_counts=True)[1]
+
+
+@pytest.mark.parametrize("lens", [(), (-0.2, 0.05, 1e-3, 0.0)], ids=["plain", "lens"])
+def test_hull_of_an_ellipsoid_is_no_smaller_and_little_larger(lens):
+    cameras = ring(24, lens=lens)
+    hull = visual_hull([ellipsoid_mask(camera) for camera in cameras], cameras, resolution=64)
+    truth = 4 / 3 * math.pi * float(RADII.prod())
+    assert 0.99 * truth < hull.volume() < 1.06 * truth
+    mesh = hull.mesh()
+    assert (edges_used(mesh) == 1).all()
+    outside = (((mesh.vertices - CENTER) / RADII) ** 2).sum(-1).sqrt()
+    assert outside.min() > 0.97
+
+
+def test_octree_equals_looking_at_every_voxel():
+    cameras = ring(5, size=60, focal=70.0)
+    masks = [ellipsoid_mask(camera) for camera in cameras]
+    hull = visual_hull(masks, cameras, resolution=48)
+    steps = torch.ones(hull.field.shape, dtype=torch.bool).nonzero()
+    points = hull.origin + hull.spacing * steps
+    inside = torch.ones(len(points), dtype=torch.bool)
+    near = torch.zeros_like(inside)
+    for mask, camera in zip(masks, cameras, strict=True):
+        pixels, _ = camera.project(points.double())
+        column, row = pixels.round().long().clamp(0, 59).unbind(-1)
+        inside &= mask[row, column] & camera.contains(pixels)
+        # Interpolation and nearest pixel may differ along the outline.
+        patch = torch.nn.functional.max_pool2d(mask[None].float(), 3, 1, 1) != -torch.nn.functional.max_pool2d(
+            -mask[None].float(), 3, 1, 1
+        )
+        near |= patch[0, row, column]
+    found = (hull.field < 0).flatten()
+    assert (found == inside)[~near].all()
+    assert (found != inside).double().mean() < 0.01
+
+
+def test_exact_hull_of_a_box_from_its_silhouettes():
+    # Seen along its faces from afar, a box is its own hull.
+    half, mesh = torch.tensor([0.2, 0.15, 0.1], dtype=torch.float64), None
+    mesh = box_mesh(half)
+    cameras = [
+        Camera.looking_at(CENTER + 50 * away, CENTER, focal=9000.0, width=120, height=120)
+        for away in torch.cat((torch.eye(3), -torch.eye(3))).double()
+    ]
+    masks = [rasterize(mesh, camera.view()).face_index >= 0 for camera in cameras]
+    hull = visual_hull(masks, CameraRig(tuple(cameras)), resolution=64)
+    assert hull.volume() == pytest.approx(float(8 * half.prod()), rel=0.03)
+
+
+def test_hull_moves_with_the_cameras_and_a_given_box_cuts_it():
+    cameras = ring(6, size=60, focal=70.0)
+    masks = [ellipsoid_mask(camera) for camera in cameras]
+    hull = visual_hull(masks, cameras, resolution=32)
+    motion = torch.eye(4, dtype=torch.float64)
+    motion[:3, 3] = torch.tensor([1.0, 2.0, 3.0])
+    moved = visual_hull(masks, [camera.moved(motion) for camera in cameras], resolution=32)
+    assert moved.volume() == pytest.approx(hull.volume(), rel=1e-2)
+    assert torch.allclose(
+        moved.mesh().vertices.mean(0), hull.mesh().vertices.mean(0) + motion[:3, 3].float(), atol=0.01
+    )
+    half = visual_hull(
+        masks, cameras, resolution=32, box=torch.stack((CENTER - 1, CENTER + CENTER.new_tensor([0, 1, 1])))
+    )
+    assert half.volume() == pytest.approx(0.5 * hull.volume(), rel=0.15)
+    assert (edges_used(half.mesh()) == 1).all()
+
+
+def test_what_gives_no_hull_is_refused():
+    cameras = ring(4, size=40, focal=45.0)
+    masks = [ellipsoid_mask(camera) for camera in cameras]
+    with pytest.raises(InputError, match="one per camera, two or more, got 3 and 4"):
+        visual_hull(masks[:3], cameras)
+    with pytest.raises(InputTypeError, match="masks must be Boolean"):
+        visual_hull([mask.float() for mask in masks], cameras)
+    with pytest.raises(InputError, match=r"c0 has 40 x 40 pixels, the mask has shape \(39, 40\)"):
+        visual_hull([masks[0][1:], *masks[1:]], cameras)
+    with pytest.raises(InputError, match="that of c1 is empty"):
+        visual_hull([masks[0], masks[1] & False, *masks[2:]], cameras)
+    with pytest.raises(InputError, match="that of c1 touches the border"):
+        visual_hull([masks[0], masks[1] | True, *masks[2:]], cameras)
+    with pytest.raises(InputError, match="at most 512"):
+        visual_hull(masks, cameras, resolution=1000)
+    corner = torch.zeros(40, 40, dtype=torch.bool)
+    corner[2:6, 2:6] = True
+    with pytest.raises(InputError, match="no point is inside all of them"):
+        visual_hull([corner, *masks[1:]], cameras, resolution=16)
+    with pytest.raises(InputError, match="lower and its upper corner"):
+        visual_hull(masks, cameras, box=torch.zeros(2, 3))
+    inwards = [Camera(c.width, c.height, c.intrinsics, cameras[0].world_to_camera) for c in cameras]
+    with pytest.raises(InputError, match="stand around the object"):
+        visual_hull(masks, inwards)
+
+
+@pytest.mark.parametrize("background", [None, (0.1, 0.7, 0.2)])
+def test_chroma_key_tells_skin_from_a_shaded_screen(background):
+    generator = torch.Generator().manual_seed(0)
+    row, column = torch.meshgrid(torch.arange(60.0), torch.arange(80.0), indexing="ij")
+    truth = torch.hypot(row - 30, column - 40) < 15
+    light = (0.5 + 0.5 * column / 80).unsqueeze(-1)
+    skin, screen = torch.tensor([0.8, 0.55, 0.45]), torch.tensor([0.1, 0.7, 0.2])
+    image = torch.where(truth.unsqueeze(-1), skin, screen) * light
+    image = image + 0.01 * torch.randn(60, 80, 3, generator=generator)
+    mask = chroma_key(torch.stack((image, image.flip(1))), background)
+    assert (mask[0] != truth).float().mean() < 0.005
+    assert torch.equal(mask[1], mask[0].flip(1))
+
+
+def test_chroma_key_checks_its_arguments():
+    with pytest.raises(InputError, match="image must have shape"):
+        chroma_key(torch.zeros(5, 5))
+    with pytest.raises(InputError, match="tolerance must be positive"):
+        chroma_key(torch.zeros(5, 5, 3), tolerance=0.0)
+    with pytest.raises(InputError, match="background must have shape"):
+        chroma_key(torch.zeros(5, 5, 3), (1.0, 0.0))
+
+
+def test_sphere_mesh_and_cameras_agree():
+    mesh = unit_sphere(3, dtype=torch.float64)
+    mesh = TriangleMesh(CENTER + 0.2 * mesh.vertices, mesh.faces)
+    cameras = ring(16)
+    masks = [rasterize(mesh, camera.view()).face_index >= 0 for camera in cameras]
+    assert visual_hull(masks, cameras, resolution=48).volume() == pytest.approx(4 / 3 * math.pi * 0.2**3, rel=0.06)

@@ -1,0 +1,110 @@
+import pytest
+import torch
+
+from torchreg.datasets.hand import placed
+from torchreg.datasets.pictures import (
+    PictureStyle,
+    camera_ring,
+    hand_pictures,
+    render,
+    skin_color,
+    stereo_cameras,
+    value_noise,
+)
+from torchreg.errors import InputError
+from torchreg.geometry.camera import Camera
+from torchreg.geometry.mesh import TriangleMesh, unit_sphere
+
+CAMERA = Camera.looking_at([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], focal=60.0, width=48, height=40)
+
+
+@pytest.fixture(scope="module")
+def ball():
+    mesh = unit_sphere(3, dtype=torch.float64)
+    return TriangleMesh(0.1 * mesh.vertices + mesh.vertices.new_tensor([0.0, 0.0, 0.5]), mesh.faces)
+
+
+def test_depth_and_mask_are_those_of_the_sphere(ball):
+    picture = render(ball, CAMERA)
+    assert picture.image.shape == (40, 48, 3)
+    rays = CAMERA.directions(CAMERA.pixel_grid())
+    a, b = (rays**2).sum(-1), rays[..., 2] * 0.5
+    inside = b**2 - a * (0.25 - 0.01)
+    assert ((inside > 0) != picture.mask).sum() < 12
+    both = (inside > 1e-4) & picture.mask
+    assert ((b - inside.clamp(min=0).sqrt()) / a - picture.depth)[both].abs().max() < 4e-3
+    assert torch.equal(picture.mask, picture.face_index >= 0)
+    assert not picture.depth[~picture.mask].any()
+    assert 0 <= picture.image.min() <= picture.image.max() <= 1
+
+
+def test_texture_moves_with_the_surface(ball):
+    style = PictureStyle(noise=0.0, light=(0.0, 0.0, -1.0))
+    still = render(ball, CAMERA, style=style)
+    # Two pixels to the right at every depth: the camera turns instead of the ball.
+    shifted = CAMERA.intrinsics + torch.tensor([0.0, 0.0, 2.0, 0.0], dtype=torch.float64)
+    moved = render(ball, Camera(48, 40, shifted, CAMERA.world_to_camera), style=style)
+    assert torch.allclose(moved.image[:, 2:], still.image[:, :-2], atol=1e-6)
+    step = ball.vertices.new_tensor([0.3, 0.0, 0.0])
+    away = TriangleMesh(ball.vertices + step, ball.faces)
+    other = Camera.looking_at(step, step + step.new_tensor([0, 0, 1]), focal=60.0, width=48, height=40)
+    assert torch.allclose(render(away, other, ball.vertices, style=style).image, still.image, atol=1e-6)
+
+
+def test_wall_is_where_it_says_and_noise_is_seeded(ball):
+    style = PictureStyle(wall=0.8, noise=0.02)
+    first, second = render(ball, CAMERA, style=style), render(ball, CAMERA, style=style)
+    assert torch.equal(first.image, second.image)
+    assert torch.allclose(first.depth[~first.mask], first.depth.new_tensor(0.8))
+    other = render(ball, CAMERA, style=style, generator=torch.Generator().manual_seed(1))
+    assert float((other.image - first.image).std()) == pytest.approx(0.02 * 2**0.5, rel=0.1)
+    assert not torch.allclose(render(ball, CAMERA, style=style, seed=3).image, first.image, atol=0.1)
+
+
+def test_value_noise_is_smooth_centered_and_of_its_wavelength():
+    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    noise = value_noise(points, 0.01)
+    assert noise.abs().max() <= 1
+    assert abs(float(noise.mean())) < 0.03
+    near = value_noise(points + 1e-5, 0.01)
+    assert (near - noise).abs().max() < 0.02
+    far = value_noise(points + 0.02, 0.01)
+    assert abs(float((far * noise).mean())) < 0.02
+    assert abs(float((value_noise(points, 0.01, seed=1) * noise).mean())) < 0.02
+    color = skin_color(points)
+    assert (color[:, 0] > color[:, 2]).double().mean() > 0.99
+    with pytest.raises(InputError, match="wavelength must be positive"):
+        value_noise(points, 0.0)
+
+
+def test_hand_before_a_pair_and_in_a_ring(plain_hand, plain_hand_surface):
+    pair = stereo_cameras(width=80, height=60, focal=75.0)
+    assert pair.is_rectified
+    assert pair.baseline == pytest.approx(0.12)
+    pose = placed(plain_hand, plain_hand.rest_pose(), torch.tensor([0.0, 0.0, 0.6]))
+    left, right = hand_pictures(plain_hand, pose, pair, skin=plain_hand_surface, style=PictureStyle(wall=0.9))
+    assert left.mask.sum() > 50
+    # The disparity of the hand is about that of its distance.
+    middle = [picture.mask.nonzero()[:, 1].double().mean() for picture in (left, right)]
+    expected = pair.disparity(left.depth[left.mask].mean())
+    assert float(middle[0] - middle[1]) == pytest.approx(float(expected), abs=1.5)
+    ring = camera_ring([0.0, 0.0, 0.6], 0.5, 5, focal=50.0, width=48, height=48)
+    pictures = hand_pictures(plain_hand, pose, ring, skin=plain_hand_surface)
+    assert len(pictures) == len(ring) == 5
+    assert all(picture.mask.sum() > 20 for picture in pictures)
+    assert all(camera.project(torch.tensor([[0.0, 0.0, 0.6]]))[1].item() == pytest.approx(0.5) for camera in ring)
+
+
+def test_arguments_are_checked(ball, plain_hand, plain_hand_skin):
+    with pytest.raises(InputError, match="noise must be zero or positive"):
+        PictureStyle(noise=-1.0)
+    with pytest.raises(InputError, match="supersampling must be at least 1"):
+        PictureStyle(supersampling=0)
+    with pytest.raises(InputError, match="wall must be positive"):
+        PictureStyle(wall=0.0)
+    with pytest.raises(InputError, match="rest must have shape"):
+        render(ball, CAMERA, ball.vertices[:3])
+    with pytest.raises(InputError, match="count must be at least 2"):
+        camera_ring([0, 0, 0], 1.0, 1)
+    with pytest.raises(InputError, match="skin must have faces"):
+        hand_pictures(plain_hand, plain_hand.rest_pose(), stereo_cameras(), skin=plain_hand_skin)

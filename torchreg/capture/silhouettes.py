@@ -1,0 +1,316 @@
+"""Silhouettes to surfaces: the visual hull of calibrated masks, refined only where its surface runs, and its mesh."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import as_float_tensor, check_count, check_finite, check_shape
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.camera import Camera, lens_jacobian
+from torchreg.geometry.camera_rig import CameraRig
+from torchreg.geometry.marching_cubes import marching_cubes
+from torchreg.geometry.mask_distance import signed_mask_distance
+from torchreg.geometry.mesh import TriangleMesh
+
+# Blocks of 16^3 voxels are looked at first, then their eighths, down to voxels.
+_LEVELS = 4
+_MAX_RESOLUTION = 512
+# Points looked at in one go; bounds memory at about 50 MB.
+_CHUNK = 1 << 20
+# Resolution at which the box is looked for, how often, and empty layers around it.
+_BOX_RESOLUTION, _BOX_ROUNDS, _BORDER = 32, 3, 2
+_SMALLEST_MASK = 4
+# By so many pixels interpolation between the middles of pixels may change more than the distance itself.
+_INTERPOLATION = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class VisualHull:
+    """The largest body with given silhouettes, as a field on a grid.
+
+    Args:
+        field: (X, Y, Z) signed distance to the outline in the picture that is least inside, times the size of a pixel
+            there: negative inside, in the unit of the cameras. Far from the surface only its sign tells anything.
+        origin: (3,) of sample (0, 0, 0).
+        spacing: between samples.
+    """
+
+    field: Tensor
+    origin: Tensor
+    spacing: float
+
+    def mesh(self) -> TriangleMesh:
+        """Return the watertight surface, oriented outwards."""
+        return marching_cubes(self.field, self.origin, self.spacing)
+
+    def volume(self) -> float:
+        """Return the volume inside the surface."""
+        mesh = self.mesh()
+        corners = (mesh.vertices - mesh.vertices.mean(0)).double()[mesh.faces]
+        return float(torch.linalg.det(corners).sum()) / 6
+
+
+def visual_hull(
+    masks: Sequence[Tensor],
+    cameras: CameraRig | Sequence[Camera],
+    *,
+    resolution: int = 256,
+    box: Tensor | None = None,
+) -> VisualHull:
+    """Return the visual hull of calibrated silhouettes: all points that every camera sees inside its mask.
+
+    Blocks of the grid whose picture lies clear of every outline are decided at once; the others are split into eight.
+    What a camera does not see, because it lies beside its picture or behind it, counts as outside.
+
+    Args:
+        masks: one (H, W) bool per camera; True on the object.
+        cameras: where the masks were taken.
+        resolution: samples along the longest side of the box.
+        box: (2, 3) lower and upper corner of what may hold the object; found from the masks by default.
+
+    Returns:
+        the hull, float32.
+
+    Raises:
+        InputError: if numbers or sizes do not fit, a mask is (nearly) empty or touches the border of its picture, or
+            no point is inside all masks.
+        InputTypeError: if a mask is not Boolean.
+
+    Differentiable: no.
+
+    Cost: proportional to the surface, resolution^2 times the number of cameras.
+
+    References: Laurentini 1994 (the hull); Szeliski 1993 (octrees from silhouettes).
+    """
+    silhouettes = [_Silhouette.of(mask, camera) for mask, camera in _paired(masks, cameras)]
+    check_count(resolution, "resolution", 8)
+    if resolution > _MAX_RESOLUTION:
+        raise InputError(f"resolution must be at most {_MAX_RESOLUTION}, got {resolution}")
+    with torch.no_grad():
+        bounds = _found_box(silhouettes) if box is None else _checked_box(box)
+        hull = _carved(silhouettes, bounds, resolution)
+    if not bool((hull.field < 0).any()):
+        raise InputError(
+            "masks must have a point of space in common, but no point is inside all of them; check that masks and "
+            "cameras are in the same order and the motions are world to camera"
+        )
+    return hull
+
+
+def _paired(masks: Sequence[Tensor], cameras: CameraRig | Sequence[Camera]) -> list[tuple[Tensor, Camera]]:
+    cameras = list(cameras)
+    if len(masks) != len(cameras) or len(cameras) < 2:
+        raise InputError(f"masks must be one per camera, two or more, got {len(masks)} and {len(cameras)} cameras")
+    for mask, camera in zip(masks, cameras, strict=True):
+        if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
+            raise InputTypeError(f"masks must be Boolean, got {getattr(mask, 'dtype', type(mask).__name__)}")
+        if mask.shape != (camera.height, camera.width):
+            raise InputError(
+                f"masks must have the size of their camera's picture: {camera.name or 'camera'} has {camera.width} x "
+                f"{camera.height} pixels, the mask has shape {tuple(mask.shape)}"
+            )
+        rim = torch.cat((mask[0], mask[-1], mask[:, 0], mask[:, -1]))
+        if int(mask.sum()) < _SMALLEST_MASK or bool(rim.any()):
+            what = "touches the border of the picture" if bool(rim.any()) else "is empty"
+            raise InputError(
+                f"masks must show the whole object, that of {camera.name or 'a camera'} {what}; leave it out"
+            )
+    return list(zip(masks, cameras, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class _Silhouette:
+    """A camera, the signed distance (1, 1, H, W) to its mask's outline, and by how much its lens stretches at most."""
+
+    camera: Camera
+    distance: Tensor
+    stretch: float
+
+    @classmethod
+    def of(cls, mask: Tensor, camera: Camera) -> _Silhouette:
+        camera = camera.to(device=mask.device, dtype=torch.float32)
+        # Averaged over 3 x 3 pixels, the steps of the outline vanish, and its curves lose a hundredth of a pixel.
+        distance = torch.nn.functional.pad(signed_mask_distance(mask)[None, None], (1, 1, 1, 1), mode="replicate")
+        distance = torch.nn.functional.avg_pool2d(distance, 3, stride=1).to(mask.device)
+        stretch = 1.0
+        if camera.is_distorted:
+            focal, center = camera.intrinsics.split(2)
+            plane = (camera.pixel_grid()[::8, ::8] - center) / focal
+            jacobian = lens_jacobian(camera.undistorted(plane), camera.distortion)
+            stretch = 1.1 * float(torch.linalg.matrix_norm(jacobian.nan_to_num(0.0), 2).max())
+        return cls(camera, distance, stretch)
+
+    def look(self, points: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+        """Return for points (N, 3) the signed distance in pixels, how much it may change within ``radius``."""
+        local = points @ self.camera.world_to_camera[:3, :3].mT + self.camera.world_to_camera[:3, 3]
+        depth = local[:, 2]
+        plane = local[:, :2] / depth.clamp(min=1e-9).unsqueeze(-1)
+        focal, center = self.camera.intrinsics.split(2)
+        pixels = self.camera.distorted(plane) * focal + center
+        size = pixels.new_tensor([self.camera.width, self.camera.height])
+        place = (2 * pixels + 1) / size - 1
+        sampled = torch.nn.functional.grid_sample(
+            self.distance, place[None, None], mode="bilinear", padding_mode="border", align_corners=False
+        )[0, 0, 0]
+        # Beside the picture it is at least as far outside as from the border.
+        beyond = (pixels - pixels.clamp(torch.zeros_like(size), size - 1)).norm(dim=-1)
+        sampled = torch.where((beyond > 0) | (depth <= 0), sampled.clamp(min=0.5) + beyond, sampled)
+        slope = float(focal.max()) * self.stretch * (1 + (plane**2).sum(-1)).sqrt()
+        reach = torch.where(depth > 1.001 * radius, slope * radius / (depth - radius).clamp(min=1e-9), torch.inf)
+        return sampled, reach
+
+    def pixel_size(self, points: Tensor) -> Tensor:
+        """Return the width of a pixel at points (N, 3)."""
+        depth = points @ self.camera.world_to_camera[2, :3] + self.camera.world_to_camera[2, 3]
+        return depth.clamp(min=0.0) / self.camera.intrinsics[0]
+
+
+def _carved(silhouettes: list[_Silhouette], box: Tensor, resolution: int) -> VisualHull:
+    """Return the hull within a box, by blocks that are split while an outline passes through their picture."""
+    spacing = float((box[1] - box[0]).max()) / (resolution - 1)
+    edge = 1 << _LEVELS
+    counts = [math.ceil((math.ceil(side / spacing) + 1 + 2 * _BORDER) / edge) for side in (box[1] - box[0]).tolist()]
+    middle = 0.5 * (box[0] + box[1])
+    origin = middle - 0.5 * spacing * (middle.new_tensor(counts) * edge - 1)
+    state = torch.zeros(counts, dtype=torch.int8, device=box.device)
+    for level in range(_LEVELS + 1):
+        edge = 1 << (_LEVELS - level)
+        if level:
+            state = state.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+        open_blocks = (state == 0).nonzero()
+        if edge == 1:
+            break
+        centers = origin + spacing * (open_blocks * edge + 0.5 * (edge - 1))
+        state[tuple(open_blocks.unbind(-1))] = _decided(silhouettes, centers, spacing * 0.5 * (edge - 1) * 3**0.5)
+    field = state.to(box) * (10 * spacing)
+    field[tuple(open_blocks.unbind(-1))] = _sampled(silhouettes, origin + spacing * open_blocks)
+    # What reaches out of the box is cut there, so that the surface is closed.
+    for axis in range(3):
+        along = origin[axis] + spacing * torch.arange(field.shape[axis]).to(box)
+        beyond = torch.maximum(box[0, axis] - along, along - box[1, axis])
+        field = torch.maximum(field, beyond.reshape([-1 if k == axis else 1 for k in range(3)]))
+    return VisualHull(field, origin, spacing)
+
+
+def _decided(silhouettes: list[_Silhouette], centers: Tensor, radius: float) -> Tensor:
+    """Return 1 for blocks (N, 3) that lie outside one mask, -1 for those inside all, 0 for the others, int8."""
+    verdict = torch.full(centers.shape[:1], -1, dtype=torch.int8, device=centers.device)
+    left = torch.arange(len(centers), device=centers.device)
+    for silhouette in silhouettes:
+        distance, reach = silhouette.look(centers[left], radius)
+        outside = distance > reach + _INTERPOLATION
+        inside = distance < -reach - _INTERPOLATION
+        verdict[left] = torch.where(outside, 1, torch.where(inside, verdict[left], 0)).to(torch.int8)
+        left = left[~outside]
+    return verdict
+
+
+def _sampled(silhouettes: list[_Silhouette], points: Tensor) -> Tensor:
+    """Return the field at points (N, 3): the largest signed distance of all silhouettes, in the unit of space."""
+    parts = []
+    for chunk in points.split(_CHUNK):
+        field = chunk.new_full(chunk.shape[:1], -torch.inf)
+        for silhouette in silhouettes:
+            distance, _ = silhouette.look(chunk, 0.0)
+            field = torch.maximum(field, distance * silhouette.pixel_size(chunk))
+        parts.append(field)
+    return torch.cat(parts) if parts else points.new_zeros(0)
+
+
+def _found_box(silhouettes: list[_Silhouette]) -> Tensor:
+    """Return a box (2, 3) around the hull: first about the point nearest to all middles of masks, then ever tighter."""
+    places = torch.stack([silhouette.camera.position for silhouette in silhouettes])
+    middles = []
+    for silhouette in silhouettes:
+        inside = (silhouette.distance[0, 0] < 0).nonzero().flip(-1).to(places)
+        middles.append(silhouette.camera.directions(inside.mean(0, keepdim=True))[0])
+    rays = torch.nn.functional.normalize(torch.stack(middles), dim=-1)
+    across = torch.eye(3).to(rays) - rays.unsqueeze(-1) * rays.unsqueeze(-2)
+    center = torch.linalg.lstsq(across.sum(0), (across @ places.unsqueeze(-1)).sum(0)).solution[:, 0]
+    half = (places - center).norm(dim=-1).min()
+    # Rays within half a degree of each other tell nothing of the depth.
+    if float(torch.linalg.eigvalsh(across.mean(0))[0]) < 1e-4:
+        raise InputError("cameras must stand around the object; pass box= where they do not")
+    box = torch.stack((center - half, center + half))
+    for _ in range(_BOX_ROUNDS):
+        box = _shrunk(silhouettes, box)
+    return box
+
+
+def _shrunk(silhouettes: list[_Silhouette], box: Tensor) -> Tensor:
+    """Return the box of the cells of a box, 32 to its longest side, in which part of the hull may lie."""
+    size = float((box[1] - box[0]).max()) / _BOX_RESOLUTION
+    counts = [max(1, math.ceil(side / size - 1e-6)) for side in (box[1] - box[0]).tolist()]
+    cells = torch.ones(counts, dtype=torch.bool).nonzero().to(box)
+    verdict = _decided(silhouettes, box[0] + size * (cells + 0.5), 0.5 * size * 3**0.5)
+    kept = cells[verdict < 1]
+    if not len(kept):
+        return box
+    return torch.stack((box[0] + size * kept.amin(0), box[0] + size * (kept.amax(0) + 1)))
+
+
+def _checked_box(box: Tensor) -> Tensor:
+    box = as_float_tensor(box, "box").float()
+    check_shape(box, "box", (2, 3))
+    check_finite(box, "box")
+    if not bool((box[1] > box[0]).all()):
+        raise InputError(f"box must hold its lower and its upper corner, got {box.tolist()}")
+    return box
+
+
+def chroma_key(image: Tensor, background: Sequence[float] | None = None, *, tolerance: float = 0.12) -> Tensor:
+    """Return which pixels differ from a background of one color, in light and in shade.
+
+    Pixels are compared by chroma, their blue and red less their brightness: ``(B - Y, R - Y)``, with that of the
+    background scaled to each pixel's own brightness, since in shade a screen keeps its hue. Specks are removed and
+    pinholes closed, one pixel wide.
+
+    Args:
+        image: (..., H, W, 3) from 0 to 1.
+        background: its red, green and blue; the median of the border of each picture by default.
+        tolerance: distance in chroma from which a pixel is foreground.
+
+    Returns:
+        (..., H, W) bool.
+
+    Raises:
+        InputError: if the shape does not fit or ``tolerance`` is not positive.
+
+    Differentiable: no.
+    """
+    image = as_float_tensor(image, "image")
+    check_shape(image, "image", ("H", "W", 3), batch=True)
+    if not tolerance > 0:
+        raise InputError(f"tolerance must be positive, got {tolerance}")
+    with torch.no_grad():
+        if background is None:
+            sides = (image[..., 0, :, :], image[..., -1, :, :], image[..., :, 0, :], image[..., :, -1, :])
+            rim = torch.cat(sides, dim=-2)
+            screen = rim.median(dim=-2).values[..., None, None, :]
+        else:
+            screen = torch.as_tensor(background).to(image)
+            check_shape(screen, "background", (3,))
+        luma = image.new_tensor([0.299, 0.587, 0.114])
+        brightness, own = (image @ luma).unsqueeze(-1), (screen @ luma).unsqueeze(-1)
+        shaded = screen * (brightness / own.clamp(min=1e-3)).clamp(max=1.5)
+        difference = (image - brightness) - (shaded - (shaded @ luma).unsqueeze(-1))
+        mask = difference[..., [0, 2]].norm(dim=-1) > tolerance
+        return _tidied(mask)
+
+
+def _tidied(mask: Tensor) -> Tensor:
+    """Return masks (..., H, W) opened and then closed by squares of 3 x 3."""
+    flat = mask.reshape(-1, 1, *mask.shape[-2:]).float()
+
+    def grown(values: Tensor) -> Tensor:
+        return torch.nn.functional.max_pool2d(values, 3, stride=1, padding=1)
+
+    def shrunk(values: Tensor) -> Tensor:
+        return -grown(-values)
+
+    return (shrunk(grown(grown(shrunk(flat)))) > 0.5).reshape(mask.shape)
