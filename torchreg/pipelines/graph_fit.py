@@ -140,21 +140,24 @@ def _of_matches(graph: DeformationGraph, transforms: Tensor, middles: Tensor, ma
 
 def _of_edges(graph: DeformationGraph, transforms: Tensor, middles: Tensor, give: float | None) -> Linearization:
     """Return the sum of squared gaps, its gradient (J, 6) and Hessian (J, J, 6, 6)."""
-    size = graph.num_nodes
-    hessian, gradient = transforms.new_zeros(size * size, 6, 6), transforms.new_zeros(size, 6)
-    both, gap = graph.centers[graph.edges], graph.edge_gaps(transforms)
+    size, ends = graph.num_nodes, graph.edges
+    both, gap = graph.centers[ends], graph.edge_gaps(transforms)
     weight = graph.edge_weights[:, None, None]
     if give is not None:
         weight = weight / (1 + gap.square().sum((1, 2), keepdim=True) / (2 * give**2))
+    # Derivatives of the two gaps (E, 6) by the twists of one node and, with the other sign, the other: (E, 6, 12).
     identity = torch.eye(3).to(both).expand(*both.shape, 3)
-    ends, sides = graph.edges.unbind(-1), []
-    for node, sign in zip(ends, (1.0, -1.0), strict=True):
-        arm = transform_points(transforms[node], both) - middles[node].unsqueeze(1)
-        sides.append(sign * torch.cat((identity, -skew(arm)), dim=-1).flatten(1, 2))
-    for first, one in zip(ends, sides, strict=True):
-        gradient.index_add_(0, first, (weight * (one.mT @ gap.flatten(1).unsqueeze(-1))).squeeze(-1))
-        for second, other in zip(ends, sides, strict=True):
-            hessian.index_add_(0, first * size + second, weight * (one.mT @ other))
+    sides = []
+    for node, sign in zip(ends.unbind(-1), (1.0, -1.0), strict=True):
+        arms = transform_points(transforms[node], both) - middles[node].unsqueeze(1)
+        sides.append(sign * torch.cat((identity, -skew(arms)), dim=-1).flatten(1, 2))
+    blocks = torch.cat(sides, dim=-1)
+    weighted = (weight * blocks).mT
+    square = (weighted @ blocks).unflatten(2, (2, 6)).unflatten(1, (2, 6)).transpose(2, 3)
+    pair = ends.unsqueeze(2) * size + ends.unsqueeze(1)
+    hessian = transforms.new_zeros(size * size, 36).index_add_(0, pair.reshape(-1), square.reshape(-1, 36))
+    slope = (weighted @ gap.flatten(1).unsqueeze(-1)).reshape(-1, 6)
+    gradient = transforms.new_zeros(size, 6).index_add_(0, ends.reshape(-1), slope)
     cost = 0.5 * (weight * gap.square()).sum()
     return Linearization(cost, gradient, hessian.view(size, size, 6, 6))
 

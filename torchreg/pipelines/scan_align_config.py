@@ -103,8 +103,8 @@ class RefineConfig:
         compatible: see `ScanEMConfig`.
     """
 
-    num_steps: int = 8
-    final_steps: int = 3
+    num_steps: int = 6
+    final_steps: int = 1
     sigma: tuple[float, float] = (0.025, 0.006)
     near_sigma: float = 0.02
     stiffness: tuple[float, float] = (0.2, 0.006)
