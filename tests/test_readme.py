@@ -36,8 +36,9 @@ def test_ci_refuses_unknown_arguments():
     assert "usage" in answer.stderr
 
 
-def test_example_is_short_and_runs(tmp_path):
-    example = block_after("example", "python")
+@pytest.mark.parametrize("marker", ["example", "scan example"])
+def test_example_is_short_and_runs(tmp_path, marker):
+    example = block_after(marker, "python")
     assert len([line for line in example.splitlines() if line.strip()]) <= 12
     script = tmp_path / "example.py"
     script.write_text(example, encoding="utf-8")
