@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from torchreg.pipelines.pose_initializer import InitialPose, PoseInitializer, PoseInitializerConfig
     from torchreg.pipelines.register import register
     from torchreg.pipelines.register_config import RegisterConfig
+    from torchreg.pipelines.register_sequence import register_sequence
     from torchreg.pipelines.skeletonize import SkeletonizeConfig, skeletonize
     from torchreg.pipelines.solve_pose import solve_pose
     from torchreg.pipelines.storage import load
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
         PoseSolution,
         PoseStarts,
         ScanRegistration,
+        SequenceRegistration,
         SpineSequence,
         Status,
         TrackResult,
@@ -71,6 +73,7 @@ __all__ = [
     "RangeScan",
     "RegisterConfig",
     "ScanRegistration",
+    "SequenceRegistration",
     "SigmaSchedule",
     "Skeleton",
     "SkeletonizeConfig",
@@ -94,6 +97,7 @@ __all__ = [
     "load_points",
     "metrics",
     "register",
+    "register_sequence",
     "sample_skin",
     "skeletonize",
     "solve_pose",
@@ -123,6 +127,7 @@ _OWNERS = {
     "RangeScan": "geometry.range_scan",
     "RegisterConfig": "pipelines.register_config",
     "ScanRegistration": "results",
+    "SequenceRegistration": "results",
     "SigmaSchedule": "correspondence.sigma",
     "Skeleton": "geometry.skeleton",
     "SkeletonizeConfig": "pipelines.skeletonize",
@@ -143,6 +148,7 @@ _OWNERS = {
     "load_mesh": "io.points",
     "load_points": "io.points",
     "register": "pipelines.register",
+    "register_sequence": "pipelines.register_sequence",
     "sample_skin": "models.skin",
     "skeletonize": "pipelines.skeletonize",
     "solve_pose": "pipelines.solve_pose",

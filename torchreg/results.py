@@ -501,3 +501,38 @@ class ScanRegistration(Result, Generic[Shape]):
         for _ in range(len(motions)):
             reach = ((reach @ reach) > 0).double()
         return reach.argmax(1)[self.labels].unique(return_inverse=True)[1]
+
+
+@dataclass(frozen=True)
+class SequenceRegistration(Result, Generic[Shape]):
+    """A reference scan taken onto T scans by one set of B bones, in the unit and frame of the scans.
+
+    Args:
+        model: the `GridLBS`, its poses the T frames: ``model(points)`` is (T, N, 3).
+        points: (N, 3) of the reference, before they are moved.
+        faces: (F, 3) of the reference, or None.
+        deformed: (T, N, 3) its points moved onto every scan.
+        labels: (N,) int64, the bone with the largest weight at each point.
+        transforms: (T, B, 4, 4) of the bones.
+        weights: (N, B) of the bones at the points, rows sum to one.
+        fused: (K, 3) the points of all scans in the pose of the reference: a more complete model than any of them.
+        fused_normals: (K, 3) unit normals there.
+        fused_frames: (K,) int64, the scan that each is from.
+        reference: number of the scan that is moved.
+        status: how the registration ended.
+        history: one `RegisterRecord` per step of the joint fit.
+    """
+
+    model: Shape
+    points: Tensor
+    faces: Tensor | None
+    deformed: Tensor
+    labels: Tensor
+    transforms: Tensor
+    weights: Tensor
+    fused: Tensor
+    fused_normals: Tensor
+    fused_frames: Tensor
+    reference: int
+    status: Status
+    history: tuple[RegisterRecord, ...] = ()

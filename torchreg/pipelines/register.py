@@ -23,7 +23,7 @@ from torchreg.pipelines.scan_alignment import align_scans
 from torchreg.results import RegisterRecord, ScanRegistration, Status
 
 # Points that the dense alignment is unsure of count this much at least: they follow what is around them.
-_LEAST_CONFIDENCE = 0.1
+LEAST_CONFIDENCE = 0.1
 
 
 @torch.no_grad()
@@ -91,7 +91,7 @@ def register(
     moved = unit.of_points(start)
     trust = torch.ones_like(moved[:, 0]) if confidence is None else confidence.detach().cpu().double()
     samples = Samples(
-        scan.points[index], scan.normals[index], moved[None, index], trust[None, index].clamp(min=_LEAST_CONFIDENCE)
+        scan.points[index], scan.normals[index], moved[None, index], trust[None, index].clamp(min=LEAST_CONFIDENCE)
     )
     clock.lap()
     # Lines 3 to 8: motions, correspondences and labels in turn.

@@ -1,0 +1,67 @@
+"""Many scans together: every frame reached, one set of weights, all points in one pose, bad input."""
+
+import math
+
+import pytest
+import torch
+
+import torchreg as tr
+from torchreg.datasets.depth_scanner import DepthScanner
+from torchreg.datasets.scan_sequences import jointed_toy
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.neighbors import nearest_neighbor
+from torchreg.pipelines.register_config import RegisterConfig
+from torchreg.pipelines.register_sequence import register_sequence
+from torchreg.pipelines.scan_align_config import ScanAlignConfig
+
+QUICK = RegisterConfig(align=ScanAlignConfig(num_samples=300, num_target_samples=400), num_samples=500)
+
+
+@pytest.fixture(scope="module")
+def toy():
+    return jointed_toy(3, seed=2, scanner=DepthScanner(num_points=700), step=math.radians(12))
+
+
+@pytest.fixture(scope="module")
+def found(toy):
+    return register_sequence([toy[frame] for frame in range(3)], 8, 30, QUICK, reference=1)
+
+
+def test_every_frame_is_reached_from_the_reference(toy, found):
+    assert found.deformed.shape == (3, len(toy[1]), 3)
+    assert found.transforms.shape[0] == 3
+    for frame in range(3):
+        errors = (found.deformed[frame] - toy.truth(1, frame)).norm(dim=-1) / toy[1].diagonal
+        assert float((errors < 0.025).float().mean()) > 0.85
+    with torch.no_grad():
+        torch.testing.assert_close(found.model(found.points), found.deformed, atol=1e-4, rtol=0)
+    assert found.status.usable
+
+
+def test_the_reference_stays_where_it_is(toy, found):
+    assert float((found.deformed[1] - found.points).norm(dim=-1).mean()) < 0.005 * toy[1].diagonal
+
+
+def test_all_points_meet_in_the_pose_of_the_reference(toy, found):
+    assert len(found.fused) == sum(len(toy[frame]) for frame in range(3))
+    assert found.fused_frames.unique().tolist() == [0, 1, 2]
+    torch.testing.assert_close(found.fused_normals.norm(dim=-1), torch.ones(len(found.fused)))
+    distance = nearest_neighbor(found.fused, toy[1].points)[1] / toy[1].diagonal
+    assert float(distance.median()) < 0.01
+
+
+def test_results_are_the_same_on_disk(found, tmp_path):
+    found.save(tmp_path / "all.safetensors")
+    back = tr.load(tmp_path / "all.safetensors")
+    for name in ("deformed", "transforms", "weights", "fused", "fused_frames"):
+        assert torch.equal(getattr(back, name), getattr(found, name))
+    assert back.history == found.history
+
+
+def test_bad_arguments_are_refused_by_name(toy):
+    with pytest.raises(InputError, match="scans must hold at least two"):
+        register_sequence([toy[0]])
+    with pytest.raises(InputError, match="reference must be below"):
+        register_sequence([toy[0], toy[1]], reference=2)
+    with pytest.raises(InputTypeError, match="RangeScan"):
+        register_sequence([toy[0], toy[1].points])

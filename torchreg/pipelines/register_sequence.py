@@ -1,0 +1,174 @@
+"""Registering many range scans of one thing together: one set of bones and weights, motions for every frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+import torchreg.pipelines.storage  # noqa: F401  (results can be saved)
+from torchreg._checks import check_count
+from torchreg.errors import InputError
+from torchreg.geometry.neighbors import nearest_neighbor
+from torchreg.geometry.range_scan import RangeScan
+from torchreg.geometry.sparse_grid import SparseGrid
+from torchreg.pipelines.bone_labels import CellData
+from torchreg.pipelines.reduced_fit import ReducedFit, Samples
+from torchreg.pipelines.register import (
+    LEAST_CONFIDENCE,
+    Unit,
+    check_inputs,
+    initial_records,
+    register,
+    source_samples,
+)
+from torchreg.pipelines.register_config import OnRegisterStep, RegisterConfig
+from torchreg.pipelines.scan_alignment import align_scans
+from torchreg.results import SequenceRegistration, Status
+
+
+@torch.no_grad()
+def register_sequence(
+    scans: Sequence[RangeScan],
+    num_bones: int = 10,
+    grid_resolution: int = 50,
+    config: RegisterConfig | None = None,
+    generator: torch.Generator | None = None,
+    on_step: OnRegisterStep | None = None,
+    *,
+    reference: int = 0,
+) -> SequenceRegistration:
+    """Return one set of bones and weights that takes a reference scan onto all scans, and what all of them show.
+
+    Going from the reference outward, the reference as moved for one frame is aligned with the next, and bones are
+    fitted to that: every frame is reached by bending the reference itself, not what earlier frames made of it, so that
+    errors do not pile up. Then labels, weights and the motions of all frames are solved together.
+
+    Args:
+        scans: T scans of one thing, two at least, in one unit and frame; motions between neighbors as in `register`.
+        num_bones: see `register`.
+        grid_resolution: see `register`.
+        config: see `RegisterConfig`.
+        generator: source of randomness; None draws the same numbers at every call.
+        on_step: called with a `RegisterRecord` after each step.
+        reference: number of the scan that is moved.
+
+    Returns:
+        a `SequenceRegistration`.
+
+    Raises:
+        InputError: if there are fewer than two scans, or a number is out of range.
+        InputTypeError: if a scan is none.
+
+    Differentiable: no.
+
+    Cost: that of `register` for every frame, and half a second each for the joint fit.
+
+    References: Chang and Zwicker 2009, section 6, which asks for a simultaneous optimization.
+    """
+    config = RegisterConfig() if config is None else config
+    scans = tuple(scans)
+    if len(scans) < 2:
+        raise InputError(f"scans must hold at least two, got {len(scans)}")
+    for scan in scans:
+        check_inputs((scan, scan), num_bones, grid_resolution)
+    check_count(reference, "reference", 0)
+    if reference >= len(scans):
+        raise InputError(f"reference must be below the number of scans {len(scans)}, got {reference}")
+    source = scans[reference]
+    unit = Unit(source)
+    moved, confidence = _chain(scans, reference, num_bones, grid_resolution, config, generator, on_step)
+    scan = unit.of_scan(source)
+    index = source_samples(scan, config, generator)
+    data = CellData(SparseGrid.from_points(scan.points, grid_resolution), scan.points[index], config.num_patches)
+    places = unit.of_points(moved)[:, index]
+    trust = confidence[:, index].double().clamp(min=LEAST_CONFIDENCE)
+    samples = Samples(scan.points[index], scan.normals[index], places, trust)
+    fit = ReducedFit(data, samples, [unit.of_scan(other) for other in scans], num_bones, config, on_step)
+    settled = fit.fit_labels()
+    settled = fit.refine() and settled
+    return _result(scans, reference, unit, fit, settled)
+
+
+def _chain(
+    scans: tuple[RangeScan, ...],
+    reference: int,
+    num_bones: int,
+    grid_resolution: int,
+    config: RegisterConfig,
+    generator: torch.Generator | None,
+    on_step: OnRegisterStep | None,
+) -> tuple[Tensor, Tensor]:
+    """Return where the reference's points are in every frame, (T, N, 3), and how far that can be trusted, (T, N)."""
+    source, ones = scans[reference], torch.ones(len(scans[reference]))
+    places, trust = [source.points] * len(scans), [ones] * len(scans)
+    for steps in (range(reference + 1, len(scans)), range(reference - 1, -1, -1)):
+        current = source
+        for frame in steps:
+            aligned = align_scans(
+                current, scans[frame], config.align, generator=generator, on_step=initial_records(on_step)
+            )
+            found = register(
+                source, scans[frame], num_bones, grid_resolution, config, generator,
+                start=aligned.points, confidence=aligned.confidence,
+            )  # fmt: skip
+            places[frame], trust[frame] = found.deformed, aligned.confidence
+            current = RangeScan(found.deformed, source.faces, _turned(source.normals, found.weights, found.transforms))
+    return torch.stack(places), torch.stack([row.cpu() for row in trust])
+
+
+def _turned(normals: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
+    """Return normals (..., N, 3) moved by bones (..., B, 4, 4), not of unit length."""
+    return torch.einsum("nb,...bij,nj->...ni", weights, transforms[..., :3, :3], normals)
+
+
+def _result(
+    scans: tuple[RangeScan, ...], reference: int, unit: Unit, fit: ReducedFit, settled: bool
+) -> SequenceRegistration:
+    """Return what was found, in the unit and frame of the scans."""
+    source = scans[reference]
+    like, points = source.points, unit.of_points(source.points)
+    weights = fit.model.weights_at(points)
+    moved = fit.model.move(points, weights)
+    fused, normals, frames = _fused(scans, unit, moved, weights, fit.model.transforms.detach())
+    shares = fit.history[-1].kept / (len(scans) * len(fit.samples.points))
+    status = Status.CONVERGED if settled else Status.MAX_STEPS
+    if shares < fit.config.min_matched:
+        status = Status.NO_DATA if shares == 0 else Status.FEW_INLIERS
+    model = unit.model_back(fit.model, like)
+    return SequenceRegistration(
+        model,
+        like.detach(),
+        source.faces,
+        unit.points_back(moved, like),
+        weights.argmax(-1).to(like.device),
+        model.transforms.detach(),
+        weights.to(like),
+        unit.points_back(fused, like),
+        normals.to(like),
+        frames.to(like.device),
+        reference,
+        status,
+        tuple(fit.history),
+    )
+
+
+def _fused(
+    scans: tuple[RangeScan, ...], unit: Unit, moved: Tensor, weights: Tensor, transforms: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return all points (K, 3) of all scans in the pose of the reference, their normals and the frames they are from.
+
+    Every point moves back as the nearest point of the moved reference came.
+    """
+    places, sides, frames = [], [], []
+    for frame, scan in enumerate(scans):
+        local = unit.of_scan(scan)
+        near, _ = nearest_neighbor(local.points, moved[frame])
+        blended = torch.einsum("nb,bij->nij", weights[near], transforms[frame])
+        shift = (local.points - blended[:, :3, 3]).unsqueeze(-1)
+        places.append(torch.linalg.solve(blended[:, :3, :3], shift).squeeze(-1))
+        back = torch.linalg.solve(blended[:, :3, :3], local.normals.unsqueeze(-1)).squeeze(-1)
+        sides.append(torch.nn.functional.normalize(back, dim=-1))
+        frames.append(torch.full((len(scan),), frame))
+    return torch.cat(places), torch.cat(sides), torch.cat(frames)
