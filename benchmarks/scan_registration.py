@@ -8,8 +8,9 @@ alignment), align (labels and motions) and refine (weights and motions).
 Sets are a folder of NPZ files (source_points, source_faces, target_points, target_faces, source_truth, diagonal); the
 walking figure's adjacent frames; a toy, one part of which is missing in one scan of every pair. For the last two the
 adjusted Rand index compares parts found with parts that moved apart, and joints are right within 5 % of the diagonal.
+A sequence of the figure is registered together, and beside it chained: adjacent pairs, one after the other.
 
-    python benchmarks/scan_registration.py --data FOLDER --pairs 189 --ablations --growth
+    python benchmarks/scan_registration.py --data FOLDER --pairs 189 --ablations --growth --frames 10
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import argparse
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +28,8 @@ from torch import Tensor
 
 import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import ScanPair, jointed_toy, walking_figure
+from torchreg.datasets.scan_sequences import ScanPair, ScanSequence, jointed_toy, walking_figure
+from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.metrics import adjusted_rand
 
 NEAR, REGISTERED, JOINT = 0.025, 0.9, 0.05
@@ -182,6 +185,31 @@ def print_set(title: str, problems: list[Problem], recipes: list[Recipe], verbos
         print_row(recipe.name, scores)
 
 
+def chained(scans: list[tr.RangeScan], recipe: Recipe) -> list[Tensor]:
+    """Return where the first scan's points go in every frame by pairs alone: each carries what is nearest to it."""
+    places = [scans[0].points]
+    for source, target in pairwise(scans):
+        found = tr.register(source, target, recipe.bones, recipe.grid, recipe.config)
+        near, _ = nearest_neighbor(places[-1], source.points)
+        places.append(places[-1] + (found.deformed - source.points)[near])
+    return places
+
+
+def print_sequence(sequence: ScanSequence, recipe: Recipe) -> None:
+    """Print mean errors of the first frame's points in every frame, shares of the diagonal."""
+    scans = list(sequence)
+    together = tr.register_sequence(scans, recipe.bones, recipe.grid, recipe.config).deformed
+    apart, size = chained(scans, recipe), scans[0].diagonal
+    print(f"\nsequence of {len(scans)} frames, mean % from the first\n{'frame':>6s} together chained")
+    errors = []
+    for frame in range(1, len(scans)):
+        truth = sequence.truth(0, frame)
+        pair = [100 * float((way[frame] - truth).norm(dim=-1).mean()) / size for way in (together, apart)]
+        errors.append(pair)
+        print(f"{frame:6d} {pair[0]:8.2f} {pair[1]:7.2f}", flush=True)
+    print(f"last over first: {errors[-1][0] / errors[0][0]:.2f} together, {errors[-1][1] / errors[0][1]:.2f} chained")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Print the tables; return 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -189,12 +217,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--pairs", type=int, default=20, help="made-up pairs per set; 189 as in the paper; 0 for none")
     parser.add_argument("--ablations", action="store_true", help="leave out one step after the other")
     parser.add_argument("--growth", action="store_true", help="seconds from 2,000 to 100,000 points")
+    parser.add_argument(
+        "--frames", type=int, default=0, help="length of a sequence to be registered together, 2 or more"
+    )
     parser.add_argument("--verbose", action="store_true", help="a line per pair")
     parser.add_argument("--smoke", action="store_true", help="one small pair, for a quick look")
     options = parser.parse_args(arguments)
     if options.smoke:
         small = [Recipe("default", 6, 20, tr.RegisterConfig(num_samples=500))]
         print_set("toy", list(made_up_problems("toy", 1, 600)), small, options.verbose)
+        print_sequence(walking_figure(2, scanner=DepthScanner(num_points=600)), small[0])
         return 0
     sets: dict[str, list[Problem]] = {}
     if options.data is None or not options.data.is_dir():
@@ -205,6 +237,8 @@ def main(arguments: list[str] | None = None) -> int:
         sets |= {kind: list(made_up_problems(kind, options.pairs)) for kind in ("figure", "toy")}
     for title, problems in sets.items():
         print_set(title, problems, _ablations() if options.ablations else _ablations()[:1], options.verbose)
+    if options.frames:
+        print_sequence(walking_figure(options.frames), Recipe("default"))
     if options.growth:
         for count in (2000, 5000, 10_000, 20_000, 50_000, 100_000):
             print_set(f"figure, {count} points", list(made_up_problems("figure", 1, count)), _ablations()[:1])

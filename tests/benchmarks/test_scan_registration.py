@@ -29,7 +29,9 @@ def test_truth_is_scored_as_such(benchmark, problem):
 
 def test_tables_are_printed_for_files_and_without(benchmark, problem, capsys, tmp_path, monkeypatch):
     assert benchmark.main(["--smoke", "--verbose"]) == 0
-    assert "default" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "default" in printed
+    assert "last over first" in printed
     np.savez(
         tmp_path / "one.npz", source_points=problem.source.points, source_faces=problem.source.faces,
         target_points=problem.target.points, target_faces=problem.target.faces, source_truth=problem.truth,
