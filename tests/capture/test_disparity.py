@@ -1,0 +1,88 @@
+import sys
+
+import pytest
+import torch
+
+from torchreg.capture.disparity import census, match_disparity
+from torchreg.errors import InputError, MissingExtraError
+
+
+def textured(height, width, seed=0):
+    noise = torch.rand(1, 1, height, width, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return torch.nn.functional.avg_pool2d(noise, 3, stride=1, padding=1)[0, 0]
+
+
+def scene(shift=8, front=14, noise=0.002):
+    """Two pictures of a wall with a square before it, and the disparities of the left one."""
+    wall, square = textured(50, 120), textured(50, 120, 1)
+    disparity = torch.full((50, 100), float(shift), dtype=torch.float64)
+    disparity[15:35, 40:70] = front
+    left = wall[:, :100].clone()
+    left[15:35, 40:70] = square[15:35, 40:70]
+    right = wall[:, shift : 100 + shift].clone()
+    right[15:35, 40 - front : 70 - front] = square[15:35, 40:70]
+    grain = noise * torch.randn(2, 50, 100, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    return left + grain[0], right + grain[1], disparity
+
+
+@pytest.mark.parametrize("method", ["semi-global", "block", "opencv"])
+def test_disparity_of_two_layers(method):
+    if method == "opencv":
+        pytest.importorskip("cv2")
+    left, right, truth = scene()
+    found = match_disparity(left, right, 20, method=method)
+    known = found.isfinite()
+    known[:, :25] = False
+    assert known[:, 25:].double().mean() > 0.7
+    # OpenCV's blocks fatten the square by two or three pixels.
+    assert ((found - truth)[known].abs() < 1).double().mean() > (0.92 if method == "opencv" else 0.95)
+    if method != "opencv":
+        # The strip left of the square is hidden from the right camera.
+        assert known[17:33, 35:39].double().mean() < 0.6
+
+
+def test_subpixel_shift_is_found():
+    wide = textured(30, 600, 3)
+    smooth = torch.nn.functional.avg_pool1d(wide[:, None], 9, stride=1)[:, 0]
+    left, right = smooth[:, 0:480:4], smooth[:, 27 : 27 + 480 : 4]
+    found = match_disparity(left, right, 14)
+    assert float(found[:, 20:].nanmedian()) == pytest.approx(6.75, abs=0.2)
+
+
+def test_batches_dtypes_and_offsets():
+    left, right, _ = scene()
+    both = match_disparity(torch.stack((left, left)), torch.stack((right, right)), 20)
+    one = match_disparity(left, right, 20)
+    assert torch.equal(both[1].nan_to_num(-1), one.nan_to_num(-1))
+    single = match_disparity(left.float(), right.float(), 20)
+    assert single.dtype == torch.float32
+    offset = match_disparity(left, right, 20, min_disparity=4)
+    assert ((offset - one).abs() < 0.3).double().mean() > 0.6
+    everything = match_disparity(left, right, 20, max_difference=None)
+    assert everything.isfinite().sum() > one.isfinite().sum()
+
+
+def test_census_ignores_brightness_and_counts_darker_neighbors():
+    image = textured(12, 15)
+    assert torch.equal(census(image), census(3 * image + 1))
+    bright = torch.zeros(9, 11)
+    bright[4, 5] = 1.0
+    assert int(census(bright)[4, 5]) == 2**62 - 1
+    assert int(census(bright)[0, 0]) == 0
+
+
+def test_arguments_are_checked(monkeypatch):
+    left, right, _ = scene()
+    with pytest.raises(InputError, match=r"right must have shape \(50, 100\)"):
+        match_disparity(left, right[:-1], 20)
+    with pytest.raises(InputError, match="below the width 100"):
+        match_disparity(left, right, 100)
+    with pytest.raises(InputError, match="method must be one of"):
+        match_disparity(left, right, 20, method="magic")
+    with pytest.raises(InputError, match="no less than small_step"):
+        match_disparity(left, right, 20, large_step=1.0)
+    with pytest.raises(InputError, match="max_disparity must be at least 6"):
+        match_disparity(left, right, 5, min_disparity=4)
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(MissingExtraError, match=r"torchreg\[stereo\]"):
+        match_disparity(left, right, 20, method="opencv")

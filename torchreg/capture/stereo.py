@@ -1,0 +1,269 @@
+"""Stereo pairs to points: rectification, Harris corners seen by both cameras, and 3-D points with their uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from kornia.feature import harris_response
+from kornia.geometry.transform import remap
+from torch import Tensor
+
+from torchreg._checks import as_float_tensor, check_count, check_finite, check_positive, check_shape
+from torchreg.capture.disparity import match_disparity
+from torchreg.capture.disparity_refinement import refine_disparity
+from torchreg.errors import InputError
+from torchreg.geometry.camera import Camera
+from torchreg.geometry.camera_rig import StereoPair
+from torchreg.geometry.rigid import rigid_matrix
+
+_LUMA = (0.299, 0.587, 0.114)
+# A corner is the largest response within two pixels, and no weaker than this share of the strongest.
+_CORNER_REACH, _WEAKEST_CORNER = 2, 1e-4
+# Pictures are compared at a quarter of their size; as given so many times more pixels must match than swapped.
+_GLANCE, _MORE_MATCHES = 4, 1.5
+_WINDOW_BORDER = 8
+
+
+@dataclass(frozen=True, eq=False)
+class StereoPoints:
+    """Corners that both cameras of a pair see.
+
+    Args:
+        points: (N, 3) in world coordinates, metres.
+        depth_std: (N,) standard deviation of the depth before the left camera, metres.
+        covariance: (N, 3, 3) of the points, along the rays of the left camera and, by a tenth of a pixel, across.
+        pixels: (N, 2) in the left picture, as (column, row).
+        disparity: (N,) pixels.
+        disparity_std: (N,) pixels.
+        dense: (H, W) disparity of all pixels, NaN where it is not known.
+    """
+
+    points: Tensor
+    depth_std: Tensor
+    covariance: Tensor
+    pixels: Tensor
+    disparity: Tensor
+    disparity_std: Tensor
+    dense: Tensor
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class StereoConfig:
+    """What `stereo_points` looks for.
+
+    Args:
+        nearest: depth of the nearest thing of interest, metres; it limits the disparities that are searched.
+        farthest: depth beyond which everything is background, metres.
+        num_corners: at most so many are kept, the strongest first.
+        method: see `match_disparity`.
+        max_disparity_std: corners whose disparity is less certain are dropped, pixels.
+        both: a corner must be one in both pictures, to two pixels.
+
+    Raises:
+        InputError: if a number is out of range.
+    """
+
+    nearest: float = 0.4
+    farthest: float = 1.0
+    num_corners: int = 1000
+    method: str = "semi-global"
+    max_disparity_std: float = 0.5
+    both: bool = True
+
+    def __post_init__(self) -> None:
+        check_positive(self.nearest, "nearest")
+        check_positive(self.max_disparity_std, "max_disparity_std")
+        check_count(self.num_corners, "num_corners", 1)
+        if not self.farthest > self.nearest:
+            raise InputError(f"farthest must be beyond nearest, got {self.farthest} and {self.nearest}")
+
+
+def stereo_points(
+    left: Tensor, right: Tensor, pair: StereoPair, *, config: StereoConfig | None = None, box: Tensor | None = None
+) -> StereoPoints:
+    """Return the Harris corners that both cameras of a rectified pair see, as points with their uncertainty.
+
+    Dense disparity says roughly where a corner is in the other picture; there a least-squares fit of a window, slanted
+    as the surface is, finds it to a fraction of a pixel, and the fit's own covariance and residuals how exactly.
+
+    Args:
+        left: (H, W) or (H, W, 3) from 0 to 1.
+        right: likewise.
+        pair: the cameras, rectified; see `rectify`.
+        config: what to look for.
+        box: (2, 3) lower and upper corner of the volume of interest in world coordinates, or None.
+
+    Returns:
+        the points, in the dtype of the pictures; there may be none.
+
+    Raises:
+        InputError: if the pair is not rectified, sizes do not fit, the pictures are swapped, or they hardly match.
+        MissingExtraError: as `match_disparity`.
+
+    Differentiable: no.
+
+    Cost: that of `match_disparity`.
+
+    References: Harris and Stephens 1988 (corners); Lucas and Kanade 1981 (the fit).
+    """
+    config = StereoConfig() if config is None else config
+    pair.check_rectified()
+    first, second = _gray(left, pair.left, "left"), _gray(right, pair.right, "right")
+    with torch.no_grad():
+        highest = int(pair.disparity(torch.tensor(config.nearest, dtype=torch.float64))) + 2
+        if highest >= pair.left.width:
+            raise InputError(
+                f"nearest must keep disparities within the picture, {config.nearest} m takes {highest} pixels"
+            )
+        _check_order(first, second, highest)
+        # All the way to infinity: a background that has no place to match would be put somewhere before it.
+        dense = match_disparity(first, second, highest, method=config.method)
+        depth = pair.depth(dense)
+        wanted = (depth >= config.nearest) & (depth <= config.farthest)
+        corners = _corners(first) & wanted
+        if config.both:
+            corners &= _corner_there(_corners(second), dense)
+        row, column = corners.nonzero().unbind(-1)
+        fit = refine_disparity(first, second, dense, torch.stack((column, row), dim=-1))
+        kept = fit.good & (fit.std <= config.max_disparity_std)
+        strength = torch.where(kept, harris_response(first[None, None])[0, 0][row, column], -torch.inf)
+        order = strength.argsort(descending=True)[: min(config.num_corners, int(kept.sum()))]
+        pixels = torch.stack((column, row), dim=-1)[order].to(first)
+        return _placed(pair, pixels, fit.disparity[order], fit.std[order], dense, config, box)
+
+
+def rectify(left: Tensor, right: Tensor, pair: StereoPair) -> tuple[Tensor, Tensor, StereoPair]:
+    """Return both pictures as two cameras would take them that stand there, turned alike along the baseline.
+
+    Args:
+        left: (H, W) or (H, W, 3) from 0 to 1.
+        right: likewise.
+        pair: the cameras, with or without distortion.
+
+    Returns:
+        the pictures, zero where nothing was seen, and their rectified pair.
+
+    Raises:
+        InputError: if sizes do not fit.
+
+    Differentiable: in the pictures.
+
+    References: Fusiello et al. 2000.
+    """
+    for image, camera, name in ((left, pair.left, "left"), (right, pair.right, "right")):
+        _check_size(as_float_tensor(image, name), camera, name)
+    first, second = pair.left.to(torch.float64), pair.right.to(torch.float64)
+    along = torch.nn.functional.normalize(second.position - first.position, dim=0)
+    forward = first.world_to_camera[2, :3] + second.world_to_camera[2, :3]
+    down = torch.nn.functional.normalize(torch.linalg.cross(forward, along), dim=0)
+    turn = torch.stack((along, down, torch.linalg.cross(along, down)))
+    focal = min(float(first.intrinsics[:2].min()), float(second.intrinsics[:2].min()))
+    size = first.intrinsics.new_tensor([first.width - 1, first.height - 1])
+    # The middles of both pictures come to lie, on average, in the middle.
+    sides = []
+    for camera in (first, second):
+        middle = camera.intrinsics.new_tensor([[0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]])
+        local = camera.directions(middle)[0] @ turn.mT
+        sides.append(local[:2] / local[2])
+    center = 0.5 * size - focal * 0.5 * (sides[0] + sides[1])
+    intrinsics = torch.cat((size.new_tensor([focal, focal]), center))
+    cameras, pictures = [], []
+    for camera, image in ((first, left), (second, right)):
+        motion = rigid_matrix(turn, -(turn @ camera.position))
+        straight = Camera(first.width, first.height, intrinsics, motion, name=camera.name)
+        rays = straight.directions(straight.pixel_grid())
+        source, _ = camera.project(camera.position + rays)
+        pictures.append(_sampled(as_float_tensor(image, "image"), source.nan_to_num(-1e6)))
+        cameras.append(straight)
+    return pictures[0], pictures[1], StereoPair(*cameras)
+
+
+def _sampled(image: Tensor, source: Tensor) -> Tensor:
+    planes = image.unsqueeze(-1) if image.ndim == 2 else image
+    maps = source.to(image)[None]
+    warped = remap(planes.movedim(-1, 0)[None], maps[..., 0], maps[..., 1], align_corners=True)[0].movedim(0, -1)
+    return warped[..., 0] if image.ndim == 2 else warped
+
+
+def _check_size(image: Tensor, camera: Camera, name: str) -> None:
+    if image.ndim == 3:
+        check_shape(image, name, (camera.height, camera.width, 3))
+    else:
+        check_shape(image, name, (camera.height, camera.width))
+    check_finite(image, name)
+
+
+def _gray(image: Tensor, camera: Camera, name: str) -> Tensor:
+    image = as_float_tensor(image, name).detach()
+    _check_size(image, camera, name)
+    return image @ image.new_tensor(_LUMA) if image.ndim == 3 else image
+
+
+def _check_order(left: Tensor, right: Tensor, highest: int) -> None:
+    """Raise InputError if the pictures match well the other way round, or neither way."""
+    small = [torch.nn.functional.avg_pool2d(part[None, None], _GLANCE)[0, 0] for part in (left, right)]
+    reach = min(max(highest // _GLANCE + 2, 4), small[0].shape[-1] - 1)
+    ways = ((small[0], small[1]), (small[1], small[0]))
+    found = [match_disparity(first, second, reach, method="block").isfinite() for first, second in ways]
+    forth, back = (float(known.float().mean()) for known in found)
+    if back > _MORE_MATCHES * forth:
+        raise InputError(
+            f"left and right pictures are swapped: {100 * back:.0f} % of the pixels match the other way round, "
+            f"{100 * forth:.0f} % as given"
+        )
+    if forth <= _MORE_MATCHES * back:
+        raise InputError(
+            f"left and right hardly match, {100 * forth:.0f} % of the pixels do, {100 * back:.0f} % by chance; check "
+            f"that they were taken at the same time, are rectified, and that config.nearest is near enough"
+        )
+
+
+def _corners(gray: Tensor) -> Tensor:
+    """Return at which pixels (H, W) the Harris response has a local maximum, away from the border."""
+    response = harris_response(gray[None, None])[0, 0]
+    around = torch.nn.functional.max_pool2d(response[None, None], 2 * _CORNER_REACH + 1, 1, _CORNER_REACH)[0, 0]
+    peaks = (response >= around) & (response > _WEAKEST_CORNER * response.max())
+    inner = torch.zeros_like(peaks)
+    inner[_WINDOW_BORDER:-_WINDOW_BORDER, _WINDOW_BORDER:-_WINDOW_BORDER] = True
+    return peaks & inner
+
+
+def _corner_there(corners: Tensor, disparity: Tensor) -> Tensor:
+    """Return for pixels (H, W) of the left picture whether there is a corner of the right one where they match."""
+    near = (
+        torch.nn.functional.max_pool2d(corners[None, None].float(), 2 * _CORNER_REACH + 1, 1, _CORNER_REACH)[0, 0] > 0
+    )
+    column = torch.arange(corners.shape[1], device=corners.device)
+    there = (column - disparity).round().nan_to_num(-1).long()
+    return (there >= 0) & near.gather(1, there.clamp(0, corners.shape[1] - 1))
+
+
+def _placed(
+    pair: StereoPair,
+    pixels: Tensor,
+    disparity: Tensor,
+    std: Tensor,
+    dense: Tensor,
+    config: StereoConfig,
+    box: Tensor | None,
+) -> StereoPoints:
+    """Return the points within depths and box."""
+    depth = pair.depth(disparity)
+    points = pair.left.unproject(pixels, depth)
+    kept = (depth >= config.nearest) & (depth <= config.farthest)
+    if box is not None:
+        box = as_float_tensor(box, "box", like=points)
+        check_shape(box, "box", (2, 3))
+        kept &= ((points >= box[0]) & (points <= box[1])).all(-1)
+    depth_std = pair.depth_std(depth, std)
+    rays = pair.left.directions(pixels)
+    across = (0.1 * depth / float(pair.left.intrinsics[0])) ** 2
+    spread = rays.unsqueeze(-1) * rays.unsqueeze(-2) * (depth_std**2)[:, None, None]
+    covariance = spread + across[:, None, None] * torch.eye(3).to(points)
+    found = StereoPoints(points, depth_std, covariance, pixels, disparity, std, dense)
+    parts = ("points", "depth_std", "covariance", "pixels", "disparity", "disparity_std")
+    return replace(found, **{name: getattr(found, name)[kept] for name in parts})
