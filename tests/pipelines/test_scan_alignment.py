@@ -11,8 +11,8 @@ from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.pipelines.scan_align_config import RefineConfig, ScanAlignConfig
 from torchreg.pipelines.scan_alignment import align_scans
 
-SCANNER = DepthScanner(num_points=1500)
-QUICK = ScanAlignConfig(num_samples=500, num_target_samples=1000, num_nodes=40)
+SCANNER = DepthScanner(num_points=1000)
+QUICK = ScanAlignConfig(num_samples=400, num_target_samples=800, num_nodes=40)
 QUICK = replace(
     QUICK,
     match=replace(QUICK.match, num_points=400),

@@ -71,7 +71,7 @@ class AssignConfig:
     num_points: int = 400
     normal_weight: float = 0.01
     feature_weight: float = 0.02
-    fits_per_step: int = 2
+    fits_per_step: int = 1
 
     def __post_init__(self) -> None:
         for name in ("num_steps", "num_points", "fits_per_step"):
@@ -100,7 +100,7 @@ class RefineConfig:
         boundary_above: sigma from which targets on a boundary may be matched, length.
         density: samples used per squared sigma.
         least_samples: used of each scan, where there are as many.
-        compatible: see `ScanEMConfig`.
+        compatible: see `ScanEMConfig`; its feature weight gives way to the one above.
     """
 
     num_steps: int = 6
@@ -136,7 +136,7 @@ class ChoiceConfig:
 
     Args:
         cap: distances count up to this, length.
-        normal_scale: what normals at right angles count as, a share of sqrt(2) caps.
+        normal_scale: how many caps normals count as that are one apart.
         bend: what it costs that neighboring nodes disagree by one size in the mean,
         slack: of which less than this hardly counts, length.
         same: hypotheses agree where their samples are this near each other, length,
