@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from torchreg.pipelines.skeletonize import SkeletonizeConfig, skeletonize
     from torchreg.pipelines.solve_pose import solve_pose
     from torchreg.pipelines.storage import load
-    from torchreg.pipelines.track import TrackConfig, Tracker
+    from torchreg.pipelines.track import Tracker
+    from torchreg.pipelines.track_config import TrackConfig
     from torchreg.results import (
         AlignResult,
         Calibration,
@@ -135,7 +136,7 @@ _OWNERS = {
     "SpineConfig": "pipelines.extract_spine",
     "SpineSequence": "results",
     "Status": "results",
-    "TrackConfig": "pipelines.track",
+    "TrackConfig": "pipelines.track_config",
     "TrackResult": "results",
     "TrackState": "results",
     "Tracker": "pipelines.track",
