@@ -232,7 +232,7 @@ class PoseStarts(Result):
     Args:
         poses: (S, num_dofs), metres and radians; poses that fell together with a better one come last.
         costs: (S,) data that a pose leaves unexplained, softly counted, and a weak prior; lower is better.
-        confidence: () from 0 to 1: how surely the first pose is the right one.
+        confidence: () from 0 to 1: how surely the first pose is the right one; low too where limbs are not shown.
     """
 
     poses: Tensor

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+import torchreg.pipelines.find_pose as find_pose_module
 from torchreg.datasets.hand import make_hand_cloud
 from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
@@ -73,6 +74,13 @@ def offsets(hand, poses, truths):
     return (hand.keypoints(poses) - hand.keypoints(truths)).norm(dim=-1)
 
 
+def problem_of(skin, clouds, poses):
+    """Return the alignment of clouds around poses."""
+    valid = torch.ones_like(clouds[..., 0], dtype=torch.bool)
+    origin = torch.zeros_like(clouds[:, 0])
+    return centered_problem(skin, clouds, valid, poses, origin, prior_std=0.4, pose_atol=0.0)
+
+
 # Hands
 
 
@@ -92,6 +100,22 @@ def test_the_first_start_costs_least_and_confidence_is_a_share(found):
     assert bool(((found.confidence >= 0) & (found.confidence <= 1)).all())
     # The hand's turned-over twin costs far more.
     assert bool((found.confidence > 0.5).all())
+
+
+def test_limbs_that_no_data_show_make_unsure(plain_hand, plain_hand_skin, clouds, truths):
+    """Without the data of one finger, then of two, the confidence falls by their share of the five."""
+    problem = problem_of(plain_hand_skin, clouds[:1], truths[:1])
+    lead = torch.tensor([1e6])
+    parts = plain_hand_skin.weights.argmax(-1)
+    nearest = torch.cdist(clouds[:1], plain_hand_skin(truths[:1])).argmin(-1)
+    whole, told = find_pose_module._confidence(problem, truths[:1], lead), []
+    for tips in ([], plain_hand.fingertip_parts[:1], plain_hand.fingertip_parts[:2]):
+        fingers = torch.tensor([part for tip in tips for part in (tip - 2, tip - 1, tip)], dtype=torch.long)
+        shown = replace(problem, valid=~torch.isin(parts[nearest], fingers))
+        told.append(float(find_pose_module._shown_share(shown, truths[:1])))
+        assert find_pose_module._confidence(shown, truths[:1], lead) <= told[-1] + 1e-6
+    assert told == pytest.approx([1.0, 0.8, 0.6])
+    assert float(whole) > 0.8
 
 
 def test_one_cloud_is_a_batch_of_one(plain_hand, plain_hand_skin, clouds, found, truths):

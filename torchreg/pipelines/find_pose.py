@@ -18,6 +18,7 @@ from torchreg.geometry.rigid import fit_rigid, rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.sampling import farthest_points
 from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.limbs import find_limbs
 from torchreg.models.skin import LinearBlendSkin, sample_skin
 from torchreg.pipelines.align_problem import (
     AlignProblem,
@@ -43,6 +44,10 @@ _RIGID_POINTS, _RIGID_DATA = 60, 120
 _RIGID_SCORE, _MODEL_SHARE = 0.05, 0.5
 # The best so many are compared; two whose points differ by less than this share of the size are one.
 _MAX_COMPARED, _SAME_ROUGH, _SAME_POSE = 300, 0.045, 0.05
+# Data whose nearest model point lies on a limb, within this share of the size, show it; fewer may be outliers.
+_SHOWN_SHARE, _MIN_SHOWN = 0.03, 3
+# More data show no more limbs.
+_SHOWN_DATA = 2000
 # A lead of this many data over a different pose makes sure; clusters of this share of the data on the surface do not.
 _SURE_LEAD, _DOUBTFUL_SHARE = 4.0, 0.1
 _FIT_STEPS, _FINAL_SIGMAS, _FINAL_STEPS = 3, (0.022,), 4
@@ -158,7 +163,8 @@ def find_pose(
         config: see `FindPoseConfig`.
 
     Returns:
-        a `PoseStarts`; with a batch of clouds its tensors have a leading dimension B.
+        a `PoseStarts`; with a batch of clouds its tensors have a leading dimension B. The confidence falls with every
+        limb that no data show.
 
     Raises:
         InputError: if the data are empty or not finite, or there is no source.
@@ -321,8 +327,24 @@ def _ranked(problem: AlignProblem, poses: Tensor, costs: Tensor, count: int) -> 
 def _confidence(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor:
     """Return how surely poses (B, num_dofs) are right, (B,) from 0 to 1.
 
-    A pose is doubtful if a different one explains nearly as many data, or if it leaves dense clusters of data over.
+    A pose is doubtful if a different one explains nearly as many data, if it leaves dense clusters of data over, or if
+    no data show some of its limbs, which may be anywhere hidden.
     """
     clustered, near = clustered_data(problem, pose)
     left_over = clustered / near.clamp_min(1)
-    return (1 - (-lead / _SURE_LEAD).exp()) * (-left_over / _DOUBTFUL_SHARE).exp()
+    return (1 - (-lead / _SURE_LEAD).exp()) * (-left_over / _DOUBTFUL_SHARE).exp() * _shown_share(problem, pose)
+
+
+def _shown_share(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return the share (B,) of the limbs that data show in poses (B, num_dofs); 1 without limbs."""
+    skin = problem.skin
+    limbs = [limb.parts for limb in find_limbs(skin.shape)[0]]
+    if not limbs:
+        return torch.ones_like(pose[:, 0])
+    if problem.data.shape[-2] > _SHOWN_DATA:
+        problem = problem.draw(_SHOWN_DATA, torch.Generator().manual_seed(0))
+    distance, nearest = torch.cdist(problem.data, skin(pose)).min(-1)
+    part = skin.weights.argmax(-1)[nearest]
+    on = (distance < _SHOWN_SHARE * problem.size) & problem.valid
+    counts = torch.stack([(on & torch.isin(part, part.new_tensor(parts))).sum(-1) for parts in limbs], dim=-1)
+    return (counts >= _MIN_SHOWN).to(pose).mean(-1)
