@@ -12,6 +12,7 @@ from torchreg.cli.align import align
 from torchreg.cli.demo import demo
 from torchreg.cli.figure import figure
 from torchreg.cli.info import info
+from torchreg.cli.label import label
 from torchreg.cli.pose import pose
 from torchreg.cli.register import register
 from torchreg.cli.spine import spine
@@ -56,6 +57,7 @@ app.command(short_help="Align a shape to point clouds.")(align)
 app.command(short_help="Run the main job on built-in data.")(demo)
 app.command(short_help="Draw the bending skin, or the picture of the README.")(figure)
 app.command(short_help="Show the degrees of freedom and the parts of a shape.")(info)
+app.command(short_help="Label point clouds with poses, to train networks on.")(label)
 app.command(short_help="Extract the moving skeleton of a sequence of meshes.")(spine)
 app.command(short_help="Pose a registered scan by dragging points.")(pose)
 app.command(short_help="Register two range scans of something that moves.")(register)

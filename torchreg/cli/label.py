@@ -1,0 +1,72 @@
+"""``torchreg label``: clouds to training data for pose networks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from torchreg.cli.align_options import NanPolicy, Scale, read_cloud
+from torchreg.cli.outputs import Force, Quiet, check_outputs
+from torchreg.cli.reporting import interruption, reporting
+from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, load_shape
+
+
+@reporting
+def label(
+    shape: Shape,
+    frames: Annotated[
+        list[Path],
+        typer.Argument(metavar="FRAME", help="Point clouds, metres, in the order of the motion; the formats of align."),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("--output", "-o", metavar="FOLDER", help="Labels are written here; created where it is missing."),
+    ] = Path("labels"),
+    start: Annotated[
+        Path | None, typer.Option(help="Pose of the first frame, as for align; searched by default.")
+    ] = None,
+    trusted: Annotated[
+        float, typer.Option(help="Poses less sure than this are not started from: the next frame is searched.")
+    ] = 0.5,
+    nan_policy: NanPolicy = "raise",
+    scale: Scale = 1.0,
+    parents: Parents = None,
+    package_dir: PackageDir = None,
+    free_base: FreeBase = None,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """Label point clouds with poses, keypoints, parts and confidence.
+
+    Each frame gives label_NUMBER.safetensors and .json; torchreg.datasets.pose_labels.PoseLabels reads them for torch.
+
+    Exit codes: 0; 2 for an error; 130 for Ctrl-C, which leaves the labels of the finished frames.
+    """
+    from tqdm import tqdm
+
+    with tqdm(total=len(frames), unit="frame", desc="reading", leave=False, disable=quiet) as bar:
+        for place in frames:
+            place.stat()  # a missing file is told before the first is labeled
+        from torchreg.datasets.pose_labels import label_path
+        from torchreg.pipelines.label import label_frames
+        from torchreg.pipelines.pose_initializer import PoseInitializer
+        from torchreg.pipelines.storage import load_pose
+
+        output.mkdir(exist_ok=True)
+        paths = [label_path(output, number) for number in range(len(frames))]
+        check_outputs([path.with_suffix(ending) for path in paths for ending in (".safetensors", ".json")], force)
+        model = load_shape(shape, parents, package_dir, free_base)
+        first = None if start is None else load_pose(start, model)
+        clouds = (read_cloud(place, scale, nan_policy) for place in frames)
+        done = 0
+        try:
+            for found in label_frames(PoseInitializer(model), clouds, trusted=trusted, start=first):
+                path = found.save(output, done)
+                if not quiet:
+                    bar.write(f"{frames[done]}: confidence {float(found.confidence):.2f} -> {path}")
+                done += 1
+                bar.update()
+        except KeyboardInterrupt:
+            raise interruption(f"{done} of {len(frames)} frames are labeled") from None
