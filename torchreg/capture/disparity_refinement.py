@@ -9,12 +9,14 @@ from torch import Tensor
 
 from torchreg._checks import check_shape
 
-_RADIUS, _SPREAD = 6, 3.0
+_RADIUS, _SPREAD = 5, 2.0
 _STEPS = 8
 # Pixels of the window further in disparity from its middle belong to something else.
 _SAME_SURFACE = 1.5
 # The fit may not leave the dense disparity by more, must correlate so well, and is never surer than that (pixels).
 _MAX_MOVE, _MIN_CORRELATION, _FLOOR = 1.5, 0.8, 0.05
+# Share of how far the surface in a window is from a plane by which the middle may be off.
+_UNEVEN = 0.5
 # Pictures are smoothed by this before, along rows and columns: noise is then the same at fractional places.
 _BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 # A prior on the slopes of disparity: standard deviation, pixels per pixel; and the least noise of a picture.
@@ -37,7 +39,7 @@ class RefinedDisparity:
 
 
 def refine_disparity(left: Tensor, right: Tensor, dense: Tensor, pixels: Tensor) -> RefinedDisparity:
-    """Return the disparities of some pixels to a fraction of a pixel, from windows of 13 x 13.
+    """Return the disparities of some pixels to a fraction of a pixel, from windows of 11 x 11.
 
     Minimizes ``sum_q w_q (I_L(q) - g I_R(q - d - s . (q - p)) - b)^2`` over disparity d and slopes s by Gauss-Newton,
     the gain g and offset b taken from the windows' means and deviations. The weights are a Gaussian, zero where the
@@ -69,6 +71,9 @@ def refine_disparity(left: Tensor, right: Tensor, dense: Tensor, pixels: Tensor)
     row = (pixels[:, 1:] + down).clamp(0, left.shape[0] - 1)
     start = dense[pixels[:, 1], pixels[:, 0]].double()
     same = ((dense[row, column] - start[:, None]).abs() <= _SAME_SURFACE).double()
+    # Smoothing carries what is beside a surface over its edge.
+    side = 2 * _RADIUS + 1
+    same = 1 - torch.nn.functional.max_pool2d((1 - same).reshape(-1, 1, side, side), 3, 1, 1).reshape(same.shape)
     weights = same * torch.exp(-0.5 * (along**2 + down**2) / _SPREAD**2).double()
     first, second = _smoothed(torch.stack((left, right)).double())
     target = first[row, column]
@@ -91,9 +96,13 @@ def refine_disparity(left: Tensor, right: Tensor, dense: Tensor, pixels: Tensor)
         unknowns = unknowns + torch.linalg.solve(normal, right_side).clamp(-0.5, 0.5)
     inverse = torch.linalg.inv(normal)
     # Smoothed noise: raw noise of a variance so much larger, seen through the smoothed weights of the fit.
-    pull = _smoothed(weighted.mT.reshape(-1, 2 * _RADIUS + 1, 2 * _RADIUS + 1)).reshape(weighted.mT.shape)
+    pull = _smoothed(weighted.mT.reshape(-1, side, side)).reshape(weighted.mT.shape)
     spread = inverse @ (pull @ pull.mT / sum(tap**2 for tap in _BINOMIAL) ** 2 + ridge) @ inverse
-    std = (spread[:, 0, 0] * noise + _FLOOR**2).sqrt()
+    # Where the dense disparity is no plane, neither fit nor noise tell how far off the plane is.
+    plane = (unknowns.unsqueeze(1) * shape).sum(-1)
+    bumps = (weights * (dense[row, column].double() - plane).nan_to_num(0.0) ** 2).sum(-1)
+    bumps = bumps / weights.sum(-1).clamp(min=1e-9)
+    std = (spread[:, 0, 0] * noise + _UNEVEN**2 * bumps + _FLOOR**2).sqrt()
     alike = (weights * wanted * seen).sum(-1) / weights.sum(-1).clamp(min=1e-9)
     found = unknowns[:, 0]
     good = ((found - start).abs() <= _MAX_MOVE) & (alike >= _MIN_CORRELATION) & std.isfinite() & found.isfinite()

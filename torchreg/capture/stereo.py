@@ -18,8 +18,9 @@ from torchreg.geometry.camera_rig import StereoPair
 from torchreg.geometry.rigid import rigid_matrix
 
 _LUMA = (0.299, 0.587, 0.114)
-# A corner is the largest response within two pixels, and no weaker than this share of the strongest.
-_CORNER_REACH, _WEAKEST_CORNER = 2, 1e-4
+# A corner is the largest response of its neighbors and no weaker than this share of the strongest; one of the other
+# picture is the same if it is within so many pixels.
+_WEAKEST_CORNER, _CORNER_REACH = 1e-4, 2
 # Pictures are compared at a quarter of their size; as given so many times more pixels must match than swapped.
 _GLANCE, _MORE_MATCHES = 4, 1.5
 _WINDOW_BORDER = 8
@@ -225,7 +226,7 @@ def _check_order(left: Tensor, right: Tensor, highest: int) -> None:
 def _corners(gray: Tensor) -> Tensor:
     """Return at which pixels (H, W) the Harris response has a local maximum, away from the border."""
     response = harris_response(gray[None, None])[0, 0]
-    around = torch.nn.functional.max_pool2d(response[None, None], 2 * _CORNER_REACH + 1, 1, _CORNER_REACH)[0, 0]
+    around = torch.nn.functional.max_pool2d(response[None, None], 3, 1, 1)[0, 0]
     peaks = (response >= around) & (response > _WEAKEST_CORNER * response.max())
     inner = torch.zeros_like(peaks)
     inner[_WINDOW_BORDER:-_WINDOW_BORDER, _WINDOW_BORDER:-_WINDOW_BORDER] = True
