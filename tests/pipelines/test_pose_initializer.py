@@ -12,7 +12,7 @@ from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
 from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.hand import Hand
 from torchreg.models.primitives import Primitive
-from torchreg.models.skin import sample_skin
+from torchreg.models.skin import bending_weights, sample_skin
 from torchreg.pipelines.find_pose import FindPoseConfig
 from torchreg.pipelines.pose_initializer import InitialPose, PoseInitializer, PoseInitializerConfig
 
@@ -130,6 +130,24 @@ def test_gradients_in_the_sizes_of_the_shape(points, start):
 
     expected = slope(function, torch.zeros(4, dtype=D), direction, 1e-3)
     assert float(torch.cat(gradients) @ direction) == pytest.approx(expected, rel=1e-5)
+
+
+def test_gradients_of_a_shape_whose_file_has_a_mesh(shape, points, start):
+    """The nearest points of a mesh jump; the last fit, to its solids, does not."""
+    mesh = shape.surface_mesh(spacing=0.006)
+    weights = bending_weights(shape, mesh.vertices, shape.rest_pose(), 2.0)
+    joints = shape.part_transforms(shape.rest_pose())[:, :3, 3]
+    rig = ArticulatedShape.from_skinned_mesh(
+        mesh.vertices, mesh.faces, weights, joints, [-1, 0], axes={"joint_0": [], "joint_1": ["x"]}, dtype=D
+    ).requires_grad_(False)
+    layer = PoseInitializer(rig, EXACT)
+    leaf = points[2:].clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss_of(layer(leaf, start=start[2:])), leaf)
+    direction = 0.01 * direction_like(leaf, 1)
+    expected = slope(
+        lambda x: loss_of(layer(x.requires_grad_(), start=start[2:])).detach(), points[2:], direction, 1e-4
+    )
+    assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5)
 
 
 def test_gradients_are_those_of_unrolling(shape, skin, points, start):

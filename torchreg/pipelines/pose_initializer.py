@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +12,7 @@ from torchreg.correspondence.sigma import SigmaSchedule
 from torchreg.errors import InputError
 from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.skin import LinearBlendSkin, sample_skin
+from torchreg.models.surface import FusedSurface
 from torchreg.pipelines.align_objectives import PosePrior, SurfaceObjective
 from torchreg.pipelines.align_problem import AlignProblem, centered_problem, check_data, masked_mean, shifted
 from torchreg.pipelines.align_search import clustered_data
@@ -96,6 +97,8 @@ class PoseInitializer(nn.Module):
     point of the last fit, takes its gradients from the implicit function: in the points, the starts, and the shape's
     parameters that require them, in memory that does not grow with the iterations.
 
+    The last fit is to the shape's solids, also where its file has a mesh: `align` then fits more closely.
+
     All is computed in the shape's dtype, whatever autocast says; the solve of the backward pass in float64.
 
     Args:
@@ -178,6 +181,8 @@ class PoseInitializer(nn.Module):
                 begin = self._approach(problem, problem.clamp(begin))
             else:
                 begin = self._descend(problem, problem.clamp(problem.prior.mean))
+            # A file's own mesh, whose nearest points jump, has no smooth fixed point: the solids have.
+            problem = replace(problem, surface=FusedSurface(self.shape))
             fixed, pose = self._settle(problem, begin, has_base=given is not None)
             confidence = sure * self._confidence(problem, pose)
         mean = shifted(mean, -origin)
