@@ -80,7 +80,7 @@ def test_octree_equals_looking_at_every_voxel():
 
 def test_exact_hull_of_a_box_from_its_silhouettes():
     # Seen along its faces from afar, a box is its own hull.
-    half, mesh = torch.tensor([0.2, 0.15, 0.1], dtype=torch.float64), None
+    half = torch.tensor([0.2, 0.15, 0.1], dtype=torch.float64)
     mesh = box_mesh(half)
     cameras = [
         Camera.looking_at(CENTER + 50 * away, CENTER, focal=9000.0, width=120, height=120)

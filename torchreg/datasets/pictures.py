@@ -145,7 +145,7 @@ def render(
 
     Differentiable: no.
 
-    Cost: 0.5 s for 640 x 480 pixels, two rays by two, on one CPU core.
+    Cost: 3 to 6 s for 640 x 480 pixels, two rays by two and a wall, on one CPU core; the noise takes most of it.
     """
     style = PictureStyle() if style is None else style
     rest = mesh.vertices if rest is None else rest

@@ -157,7 +157,7 @@ class StereoPair:
         if not self.is_rectified:
             raise InputError(
                 f"the pair is not rectified: rows or scales differ by up to {self.row_error():.3g} pixels, or the "
-                f"lenses distort; pass pictures and cameras through torchreg.capture.rectify first"
+                f"lenses distort; pass pictures and cameras through torchreg.capture.stereo.rectify first"
             )
 
     def disparity(self, depth: Tensor) -> Tensor:
