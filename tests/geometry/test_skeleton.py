@@ -210,3 +210,16 @@ def test_everything_takes_the_dtype_of_the_nodes(dtype):
     assert {value.dtype for value in (tree.radii, tree.frames, tree.confidence, tree.length, *tree.resample(3))} == {
         dtype
     }
+
+
+def test_points_belong_to_the_limb_whose_surface_is_nearest():
+    # A cross: four arms of length 2 from a thick middle.
+    nodes = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [-1, 0, 0], [-2, 0, 0], [0, 1, 0], [0, 2, 0], [0, -1, 0]])
+    edges = torch.tensor([[0, 1], [1, 2], [0, 3], [3, 4], [0, 5], [5, 6], [0, 7]])
+    skeleton = Skeleton(nodes, edges, torch.tensor([0.5, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]))
+    found = skeleton.limb_of(torch.tensor([[1.9, 0.2, 0.0], [0.1, 1.4, 0.0], [-3.0, 0.0, 1.0], [0.0, -0.8, 0.0]]))
+    assert [int(skeleton.limbs[limb][0]) for limb in found] == [2, 6, 4, 7]
+    moved = skeleton.transformed(se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.3, -1.0, 0.4])))
+    assert torch.equal(moved.limb_of(moved.nodes[1:]), skeleton.limb_of(nodes[1:]))
+    with pytest.raises(InputError, match="must have a limb"):
+        Skeleton(nodes[:1], torch.zeros(0, 2, dtype=torch.int64), torch.ones(1)).limb_of(nodes)

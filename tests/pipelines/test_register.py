@@ -174,3 +174,34 @@ def test_bad_arguments_are_refused_by_name(pair):
     for points in (torch.zeros(0, 3), torch.zeros(5, 3), torch.full((5, 3), torch.nan)):
         with pytest.raises(InputError, match="points"):
             tr.RangeScan(points)
+
+
+def test_bones_start_from_known_parts(pair, known):
+    found = register(pair.source, pair.target, 10, 30, start=known[1], parts=pair.labels)
+    assert float(adjusted_rand(found.parts(0.01), pair.moving_labels(0.01))) > 0.8
+    assert float(pair.error(found.deformed).mean()) < 0.01
+
+
+def test_limbs_of_a_spine_are_parts_to_start_from(pair, known):
+    nodes = torch.stack([pair.source.points[pair.labels == part].mean(0) for part in pair.labels.unique()])
+    middle = nodes.mean(0, keepdim=True)
+    edges = torch.tensor([[0, k] for k in range(1, len(nodes) + 1)])
+    frames = torch.eye(3).repeat(len(nodes) + 1, 1, 1)
+    spine = tr.Skeleton(torch.cat([middle, nodes]), edges, torch.full((len(nodes) + 1,), 1e-3), frames)
+    found = register(pair.source, pair.target, 10, 30, start=known[1], parts=spine.limb_of(pair.source.points))
+    assert float(pair.error(found.deformed).mean()) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("parts", "error", "message"),
+    [
+        (torch.zeros(3, dtype=torch.int64), InputError, "parts must have shape"),
+        (torch.zeros(1), InputTypeError, "parts must be integers"),
+        (None, InputError, "parts must be from 0 to num_bones - 1 = 1, got 0 to 2"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(pair, known, parts, error, message):
+    if parts is None:
+        parts = torch.arange(len(pair.source)) % 3
+    with pytest.raises(error, match=message):
+        register(pair.source, pair.target, 2, 30, start=known[1], parts=parts)

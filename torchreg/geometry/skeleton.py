@@ -155,6 +155,29 @@ class Skeleton:
             graph[number[end]].append(number[start])
         return min(_bracketed(graph, middle) for middle in _middles(graph))
 
+    def limb_of(self, points: Tensor) -> Tensor:
+        """Return the limb (N,) whose surface is nearest to each point (N, 3): a first guess of the parts of a body.
+
+        A limb ends where the surface around the junction begins: its own nodes within the radius of a junction, which
+        lie inside the trunk, do not count, unless it has no others. Distances are to nodes, less their radii.
+
+        Raises:
+            InputError: if points have another shape, or the skeleton has no limb.
+        """
+        points = as_float_tensor(points, "points", like=self.nodes)
+        check_points(points, "points", batch=False)
+        if not self.limbs:
+            raise InputError("the skeleton must have a limb, got a single node")
+        distance = torch.cdist(points, self.nodes) - self.radii
+        return torch.stack([distance[:, self._outside(limb)].amin(1) for limb in self.limbs]).argmin(0)
+
+    def _outside(self, limb: Tensor) -> Tensor:
+        """Return the nodes of a limb outside the spheres around the junctions in which it ends."""
+        ends = [end for end in (limb[0], limb[-1]) if self.degrees[end] >= 3]
+        inside = [(self.nodes[limb] - self.nodes[end]).norm(dim=-1) < self.radii[end] for end in ends]
+        kept = limb[~torch.stack(inside).any(0)] if inside else limb
+        return kept if len(kept) else limb
+
     def path(self, start: int, end: int) -> Tensor:
         """Return the node indices (n,) from one node to another along the tree, both included.
 

@@ -105,6 +105,14 @@ class Pull:
         return (1 - self.point_to_point) * along + self.point_to_point * square
 
 
+def labels_of_parts(data: CellData, points: Tensor, parts: Tensor) -> Tensor:
+    """Return the part (C,) that most of the points (N, 3) in each patch of cells belong to; parts (N,) from zero."""
+    patch = data.patches[data.grid.locate(points).cell]
+    votes = torch.zeros(int(data.patches.max()) + 1, int(parts.max()) + 1, dtype=torch.int64, device=parts.device)
+    votes.index_put_((patch, parts), torch.ones_like(parts), accumulate=True)
+    return votes.argmax(1)[data.patches].unique(return_inverse=True)[1]
+
+
 def first_labels(data: CellData, moved: Tensor, weights: Tensor, num_bones: int, costs: LabelCosts) -> Tensor:
     """Return labels (C,) of at most ``num_bones`` parts that move rigidly, in all frames.
 

@@ -68,6 +68,7 @@ class ReducedFit:
         num_bones: int,
         config: RegisterConfig,
         on_step: OnRegisterStep | None = None,
+        labels: Tensor | None = None,
     ) -> None:
         self.data, self.samples, self.targets = data, samples, targets
         self.num_bones, self.config, self._on_step = num_bones, config, on_step
@@ -76,7 +77,9 @@ class ReducedFit:
         self.pull = Pull(samples.moved, None, samples.confidence)
         per_label = data.grid.num_cells * (config.label_cost / data.grid.spacing) ** 2
         self._costs = LabelCosts(config.smoothness, per_label, config.truncation)
-        self.labels = first_labels(data, samples.moved, samples.confidence, num_bones, self._costs)
+        if labels is None:
+            labels = first_labels(data, samples.moved, samples.confidence, num_bones, self._costs)
+        self.labels = labels
         self.model = self._labeled(data.moments(samples.moved, samples.confidence).joined(*self._parts()).motions())
         self._counts = (0, 0, 0, 0)
 

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 import torchreg.pipelines.storage  # noqa: F401  (results can be saved)
-from torchreg._checks import as_float_tensor, check_count, check_finite, check_shape
+from torchreg._checks import as_float_tensor, as_tensor, check_count, check_finite, check_shape
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.sparse_grid import MAX_RESOLUTION, SparseGrid
 from torchreg.models.grid_lbs import GridLBS
-from torchreg.pipelines.bone_labels import CellData
+from torchreg.pipelines.bone_labels import CellData, labels_of_parts
 from torchreg.pipelines.reduced_fit import ReducedFit, Samples
 from torchreg.pipelines.register_config import OnRegisterStep, RegisterConfig
 from torchreg.pipelines.scan_alignment import align_scans
@@ -38,6 +38,7 @@ def register(
     *,
     start: Tensor | None = None,
     confidence: Tensor | None = None,
+    parts: Tensor | None = None,
 ) -> ScanRegistration:
     """Return the bones, weights and deformation that take one range scan onto another, without a template.
 
@@ -59,6 +60,8 @@ def register(
         on_step: called with a `RegisterRecord` after each step.
         start: (N, 3) where the source's points are known to be near in the target's pose, instead of an alignment.
         confidence: (N,) from 0 to 1, how far each of ``start`` can be trusted; ones by default.
+        parts: (N,) integers from zero, less than ``num_bones``, the parts from which bones start, such as the limbs of
+            a spine, ``skeletonize(mesh).limb_of(source.points)``; by default patches that move as one.
 
     Returns:
         a `ScanRegistration`.
@@ -76,6 +79,7 @@ def register(
     config = RegisterConfig() if config is None else config
     check_inputs((source, target), num_bones, grid_resolution)
     check_start(source, start, confidence)
+    parts = None if parts is None else checked_parts(source, parts, num_bones)
     clock = Clock()
     unit = Unit(source)
     scan, other = unit.of_scan(source), unit.of_scan(target)
@@ -95,7 +99,8 @@ def register(
     )
     clock.lap()
     # Lines 3 to 8: motions, correspondences and labels in turn.
-    fit = ReducedFit(data, samples, (other,), num_bones, config, on_step)
+    labels = None if parts is None else labels_of_parts(data, scan.points, parts)
+    fit = ReducedFit(data, samples, (other,), num_bones, config, on_step, labels)
     settled = fit.fit_labels()
     clock.lap()
     # Line 9: continuous weights.
@@ -220,6 +225,19 @@ def check_inputs(scans: tuple[Any, ...], num_bones: int, grid_resolution: int) -
     check_count(grid_resolution, "grid_resolution", 1)
     if grid_resolution > MAX_RESOLUTION:
         raise InputError(f"grid_resolution must be at most {MAX_RESOLUTION}, got {grid_resolution}")
+
+
+def checked_parts(source: RangeScan, parts: Any, num_bones: int) -> Tensor:
+    """Return known parts (N,) as int64 on the CPU; raise unless they fit the source and the number of bones."""
+    parts = as_tensor(parts, "parts", "integers")
+    if parts.is_floating_point() or parts.dtype == torch.bool:
+        raise InputTypeError(f"parts must be integers, got {parts.dtype}")
+    check_shape(parts, "parts", (len(source),))
+    if not 0 <= int(parts.min()) <= int(parts.max()) < num_bones:
+        raise InputError(
+            f"parts must be from 0 to num_bones - 1 = {num_bones - 1}, got {int(parts.min())} to {int(parts.max())}"
+        )
+    return parts.detach().cpu().long()
 
 
 def check_start(source: RangeScan, start: Any, confidence: Any) -> None:
