@@ -25,8 +25,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
 import torchreg as tr
@@ -35,8 +33,8 @@ from torchreg.correspondence.isometry import consistent_matches
 from torchreg.correspondence.spin_images import spin_images
 from torchreg.datasets.bodies import Proportions
 from torchreg.datasets.scan_sequences import ScanSequence, jointed_toy, walking_animal, walking_figure
+from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.neighbors import nearest_neighbor
-from torchreg.geometry.normals import k_nearest
 from torchreg.geometry.sampling import farthest_points
 from torchreg.solvers.ransac import ransac_rigid
 
@@ -194,10 +192,7 @@ def surroundings_agree(pair: Pair, found: Described, matches: DescriptorMatches)
 
 def ways(points: Tensor) -> Tensor:
     """Return distances (N, N) along the graph of nearest neighbors, float32."""
-    index, length = k_nearest(points.double(), NUM_NEIGHBORS)
-    starts = torch.arange(0, index.numel() + 1, NUM_NEIGHBORS)
-    graph = csr_array((length.reshape(-1).numpy(), index.reshape(-1).numpy(), starts.numpy()), shape=(len(points),) * 2)
-    return torch.from_numpy(dijkstra(graph, directed=False)).float()
+    return GeodesicGraph.from_points(points, NUM_NEIGHBORS).distances().float()
 
 
 def closest_share(pair: Pair) -> float:

@@ -172,3 +172,20 @@ def test_wrong_sources_are_refused():
         graph.nearest([])
     with pytest.raises(InputError, match="pieces must be one of"):
         GeodesicGraph.from_mesh(grid(3, 3), "some")
+
+
+def test_graphs_of_given_steps_return_them_and_look_no_farther_than_asked():
+    pairs = torch.tensor([[0, 1], [1, 2], [3, 2], [0, 3]])
+    graph = GeodesicGraph.from_steps(pairs, torch.tensor([1.0, 2.0, 4.0, 9.0]), 5)
+    found, lengths = graph.steps()
+    assert found.tolist() == [[0, 1], [0, 3], [1, 2], [2, 3]]
+    assert lengths.tolist() == [1.0, 9.0, 2.0, 4.0]
+    assert graph.distances()[0].tolist() == [0.0, 1.0, 3.0, 7.0, math.inf]
+    assert graph.distances([0], limit=3.0)[0].tolist() == [0.0, 1.0, 3.0, math.inf, math.inf]
+    assert graph.joined(torch.tensor([[4, 0]]), torch.tensor([1.0])).distances([4])[0].tolist() == [
+        1.0,
+        2.0,
+        4.0,
+        8.0,
+        0.0,
+    ]

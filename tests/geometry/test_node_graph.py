@@ -2,14 +2,14 @@ import pytest
 import torch
 
 from torchreg.errors import InputError
+from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.node_graph import build_node_graph, spread_weights
-from torchreg.geometry.sample_graph import SampleGraph
 
 
 def line(count):
     """Return a chain of samples, one apart."""
     edges = torch.stack((torch.arange(count - 1), torch.arange(1, count)), dim=1)
-    return SampleGraph(count, edges, torch.ones(count - 1, dtype=torch.float64))
+    return GeodesicGraph.from_steps(edges, torch.ones(count - 1), count)
 
 
 def test_nodes_spread_along_the_surface():

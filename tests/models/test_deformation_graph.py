@@ -2,9 +2,9 @@ import pytest
 import torch
 
 from torchreg.errors import InputError
+from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.node_graph import build_node_graph
 from torchreg.geometry.rigid import se3_exp, transform_points
-from torchreg.geometry.sample_graph import neighbor_graph
 from torchreg.models.deformation_graph import DeformationGraph
 
 F64 = torch.float64
@@ -15,7 +15,7 @@ def graph():
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(60, 3, generator=generator, dtype=F64)
     normals = torch.nn.functional.normalize(torch.randn(60, 3, generator=generator, dtype=F64), dim=-1)
-    return DeformationGraph(points, normals, build_node_graph(neighbor_graph(points, 8), 0, 8, 3))
+    return DeformationGraph(points, normals, build_node_graph(GeodesicGraph.from_points(points, 8), 0, 8, 3))
 
 
 def motions(graph, size=0.5, batch=(), seed=1):
@@ -84,13 +84,13 @@ def test_gradients(graph):
 
 def test_one_node_has_no_neighbors():
     points = torch.rand(5, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
-    graph = DeformationGraph(points, points, build_node_graph(neighbor_graph(points, 4), 0, 1))
+    graph = DeformationGraph(points, points, build_node_graph(GeodesicGraph.from_points(points, 4), 0, 1))
     assert graph.edges.shape == (0, 2)
     assert float(graph.bend(graph.rest())) == 0
 
 
 def test_bad_input_is_named(graph):
-    nodes = build_node_graph(neighbor_graph(graph.points, 8), 0, 4)
+    nodes = build_node_graph(GeodesicGraph.from_points(graph.points, 8), 0, 4)
     with pytest.raises(InputError, match="points must be the 60 samples"):
         DeformationGraph(graph.points[:5], graph.normals[:5], nodes)
     with pytest.raises(InputError, match="normals must have shape"):

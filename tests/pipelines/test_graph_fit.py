@@ -5,9 +5,9 @@ import torch
 
 from torchreg.errors import InputError
 from torchreg.geometry.blend import turn_about
+from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.node_graph import build_node_graph
 from torchreg.geometry.rigid import se3_exp, transform_points
-from torchreg.geometry.sample_graph import neighbor_graph
 from torchreg.models.deformation_graph import DeformationGraph
 from torchreg.pipelines.graph_fit import GraphMatches, fit_graph
 
@@ -18,7 +18,7 @@ F64 = torch.float64
 def graph():
     points = torch.rand(80, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
     normals = torch.nn.functional.normalize(points - 0.5, dim=-1)
-    return DeformationGraph(points, normals, build_node_graph(neighbor_graph(points, 8), 0, 6, 3))
+    return DeformationGraph(points, normals, build_node_graph(GeodesicGraph.from_points(points, 8), 0, 6, 3))
 
 
 def problem(graph, seed=1):
@@ -90,7 +90,7 @@ def test_rigid_motions_are_found_whatever_the_stiffness(graph):
 def test_turning_everything_turns_the_answer(graph):
     transforms, matches = problem(graph)
     whole = se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.4, 0.8, -0.3], dtype=F64))
-    nodes = build_node_graph(neighbor_graph(graph.points, 8), 0, 6, 3)
+    nodes = build_node_graph(GeodesicGraph.from_points(graph.points, 8), 0, 6, 3)
     turned = DeformationGraph(transform_points(whole, graph.points), graph.normals @ whole[:3, :3].mT, nodes)
     moved = GraphMatches(
         matches.which, transform_points(whole, matches.targets), matches.weights,
@@ -118,7 +118,7 @@ def test_edges_that_give_count_less(graph):
     expected = (graph.edge_weights / (1 + gap / 0.05**2) * 2 * gap).sum() / graph.num_nodes
     assert fit.gaps == pytest.approx(float(expected))
     # A weight fixed before the step, as if the graph had it from the start.
-    nodes = build_node_graph(neighbor_graph(graph.points, 8), 0, 6, 3)
+    nodes = build_node_graph(GeodesicGraph.from_points(graph.points, 8), 0, 6, 3)
     softer = DeformationGraph(
         graph.points, graph.normals, replace(nodes, edge_weights=nodes.edge_weights / (1 + gap / 0.05**2))
     )

@@ -21,12 +21,12 @@ def problem(pair):
 
 
 def test_samples_are_normalized_and_belong_to_the_scans(pair, problem):
-    assert problem.size == pytest.approx(pair.source.diagonal, rel=0.3)
+    assert problem.unit.size == pytest.approx(pair.source.diagonal, rel=0.3)
     assert float(problem.source.points.mean(0).norm()) < 1e-6
-    torch.testing.assert_close(problem.normalized(pair.source.points[problem.samples]), problem.graph.points)
+    torch.testing.assert_close(problem.unit.of_points(pair.source.points[problem.samples]), problem.graph.points)
     torch.testing.assert_close(problem.graph.points[0], problem.source.points[0])
     assert len(problem.nodes) == problem.graph.num_nodes == 30
-    torch.testing.assert_close(problem.normalized(pair.source.points[problem.nodes]), problem.graph.centers)
+    torch.testing.assert_close(problem.unit.of_points(pair.source.points[problem.nodes]), problem.graph.centers)
     assert len(problem.target) == 800
 
 
@@ -35,7 +35,7 @@ def test_frames_and_units_change_nothing(pair, problem):
     motion[:3] = 7 * motion[:3]
     source, target = (scan.to(torch.float64).transformed(motion) for scan in (pair.source, pair.target))
     moved = describe(source, target, CONFIG)
-    assert moved.size == pytest.approx(7 * problem.size, rel=1e-5)
+    assert moved.unit.size == pytest.approx(7 * problem.unit.size, rel=1e-5)
     assert torch.equal(moved.samples, problem.samples)
     assert torch.equal(moved.nodes, problem.nodes)
     torch.testing.assert_close(moved.target.features, problem.target.features, rtol=0, atol=1e-3)
@@ -50,7 +50,7 @@ def test_moved_samples_are_those_of_the_graph(problem):
 
 def test_most_first_matches_are_right(pair, problem):
     matches = first_matches(problem, MatchConfig(num_points=400))
-    truth = problem.normalized(pair.truth[problem.samples])[matches.which]
+    truth = problem.unit.of_points(pair.truth[problem.samples])[matches.which]
     near = (matches.targets - truth).norm(dim=-1) < 0.05
     assert len(near) > 50
     assert float(near.double().mean()) > 0.9

@@ -43,12 +43,12 @@ def reporter():
 
 
 def misses(pair, problem, transforms):
-    truth = problem.normalized(pair.truth[problem.samples])
+    truth = problem.unit.of_points(pair.truth[problem.samples])
     return (problem.graph(transforms) - truth).norm(dim=-1)
 
 
 def test_wrong_ones_among_the_first_matches_are_ignored(pair, problem, reporter):
-    truth = problem.normalized(pair.truth[problem.samples])
+    truth = problem.unit.of_points(pair.truth[problem.samples])
     targets = truth[:200].clone()
     targets[::10] += 0.3
     matches = GraphMatches(torch.arange(200), targets, torch.ones(200, dtype=torch.float64))

@@ -129,12 +129,24 @@ class GeodesicGraph:
         from_ = np.repeat(np.arange(len(points)), num_neighbors)
         return cls._joined([(from_, index.numpy().reshape(-1), distance.numpy().reshape(-1))], len(points))
 
+    @classmethod
+    def from_steps(cls, pairs: Tensor, lengths: Tensor, count: int) -> GeodesicGraph:
+        """Return the graph of ``count`` places with steps between pairs (P, 2) int64, of given lengths (P,)."""
+        return cls._joined([(*pairs.cpu().numpy().T, lengths.cpu().double().numpy())], count)
+
     def joined(self, pairs: Tensor, lengths: Tensor) -> GeodesicGraph:
         """Return the graph with more steps, between pairs (P, 2) of places, of given lengths (P,)."""
-        from_ = np.repeat(np.arange(len(self)), np.diff(self.starts.numpy()))
-        once = from_ < self.ends.numpy()
-        old = (from_[once], self.ends.numpy()[once], self.lengths.numpy()[once])
-        return self._joined([old, (*pairs.numpy().T, lengths.double().numpy())], len(self))
+        old, old_lengths = self.steps()
+        return self.from_steps(torch.cat((old, pairs)), torch.cat((old_lengths, lengths.double())), len(self))
+
+    def steps(self) -> tuple[Tensor, Tensor]:
+        """Return pairs (P, 2) int64 of places between which a step leads, the smaller first, and the lengths (P,).
+
+        A step that was given twice is returned twice.
+        """
+        from_ = torch.arange(len(self)).repeat_interleave(self.starts.diff().long())
+        once = from_ < self.ends
+        return torch.stack((from_[once], self.ends[once].long()), dim=1), self.lengths[once]
 
     @classmethod
     def _joined(cls, pairs: list[_Steps], count: int) -> GeodesicGraph:
@@ -156,11 +168,12 @@ class GeodesicGraph:
     def __repr__(self) -> str:
         return f"GeodesicGraph({len(self)} places, {len(self.ends) // 2} steps)"
 
-    def distances(self, sources: Any) -> Tensor:
-        """Return how far every place is from each source, (S, V) float64; infinite where no way leads.
+    def distances(self, sources: Any = None, limit: float = math.inf) -> Tensor:
+        """Return how far every place is from each source, (S, V) float64; infinite where no way within limits leads.
 
         Args:
-            sources: (S,) places.
+            sources: (S,) places; all by default.
+            limit: ways longer than this are not looked for, which saves time.
 
         Raises:
             InputError: if a source is no place.
@@ -170,10 +183,10 @@ class GeodesicGraph:
 
         References: Dijkstra 1959.
         """
-        sources = self._check(sources)
-        if len(sources) == 0:
+        sources = None if sources is None else self._check(sources)
+        if sources is not None and len(sources) == 0:
             return self.lengths.new_zeros(0, len(self))
-        return torch.from_numpy(dijkstra(self._matrix(), indices=sources))
+        return torch.from_numpy(dijkstra(self._matrix(), indices=sources, limit=limit))
 
     def nearest(self, sources: Any) -> tuple[Tensor, Tensor]:
         """Return how far the nearest source is, (V,) float64, and which of them (V,) it is, -1 where no way leads.

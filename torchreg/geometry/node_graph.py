@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_count, check_points
 from torchreg.errors import InputError
+from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.neighbors import nearest_few
-from torchreg.geometry.sample_graph import SampleGraph
 
 # Two nodes are neighbors if what they carry in common weighs at least this many samples.
 _LEAST_SHARED = 1e-3
@@ -41,7 +41,7 @@ class NodeGraph:
         return self.weights.new_zeros(len(self.weights), len(self.nodes)).scatter_add(1, self.nearest, self.weights)
 
 
-def build_node_graph(graph: SampleGraph, start: int, num_nodes: int, num_nearest: int = 4) -> NodeGraph:
+def build_node_graph(graph: GeodesicGraph, start: int, num_nodes: int, num_nearest: int = 4) -> NodeGraph:
     """Return nodes chosen by farthest-point sampling along a surface, and the samples hung on them.
 
     A sample at distances ``d_1 <= d_2 <= ...`` from the nodes follows the first K with weights in proportion to
@@ -64,9 +64,9 @@ def build_node_graph(graph: SampleGraph, start: int, num_nodes: int, num_nearest
     """
     check_count(num_nodes, "num_nodes", 1)
     check_count(num_nearest, "num_nearest", 1)
-    if not 0 <= start < graph.count:
-        raise InputError(f"start must be one of {graph.count} samples, got {start}")
-    num_nodes = min(num_nodes, graph.count)
+    if not 0 <= start < len(graph):
+        raise InputError(f"start must be one of {len(graph)} samples, got {start}")
+    num_nodes = min(num_nodes, len(graph))
     nodes, rows = [start], [graph.distances(torch.tensor([start]))[0]]
     nearest = rows[0].clone()
     while len(nodes) < num_nodes:

@@ -2,55 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 import torch
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchreg._checks import as_tensor, check_count, check_points, check_positive
 from torchreg.errors import InputError
+from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.normals import distinct_places, k_nearest
 
 # Links between two parts of a scan that no surface joins.
 _BRIDGE_LINKS = 3
-
-
-@dataclass(frozen=True, eq=False)
-class SampleGraph:
-    """Samples and the steps between them.
-
-    Args:
-        count: number of samples.
-        edges: (E, 2) int64, each once.
-        lengths: (E,) float64, in the unit of the points.
-    """
-
-    count: int
-    edges: Tensor
-    lengths: Tensor
-
-    def distances(self, sources: Tensor | None = None, limit: float = float("inf")) -> Tensor:
-        """Return how far all samples are from some, (S, count) float64; infinite where no way leads within the limit.
-
-        Args:
-            sources: (S,) samples; all by default.
-            limit: ways longer than this are not looked for.
-
-        Cost: O(E log E) per source, far less with a small limit.
-        """
-        index = None if sources is None else sources.cpu().numpy()
-        return torch.from_numpy(dijkstra(self._matrix, indices=index, limit=limit))
-
-    @cached_property
-    def _matrix(self) -> csr_array:
-        start, end = self.edges.cpu().numpy().T
-        both = (np.concatenate((start, end)), np.concatenate((end, start)))
-        return csr_array((np.tile(self.lengths.cpu().numpy(), 2), both), shape=(self.count, self.count))
 
 
 def sample_graph(
@@ -60,13 +25,13 @@ def sample_graph(
     *,
     num_neighbors: int = 8,
     bridge: float | None = 3.0,
-) -> SampleGraph:
+) -> GeodesicGraph:
     """Return the graph of samples of a surface, joined where their surroundings meet.
 
     The surroundings of a sample are the points that are nearer to it than to any other sample; they meet where an edge
-    leads from one to the other. Edges are those of the
-    triangles, or without faces those between points and their nearest neighbors; limbs that touch in space alone are
-    not joined by triangles. What does not hang together is bridged where it is nearest, by few and costly links.
+    leads from one to the other. Edges are those of the triangles, or without faces those between points and their
+    nearest neighbors; limbs that touch in space alone are not joined by triangles. What does not hang together is
+    bridged where it is nearest, by few and costly links.
 
     Args:
         points: (N, 3) all of the surface, any unit.
@@ -76,7 +41,7 @@ def sample_graph(
         bridge: lengths of the links between parts are multiplied by this; None leaves the parts apart.
 
     Returns:
-        a `SampleGraph`, its steps as long as the straight way.
+        a `GeodesicGraph`, its steps as long as the straight way.
 
     Raises:
         InputError: if a shape does not fit or there are no samples.
@@ -95,28 +60,14 @@ def sample_graph(
     places = points.detach().cpu().double().numpy()
     centers = places[samples.cpu().numpy()]
     if len(centers) == 1:
-        return SampleGraph(1, torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.float64))
+        return GeodesicGraph.from_steps(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0), 1)
     owner = cKDTree(centers).query(places)[1]
     steps = _steps_of_points(points, num_neighbors) if faces is None else _steps_of_faces(faces)
     edges = _distinct(owner[steps], len(centers))
     lengths = _lengths(centers, edges)
     if bridge is not None:
         edges, lengths = _bridged(centers, edges, lengths, bridge)
-    return SampleGraph(len(centers), torch.from_numpy(edges), torch.from_numpy(lengths))
-
-
-def neighbor_graph(points: Tensor, num_neighbors: int = 8) -> SampleGraph:
-    """Return the graph in which every point is joined to its nearest others.
-
-    Args:
-        points: (N, 3), at least two, no two at one place.
-        num_neighbors: see above.
-    """
-    places = points.detach().cpu().double().numpy()
-    index, _ = k_nearest(points, num_neighbors)
-    start = np.repeat(np.arange(len(places)), index.shape[1])
-    edges = _distinct(np.stack((start, index.numpy().reshape(-1)), axis=1), len(places))
-    return SampleGraph(len(places), torch.from_numpy(edges), torch.from_numpy(_lengths(places, edges)))
+    return GeodesicGraph.from_steps(torch.from_numpy(edges), torch.from_numpy(lengths), len(centers))
 
 
 def _steps_of_faces(faces: Tensor) -> np.ndarray:

@@ -42,6 +42,12 @@ class Samples:
     confidence: Tensor
 
 
+def turned_normals(normals: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
+    """Return unit normals (..., N, 3) of points (N,) of weights (N, B) moved by bones (..., B, 4, 4)."""
+    turned = torch.einsum("nb,...bij,nj->...ni", weights, transforms[..., :3, :3], normals)
+    return torch.nn.functional.normalize(turned, dim=-1)
+
+
 class ReducedFit:
     """A registration under way: F frames of one source.
 
@@ -169,8 +175,7 @@ class ReducedFit:
         """Return where points (N, 3) and their unit normals go in every frame, (F, N, 3) each."""
         with torch.no_grad():
             weights, transforms = self.model.weights_at(points), self.model.transforms
-            turned = torch.einsum("nb,fbij,nj->fni", weights, transforms[..., :3, :3], normals)
-            return self.model.move(points, weights), torch.nn.functional.normalize(turned, dim=-1)
+            return self.model.move(points, weights), turned_normals(normals, weights, transforms)
 
     def _parts(self) -> tuple[Tensor, int]:
         """Return the label of each patch, and the number of labels, while labels do not cut patches."""

@@ -15,11 +15,11 @@ from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.sparse_grid import MAX_RESOLUTION, SparseGrid
-from torchreg.models.grid_lbs import GridLBS
 from torchreg.pipelines.bone_labels import CellData, labels_of_parts
 from torchreg.pipelines.reduced_fit import ReducedFit, Samples
 from torchreg.pipelines.register_config import OnRegisterStep, RegisterConfig
 from torchreg.pipelines.scan_alignment import align_scans
+from torchreg.pipelines.scan_unit import ScanUnit
 from torchreg.results import RegisterRecord, ScanRegistration, Status
 
 # Points that the dense alignment is unsure of count this much at least: they follow what is around them.
@@ -81,11 +81,11 @@ def register(
     check_start(source, start, confidence)
     parts = None if parts is None else checked_parts(source, parts, num_bones)
     clock = Clock()
-    unit = Unit(source)
+    index = source_samples(source, config, generator)
+    unit = ScanUnit.of(source.points[index])
     scan, other = unit.of_scan(source), unit.of_scan(target)
     # Line 1 of the algorithm: the grid.
     grid = SparseGrid.from_points(scan.points, grid_resolution)
-    index = source_samples(scan, config, generator)
     data = CellData(grid, scan.points[index], config.num_patches)
     clock.lap()
     # Line 2: where everything goes, roughly.
@@ -110,21 +110,26 @@ def register(
 
 
 def _result(
-    source: RangeScan, scan: RangeScan, other: RangeScan, unit: Unit, fit: ReducedFit, settled: bool, seconds: Tensor
+    source: RangeScan,
+    scan: RangeScan,
+    other: RangeScan,
+    unit: ScanUnit,
+    fit: ReducedFit,
+    settled: bool,
+    seconds: Tensor,
 ) -> ScanRegistration:
     """Return what was found, in the unit and frame of the source."""
     config, points = fit.config, scan.points
-    fit.model.set_transforms_(fit.model.transforms.detach()[0])
     weights = fit.model.weights_at(points)
-    moved = fit.model.move(points, weights)
-    turned = torch.einsum("nb,bij,nj->ni", weights, fit.model.transforms[:, :3, :3], scan.normals)
+    (moved,), (normals,) = fit.moved(points, scan.normals)
     found = fit.matchers[0].match(
         moved,
-        torch.nn.functional.normalize(turned, dim=-1),
+        normals,
         max_distance=max(config.max_distance[1], 2 * other.spacing),
         max_angle=config.max_angle[1],
     )
     like = source.points
+    fit.model.set_transforms_(fit.model.transforms.detach()[0])
     model = unit.model_back(fit.model, like)
     return ScanRegistration(
         model,
@@ -136,50 +141,19 @@ def _result(
         weights.to(like),
         (unit.size * nearest_neighbor(moved, other.points)[1]).to(like),
         found.kept.to(like.device),
-        _status(found.counts.kept / len(points), settled, config),
+        fit_status(found.counts.kept / len(points), settled, config),
         seconds,
         tuple(fit.history),
     )
 
 
-def _status(matched: float, settled: bool, config: RegisterConfig) -> Status:
+def fit_status(matched: float, settled: bool, config: RegisterConfig) -> Status:
+    """Return how a fit went that matched a share of the points."""
     if matched == 0:
         return Status.NO_DATA
     if matched < config.min_matched:
         return Status.FEW_INLIERS
     return Status.CONVERGED if settled else Status.MAX_STEPS
-
-
-class Unit:
-    """Coordinates about the middle of the source, in units of its diagonal, double precision on the CPU."""
-
-    def __init__(self, source: RangeScan) -> None:
-        points = source.points.detach().cpu().double()
-        self.middle, self.size = points.mean(0), source.diagonal
-
-    def of_points(self, points: Tensor) -> Tensor:
-        """Return points (..., N, 3) of the user in these coordinates."""
-        return (points.detach().cpu().double() - self.middle) / self.size
-
-    def of_scan(self, scan: RangeScan) -> RangeScan:
-        """Return a scan of the user in these coordinates."""
-        motion = torch.eye(4, dtype=torch.float64) / self.size
-        motion[:3, 3], motion[3, 3] = -self.middle / self.size, 1.0
-        return scan.to(dtype=torch.float64, device="cpu").transformed(motion)
-
-    def points_back(self, points: Tensor, like: Tensor) -> Tensor:
-        """Return points in the coordinates of the user, in the dtype and on the device of ``like``."""
-        return (self.middle + self.size * points).to(like)
-
-    def model_back(self, model: GridLBS, like: Tensor) -> GridLBS:
-        """Return a model in the coordinates of the user, in the dtype and on the device of ``like``."""
-        grid, transforms = model.grid, model.transforms.detach().clone()
-        shift = self.middle - (transforms[..., :3, :3] @ self.middle.unsqueeze(-1)).squeeze(-1)
-        transforms[..., :3, 3] = self.size * transforms[..., :3, 3] + shift
-        origin = self.middle + self.size * grid.origin
-        bigger = SparseGrid(grid.cells, grid.shape, origin, grid.axes, self.size * grid.spacing)
-        found = GridLBS(bigger, model.weights.detach(), transforms, blend=model.blend)
-        return found.to(dtype=like.dtype, device=like.device)
 
 
 class Clock:

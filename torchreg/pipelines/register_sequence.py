@@ -14,18 +14,19 @@ from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.sparse_grid import SparseGrid
 from torchreg.pipelines.bone_labels import CellData
-from torchreg.pipelines.reduced_fit import ReducedFit, Samples
+from torchreg.pipelines.reduced_fit import ReducedFit, Samples, turned_normals
 from torchreg.pipelines.register import (
     LEAST_CONFIDENCE,
-    Unit,
     check_inputs,
+    fit_status,
     initial_records,
     register,
     source_samples,
 )
 from torchreg.pipelines.register_config import OnRegisterStep, RegisterConfig
 from torchreg.pipelines.scan_alignment import align_scans
-from torchreg.results import SequenceRegistration, Status
+from torchreg.pipelines.scan_unit import ScanUnit
+from torchreg.results import SequenceRegistration
 
 
 @torch.no_grad()
@@ -77,10 +78,10 @@ def register_sequence(
     if reference >= len(scans):
         raise InputError(f"reference must be below the number of scans {len(scans)}, got {reference}")
     source = scans[reference]
-    unit = Unit(source)
+    index = source_samples(source, config, generator)
+    unit = ScanUnit.of(source.points[index])
     moved, confidence = _chain(scans, reference, num_bones, grid_resolution, config, generator, on_step)
     scan = unit.of_scan(source)
-    index = source_samples(scan, config, generator)
     data = CellData(SparseGrid.from_points(scan.points, grid_resolution), scan.points[index], config.num_patches)
     places = unit.of_points(moved)[:, index]
     trust = confidence[:, index].double().clamp(min=LEAST_CONFIDENCE)
@@ -114,17 +115,13 @@ def _chain(
                 start=aligned.points, confidence=aligned.confidence,
             )  # fmt: skip
             places[frame], trust[frame] = found.deformed, aligned.confidence
-            current = RangeScan(found.deformed, source.faces, _turned(source.normals, found.weights, found.transforms))
+            normals = turned_normals(source.normals, found.weights, found.transforms)
+            current = RangeScan(found.deformed, source.faces, normals)
     return torch.stack(places), torch.stack([row.cpu() for row in trust])
 
 
-def _turned(normals: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
-    """Return normals (..., N, 3) moved by bones (..., B, 4, 4), not of unit length."""
-    return torch.einsum("nb,...bij,nj->...ni", weights, transforms[..., :3, :3], normals)
-
-
 def _result(
-    scans: tuple[RangeScan, ...], reference: int, unit: Unit, fit: ReducedFit, settled: bool
+    scans: tuple[RangeScan, ...], reference: int, unit: ScanUnit, fit: ReducedFit, settled: bool
 ) -> SequenceRegistration:
     """Return what was found, in the unit and frame of the scans."""
     source = scans[reference]
@@ -133,9 +130,6 @@ def _result(
     moved = fit.model.move(points, weights)
     fused, normals, frames = _fused(scans, unit, moved, weights, fit.model.transforms.detach())
     shares = fit.history[-1].kept / (len(scans) * len(fit.samples.points))
-    status = Status.CONVERGED if settled else Status.MAX_STEPS
-    if shares < fit.config.min_matched:
-        status = Status.NO_DATA if shares == 0 else Status.FEW_INLIERS
     model = unit.model_back(fit.model, like)
     return SequenceRegistration(
         model,
@@ -149,13 +143,13 @@ def _result(
         normals.to(like),
         frames.to(like.device),
         reference,
-        status,
+        fit_status(shares, settled, fit.config),
         tuple(fit.history),
     )
 
 
 def _fused(
-    scans: tuple[RangeScan, ...], unit: Unit, moved: Tensor, weights: Tensor, transforms: Tensor
+    scans: tuple[RangeScan, ...], unit: ScanUnit, moved: Tensor, weights: Tensor, transforms: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return all points (K, 3) of all scans in the pose of the reference, their normals and the frames they are from.
 

@@ -12,17 +12,16 @@ from torchreg.correspondence.isometry import consistent_matches
 from torchreg.correspondence.oriented_samples import OrientedSamples, scaled_together
 from torchreg.correspondence.spin_images import spin_images
 from torchreg.geometry.curvature import curvature_features
+from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.node_graph import build_node_graph
 from torchreg.geometry.range_scan import RangeScan
-from torchreg.geometry.sample_graph import neighbor_graph, sample_graph
+from torchreg.geometry.sample_graph import sample_graph
 from torchreg.geometry.sampling import even_order
 from torchreg.models.deformation_graph import DeformationGraph
 from torchreg.pipelines.graph_fit import GraphMatches
 from torchreg.pipelines.scan_align_config import MatchConfig, ScanAlignConfig
+from torchreg.pipelines.scan_unit import ScanUnit
 
-# Root mean squared distance from the middle, over the diagonal of the bounding box, of people and animals; unlike the
-# box it does not change with the frame.
-_SPREAD = 0.23
 # Points that spin images look at, and neighbors that curvature looks at.
 _SCENE, _AROUND = 1250, 100
 # Neighbors of a sample in the graph that distances for the matches are measured on.
@@ -39,8 +38,7 @@ class ScanAlignProblem:
         target: samples of the target.
         samples: (S,) source points that are samples of the graph.
         nodes: (J,) source points that are nodes.
-        middle: (3,) of the source, and
-        size: by which coordinates were shifted and divided.
+        unit: in which coordinates are given.
     """
 
     graph: DeformationGraph
@@ -48,12 +46,7 @@ class ScanAlignProblem:
     target: OrientedSamples
     samples: Tensor
     nodes: Tensor
-    middle: Tensor
-    size: float
-
-    def normalized(self, points: Tensor) -> Tensor:
-        """Return points in the problem's unit and frame."""
-        return (points.detach().cpu().double() - self.middle) / self.size
+    unit: ScanUnit
 
     def moved(self, transforms: Tensor, count: int | None = None) -> OrientedSamples:
         """Return the first ``count`` samples of the graph where its nodes take them."""
@@ -78,9 +71,9 @@ def describe(
     here = source.uniform_subsample(count, generator=generator)
     there = target.uniform_subsample(config.num_target_samples, generator=generator)
     here, there = here[even_order(source.points[here])], there[even_order(target.points[there])]
-    middle, size = _frame(source.points[here])
+    unit = ScanUnit.of(source.points[here])
     places = [
-        ((scan.points[which].detach().cpu().double() - middle) / size, scan.normals[which].detach().cpu().double())
+        (unit.of_points(scan.points[which]), scan.normals[which].detach().cpu().double())
         for scan, which in ((source, here), (target, there))
     ]
     features = scaled_together(
@@ -92,17 +85,10 @@ def describe(
     )
     samples = here[: config.num_samples].cpu()
     faces = None if source.faces is None else source.faces.cpu()
-    ways = sample_graph((source.points.detach().cpu().double() - middle) / size, samples, faces)
+    ways = sample_graph(unit.of_points(source.points), samples, faces)
     nodes = build_node_graph(ways, 0, config.num_nodes, config.num_nearest)
     graph = DeformationGraph(one.points[: len(samples)], one.normals[: len(samples)], nodes)
-    return ScanAlignProblem(graph, one, other, samples, samples[nodes.nodes], middle, size)
-
-
-def _frame(points: Tensor) -> tuple[Tensor, float]:
-    """Return the middle (3,) and size of evenly spread points, the same in any frame."""
-    places = points.detach().cpu().double()
-    middle = places.mean(0)
-    return middle, float((places - middle).square().sum(-1).mean().sqrt()) / _SPREAD
+    return ScanAlignProblem(graph, one, other, samples, samples[nodes.nodes], unit)
 
 
 def first_matches(problem: ScanAlignProblem, config: MatchConfig) -> GraphMatches:
@@ -119,7 +105,8 @@ def first_matches(problem: ScanAlignProblem, config: MatchConfig) -> GraphMatche
         scene = scan.first(_SCENE)
         surface = (few.points, few.normals, scene.points, scene.normals)
         images.append(spin_images(*(value.float() for value in surface), bin_size=config.bin_size))
-        ways.append(neighbor_graph(few.points, _NEIGHBORS).distances(limit=2 * config.radius).float())
+        graph = GeodesicGraph.from_points(few.points, min(_NEIGHBORS, len(few.points) - 1))
+        ways.append(graph.distances(limit=2 * config.radius).float())
     matches = match_descriptors(
         *images,
         num_candidates=config.num_candidates,
