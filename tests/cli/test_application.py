@@ -22,7 +22,7 @@ finally:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--help"], ("align", "demo", "figure", "info", "label", "pose", "register", "spine", "track")),
+        (["--help"], ("align", "demo", "figure", "info", "label", "pose", "register", "spine", "track", "view")),
         (["track", "--help"], ("--resume", "--overlay")),
     ],
 )
@@ -34,7 +34,7 @@ def test_help_is_light(arguments, words):
 
 
 def test_every_command_explains_itself(run):
-    for command in ("align", "demo", "figure", "info", "label", "pose", "register", "spine", "track"):
+    for command in ("align", "demo", "figure", "info", "label", "pose", "register", "spine", "track", "view"):
         assert "Usage:" in run(command, "--help").output
     assert "poses are not searched" in " ".join(run("align", "--help").output.split())
     assert run("--version").output == f"torchreg {torchreg.__version__}\n"

@@ -17,6 +17,7 @@ from torchreg.cli.pose import pose
 from torchreg.cli.register import register
 from torchreg.cli.spine import spine
 from torchreg.cli.track import track
+from torchreg.cli.view import view
 
 app = typer.Typer(
     name="torchreg",
@@ -62,3 +63,4 @@ app.command(short_help="Extract the moving skeleton of a sequence of meshes.")(s
 app.command(short_help="Pose a registered scan by dragging points.")(pose)
 app.command(short_help="Register two range scans of something that moves.")(register)
 app.command(short_help="Follow a shape through a sequence of clouds.")(track)
+app.command(short_help="Show a result in the browser, or write it as one HTML file.")(view)

@@ -1,0 +1,103 @@
+"""The viewer without a browser: nodes, controls and files; `tests/web` looks at it through a browser."""
+
+import builtins
+import socket
+import time
+
+import numpy as np
+import pytest
+import torch
+
+from torchreg.errors import InputError, MissingExtraError
+from torchreg.viz.result_scenes import result_scene
+from torchreg.viz.scene import Scene
+from torchreg.viz.viewer import HOST, SceneViewer, import_viser, scene_html
+
+pytest.importorskip("viser", reason="the viewer needs viser")
+KINDS = ("alignment", "track", "demo", "starts", "calibration", "registration", "sequence", "spine")
+
+
+def scene_of(everything, name, hand):
+    return result_scene(everything[name], shape=hand if name in {"track", "starts"} else None)
+
+
+def wait_for(condition):
+    for _ in range(400):
+        if condition():
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def node(viewer, name):
+    return viewer.server.scene.get_handle_by_name(name)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_kind_of_result_opens_here_alone(everything, name, hand, capsys):
+    scene = scene_of(everything, name, hand)
+    with SceneViewer(scene, port=0) as viewer:
+        assert viewer.url.startswith(f"http://{HOST}:")
+        assert viewer.server.get_host() == HOST
+        assert viewer.server.request_share_url() is None
+        with socket.create_connection((HOST, viewer.server.get_port()), timeout=5):
+            pass
+        viewer.show(scene.num_frames - 1)
+        assert viewer.frame == scene.num_frames - 1 or scene.num_frames == 1
+        with pytest.raises(InputError, match="frame must be from 0"):
+            viewer.show(scene.num_frames)
+    assert capsys.readouterr().out == ""
+
+
+def test_frames_and_toggles_reach_the_nodes(track, hand):
+    scene = result_scene(track, shape=hand)
+    with SceneViewer(scene, port=0) as viewer:
+        surface = node(viewer, "/layers/0/0")
+        assert not surface.visible  # not found in the first frame
+        viewer.show(2)
+        assert surface.visible
+        np.testing.assert_allclose(surface.vertices, scene.layer("shape").points(2), atol=1e-6)
+        boxes = {handle.label: handle for handle in viewer.server.gui._gui_input_handle_from_uuid.values()}
+        boxes["shape"].value = False
+        assert wait_for(lambda: not surface.visible)
+        boxes["bones"].value = True
+        assert wait_for(lambda: node(viewer, "/layers/1/lines").visible)
+
+
+def test_play_and_pause(sequence):
+    scene = result_scene(sequence)
+    with SceneViewer(Scene(scene.title, scene.layers, torch.tensor([0.0, 0.02])), port=0) as viewer:
+        viewer._timeline.play()
+        assert wait_for(lambda: viewer.frame == 1)
+        assert wait_for(lambda: viewer.frame == 0)  # over and over
+        viewer._timeline.pause()
+        time.sleep(0.05)
+        shown = viewer.frame
+        time.sleep(0.7)
+        assert viewer.frame == shown
+
+
+def test_one_file_holds_it_all(spine, tmp_path):
+    scene = result_scene(spine)
+    path = scene_html(tmp_path / "spine.html", scene)
+    content = path.read_text(encoding="utf-8")
+    assert "__VISER_EMBED_DATA__" in content
+    still = scene_html(tmp_path / "still.html", Scene("still", scene.layers[:1]), num_loops=0)
+    assert still.stat().st_size < path.stat().st_size
+    with pytest.raises(InputError, match=r"end in \.html"):
+        scene_html(tmp_path / "spine.htm", scene)
+    with pytest.raises(FileNotFoundError):
+        scene_html(tmp_path / "nowhere" / "spine.html", scene)
+
+
+def test_without_viser_the_extra_is_named(monkeypatch):
+    real = builtins.__import__
+
+    def without(name, *arguments, **options):
+        if name == "viser":
+            raise ImportError("no viser")
+        return real(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(MissingExtraError, match=r"pip install 'torchreg\[viewer\]'"):
+        import_viser()

@@ -1,0 +1,135 @@
+"""``torchreg view``: results of all systems in the browser, or as one HTML file."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
+from torchreg.cli.reporting import reporting
+from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, load_shape
+from torchreg.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchreg.geometry.mesh import TriangleMesh
+    from torchreg.viz.scene import Scene
+
+UPS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+UPS |= {f"-{name}": (-place[0], -place[1], -place[2]) for name, place in UPS.items()}
+
+Port = Annotated[int, typer.Option(min=0, max=65535, help="Where to listen on 127.0.0.1; if taken, a later one.")]
+Browser = Annotated[bool, typer.Option("--browser/--no-browser", help="Whether to open a window of the browser.")]
+Up = Annotated[
+    str | None, typer.Option(help="What is upright: x, y, z, -x, -y or -z; by default -y before a camera, else z.")
+]
+
+
+@reporting
+def view(
+    result: Annotated[
+        Path, typer.Argument(metavar="RESULT", help="What a command or Result.save wrote (.safetensors).")
+    ],
+    shape: Annotated[
+        str | None,
+        typer.Option(help="What was aligned or tracked: hand, hand-left, a robot (.urdf) or a rig (.glb, .gltf)."),
+    ] = None,
+    data: Annotated[
+        list[Path] | None,
+        typer.Option(help="What was measured, once per frame, or a folder: clouds, the target scan, the meshes."),
+    ] = None,
+    html: Annotated[
+        Path | None, typer.Option(metavar="OUT.html", help="Write one file that needs no network, instead of serving.")
+    ] = None,
+    port: Port = 8080,
+    browser: Browser = True,
+    up: Up = None,
+    parents: Parents = None,
+    package_dir: PackageDir = None,
+    free_base: FreeBase = None,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """Show a result in the browser: shapes, clouds, bones, weights, spines, with a timeline where something moves.
+
+    The page is served to this machine alone, until Ctrl-C. Needs the extra: pip install 'torchreg[viewer]'.
+
+    Exit codes: 0, also after Ctrl-C; 2 for an error.
+    """
+    html = with_ending(html, (".html",))
+    check_outputs([html], force)
+    up_direction = check_up(up)
+    if shape is None and (parents or package_dir or free_base is not None):
+        raise InputError("--parents, --package-dir and --free-base are about a --shape, which was not given")
+    from torchreg.pipelines.storage import load
+    from torchreg.viz.result_scenes import result_scene
+    from torchreg.viz.viewer import import_viser, scene_html
+
+    import_viser()
+    found = load(result if result.suffix else result.with_suffix(".safetensors"))
+    model = None if shape is None else load_shape(shape, parents, package_dir, free_base)
+    scene = with_up(result_scene(found, shape=model, data=_read(data or [])), up_direction)
+    if html is not None:
+        scene_html(html, scene)
+        if not quiet:
+            typer.echo(f"{scene.title} -> {html}")
+        return
+    _serve(scene, port, browser, quiet)
+
+
+def check_up(up: str | None) -> tuple[float, float, float] | None:
+    """Return the direction of a name; InputError if it is none."""
+    if up is not None and up not in UPS:
+        raise InputError(f"--up must be one of {', '.join(sorted(UPS))}, got {up!r}")
+    return None if up is None else UPS[up]
+
+
+def with_up(scene: Scene, up: tuple[float, float, float] | None) -> Scene:
+    """Return a scene with another upright direction, if one is given."""
+    from dataclasses import replace
+
+    return scene if up is None else replace(scene, up=up)
+
+
+def wait_for_interrupt(url: str, browser: bool, quiet: bool) -> None:
+    """Tell where a page is, open it if asked to, and wait until Ctrl-C."""
+    if not quiet:
+        typer.echo(f"{url} (Ctrl-C ends)")
+    if browser:
+        import webbrowser
+
+        webbrowser.open(url)
+    try:
+        while True:
+            time.sleep(3600)
+    except KeyboardInterrupt:
+        return
+
+
+def _serve(scene: Scene, port: int, browser: bool, quiet: bool) -> None:
+    from torchreg.viz.viewer import SceneViewer
+
+    with SceneViewer(scene, port=port) as viewer:
+        wait_for_interrupt(viewer.url, browser, quiet)
+
+
+def _read(paths: list[Path]) -> list[Tensor | TriangleMesh]:
+    """Return what files hold, meshes where they have triangles; of a folder or one .npz, its frames in their order."""
+    from torchreg.geometry.mesh import TriangleMesh
+    from torchreg.io.frames import load_frames
+    from torchreg.io.points import load_points
+
+    if not paths:
+        return []
+    frames = load_frames(paths[0] if len(paths) == 1 else paths)
+    if any(path.suffix.lower() == ".npz" for path in paths):
+        return list(frames)
+    clouds = [load_points(name) for name in frames.names]
+    return [
+        cloud.points if cloud.faces is None or not len(cloud.faces) else TriangleMesh(cloud.points, cloud.faces)
+        for cloud in clouds
+    ]

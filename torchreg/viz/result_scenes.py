@@ -1,0 +1,287 @@
+"""Scenes of results: what a viewer shows of an alignment, a tracked sequence, registered scans, a spine."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import singledispatch
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import check_shape
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.rigid import transform_points
+from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.grid_lbs import GridLBS
+from torchreg.models.hand import Hand
+from torchreg.results import (
+    AlignResult,
+    Calibration,
+    DemoResult,
+    PoseStarts,
+    Result,
+    ScanRegistration,
+    SequenceRegistration,
+    SpineSequence,
+    TrackResult,
+)
+from torchreg.viz.animation import coarse_skin
+from torchreg.viz.bone_colors import bone_palette, error_colors, weight_colors
+from torchreg.viz.figures import SKIN_COLOR
+from torchreg.viz.key_poses import between_poses
+from torchreg.viz.scene import Cloud, Curves, Layer, Meshes, Scene, Surface
+
+Data = Sequence[Tensor | TriangleMesh]
+
+_GRAY, _BODY = (0.62, 0.62, 0.64), (0.78, 0.76, 0.74)
+_TARGET, _INLIER, _OUTLIER = (0.45, 0.52, 0.62), (0.04, 0.31, 0.62), (0.62, 0.62, 0.62)
+# An inlier of no posterior at all is drawn in this share of its color, the rest white.
+_PALEST = 0.35
+# Frames of the way from a scan to where it was registered.
+_STEPS = 25
+# Data this near a surface, as a share of the size of the shape, belong to it where nobody says so.
+_NEAR = 0.02
+
+
+def result_scene(result: Result, *, shape: ArticulatedShape | None = None, data: Data = ()) -> Scene:
+    """Return the scene of a result.
+
+    Args:
+        result: of any of the three systems: an `AlignResult`, `TrackResult`, `DemoResult`, `PoseStarts`, `Calibration`,
+            `ScanRegistration`, `SequenceRegistration` or `SpineSequence`.
+        shape: that was aligned or tracked; without it keypoints and registered points alone are shown.
+        data: what was measured, one cloud or mesh per frame: the clouds of alignments and sequences, the target of a
+            registration, the surfaces of a spine; may be left out.
+
+    Raises:
+        InputError: if sizes do not fit, or ``shape`` is given to a result of scans.
+        InputTypeError: if there is nothing to show of such a result.
+    """
+    if shape is not None and isinstance(result, (ScanRegistration, SequenceRegistration, SpineSequence)):
+        raise InputError(f"shape has no meaning for a {type(result).__name__}; leave it out")
+    return _scene(result, shape, data)
+
+
+@singledispatch
+def _scene(result: Result, shape: ArticulatedShape | None, data: Data) -> Scene:
+    raise InputTypeError(f"result must be one that can be shown, not a {type(result).__name__}")
+
+
+@_scene.register
+def _align_scene(result: AlignResult, shape: ArticulatedShape | None, data: Data) -> Scene:
+    poses = _batched(result.pose, 1)
+    masks, posterior = _batched(result.inliers, 1), _batched(result.posterior, 1)
+    clouds = _clouds(data, len(poses))
+    layers = _shape_layers(shape, poses)
+    layers.append(_points("registered points", _batched(result.registered, 2), _INLIER, visible=shape is None))
+    layers.append(_points("keypoints", _batched(result.keypoints, 2), (0.85, 0.25, 0.2), 0.02, visible=shape is None))
+    for frame, cloud in enumerate(clouds):
+        check_shape(masks[frame], "result.inliers", (len(cloud),))
+    if clouds:
+        paints = [_posterior_paint(mask, share) for mask, share in zip(masks, posterior, strict=True)]
+        layers.append(_cloud("data", clouds, paints))
+    return Scene(f"alignment: {', '.join(sorted({status.value for status in result.statuses}))}", tuple(layers))
+
+
+@_scene.register
+def _track_scene(result: TrackResult, shape: ArticulatedShape | None, data: Data) -> Scene:
+    clouds = _clouds(data, len(result.poses))
+    layers = _shape_layers(shape, result.poses)
+    layers.append(_points("keypoints", result.keypoints, (0.85, 0.25, 0.2), 0.02, visible=shape is None))
+    if clouds:
+        layers.append(
+            _cloud("data", clouds, [_nearness(shape, *pair) for pair in zip(clouds, result.poses, strict=True)])
+        )
+    return Scene(f"{len(result.poses)} tracked frames", tuple(layers), result.times)
+
+
+@_scene.register
+def _demo_scene(result: DemoResult, shape: ArticulatedShape | None, data: Data) -> Scene:
+    hand = Hand() if shape is None else shape
+    paints = [_posterior_paint(mask, torch.ones(len(mask))) for mask in result.inliers]
+    layers = [*_shape_layers(hand, result.track.poses), _cloud("data", result.clouds, paints)]
+    return Scene(f"demo, seed {result.seed}", tuple(layers), result.track.times)
+
+
+@_scene.register
+def _starts_scene(result: PoseStarts, shape: ArticulatedShape | None, data: Data) -> Scene:
+    if shape is None:
+        raise InputError("shape must be given to show a PoseStarts, which holds poses alone")
+    poses = result.poses.reshape(-1, result.poses.shape[-1])
+    layers = _shape_layers(shape, poses)
+    if data:
+        layers.append(_cloud("data", _clouds(data, 1), _INLIER))
+    return Scene("poses found, best first", tuple(layers), torch.arange(float(len(poses))))
+
+
+@_scene.register
+def _calibration_scene(result: Calibration, shape: ArticulatedShape | None, data: Data) -> Scene:
+    clouds = _clouds(data, len(result.poses))
+    layers = _shape_layers(result.shape, result.poses)
+    if shape is not None:
+        layers += [_renamed(layer, f"given {layer.name}") for layer in _shape_layers(shape, result.poses)]
+    if clouds:
+        layers.append(_cloud("data", clouds, _INLIER))
+    return Scene("calibrated shape", tuple(layers))
+
+
+@_scene.register
+def _registration_scene(result: ScanRegistration, shape: None, data: Data) -> Scene:
+    with torch.no_grad():
+        rest = torch.eye(4).to(result.transforms).expand_as(result.transforms)
+        keys = torch.stack([rest, result.transforms])
+        poses = between_poses(result.model, keys, torch.linspace(0, 1, _STEPS))
+        moving = result.model.move(result.points, result.weights, poses)
+    moving[-1] = result.deformed
+    errors = result.distances.clamp(min=0).nan_to_num(0.0, 0.0)
+    largest = float(errors.quantile(0.98)) or 1.0
+    faces = result.faces
+    layers = [
+        _scan("source", result.points, faces, _GRAY, visible=False),
+        _scan("moved, by bones", moving, faces, weight_colors(result.weights).clamp(0, 1)),
+        _scan(f"moved, by error (red: {largest:.3g})", moving, faces, error_colors(errors, largest), visible=False),
+        _bones(result.model, poses),
+    ]
+    for target in data[:1]:
+        points, over = (target.vertices, target.faces) if isinstance(target, TriangleMesh) else (target, None)
+        layers.append(_scan("target", points, over, _TARGET, opacity=0.5))
+    title = f"{result.model.num_bones} bones, {float(result.matched.float().mean()):.0%} of the points match"
+    return Scene(title, tuple(layers), torch.linspace(0, 2, _STEPS))
+
+
+@_scene.register
+def _sequence_scene(result: SequenceRegistration, shape: None, data: Data) -> Scene:
+    clouds = _clouds(data, len(result.deformed))
+    layers = [
+        _scan("reference, by bones", result.deformed, result.faces, weight_colors(result.weights).clamp(0, 1)),
+        _bones(result.model, result.transforms),
+    ]
+    if len(result.fused):
+        hue = bone_palette(len(result.deformed)).to(result.fused)[result.fused_frames]
+        layers.append(_cloud("fused, by frame", [result.fused], [hue], visible=False))
+    if clouds:
+        layers.append(_cloud("scans", clouds, _TARGET))
+    return Scene(f"{len(result.deformed)} scans, {result.model.num_bones} bones", tuple(layers))
+
+
+@_scene.register
+def _spine_scene(result: SpineSequence, shape: None, data: Data) -> Scene:
+    paint = bone_palette(len(result.graph))
+    tips = tuple(str(number) for number in range(result.num_tips))
+    layers: list[Layer] = [Curves("limbs", result.curves, paint, labels=tips, thickness=0.009)]
+    if data and len(data) != len(result.curves):
+        raise InputError(f"data must hold one surface per frame ({len(result.curves)}), got {len(data)}")
+    layers += _surface_frames(data)
+    return Scene(f"{result.num_tips} tips, {len(result.graph)} limbs", tuple(layers), result.times)
+
+
+def _surface_frames(data: Data) -> list[Layer]:
+    """Return surfaces, each frame's with triangles of its own, or clouds."""
+    meshes = [item for item in data if isinstance(item, TriangleMesh)]
+    if meshes and len(meshes) == len(data):
+        return [Meshes("surface", meshes, _BODY, opacity=0.3)]
+    clouds = [(item.vertices if isinstance(item, TriangleMesh) else item).detach() for item in data]
+    return [Cloud("surface", clouds, _BODY, size=0.003)] if clouds else []
+
+
+def _shape_layers(shape: ArticulatedShape | None, poses: Tensor) -> list[Layer]:
+    """Return the surface of a shape in poses (T, num_dofs) and its bones; NaN where there is no pose."""
+    if shape is None:
+        return []
+    poses = poses.to(shape.rest)
+    check_shape(poses, "poses", ("T", shape.num_dofs))
+    found = poses.isfinite().all(-1)
+    safe = torch.where(found.unsqueeze(-1), poses, shape.rest_pose())
+    skin = coarse_skin(shape)
+    if skin.faces is None:
+        raise InputError("shape must have a surface with faces to be shown")
+    with torch.no_grad():
+        vertices = torch.where(found[:, None, None], skin(safe), torch.nan)
+        origins = torch.where(found[:, None, None], shape.part_transforms(safe)[..., :3, 3], torch.nan)
+    layers: list[Layer] = [Surface("shape", vertices, skin.faces, SKIN_COLOR)]
+    pairs = [(parent, part) for part, parent in enumerate(shape.part_parents) if parent >= 0]
+    if pairs:
+        layers.append(Curves("bones", origins[:, torch.tensor(pairs)], bone_palette(len(pairs)), visible=False))
+    return layers
+
+
+def _bones(model: GridLBS, poses: Tensor) -> Curves:
+    """Return the bones of a model in poses (T, B, 4, 4): from each joint to those that hang on it."""
+    tree = model.skeleton(poses)
+    places = transform_points(poses, tree.origins.to(poses).unsqueeze(-2)).squeeze(-2).detach()
+    pairs = [(max(parent, 0) if parent >= 0 else bone, bone) for bone, parent in enumerate(tree.parents)]
+    return Curves("bones", places[:, torch.tensor(pairs)], bone_palette(len(pairs)), visible=False)
+
+
+def _scan(
+    name: str,
+    points: Tensor,
+    faces: Tensor | None,
+    paint: Tensor | tuple[float, float, float],
+    *,
+    visible: bool = True,
+    opacity: float = 1.0,
+) -> Layer:
+    """Return a scan: a surface if it has triangles, else points."""
+    points = points.detach()
+    if faces is not None and len(faces):
+        return Surface(name, points, faces, paint, opacity=opacity, visible=visible)
+    frames = list(points) if points.ndim == 3 else [points]
+    return _cloud(name, frames, paint if isinstance(paint, tuple) else [paint] * len(frames), visible=visible)
+
+
+def _cloud(
+    name: str, frames: Sequence[Tensor], paints: Sequence[Tensor] | tuple[float, float, float], *, visible: bool = True
+) -> Cloud:
+    """Return a cloud without the points that are not finite."""
+    keep = [points.isfinite().all(-1) for points in frames]
+    if not isinstance(paints, tuple):
+        paints = [paint[mask] for paint, mask in zip(paints, keep, strict=True)]
+    return Cloud(
+        name, [points.detach()[mask] for points, mask in zip(frames, keep, strict=True)], paints, visible=visible
+    )
+
+
+def _points(
+    name: str, points: Tensor, color: tuple[float, float, float], size: float = 0.006, *, visible: bool
+) -> Cloud:
+    frames = [frame[frame.isfinite().all(-1)] for frame in points.detach()]
+    return Cloud(name, frames, color, size=size, visible=visible)
+
+
+def _posterior_paint(inliers: Tensor, posterior: Tensor) -> Tensor:
+    """Return colors (M, 3): outliers gray, inliers from pale to full blue by their posterior."""
+    share = posterior.double().nan_to_num(0.0)
+    share = (share / share.max().clamp(min=1e-12) if len(share) else share).unsqueeze(-1).clamp(0, 1)
+    strength = _PALEST + (1 - _PALEST) * share
+    blue = 1 - strength * (1 - torch.tensor(_INLIER, dtype=torch.float64))
+    return torch.where(inliers.unsqueeze(-1), blue, torch.tensor(_OUTLIER, dtype=torch.float64)).float()
+
+
+def _nearness(shape: ArticulatedShape | None, cloud: Tensor, pose: Tensor) -> Tensor:
+    """Return colors (M, 3) of data: blue near the surface of the shape in its pose, else gray."""
+    near = torch.zeros(len(cloud), dtype=torch.bool)
+    known = cloud.isfinite().all(-1)
+    if shape is not None and bool(pose.isfinite().all()) and bool(known.any()):
+        with torch.no_grad():
+            points = shape.keypoints(shape.rest_pose())
+            reach = _NEAR * float((points.amax(0) - points.amin(0)).norm())
+            near[known] = (shape.distance(cloud[known].to(shape.rest), pose.to(shape.rest)).abs() < reach).cpu()
+    return _posterior_paint(near | torch.tensor(shape is None), torch.ones(len(cloud)))
+
+
+def _clouds(data: Data, count: int) -> list[Tensor]:
+    if data and len(data) != count:
+        raise InputError(f"data must hold one cloud per frame ({count}), got {len(data)}")
+    return [(item.vertices if isinstance(item, TriangleMesh) else item).detach().cpu() for item in data]
+
+
+def _batched(value: Tensor, dimensions: int) -> Tensor:
+    """Return a tensor with a leading dimension of frames, of one that may lack it."""
+    return value.detach().cpu().unsqueeze(0) if value.ndim == dimensions else value.detach().cpu()
+
+
+def _renamed(layer: Layer, name: str) -> Layer:
+    return replace(layer, name=name, visible=False)

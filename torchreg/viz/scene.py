@@ -1,0 +1,311 @@
+"""What a viewer shows, as plain data: surfaces, clouds and curves, standing still or moving frame by frame."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import as_float_tensor, check_shape
+from torchreg.errors import InputError
+from torchreg.geometry.mesh import TriangleMesh
+
+Color = tuple[float, float, float]
+
+FIELD_OF_VIEW = math.radians(45)
+# Points whose middle is farther from the origin than this share of their diagonal were measured from there.
+_FAR_SHARE = 0.75
+# Points that decide about the camera.
+_FEW_POINTS = 4000
+# Levels per color channel that are tried, most first, until a painted surface has few enough colors.
+_LEVELS = (7, 6, 5, 4, 3, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles.
+
+    A frame in which a coordinate is not finite is not shown: the shape was not found there.
+
+    Args:
+        name: what the viewer calls it.
+        vertices: (T, V, 3), or (V, 3) where nothing moves.
+        faces: (F, 3) int64.
+        paint: (V, 3) colors in [0, 1], or one color.
+        opacity: from 0 to 1.
+        visible: whether it is shown at first.
+
+    Raises:
+        InputError: if a shape does not fit.
+    """
+
+    name: str
+    vertices: Tensor
+    faces: Tensor
+    paint: Tensor | Color = (0.75, 0.75, 0.78)
+    opacity: float = 1.0
+    visible: bool = True
+
+    def __post_init__(self) -> None:
+        check_shape(self.vertices, f"vertices of {self.name}", ("V", 3), batch=True)
+        check_shape(self.faces, f"faces of {self.name}", ("F", 3))
+        if isinstance(self.paint, Tensor):
+            check_shape(self.paint, f"paint of {self.name}", (self.vertices.shape[-2], 3))
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames, 1 where nothing moves."""
+        return len(self.vertices) if self.vertices.ndim == 3 else 1
+
+    def points(self, frame: int) -> Tensor:
+        """Return the vertices (V, 3) of a frame."""
+        return self.vertices[frame] if self.vertices.ndim == 3 else self.vertices
+
+    def patches(self, most: int = 48) -> list[tuple[Tensor, Tensor, Color]]:
+        """Return patches of one color each: their vertices (K,) by index, faces (G, 3) over these, color.
+
+        Viewers that know one color per mesh show paint so. Colors are rounded until there are at most ``most``.
+        """
+        if not isinstance(self.paint, Tensor):
+            return [(torch.arange(self.vertices.shape[-2]), self.faces, self.paint)]
+        color = self.paint.detach().cpu().double().clamp(0, 1)[self.faces.cpu()].mean(1)
+        for levels in _LEVELS:
+            _, group = (color * (levels - 1)).round().unique(dim=0, return_inverse=True)
+            count = int(group.max()) + 1 if len(group) else 0
+            if count <= most:
+                break
+        found = []
+        for number in range(count):
+            used, corner = self.faces.cpu()[group == number].unique(return_inverse=True)
+            red, green, blue = color[group == number].mean(0).tolist()
+            found.append((used, corner, (red, green, blue)))
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Meshes:
+    """Surfaces that share nothing, one per frame.
+
+    Args:
+        name: what the viewer calls them.
+        frames: T meshes.
+        color: of all.
+        opacity: from 0 to 1.
+        visible: whether they are shown at first.
+    """
+
+    name: str
+    frames: Sequence[TriangleMesh]
+    color: Color = (0.75, 0.75, 0.78)
+    opacity: float = 1.0
+    visible: bool = True
+
+    @property
+    def num_frames(self) -> int:
+        """Number T of frames."""
+        return len(self.frames)
+
+    def points(self, frame: int) -> Tensor:
+        """Return the vertices (V_t, 3) of a frame."""
+        return self.frames[frame if self.num_frames > 1 else 0].vertices
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Points.
+
+    Args:
+        name: what the viewer calls it.
+        frames: T clouds (N_t, 3), or one where nothing moves.
+        paints: as many colorings, (N_t, 3) in [0, 1] each; or one color.
+        size: diameter of a point as a share of the diagonal of the scene.
+        visible: whether it is shown at first.
+
+    Raises:
+        InputError: if a shape does not fit.
+    """
+
+    name: str
+    frames: Sequence[Tensor]
+    paints: Sequence[Tensor] | Color
+    size: float = 0.006
+    visible: bool = True
+
+    def __post_init__(self) -> None:
+        for frame, points in enumerate(self.frames):
+            check_shape(points, f"frames[{frame}] of {self.name}", ("N", 3))
+        if not self.one_color:
+            if len(self.paints) != len(self.frames):
+                raise InputError(f"paints of {self.name} must be {len(self.frames)} as the frames, {len(self.paints)}")
+            for frame, (points, paint) in enumerate(zip(self.frames, self.paints, strict=True)):
+                check_shape(as_float_tensor(paint, "paints"), f"paints[{frame}] of {self.name}", tuple(points.shape))
+
+    @property
+    def one_color(self) -> bool:
+        """Whether all points have the same color."""
+        return isinstance(self.paints, tuple) and len(self.paints) == 3 and isinstance(self.paints[0], float)
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames, 1 where nothing moves."""
+        return len(self.frames)
+
+    def points(self, frame: int) -> Tensor:
+        """Return the points (N, 3) of a frame."""
+        return self.frames[frame if self.num_frames > 1 else 0]
+
+    def paint(self, frame: int) -> Tensor:
+        """Return the colors (N, 3) of a frame."""
+        points = self.points(frame)
+        if self.one_color:
+            return torch.tensor(self.paints).expand(len(points), 3)
+        return as_float_tensor(self.paints[frame if self.num_frames > 1 else 0], "paints").detach().cpu()
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """Polylines in a color each, such as limbs, bones or the parts of a skeleton.
+
+    Args:
+        name: what the viewer calls them.
+        curves: (T, L, S, 3), or (L, S, 3) where nothing moves.
+        paint: (L, 3) colors in [0, 1].
+        labels: of the first points of the first curves; none by default.
+        thickness: as a share of the diagonal of the scene.
+        visible: whether they are shown at first.
+
+    Raises:
+        InputError: if a shape does not fit.
+    """
+
+    name: str
+    curves: Tensor
+    paint: Tensor
+    labels: tuple[str, ...] = ()
+    thickness: float = 0.006
+    visible: bool = True
+
+    def __post_init__(self) -> None:
+        check_shape(self.curves, f"curves of {self.name}", ("L", "S", 3), batch=True)
+        check_shape(self.paint, f"paint of {self.name}", (self.curves.shape[-3], 3))
+        if len(self.labels) > self.curves.shape[-3]:
+            raise InputError(f"labels of {self.name} must be at most one per curve, got {len(self.labels)}")
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames, 1 where nothing moves."""
+        return len(self.curves) if self.curves.ndim == 4 else 1
+
+    def points(self, frame: int) -> Tensor:
+        """Return the curves (L, S, 3) of a frame."""
+        return self.curves[frame] if self.curves.ndim == 4 else self.curves
+
+    def segments(self, frame: int) -> Tensor:
+        """Return the pieces (L (S - 1), 2, 3) of a frame, curve by curve."""
+        points = self.points(frame)
+        return torch.stack((points[:, :-1], points[:, 1:]), dim=2).flatten(0, 1)
+
+    def segment_paint(self) -> Tensor:
+        """Return the colors (L (S - 1), 3) of the pieces."""
+        return self.paint.repeat_interleave(self.curves.shape[-2] - 1, dim=0)
+
+
+Layer = Surface | Meshes | Cloud | Curves
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Layers that are shown together.
+
+    Args:
+        title: of the whole.
+        layers: with different names; those that move have T frames each.
+        times: (T,) seconds, strictly increasing; one frame every 1 / 20 second by default.
+        up: what is upright; by default -y for measurements of a camera at the origin, else z.
+
+    Raises:
+        InputError: if there is no layer, two have one name, or numbers of frames differ.
+    """
+
+    title: str
+    layers: tuple[Layer, ...]
+    times: Tensor | None = None
+    up: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        names = [layer.name for layer in self.layers]
+        if not names or len(set(names)) < len(names):
+            raise InputError(f"layers must be one at least and have different names, got {', '.join(names) or 'none'}")
+        counts = {layer.num_frames for layer in self.layers} - {1}
+        if len(counts) > 1:
+            raise InputError(f"layers must have one number of frames, got {', '.join(map(str, sorted(counts)))}")
+        if self.times is not None:
+            check_shape(self.times, "times", (self.num_frames,))
+
+    @property
+    def num_frames(self) -> int:
+        """Number T of frames, 1 where nothing moves."""
+        return max(layer.num_frames for layer in self.layers)
+
+    @property
+    def seconds(self) -> list[float]:
+        """When the frames are, starting at zero."""
+        if self.times is None:
+            return [frame / 20 for frame in range(self.num_frames)]
+        return (self.times.double() - float(self.times[0])).tolist()
+
+    def layer(self, name: str) -> Layer:
+        """Return the layer of a name; InputError if there is none."""
+        for layer in self.layers:
+            if layer.name == name:
+                return layer
+        raise InputError(f"the scene has no layer {name!r}; it has {', '.join(item.name for item in self.layers)}")
+
+    def camera(self, field_of_view: float = FIELD_OF_VIEW) -> tuple[Tensor, Tensor, Tensor]:
+        """Return where a camera that sees all frames stands, what it looks at, and what it shows upright, (3,) each.
+
+        Args:
+            field_of_view: radians, of the shorter side of the picture.
+        """
+        lower, upper = self.bounds()
+        middle = (lower + upper) / 2
+        size = (upper - lower).norm().clamp(min=1e-9)
+        from_camera = bool(middle.norm() > _FAR_SHARE * size)
+        up = torch.tensor(self.up or ((0.0, -1.0, 0.0) if from_camera else (0.0, 0.0, 1.0))).to(middle)
+        if from_camera and self.up is None:
+            # From a little right of and above where it was measured.
+            away = middle.norm()
+            direction = middle - away * middle.new_tensor([0.35, -0.25, 0.0])
+        else:
+            side = torch.linalg.cross(up, middle.new_tensor([1.0, 0.0, 0.0]) if abs(up[0]) < 0.5 else up.roll(1))
+            direction = -(0.5 * up - 0.6 * torch.linalg.cross(side, up) - side)
+        direction = direction / direction.norm()
+        return middle - 0.5 * size / math.sin(field_of_view / 2) * direction, middle, up
+
+    def bounds(self) -> tuple[Tensor, Tensor]:
+        """Return the lower and upper corner (3,) of all that is shown in any frame."""
+        points = self._few_points()
+        return points.amin(0), points.amax(0)
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the diagonal of `bounds`."""
+        lower, upper = self.bounds()
+        return float((upper - lower).norm()) or 1.0
+
+    def _few_points(self) -> Tensor:
+        # Outliers reach far: where there is more than points, they do not decide.
+        visible = [layer for layer in self.layers if layer.visible] or list(self.layers)
+        shown = [layer for layer in visible if not isinstance(layer, Cloud)] or visible
+        found = [points for layer in shown for points in _all_points(layer)]
+        points = torch.cat(found) if found else torch.zeros(1, 3)
+        points = points[points.isfinite().all(-1)]
+        return points[:: max(1, len(points) // _FEW_POINTS)] if len(points) else torch.zeros(1, 3)
+
+
+def _all_points(layer: Layer) -> Iterator[Tensor]:
+    for frame in range(layer.num_frames):
+        yield layer.points(frame).detach().reshape(-1, 3).cpu().double()
