@@ -1,0 +1,1 @@
+"""Sweeps of torchreg's systems: run them, survive crashes, scale out, and read the answer in a report."""

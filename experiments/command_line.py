@@ -1,0 +1,211 @@
+"""The commands: run one trial, run a sweep, collect its records, query them, and write its report."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from experiments.compose import known_configs, load_sweep
+from experiments.driver import OnOutcome, Summary, run_sweep
+from experiments.engines.base import EngineConfig, make_engine
+from experiments.errors import ConfigError, ExperimentError
+from experiments.plan import planned_trials
+from experiments.records import TrialRecord, parse_record
+from experiments.registry import Bench, find_task
+from experiments.schema import SweepConfig
+from experiments.sinks import make_sink
+from experiments.store import Store, same_sweep
+from experiments.worker import Job, Outcome, execute, measure, use_threads
+
+application = typer.Typer(help=__doc__, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+
+Name = Annotated[str, typer.Argument(help="a configuration such as alignment/sigma_schedule, or a YAML file")]
+Overrides = Annotated[list[str] | None, typer.Argument(help="key=value, such as seeds=3 scene.outlier_ratio=0.4")]
+Results = Annotated[Path, typer.Option(help="folder of all results")]
+_RESULTS = Path("results")
+
+
+@application.command("list")
+def list_configs() -> None:
+    """Print the names of all configurations."""
+    for name in known_configs():
+        typer.echo(name)
+
+
+@application.command()
+def run(config: Name, overrides: Overrides = None, threads: int = 1) -> None:
+    """Run the one trial that a configuration describes, without its cases and its grid, and print what it found."""
+    plan = replace(load_sweep(config, overrides or []), grid={}, cases=(), seeds=1, picture_seeds=0)
+    (trial,) = planned_trials(plan)
+    accelerated = find_task(plan.task).accelerated
+    with tempfile.TemporaryDirectory() as folder:
+        store = Store(Path(folder))
+        store.prepare()
+        execute(Job(folder, plan.task, trial.id, trial.config, "run", "none", threads, accelerated))
+        record = store.read(trial.id)
+    if record is not None:
+        _print_record(record)
+        if record.status == "failed":
+            raise typer.Exit(1)
+
+
+@application.command()
+def rerun(record: Path, threads: int = 1) -> None:
+    """Run the trial of a record file again, and say whether it finds the same numbers."""
+    with _readable(record):
+        old = parse_record(record.read_bytes(), record.name)
+    use_threads(threads)
+    with tempfile.TemporaryDirectory() as folder:
+        found = measure(find_task(old.task), old.config, Bench("cpu", Path(folder)))
+    for name, value in found.metrics.items():
+        before = old.metrics.get(name)
+        same = "as recorded" if value == before or (before is None and value != value) else f"recorded: {before}"
+        typer.echo(f"{name:24} {value!r:24} {same}")
+
+
+@application.command()
+def sweep(
+    config: Name,
+    overrides: Overrides = None,
+    engine: Annotated[str, typer.Option(help="local, ray or slurm")] = "local",
+    jobs: Annotated[int, typer.Option(help="trials at a time")] = 1,
+    threads: Annotated[int, typer.Option(help="of each worker")] = 1,
+    gpus: Annotated[float | None, typer.Option(help="per trial; by default one if there are any")] = None,
+    retry_failed: Annotated[bool, typer.Option("--retry-failed", help="run failed and skipped trials again")] = False,
+    slurm: Annotated[list[str] | None, typer.Option(help="key=value for Slurm, such as partition=short")] = None,
+    sink: Annotated[list[str] | None, typer.Option(help="tensorboard, mlflow or wandb")] = None,
+    results: Results = _RESULTS,
+) -> None:
+    """Run what is missing of a sweep. Give the same command again after a crash, or on several machines at once."""
+    plan = load_sweep(config, overrides or [])
+    store = Store(results / plan.name)
+    options = EngineConfig(jobs, threads, gpus, dict(_pair(text) for text in slurm or []))
+    sinks = [make_sink(name, plan.name, str(store.root)) for name in sink or []]
+    with _progress(plan) as on_outcome:
+        summary = run_sweep(
+            plan, store, lambda: make_engine(engine, options), engine_name=engine, threads=threads,
+            retry_failed=retry_failed, on_outcome=on_outcome, sinks=sinks,
+        )  # fmt: skip
+    _print_summary(summary, store)
+    if summary.unfinished:
+        raise typer.Exit(1)
+
+
+@application.command()
+def collect(config: Name, results: Results = _RESULTS) -> None:
+    """Put all records of a sweep into one Parquet file."""
+    from experiments.tables import write_parquet
+
+    store = Store(results / _sweep_of(config, results).name)
+    count, bad = write_parquet(store)
+    for error in bad:
+        typer.echo(f"left out: {error}", err=True)
+    typer.echo(f"{count} records in {store.parquet}")
+
+
+@application.command()
+def query(config: Name, sql: str, results: Results = _RESULTS) -> None:
+    """Ask DuckDB about the records of a sweep; the table is called trials."""
+    from experiments.tables import query_records
+
+    typer.echo(query_records(Store(results / _sweep_of(config, results).name), sql))
+
+
+@application.command()
+def report(
+    config: Name,
+    output: Annotated[Path | None, typer.Option(help="the page; by default report.html beside the records")] = None,
+    results: Results = _RESULTS,
+) -> None:
+    """Write the report of a sweep: one page that opens without a network."""
+    from experiments.report.page import write_report
+
+    plan = _sweep_of(config, results)
+    store = Store(results / plan.name)
+    notes = []
+    if not config.endswith((".yaml", ".yml")) and config in known_configs():
+        now = load_sweep(config)
+        if now.name == plan.name and not same_sweep(now, plan):
+            notes.append(
+                "The configuration differs from the one that the sweep was last run with, which is shown here."
+            )
+    typer.echo(write_report(plan, store, output or store.root / "report.html", notes))
+
+
+def main() -> None:
+    """Run a command; errors that a person can put right end with one line and code 1."""
+    try:
+        application()
+    except ExperimentError as error:
+        typer.echo(f"error: {error}", err=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        typer.echo("interrupted; finished trials are kept, the same command goes on", err=True)
+        sys.exit(130)
+
+
+def _sweep_of(config: str, results: Path) -> SweepConfig:
+    """Return a sweep as it was last run, else as its configuration says."""
+    name = config if not config.endswith((".yaml", ".yml")) else load_sweep(config).name
+    found = Store(results / name).read_sweep()
+    return load_sweep(config) if found is None else found
+
+
+@contextlib.contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
+
+
+@contextlib.contextmanager
+def _progress(plan: SweepConfig) -> Iterator[OnOutcome]:
+    from tqdm import tqdm
+
+    with tqdm(total=len({trial.id for trial in planned_trials(plan)}), disable=None, desc=plan.name) as bar:
+
+        def step(outcome: Outcome, summary: Summary) -> None:
+            bar.update(summary.kept + summary.ran + summary.elsewhere - bar.n)
+            bar.set_postfix(failed=summary.failed, skipped=summary.skipped)
+            if outcome.status == "failed" and outcome.fresh:
+                bar.write(f"{outcome.id} failed: {outcome.note}", file=sys.stderr)
+
+        yield step
+
+
+def _print_summary(summary: Summary, store: Store) -> None:
+    for told in summary.set_aside:
+        typer.echo(f"set aside and run again: {told}", err=True)
+    text = f"{summary.planned} trials: {summary.ran} run now, {summary.kept} finished before"
+    text += f", {summary.elsewhere} run by another driver" if summary.elsewhere else ""
+    text += f"; {summary.failed} failed, {summary.skipped} skipped"
+    typer.echo(text)
+    if summary.unfinished:
+        typer.echo(f"{summary.unfinished} trials have no result: no process that could run them stayed alive", err=True)
+    if summary.foreign:
+        typer.echo(f"{summary.foreign} records of other configurations of this sweep are kept beside them")
+    typer.echo(f"results in {store.root}")
+
+
+def _print_record(record: TrialRecord) -> None:
+    typer.echo(f"{record.status} in {record.wall_seconds:.2f} s, {record.peak_memory_mb:.0f} MB, {record.device}")
+    for name, value in {**record.metrics, **{f"seconds.{k}": v for k, v in record.seconds.items()}}.items():
+        typer.echo(f"{name:24} {value}")
+    for told in (*record.warnings, record.traceback or record.note):
+        if told:
+            typer.echo(told, err=True)
+
+
+def _pair(text: str) -> tuple[str, str]:
+    key, sign, value = text.partition("=")
+    if not sign:
+        raise ConfigError(f"--slurm takes key=value, got {text!r}")
+    return key, value

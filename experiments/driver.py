@@ -1,0 +1,168 @@
+"""A sweep from plan to results: what is finished stays, what is missing runs."""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from experiments.engines.base import Engine
+from experiments.errors import CorruptRecordError
+from experiments.plan import PlannedTrial, planned_trials
+from experiments.records import TrialRecord
+from experiments.registry import find_task
+from experiments.schema import SweepConfig
+from experiments.sinks import Sink
+from experiments.store import Store
+from experiments.worker import Job, Outcome, finished
+
+# How long to wait before asking again for trials that another driver runs.
+_BUSY_SECONDS = 0.3
+# Rounds without any progress after which trials whose process never begins are given up.
+_MAX_IDLE_ROUNDS = 3
+
+
+@dataclass
+class Summary:
+    """What a run of a driver did.
+
+    Args:
+        planned: number of different trials.
+        kept: that were finished before.
+        ran: that were run now, by this driver.
+        elsewhere: that another driver ran meanwhile.
+        failed: of all, those that failed.
+        skipped: of all, those that had nothing to do.
+        unfinished: trials without a record, as no process could run them.
+        set_aside: messages about files that were no records.
+        foreign: records in the folder that belong to other configurations.
+    """
+
+    planned: int = 0
+    kept: int = 0
+    ran: int = 0
+    elsewhere: int = 0
+    failed: int = 0
+    skipped: int = 0
+    unfinished: int = 0
+    set_aside: list[str] = field(default_factory=list)
+    foreign: int = 0
+
+
+OnOutcome = Callable[[Outcome, Summary], None]
+
+
+def run_sweep(
+    sweep: SweepConfig,
+    store: Store,
+    start_engine: Callable[[], Engine],
+    *,
+    engine_name: str = "local",
+    threads: int = 1,
+    retry_failed: bool = False,
+    on_outcome: OnOutcome | None = None,
+    sinks: Sequence[Sink] = (),
+) -> Summary:
+    """Run what is missing of a sweep, and return what was done.
+
+    Args:
+        sweep: which trials there are.
+        store: folder of the results; drivers may share it.
+        start_engine: makes the engine; not called if nothing is missing.
+        engine_name: for the records.
+        threads: of each worker.
+        retry_failed: whether trials that failed or were skipped run again.
+        on_outcome: called after each trial.
+        sinks: called with each new record.
+
+    Raises:
+        ConfigError: if a case or axis does not fit the task.
+        StoreError: if results cannot be written.
+    """
+    trials = {trial.id: trial for trial in planned_trials(sweep)}
+    store.prepare()
+    store.write_sweep(sweep)
+    session, summary = secrets.token_hex(4), Summary(planned=len(trials))
+    waiting = []
+    for trial in trials.values():
+        record = _known(store, trial.id, summary)
+        if record is not None and finished(record, session, retry_failed):
+            summary.kept += 1
+            _count(record.status, summary)
+        else:
+            waiting.append(_job(sweep, trial, store, session, engine_name, threads, retry_failed))
+    summary.foreign = sum(path.stem not in trials for path in store.trials.glob("*.json"))
+    if waiting:
+        engine = start_engine()
+        try:
+            for outcome in _rounds(engine, waiting):
+                _tally(outcome, summary)
+                if on_outcome is not None:
+                    on_outcome(outcome, summary)
+                if outcome.fresh and sinks:
+                    _tell(store.read(outcome.id), sinks)
+        finally:
+            engine.close()
+    summary.unfinished = summary.planned - summary.kept - summary.ran - summary.elsewhere
+    return summary
+
+
+def _rounds(engine: Engine, jobs: list[Job]) -> Iterator[Outcome]:
+    """Yield the outcomes of jobs that end with a record; those that another process has, or that are lost, go again."""
+    idle = 0
+    while jobs and idle < _MAX_IDLE_ROUNDS:
+        left, again, lost = {job.id: job for job in jobs}, [], False
+        for outcome in engine.run(jobs):
+            job = left.pop(outcome.id)
+            if outcome.state == "recorded":
+                yield outcome
+            else:
+                again.append(job)
+                lost |= outcome.state == "lost"
+        # A worker that takes a trial counts attempts and gives up itself: only processes that never begin get here.
+        idle = idle + 1 if lost and len(again) == len(jobs) and not _begun(again) else 0
+        jobs = [*again, *left.values()]
+        if jobs:
+            time.sleep(_BUSY_SECONDS)
+
+
+def _begun(jobs: Sequence[Job]) -> bool:
+    return any(Store(Path(job.store)).claim_path(job.id).exists() for job in jobs)
+
+
+def _job(
+    sweep: SweepConfig, trial: PlannedTrial, store: Store, session: str, engine: str, threads: int, retry: bool
+) -> Job:
+    accelerated = find_task(sweep.task).accelerated
+    root = str(store.root.absolute())
+    return Job(root, sweep.task, trial.id, trial.config, session, engine, threads, accelerated, retry)
+
+
+def _known(store: Store, trial: str, summary: Summary) -> TrialRecord | None:
+    try:
+        return store.read(trial)
+    except CorruptRecordError as error:
+        # The worker that runs the trial again sets the file aside.
+        summary.set_aside.append(str(error))
+        return None
+
+
+def _tally(outcome: Outcome, summary: Summary) -> None:
+    if outcome.fresh:
+        summary.ran += 1
+    else:
+        summary.elsewhere += 1
+    _count(outcome.status, summary)
+
+
+def _count(status: str, summary: Summary) -> None:
+    summary.failed += status == "failed"
+    summary.skipped += status == "skipped"
+
+
+def _tell(record: TrialRecord | None, sinks: Sequence[Sink]) -> None:
+    if record is not None:
+        for sink in sinks:
+            sink(record)

@@ -1,0 +1,102 @@
+"""The interface of all engines, and what they share."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from experiments.errors import ConfigError
+from experiments.worker import Job, Outcome
+
+ENGINES = ("local", "ray", "slurm")
+
+
+class Engine(Protocol):
+    """Runs jobs in other processes."""
+
+    def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
+        """Yield one outcome per job, in the order in which they end.
+
+        Raises:
+            StoreError: if results cannot be written.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let go of all processes; jobs that run are given up."""
+        ...
+
+
+@dataclass(frozen=True)
+class EngineConfig:
+    """How an engine runs.
+
+    Args:
+        jobs: trials at a time.
+        threads: per worker.
+        gpus: per trial of a task that has use for one; None: one, if the machine has any.
+        options: of Slurm, such as {"cluster": "local", "partition": "short", "timeout_min": "60"}.
+    """
+
+    jobs: int = 1
+    threads: int = 1
+    gpus: float | None = None
+    options: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in ("jobs", "threads"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        if self.gpus is not None and self.gpus < 0:
+            raise ConfigError(f"--gpus must not be negative, got {self.gpus}")
+
+
+def make_engine(name: str, config: EngineConfig) -> Engine:
+    """Return an engine by name.
+
+    Raises:
+        ConfigError: if there is no such engine.
+        ExperimentError: if the package that it needs is not installed.
+    """
+    if name == "local":
+        from experiments.engines.local import LocalEngine
+
+        return LocalEngine(config)
+    if name == "ray":
+        from experiments.engines.ray_cluster import RayEngine
+
+        return RayEngine(config)
+    if name == "slurm":
+        from experiments.engines.slurm import SlurmEngine
+
+        return SlurmEngine(config)
+    raise ConfigError(f"unknown engine {name!r}; known engines: {', '.join(ENGINES)}")
+
+
+def visible_gpus() -> list[str]:
+    """Return the GPUs of this machine that may be used, without loading torch."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if named is not None:
+        return [one.strip() for one in named.split(",") if one.strip() not in ("", "-1")]
+    tool = shutil.which("nvidia-smi")
+    if tool is None:
+        return []
+    try:
+        listed = subprocess.run([tool, "-L"], capture_output=True, text=True, timeout=30, check=False).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return []
+    count = sum(line.startswith("GPU ") for line in listed.splitlines())
+    return [str(number) for number in range(count)]
+
+
+def share_code() -> None:
+    """Let processes that start from now on find this package as this process does."""
+    root = str(Path(__file__).resolve().parents[2])
+    paths = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    if root not in paths:
+        os.environ["PYTHONPATH"] = os.pathsep.join([root, *filter(None, paths)])

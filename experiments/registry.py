@@ -1,0 +1,95 @@
+"""What a configuration can name: tasks, each a dataclass of settings and a function that runs one trial.
+
+The functions are loaded when a trial runs; configurations are read without them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from experiments.errors import ConfigError
+from experiments.schema import AlignmentTrial, ProbeTrial, RegistrationTrial, SpineTrial
+
+
+@dataclass
+class TrialOutcome:
+    """What a trial found.
+
+    Args:
+        metrics: that depend on the configuration alone, by name.
+        seconds: by stage, which differ from run to run.
+        curves: by name, a value per step.
+        artifacts: by name, files in the trial's folder.
+    """
+
+    metrics: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    curves: dict[str, list[float]] = field(default_factory=dict)
+    artifacts: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Where a trial runs.
+
+    Args:
+        device: "cpu" or "cuda".
+        folder: for files to keep; made when it is asked for.
+    """
+
+    device: str
+    folder: Path
+
+    def file(self, name: str) -> Path:
+        """Return where to write a file to keep."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        return self.folder / name
+
+
+Run = Callable[[Any, Bench], TrialOutcome]
+
+
+@dataclass(frozen=True)
+class Task:
+    """A kind of trial.
+
+    Args:
+        name: in configurations.
+        schema: dataclass of a trial's settings.
+        module: that holds ``run(config, bench) -> TrialOutcome``.
+        accelerated: whether a GPU is of use.
+    """
+
+    name: str
+    schema: type
+    module: str
+    accelerated: bool = False
+
+    def load(self) -> Run:
+        """Return the function that runs one trial."""
+        run: Run = import_module(self.module).run
+        return run
+
+
+_TASKS = (
+    Task("alignment", AlignmentTrial, "experiments.tasks.alignment", accelerated=True),
+    Task("registration", RegistrationTrial, "experiments.tasks.registration"),
+    Task("spine", SpineTrial, "experiments.tasks.spine"),
+    Task("probe", ProbeTrial, "experiments.tasks.probe"),
+)
+TASKS = {task.name: task for task in _TASKS}
+
+
+def find_task(name: str) -> Task:
+    """Return a task by name.
+
+    Raises:
+        ConfigError: if there is none, naming those there are.
+    """
+    if name not in TASKS:
+        raise ConfigError(f"unknown task {name!r}; known tasks: {', '.join(sorted(TASKS))}")
+    return TASKS[name]

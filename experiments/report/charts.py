@@ -1,0 +1,163 @@
+"""The charts of a report, as pieces of HTML that need Plotly's script on the page."""
+
+from __future__ import annotations
+
+import itertools
+import statistics
+from collections.abc import Sequence
+from typing import Any
+
+from experiments.plan import PlannedTrial, axes_of
+from experiments.records import TrialRecord
+from experiments.report.cells import Cell, Spread, all_axes, label, short
+from experiments.schema import SweepConfig
+
+_MAX_MAPS, _MAX_DOTS, _MAX_LINES = 6, 60, 12
+_HEIGHT, _CELL_PIXELS = 380, 46
+_COLORS = ("#3366aa", "#dd7733", "#339966", "#aa3355", "#7755bb", "#888833", "#33a0b5", "#775544", "#555555", "#cc66aa")
+
+
+def heat_maps(sweep: SweepConfig, cells: Sequence[Cell], metric: str) -> list[str]:
+    """Return a heat map per combination of the axes that are not on it."""
+    if not sweep.report.heat:
+        return []
+    across, down = sweep.report.heat
+    axes = axes_of(sweep)
+    others = [name for name in all_axes(sweep) if name not in (across, down)]
+    found = []
+    for rest in itertools.islice(itertools.product(*(axes[name] for name in others)), _MAX_MAPS):
+        chosen = dict(zip(others, rest, strict=True))
+        here = [cell for cell in cells if all(cell.axes[name] == value for name, value in chosen.items())]
+        title = ", ".join(f"{short(name)} {label(value)}" for name, value in chosen.items())
+        found.append(_heat_map(sweep, here, metric, (axes[across], axes[down]), title))
+    return found
+
+
+def _heat_map(
+    sweep: SweepConfig, cells: Sequence[Cell], metric: str, values: tuple[list[Any], list[Any]], title: str
+) -> str:
+    import plotly.graph_objects as go
+
+    across, down = sweep.report.heat
+    known = {(label(cell.axes[across]), label(cell.axes[down])): told(sweep, cell, metric) for cell in cells}
+    right, below = ([label(value) for value in side] for side in values)
+    numbers = [[known.get((x, y)) for x in right] for y in below]
+    texts = [["" if number is None else f"{number:.3g}" for number in row] for row in numbers]
+    high = metric in sweep.report.higher
+    scale = "Blues" if high else "Oranges"
+    figure = go.Figure(
+        go.Heatmap(
+            z=numbers, x=right, y=below, text=texts, texttemplate="%{text}", colorscale=scale, xgap=2, ygap=2,
+            hovertemplate=f"{short(across)} %{{x}}<br>{short(down)} %{{y}}<br>%{{z:.4g}}<extra></extra>",
+            colorbar={"title": {"text": named(metric)}, "thickness": 12},
+        )
+    )  # fmt: skip
+    figure.update_xaxes(type="category", title=short(across))
+    figure.update_yaxes(type="category", title=short(down), autorange="reversed")
+    heading = f"{named(metric)} ({'more' if high else 'less'} is better)" + (f"; {title}" if title else "")
+    return _html(figure, heading, max(_HEIGHT - 100, 150 + _CELL_PIXELS * len(below)))
+
+
+def dots(sweep: SweepConfig, cells: Sequence[Cell], metric: str) -> str | None:
+    """Return medians with quartiles of all cells, or None if there are too many."""
+    import plotly.graph_objects as go
+
+    shown = [cell for cell in cells if metric in cell.metrics]
+    if not 2 <= len(shown) <= _MAX_DOTS:
+        return None
+    axes = all_axes(sweep)
+    first = sweep.report.group or axes[0]
+    rest = [name for name in axes if name != first]
+    figure = go.Figure()
+    for value, color in zip(dict.fromkeys(label(cell.axes[first]) for cell in shown), itertools.cycle(_COLORS)):
+        mine = [cell for cell in shown if label(cell.axes[first]) == value]
+        spreads = [cell.metrics[metric] for cell in mine]
+        middle = [told(sweep, cell, metric) for cell in mine]
+        places = [", ".join(label(cell.axes[name]) for name in rest) or value for cell in mine]
+        figure.add_scatter(
+            x=places, y=middle, name=value, mode="markers", marker={"size": 9, "color": color},
+            error_y=None if metric in sweep.report.share else _whiskers(spreads),
+        )  # fmt: skip
+    figure.update_xaxes(type="category", title=", ".join(short(name) for name in rest) or short(first))
+    figure.update_yaxes(title=named(metric), rangemode="tozero")
+    figure.update_layout(scattermode="group", legend_title_text=short(first))
+    kind = "means" if metric in sweep.report.share else "medians and quartiles"
+    return _html(figure, f"{named(metric)}: {kind} over seeds", _HEIGHT)
+
+
+def _whiskers(spreads: Sequence[Spread]) -> dict[str, Any]:
+    above = [one.high - one.median for one in spreads]
+    below = [one.median - one.low for one in spreads]
+    return {"type": "data", "symmetric": False, "array": above, "arrayminus": below, "thickness": 1, "width": 3}
+
+
+def curve_names(sweep: SweepConfig, records: dict[str, TrialRecord]) -> list[str]:
+    """Return the curves to draw."""
+    found = dict.fromkeys(name for record in records.values() for name in record.curves)
+    return [name for name in sweep.report.curves or found if name in found]
+
+
+def curves(
+    sweep: SweepConfig, trials: Sequence[PlannedTrial], records: dict[str, TrialRecord], name: str
+) -> str:  # fmt: skip
+    """Return the median of a curve per step, a line per value of the axis that groups them."""
+    import plotly.graph_objects as go
+
+    axis = sweep.report.group or next(iter(axes_of(sweep)), "")
+    groups: dict[str, list[list[float | None]]] = {}
+    for trial in trials:
+        record = records.get(trial.id)
+        if record is not None and name in record.curves:
+            groups.setdefault(label(trial.axes.get(axis, "")), []).append(record.curves[name])
+    figure = go.Figure()
+    for (value, lines), color in zip(itertools.islice(groups.items(), _MAX_LINES), itertools.cycle(_COLORS)):
+        middle = _median_line(lines)
+        figure.add_scatter(
+            x=list(range(1, len(middle) + 1)), y=middle, name=value or name, mode="lines+markers",
+            line={"color": color}, marker={"size": 4},
+        )  # fmt: skip
+    figure.update_xaxes(title="step")
+    figure.update_yaxes(title=named(name), rangemode="tozero")
+    figure.update_layout(legend_title_text=short(axis), showlegend=True)
+    return _html(
+        figure, f"{named(name)} along the steps: median over all trials of a {short(axis) or 'sweep'}", _HEIGHT
+    )
+
+
+def _median_line(lines: Sequence[Sequence[float | None]]) -> list[float | None]:
+    """Return the median at every step; trials that ended before stay at their last value."""
+    length = max(map(len, lines))
+    padded = [[*line, *[line[-1]] * (length - len(line))] for line in lines if line]
+    steps = ([value for value in step if value is not None] for step in zip(*padded, strict=True))
+    return [statistics.median(step) if step else None for step in steps]
+
+
+def told(sweep: SweepConfig, cell: Cell, metric: str) -> float | None:
+    """Return what stands for a cell: the median over its seeds, or for a share the mean."""
+    spread = cell.metrics.get(metric)
+    if spread is None:
+        return None
+    return spread.mean if metric in sweep.report.share else spread.median
+
+
+def named(metric: str) -> str:
+    """Return a metric's name as text, with its unit."""
+    name = metric.removeprefix("seconds.")
+    text = name.replace("_", " ")
+    if name != metric:
+        return f"{text}, s"
+    for ending, unit in ((" mm", "mm"), (" percent", "%"), (" ms", "ms"), (" seconds", "s")):
+        if text.endswith(ending):
+            return f"{text.removesuffix(ending)}, {unit}"
+    return text
+
+
+def _html(figure: Any, title: str, height: int) -> str:
+    figure.update_layout(
+        title={"text": title, "font": {"size": 14}}, template="simple_white", height=height,
+        margin={"l": 70, "r": 20, "t": 45, "b": 55}, font={"family": "system-ui, sans-serif", "size": 12},
+    )  # fmt: skip
+    text: str = figure.to_html(
+        full_html=False, include_plotlyjs=False, config={"displaylogo": False, "responsive": True}
+    )
+    return text

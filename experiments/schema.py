@@ -1,0 +1,279 @@
+"""The schema of configurations: frozen dataclasses, plain data, light to import.
+
+What a trial is made of is a task's dataclass; a `SweepConfig` says which trials there are and what is asked of them.
+Every field is part of a trial's identity.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+
+def _require(good: bool, message: str) -> None:
+    if not good:
+        raise ValueError(message)
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """The sigmas of an alignment; widths are shares of the shape's size.
+
+    Args:
+        kind: "default" takes the library's; "geometric" and "linear" fall from start to stop; "constant" stays at
+            start; "adaptive" is estimated from the residuals, between the two.
+        start: first sigma.
+        stop: last sigma.
+        steps: number of sigmas, or for "adaptive" of estimates.
+        kappa: of "geometric": the ratio of neighbors, never below ``stop``; None: it follows from the ends.
+    """
+
+    kind: Literal["default", "geometric", "linear", "constant", "adaptive"] = "geometric"
+    start: float = 0.08
+    stop: float = 0.02
+    steps: int = 5
+    kappa: float | None = None
+
+    def __post_init__(self) -> None:
+        _require(0 < self.stop <= self.start, f"stop must be positive and at most start, got {self.stop}")
+        _require(self.steps >= 1, f"steps must be at least 1, got {self.steps}")
+        _require(self.kappa is None or 0 < self.kappa <= 1, f"kappa must be above 0 and at most 1, got {self.kappa}")
+
+
+@dataclass(frozen=True)
+class HandScene:
+    """A cloud of a hand in a random pose, and how far off the start is.
+
+    Args:
+        view: "whole": data and model points on all sides. "tracked": data on the side that a camera sees; the model
+            points are noisy points that it sees of the start, as in a sequence. "side": data on the side that a camera
+            sees, model points on all sides.
+        num_points: on the hand.
+        noise_mm: standard deviation of each coordinate.
+        outlier_ratio: share of all points, uniform in the hand's box grown by 5 cm.
+        start_deg: every joint of the start is off by as much.
+        sharpness: a of the true skin.
+    """
+
+    view: Literal["whole", "tracked", "side"] = "whole"
+    num_points: int = 500
+    noise_mm: float = 1.5
+    outlier_ratio: float = 0.2
+    start_deg: float = 20.0
+    sharpness: float = 2.0
+
+    def __post_init__(self) -> None:
+        _require(self.num_points >= 1, f"num_points must be at least 1, got {self.num_points}")
+        _require(0 <= self.outlier_ratio < 1, f"outlier_ratio must be at least 0 and below 1, got {self.outlier_ratio}")
+        _require(self.noise_mm >= 0, f"noise_mm must not be negative, got {self.noise_mm}")
+
+
+@dataclass(frozen=True)
+class AlignSolver:
+    """How a hand is aligned.
+
+    Args:
+        method: of the library "em", "softassign", "closest" (ICP); of others "cpd" (pycpd, deformable) and "gicp"
+            (small_gicp, rigid), which know nothing of hands.
+        em_steps: iterations per sigma.
+        surface_steps: of the surface fit after EM, at each width.
+        search: "auto", "always" or "never".
+        debias: share of the kernel's own pull that is taken out.
+        prior: whether joints are held weakly near the start.
+        sharpness: a of the model's skin.
+        num_model_points: that are moved.
+    """
+
+    method: Literal["em", "softassign", "closest", "cpd", "gicp"] = "em"
+    em_steps: int = 6
+    surface_steps: int = 0
+    search: Literal["auto", "always", "never"] = "never"
+    debias: float = 0.0
+    prior: bool = False
+    sharpness: float = 2.0
+    num_model_points: int = 500
+
+
+@dataclass(frozen=True)
+class AlignmentTrial:
+    """A hand aligned to one cloud.
+
+    Args:
+        seed: of pose and cloud.
+        scene: the cloud.
+        schedule: the sigmas.
+        solver: the method.
+        pictures: whether a picture and a glTF file are kept.
+    """
+
+    seed: int = 0
+    scene: HandScene = field(default_factory=HandScene)
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    solver: AlignSolver = field(default_factory=AlignSolver)
+    pictures: bool = False
+
+
+@dataclass(frozen=True)
+class ScanPairConfig:
+    """Two range scans.
+
+    Args:
+        dataset: "figure" walks, "animal" trots, "toy" is a robot that lacks a part in one scan; "file" is the file
+            ``name`` of ``folder`` (NPZ: source_points, source_faces, target_points, target_faces, source_truth,
+            diagonal).
+        apart: frames between the two; of "file" without meaning.
+        num_points: of a scan.
+        folder: of "file"; relative to where the experiment is run.
+        name: of "file", without its ending.
+    """
+
+    dataset: Literal["figure", "animal", "toy", "file"] = "figure"
+    apart: int = 1
+    num_points: int = 4500
+    folder: str = ""
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        _require(self.apart >= 1, f"apart must be at least 1, got {self.apart}")
+        _require(self.dataset != "file" or bool(self.name), "name must be given with dataset file")
+
+
+@dataclass(frozen=True)
+class RegistrationTrial:
+    """A scan registered to another.
+
+    Args:
+        seed: of the motion and the scans.
+        pair: the scans.
+        method: "reduced" is the library's; "cpd" (pycpd, deformable) and "gicp" (small_gicp, rigid) are others'.
+        num_bones: at most.
+        grid_resolution: cells along the longest axis.
+        joint_weight: of the joint term; 0 leaves it out.
+        reuse: whether lost labels are reborn.
+        refine_steps: rounds of refining weights.
+        num_samples: source points that are matched.
+        pictures: whether a picture and a glTF file are kept.
+    """
+
+    seed: int = 0
+    pair: ScanPairConfig = field(default_factory=ScanPairConfig)
+    method: Literal["reduced", "cpd", "gicp"] = "reduced"
+    num_bones: int = 10
+    grid_resolution: int = 50
+    joint_weight: float = 0.0
+    reuse: bool = True
+    refine_steps: int = 3
+    num_samples: int = 2500
+    pictures: bool = False
+
+
+@dataclass(frozen=True)
+class SpineTrial:
+    """One spine of a sequence of surfaces.
+
+    Args:
+        seed: of form and motion.
+        creature: "starfish" or "octopus"; "file" is the sequence ``name`` of ``folder`` (NPZ: vertices, faces).
+        frames: number of them; of "file" every n-th, so that there are about as many; 0 for all.
+        touching: whether two arms merge, see the dataset.
+        noise: in voxels.
+        resolution: voxels along the longest side.
+        folder: of "file".
+        name: of "file", without its ending.
+        method: "spine" is the library's. "skeletor" counts the tips of another program's skeletons.
+        pictures: whether a picture and a glTF file are kept.
+    """
+
+    seed: int = 0
+    creature: Literal["starfish", "octopus", "file"] = "starfish"
+    frames: int = 12
+    touching: Literal["none", "flanks", "tips"] = "none"
+    noise: float = 0.0
+    resolution: int = 96
+    folder: str = ""
+    name: str = ""
+    method: Literal["spine", "skeletor"] = "spine"
+    pictures: bool = False
+
+    def __post_init__(self) -> None:
+        _require(self.creature != "file" or bool(self.name), "name must be given with creature file")
+
+
+@dataclass(frozen=True)
+class ProbeTrial:
+    """A trial that costs what it is told to: what the runner itself is measured and tested with.
+
+    Args:
+        seed: of the numbers.
+        size: of the matrices that are multiplied; 0 for none.
+        rounds: of multiplying.
+        seconds: to sleep.
+        outcome: "done"; "failed" raises; "skipped"; "killed" ends the process, "killed once" only the first time.
+        log: file to which a line is written at the start of every run; none if empty.
+        scale: of the result.
+    """
+
+    seed: int = 0
+    size: int = 8
+    rounds: int = 1
+    seconds: float = 0.0
+    outcome: Literal["done", "failed", "skipped", "killed", "killed once"] = "done"
+    log: str = ""
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class ReportConfig:
+    """What a report shows first.
+
+    Args:
+        metrics: of the table, in this order; all if empty. Names of seconds are "seconds.NAME".
+        heat: two axes; the first goes to the right.
+        heat_metrics: of the heat maps; the first of the table if empty.
+        curves: that are drawn; all if empty.
+        group: axis by which curves are colored; the first one if empty.
+        share: metrics that are shares or counts, for which the mean over seeds is told instead of the median.
+        higher: metrics of which more is better; of all others, less.
+    """
+
+    metrics: tuple[str, ...] = ()
+    heat: tuple[str, ...] = ()
+    heat_metrics: tuple[str, ...] = ()
+    curves: tuple[str, ...] = ()
+    group: str = ""
+    share: tuple[str, ...] = ()
+    higher: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        _require(len(self.heat) in (0, 2), f"heat must name two axes, got {len(self.heat)}")
+
+
+@dataclass(frozen=True)
+class SweepConfig:
+    """Which trials there are: all cases, times all points of the grid, times all seeds.
+
+    Args:
+        name: of the sweep and its folder of results.
+        task: name in the registry.
+        question: that the sweep answers.
+        trial: the task's configuration, of which the rest changes some fields.
+        cases: each changes several fields at once; the key "case" names it.
+        grid: per field (a path with dots) its values.
+        seeds: number of seeds, from ``trial.seed`` on.
+        picture_seeds: of them, those whose pictures are kept.
+        report: what the report shows.
+    """
+
+    name: str
+    task: str
+    question: str
+    trial: Any
+    cases: tuple[dict[str, Any], ...] = ()
+    grid: dict[str, Any] = field(default_factory=dict)
+    seeds: int = 1
+    picture_seeds: int = 0
+    report: ReportConfig = field(default_factory=ReportConfig)
+
+    def __post_init__(self) -> None:
+        _require(self.seeds >= 1, f"seeds must be at least 1, got {self.seeds}")
+        _require(bool(self.question), "question must say what the sweep is for")

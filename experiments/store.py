@@ -1,0 +1,189 @@
+"""A folder of results: one JSON file per trial is the truth, everything else can be made from them again.
+
+trials/ID.json          the record of a trial, written whole or not at all
+trials/ID.json.corrupt-N    what was found in its place and was no record; never deleted
+claims/ID               who runs the trial at this moment
+artifacts/ID/           pictures and models
+sweep.json              the sweep as it was last started
+collected.parquet       all records as one table
+report.html             the report
+"""
+
+from __future__ import annotations
+
+import errno
+import itertools
+import json
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from experiments.claims import is_claimed
+from experiments.compose import from_data
+from experiments.errors import CorruptRecordError, StoreError
+from experiments.plan import canonical
+from experiments.records import TrialRecord, parse_record
+from experiments.schema import SweepConfig
+from experiments.structure import plain
+from torchreg.io.atomic import write_atomic
+
+_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_FORBIDDEN = {errno.EROFS, errno.EACCES, errno.EPERM}
+# What a crash may leave behind is swept away after an hour.
+_STALE_SECONDS = 3600
+
+
+@contextmanager
+def explained(path: Path) -> Iterator[None]:
+    """Turn an OSError while writing to ``path`` into one that says what to do."""
+    try:
+        yield
+    except StoreError:
+        raise
+    except OSError as error:
+        told = "; check the path"
+        if error.errno in _FULL:
+            told = "; free some space and give the same command again: finished trials are kept"
+        elif error.errno in _FORBIDDEN:
+            told = "; make the folder writable, or name another one with --results"
+        raise StoreError(f"{path} cannot be written: {error.strerror or error}{told}") from error
+
+
+@dataclass(frozen=True)
+class Store:
+    """The results of a sweep.
+
+    Args:
+        root: their folder.
+    """
+
+    root: Path
+
+    @property
+    def trials(self) -> Path:
+        """The folder of records."""
+        return self.root / "trials"
+
+    @property
+    def parquet(self) -> Path:
+        """The table of all records."""
+        return self.root / "collected.parquet"
+
+    def record_path(self, trial: str) -> Path:
+        """Return the file of a trial's record."""
+        return self.trials / f"{trial}.json"
+
+    def claim_path(self, trial: str) -> Path:
+        """Return the file of a trial's claim."""
+        return self.root / "claims" / trial
+
+    def artifacts(self, trial: str) -> Path:
+        """Return the folder of what a trial keeps."""
+        return self.root / "artifacts" / trial
+
+    def prepare(self) -> None:
+        """Make the folders, and see that they can be written to.
+
+        Raises:
+            StoreError: if not, saying what to do.
+        """
+        with explained(self.root):
+            for folder in (self.trials, self.root / "claims"):
+                folder.mkdir(parents=True, exist_ok=True)
+            write_atomic(self.trials / f".probe-{os.getpid()}", b"probe")
+            (self.trials / f".probe-{os.getpid()}").unlink()
+            for left in self.trials.glob(".*.part"):
+                self._remove_stale(left)
+
+    def _remove_stale(self, path: Path) -> None:
+        try:
+            if time.time() - path.stat().st_mtime > _STALE_SECONDS:
+                path.unlink()
+        except FileNotFoundError:
+            pass  # another driver was faster
+
+    def read(self, trial: str) -> TrialRecord | None:
+        """Return the record of a trial, or None if there is none.
+
+        Raises:
+            CorruptRecordError: if the file is no record of this trial.
+        """
+        path = self.record_path(trial)
+        try:
+            content = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        return parse_record(content, path.name, trial)
+
+    def write(self, record: TrialRecord) -> None:
+        """Put a record in its place: whole or not at all, and on the disk when this returns.
+
+        Raises:
+            StoreError: if it cannot be written.
+        """
+        with explained(self.record_path(record.id)):
+            write_atomic(self.record_path(record.id), record.to_json())
+
+    def set_aside(self, trial: str) -> Path:
+        """Give a file that is no record another name, and return it: nothing is deleted.
+
+        Raises:
+            StoreError: if it cannot be renamed.
+        """
+        path = self.record_path(trial)
+        aside = next(one for number in itertools.count(1) if not (one := Path(f"{path}.corrupt-{number}")).exists())
+        with explained(path):
+            path.rename(aside)
+        return aside
+
+    def records(self) -> tuple[list[TrialRecord], list[CorruptRecordError]]:
+        """Return all records in the order of their ids, and what was no record."""
+        found, bad = [], []
+        for path in sorted(self.trials.glob("*.json")):
+            try:
+                record = self.read(path.stem)
+            except CorruptRecordError as error:
+                bad.append(error)
+            else:
+                found += [record] if record is not None else []
+        return found, bad
+
+    def is_claimed(self, trial: str) -> bool:
+        """Return whether some process runs a trial now."""
+        return is_claimed(self.claim_path(trial))
+
+    def write_sweep(self, sweep: SweepConfig) -> None:
+        """Keep what was last asked.
+
+        Raises:
+            StoreError: if it cannot be written.
+        """
+        content = json.dumps(plain(sweep), indent=1).encode()
+        with explained(self.root / "sweep.json"):
+            write_atomic(self.root / "sweep.json", content)
+
+    def read_sweep(self) -> SweepConfig | None:
+        """Return what was last asked, or None if nothing was.
+
+        Raises:
+            StoreError: if the file is damaged.
+        """
+        path = self.root / "sweep.json"
+        try:
+            data: dict[str, Any] = json.loads(path.read_bytes())
+            return from_data(data)
+        except FileNotFoundError:
+            return None
+        except (ValueError, AttributeError) as error:
+            raise StoreError(
+                f"{path} is damaged ({error}); delete it and start the sweep again, results stay"
+            ) from error
+
+
+def same_sweep(one: SweepConfig, other: SweepConfig) -> bool:
+    """Return whether two sweeps ask for the same."""
+    return canonical(plain(one)) == canonical(plain(other))
