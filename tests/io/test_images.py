@@ -7,7 +7,7 @@ from PIL import Image
 
 from torchreg.errors import FormatError, MissingExtraError
 from torchreg.geometry.camera import Camera
-from torchreg.io.images import load_depth, load_image, load_mask, save_depth, save_image
+from torchreg.io.images import list_pictures, load_depth, load_image, load_mask, save_depth, save_image
 from torchreg.io.limits import FileLimits
 
 STEPS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
@@ -127,3 +127,16 @@ def test_truncated_files_are_refused(tmp_path, name):
             load_depth(tmp_path / name)
     with pytest.raises(FormatError, match="the limit is 4"):
         load_depth(tmp_path / name, limits=FileLimits(max_bytes=4))
+
+
+def test_pictures_of_a_folder_in_the_order_of_their_numbers(tmp_path):
+    for name in ("f10.png", "f9.png", ".hidden.png", "notes.txt", "F2.JPG"):
+        (tmp_path / name).touch()
+    assert [file.name for file in list_pictures(tmp_path)] == ["F2.JPG", "f9.png", "f10.png"]
+    with pytest.raises(FormatError, match="must be a folder of pictures"):
+        list_pictures(tmp_path / "f9.png")
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        list_pictures(tmp_path / "none")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FormatError, match="holds no pictures"):
+        list_pictures(tmp_path / "empty")

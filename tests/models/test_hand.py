@@ -203,3 +203,9 @@ def test_bad_options_are_refused(options, message):
 def test_poses_of_the_wrong_size_are_refused(hand):
     with pytest.raises(InputError, match=r"pose must have shape \(\.\.\., 27\), got \(26,\)"):
         hand.keypoints(torch.zeros(26, dtype=torch.float64))
+
+
+def test_length_is_from_the_wrist_to_the_middle_fingertip():
+    points = Hand().keypoints(Hand().rest_pose()).detach()
+    assert Hand().length == pytest.approx(float((points[12] - points[0]).norm()))
+    assert 0.15 < Hand().length < 0.25

@@ -79,7 +79,7 @@ def match_disparity(
         volume = _block_mean(volume) if method == "block" else _semi_global(volume, small_step, large_step)
         found = min_disparity + _minima(volume)
         if max_difference is not None:
-            other = min_disparity + _minima(_seen_from_right(volume, min_disparity))
+            other = min_disparity + _minima(_seen_from_right(volume)).roll(-min_disparity, dims=-1)
             found = _agreeing(found, other, max_difference)
         return found.to(left).reshape(left.shape)
 
@@ -162,15 +162,17 @@ def _minima(volume: Tensor) -> Tensor:
     return torch.where((place > 0) & (place < last), place + shift, torch.nan)
 
 
-def _seen_from_right(volume: Tensor, lowest: int) -> Tensor:
-    """Return the volume (B, H, W, D) of the right picture: pixel x with disparity d is pixel x + d on the left."""
-    worst = float(volume.max())
-    other = torch.full_like(volume, worst)
-    width = volume.shape[2]
-    for step in range(volume.shape[-1]):
-        disparity = lowest + step
-        other[:, :, : width - disparity, step] = volume[:, :, disparity:, step]
-    return other
+def _seen_from_right(volume: Tensor) -> Tensor:
+    """Return the volume (B, H, W, D) of the right picture, as a view: its column x is x + step on the left.
+
+    Columns are counted from the lowest disparity on; what lies beyond the left picture costs most.
+    """
+    batch, height, width, count = volume.shape
+    padded = volume.new_full((batch, height, width + count, count), float(volume.max()))
+    padded[:, :, :width] = volume
+    strides = padded.stride()
+    # One column and one disparity further at once.
+    return padded.as_strided((batch, height, width, count), (*strides[:3], strides[2] + strides[3]))
 
 
 def _agreeing(found: Tensor, other: Tensor, slack: float) -> Tensor:

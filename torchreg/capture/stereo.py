@@ -24,6 +24,9 @@ _WEAKEST_CORNER, _CORNER_REACH = 1e-4, 2
 # Pictures are compared at a quarter of their size; as given so many times more pixels must match than swapped.
 _GLANCE, _MORE_MATCHES = 4, 1.5
 _WINDOW_BORDER = 8
+# Nearer to an outline, pixels, dense disparity may belong to the other side. Between neighbors, disparities of one
+# surface differ by no more than the steepest slope.
+_OUTLINE, _STEEPEST = 2, 1.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +53,11 @@ class StereoPoints:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def subset(self, kept: Tensor) -> StereoPoints:
+        """Return some of the points, chosen by a mask (N,) bool or indices."""
+        parts = ("points", "depth_std", "covariance", "pixels", "disparity", "disparity_std")
+        return replace(self, **{name: getattr(self, name)[kept] for name in parts})
 
 
 @dataclass(frozen=True)
@@ -84,12 +92,19 @@ class StereoConfig:
 
 
 def stereo_points(
-    left: Tensor, right: Tensor, pair: StereoPair, *, config: StereoConfig | None = None, box: Tensor | None = None
+    left: Tensor,
+    right: Tensor,
+    pair: StereoPair,
+    *,
+    config: StereoConfig | None = None,
+    box: Tensor | None = None,
+    check_order: bool = True,
 ) -> StereoPoints:
     """Return the Harris corners that both cameras of a rectified pair see, as points with their uncertainty.
 
     Dense disparity says roughly where a corner is in the other picture; there a least-squares fit of a window, slanted
     as the surface is, finds it to a fraction of a pixel, and the fit's own covariance and residuals how exactly.
+    Corners that an outline may make, beside unknown disparities or a jump of them, are left out.
 
     Args:
         left: (H, W) or (H, W, 3) from 0 to 1.
@@ -97,6 +112,7 @@ def stereo_points(
         pair: the cameras, rectified; see `rectify`.
         config: what to look for.
         box: (2, 3) lower and upper corner of the volume of interest in world coordinates, or None.
+        check_order: whether to look if the pictures match the other way round; once per sequence is enough.
 
     Returns:
         the points, in the dtype of the pictures; there may be none.
@@ -113,19 +129,21 @@ def stereo_points(
     """
     config = StereoConfig() if config is None else config
     pair.check_rectified()
-    first, second = _gray(left, pair.left, "left"), _gray(right, pair.right, "right")
+    first, second = as_gray(left, pair.left, "left"), as_gray(right, pair.right, "right")
     with torch.no_grad():
         highest = int(pair.disparity(torch.tensor(config.nearest, dtype=torch.float64))) + 2
         if highest >= pair.left.width:
             raise InputError(
                 f"nearest must keep disparities within the picture, {config.nearest} m takes {highest} pixels"
             )
-        _check_order(first, second, highest)
+        if check_order:
+            _check_order(first, second, highest)
         # All the way to infinity: a background that has no place to match would be put somewhere before it.
         dense = match_disparity(first, second, highest, method=config.method)
         depth = pair.depth(dense)
         wanted = (depth >= config.nearest) & (depth <= config.farthest)
-        corners = _corners(first) & wanted
+        # Where an outline makes the corner, it is no place of either surface.
+        corners = _corners(first) & wanted & ~_on_outline(dense)
         if config.both:
             corners &= _corner_there(_corners(second), dense)
         row, column = corners.nonzero().unbind(-1)
@@ -198,7 +216,8 @@ def _check_size(image: Tensor, camera: Camera, name: str) -> None:
     check_finite(image, name)
 
 
-def _gray(image: Tensor, camera: Camera, name: str) -> Tensor:
+def as_gray(image: Tensor, camera: Camera, name: str) -> Tensor:
+    """Return a camera's picture (H, W) or (H, W, 3) as gray (H, W); InputError if it has another size."""
     image = as_float_tensor(image, name).detach()
     _check_size(image, camera, name)
     return image @ image.new_tensor(_LUMA) if image.ndim == 3 else image
@@ -233,6 +252,14 @@ def _corners(gray: Tensor) -> Tensor:
     return peaks & inner
 
 
+def _on_outline(disparity: Tensor) -> Tensor:
+    """Return which pixels (H, W) have unknown ones or another surface near by."""
+    unknown = disparity.isnan()
+    planes = torch.stack((unknown.to(disparity), disparity.nan_to_num(-torch.inf), -disparity.nan_to_num(torch.inf)))
+    beside, most, least = torch.nn.functional.max_pool2d(planes[None], 2 * _OUTLINE + 1, 1, _OUTLINE)[0]
+    return (beside > 0) | (most + least > 2 * _OUTLINE * _STEEPEST)
+
+
 def _corner_there(corners: Tensor, disparity: Tensor) -> Tensor:
     """Return for pixels (H, W) of the left picture whether there is a corner of the right one where they match."""
     near = (
@@ -265,6 +292,4 @@ def _placed(
     across = (0.1 * depth / float(pair.left.intrinsics[0])) ** 2
     spread = rays.unsqueeze(-1) * rays.unsqueeze(-2) * (depth_std**2)[:, None, None]
     covariance = spread + across[:, None, None] * torch.eye(3).to(points)
-    found = StereoPoints(points, depth_std, covariance, pixels, disparity, std, dense)
-    parts = ("points", "depth_std", "covariance", "pixels", "disparity", "disparity_std")
-    return replace(found, **{name: getattr(found, name)[kept] for name in parts})
+    return StereoPoints(points, depth_std, covariance, pixels, disparity, std, dense).subset(kept)

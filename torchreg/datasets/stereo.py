@@ -207,6 +207,11 @@ def _make_scene(
     return _Scene(shape, skin, poses, surface, others, torch.cat(faces), owners, volume, wall)
 
 
+def drawn_forearm(hand: Hand, generator: torch.Generator) -> TriangleMesh:
+    """Return a forearm in the frame of the palm, bent at the wrist by random angles."""
+    return _forearm(hand, 2 * torch.rand(2, generator=generator, dtype=torch.float64).to(hand.rest) - 1)
+
+
 def _forearm(hand: Hand, bend: Tensor) -> TriangleMesh:
     """Return a tapering tube behind the wrist, in the frame of the palm, bent there by shares of the largest angle."""
     rings = (hand.radii.new_tensor(_FOREARM) * hand.radii[0][[2, 0, 1]]).unsqueeze(1)

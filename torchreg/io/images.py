@@ -15,12 +15,32 @@ from torch import Tensor
 from torchreg.errors import FormatError, MissingExtraError
 from torchreg.geometry.camera import MAX_PIXELS, Camera
 from torchreg.io.atomic import write_atomic
+from torchreg.io.frames import natural_key
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 
+ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 _DEPTH_KINDS = {"I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
 _COLOR_KINDS = {"1": "L", "L": "L", "P": "RGB", "RGB": "RGB", "RGBA": "RGB", "LA": "L"}
 # The channel of an EXR file that holds depth, by what renderers call it.
 _EXR_CHANNELS = ("Z", "depth.Z", "Depth.Z", "Y", "V", "R", "RGB")
+
+
+def list_pictures(folder: str | os.PathLike[str]) -> list[Path]:
+    """Return the pictures in a folder, in the order of the numbers in their names.
+
+    Raises:
+        FormatError: if it holds none, or names the folder of something else.
+        FileNotFoundError: if there is no such folder.
+    """
+    place = local_path(folder)
+    if not place.exists():
+        raise FileNotFoundError(f"the folder {place} does not exist")
+    if not place.is_dir():
+        raise FormatError(f"{place}: must be a folder of pictures")
+    files = [file for file in place.iterdir() if file.suffix.lower() in ENDINGS and not file.name.startswith(".")]
+    if not files:
+        raise FormatError(f"{place} holds no pictures: no file ends in one of {', '.join(ENDINGS)}")
+    return sorted(files, key=natural_key)
 
 
 def load_image(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Tensor:

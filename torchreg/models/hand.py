@@ -132,6 +132,13 @@ class Hand(ArticulatedShape):
         """Indices of the five distal phalanges, thumb to little finger."""
         return tuple(3 * finger + 3 for finger in range(5))
 
+    @property
+    def length(self) -> float:
+        """From the wrist to the farthest fingertip at rest, metres."""
+        with torch.no_grad():
+            points = self.keypoints(self.rest_pose())
+        return float((points - points[0]).norm(dim=-1).max())
+
     def keypoints(self, pose: Tensor) -> Tensor:
         """Return 21 keypoints: wrist, then thumb to little finger, each from its base joint to its tip.
 
