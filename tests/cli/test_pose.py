@@ -10,6 +10,7 @@ from torchreg.datasets.scan_sequences import jointed_toy
 from torchreg.io.points import load_points
 from torchreg.pipelines.register import register
 from torchreg.results import PoseStarts
+from torchreg.viz.pose_editor import PoseEditor
 
 
 @pytest.fixture(scope="module")
@@ -49,3 +50,21 @@ def test_what_does_not_fit_is_refused(error_of, result, tmp_path):
     other = tmp_path / "starts.safetensors"
     PoseStarts(torch.zeros(1, 6), torch.zeros(1), torch.tensor(1.0)).save(other)
     assert "holds a PoseStarts" in error_of("pose", other, *one, "-o", tmp_path / "no.ply")
+
+
+def test_without_handles_a_page_opens(run, error_of, result, tmp_path, monkeypatch):
+    pytest.importorskip("viser", reason="the viewer needs viser")
+    place, found = result
+
+    def interrupted(seconds):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torchreg.cli.view.time.sleep", interrupted)
+    editor = PoseEditor(found)
+    editor.add_handle(0)
+    editor.drag({0: editor.placed()[0] + 0.05})
+    editor.save_pose(tmp_path / "start.safetensors")
+    answer = run("pose", place, "--start", tmp_path / "start", "--no-browser", "--port", "0", "-o", tmp_path / "p.ply")
+    assert answer.exit_code == 0, answer.output
+    assert "http://127.0.0.1:" in answer.output
+    assert "a pose to start from" in error_of("pose", place, "--start", place, "-o", tmp_path / "p.ply")

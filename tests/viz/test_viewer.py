@@ -1,6 +1,5 @@
 """The viewer without a browser: nodes, controls and files; `tests/web` looks at it through a browser."""
 
-import builtins
 import socket
 import time
 
@@ -8,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from torchreg.errors import InputError, MissingExtraError
+from torchreg.errors import InputError
 from torchreg.viz.result_scenes import result_scene
 from torchreg.viz.scene import Scene
-from torchreg.viz.viewer import HOST, SceneViewer, import_viser, scene_html
+from torchreg.viz.viewer import SceneViewer, scene_html
+from torchreg.viz.viser_server import HOST
 
 pytest.importorskip("viser", reason="the viewer needs viser")
 KINDS = ("alignment", "track", "demo", "starts", "calibration", "registration", "sequence", "spine")
@@ -88,16 +88,3 @@ def test_one_file_holds_it_all(spine, tmp_path):
         scene_html(tmp_path / "spine.htm", scene)
     with pytest.raises(FileNotFoundError):
         scene_html(tmp_path / "nowhere" / "spine.html", scene)
-
-
-def test_without_viser_the_extra_is_named(monkeypatch):
-    real = builtins.__import__
-
-    def without(name, *arguments, **options):
-        if name == "viser":
-            raise ImportError("no viser")
-        return real(name, *arguments, **options)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(MissingExtraError, match=r"pip install 'torchreg\[viewer\]'"):
-        import_viser()

@@ -67,7 +67,8 @@ def view(
         raise InputError("--parents, --package-dir and --free-base are about a --shape, which was not given")
     from torchreg.pipelines.storage import load
     from torchreg.viz.result_scenes import result_scene
-    from torchreg.viz.viewer import import_viser, scene_html
+    from torchreg.viz.viewer import scene_html
+    from torchreg.viz.viser_server import import_viser
 
     import_viser()
     found = load(result if result.suffix else result.with_suffix(".safetensors"))

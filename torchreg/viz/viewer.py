@@ -2,91 +2,27 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
-from torch import Tensor
 
-from torchreg.errors import InputError, MissingExtraError
+from torchreg.errors import InputError
 from torchreg.io.atomic import write_atomic
-from torchreg.viz.scene import FIELD_OF_VIEW, Cloud, Curves, Layer, Meshes, Scene, Surface
+from torchreg.viz.scene import Layer, Scene
+from torchreg.viz.viser_nodes import DrawnScene
+from torchreg.viz.viser_server import page_url, point_camera, start_server, stop_server
 
 if TYPE_CHECKING:
     import viser
 
-Place = NDArray[np.floating]
-
-HOST = "127.0.0.1"
-# How often the timeline looks whether to go on, seconds.
+# How often the timeline looks whether to go on, and how long it holds the last frame, seconds.
 _TICK = 1 / 60
 _HOLD = 0.5
-
-
-def import_viser() -> Any:
-    """Return the module viser; MissingExtraError, which names the extra, where it is not installed."""
-    try:
-        import viser
-    except ImportError as error:
-        raise MissingExtraError("the viewer needs viser; install it with: pip install 'torchreg[viewer]'") from error
-    return viser
-
-
-def start_server(title: str, port: int) -> viser.ViserServer:
-    """Return a server on 127.0.0.1 that other machines cannot reach and that asks none for anything.
-
-    Args:
-        title: shown above the controls.
-        port: where to listen; where it is taken, a later one.
-
-    Raises:
-        MissingExtraError: if viser is not installed.
-    """
-    library = import_viser()
-    with contextlib.redirect_stdout(io.StringIO()):  # viser greets
-        server: viser.ViserServer = library.ViserServer(host=HOST, port=port, label=title, verbose=False)
-    # Sharing would open a tunnel through a server of others.
-    setattr(server, "request_share_url", lambda verbose=True: None)  # noqa: B010
-    server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
-    server.scene.configure_environment_map(None)
-    return server
-
-
-def stop_server(server: viser.ViserServer) -> None:
-    """Stop a server without a word."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()
-
-
-def point_camera(server: viser.ViserServer, scene: Scene) -> None:
-    """Let new windows see all of a scene."""
-    position, target, up = scene.camera()
-    server.scene.set_up_direction(tuple(up.tolist()))
-    camera, size = server.initial_camera, scene.diagonal
-    camera.fov, camera.near, camera.far = FIELD_OF_VIEW, 0.01 * size, 100 * size
-    camera.position, camera.look_at, camera.up = position.numpy(), target.numpy(), up.numpy()
-    _light(server, position.numpy(), target.numpy(), up.numpy())
-
-
-def _light(server: viser.ViserServer, position: Place, target: Place, up: Place) -> None:
-    """Light a scene from above and from the camera's side, with no shadows."""
-    server.scene.configure_default_lights(enabled=False)
-    server.scene.add_light_hemisphere(
-        "/lights/sky", sky_color=(255, 255, 255), ground_color=(150, 150, 160), intensity=1.6
-    )
-    right = np.cross(target - position, up)
-    for name, place, strength in (("key", position + 0.8 * right + up, 2.2), ("back", 2 * target - position + up, 0.7)):
-        toward = tuple(place - target)
-        server.scene.add_light_directional(
-            f"/lights/{name}", color=(255, 255, 255), intensity=strength, position=toward, cast_shadow=False
-        )
 
 
 class SceneViewer:
@@ -115,7 +51,7 @@ class SceneViewer:
     @property
     def url(self) -> str:
         """Where a browser on this machine finds it."""
-        return f"http://{HOST}:{self.server.get_port()}"
+        return page_url(self.server)
 
     @property
     def frame(self) -> int:
@@ -150,38 +86,6 @@ class SceneViewer:
     def _add_toggle(self, layer: Layer) -> None:
         box = self.server.gui.add_checkbox(layer.name, initial_value=layer.visible)
         box.on_update(lambda _: self._drawn.set_visible(layer.name, box.value))
-
-
-class DrawnScene:
-    """The nodes that a scene has become on a server, of which one frame is shown.
-
-    Args:
-        api: ``scene`` of a server.
-        scene: what to draw.
-    """
-
-    def __init__(self, api: viser.SceneApi, scene: Scene) -> None:
-        self._api, self._scene = api, scene
-        self._lock = threading.Lock()
-        self._visible = {layer.name: layer.visible for layer in scene.layers}
-        self._drawn: dict[str, _DrawnLayer] = {}
-        self.frame = 0
-        for number, layer in enumerate(scene.layers):
-            self._drawn[layer.name] = _draw(api, f"/layers/{number}", layer, scene.diagonal)
-        self.show(0)
-
-    def show(self, frame: int) -> None:
-        """Show a frame."""
-        with self._lock:
-            self.frame = frame
-            for name, drawn in self._drawn.items():
-                drawn.show(frame, self._visible[name])
-
-    def set_visible(self, name: str, visible: bool) -> None:
-        """Show or hide a layer."""
-        with self._lock:
-            self._visible[name] = visible
-            self._drawn[name].show(self.frame, visible)
 
 
 class Timeline:
@@ -286,120 +190,3 @@ def _durations(seconds: list[float]) -> Iterator[tuple[int, float]]:
     """Yield each frame with how long it is shown."""
     for frame in range(len(seconds)):
         yield frame, seconds[frame + 1] - seconds[frame] if frame + 1 < len(seconds) else _HOLD
-
-
-class _DrawnLayer:
-    """Nodes of one layer.
-
-    Args:
-        nodes: its handles.
-        update: puts them where a frame has them and returns those that the frame shows.
-        num_frames: of the layer.
-    """
-
-    def __init__(self, nodes: list[Any], update: Callable[[int], list[Any]], num_frames: int) -> None:
-        self._nodes, self._update, self._num_frames = nodes, update, num_frames
-        self._frame = -1
-        self._shown: set[int] = set()
-
-    def show(self, frame: int, visible: bool) -> None:
-        at = min(frame, self._num_frames - 1)
-        if visible and at != self._frame:
-            self._frame, self._shown = at, {id(node) for node in self._update(at)}
-        for node in self._nodes:
-            node.visible = visible and id(node) in self._shown
-
-
-def _draw(api: viser.SceneApi, name: str, layer: Layer, size: float) -> _DrawnLayer:
-    if isinstance(layer, Surface):
-        return _draw_surface(api, name, layer)
-    if isinstance(layer, Meshes):
-        return _draw_meshes(api, name, layer)
-    return _draw_cloud(api, name, layer, size) if isinstance(layer, Cloud) else _draw_curves(api, name, layer, size)
-
-
-def draw_patches(api: viser.SceneApi, name: str, surface: Surface) -> list[tuple[Any, NDArray[Any]]]:
-    """Return the nodes of a surface at its first frame, with which vertices each of them shows."""
-    smooth = not isinstance(surface.paint, Tensor)
-    points = _floats(surface.points(0))
-    found = []
-    for number, (used, faces, color) in enumerate(surface.patches()):
-        index = used.numpy()
-        node = api.add_mesh_simple(
-            f"{name}/{number}", np.nan_to_num(points[index]), faces.cpu().numpy(), color=color, side="double",
-            opacity=None if surface.opacity >= 1 else surface.opacity, flat_shading=not smooth, cast_shadow=False,
-            receive_shadow=False, visible=surface.visible,
-        )  # fmt: skip
-        found.append((node, index))
-    return found
-
-
-def _draw_surface(api: viser.SceneApi, name: str, layer: Surface) -> _DrawnLayer:
-    patches = draw_patches(api, name, layer)
-
-    def update(frame: int) -> list[Any]:
-        points = _floats(layer.points(frame))
-        if not np.isfinite(points).all():
-            return []
-        for node, index in patches:
-            node.vertices = points[index]
-        return [node for node, _ in patches]
-
-    return _DrawnLayer([node for node, _ in patches], update, layer.num_frames)
-
-
-def _draw_meshes(api: viser.SceneApi, name: str, layer: Meshes) -> _DrawnLayer:
-    nodes = [
-        api.add_mesh_simple(
-            f"{name}/{number}", _floats(mesh.vertices), mesh.faces.cpu().numpy(), color=layer.color, side="double",
-            opacity=None if layer.opacity >= 1 else layer.opacity, cast_shadow=False, receive_shadow=False,
-            visible=False,
-        )
-        for number, mesh in enumerate(layer.frames)
-    ]  # fmt: skip
-    return _DrawnLayer(nodes, lambda frame: [nodes[frame]], layer.num_frames)
-
-
-def _draw_cloud(api: viser.SceneApi, name: str, layer: Cloud, size: float) -> _DrawnLayer:
-    node = api.add_point_cloud(
-        name, _floats(layer.points(0)), _floats(layer.paint(0)), point_size=layer.size * size, point_shape="circle",
-        precision="float32", point_shading="flat", visible=layer.visible,
-    )  # fmt: skip
-
-    def update(frame: int) -> list[Any]:
-        node.points, node.colors = _floats(layer.points(frame)), _bytes(layer.paint(frame))
-        return [node] if len(layer.points(frame)) else []
-
-    return _DrawnLayer([node], update, layer.num_frames)
-
-
-def _draw_curves(api: viser.SceneApi, name: str, layer: Curves, size: float) -> _DrawnLayer:
-    paint = np.repeat(_floats(layer.segment_paint())[:, None], 2, axis=1)
-    node = api.add_line_segments(
-        f"{name}/lines", np.nan_to_num(_floats(layer.segments(0))), paint, thickness=layer.thickness * size,
-        visible=layer.visible,
-    )  # fmt: skip
-    first = np.nan_to_num(_floats(layer.points(0)))
-    labels = [
-        api.add_label(f"{name}/label_{number}", text, position=first[number, 0], visible=layer.visible)
-        for number, text in enumerate(layer.labels)
-    ]
-
-    def update(frame: int) -> list[Any]:
-        segments = _floats(layer.segments(frame))
-        if not np.isfinite(segments).all():
-            return []
-        node.points = segments
-        for label, curve in zip(labels, _floats(layer.points(frame)), strict=False):
-            label.position = curve[0]
-        return [node, *labels]
-
-    return _DrawnLayer([node, *labels], update, layer.num_frames)
-
-
-def _floats(values: Tensor) -> NDArray[np.float32]:
-    return values.detach().cpu().float().numpy()
-
-
-def _bytes(colors: Tensor) -> NDArray[np.uint8]:
-    return (255 * colors.detach().cpu().float().clamp(0, 1)).round().byte().numpy()

@@ -1,0 +1,293 @@
+"""Posing step by step: handles that are dragged or pinned, undo and redo, key poses, files."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import as_float_tensor, check_finite, check_shape
+from torchreg.errors import InputError
+from torchreg.models.grid_lbs import GridLBS
+from torchreg.pipelines.solve_pose import PoseConfig, PoseSolver
+from torchreg.results import PoseSolution, ScanRegistration, SequenceRegistration
+from torchreg.viz.bone_colors import weight_colors
+from torchreg.viz.key_poses import between_poses
+from torchreg.viz.scan_gltf import save_grid_animation
+
+# Frames between two key poses when they are played.
+_FRAMES_PER_KEY = 30
+
+
+@dataclass(frozen=True, eq=False)
+class PoseState:
+    """What undo brings back.
+
+    Args:
+        transforms: (B, 4, 4) of the bones.
+        vertices: of the H handles, their numbers in the scan.
+        targets: (H, 3) where the handles should be; a handle that is neither dragged nor pinned follows the shape.
+        pinned: per handle, whether it is held where it is while others are dragged.
+        solution: that led here, None before anything was dragged.
+    """
+
+    transforms: Tensor
+    vertices: tuple[int, ...]
+    targets: Tensor
+    pinned: tuple[bool, ...]
+    solution: PoseSolution | None = None
+
+
+class PoseEditor:
+    """A registered scan that is posed by dragging handles. All methods may be called from any thread.
+
+    Args:
+        registration: whose bones move.
+        frame: of a `SequenceRegistration`, the pose to start from.
+        start: (B, 4, 4) to start from instead, such as ``transforms`` of a `PoseSolution`.
+        config: of the solver.
+
+    Raises:
+        InputError: if there is no such frame or ``start`` does not fit.
+    """
+
+    def __init__(
+        self,
+        registration: ScanRegistration[GridLBS] | SequenceRegistration[GridLBS],
+        *,
+        frame: int = 0,
+        start: Tensor | None = None,
+        config: PoseConfig | None = None,
+    ) -> None:
+        own = registration.transforms.detach()
+        if own.ndim == 4 and not 0 <= frame < len(own):
+            raise InputError(f"frame must be from 0 to {len(own) - 1}, got {frame}")
+        transforms = own[frame] if own.ndim == 4 else own
+        if start is not None:
+            transforms = as_float_tensor(start, "start", like=own).detach()
+            check_shape(transforms, "start", tuple(own.shape[-3:]))
+        # A copy in one pose: later changes of the registration do not come through.
+        self.model: GridLBS = GridLBS.from_record(replace(registration.model.record(), transforms=transforms.cpu()))
+        self.points, self.faces = registration.points.detach().cpu(), registration.faces
+        self._weights = self.model.weights_at(self.points).detach()
+        self._solver = PoseSolver(self.model, config=config)
+        self._lock = threading.RLock()
+        self._state = PoseState(transforms.cpu().clone(), (), self.points.new_zeros(0, 3), ())
+        self._history, self._at = [self._state], 0
+        self._keys: list[Tensor] = []
+
+    @property
+    def state(self) -> PoseState:
+        """The state as it is."""
+        return self._state
+
+    @property
+    def colors(self) -> Tensor:
+        """Colors (N, 3) of the points by their bones."""
+        return weight_colors(self._weights).clamp(0, 1)
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the diagonal of the scan."""
+        return float((self.points.amax(0) - self.points.amin(0)).norm())
+
+    @property
+    def can_undo(self) -> bool:
+        """Whether there is anything to undo."""
+        return self._at > 0
+
+    @property
+    def can_redo(self) -> bool:
+        """Whether anything was undone."""
+        return self._at + 1 < len(self._history)
+
+    @property
+    def num_keys(self) -> int:
+        """Number of key poses."""
+        return len(self._keys)
+
+    @torch.no_grad()
+    def moved(self, transforms: Tensor | None = None) -> Tensor:
+        """Return the points (N, 3) in the current pose, or in another (B, 4, 4)."""
+        pose = self._state.transforms if transforms is None else transforms
+        return self.model.move(self.points, self._weights, pose)
+
+    @torch.no_grad()
+    def placed(self) -> Tensor:
+        """Return where the handles (H, 3) are."""
+        index = list(self._state.vertices)
+        return self.model.move(self.points[index], self._weights[index], self._state.transforms)
+
+    def add_handle(self, vertex: int) -> int:
+        """Make a point of the scan a handle and return its number; that of the handle it already is.
+
+        Raises:
+            InputError: if there is no such point.
+        """
+        if not 0 <= vertex < len(self.points):
+            raise InputError(f"vertex must be from 0 to {len(self.points) - 1}, got {vertex}")
+        with self._lock:
+            state = self._state
+            if vertex in state.vertices:
+                return state.vertices.index(vertex)
+            vertices = (*state.vertices, vertex)
+            place = self.moved()[vertex].unsqueeze(0)
+            targets = torch.cat([state.targets, place])
+            self._enter(replace(state, vertices=vertices, targets=targets, pinned=(*state.pinned, False)))
+            return len(vertices) - 1
+
+    def remove_handle(self, number: int) -> None:
+        """Remove a handle; those after it get lower numbers.
+
+        Raises:
+            InputError: if there is none.
+        """
+        with self._lock:
+            self._check(number)
+            state, keep = self._state, [k for k in range(len(self._state.vertices)) if k != number]
+            vertices, pinned = (tuple(row[k] for k in keep) for row in (state.vertices, state.pinned))
+            self._enter(replace(state, vertices=vertices, targets=state.targets[keep], pinned=pinned))  # type: ignore[arg-type]
+
+    def pin(self, number: int, pinned: bool = True) -> None:
+        """Hold a handle where it is while others are dragged, or let it go.
+
+        Raises:
+            InputError: if there is none.
+        """
+        with self._lock:
+            self._check(number)
+            state = self._state
+            if state.pinned[number] == pinned:
+                return
+            flags = tuple(pinned if k == number else flag for k, flag in enumerate(state.pinned))
+            targets = state.targets.clone()
+            targets[number] = self.placed()[number]
+            self._enter(replace(state, pinned=flags, targets=targets))
+
+    def drag(self, targets: Mapping[int, Tensor]) -> PoseSolution:
+        """Move handles to targets (3,) each, and the shape with them; `commit` makes it one step of undo.
+
+        The solver starts from the pose as it is. Pinned handles count as dragged to where they are held; others follow.
+
+        Returns:
+            the solution.
+
+        Raises:
+            InputError: if there is no such handle, or a target is not finite.
+        """
+        with self._lock:
+            state = self._state
+            wanted = state.targets.clone()
+            for number, target in targets.items():
+                self._check(number)
+                place = as_float_tensor(target, "targets", like=wanted)
+                check_shape(place, "targets", (3,))
+                check_finite(place, "targets")
+                wanted[number] = place
+            held = [k for k, pinned in enumerate(state.pinned) if pinned or k in targets]
+            index = [state.vertices[k] for k in held]
+            solution = self._solver.solve(self.points[index], wanted[held], start=state.transforms)
+            self._state = replace(state, transforms=solution.transforms, targets=wanted, solution=solution)
+            free = [k for k in range(len(state.vertices)) if k not in held]
+            if free:
+                wanted[free] = self.placed()[free]
+            return solution
+
+    def commit(self) -> None:
+        """Make what was dragged since the last step one step of undo."""
+        with self._lock:
+            if self._state is not self._history[self._at]:
+                self._enter(self._state)
+
+    def undo(self) -> bool:
+        """Go back one step; False if there is none. What was dragged but not committed counts as a step."""
+        with self._lock:
+            self.commit()
+            if not self.can_undo:
+                return False
+            self._at -= 1
+            self._state = self._history[self._at]
+            return True
+
+    def redo(self) -> bool:
+        """Go forward one step that was undone; False if there is none."""
+        with self._lock:
+            if not self.can_redo or self._state is not self._history[self._at]:
+                return False
+            self._at += 1
+            self._state = self._history[self._at]
+            return True
+
+    def reset(self) -> None:
+        """Bring the pose at the start back and drop all handles, as a step of undo."""
+        with self._lock:
+            self._enter(self._history[0])
+
+    def add_key(self) -> int:
+        """Add the current pose to the key poses and return how many there are."""
+        self._keys.append(self._state.transforms.clone())
+        return len(self._keys)
+
+    def remove_key(self) -> int:
+        """Remove the last key pose, if any, and return how many there are."""
+        if self._keys:
+            self._keys.pop()
+        return len(self._keys)
+
+    def animation(self, frames_per_key: int = _FRAMES_PER_KEY) -> Tensor:
+        """Return poses (T, B, 4, 4) that go through the key poses, as a glTF viewer plays the file of `save_gltf`.
+
+        Raises:
+            InputError: if there are fewer than two key poses.
+        """
+        if len(self._keys) < 2:
+            raise InputError(f"an animation needs two key poses at least, got {len(self._keys)}")
+        steps = frames_per_key * (len(self._keys) - 1)
+        at = torch.linspace(0, len(self._keys) - 1, steps + 1)
+        return between_poses(self.model, torch.stack(self._keys), at)
+
+    def save_pose(self, path: str | Path) -> Path:
+        """Return the path of the current `PoseSolution` (.safetensors and .json).
+
+        Raises:
+            InputError: if nothing was dragged yet, or the ending is another.
+        """
+        solution = self._state.solution
+        if solution is None:
+            raise InputError("nothing was posed yet; drag a handle first")
+        solution.save(path)
+        return Path(path)
+
+    def save_ply(self, path: str | Path) -> Path:
+        """Return the path of the scan in the current pose, colored by bones (.ply)."""
+        from torchreg.io.points import save_points
+
+        save_points(path, self.moved(), colors=self.colors, faces=self.faces)
+        return Path(path)
+
+    def save_gltf(self, path: str | Path, *, seconds_per_key: float = 1.0) -> Path:
+        """Return the path of the skinned scan (.glb): its key poses as an animation, or from rest to the current pose.
+
+        Raises:
+            InputError: if the scan has no triangles, or the ending is another.
+        """
+        if self.faces is None or not len(self.faces):
+            raise InputError("a scan without triangles cannot be written as glTF; export PLY instead")
+        rest = torch.eye(4).to(self._state.transforms).expand_as(self._state.transforms)
+        poses = torch.stack(self._keys if self._keys else [rest, self._state.transforms])
+        times = torch.arange(len(poses), dtype=torch.float64) * seconds_per_key
+        return save_grid_animation(path, self.model, self.points, self.faces, poses, times).path
+
+    def _check(self, number: int) -> None:
+        if not 0 <= number < len(self._state.vertices):
+            raise InputError(f"number must be that of one of {len(self._state.vertices)} handles, got {number}")
+
+    def _enter(self, state: PoseState) -> None:
+        """Make a state a step: what was undone before is gone."""
+        self._state = state
+        self._history = [*self._history[: self._at + 1], state]
+        self._at += 1
