@@ -93,7 +93,7 @@ def point_figures(frames: StereoFrames, folder: Path) -> dict[str, float]:
     }
 
 
-def track_figures(hand: tr.Hand, poses: Tensor, frames: StereoFrames) -> dict[str, float]:
+def track_figures(hand: tr.Hand, poses: Tensor, frames: StereoFrames, flips: bool) -> dict[str, float]:
     """Return how well the tracker follows the hand on these points alone."""
     times = [number / FPS for number in range(len(frames))]
     clouds = tqdm(frames, desc="tracking", leave=False, disable=None)
@@ -101,7 +101,9 @@ def track_figures(hand: tr.Hand, poses: Tensor, frames: StereoFrames) -> dict[st
     errors = 1e3 * (result.keypoints - hand.keypoints(poses)).norm(dim=-1)[:, TIPS]
     turns = compose_rotation_vectors(poses[1:, 3:6], -poses[:-1, 3:6]).norm(dim=-1)
     # With a tenth of a second before and after.
-    flipping = torch.nn.functional.pad((turns > FLIPPING).float(), (3, 2)).unfold(0, 5, 1).amax(-1) > 0
+    flipping = torch.nn.functional.pad((turns > FLIPPING).float(), (3, 2)).unfold(0, 5, 1).amax(-1) > (
+        0 if flips else 1
+    )
     lost = torch.tensor([not status.usable for status in result.statuses])
     return {
         "fingertips, mean mm (<= 5)": float(errors.mean()),
@@ -173,7 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
             frames = StereoFrames(folder / "left", folder / "right", pair, config=config, reach=hand.length)
             found = {f"{motion}, points by {matcher}": point_figures(frames, folder)}
             if not options.smoke:
-                found[f"{motion}, tracker"] = track_figures(hand, poses, frames)
+                found[f"{motion}, tracker"] = track_figures(hand, poses, frames, motion == "flip")
             for key, figures in dense_figures(frames, folder, methods, options.dense).items():
                 found[f"{motion}, {key}"] = figures
             for title, figures in found.items():

@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
-import warnings
-from collections import Counter
-from collections.abc import Callable, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from functools import cached_property, reduce
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TextIO
+from typing import Annotated
 
 import typer
 
 from torchreg.cli.align_options import NanPolicy, Scale
-from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
-from torchreg.cli.reporting import UNUSABLE, interruption, reporting, show_warning
+from torchreg.cli.cameras import (
+    Calibration,
+    DepthRange,
+    Matcher,
+    Reach,
+    Seen,
+    Volume,
+    check_used,
+    seen_folder,
+    stereo_job,
+    stereo_source,
+)
+from torchreg.cli.outputs import Force, Quiet, with_ending
+from torchreg.cli.reporting import UNUSABLE, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, load_shape
-from torchreg.errors import FormatError, InputError, UnitsWarning
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from torch import Tensor
-
-    from torchreg.io.frames import Frames
-    from torchreg.models.skin import LinearBlendSkin
-    from torchreg.pipelines.track import TrackConfig, Tracker
-    from torchreg.pipelines.track_progress import TrackProgress
-    from torchreg.results import FrameResult, TrackResult, TrackState
+from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary, track_job
+from torchreg.errors import InputError
 
 MOVIES = ("gif", "mp4", "none")
 
@@ -41,7 +37,7 @@ def track(
         typer.Argument(
             metavar="FRAMES",
             help="The clouds, metres: files, which are put in the order of the numbers in their names, one folder of "
-            "them, or one .npz of frames.",
+            "them, or one .npz of frames. With --stereo two folders: the left pictures and the right ones.",
         ),
     ],
     output: Annotated[
@@ -60,6 +56,15 @@ def track(
             "without one the shape is searched for."
         ),
     ] = None,
+    stereo: Annotated[
+        bool, typer.Option("--stereo", help="FRAMES are the pictures of a calibrated pair of cameras.")
+    ] = False,
+    calibration: Calibration = None,
+    depth_range: DepthRange = None,
+    volume: Volume = None,
+    matcher: Matcher = None,
+    reach: Reach = None,
+    seen: Seen = None,
     fps: Annotated[float, typer.Option(help="Frames per second.")] = 20.0,
     scale: Scale = 1.0,
     nan_policy: NanPolicy = "omit",
@@ -93,6 +98,10 @@ def track(
     pose is predicted. After Ctrl-C the results so far are on disk, and the same command with --resume goes on to the
     same end, also with more frames than before.
 
+    With --stereo LEFT RIGHT --calibration FILE clouds are the corners that both cameras see. For every frame two
+    pictures go to RESULT_seen: the disparity, and the left picture with its points, blue where they are inliers, and
+    the outline of the shape.
+
     Exit codes: 0; 1 if in any frame the shape was lost or there were no data; 2 for an error; 130 for Ctrl-C.
     """
     from torchreg._checks import check_choice, check_positive
@@ -101,15 +110,25 @@ def track(
     check_choice(movie, "--movie", MOVIES)
     check_positive(fps, "--fps")
     check_positive(scale, "--scale")
-    files = _Files.at(with_ending(output, (".safetensors",), add=True), movie, gltf, overlay)
+    files = TrackFiles.at(with_ending(output, (".safetensors",), add=True), movie, gltf, overlay)
     resumed = resume and files.progress.exists()
     files.check(force or resumed)
-    clouds = _Clouds(load_frames(frames[0] if len(frames) == 1 else frames, nan_policy=nan_policy), scale)
+    views = {"--depth-range": depth_range, "--volume": volume, "--matcher": matcher, "--reach": reach, "--seen": seen}
+    check_used(stereo, "--stereo", {"--calibration": calibration, **views})
+    if stereo:
+        if scale != 1:
+            raise InputError("--scale has no meaning with --stereo: calibrations are in metres; leave it out")
+        model = load_shape(shape, parents, package_dir, free_base)
+        source = stereo_source(frames, calibration, model, depth_range, volume, matcher, reach)
+        clouds = Clouds(source, 1.0)
+        pictures = seen_folder(seen, files.result, force or resumed)
+    else:
+        clouds = Clouds(load_frames(frames[0] if len(frames) == 1 else frames, nan_policy=nan_policy), scale)
 
     from tqdm import tqdm
 
     with tqdm(total=len(clouds), unit="frame", desc="tracking", leave=False, disable=quiet) as bar:
-        model = load_shape(shape, parents, package_dir, free_base)
+        model = model if stereo else load_shape(shape, parents, package_dir, free_base)
         from torchreg.pipelines.storage import load_pose
         from torchreg.pipelines.track import TrackConfig, Tracker
         from torchreg.pipelines.track_progress import load_progress
@@ -118,9 +137,14 @@ def track(
             model_points=model_points, num_model_points=points, prediction=prediction, recovery=recovery, seed=seed
         )
         first = None if start is None else load_pose(start, model)
-        job = _job(shape, (parents, package_dir, free_base), first, config, fps, scale, nan_policy, clouds)
+        job = track_job(shape, (parents, package_dir, free_base), first, config, fps, scale, nan_policy, clouds)
         tracker = Tracker(model, first, config=config)
-        run = _TrackRun(tracker, clouds, fps, job, files, _Report(bar, clouds, quiet), save_every)
+        run = TrackRun(tracker, clouds, fps, job, files, Report(bar, clouds, quiet), save_every)
+        if stereo:
+            from torchreg.viz.seen import StereoPictures
+
+            run.job |= stereo_job(source)
+            run.seen = lambda skin: StereoPictures(source, skin, pictures)
         if resumed:
             run.go_on(load_progress(files.progress))
         complete = run.run()
@@ -130,263 +154,8 @@ def track(
             run.write(on_frame=lambda done, planned: bar.update())
     result = run.result
     if not quiet:
-        typer.echo(f"{_summary(result)} -> {files.result}")
+        typer.echo(f"{summary(result)} -> {files.result}")
     if not complete:
         raise interruption(f"{len(result.statuses)} of {len(clouds)} frames are done; --resume goes on from there")
     if not all(status.usable for status in result.statuses):
         raise typer.Exit(UNUSABLE)
-
-
-@dataclass(frozen=True)
-class _Files:
-    """Where the outputs go."""
-
-    result: Path
-    progress: Path
-    movie: Path | None
-    gltf: Path | None
-    overlay: Path | None
-
-    @classmethod
-    def at(cls, result: Path, movie: str, gltf: bool, overlay: Path | None) -> _Files:
-        moving = None if movie == "none" else result.with_suffix(f".{movie}")
-        scene = result.with_suffix(".glb") if gltf else None
-        return cls(result, result.with_suffix(".progress"), moving, scene, overlay)
-
-    def frame(self, number: int) -> Path:
-        """Return where the picture of a frame goes."""
-        return (self.overlay or Path()) / f"frame_{number:04d}.png"
-
-    def check(self, force: bool) -> None:
-        """Raise before any work is done if an output cannot be written, or exists and may not be overwritten."""
-        if self.progress.exists() and not force:
-            raise InputError(f"{self.progress} is how far an earlier run got; pass --resume to go on, or --force")
-        check_outputs([self.result, self.result.with_suffix(".json"), self.movie, self.gltf, self.progress], force)
-        if self.movie is not None and self.movie.suffix == ".mp4":
-            from torchreg.viz.animation import check_animation_path
-
-            check_animation_path(self.movie)
-        if self.overlay is not None:
-            if self.overlay.is_dir():
-                check_outputs([next(self.overlay.glob("frame_*.png"), None)], force)
-            self.overlay.mkdir(exist_ok=True)
-
-
-class _Clouds(Sequence["Tensor"]):
-    """The clouds (M, 3) in metres; those that cannot be read have no points.
-
-    Args:
-        frames: the sequence.
-        scale: its unit in metres.
-    """
-
-    def __init__(self, frames: Frames, scale: float) -> None:
-        self.names, self._frames, self._scale = frames.names, frames, scale
-        self.on_drop: Callable[[int, str], None] | None = None
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, index: Any) -> Any:
-        try:
-            return self._frames[index] * self._scale
-        except (FormatError, OSError) as error:
-            if self.on_drop is not None:
-                self.on_drop(index, " ".join(str(error).split()))
-        import torch
-
-        return torch.zeros(0, 3)
-
-
-def _job(
-    shape: str, options: tuple[Any, ...], start: Tensor | None, config: TrackConfig, fps: float, scale: float,
-    nan_policy: str, clouds: _Clouds,
-) -> dict[str, Any]:  # fmt: skip
-    """Return all that decides about the poses, as plain data."""
-    return {
-        "shape": shape, "shape options": [None if value is None else str(value) for value in options],
-        "--start": None if start is None else start.tolist(), "configuration": asdict(config), "--fps": fps,
-        "--scale": scale, "--nan-policy": nan_policy, "frames": list(clouds.names),
-    }  # fmt: skip
-
-
-@dataclass
-class _Report:
-    """Tells how a run goes on.
-
-    Args:
-        bar: of tqdm.
-        clouds: the frames.
-        quiet: whether only what went wrong with files is told.
-    """
-
-    bar: Any
-    clouds: _Clouds
-    quiet: bool
-    usable: bool = True
-    warned: bool = False
-
-    def frame(self, result: FrameResult) -> None:
-        """Show a frame that is done; say when the shape was lost and when it is back."""
-        status = result.statuses[0]
-        if not self.quiet:
-            self.bar.update()
-            self.bar.set_postfix_str(result.acquired)
-            if status.usable != self.usable:
-                what = f"back ({result.acquired})" if status.usable else status.value.replace("_", " ")
-                self.bar.write(f"{self.clouds.names[result.frame]}: {what}")
-        self.usable = status.usable
-
-    def dropped(self, number: int, reason: str) -> None:
-        """Tell that a frame cannot be read."""
-        self.bar.clear()
-        typer.echo(f"torchreg: warning: frame {number} is dropped: {reason}", err=True)
-
-    @contextmanager
-    def warnings(self) -> Iterator[None]:
-        """Tell the first warning of other units only: all frames have the same."""
-
-        def show(
-            message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None,
-            line: str | None = None,
-        ) -> None:  # fmt: skip
-            if not (self.warned and issubclass(category, UnitsWarning)):
-                self.bar.clear()
-                show_warning(message, category, filename, lineno)
-            self.warned = self.warned or issubclass(category, UnitsWarning)
-
-        with warnings.catch_warnings():
-            warnings.showwarning = show
-            yield
-
-
-@dataclass
-class _TrackRun:
-    """Tracks frame after frame, and keeps on disk how far it got.
-
-    Args:
-        tracker: of the shape.
-        clouds: the frames.
-        fps: frames per second.
-        job: what decides about the poses.
-        files: where outputs go.
-        report: tells how it goes on.
-        save_every: frames between two writings.
-        parts: results of the frames done.
-        state: after them.
-    """
-
-    tracker: Tracker
-    clouds: _Clouds
-    fps: float
-    job: dict[str, Any]
-    files: _Files
-    report: _Report
-    save_every: int
-    parts: list[TrackResult] = field(default_factory=list)
-    state: TrackState = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.state = self.tracker.state
-
-    @property
-    def result(self) -> TrackResult:
-        """All frames done."""
-        from torchreg.pipelines.track_progress import join_frames
-
-        self.parts[:] = [reduce(join_frames, self.parts)]
-        return self.parts[0]
-
-    @cached_property
-    def surface(self) -> LinearBlendSkin:
-        """What pictures show, meshed once."""
-        from torchreg.viz.animation import coarse_skin
-
-        return coarse_skin(self.tracker.shape)
-
-    def go_on(self, progress: TrackProgress) -> None:
-        """Begin where an earlier run of the same command ended."""
-        done = len(progress.result.statuses)
-        frames = {"frames": self.job["frames"][:done]}
-        before = {**progress.job, "frames": progress.job.get("frames", [])[:done]}
-        other = [name for name, value in {**self.job, **frames}.items() if before.get(name) != value]
-        if other:
-            raise InputError(
-                f"{self.files.progress} was written by another command: {', '.join(other)} differ; repeat that one, or "
-                f"pass --force without --resume to begin anew"
-            )
-        self.tracker.state = self.state = progress.state
-        self.parts = [progress.result]
-        self.report.usable = progress.result.statuses[-1].usable
-        self.report.bar.update(done)
-
-    def run(self) -> bool:
-        """Track what is left, and return whether all is done; what is done is on disk."""
-        from torchreg.pipelines.track_progress import TrackProgress, save_progress
-
-        overlays = self._overlays()
-        self.clouds.on_drop = self.report.dropped
-        complete = True
-        while complete and self.state.frame < len(self.clouds):
-            end = min(self.state.frame + self.save_every, len(self.clouds))
-            with self.report.warnings():
-                self._part(range(self.state.frame, end), overlays)
-            complete = self.state.frame == end
-            save_progress(self.files.progress, TrackProgress(self.result, self.state, self.job))
-        self.clouds.on_drop = None
-        self.result.save(self.files.result)
-        return complete
-
-    def _part(self, numbers: range, overlay: Callable[[Tensor, FrameResult], object] | None) -> None:
-        """Track some frames; fewer are done if the keyboard interrupts."""
-        from torchreg.pipelines.track_progress import first_frames
-
-        def note(points: Tensor, frame: FrameResult) -> None:
-            if overlay is not None:
-                overlay(points, frame)
-            self.report.frame(frame)
-            # A frame counts as done when all of it is.
-            self.state = self.tracker.state
-
-        times = [number / self.fps for number in numbers]
-        try:
-            result = self.tracker.run((self.clouds[number] for number in numbers), note, times=times)
-        except KeyboardInterrupt:
-            if not self.parts:
-                raise
-            return
-        done = self.state.frame - numbers.start
-        if not done and not self.parts:
-            raise KeyboardInterrupt
-        self.parts.append(first_frames(result, done))
-
-    def _overlays(self) -> Callable[[Tensor, FrameResult], object] | None:
-        if self.files.overlay is None:
-            return None
-        from torchreg.viz.tracking import FrameOverlays
-
-        overlays = FrameOverlays(self.tracker.shape, self.surface)
-        return lambda points, frame: overlays.save(self.files.frame(frame.frame), points, frame)
-
-    def write(self, on_frame: Callable[[int, int], None]) -> None:
-        """Write the moving shape and the moving picture, where asked for."""
-        from torchreg.viz.tracking import animate_track, save_track_gltf
-
-        result, shape = self.result, self.tracker.shape
-        if self.files.gltf is not None and bool(result.poses.isfinite().all(-1).any()):
-            save_track_gltf(self.files.gltf, shape, result)
-        if self.files.movie is not None:
-            animate_track(
-                self.files.movie, shape, result, self.clouds, fps=self.fps, skin=self.surface, on_frame=on_frame
-            )
-
-
-def _summary(result: TrackResult) -> str:
-    """Return what became of the frames, and the usual time for one, in one line."""
-    usable = sum(status.usable for status in result.statuses)
-    others = Counter(status.value.replace("_", " ") for status in result.statuses if not status.usable)
-    counts = [f"{usable} tracked", *(f"{count} {name}" for name, count in others.items())]
-    # The mean tells of searches rather than of frames.
-    usual = 1e3 * float(result.seconds.median())
-    number = f"{len(result.statuses)} frame{'s' * (len(result.statuses) > 1)}"
-    return f"{number}: {', '.join(counts)}; {usual:.0f} ms per frame"

@@ -1,0 +1,64 @@
+import pytest
+import torch
+
+from torchreg.errors import InputError
+from torchreg.geometry.camera import Camera
+from torchreg.geometry.mesh import TriangleMesh, unit_sphere
+from torchreg.viz.seen import cut_picture, hull_picture, mask_outline, model_mask, picture_with_points, ramp_colors
+
+CAMERA = Camera.looking_at([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], focal=60.0, width=48, height=40)
+
+
+def test_ramp_goes_from_dark_blue_to_orange():
+    colors = ramp_colors(torch.tensor([1.0, 2.0, 9.0, torch.nan]), 1.0, 3.0)
+    assert colors[0, 2] > colors[0, 0]
+    assert colors[2, 0] > 0.9
+    assert torch.equal(colors[3], torch.zeros(3))
+    assert torch.equal(ramp_colors(torch.tensor([3.0]), 1.0, 3.0)[0], colors[2])
+    with pytest.raises(InputError, match="highest must be above lowest"):
+        ramp_colors(torch.zeros(1), 1.0, 1.0)
+
+
+def test_points_are_squares_and_inliers_hide_others():
+    pixels = torch.tensor([[10.0, 5.0], [11.0, 5.0], [-1.0, 0.0], [torch.nan, 1.0]])
+    drawn = picture_with_points(torch.zeros(12, 20), pixels, torch.tensor([True, False, True, True]))
+    assert drawn.shape == (12, 20, 3)
+    blue, red = drawn[5, 9], drawn[5, 12]
+    assert (drawn[4:7, 9:12] == blue).all()
+    assert (drawn[4:7, 12] == red).all()
+    assert blue[2] > blue[0]
+    assert red[0] > red[2]
+    assert torch.equal(drawn[0, 0], blue)  # half beside the picture
+    assert torch.allclose(drawn[11], torch.full((20, 3), 0.4))
+    with pytest.raises(InputError, match="inliers must have shape"):
+        picture_with_points(torch.zeros(12, 20), pixels, torch.ones(3, dtype=torch.bool))
+
+
+def test_outline_of_a_ball_runs_around_its_mask():
+    mesh = unit_sphere(3, dtype=torch.float64)
+    ball = TriangleMesh(0.1 * mesh.vertices + mesh.vertices.new_tensor([0.0, 0.0, 0.5]), mesh.faces)
+    mask = model_mask(ball, CAMERA)
+    outline = mask_outline(mask)
+    assert 0 < outline.sum() < mask.sum()
+    assert (outline & ~mask).sum() == 0
+    assert not outline[20, 24]
+    drawn = picture_with_points(torch.zeros(40, 48, 3), torch.zeros(0, 2), torch.zeros(0, dtype=torch.bool), outline)
+    assert torch.equal((drawn[..., 1] == 1.0), outline)
+    behind = TriangleMesh(-ball.vertices, ball.faces)
+    assert not model_mask(behind, CAMERA).any()
+
+
+def test_cut_and_hull_pictures_tell_pixels_apart():
+    depth = torch.tensor([[0.0, 1.0, 2.0], [1.0, 1.5, 2.0]])
+    kept = torch.tensor([[False, True, False], [True, True, True]])
+    colors = cut_picture(depth, kept)
+    assert torch.equal(colors[0, 0], torch.zeros(3))
+    assert colors[0, 2, 0] == 1.0
+    assert torch.equal(colors[0, 1], colors[1, 0])
+    assert not torch.equal(colors[0, 1], colors[1, 2])
+    mask, hull = torch.tensor([[True, True, False, False]]), torch.tensor([[True, False, True, False]])
+    row = hull_picture(mask, hull)[0]
+    assert len({tuple(color.tolist()) for color in row}) == 4
+    assert torch.equal(row[3], torch.zeros(3))
+    with pytest.raises(InputError, match="hull must have shape"):
+        hull_picture(mask, hull[:, :2])

@@ -1,0 +1,124 @@
+"""Options of commands that begin at pictures, and the folder in which they show what was seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from torchreg.errors import InputError
+
+if TYPE_CHECKING:
+    from torchreg.capture.stereo_frames import StereoFrames
+    from torchreg.geometry.camera_rig import CameraRig
+    from torchreg.models.articulated import ArticulatedShape
+
+Calibration = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="The cameras: .json, OpenCV's .yml, or a folder of COLMAP's text files."),
+]
+DepthRange = Annotated[
+    tuple[float, float] | None,
+    typer.Option(metavar="NEAR FAR", help="Depths of interest, metres; what lies beyond is background."),
+]
+Volume = Annotated[
+    tuple[float, float, float, float, float, float] | None,
+    typer.Option(metavar="X Y Z X Y Z", help="Lower and upper corner of the volume of interest, metres."),
+]
+Matcher = Annotated[
+    str | None,
+    typer.Option(help="How pictures are matched: semi-global, block, or opencv, the default where it is installed."),
+]
+Reach = Annotated[
+    float | None,
+    typer.Option(
+        help="What comes in through the border of the picture, as an arm, is cut off so far from its far end, metres; "
+        "0 keeps it. By default the length of a hand; other shapes keep all."
+    ),
+]
+Seen = Annotated[
+    Path | None,
+    typer.Option(metavar="FOLDER", help="Where pictures of what was seen go; by default RESULT_seen."),
+]
+
+
+def check_used(wanted: bool, flag: str, options: Mapping[str, Any]) -> None:
+    """Raise InputError if options are given that mean nothing without a flag."""
+    for name, value in options.items():
+        if value is not None and not wanted:
+            raise InputError(f"{name} has no meaning without {flag}; leave it out")
+
+
+def seen_folder(seen: Path | None, result: Path, force: bool) -> Path:
+    """Return the folder for pictures, made if need be; InputError if it holds some that may not be overwritten."""
+    folder = seen or result.with_name(f"{result.stem}_seen")
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} must be a folder, it is a file; name another with --seen")
+    if folder.is_dir() and not force and any(folder.glob("*.png")):
+        raise InputError(f"{folder} holds pictures; pass --force to overwrite them, or name another folder with --seen")
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
+def load_rig(calibration: Path | None, flag: str) -> CameraRig:
+    """Return the cameras of a calibration, which a flag calls for."""
+    from torchreg.io.calibration import load_cameras
+
+    if calibration is None:
+        raise InputError(f"{flag} takes --calibration FILE with the cameras")
+    return load_cameras(calibration)
+
+
+def stereo_source(
+    folders: list[Path],
+    calibration: Path | None,
+    shape: ArticulatedShape,
+    depths: tuple[float, float] | None,
+    volume: tuple[float, ...] | None,
+    matcher: str | None,
+    reach: float | None,
+) -> StereoFrames:
+    """Return the clouds of stereo pictures; the first pair has been looked at, so that swapped ones are refused."""
+    from importlib.util import find_spec
+
+    import torch
+
+    from torchreg.capture.stereo import StereoConfig
+    from torchreg.capture.stereo_frames import StereoFrames
+    from torchreg.models.hand import Hand
+
+    if len(folders) != 2:
+        raise InputError(
+            f"--stereo takes two folders as FRAMES, the left pictures and the right ones; got {len(folders)}"
+        )
+    rig = load_rig(calibration, "--stereo")
+    if len(rig) != 2:
+        raise InputError(f"--calibration must hold the left and the right camera, in this order; got {len(rig)}")
+    method = matcher or ("opencv" if find_spec("cv2") else "semi-global")
+    near, far = depths or (StereoConfig.nearest, StereoConfig.farthest)
+    if reach is None and isinstance(shape, Hand):
+        reach = shape.length
+    frames = StereoFrames(
+        folders[0],
+        folders[1],
+        rig.stereo(),
+        config=StereoConfig(nearest=near, farthest=far, method=method),
+        box=None if volume is None else torch.tensor(volume).reshape(2, 3),
+        reach=reach or None,
+    )
+    frames.sight(0)
+    return frames
+
+
+def stereo_job(frames: StereoFrames) -> dict[str, Any]:
+    """Return what decides about the clouds of stereo pictures, as plain data."""
+    from dataclasses import asdict
+
+    cameras = [
+        [camera.intrinsics.tolist(), camera.world_to_camera.tolist(), camera.distortion.tolist()]
+        for camera in (frames.pair.left, frames.pair.right)
+    ]
+    box = None if frames.box is None else frames.box.tolist()
+    return {"cameras": cameras, "configuration": asdict(frames.config), "--volume": box, "--reach": frames.reach}

@@ -1,0 +1,292 @@
+"""What ``torchreg track`` does: frames one after another, how far it got kept on disk, what is told and written."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from functools import cached_property, reduce
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+import typer
+
+from torchreg.cli.outputs import check_outputs
+from torchreg.cli.reporting import show_warning
+from torchreg.errors import FormatError, InputError, UnitsWarning
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from torch import Tensor
+
+    from torchreg.capture.stereo_frames import StereoFrames
+    from torchreg.io.frames import Frames
+    from torchreg.models.skin import LinearBlendSkin
+    from torchreg.pipelines.track import TrackConfig, Tracker
+    from torchreg.pipelines.track_progress import TrackProgress
+    from torchreg.results import FrameResult, TrackResult, TrackState
+
+    OnFrame = Callable[[Tensor, FrameResult], object]
+
+
+@dataclass(frozen=True)
+class TrackFiles:
+    """Where the outputs go."""
+
+    result: Path
+    progress: Path
+    movie: Path | None
+    gltf: Path | None
+    overlay: Path | None
+
+    @classmethod
+    def at(cls, result: Path, movie: str, gltf: bool, overlay: Path | None) -> TrackFiles:
+        """Return them for a result, and what else is asked for."""
+        moving = None if movie == "none" else result.with_suffix(f".{movie}")
+        scene = result.with_suffix(".glb") if gltf else None
+        return cls(result, result.with_suffix(".progress"), moving, scene, overlay)
+
+    def frame(self, number: int) -> Path:
+        """Return where the picture of a frame goes."""
+        return (self.overlay or Path()) / f"frame_{number:04d}.png"
+
+    def check(self, force: bool) -> None:
+        """Raise before any work is done if an output cannot be written, or exists and may not be overwritten."""
+        if self.progress.exists() and not force:
+            raise InputError(f"{self.progress} is how far an earlier run got; pass --resume to go on, or --force")
+        check_outputs([self.result, self.result.with_suffix(".json"), self.movie, self.gltf, self.progress], force)
+        if self.movie is not None and self.movie.suffix == ".mp4":
+            from torchreg.viz.animation import check_animation_path
+
+            check_animation_path(self.movie)
+        if self.overlay is not None:
+            if self.overlay.is_dir():
+                check_outputs([next(self.overlay.glob("frame_*.png"), None)], force)
+            self.overlay.mkdir(exist_ok=True)
+
+
+class Clouds(Sequence["Tensor"]):
+    """The clouds (M, 3) in metres; those that cannot be read have no points.
+
+    Args:
+        frames: the sequence.
+        scale: its unit in metres.
+    """
+
+    def __init__(self, frames: Frames | StereoFrames, scale: float) -> None:
+        self.names, self._frames, self._scale = frames.names, frames, scale
+        self.on_drop: Callable[[int, str], None] | None = None
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: Any) -> Any:
+        try:
+            return self._frames[index] * self._scale
+        except (FormatError, OSError) as error:
+            if self.on_drop is not None:
+                self.on_drop(index, " ".join(str(error).split()))
+        import torch
+
+        return torch.zeros(0, 3)
+
+
+def track_job(
+    shape: str, options: tuple[Any, ...], start: Tensor | None, config: TrackConfig, fps: float, scale: float,
+    nan_policy: str, clouds: Clouds,
+) -> dict[str, Any]:  # fmt: skip
+    """Return all that decides about the poses, as plain data."""
+    return {
+        "shape": shape, "shape options": [None if value is None else str(value) for value in options],
+        "--start": None if start is None else start.tolist(), "configuration": asdict(config), "--fps": fps,
+        "--scale": scale, "--nan-policy": nan_policy, "frames": list(clouds.names),
+    }  # fmt: skip
+
+
+@dataclass
+class Report:
+    """Tells how a run goes on.
+
+    Args:
+        bar: of tqdm.
+        clouds: the frames.
+        quiet: whether only what went wrong with files is told.
+    """
+
+    bar: Any
+    clouds: Clouds
+    quiet: bool
+    usable: bool = True
+    warned: bool = False
+
+    def frame(self, result: FrameResult) -> None:
+        """Show a frame that is done; say when the shape was lost and when it is back."""
+        status = result.statuses[0]
+        if not self.quiet:
+            self.bar.update()
+            self.bar.set_postfix_str(result.acquired)
+            if status.usable != self.usable:
+                what = f"back ({result.acquired})" if status.usable else status.value.replace("_", " ")
+                self.bar.write(f"{self.clouds.names[result.frame]}: {what}")
+        self.usable = status.usable
+
+    def dropped(self, number: int, reason: str) -> None:
+        """Tell that a frame cannot be read."""
+        self.bar.clear()
+        typer.echo(f"torchreg: warning: frame {number} is dropped: {reason}", err=True)
+
+    @contextmanager
+    def warnings(self) -> Iterator[None]:
+        """Tell the first warning of other units only: all frames have the same."""
+
+        def show(
+            message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:  # fmt: skip
+            if not (self.warned and issubclass(category, UnitsWarning)):
+                self.bar.clear()
+                show_warning(message, category, filename, lineno)
+            self.warned = self.warned or issubclass(category, UnitsWarning)
+
+        with warnings.catch_warnings():
+            warnings.showwarning = show
+            yield
+
+
+@dataclass
+class TrackRun:
+    """Tracks frame after frame, and keeps on disk how far it got.
+
+    Args:
+        tracker: of the shape.
+        clouds: the frames.
+        fps: frames per second.
+        job: what decides about the poses.
+        files: where outputs go.
+        report: tells how it goes on.
+        save_every: frames between two writings.
+        seen: draws what the cameras saw of a frame, or None.
+        parts: results of the frames done.
+        state: after them.
+    """
+
+    tracker: Tracker
+    clouds: Clouds
+    fps: float
+    job: dict[str, Any]
+    files: TrackFiles
+    report: Report
+    save_every: int
+    seen: Callable[[LinearBlendSkin], OnFrame] | None = None
+    parts: list[TrackResult] = field(default_factory=list)
+    state: TrackState = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.state = self.tracker.state
+
+    @property
+    def result(self) -> TrackResult:
+        """All frames done."""
+        from torchreg.pipelines.track_progress import join_frames
+
+        self.parts[:] = [reduce(join_frames, self.parts)]
+        return self.parts[0]
+
+    @cached_property
+    def surface(self) -> LinearBlendSkin:
+        """What pictures show, meshed once."""
+        from torchreg.viz.animation import coarse_skin
+
+        return coarse_skin(self.tracker.shape)
+
+    def go_on(self, progress: TrackProgress) -> None:
+        """Begin where an earlier run of the same command ended."""
+        done = len(progress.result.statuses)
+        frames = {"frames": self.job["frames"][:done]}
+        before = {**progress.job, "frames": progress.job.get("frames", [])[:done]}
+        other = [name for name, value in {**self.job, **frames}.items() if before.get(name) != value]
+        if other:
+            raise InputError(
+                f"{self.files.progress} was written by another command: {', '.join(other)} differ; repeat that one, or "
+                f"pass --force without --resume to begin anew"
+            )
+        self.tracker.state = self.state = progress.state
+        self.parts = [progress.result]
+        self.report.usable = progress.result.statuses[-1].usable
+        self.report.bar.update(done)
+
+    def run(self) -> bool:
+        """Track what is left, and return whether all is done; what is done is on disk."""
+        from torchreg.pipelines.track_progress import TrackProgress, save_progress
+
+        overlays = self._overlays()
+        self.clouds.on_drop = self.report.dropped
+        complete = True
+        while complete and self.state.frame < len(self.clouds):
+            end = min(self.state.frame + self.save_every, len(self.clouds))
+            with self.report.warnings():
+                self._part(range(self.state.frame, end), overlays)
+            complete = self.state.frame == end
+            save_progress(self.files.progress, TrackProgress(self.result, self.state, self.job))
+        self.clouds.on_drop = None
+        self.result.save(self.files.result)
+        return complete
+
+    def _part(self, numbers: range, overlays: Sequence[OnFrame]) -> None:
+        """Track some frames; fewer are done if the keyboard interrupts."""
+        from torchreg.pipelines.track_progress import first_frames
+
+        def note(points: Tensor, frame: FrameResult) -> None:
+            for overlay in overlays:
+                overlay(points, frame)
+            self.report.frame(frame)
+            # A frame counts as done when all of it is.
+            self.state = self.tracker.state
+
+        times = [number / self.fps for number in numbers]
+        try:
+            result = self.tracker.run((self.clouds[number] for number in numbers), note, times=times)
+        except KeyboardInterrupt:
+            if not self.parts:
+                raise
+            return
+        done = self.state.frame - numbers.start
+        if not done and not self.parts:
+            raise KeyboardInterrupt
+        self.parts.append(first_frames(result, done))
+
+    def _overlays(self) -> list[OnFrame]:
+        """Return what draws each frame as soon as it is done."""
+        drawn: list[OnFrame] = [] if self.seen is None else [self.seen(self.surface)]
+        if self.files.overlay is not None:
+            from torchreg.viz.tracking import FrameOverlays
+
+            overlays = FrameOverlays(self.tracker.shape, self.surface)
+            drawn.append(lambda points, frame: overlays.save(self.files.frame(frame.frame), points, frame))
+        return drawn
+
+    def write(self, on_frame: Callable[[int, int], None]) -> None:
+        """Write the moving shape and the moving picture, where asked for."""
+        from torchreg.viz.tracking import animate_track, save_track_gltf
+
+        result, shape = self.result, self.tracker.shape
+        if self.files.gltf is not None and bool(result.poses.isfinite().all(-1).any()):
+            save_track_gltf(self.files.gltf, shape, result)
+        if self.files.movie is not None:
+            animate_track(
+                self.files.movie, shape, result, self.clouds, fps=self.fps, skin=self.surface, on_frame=on_frame
+            )
+
+
+def summary(result: TrackResult) -> str:
+    """Return what became of the frames, and the usual time for one, in one line."""
+    usable = sum(status.usable for status in result.statuses)
+    others = Counter(status.value.replace("_", " ") for status in result.statuses if not status.usable)
+    counts = [f"{usable} tracked", *(f"{count} {name}" for name, count in others.items())]
+    # The mean tells of searches rather than of frames.
+    usual = 1e3 * float(result.seconds.median())
+    number = f"{len(result.statuses)} frame{'s' * (len(result.statuses) > 1)}"
+    return f"{number}: {', '.join(counts)}; {usual:.0f} ms per frame"
