@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 
 from torchreg.datasets.creatures import STARFISH, creature_sequence
+from torchreg.datasets.pictures import camera_ring
+from torchreg.io.calibration import save_cameras
+from torchreg.io.images import save_image
 from torchreg.io.points import save_points
 from torchreg.io.swc import load_swc
 from torchreg.pipelines.storage import load
+from torchreg.viz.seen import model_mask
 
 
 @pytest.fixture(scope="module")
@@ -16,6 +20,19 @@ def frames(tmp_path_factory):
     for number, mesh in zip((2, 10, 11), creature_sequence(STARFISH, 3, resolution=32).meshes, strict=True):
         save_points(folder / f"frame{number}.ply", mesh.vertices, faces=mesh.faces)
     return folder
+
+
+@pytest.fixture(scope="module")
+def masks(tmp_path_factory):
+    """Folders with the mask of a starfish, one per camera, and the calibration."""
+    place = tmp_path_factory.mktemp("masks")
+    mesh = creature_sequence(STARFISH, 1, resolution=32).meshes[0]
+    ring = camera_ring(mesh.vertices.mean(0), 5.0, 10, focal=190.0, width=120, height=120)
+    for camera in ring:
+        (place / camera.name).mkdir()
+        save_image(place / camera.name / "0.png", model_mask(mesh, camera))
+    save_cameras(place / "calib.json", ring)
+    return [place / name for name in ring.names], place / "calib.json"
 
 
 def test_everything_is_written(run, frames, tmp_path):
@@ -58,3 +75,21 @@ def test_errors_take_one_line(error_of, frames, tmp_path):
     assert "must end in .swc" in error_of("spine", frames, *out, "--swc", tmp_path / "a.txt")
     assert "num_tips must be what a frame shows" in error_of("spine", frames, *out, "--tips", 9)
     assert "--fps must be positive" in error_of("spine", frames, *out, "--fps", 0)
+
+
+def test_masks_of_several_cameras_become_a_spine(run, error_of, masks, tmp_path):
+    folders, calibration = masks
+    command = ("spine", "--silhouettes", *folders, "--calibration", calibration, "--resolution", 48)
+    answer = run(*command, "-o", tmp_path / "s.glb", "--progress", tmp_path / "kept")
+    assert answer.exit_code == 0, answer.output
+    assert "5 tips, 1 junctions, 5 limbs" in answer.output
+    whole = load(tmp_path / "s.safetensors")
+    assert whole.num_tips == 5
+    assert [path.name for path in (tmp_path / "s_seen").iterdir()] == ["hull_0000.png"]
+    assert run(*command, "-o", tmp_path / "s.glb", "--progress", tmp_path / "kept", "--force").exit_code == 0
+    assert (load(tmp_path / "s.safetensors").curves == whole.curves).all()
+    out = ("-o", tmp_path / "t.glb")
+    assert "--silhouettes takes --calibration" in error_of("spine", "--silhouettes", *folders, *out)
+    assert "no meaning without --silhouettes" in error_of("spine", *folders, "--resolution", 64, *out)
+    assert "holds pictures" in error_of(*command, *out, "--seen", tmp_path / "s_seen")
+    assert "folders must be one per camera" in error_of("spine", "--silhouettes", tmp_path, *command[-4:], *out)

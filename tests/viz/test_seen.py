@@ -1,10 +1,19 @@
 import pytest
 import torch
 
+from torchreg.datasets.pictures import camera_ring
 from torchreg.errors import InputError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
-from torchreg.viz.seen import cut_picture, hull_picture, mask_outline, model_mask, picture_with_points, ramp_colors
+from torchreg.viz.seen import (
+    cut_picture,
+    hull_picture,
+    hull_sheet,
+    mask_outline,
+    model_mask,
+    picture_with_points,
+    ramp_colors,
+)
 
 CAMERA = Camera.looking_at([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], focal=60.0, width=48, height=40)
 
@@ -62,3 +71,29 @@ def test_cut_and_hull_pictures_tell_pixels_apart():
     assert torch.equal(row[3], torch.zeros(3))
     with pytest.raises(InputError, match="hull must have shape"):
         hull_picture(mask, hull[:, :2])
+
+
+def test_model_mask_follows_the_lens():
+    mesh = unit_sphere(3, dtype=torch.float64)
+    ball = TriangleMesh(0.1 * mesh.vertices + mesh.vertices.new_tensor([0.1, 0.05, 0.5]), mesh.faces)
+    lens = Camera(48, 40, [60.0, 55.0, 23.5, 19.5], distortion=(-0.3, 0.1, 0.0, 0.0))
+    mask = model_mask(ball, lens)
+    rays = lens.directions(lens.pixel_grid())
+    center = rays.new_tensor([0.1, 0.05, 0.5])
+    exact = (rays @ center) ** 2 > (rays**2).sum(-1) * ((center**2).sum() - 0.01)
+    assert exact.sum() > 100
+    assert (mask ^ exact).sum() < 0.1 * exact.sum()
+
+
+def test_sheet_holds_the_picture_of_every_camera():
+    mesh = unit_sphere(3, dtype=torch.float64)
+    ball = TriangleMesh(0.1 * mesh.vertices, mesh.faces)
+    ring = camera_ring([0.0, 0.0, 0.0], 0.6, 3, focal=60.0, width=48, height=40)
+    masks = [model_mask(ball, camera) for camera in ring]
+    sheet = hull_sheet(masks, ring, ball, width=48)
+    assert sheet.shape == (84, 100, 3)
+    assert torch.equal(sheet[1:41, 1:49], hull_picture(masks[0], masks[0]))
+    assert not sheet[42:, 50:].any()
+    assert hull_sheet(masks, ring, ball, width=24).shape == (44, 52, 3)
+    with pytest.raises(InputError, match="one per camera"):
+        hull_sheet(masks[:2], ring, ball)

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from torchreg.cli.cameras import Calibration, Seen, check_used, load_rig, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, numbered, with_ending
 from torchreg.cli.reporting import reporting
 
 if TYPE_CHECKING:
+    from torchreg.capture.silhouette_frames import SilhouetteFrames
     from torchreg.geometry.mesh import TriangleMesh
     from torchreg.models.spine import Spine
     from torchreg.results import SpineSequence
@@ -24,13 +26,24 @@ def spine(
         typer.Argument(
             metavar="FRAMES",
             help="The meshes, in any unit: files, which are put in the order of the numbers in their names, or one "
-            "folder of them.",
+            "folder of them. With --silhouettes one folder of masks per camera.",
         ),
     ],
     output: Annotated[
         Path,
         typer.Option("--output", "-o", metavar="OUT.glb", help="OUT.glb, OUT.safetensors and OUT.json are written."),
     ] = Path("spine.glb"),
+    silhouettes: Annotated[
+        bool, typer.Option("--silhouettes", help="FRAMES are folders of masks, or with --screen of pictures.")
+    ] = False,
+    calibration: Calibration = None,
+    screen: Annotated[
+        bool | None, typer.Option("--screen", help="Pictures before a screen of one color stand for masks.")
+    ] = None,
+    resolution: Annotated[
+        int | None, typer.Option(min=8, help="Voxels along the longest side of a hull; 128 by default.")
+    ] = None,
+    seen: Seen = None,
     swc: Annotated[
         Path | None, typer.Option(metavar="OUT.swc", help="Also write the curves as SWC, one numbered file per frame.")
     ] = None,
@@ -59,6 +72,10 @@ def spine(
     The glTF file shows the curves in the translucent surface of one frame, which they move. Everything is in the
     .safetensors file, which `torchreg.load` reads.
 
+    With --silhouettes CAMERA... --calibration FILE the meshes are visual hulls; a folder belongs to the camera of its
+    name, or all are in the order of the cameras. How hulls cover masks goes to OUT_seen: white, red where a hull misses
+    its mask, blue beyond it.
+
     Exit codes: 0; 2 for an error; 130 for Ctrl-C.
     """
     from torchreg._checks import check_positive
@@ -68,14 +85,23 @@ def spine(
     result = glb.with_suffix(".safetensors")
     swc = with_ending(swc, (".swc",))
     npz = with_ending(npz, (".npz",))
-    meshes, names = _read(frames)
-    curves = [numbered(swc, frame, len(meshes)) for frame in range(len(meshes))] if swc is not None else []
+    hulls = {"--calibration": calibration, "--screen": screen, "--resolution": resolution, "--seen": seen}
+    check_used(silhouettes, "--silhouettes", hulls)
+    if silhouettes:
+        source = _silhouettes(frames, calibration, bool(screen), resolution)
+        count, names = len(source), source.names
+    else:
+        meshes, names = _read(frames)
+        count = len(meshes)
+    curves = [numbered(swc, frame, count) for frame in range(count)] if swc is not None else []
     check_outputs([glb, result, result.with_suffix(".json"), npz, movie, *curves], force)
     if movie is not None:
         from torchreg.viz.animation import check_animation_path
 
         check_animation_path(movie)
 
+    if silhouettes:
+        meshes = _hulls(source, seen_folder(seen, glb, force), progress, quiet)
     from tqdm import tqdm
 
     from torchreg.pipelines.extract_spine import SpineConfig, extract_spine
@@ -102,6 +128,29 @@ def _read(frames: list[Path]) -> tuple[list[TriangleMesh], tuple[str, ...]]:
         raise InputError("FRAMES must be files of meshes, not of arrays; give a folder, or files such as *.ply")
     names = load_frames(frames[0] if len(frames) == 1 else frames).names
     return [load_mesh(name) for name in names], names
+
+
+def _silhouettes(
+    folders: list[Path], calibration: Path | None, screen: bool, resolution: int | None
+) -> SilhouetteFrames:
+    from torchreg.capture.silhouette_frames import SilhouetteFrames
+
+    rig = load_rig(calibration, "--silhouettes")
+    return SilhouetteFrames(folders, rig, screen=screen, resolution=resolution or 128)
+
+
+def _hulls(source: SilhouetteFrames, folder: Path, progress: Path | None, quiet: bool) -> list[TriangleMesh]:
+    """Return the visual hulls of all frames, and draw how each covers its masks."""
+    from tqdm import tqdm
+
+    from torchreg.io.images import save_image
+    from torchreg.viz.seen import hull_sheet
+
+    meshes = []
+    for number in tqdm(range(len(source)), unit="frame", desc="hulls", leave=False, disable=quiet):
+        meshes.append(source.mesh(number, progress))
+        save_image(folder / f"hull_{number:04d}.png", hull_sheet(source.masks(number), source.cameras, meshes[-1]))
+    return meshes
 
 
 def _write(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -11,6 +13,7 @@ from torchreg._checks import check_shape
 from torchreg.capture.stereo_frames import StereoFrames
 from torchreg.errors import FormatError, InputError
 from torchreg.geometry.camera import Camera
+from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.visibility import rasterize
 from torchreg.io.images import save_image
@@ -75,12 +78,21 @@ def picture_with_points(
 def model_mask(mesh: TriangleMesh, camera: Camera) -> Tensor:
     """Return which pixels (H, W) of a camera show a mesh; none if a part of it lies beside or behind the camera.
 
-    Raises:
-        InputError: as `Camera.view`.
+    What a lens bends into the picture from beyond the border of a plain one is left out.
     """
     if bool((camera.project(mesh.vertices)[1] <= 0).any()):
         return torch.zeros(camera.height, camera.width, dtype=torch.bool)
-    return rasterize(mesh, camera.view()).face_index >= 0
+    focal, center = camera.intrinsics.split(2)
+    square = focal.mean().expand(2)
+    plain = Camera(camera.width, camera.height, torch.cat((square, center)), camera.world_to_camera)
+    mask = rasterize(mesh, plain.view()).face_index >= 0
+    if not camera.is_distorted and bool((focal == square).all()):
+        return mask
+    plane = camera.undistorted((camera.pixel_grid() - center) / focal)
+    pixels = plane * square + center
+    column, row = pixels.nan_to_num(0.0).round().long().unbind(-1)
+    there = mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
+    return there & plain.contains(pixels)
 
 
 def mask_outline(mask: Tensor) -> Tensor:
@@ -126,6 +138,37 @@ def hull_picture(mask: Tensor, hull: Tensor) -> Tensor:
     for where, color in ((mask & hull, (0.9, 0.9, 0.9)), (mask & ~hull, _OUTLIER), (hull & ~mask, _INLIER)):
         colors[where] = colors.new_tensor(color)
     return colors
+
+
+def hull_sheet(masks: Sequence[Tensor], cameras: CameraRig, mesh: TriangleMesh, width: int = 240) -> Tensor:
+    """Return the `hull_picture` of every camera side by side in rows, each about so many pixels wide, (H, W, 3).
+
+    Args:
+        masks: one (H, W) bool per camera.
+        cameras: calibrated.
+        mesh: the surface of the hull.
+        width: of each picture, pixels.
+
+    Raises:
+        InputError: if there are not as many masks as cameras.
+    """
+    if len(masks) != len(cameras):
+        raise InputError(f"masks must be one per camera, got {len(masks)} and {len(cameras)} cameras")
+    pictures = []
+    for mask, camera in zip(masks, cameras, strict=True):
+        step = max(1, camera.width // width)
+        small = camera.scaled(1 / step)
+        rows, columns = (torch.arange(side) * step + step // 2 for side in (small.height, small.width))
+        kept = mask[rows.clamp(max=mask.shape[0] - 1)][:, columns.clamp(max=mask.shape[1] - 1)]
+        picture = hull_picture(kept, model_mask(mesh, small))
+        pictures.append(torch.nn.functional.pad(picture.movedim(-1, 0), (1, 1, 1, 1), value=0.3))
+    across = math.ceil(len(pictures) ** 0.5)
+    high, wide = (max(picture.shape[side] for picture in pictures) for side in (1, 2))
+    sheet = torch.zeros(3, high * math.ceil(len(pictures) / across), wide * across)
+    for number, picture in enumerate(pictures):
+        top, left = high * (number // across), wide * (number % across)
+        sheet[:, top : top + picture.shape[1], left : left + picture.shape[2]] = picture
+    return sheet.movedim(0, -1)
 
 
 class StereoPictures:
