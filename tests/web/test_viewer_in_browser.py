@@ -1,0 +1,95 @@
+"""The viewer in headless Chromium: every kind of result opens, is drawn and plays, and nothing leaves the machine."""
+
+import io
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from torchreg.datasets.hand import hand_motion, make_hand_cloud
+from torchreg.geometry.mesh import unit_sphere
+from torchreg.models.hand import Hand
+from torchreg.models.spine import Spine
+from torchreg.results import SpineSequence, Status, TrackResult
+from torchreg.viz.result_scenes import result_scene
+from torchreg.viz.scene import Scene
+from torchreg.viz.viewer import SceneViewer, scene_html
+
+BACKGROUND = 250
+
+
+def track_scene():
+    hand = Hand()
+    poses = hand_motion(hand, "bend", 4)
+    clouds = [make_hand_cloud(hand, pose, num_points=300, camera=torch.zeros(3)).points for pose in poses]
+    count = len(poses)
+    track = TrackResult(
+        poses, torch.zeros_like(poses), hand.keypoints(poses).detach(), torch.ones(count), torch.ones(count),
+        torch.arange(float(count)) / 20, torch.ones(count), (Status.CONVERGED,) * count, ("tracked",) * count,
+    )  # fmt: skip
+    return result_scene(track, shape=hand, data=clouds)
+
+
+def spine_scene():
+    line = torch.linspace(1, 0, 8).unsqueeze(-1)
+    still = line * torch.tensor([[1.0, 0, 0], [-0.5, 0.9, 0], [-0.5, -0.9, 0]]).unsqueeze(1)
+    curves = torch.stack([still, still + torch.tensor([0.0, 0, 0.3])])
+    graph, radii = torch.tensor([[0, 3], [1, 3], [2, 3]]), torch.full((2, 3, 8), 0.1)
+    frames, yes = torch.eye(3).expand(2, 3, 8, 3, 3), torch.ones(2, 3, dtype=torch.bool)
+    spine = SpineSequence(
+        Spine(curves, graph, radii), graph, curves, radii, frames, torch.arange(2.0), yes, yes, 0, ("(()()())",) * 2,
+        ("(()()())",) * 2, (Status.CONVERGED,) * 2, Status.CONVERGED, (),
+    )  # fmt: skip
+    return result_scene(spine, data=[unit_sphere(2), unit_sphere(3)])
+
+
+def drawn(page):
+    """Return which pixels of the scene, left of the controls, are not background."""
+    picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
+    return (picture[150:, :560] < BACKGROUND).any(-1)
+
+
+def wait_until_drawn(page):
+    page.wait_for_selector("canvas")
+    page.wait_for_timeout(1500)
+    for _ in range(60):
+        page.wait_for_timeout(250)
+        mask = drawn(page)
+        if mask.mean() > 0.005:
+            return mask
+    return drawn(page)
+
+
+@pytest.mark.parametrize("kind", ["track", "registration", "spine"])
+def test_a_result_opens_and_plays(kind, request, record, pictures):
+    if kind == "registration":
+        pair = request.getfixturevalue("toy_pair")
+        scene = result_scene(request.getfixturevalue("registered_toy"), data=[pair.target.points])
+    else:
+        scene = {"track": track_scene, "spine": spine_scene}[kind]()
+    with SceneViewer(scene, port=0) as viewer:
+        page = record.page
+        page.goto(viewer.url)
+        first = wait_until_drawn(page)
+        assert 0.005 < first.mean() < 0.9
+        page.screenshot(path=pictures / f"view_{kind}.png")
+        viewer.show(scene.num_frames - 1)
+        page.wait_for_timeout(800)
+        assert (drawn(page) != first).sum() > 20  # it moved
+        page.get_by_role("button", name="Play").click()
+        page.get_by_role("button", name="Pause").wait_for(timeout=10_000)
+        page.get_by_role("button", name="Pause").click()
+        assert record.problems(viewer.url) == []
+
+
+def test_one_file_opens_without_a_server(record, tmp_path, pictures):
+    scene = spine_scene()
+    # Long frames: without a graphics card, playing it over and over takes all of the processor.
+    path = scene_html(tmp_path / "spine.html", Scene(scene.title, scene.layers, torch.tensor([0.0, 600.0])))
+    url = path.as_uri()
+    record.page.context.set_offline(True)
+    record.page.goto(url)
+    assert wait_until_drawn(record.page).mean() > 0.005
+    record.page.screenshot(path=pictures / "file.png")
+    assert record.problems(url) == []
