@@ -9,6 +9,10 @@ import torch
 import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
+from torchreg.geometry.camera import Camera
+from torchreg.geometry.visibility import rasterize
+from torchreg.io.calibration import load_depth_camera, save_depth_camera
+from torchreg.io.images import load_image, save_depth
 from torchreg.io.points import load_points, save_points
 from torchreg.pipelines import register as pipeline
 
@@ -63,3 +67,46 @@ def test_scans_that_have_nothing_in_common_end_with_one(run, scans, tmp_path, mo
     answer = run("register", folder / "source.ply", tmp_path / "far.ply", "-o", tmp_path / "far.safetensors")
     assert answer.exit_code == 1, answer.output
     assert "no data" in answer.output
+
+
+@pytest.fixture(scope="module")
+def depth_images(tmp_path_factory):
+    """Depth images of a toy in two poses, their camera, and a registration that starts from the truth."""
+    folder = tmp_path_factory.mktemp("depth")
+    sequence = jointed_toy(2, seed=2, scanner=DepthScanner(num_points=800, num_holes=0), step=math.radians(20))
+    view = sequence.view
+    center = (-view.corner / view.pitch - 0.5).tolist()
+    camera = Camera(view.width, view.height, [1 / view.pitch, 1 / view.pitch, *center])
+    for frame in range(2):
+        depth = rasterize(sequence.mesh(frame), view, cull_back=True).depth
+        save_depth(folder / f"{frame}.png", depth.where(depth.isfinite(), 0.0), 2e-4)
+    save_depth_camera(folder / "k.json", camera, 2e-4)
+    return folder
+
+
+def test_depth_images_are_registered_and_what_was_seen_is_drawn(run, error_of, depth_images, tmp_path, monkeypatch):
+    folder = depth_images
+
+    def still(source, target, bones, grid, on_step):
+        return register(source, target, bones, grid, start=source.points, on_step=on_step)
+
+    register = pipeline.register
+    monkeypatch.setattr(pipeline, "register", still)
+    pair = ("register", "--depth", folder / "0.png", folder / "1.png")
+    options = ("--intrinsics", folder / "k.json", "-o", tmp_path / "out.glb", "--bones", 4, "--grid", 20)
+    answer = run(*pair, *options)
+    assert answer.exit_code in (0, 1), answer.output
+    found = tr.load(tmp_path / "out.safetensors")
+    assert len(found.points) > 300
+    names = sorted(path.name for path in (tmp_path / "out_seen").iterdir())
+    assert names == ["registered.png", "source.png", "target.png"]
+    source = load_image(tmp_path / "out_seen" / "source.png")
+    camera, _ = load_depth_camera(folder / "k.json")
+    assert source.shape == (camera.height, camera.width, 3)
+    colored = (source.amax(-1) > 0) & ~((source - torch.tensor([1.0, 0.25, 0.15])).abs() < 0.01).all(-1)
+    assert int(colored.sum()) == len(found.points)
+    out = ("-o", tmp_path / "no.glb")
+    assert "--depth takes --intrinsics" in error_of(*pair, *out)
+    assert "no meaning without --depth" in error_of("register", "a.ply", "b.ply", "--smoothing", 0.001, *out)
+    far = ("--intrinsics", folder / "k.json", "--depth-range", 900, 901)
+    assert "0.png: depth" in error_of(*pair, *far, *out, "--seen", tmp_path / "far")

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from torchreg.cli.cameras import DepthRange, Seen, check_used, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
 from torchreg.cli.reporting import UNUSABLE, reporting
+from torchreg.errors import InputError
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchreg.geometry.camera import Camera
+    from torchreg.geometry.range_scan import RangeScan
     from torchreg.results import ScanRegistration
+
+# Pictures of what was kept of source and target.
+_KEPT = ("source.png", "target.png")
 
 
 @reporting
@@ -30,6 +40,18 @@ def register(
     ] = Path("registered.glb"),
     bones: Annotated[int, typer.Option(help="Most bones.")] = 10,
     grid: Annotated[int, typer.Option(help="Cells of the grid along the longest side.")] = 50,
+    depth: Annotated[
+        bool, typer.Option("--depth", help="SOURCE and TARGET are depth images (16-bit .png or .tif, .exr, .npy).")
+    ] = False,
+    intrinsics: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="FILE", help="The camera of the depth images, .json; twice if they have two cameras."),
+    ] = None,
+    depth_range: DepthRange = None,
+    smoothing: Annotated[
+        float | None, typer.Option(min=0, help="Noise of depths at one metre, metres; depths are smoothed by it.")
+    ] = None,
+    seen: Seen = None,
     weights: Annotated[Path | None, typer.Option(help="Also write the moved source, colored by bones (.ply).")] = None,
     errors: Annotated[
         Path | None, typer.Option(help="Also write the moved source, colored by its distance from the target (.ply).")
@@ -38,6 +60,9 @@ def register(
     quiet: Quiet = False,
 ) -> None:
     """Register two range scans of something that moves, without a template: bones, weights, the deformation.
+
+    With --depth A B --intrinsics FILE the scans are depth images in metres, steps cut and flying pixels left out. What
+    was kept of each goes to OUT_seen, red where it was cut, and the moved source over the picture of the target.
 
     Exit codes: 0; 1 if too few points match to mean anything; 2 for an error; 130 for Ctrl-C.
     """
@@ -48,11 +73,19 @@ def register(
     check_outputs([scene, result, result.with_suffix(".json"), weights, errors], force)
     from tqdm import tqdm
 
-    from torchreg.errors import InputError
     from torchreg.io.scans import load_scan
     from torchreg.pipelines.register import register as run
 
-    scans = load_scan(source), load_scan(target)
+    views = {"--intrinsics": intrinsics, "--depth-range": depth_range, "--smoothing": smoothing, "--seen": seen}
+    check_used(depth, "--depth", views)
+    if depth:
+        folder = seen_folder(seen, output, force)
+        images = [_DepthImage.read(*pair) for pair in zip((source, target), _cameras(intrinsics), strict=True)]
+        scans = [
+            image.scan(depth_range, smoothing or 0.0, folder / name) for image, name in zip(images, _KEPT, strict=True)
+        ]
+    else:
+        scans = [load_scan(source), load_scan(target)]
     if scene is not None and scans[0].faces is None:
         raise InputError(f"{source} has no triangles, which a .glb needs; name an output that ends in .safetensors")
     with tqdm(desc="initialize", unit="step", leave=False, disable=quiet) as bar:
@@ -63,11 +96,62 @@ def register(
 
         found = run(*scans, bones, grid, on_step=show)
     _write(found, scene, weights, errors)
+    if depth:
+        images[1].draw_over(found, folder / "registered.png")
     found.save(result)
     if not quiet:
         typer.echo(f"{_summary(found)} -> {scene or result}")
     if not found.status.usable:
         raise typer.Exit(UNUSABLE)
+
+
+@dataclass(frozen=True, eq=False)
+class _DepthImage:
+    """A depth image (H, W) from a file, metres, and its camera."""
+
+    path: Path
+    intrinsics: Path
+    camera: Camera
+    depth: Tensor
+
+    @classmethod
+    def read(cls, path: Path, intrinsics: Path) -> _DepthImage:
+        from torchreg.io.calibration import load_depth_camera
+        from torchreg.io.images import load_depth
+
+        camera, scale = load_depth_camera(intrinsics)
+        return cls(path, intrinsics, camera, load_depth(path, scale, camera=camera))
+
+    def scan(self, depths: tuple[float, float] | None, smoothing: float, picture: Path) -> RangeScan:
+        """Return the scan, and draw what was kept of the image."""
+        import torch
+
+        from torchreg.capture.depth import load_depth_scan
+        from torchreg.io.images import save_image
+        from torchreg.viz.seen import cut_picture
+
+        near, far = depths or (0.0, float("inf"))
+        found = load_depth_scan(self.path, self.intrinsics, smoothing=smoothing, nearest=near, farthest=far)
+        column, row = self.camera.project(found.points.double())[0].round().long().unbind(-1)
+        kept = torch.zeros(self.depth.shape, dtype=torch.bool)
+        kept[row.clamp(0, self.camera.height - 1), column.clamp(0, self.camera.width - 1)] = True
+        save_image(picture, cut_picture(self.depth, kept))
+        return found
+
+    def draw_over(self, found: ScanRegistration, picture: Path) -> None:
+        """Draw the moved source over this image, the target."""
+        from torchreg.io.images import save_image
+        from torchreg.viz.seen import cut_picture, picture_with_points
+
+        pixels = self.camera.project(found.deformed.detach().double())[0]
+        drawn = picture_with_points(cut_picture(self.depth, self.depth > 0), pixels, found.matched, radius=0)
+        save_image(picture, drawn)
+
+
+def _cameras(intrinsics: list[Path] | None) -> tuple[Path, Path]:
+    if intrinsics is None or len(intrinsics) > 2:
+        raise InputError("--depth takes --intrinsics FILE once, or twice where source and target have two cameras")
+    return intrinsics[0], intrinsics[-1]
 
 
 def _write(found: ScanRegistration, scene: Path | None, weights: Path | None, errors: Path | None) -> None:
