@@ -14,7 +14,7 @@ from __future__ import annotations
 import errno
 import itertools
 import json
-import os
+import secrets
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -94,8 +94,9 @@ class Store:
         with explained(self.root):
             for folder in (self.trials, self.root / "claims"):
                 folder.mkdir(parents=True, exist_ok=True)
-            write_atomic(self.trials / f".probe-{os.getpid()}", b"probe")
-            (self.trials / f".probe-{os.getpid()}").unlink()
+            probe = self.trials / f".probe-{secrets.token_hex(8)}"
+            write_atomic(probe, b"probe")
+            probe.unlink()
             for left in self.trials.glob(".*.part"):
                 self._remove_stale(left)
 

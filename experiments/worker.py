@@ -139,16 +139,17 @@ def _gave_up(job: Job, attempt: int) -> TrialRecord:
 
 
 def _run(job: Job, store: Store, attempt: int) -> TrialRecord:
-    use_threads(job.threads)
-    record, task = _blank(job, attempt), find_task(job.task)
-    task.load()  # what is imported for the first trial of a process is not a part of it
-    use_threads(job.threads)
-    bench = Bench(_device(job), store.artifacts(job.id))
-    record = replace(record, device=bench.device if bench.device == "cpu" else _gpu_name())
+    record, task, begin = _blank(job, attempt), find_task(job.task), time.perf_counter()
     with warnings.catch_warnings(record=True) as told, _peak_memory() as peak:
         warnings.simplefilter("always")
-        begin = time.perf_counter()
         try:
+            use_threads(job.threads)
+            task.load()
+            # Once more, for the libraries that came with the task; their loading is no part of the trial's time.
+            use_threads(job.threads)
+            bench = Bench(_device(job), store.artifacts(job.id))
+            record = replace(record, device=bench.device if bench.device == "cpu" else _gpu_name())
+            begin = time.perf_counter()
             found = measure(task, job.config, bench)
             record = replace(
                 record, metrics=found.metrics, seconds=found.seconds, curves=found.curves, artifacts=found.artifacts

@@ -16,7 +16,8 @@ from experiments.worker import Job, Outcome, execute, finished, use_threads
 
 _POLL_SECONDS = 0.2
 # After the end of a job its files may take a moment to be seen.
-_GRACE_SECONDS = 5.0
+_GRACE_SECONDS = {"local": 0.3}
+_GRACE_ELSEWHERE = 5.0
 
 
 def work(jobs: Sequence[Job]) -> list[str]:
@@ -72,8 +73,8 @@ class SlurmEngine:
             running = [executor.submit(work, part) for part in parts]
         self._running = list(running)
         yield from self._watch(jobs, running)
-        # All is recorded, so that jobs that still run have nothing left to do.
-        deadline = time.monotonic() + _GRACE_SECONDS
+        # All is recorded, so that jobs that still run end by themselves.
+        deadline = time.monotonic() + _GRACE_ELSEWHERE
         while self.cluster == "local" and time.monotonic() < deadline and not all(job.done() for job in running):
             time.sleep(_POLL_SECONDS)
         self._running = []
@@ -88,7 +89,7 @@ class SlurmEngine:
 
     def _watch(self, jobs: Sequence[Job], running: list[Any]) -> Iterator[Outcome]:
         """Yield outcomes as records appear, and what is left when all jobs have ended."""
-        left = {job.id: job for job in jobs}
+        left, grace = {job.id: job for job in jobs}, _GRACE_SECONDS.get(self.cluster, _GRACE_ELSEWHERE)
         ended: float | None = None
         while left:
             for outcome in [one for one in map(_recorded, left.values()) if one is not None]:
@@ -97,7 +98,7 @@ class SlurmEngine:
             if ended is None and all(job.done() for job in running):
                 ended = time.monotonic()
                 self._raise_unwritten(running)
-            if ended is not None and time.monotonic() - ended > _GRACE_SECONDS:
+            if ended is not None and time.monotonic() - ended > grace:
                 break
             if left:
                 time.sleep(_POLL_SECONDS)
@@ -107,11 +108,8 @@ class SlurmEngine:
 
     def _raise_unwritten(self, running: list[Any]) -> None:
         for job in running:
-            try:
-                told = job.result()
-            except (self._submitit.core.utils.UncompletedJobError, self._submitit.core.utils.FailedJobError):
-                continue  # it died; its trials come back as lost
-            if told:
+            # A job that died left nothing, and its trials come back as lost; submitit would wait for its result.
+            if job.paths.result_pickle.exists() and (told := job.result()):
                 raise StoreError(told[0])
 
     def close(self) -> None:

@@ -67,11 +67,18 @@ def cells_of(sweep: SweepConfig, trials: Sequence[PlannedTrial], records: dict[s
     ]
     spreads = _spreads(rows)
     done = [sum(trial.id in records and records[trial.id].status == "done" for trial in members) for members in cells]
-    names = shown_metrics(sweep, list(dict.fromkeys(name for _, name, _ in rows)))
+    names = shown_metrics(sweep, known_metrics(records))
     return [
         Cell(axes, len(members), good, {name: spreads[index, name] for name in names if (index, name) in spreads})
         for index, (axes, members, good) in enumerate(zip(keys.values(), cells, done, strict=True))
     ]
+
+
+def known_metrics(records: dict[str, TrialRecord]) -> list[str]:
+    """Return the names of all metrics and seconds in records."""
+    metrics = dict.fromkeys(name for record in records.values() for name in record.metrics)
+    seconds = dict.fromkeys(f"seconds.{name}" for record in records.values() for name in record.seconds)
+    return [*metrics, *seconds]
 
 
 def shown_metrics(sweep: SweepConfig, found: Sequence[str]) -> list[str]:

@@ -15,7 +15,7 @@ from experiments.errors import ExperimentError
 from experiments.plan import PlannedTrial, planned_trials
 from experiments.records import TrialRecord
 from experiments.report import charts
-from experiments.report.cells import Cell, all_axes, cells_of, label, marginal, short, shown_metrics
+from experiments.report.cells import Cell, all_axes, cells_of, known_metrics, label, marginal, short, shown_metrics
 from experiments.schema import SweepConfig
 from experiments.store import Store, explained
 from torchreg.io.atomic import write_atomic
@@ -76,7 +76,7 @@ def _page(
     notes: list[str], output: Path,
 ) -> dict[str, Any]:  # fmt: skip
     cells = cells_of(sweep, rows, records)
-    metrics = shown_metrics(sweep, list(dict.fromkeys(name for cell in cells for name in cell.metrics)))
+    metrics = shown_metrics(sweep, known_metrics(records))
     heat = list(sweep.report.heat_metrics) or metrics[:1]
     drawn = [chart for metric in heat for chart in charts.heat_maps(sweep, cells, metric)]
     if not drawn:

@@ -51,15 +51,22 @@ def store(tmp_path):
     return Store(tmp_path / "results")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture
 def start_driver():
     """Return the function that starts ``python -m experiments`` with arguments in a process of its own."""
+    started = []
 
     def start(*arguments, **variables):
         environment = {**os.environ, "OMP_NUM_THREADS": "1", **variables}
-        return subprocess.Popen(
+        driver = subprocess.Popen(
             [sys.executable, "-m", "experiments", *map(str, arguments)],
             cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
+        started.append(driver)
+        return driver
 
-    return start
+    yield start
+    for driver in started:
+        driver.kill()
+        driver.wait()
+        driver.stdout.close()

@@ -1,0 +1,149 @@
+"""One spine of a sequence of surfaces: tips that the frames show, trees before and after, names that hold."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import torchreg as tr
+from experiments.errors import SkippedTrial
+from experiments.registry import Bench, TrialOutcome
+from experiments.schema import SpineTrial
+from experiments.tasks.peers import peer
+from torchreg.datasets.creatures import OCTOPUS, STARFISH, CreatureSequence, creature_sequence
+from torchreg.viz.figures import new_figure, save_picture
+from torchreg.viz.spine_gltf import save_spine_animation
+from torchreg.viz.spines import draw_spine_frame, spine_view
+
+PICTURE_PIXELS = (300, 300)
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Surfaces, and what is known of them.
+
+    Args:
+        meshes: T surfaces.
+        tips: true number of tips; 0 if unknown.
+        named: tells in which frames (T,) of a spine every tip keeps its name.
+    """
+
+    meshes: tuple[tr.TriangleMesh, ...]
+    tips: int
+    named: Callable[[tr.SpineSequence], Tensor]
+
+
+def run(config: SpineTrial, bench: Bench) -> TrialOutcome:
+    """Return how well one spine holds a sequence."""
+    begin = time.perf_counter()
+    sequence = make_sequence(config)
+    seconds = {"setup": time.perf_counter() - begin}
+    begin = time.perf_counter()
+    if config.method == "skeletor":
+        counts = [_peer_tips(mesh) for mesh in sequence.meshes]
+        seconds["total"] = time.perf_counter() - begin
+        return TrialOutcome(_tip_metrics(counts, sequence), seconds, {"own_tips": [float(count) for count in counts]})
+    spine = tr.extract_spine(sequence.meshes, workers=1)
+    seconds["total"] = time.perf_counter() - begin
+    counts = [count_tips(topology) for topology in spine.own_topologies]
+    outcome = TrialOutcome(
+        _tip_metrics(counts, sequence) | _metrics(spine, sequence),
+        seconds,
+        {"own_tips": [float(count) for count in counts], "tips": [float(count_tips(one)) for one in spine.topologies]},
+    )
+    if config.pictures:
+        outcome.artifacts = _artifacts(sequence, spine, bench)
+    return outcome
+
+
+def make_sequence(config: SpineTrial) -> Sequence:
+    """Return the surfaces of a trial.
+
+    Raises:
+        SkippedTrial: if a file is asked for that is not here.
+    """
+    if config.creature == "file":
+        return _from_file(Path(config.folder) / f"{config.name}.npz", config.frames)
+    form = STARFISH if config.creature == "starfish" else OCTOPUS
+    made = creature_sequence(
+        form, config.frames, touching=config.touching, noise=config.noise, resolution=config.resolution,
+        seed=config.seed,
+    )  # fmt: skip
+    return Sequence(made.meshes, form.num_arms, lambda spine: _arms_named(spine, made))
+
+
+def _from_file(path: Path, frames: int) -> Sequence:
+    if not path.is_file():
+        raise SkippedTrial(f"there is no file {path}; say where the data lie with folder=FOLDER")
+    with np.load(path, allow_pickle=False) as file:
+        every = max(1, len(file["vertices"]) // frames) if frames else 1
+        vertices = torch.from_numpy(file["vertices"][::every])
+        faces = torch.from_numpy(file["faces"].astype(np.int64))
+
+    def named(spine: tr.SpineSequence) -> Tensor:
+        """Of each tip the vertex nearest to it in the reference frame should be so in all frames."""
+        tips, places = spine.tips.double(), vertices.double()
+        own = torch.cdist(tips[spine.reference], places[spine.reference]).argmin(-1)
+        return (torch.cdist(tips, places[:, own]).argmin(-1) == torch.arange(spine.num_tips)).all(-1)
+
+    return Sequence(tuple(tr.TriangleMesh(frame, faces) for frame in vertices), 0, named)
+
+
+def count_tips(topology: str) -> int:
+    """Return the number of tips of a tree in the form of `Skeleton.topology`: its leaves."""
+    return topology.count("()")
+
+
+def _tip_metrics(counts: list[int], sequence: Sequence) -> dict[str, float]:
+    mode = max(set(counts), key=counts.count)
+    metrics = {"tips_mode": float(mode), "own_tips_stable": sum(count == mode for count in counts) / len(counts)}
+    return metrics | ({"tips_right": float(mode == sequence.tips)} if sequence.tips else {})
+
+
+def _metrics(spine: tr.SpineSequence, sequence: Sequence) -> dict[str, float]:
+    final = max(set(spine.topologies), key=spine.topologies.count)
+    frames = len(sequence.meshes)
+    right = spine.num_tips == sequence.tips or not sequence.tips
+    return {
+        "tips": float(spine.num_tips),
+        "trees_before": float(len(set(spine.own_topologies))),
+        "trees_after": float(len(set(spine.topologies))),
+        "own_tree": sum(own == final for own in spine.own_topologies) / frames,
+        "named": float(sequence.named(spine).double().mean()) if right else 0.0,
+        "frames": float(frames),
+        "vertices": float(np.mean([mesh.num_vertices for mesh in sequence.meshes])),
+    }
+
+
+def _arms_named(spine: tr.SpineSequence, truth: CreatureSequence) -> Tensor:
+    """Return in which frames (T,) every limb is nearest to the axis of its own arm, the one nearest on average."""
+    curves, axes = spine.curves[:, : spine.num_tips].double(), truth.curves.double().flip(2)
+    few = torch.linspace(0, axes.shape[2] - 1, curves.shape[2]).round().long()
+    apart = (curves.unsqueeze(2) - axes[:, None, :, few]).norm(dim=-1).mean(-1)
+    return (apart.argmin(-1) == apart.mean(0).argmin(-1)).all(-1)
+
+
+def _peer_tips(mesh: tr.TriangleMesh) -> int:
+    """Return the number of leaves of the skeleton that skeletor finds, a program of its own under another licence."""
+    skeletor = peer("skeletor")
+    import trimesh
+
+    body = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
+    table = skeletor.skeletonize.by_wavefront(body, waves=1, step_size=1).swc
+    return int((~table.node_id.isin(table.parent_id)).sum())
+
+
+def _artifacts(sequence: Sequence, spine: tr.SpineSequence, bench: Bench) -> dict[str, str]:
+    frame = spine.reference
+    view = spine_view([sequence.meshes[frame]], size=PICTURE_PIXELS)
+    figure, (ax,) = new_figure(*PICTURE_PIXELS)
+    draw_spine_frame(ax, sequence.meshes[frame], spine.curves[frame], spine.num_tips, view=view, own=spine.own[frame])
+    save_picture(figure, bench.file("spine.png"))
+    save_spine_animation(bench.file("spine.glb"), spine.model)
+    return {"spine": "spine.png", "spine, moving": "spine.glb"}

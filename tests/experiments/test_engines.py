@@ -1,0 +1,238 @@
+"""Three engines, one behavior: what one process finds, all find, whoever is killed on the way."""
+
+import contextlib
+import os
+import random
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from experiments.driver import run_sweep
+from experiments.engines.base import EngineConfig, make_engine, share_code, visible_gpus
+from experiments.errors import ConfigError, ExperimentError, StoreError
+from experiments.plan import planned_trials
+from experiments.records import parse_record
+from experiments.schema import AlignmentTrial, AlignSolver, HandScene, ProbeTrial, ScheduleConfig, SweepConfig
+from experiments.store import Store
+from experiments.worker import Job
+
+ENGINES = {"local": (), "ray": (), "slurm": ("--slurm", "cluster=local")}
+SWEEP = """
+task: probe
+question: Does every trial end with one result?
+trial: {{size: 16, seconds: {seconds}, log: {log}}}
+grid: {{scale: [1.0, 2.0], rounds: [2, 4, 8]}}
+seeds: 4
+"""
+
+
+@pytest.fixture(scope="module")
+def ray_cluster():
+    """One Ray cluster for all tests, as its start takes longest; drivers find it by its address."""
+    ray = pytest.importorskip("ray")
+    share_code()
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    context = ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    yield context.address_info["address"]
+    ray.shutdown()
+
+
+@pytest.fixture
+def engine_name(request):
+    name = request.param
+    if name == "slurm":
+        pytest.importorskip("submitit")
+    variables = {"RAY_ADDRESS": request.getfixturevalue("ray_cluster")} if name == "ray" else {}
+    with pytest.MonkeyPatch.context() as patch:
+        for key, value in variables.items():
+            patch.setenv(key, value)
+        yield name
+
+
+def config(name, **settings):
+    options = {"cluster": "local"} if name == "slurm" else {}
+    return EngineConfig(options=options, **settings)
+
+
+def wait_for_records(store, count, driver, timeout=60):
+    deadline = time.monotonic() + timeout
+    while len(list(store.trials.glob("*.json"))) < count:
+        assert driver.poll() is None, driver.stdout.read()
+        assert time.monotonic() < deadline, "no progress"
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("engine_name", ENGINES, indirect=True)
+def test_a_driver_may_be_killed_at_any_moment(engine_name, tmp_path, start_driver):
+    """Three times; then every trial has one result, and no finished one ran again."""
+    sweep, log = tmp_path / "many.yaml", tmp_path / "log"
+    # The jobs of Slurm do not end with the driver, and should leave something for the next one.
+    sweep.write_text(SWEEP.format(log=log, seconds=0.15 if engine_name == "slurm" else 0.06))
+    store, chance = Store(tmp_path / "results/many"), random.Random(engine_name)
+    command = ["sweep", sweep, "--results", tmp_path / "results", "--jobs", "2", "--engine", engine_name]
+    snapshots = []
+    for turn in range(3):
+        driver = start_driver(*command, *ENGINES[engine_name])
+        known = len(list(store.trials.glob("*.json")))
+        wait_for_records(store, known + chance.randint(1, 3), driver)
+        time.sleep(chance.uniform(0, 0.1))
+        driver.kill()
+        driver.wait()
+        if turn < 2:
+            kill_jobs(store)
+        snapshots.append({path: (path.stat().st_ino, path.read_bytes()) for path in store.trials.glob("*.json")})
+    final = start_driver(*command, *ENGINES[engine_name])
+    told, _ = final.communicate(timeout=100)
+    assert final.returncode == 0, told
+    records, bad = store.records()
+    assert (len(records), bad) == (24, [])
+    assert {record.status for record in records} == {"done"}
+    for snapshot in snapshots:
+        for path, before in snapshot.items():
+            assert (path.stat().st_ino, path.read_bytes()) == before
+    # A trial starts again only if it was cut off: at most two at a time, three times.
+    assert 24 <= len(log.read_text().splitlines()) <= 24 + 3 * 2
+    begin = time.perf_counter()
+    again = start_driver(*command, *ENGINES[engine_name])
+    told, _ = again.communicate(timeout=60)
+    seconds = time.perf_counter() - begin
+    assert "24 trials: 0 run now, 24 finished before" in told
+    assert seconds < 2 or again_in_processor_time(command) < 2
+
+
+def kill_jobs(store):
+    """Kill what submitit started, which outlives its driver and would do all the work before the next one is there."""
+    for path in store.root.glob("slurm/*_submitted.pkl"):
+        pid = int(path.name.partition("_")[0])
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            if b"submitit" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+                for one in (pid, *map(int, children)):
+                    os.kill(one, signal.SIGKILL)
+
+
+def again_in_processor_time(command):
+    """Return the processor time of the finished sweep, which other programs on a busy machine spare."""
+    before = os.times()
+    subprocess.run(["python", "-m", "experiments", *map(str, command)], check=True, capture_output=True)
+    after = os.times()
+    return after.children_user + after.children_system - before.children_user - before.children_system
+
+
+@pytest.mark.parametrize("engine_name", ENGINES, indirect=True)
+def test_a_killed_worker_does_not_stop_the_sweep(engine_name, store, probe_sweep):
+    """One trial kills its process the first time; another always, and is told as failed."""
+    sweep = probe_sweep(trial=ProbeTrial(), grid={"outcome": ["done", "killed once", "killed"]})
+    told = run_sweep(
+        sweep, store, lambda: make_engine(engine_name, config(engine_name, jobs=2)), engine_name=engine_name
+    )
+    assert (told.ran, told.failed, told.unfinished) == (3, 1, 0)
+    records = {record.config["outcome"]: record for record in store.records()[0]}
+    assert {name: record.status for name, record in records.items()} == {
+        "done": "done", "killed once": "done", "killed": "failed",
+    }  # fmt: skip
+    assert "died 3 times" in records["killed"].note
+    assert records["killed once"].attempt == 2
+
+
+def test_all_engines_find_the_same_bit_for_bit(tmp_path, ray_cluster, monkeypatch, inline_engine):
+    monkeypatch.setenv("RAY_ADDRESS", ray_cluster)
+    trial = AlignmentTrial(
+        scene=HandScene(num_points=60),
+        schedule=ScheduleConfig(steps=2),
+        solver=AlignSolver(em_steps=1, num_model_points=60),
+    )
+    sweep = SweepConfig("same", "alignment", "q", trial, grid={"schedule.kind": ["geometric", "adaptive"]})
+    found = {}
+    for name in (*ENGINES, "none"):
+        store = Store(tmp_path / name)
+        start = (lambda: inline_engine) if name == "none" else (lambda name=name: make_engine(name, config(name)))
+        run_sweep(sweep, store, start, engine_name=name)
+        records = [store.read(one.id) for one in planned_trials(sweep)]
+        assert [record.status for record in records] == ["done", "done"], records[0].traceback
+        assert {record.engine for record in records} == {name}
+        found[name] = [(record.metrics, record.curves) for record in records]
+    assert found["local"] == found["ray"] == found["slurm"] == found["none"]
+    assert found["local"][0] != found["local"][1]
+
+
+def test_an_engine_passes_on_that_results_cannot_be_written(tmp_path, monkeypatch):
+    """The folder is gone when the worker gets there."""
+    engine = make_engine("local", EngineConfig())
+    job = Job(str(tmp_path / "gone"), "probe", "x", {}, "s")
+    try:
+        with pytest.raises(StoreError, match=r"gone/claims/x cannot be written: No such file or directory"):
+            list(engine.run([job]))
+    finally:
+        engine.close()
+
+
+def test_workers_end_with_their_driver(tmp_path, start_driver):
+    sweep = tmp_path / "slow.yaml"
+    sweep.write_text(f"task: probe\nquestion: q\ntrial: {{seconds: 60, log: {tmp_path / 'log'}}}\n")
+    driver = start_driver("sweep", sweep, "--results", tmp_path)
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "log").exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    children = subprocess.run(["ps", "-o", "pid=", "--ppid", str(driver.pid)], capture_output=True, text=True).stdout
+    os.kill(driver.pid, signal.SIGKILL)
+    driver.communicate()
+    pids = [int(pid) for pid in children.split()]
+    assert pids
+    while any(os.path.exists(f"/proc/{pid}") for pid in pids):
+        assert time.monotonic() < deadline, "a worker lives on"
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "error", "message"),
+    [
+        ("cloud", {}, ConfigError, "unknown engine 'cloud'; known engines: local, ray, slurm"),
+        ("local", {"jobs": 0}, ConfigError, "--jobs must be at least 1, got 0"),
+        ("local", {"threads": 0}, ConfigError, "--threads must be at least 1, got 0"),
+        ("local", {"gpus": -1.0}, ConfigError, "--gpus must not be negative"),
+        ("slurm", {}, ExperimentError, "there is no Slurm here .*--slurm cluster=local"),
+    ],
+)
+def test_engines_that_cannot_be_are_refused(name, settings, error, message, monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(error, match=message):
+        make_engine(name, EngineConfig(**settings))
+
+
+def test_gpus_are_found_without_torch(monkeypatch, tmp_path):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2, 5")
+    assert visible_gpus() == ["2", "5"]
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    assert visible_gpus() == []
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    tool = tmp_path / "nvidia-smi"
+    tool.write_text("#!/bin/sh\necho 'GPU 0: a'\necho 'GPU 1: b'\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    assert visible_gpus() == ["0", "1"]
+    monkeypatch.setenv("PATH", "")
+    assert visible_gpus() == []
+
+
+def test_gpus_are_shared_out_among_local_workers(store, probe_sweep, monkeypatch):
+    """Each worker sees one; a task without use for it is not told of it."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
+    engine = make_engine("local", EngineConfig(jobs=3))
+    try:
+        pools = [engine._new_pool(slot) for slot in range(3)]
+        seen = [pool.submit(os.getenv, "CUDA_VISIBLE_DEVICES").result() for pool in pools]
+        for pool in pools:
+            pool.shutdown()
+    finally:
+        engine.close()
+    assert seen == ["4", "7", "4"]
+
+
+def test_records_name_their_engine_and_can_be_read_by_hand(store, probe_sweep):
+    run_sweep(probe_sweep(), store, lambda: make_engine("local", EngineConfig()), threads=1)
+    for path in store.trials.glob("*.json"):
+        assert parse_record(path.read_bytes(), path.name).engine == "local"
