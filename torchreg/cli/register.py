@@ -81,12 +81,12 @@ def register(
     if depth:
         folder = seen_folder(seen, output, force)
         images = [_DepthImage.read(*pair) for pair in zip((source, target), _cameras(intrinsics), strict=True)]
-        scans = [
+        first, second = (
             image.scan(depth_range, smoothing or 0.0, folder / name) for image, name in zip(images, _KEPT, strict=True)
-        ]
+        )
     else:
-        scans = [load_scan(source), load_scan(target)]
-    if scene is not None and scans[0].faces is None:
+        first, second = load_scan(source), load_scan(target)
+    if scene is not None and first.faces is None:
         raise InputError(f"{source} has no triangles, which a .glb needs; name an output that ends in .safetensors")
     with tqdm(desc="initialize", unit="step", leave=False, disable=quiet) as bar:
 
@@ -94,7 +94,7 @@ def register(
             bar.set_description(getattr(record, "stage", ""))
             bar.update()
 
-        found = run(*scans, bones, grid, on_step=show)
+        found = run(first, second, bones, grid, on_step=show)
     _write(found, scene, weights, errors)
     if depth:
         images[1].draw_over(found, folder / "registered.png")
