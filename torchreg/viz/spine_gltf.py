@@ -75,6 +75,7 @@ def save_spine_animation(
         (spine.times - spine.times[0]) / fps,
         whole.vertex_normals(),
         paint,
+        most_weights=4,  # all that many viewers look at
     )
 
 
