@@ -111,3 +111,28 @@ def test_bones_that_meet_and_move_alike_are_one_part():
     assert bones(0.0, 0.5, 1.0, weights=blend).parts(0.2).tolist() == [0, 0, 0, 0]
     apart = torch.tensor([[1.0, 0, 0], [1, 0, 0], [0, 0, 1], [0, 0, 1]])
     assert bones(0.0, 0.0, 0.0, weights=apart).parts().tolist() == [0, 0, 1, 1]
+
+
+def test_results_print_in_one_line_without_their_numbers():
+    text = repr(result())
+    assert text.startswith("AlignResult(pose=float32 (27,), registered=float32 (5, 3)")
+    assert "sigma=0.002, cost=1.5, status=converged, history=none)" in text
+    assert "\n" not in text
+    record = AlignRecord("em", 0, 5, torch.ones(1), torch.ones(1), torch.zeros(1, 27), torch.zeros(1))
+    many = replace(result(), status=(Status.CONVERGED, Status.LOST, Status.CONVERGED), history=(record,) * 3)
+    assert "status=2 converged, 1 lost, history=3 x AlignRecord)" in repr(many)
+    shape = torch.nn.Linear(1, 1)
+    calibration = Calibration(shape, torch.zeros(2, 3), torch.zeros(1), torch.zeros(4), torch.tensor(1.0), Status.LOST)
+    assert "shape=Linear" in repr(calibration)
+    for kind in vars(results).values():
+        if isinstance(kind, type) and issubclass(kind, results.Result):
+            assert kind.__repr__ is results.Result.__repr__
+
+
+def test_notebooks_show_a_table():
+    table = replace(result(), status=(Status.OTHER_UNITS,))._repr_html_()
+    assert table.startswith("<table><caption>AlignResult</caption>")
+    assert "<td style='text-align:left'>float32 (5, 3)</td>" in table
+    assert table.count("<tr>") == 10
+    odd = PoseStarts(torch.zeros(1, 3), torch.zeros(1), "<b>")
+    assert "&lt;b&gt;" in odd._repr_html_()

@@ -49,6 +49,7 @@ if TYPE_CHECKING:
         TrackResult,
         TrackState,
     )
+    from torchreg.viz.conversions import to_open3d, to_pyvista, to_trimesh
 
 __version__ = "0.1.0"
 
@@ -102,6 +103,9 @@ __all__ = [
     "sample_skin",
     "skeletonize",
     "solve_pose",
+    "to_open3d",
+    "to_pyvista",
+    "to_trimesh",
 ]
 
 _MODULES = frozenset({"errors", "metrics"})
@@ -153,6 +157,9 @@ _OWNERS = {
     "sample_skin": "models.skin",
     "skeletonize": "pipelines.skeletonize",
     "solve_pose": "pipelines.solve_pose",
+    "to_open3d": "viz.conversions",
+    "to_pyvista": "viz.conversions",
+    "to_trimesh": "viz.conversions",
 }
 
 
