@@ -41,6 +41,8 @@ SENSORS = {"structured light": DepthNoise.structured_light(), "time of flight": 
 GOOD = DepthNoise(quadratic=2e-4, step=2e-4, jitter=0.3, flying=0.3, dropout=0.005)
 # Pixels of the depth camera per pixel of the exact scan, along each axis.
 FINER = 2
+# Metres of noise at one metre above which depths are smoothed; it costs detail.
+SMOOTHED = 1e-3
 
 
 def reprojection(size: int) -> dict[str, float]:
@@ -107,7 +109,7 @@ def normals(size: int) -> dict[str, float]:
 
 
 def depth_camera_scan(sequence: ScanSequence, frame: int, sensor: DepthNoise, folder: Path) -> tr.RangeScan:
-    """Return the scan that a depth image of a frame gives, through a file."""
+    """Return the scan that a depth image of a frame gives, through a file; noise of over a millimetre is smoothed."""
     view = sequence.view
     fine = View(view.position, view.rotation, view.corner, view.pitch / FINER, FINER * view.width, FINER * view.height)
     depth = rasterize(sequence.mesh(frame), fine, cull_back=True).depth
@@ -117,7 +119,7 @@ def depth_camera_scan(sequence: ScanSequence, frame: int, sensor: DepthNoise, fo
     save_depth(folder / "d.png", seen, STEP)
     save_depth_camera(folder / "k.json", camera, STEP)
     noise = float(sensor.depth_std(torch.tensor(1.0)))
-    return load_depth_scan(folder / "d.png", folder / "k.json", smoothing=noise)
+    return load_depth_scan(folder / "d.png", folder / "k.json", smoothing=noise if noise > SMOOTHED else 0.0)
 
 
 def registration(pairs: int, sensors: dict[str, DepthNoise]) -> dict[str, float]:

@@ -164,3 +164,15 @@ def test_sphere_mesh_and_cameras_agree():
     cameras = ring(16)
     masks = [rasterize(mesh, camera.view()).face_index >= 0 for camera in cameras]
     assert visual_hull(masks, cameras, resolution=48).volume() == pytest.approx(4 / 3 * math.pi * 0.2**3, rel=0.06)
+
+
+def test_exchanged_masks_are_refused():
+    cameras = ring(9, size=60, focal=70.0)
+    masks = [ellipsoid_mask(camera) for camera in cameras]
+    visual_hull(masks, cameras, resolution=24)
+    mesh = box_mesh(torch.tensor([0.35, 0.06, 0.12], dtype=torch.float64))
+    boxes = [rasterize(mesh, camera.view()).face_index >= 0 for camera in cameras]
+    visual_hull(boxes, cameras, resolution=24)
+    boxes[0], boxes[2] = boxes[2], boxes[0]
+    with pytest.raises(InputError, match=r"fills \d+ % of that of c\d; check that masks and cameras are in the same"):
+        visual_hull(boxes, cameras, resolution=24)

@@ -1,3 +1,4 @@
+import struct
 import sys
 
 import numpy as np
@@ -114,6 +115,64 @@ def test_pictures_over_64_megapixels_are_not_decoded(tmp_path):
         np.lib.format.write_array_header_1_0(stream, header)
     with pytest.raises(FormatError, match="1 to 64 million pixels"):
         load_depth(tmp_path / "d.npy")
+
+
+@pytest.mark.parametrize("load", [load_image, load_mask])
+def test_pictures_and_masks_have_the_same_limits(tmp_path, load):
+    Image.new("1", (8000, 8001)).save(tmp_path / "a.png")
+    with pytest.raises(FormatError, match=r"a.png: .*64 million pixels"):
+        load(tmp_path / "a.png")
+    rng = np.random.default_rng(0)
+    Image.fromarray(rng.integers(0, 256, (40, 40, 3)).astype(np.uint8)).save(tmp_path / "b.png")
+    for name in ("b.png", "b.jpg", "b.tif", "b.bmp"):
+        Image.fromarray(rng.integers(0, 256, (40, 40, 3)).astype(np.uint8)).save(tmp_path / name)
+        assert load(tmp_path / name).shape[:2] == (40, 40)
+        whole = (tmp_path / name).read_bytes()
+        for length in (0, 5, len(whole) // 2):
+            (tmp_path / name).write_bytes(whole[:length])
+            with pytest.raises(FormatError, match=name):
+                load(tmp_path / name)
+    Image.fromarray(STEPS).save(tmp_path / "c.png")
+    with pytest.raises(FormatError, match="8 bits per channel"):
+        load(tmp_path / "c.png")
+    Image.fromarray(STEPS.astype(np.float32) * np.float32("nan")).save(tmp_path / "n.tif")
+    with pytest.raises(FormatError, match="got PIL mode F"):
+        load(tmp_path / "n.tif")
+
+
+def test_mask_arrays_are_checked(tmp_path):
+    np.save(tmp_path / "m.npy", np.ones((2, 3, 1), dtype=bool))
+    with pytest.raises(FormatError, match=r"must be \(H, W\)"):
+        load_mask(tmp_path / "m.npy")
+    np.save(tmp_path / "m.npy", np.ones((20, 30), dtype=bool))
+    whole = (tmp_path / "m.npy").read_bytes()
+    (tmp_path / "m.npy").write_bytes(whole[:-7])
+    with pytest.raises(FormatError, match="cut off"):
+        load_mask(tmp_path / "m.npy")
+
+
+def test_exr_of_another_size_kind_or_too_many_pixels(tmp_path):
+    exr = pytest.importorskip("OpenEXR")
+
+    def written(name, channels):
+        header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+        with exr.File(header, channels) as file:
+            file.write(str(tmp_path / name))
+        return tmp_path / name
+
+    path = written("d.exr", {"Z": STEPS.astype(np.float32)})
+    with pytest.raises(FormatError, match="is 4 x 3 pixels, the camera's pictures are 5 x 3"):
+        load_depth(path, camera=Camera(5, 3, (1.0, 1.0, 1.0, 1.0)))
+    nothing = written("n.exr", {"Z": np.full((2, 2), np.nan, dtype=np.float32)})
+    with pytest.raises(FormatError, match="holds no depth"):
+        load_depth(nothing)
+    with pytest.raises(FormatError, match="has none of the channels"):
+        load_depth(written("o.exr", {"other": STEPS.astype(np.float32)}))
+    whole = path.read_bytes()
+    place = whole.index(b"dataWindow\x00box2i\x00") + len(b"dataWindow\x00box2i\x00") + 4
+    path.write_bytes(whole[:place] + struct.pack("<4i", 0, 0, 7999, 8000) + whole[place + 16 :])
+    with pytest.raises(FormatError, match=r"64 million pixels|cut off or damaged"):
+        load_depth(path)
 
 
 @pytest.mark.parametrize("name", ["d.png", "d.tif", "d.npy"])

@@ -25,6 +25,8 @@ _CHUNK = 1 << 20
 # Resolution at which the box is looked for, how often, and empty layers around it.
 _BOX_RESOLUTION, _BOX_ROUNDS, _BORDER = 32, 3, 2
 _SMALLEST_MASK = 4
+# The hull covers all of every mask that fits; exchanged ones are covered by less than half.
+_LEAST_COVERED = 0.6
 # By so many pixels interpolation between the middles of pixels may change more than the distance itself.
 _INTERPOLATION = 1.5
 
@@ -78,7 +80,8 @@ def visual_hull(
 
     Raises:
         InputError: if numbers or sizes do not fit, a mask is (nearly) empty or touches the border of its picture, or
-            no point is inside all masks.
+            the masks do not fit together: no point is inside all, or the hull, unless a box cuts it, covers less than
+            60 % of one.
         InputTypeError: if a mask is not Boolean.
 
     Differentiable: no.
@@ -99,6 +102,8 @@ def visual_hull(
             "masks must have a point of space in common, but no point is inside all of them; check that masks and "
             "cameras are in the same order and the motions are world to camera"
         )
+    if box is None:
+        _check_covered(hull, silhouettes, masks)
     return hull
 
 
@@ -208,6 +213,27 @@ def _decided(silhouettes: list[_Silhouette], centers: Tensor, radius: float) -> 
         verdict[left] = torch.where(outside, 1, torch.where(inside, verdict[left], 0)).to(torch.int8)
         left = left[~outside]
     return verdict
+
+
+def _check_covered(hull: VisualHull, silhouettes: list[_Silhouette], masks: Sequence[Tensor]) -> None:
+    """Raise InputError if the hull leaves much of a mask empty, as it does where masks or cameras are exchanged."""
+    points = hull.origin + 2 * hull.spacing * (hull.field[::2, ::2, ::2] < 0).nonzero()
+    for silhouette, mask in zip(silhouettes, masks, strict=True):
+        camera = silhouette.camera
+        pixels, depth = camera.project(points)
+        pixels = pixels[camera.contains(pixels)]
+        # Cells of the picture that are wider than the points lie apart.
+        side = max(2, math.ceil(4 * hull.spacing * float(camera.intrinsics[0] / depth.median())))
+        wanted = torch.nn.functional.avg_pool2d(mask[None, None].float(), side, ceil_mode=True)[0, 0] > 0.5
+        covered = torch.zeros_like(wanted)
+        column, row = ((pixels + 0.5) / side).floor().long().unbind(-1)
+        covered[row, column] = True
+        share = float((covered & wanted).sum() / wanted.sum().clamp(min=1))
+        if bool(wanted.any()) and share < _LEAST_COVERED:
+            raise InputError(
+                f"masks must fit together, but what all of them have in common fills {100 * share:.0f} % of that of "
+                f"{camera.name or 'a camera'}; check that masks and cameras are in the same order"
+            )
 
 
 def _sampled(silhouettes: list[_Silhouette], points: Tensor) -> Tensor:
