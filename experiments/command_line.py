@@ -122,6 +122,7 @@ def query(config: Name, sql: str, results: Results = _RESULTS) -> None:
 def report(
     config: Name,
     output: Annotated[Path | None, typer.Option(help="the page; by default report.html beside the records")] = None,
+    picture: Annotated[Path | None, typer.Option(help="PNG of the page in headless Chromium")] = None,
     results: Results = _RESULTS,
 ) -> None:
     """Write the report of a sweep: one page that opens without a network."""
@@ -136,7 +137,13 @@ def report(
             notes.append(
                 "The configuration differs from the one that the sweep was last run with, which is shown here."
             )
-    typer.echo(write_report(plan, store, output or store.root / "report.html", notes))
+    page = write_report(plan, store, output or store.root / "report.html", notes)
+    typer.echo(page)
+    if picture is not None:
+        from experiments.report.browser import photograph
+
+        for told in photograph(page, picture):
+            typer.echo(f"the browser's console: {told}", err=True)
 
 
 def main() -> None:

@@ -158,6 +158,6 @@ def _html(figure: Any, title: str, height: int) -> str:
         margin={"l": 70, "r": 20, "t": 45, "b": 55}, font={"family": "system-ui, sans-serif", "size": 12},
     )  # fmt: skip
     text: str = figure.to_html(
-        full_html=False, include_plotlyjs=False, config={"displaylogo": False, "responsive": True}
+        full_html=False, include_plotlyjs=False, config={"displayModeBar": False, "responsive": True}
     )
     return text
