@@ -58,6 +58,10 @@ def test_projection_agrees_with_kornia(lens):
     plain = local[:, :2] / local[:, 2:] * camera.intrinsics[:2] + camera.intrinsics[2:]
     expected = distort_points(plain, camera.matrix, camera.distortion)
     assert (camera.project(points)[0] - expected).abs().max() < 1e-6
+    cv2 = pytest.importorskip("cv2")
+    still = torch.zeros(3, dtype=torch.float64).numpy()
+    theirs, _ = cv2.projectPoints(local.numpy(), still, still, camera.matrix.numpy(), camera.distortion.numpy())
+    assert (expected - torch.from_numpy(theirs[:, 0])).abs().max() < 1e-6
 
 
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)

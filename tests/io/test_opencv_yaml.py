@@ -98,6 +98,7 @@ def test_opencv_reads_what_we_write_and_we_what_it_writes(tmp_path):
     [
         ("<opencv_storage>", "must begin with %YAML"),
         (HEAD, "holds neither camera_matrix nor M1"),
+        (HEAD.replace("640", "64000").replace("480", "48000") + LENS, "at most 64 megapixels"),
         (HEAD + LENS[:-20], "no closing bracket: the file is cut off"),
         (HEAD + LENS[:40], "lacks rows, cols or data"),
         (HEAD + matrix("camera_matrix", 3, 3, "1, 2, 3"), "must hold 3 x 3 numbers, got 3"),
