@@ -233,7 +233,8 @@ class ReportConfig:
         curves: that are drawn; all if empty.
         group: axis by which curves are colored; the first one if empty.
         share: metrics that are shares or counts, for which the mean over seeds is told instead of the median.
-        higher: metrics of which more is better; of all others, less.
+        higher: metrics of which more is better; of others, less.
+        neutral: metrics of which neither is better.
     """
 
     metrics: tuple[str, ...] = ()
@@ -243,6 +244,7 @@ class ReportConfig:
     group: str = ""
     share: tuple[str, ...] = ()
     higher: tuple[str, ...] = ()
+    neutral: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         _require(len(self.heat) in (0, 2), f"heat must name two axes, got {len(self.heat)}")

@@ -117,6 +117,11 @@ def label(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+def number(value: float, digits: int = 4) -> str:
+    """Return a number with as many digits, but whole thousands in full."""
+    return f"{value:.0f}" if abs(value) >= 10 ** (digits - 1) else f"{value:.{digits}g}"
+
+
 def short(axis: str) -> str:
     """Return the last part of an axis's name."""
     return axis.rpartition(".")[2].replace("_", " ")

@@ -15,7 +15,17 @@ from experiments.errors import ExperimentError
 from experiments.plan import PlannedTrial, planned_trials
 from experiments.records import TrialRecord
 from experiments.report import charts
-from experiments.report.cells import Cell, all_axes, cells_of, known_metrics, label, marginal, short, shown_metrics
+from experiments.report.cells import (
+    Cell,
+    all_axes,
+    cells_of,
+    known_metrics,
+    label,
+    marginal,
+    number,
+    short,
+    shown_metrics,
+)
 from experiments.schema import SweepConfig
 from experiments.store import Store, explained
 from torchreg.io.atomic import write_atomic
@@ -126,8 +136,8 @@ def _table(sweep: SweepConfig, cells: Sequence[Cell], metrics: Sequence[str]) ->
             value = charts.told(sweep, cell, metric)
             spread = cell.metrics.get(metric)
             varied = spread is not None and metric not in sweep.report.share and spread.count > 1
-            between = f"{spread.low:.3g} to {spread.high:.3g}" if spread is not None and varied else ""
-            text = "-" if value is None else f"{value:.4g}"
+            between = f"{number(spread.low, 3)} to {number(spread.high, 3)}" if spread is not None and varied else ""
+            text = "-" if value is None else number(value)
             values.append((text, between, value is not None and len(cells) > 1 and value == best[metric]))
         rows.append(([label(cell.axes[axis]) for axis in axes], f"{cell.done} / {cell.trials}", values))
     heads = [charts.named(metric) for metric in metrics]
@@ -145,7 +155,7 @@ def _marginals(sweep: SweepConfig, cells: Sequence[Cell], metrics: Sequence[str]
         best = {metric: _best(sweep, list(column.values()), metric) for metric, column in found.items()}
         values = dict.fromkeys(value for column in found.values() for value in column)
         rows = [
-            (value, [(f"{column[value]:.4g}", column[value] == best[name]) if value in column else ("-", False)
+            (value, [(number(column[value]), column[value] == best[name]) if value in column else ("-", False)
                      for name, column in found.items()])
             for value in values
         ]  # fmt: skip
@@ -155,7 +165,7 @@ def _marginals(sweep: SweepConfig, cells: Sequence[Cell], metrics: Sequence[str]
 
 def _best(sweep: SweepConfig, values: Sequence[float | None], metric: str) -> float | None:
     known = [value for value in values if value is not None]
-    if not known or len(set(known)) == 1:
+    if not known or len(set(known)) == 1 or metric in sweep.report.neutral:
         return None
     return max(known) if metric in sweep.report.higher else min(known)
 

@@ -26,7 +26,8 @@ def peer(method: str) -> Any:
     try:
         return import_module(package)
     except ImportError as error:
-        raise SkippedTrial(f"{package} is not installed: pip install 'torchreg[benchmark]'") from error
+        how = "skeletor (under the GPL)" if method == "skeletor" else "'torchreg[benchmark]'"
+        raise SkippedTrial(f"{package} is not installed: pip install {how}") from error
 
 
 def moved_by(method: str, source: Tensor, target: Tensor, outliers: float = 0.0) -> Tensor:

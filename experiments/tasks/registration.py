@@ -102,14 +102,14 @@ def _from_file(path: Path) -> Problem:
 
 
 def _accuracy(problem: Problem, moved: Tensor) -> dict[str, float]:
-    """Return errors of moved points; of a part that the target lacks, nothing tells the place."""
-    errors = (moved - problem.truth).norm(dim=-1) / problem.diagonal
-    near = (errors < NEAR).double()
-    known = near if problem.pair is None else near[~problem.pair.missing]
-    before = (problem.source.points - problem.truth).norm(dim=-1) / problem.diagonal
+    """Return errors of moved points, but for a part that the target lacks: nothing tells where it would be."""
+    known = torch.ones(len(moved), dtype=torch.bool) if problem.pair is None else ~problem.pair.missing
+    errors = ((moved - problem.truth).norm(dim=-1) / problem.diagonal)[known]
+    before = ((problem.source.points - problem.truth).norm(dim=-1) / problem.diagonal)[known]
+    near = float((errors < NEAR).double().mean())
     return {
-        "registered": float(known.mean() >= REGISTERED),
-        "near_percent": 100 * float(near.mean()),
+        "registered": float(near >= REGISTERED),
+        "near_percent": 100 * near,
         "error_percent": 100 * float(errors.mean()),
         "motion_percent": 100 * float(before.mean()),
     }
