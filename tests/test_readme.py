@@ -36,7 +36,7 @@ def test_ci_refuses_unknown_arguments():
     assert "usage" in answer.stderr
 
 
-@pytest.mark.parametrize("marker", ["example", "scan example"])
+@pytest.mark.parametrize("marker", ["example", "scan example", "camera example"])
 def test_example_is_short_and_runs(tmp_path, marker):
     example = block_after(marker, "python")
     assert len([line for line in example.splitlines() if line.strip()]) <= 12

@@ -10,10 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torchreg import errors, metrics
+    from torchreg.capture.depth import depth_scan, fuse_scans, load_depth_scan
+    from torchreg.capture.silhouette_frames import SilhouetteFrames
+    from torchreg.capture.silhouettes import visual_hull
+    from torchreg.capture.stereo import StereoConfig, stereo_points
+    from torchreg.capture.stereo_frames import StereoFrames
     from torchreg.correspondence.sigma import SigmaSchedule
+    from torchreg.geometry.camera import Camera
+    from torchreg.geometry.camera_rig import CameraRig, StereoPair
     from torchreg.geometry.mesh import TriangleMesh
     from torchreg.geometry.range_scan import RangeScan
     from torchreg.geometry.skeleton import Skeleton
+    from torchreg.io.calibration import load_cameras
     from torchreg.io.points import load_mesh, load_points
     from torchreg.losses.em import EMLoss
     from torchreg.models.articulated import ArticulatedShape
@@ -59,6 +67,8 @@ __all__ = [
     "ArticulatedShape",
     "BendingSkin",
     "Calibration",
+    "Camera",
+    "CameraRig",
     "EMLoss",
     "FindPoseConfig",
     "FrameResult",
@@ -77,12 +87,16 @@ __all__ = [
     "ScanRegistration",
     "SequenceRegistration",
     "SigmaSchedule",
+    "SilhouetteFrames",
     "Skeleton",
     "SkeletonizeConfig",
     "Spine",
     "SpineConfig",
     "SpineSequence",
     "Status",
+    "StereoConfig",
+    "StereoFrames",
+    "StereoPair",
     "TrackConfig",
     "TrackResult",
     "TrackState",
@@ -91,10 +105,14 @@ __all__ = [
     "__version__",
     "align",
     "calibrate",
+    "depth_scan",
     "errors",
     "extract_spine",
     "find_pose",
+    "fuse_scans",
     "load",
+    "load_cameras",
+    "load_depth_scan",
     "load_mesh",
     "load_points",
     "metrics",
@@ -103,9 +121,11 @@ __all__ = [
     "sample_skin",
     "skeletonize",
     "solve_pose",
+    "stereo_points",
     "to_open3d",
     "to_pyvista",
     "to_trimesh",
+    "visual_hull",
 ]
 
 _MODULES = frozenset({"errors", "metrics"})
@@ -116,6 +136,8 @@ _OWNERS = {
     "ArticulatedShape": "models.articulated",
     "BendingSkin": "models.skin",
     "Calibration": "results",
+    "Camera": "geometry.camera",
+    "CameraRig": "geometry.camera_rig",
     "EMLoss": "losses.em",
     "FindPoseConfig": "pipelines.find_pose",
     "FrameResult": "results",
@@ -134,22 +156,30 @@ _OWNERS = {
     "ScanRegistration": "results",
     "SequenceRegistration": "results",
     "SigmaSchedule": "correspondence.sigma",
+    "SilhouetteFrames": "capture.silhouette_frames",
     "Skeleton": "geometry.skeleton",
     "SkeletonizeConfig": "pipelines.skeletonize",
     "Spine": "models.spine",
     "SpineConfig": "pipelines.extract_spine",
     "SpineSequence": "results",
     "Status": "results",
+    "StereoConfig": "capture.stereo",
+    "StereoFrames": "capture.stereo_frames",
+    "StereoPair": "geometry.camera_rig",
     "TrackConfig": "pipelines.track_config",
     "TrackResult": "results",
     "TrackState": "results",
     "Tracker": "pipelines.track",
     "TriangleMesh": "geometry.mesh",
     "align": "pipelines.align",
-    "extract_spine": "pipelines.extract_spine",
     "calibrate": "pipelines.calibrate",
+    "depth_scan": "capture.depth",
+    "extract_spine": "pipelines.extract_spine",
     "find_pose": "pipelines.find_pose",
+    "fuse_scans": "capture.depth",
     "load": "pipelines.storage",
+    "load_cameras": "io.calibration",
+    "load_depth_scan": "capture.depth",
     "load_mesh": "io.points",
     "load_points": "io.points",
     "register": "pipelines.register",
@@ -157,9 +187,11 @@ _OWNERS = {
     "sample_skin": "models.skin",
     "skeletonize": "pipelines.skeletonize",
     "solve_pose": "pipelines.solve_pose",
+    "stereo_points": "capture.stereo",
     "to_open3d": "viz.conversions",
     "to_pyvista": "viz.conversions",
     "to_trimesh": "viz.conversions",
+    "visual_hull": "capture.silhouettes",
 }
 
 
