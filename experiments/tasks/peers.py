@@ -13,7 +13,9 @@ from experiments.errors import SkippedTrial
 
 PACKAGES = {"cpd": "pycpd", "gicp": "small_gicp", "skeletor": "skeletor"}
 # Coherent Point Drift takes memory and time by the product of the numbers of points.
-_MAX_POINTS = 1500
+_MAX_POINTS = 700
+# Looser, it stops while the points are still drawn together.
+_CPD_TOLERANCE, _CPD_STEPS = 1e-5, 150
 
 
 def peer(method: str) -> Any:
@@ -44,19 +46,24 @@ def moved_by(method: str, source: Tensor, target: Tensor, outliers: float = 0.0)
     """
     package = peer(method)
     first, second = source.double().cpu().numpy(), target.double().cpu().numpy()
-    middle, size = second.mean(0), float(np.linalg.norm(np.ptp(second, axis=0)))
+    middle = second.mean(0)
+    # Their constants are meant for points of unit variance, and for things about a unit long.
+    spread, length = np.sqrt(((second - middle) ** 2).sum(1).mean()), np.linalg.norm(np.ptp(second, axis=0))
+    size = float(spread if method == "cpd" else length)
     first, second = (first - middle) / size, (second - middle) / size
     found = _cpd(package, first, second, outliers) if method == "cpd" else _gicp(package, first, second)
     return torch.from_numpy(found * size + middle).to(source)
 
 
 def _cpd(package: Any, source: Any, target: Any, outliers: float) -> Any:
-    every = max(1, -(-len(source) // _MAX_POINTS))
-    few, goal = source[::every], target[:: max(1, -(-len(target) // _MAX_POINTS))]
+    few, goal = (points[:: max(1, -(-len(points) // _MAX_POINTS))] for points in (source, target))
+    found = package.DeformableRegistration(
+        X=goal, Y=few, w=min(outliers, 0.9), tolerance=_CPD_TOLERANCE, max_iterations=_CPD_STEPS
+    )
+    moved, _ = found.register()
     # Between its points, what it moved is carried by the nearest of them.
-    moved, _ = package.DeformableRegistration(X=goal, Y=few, w=min(outliers, 0.9)).register()
-    gaps = torch.cdist(torch.from_numpy(source), torch.from_numpy(few)).argmin(1).numpy()
-    return source + (moved - few)[gaps]
+    nearest = torch.cdist(torch.from_numpy(source), torch.from_numpy(few)).argmin(1).numpy()
+    return source + (moved - few)[nearest]
 
 
 def _gicp(package: Any, source: Any, target: Any) -> Any:

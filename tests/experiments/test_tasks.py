@@ -1,0 +1,180 @@
+"""What trials measure, held against what is known of their scenes."""
+
+import ast
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import torchreg as tr
+from experiments.errors import SkippedTrial
+from experiments.registry import TASKS, Bench
+from experiments.schema import (
+    AlignmentTrial,
+    AlignSolver,
+    HandScene,
+    ProbeTrial,
+    RegistrationTrial,
+    ScanPairConfig,
+    ScheduleConfig,
+    SpineTrial,
+)
+from experiments.tasks import alignment, peers, probe, registration, spine
+from torchreg.datasets.creatures import STARFISH, creature_sequence
+
+ROOT = Path(__file__).resolve().parents[2]
+SMALL = AlignmentTrial(scene=HandScene(num_points=120), solver=AlignSolver(num_model_points=120))
+
+
+@pytest.fixture
+def bench(tmp_path):
+    return Bench("cpu", tmp_path)
+
+
+def test_all_tasks_can_be_loaded():
+    assert all(callable(task.load()) for task in TASKS.values())
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [
+        ({"kind": "geometric", "start": 0.08, "stop": 0.02, "steps": 3}, (0.016, 0.008, 0.004)),
+        ({"kind": "linear", "start": 0.08, "stop": 0.02, "steps": 3}, (0.016, 0.01, 0.004)),
+        ({"kind": "constant", "start": 0.05, "steps": 2}, (0.01, 0.01)),
+        ({"kind": "adaptive", "start": 0.08, "stop": 0.02, "steps": 7}, (0.016, 0.004)),
+        ({"kind": "geometric", "start": 0.08, "stop": 0.03, "steps": 3, "kappa": 0.5}, (0.016, 0.008, 0.006)),
+    ],
+)
+def test_schedules_are_shares_of_the_size(settings, expected):
+    schedule = alignment.sigma_schedule(ScheduleConfig(**settings), 0.2)
+    assert schedule.values == pytest.approx(expected)
+    assert schedule.steps == settings["steps"]
+    assert alignment.sigma_schedule(ScheduleConfig(kind="default"), 0.2) is None
+
+
+@pytest.mark.parametrize("settings", [{"stop": 0.2}, {"stop": 0.0}, {"steps": 0}, {"kappa": 0.0}, {"kappa": 1.5}])
+def test_impossible_schedules_are_refused(settings):
+    with pytest.raises(ValueError, match=next(iter(settings))):
+        ScheduleConfig(**settings)
+
+
+def test_a_scene_depends_on_the_seed_and_not_on_the_method(plain_hand):
+    one = alignment.make_scene(plain_hand, SMALL)
+    other = alignment.make_scene(plain_hand, replace(SMALL, solver=replace(SMALL.solver, method="closest")))
+    third = alignment.make_scene(plain_hand, replace(SMALL, seed=1))
+    assert torch.equal(one.cloud.points, other.cloud.points)
+    assert torch.equal(one.start, other.start)
+    assert not torch.equal(one.start, third.start)
+
+
+def test_a_hand_that_starts_at_the_truth_stays_there(bench):
+    scene = replace(SMALL.scene, start_deg=0.0, outlier_ratio=0.0, num_points=400)
+    trial = replace(SMALL, scene=scene, schedule=ScheduleConfig(kind="default"), pictures=True)
+    found = alignment.run(replace(trial, solver=replace(SMALL.solver, em_steps=2, surface_steps=2, prior=True)), bench)
+    assert found.metrics["failed"] == 0
+    assert found.metrics["tips_mm"] < 3
+    assert found.metrics["points_mm"] < 3
+    assert found.curves["tips_mm"][-1] == pytest.approx(found.metrics["tips_mm"], rel=1e-4)
+    assert len(set(map(len, found.curves.values()))) == 1
+    assert {path.name for path in bench.folder.iterdir()} == set(found.artifacts.values())
+
+
+def test_points_are_as_far_off_as_the_start_is_if_nothing_moves(plain_hand, monkeypatch, bench):
+    monkeypatch.setattr(alignment, "moved_by", lambda method, source, target, outliers: source)
+    scene = alignment.make_scene(plain_hand, SMALL)
+    expected = 1e3 * (scene.skin(scene.start) - scene.skin(scene.cloud.pose)).norm(dim=-1).mean()
+    found = alignment.run(replace(SMALL, solver=replace(SMALL.solver, method="cpd")), bench)
+    assert found.metrics == {"points_mm": pytest.approx(float(expected), rel=1e-5)}
+
+
+@pytest.mark.parametrize(("method", "package"), [("cpd", "pycpd"), ("gicp", "small_gicp")])
+def test_other_programs_find_a_small_motion(method, package):
+    if importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} is not installed")
+    generator = torch.Generator().manual_seed(0)
+    source = torch.rand(400, 3, generator=generator) * torch.tensor([1.0, 2.0, 3.0])
+    angle = torch.tensor(0.05)
+    turn = torch.tensor([[angle.cos(), -angle.sin(), 0.0], [angle.sin(), angle.cos(), 0.0], [0.0, 0.0, 1.0]])
+    target = source @ turn.T + 0.03
+    moved = peers.moved_by(method, source, target)
+    before, after = ((points - target).norm(dim=-1).mean() for points in (source, moved))
+    assert after < 0.3 * before
+
+
+def test_a_missing_program_skips_the_trial(monkeypatch, bench):
+    monkeypatch.setitem(peers.PACKAGES, "cpd", "no_such_package")
+    with pytest.raises(SkippedTrial, match="no_such_package is not installed: pip install 'torchreg"):
+        alignment.run(replace(SMALL, solver=replace(SMALL.solver, method="cpd")), bench)
+    monkeypatch.setitem(peers.PACKAGES, "skeletor", "no_such_package")
+    with pytest.raises(SkippedTrial, match="no_such_package is not installed"):
+        spine.run(SpineTrial(method="skeletor", frames=1, resolution=24), bench)
+
+
+def test_scans_from_a_file(tmp_path, bench):
+    pair = ScanPairConfig(dataset="toy", num_points=500)
+    made = registration.make_problem(pair, 0)
+    np.savez(
+        tmp_path / "pair.npz", source_points=made.source.points, source_faces=made.source.faces,
+        target_points=made.target.points, target_faces=made.target.faces, source_truth=made.truth,
+        diagonal=made.diagonal,
+    )  # fmt: skip
+    stored = ScanPairConfig(dataset="file", folder=str(tmp_path), name="pair")
+    trial = RegistrationTrial(pair=stored, num_bones=4, grid_resolution=15, num_samples=200, pictures=True)
+    found = registration.run(trial, bench)
+    assert found.metrics["vertices"] == len(made.source.points)
+    assert set(found.seconds) == {"setup", "initialize", "align", "weights", "total"}
+    assert found.seconds["total"] == pytest.approx(sum(found.seconds[name] for name in registration.STAGES), rel=1e-5)
+    assert {path.name for path in bench.folder.iterdir()} >= set(found.artifacts.values())
+    with pytest.raises(
+        SkippedTrial, match=r"there is no file .*gone.npz; say where the data lie with pair.folder=FOLDER"
+    ):
+        registration.make_problem(replace(stored, name="gone"), 0)
+
+
+def test_errors_of_scans_leave_out_parts_that_the_target_lacks():
+    problem = registration.make_problem(ScanPairConfig(dataset="toy", num_points=500), 0)
+    assert problem.pair.missing.any()
+    moved = problem.truth.clone()
+    moved[problem.pair.missing] += 10
+    perfect = registration._accuracy(problem, moved)
+    assert (perfect["registered"], perfect["near_percent"], perfect["error_percent"]) == (1, 100, 0)
+    assert registration._accuracy(problem, problem.truth + 0.1 * problem.diagonal)["near_percent"] == 0
+
+
+def test_a_captured_sequence_from_a_file(tmp_path, bench):
+    made = creature_sequence(STARFISH, 1, resolution=24)
+    vertices = torch.stack([made.meshes[0].vertices + shift for shift in (0.0, 0.1, 0.2, 0.3)])
+    np.savez(tmp_path / "moving.npz", vertices=vertices, faces=made.meshes[0].faces)
+    trial = SpineTrial(creature="file", folder=str(tmp_path), name="moving", frames=2, pictures=True)
+    found = spine.run(trial, bench)
+    assert found.metrics["frames"] == 2
+    assert (found.metrics["tips"], found.metrics["named"], found.metrics["trees_after"]) == (5, 1, 1)
+    assert found.curves == {"own_tips": [5, 5], "tips": [5, 5]}
+    with pytest.raises(SkippedTrial, match="there is no file"):
+        spine.run(replace(trial, name="gone"), bench)
+
+
+@pytest.mark.parametrize(("topology", "tips"), [("(()()()()())", 5), ("((()())()(()()))", 5), ("(()())", 2)])
+def test_tips_of_a_tree_are_its_leaves(topology, tips):
+    assert spine.count_tips(topology) == tips
+
+
+def test_a_probe_depends_on_its_configuration_alone(bench):
+    one, same, other = (probe.run(ProbeTrial(seed=seed, rounds=3), bench) for seed in (0, 0, 1))
+    assert one.metrics == same.metrics != other.metrics
+    assert len(one.curves["norm"]) == 3
+
+
+def test_experiments_use_the_public_library_alone():
+    """Top-level names, data sets, scores and pictures; and how files are written in one step."""
+    allowed = ("torchreg.datasets.", "torchreg.viz.", "torchreg.metrics", "torchreg.io.atomic")
+    for path in (ROOT / "experiments").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("torchreg."):
+                assert node.module.startswith(allowed), f"{path}:{node.lineno}"
+                assert not any(name.name.startswith("_") for name in node.names)
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "tr":
+                assert node.attr in tr.__all__, f"{path}:{node.lineno}: tr.{node.attr} is not public"
