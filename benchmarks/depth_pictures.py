@@ -39,8 +39,6 @@ STEP = 1e-4
 SENSORS = {"structured light": DepthNoise.structured_light(), "time of flight": DepthNoise.time_of_flight()}
 # A stereo depth camera of today at one metre: 0.2 mm noise and steps, flying pixels, holes.
 GOOD = DepthNoise(quadratic=2e-4, step=2e-4, jitter=0.3, flying=0.3, dropout=0.005)
-# Pixels of the depth camera per pixel of the exact scan, along each axis.
-FINER = 2
 # Metres of noise at one metre above which depths are smoothed; it costs detail.
 SMOOTHED = 1e-3
 
@@ -108,10 +106,10 @@ def normals(size: int) -> dict[str, float]:
     return figures
 
 
-def depth_camera_scan(sequence: ScanSequence, frame: int, sensor: DepthNoise, folder: Path) -> tr.RangeScan:
+def depth_camera_scan(sequence: ScanSequence, frame: int, sensor: DepthNoise, finer: int, folder: Path) -> tr.RangeScan:
     """Return the scan that a depth image of a frame gives, through a file; noise of over a millimetre is smoothed."""
     view = sequence.view
-    fine = View(view.position, view.rotation, view.corner, view.pitch / FINER, FINER * view.width, FINER * view.height)
+    fine = View(view.position, view.rotation, view.corner, view.pitch / finer, finer * view.width, finer * view.height)
     depth = rasterize(sequence.mesh(frame), fine, cull_back=True).depth
     seen = sensor.measured(depth.where(depth.isfinite(), 0.0), torch.Generator().manual_seed(frame))
     focal = torch.full((2,), 1 / fine.pitch, dtype=torch.float64)
@@ -122,7 +120,7 @@ def depth_camera_scan(sequence: ScanSequence, frame: int, sensor: DepthNoise, fo
     return load_depth_scan(folder / "d.png", folder / "k.json", smoothing=noise if noise > SMOOTHED else 0.0)
 
 
-def registration(pairs: int, sensors: dict[str, DepthNoise]) -> dict[str, float]:
+def registration(pairs: int, sensors: dict[str, DepthNoise], finer: int) -> dict[str, float]:
     """Return mean errors of registration, as shares of the diagonal, from exact scans and from depth images."""
     errors: dict[str, list[float]] = {name: [] for name in ("exact", *sensors)}
     seconds: dict[str, list[float]] = {name: [] for name in errors}
@@ -136,7 +134,9 @@ def registration(pairs: int, sensors: dict[str, DepthNoise]) -> dict[str, float]
                 if name == "exact":
                     scans = [sequence[frame] for frame in range(2)]
                 else:
-                    scans = [depth_camera_scan(sequence, frame, sensors[name], Path(folder)) for frame in range(2)]
+                    scans = [
+                        depth_camera_scan(sequence, frame, sensors[name], finer, Path(folder)) for frame in range(2)
+                    ]
                 found = tr.register(scans[0], scans[1])
                 seconds[name].append(time.perf_counter() - started)
                 with torch.no_grad():
@@ -157,12 +157,17 @@ def registration(pairs: int, sensors: dict[str, DepthNoise]) -> dict[str, float]
 def main(arguments: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pairs", type=int, default=6, help="toys to be registered")
+    parser.add_argument(
+        "--finer", type=int, default=1, help="pixels of depth images per pixel of exact scans, each way"
+    )
+    parser.add_argument("--good", action="store_true", help="leave out the two kinds of noisy sensors")
     parser.add_argument("--smoke", action="store_true", help="seconds: small pictures, no registration")
     options = parser.parse_args(arguments)
     size = 320 if options.smoke else 640
     results = {"reprojection": reprojection(size), "normals": normals(size)}
+    sensors = {"depth camera": GOOD} | ({} if options.good else SENSORS)
     if not options.smoke and options.pairs:
-        results["registration"] = registration(options.pairs, {"depth camera": GOOD} | SENSORS)
+        results["registration"] = registration(options.pairs, sensors, options.finer)
     for title, figures in results.items():
         print(title, *(f"  {what:44s} {value:.4g}" for what, value in figures.items()), sep="\n")
     return results

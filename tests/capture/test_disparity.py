@@ -86,3 +86,13 @@ def test_arguments_are_checked(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(MissingExtraError, match=r"torchreg\[stereo\]"):
         match_disparity(left, right, 20, method="opencv")
+
+
+def test_opencv_matches_up_to_the_left_border():
+    pytest.importorskip("cv2")
+    left, right, truth = scene()
+    found = match_disparity(left, right, 30, method="opencv")
+    column = torch.arange(100).expand(50, 100)
+    both = (column - truth >= 2) & (column < 30)
+    assert found[both].isfinite().double().mean() > 0.7
+    assert not found[column < found].isfinite().any()

@@ -196,5 +196,8 @@ def _opencv(left: Tensor, right: Tensor, lowest: int, highest: int) -> Tensor:
     )  # fmt: skip
     scale = 255 / max(float(left.max()), float(right.max()), 1e-9)
     gray = [(part.cpu().clamp(min=0) * scale).round().numpy().astype(np.uint8) for part in (left, right)]
-    found = torch.from_numpy(matcher.compute(*gray)).double() / 16
-    return torch.where(found >= lowest, found, torch.nan)
+    # OpenCV leaves out columns for which not all disparities lie in the picture; its border repeated, none does.
+    wide = [np.pad(part, ((0, 0), (lowest + count, 0)), mode="edge") for part in gray]
+    found = torch.from_numpy(matcher.compute(*wide))[:, lowest + count :].double() / 16
+    inside = torch.arange(found.shape[1]) >= found
+    return torch.where((found >= lowest) & inside, found, torch.nan)
