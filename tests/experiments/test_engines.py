@@ -170,6 +170,20 @@ def test_an_engine_passes_on_that_results_cannot_be_written(tmp_path, monkeypatc
         engine.close()
 
 
+def test_two_drivers_share_a_sweep(tmp_path, start_driver):
+    """Started at once, in processes of their own, over one folder."""
+    sweep, log = tmp_path / "shared.yaml", tmp_path / "log"
+    sweep.write_text(SWEEP.format(log=log, seconds=0.06))
+    drivers = [start_driver("sweep", sweep, "--results", tmp_path / "results") for _ in range(2)]
+    told = [driver.communicate(timeout=100)[0] for driver in drivers]
+    assert [driver.returncode for driver in drivers] == [0, 0], told
+    # Every trial began once, whoever ran it, and both drivers know all results.
+    assert len(log.read_text().splitlines()) == 24
+    records, bad = Store(tmp_path / "results/shared").records()
+    assert (len(records), bad) == (24, [])
+    assert all("24 trials: " in one for one in told)
+
+
 def test_workers_end_with_their_driver(tmp_path, start_driver):
     sweep = tmp_path / "slow.yaml"
     sweep.write_text(f"task: probe\nquestion: q\ntrial: {{seconds: 60, log: {tmp_path / 'log'}}}\n")
