@@ -38,6 +38,8 @@ from torchreg.io.npz import save_arrays
 MOTIONS = ("rotation", "bending_palm", "flip")
 TIPS = [4, 8, 12, 16, 20]
 NEAREST, FARTHEST, WALL, DISTANCE, FPS = 0.45, 0.8, 0.95, 0.6, 20.0
+# Where there are fewer corners, textured places between them stand in.
+LEAST = 500
 # The palm turns faster than this, radians per frame, during a flip.
 FLIPPING = 0.06
 
@@ -171,7 +173,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
             folder = (Path(place) if options.smoke else options.folder or _kept()) / name
             poses = hand_motion(hand, motion, count, FPS, distance=DISTANCE)
             rendered(folder, motion, poses, hand, pair)
-            config = StereoConfig(nearest=NEAREST, farthest=FARTHEST, method=matcher)
+            config = StereoConfig(nearest=NEAREST, farthest=FARTHEST, method=matcher, least=LEAST)
             frames = StereoFrames(folder / "left", folder / "right", pair, config=config, reach=hand.length)
             found = {f"{motion}, points by {matcher}": point_figures(frames, folder)}
             if not options.smoke:

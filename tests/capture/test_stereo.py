@@ -75,6 +75,24 @@ def test_background_goes_by_depth_and_by_volume(scene):
     assert len(few) == 20
 
 
+def test_textured_places_stand_in_for_corners(scene):
+    pair, left, right, found = scene
+    least = len(found) + 100
+    config = StereoConfig(nearest=0.4, farthest=1.0, least=least)
+    more = stereo_points(left.image, right.image, pair, config=config)
+    assert len(more) >= len(found) + 50
+    error, _ = errors(scene, more)
+    assert error.median() < 3e-3
+    assert (error <= 3 * more.depth_std).float().mean() >= 0.95
+    corners = {tuple(pixel) for pixel in found.pixels.tolist()}
+    assert corners <= {tuple(pixel) for pixel in more.pixels.tolist()}
+    added = torch.tensor([pixel for pixel in more.pixels.tolist() if tuple(pixel) not in corners])
+    apart = torch.cdist(added, more.pixels, p=torch.inf)
+    assert apart[apart > 0].min() >= 3
+    with pytest.raises(InputError, match="least must be at most num_corners"):
+        StereoConfig(num_corners=20, least=30)
+
+
 def test_rectified_pictures_of_a_turned_pair_with_lenses_match():
     pair = stereo_cameras(width=200, height=150, focal=240.0)
     twist = torch.tensor([0.0, 0.004, 0.002, 0.02, -0.03, 0.02], dtype=torch.float64)

@@ -27,6 +27,8 @@ _WINDOW_BORDER = 8
 # Nearer to an outline, pixels, dense disparity may belong to the other side. Between neighbors, disparities of one
 # surface differ by no more than the steepest slope.
 _OUTLINE, _STEEPEST = 2, 1.25
+# Places that stand in for corners are looked for so often, and so many more of them, as some do not match well.
+_FILL_ROUNDS, _SPARE = 4, 1.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,8 @@ class StereoConfig:
         method: see `match_disparity`.
         max_disparity_std: corners whose disparity is less certain are dropped, pixels.
         both: a corner must be one in both pictures, to two pixels.
+        least: where there are fewer corners, textured places between them stand in, the most distinct first and no
+            nearer to each other than three pixels.
 
     Raises:
         InputError: if a number is out of range.
@@ -82,11 +86,15 @@ class StereoConfig:
     method: str = "semi-global"
     max_disparity_std: float = 0.5
     both: bool = True
+    least: int = 0
 
     def __post_init__(self) -> None:
         check_positive(self.nearest, "nearest")
         check_positive(self.max_disparity_std, "max_disparity_std")
         check_count(self.num_corners, "num_corners", 1)
+        check_count(self.least, "least", 0)
+        if self.least > self.num_corners:
+            raise InputError(f"least must be at most num_corners, got {self.least} and {self.num_corners}")
         if not self.farthest > self.nearest:
             raise InputError(f"farthest must be beyond nearest, got {self.farthest} and {self.nearest}")
 
@@ -143,9 +151,11 @@ def stereo_points(
         depth = pair.depth(dense)
         wanted = (depth >= config.nearest) & (depth <= config.farthest)
         # Where an outline makes the corner, it is no place of either surface.
-        corners = _corners(first) & wanted & ~_on_outline(dense)
+        wanted &= ~_on_outline(dense)
+        corners = _corners(first) & wanted
         if config.both:
             corners &= _corner_there(_corners(second), dense)
+        corners |= _textured(first, wanted, corners, config.least)
         row, column = corners.nonzero().unbind(-1)
         fit = refine_disparity(first, second, dense, torch.stack((column, row), dim=-1))
         kept = fit.good & (fit.std <= config.max_disparity_std)
@@ -246,10 +256,33 @@ def _corners(gray: Tensor) -> Tensor:
     """Return at which pixels (H, W) the Harris response has a local maximum, away from the border."""
     response = harris_response(gray[None, None])[0, 0]
     around = torch.nn.functional.max_pool2d(response[None, None], 3, 1, 1)[0, 0]
-    peaks = (response >= around) & (response > _WEAKEST_CORNER * response.max())
-    inner = torch.zeros_like(peaks)
+    return (response >= around) & (response > _WEAKEST_CORNER * response.max()) & _inner(gray)
+
+
+def _inner(gray: Tensor) -> Tensor:
+    """Return which pixels (H, W) have room for a window."""
+    inner = torch.zeros(gray.shape, dtype=torch.bool, device=gray.device)
     inner[_WINDOW_BORDER:-_WINDOW_BORDER, _WINDOW_BORDER:-_WINDOW_BORDER] = True
-    return peaks & inner
+    return inner
+
+
+def _textured(gray: Tensor, wanted: Tensor, corners: Tensor, least: int) -> Tensor:
+    """Return more pixels (H, W), wanted ones of strong Harris response apart from corners, until there are enough."""
+    response = torch.where(wanted & _inner(gray), harris_response(gray[None, None])[0, 0], 0.0)
+    response = torch.where(response > _WEAKEST_CORNER * response.max(), response, 0.0)
+    more = torch.zeros_like(corners)
+    for _ in range(_FILL_ROUNDS):
+        missing = int(_SPARE * least) - int(corners.sum() + more.sum())
+        if missing <= 0:
+            break
+        taken = torch.nn.functional.max_pool2d((corners | more)[None, None].float(), 5, 1, 2)[0, 0] > 0
+        free = torch.where(taken, 0.0, response)
+        peaks = (free > 0) & (free >= torch.nn.functional.max_pool2d(free[None, None], 5, 1, 2)[0, 0])
+        if not bool(peaks.any()):
+            break
+        weakest = free[peaks].sort(descending=True).values[: max(missing, 1)][-1]
+        more |= peaks & (free >= weakest)
+    return more
 
 
 def _on_outline(disparity: Tensor) -> Tensor:

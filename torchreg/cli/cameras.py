@@ -44,6 +44,10 @@ Seen = Annotated[
 ]
 
 
+# Corners alone may be too few where fingers point at the camera.
+_LEAST_POINTS = 500
+
+
 def check_used(wanted: bool, flag: str, options: Mapping[str, Any]) -> None:
     """Raise InputError if options are given that mean nothing without a flag."""
     for name, value in options.items():
@@ -104,7 +108,7 @@ def stereo_source(
         folders[0],
         folders[1],
         rig.stereo(),
-        config=StereoConfig(nearest=near, farthest=far, method=method),
+        config=StereoConfig(nearest=near, farthest=far, method=method, least=_LEAST_POINTS),
         box=None if volume is None else torch.tensor(volume).reshape(2, 3),
         reach=reach or None,
     )
