@@ -159,3 +159,17 @@ def test_composition_broadcasts():
     many, one = random_vectors(4), random_vectors(1, seed=3)[0]
     expected = torch.stack([compose_rotation_vectors(w, one) for w in many])
     torch.testing.assert_close(compose_rotation_vectors(many, one), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("angle", ANGLES)
+def test_without_derivatives_the_same_comes_out_sooner(angle, dtype):
+    vector, other = (angle * AXIS).to(dtype), random_vectors(1)[0].to(dtype)
+    functions = [so3_exp, wrap_rotation_vector, lambda w: compose_rotation_vectors(w, other)]
+    expected = [function(vector) for function in functions]
+    with torch.inference_mode():
+        found = [function(vector) for function in functions]
+    for one, known in zip(found, expected, strict=True):
+        # Half a turn to the left is half a turn to the right.
+        same = one if known.ndim == 2 or float(one @ known) >= 0 else -one
+        torch.testing.assert_close(same, known, atol=50 * torch.finfo(dtype).eps, rtol=0)

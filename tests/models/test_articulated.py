@@ -265,6 +265,23 @@ def test_longer_parts_carry_the_frames_below_them_away():
     torch.testing.assert_close(after[2:, :3, 3] - before[2:, :3, 3], shift.expand(3, 3))
 
 
+def test_held_sizes_change_nothing_and_are_let_go():
+    shape, points = crane(), cloud()
+    expected = shape.distance_jacobian(points, pose_with())
+    with torch.no_grad(), shape.held_sizes():
+        found = shape.distance_jacobian(points, pose_with())
+        few = shape.distance(points, pose_with(), parts=[1, 3])
+    torch.testing.assert_close(found, expected)
+    torch.testing.assert_close(few, shape.distance(points, pose_with(), parts=[1, 3]))
+    with torch.no_grad():
+        shape.log_length_scales[1] = math.log(2.0)
+    assert not torch.allclose(shape.distance(points, pose_with()), expected[0])
+    with pytest.raises(RuntimeError, match="stop"), shape.held_sizes():
+        raise RuntimeError("stop")
+    assert shape.log_length_scales.requires_grad
+    assert shape.distance(points, pose_with()).requires_grad
+
+
 def test_moving_to_another_dtype_moves_everything():
     exact, pose = crane(), pose_with()
     shape = copy.deepcopy(exact).to(torch.float32)

@@ -21,6 +21,7 @@ from torchreg.pipelines.align_stages import (
     fit_surface,
     register,
     residual_noise,
+    settle_surface,
     surface_steps,
 )
 
@@ -220,6 +221,17 @@ def test_padding_is_never_looked_at(skin, truths):
         fitted = [fit_surface(each, poses[0], steps=2).pose for each in (plain, masked)]
         torch.testing.assert_close(fitted[0], fitted[1])
         torch.testing.assert_close(residual_noise(plain, truths), residual_noise(masked, truths))
+
+
+def test_settling_ends_where_the_fit_does(skin, truths):
+    problem, start = make_problem(skin, skin(truths)), nudged(skin, truths, 0.02)
+    fitted = fit_surface(problem, start, steps=3, sigmas=(0.022,))
+    settled = settle_surface(problem, start, steps=3, sigmas=(0.022,))
+    torch.testing.assert_close(settled.pose, fitted.pose, atol=1e-4, rtol=0)
+    distance, jacobian = problem.surface.distance_jacobian(problem.data, settled.pose)
+    torch.testing.assert_close(settled.distance, distance)
+    torch.testing.assert_close(settled.jacobian, jacobian)
+    assert (settled.change < 1e-4).all()
 
 
 def test_surface_fit_finds_the_pose_under_outliers(skin, truths):

@@ -100,12 +100,12 @@ class AlignProblem:
             start=around, cost=objective.cost,
         )  # fmt: skip
 
-    def step(self, around: Linearization, pose: Tensor) -> LMResult:
+    def step(self, around: Linearization, pose: Tensor, damping: float = _EM_DAMPING) -> LMResult:
         """Return the result of one damped step, without a test: what a generalized EM needs."""
-        damping = torch.full_like(pose[:, 0], _EM_DAMPING)
+        shares = torch.full_like(pose[:, 0], damping)
         held = held_at_limits(around.gradient, pose, self.lower, self.upper)
-        step = damped_step(around, damping, frozen=held)
-        return LMResult(self.clamp(self.skin.shape.retract(pose, step)), around.cost, damping, step, 1)
+        step = damped_step(around, shares, frozen=held)
+        return LMResult(self.clamp(self.skin.shape.retract(pose, step)), around.cost, shares, step, 1)
 
     def change(self, step: Tensor) -> Tensor:
         """Return the largest change (B,) in a step, radians, or metres as a share of the size."""
