@@ -87,8 +87,8 @@ def test_prior_follows_the_surprises_between_bounds(arm_tracking):
 
 
 def test_motion_is_fast_where_predictions_fail(arm_tracking):
-    assert not moves_fast(arm_tracking.state(error=0.015), 0.4)
-    assert moves_fast(arm_tracking.state(error=0.017), 0.4)
+    assert not moves_fast(arm_tracking.state(error=0.0125), 0.4)
+    assert moves_fast(arm_tracking.state(error=0.0135), 0.4)
 
 
 def test_differences_are_the_steps_that_lead_there(arm, arm_tracking):

@@ -118,7 +118,7 @@ class Tracker:
         cloud = self._checked(points)
         state, gap = timed(self._state, time)
         # A tenth faster than without gradients alone, as most of the time goes to small operations.
-        with torch.inference_mode():
+        with torch.inference_mode(), self.shape.held_sizes():
             frame = Frame(cloud, torch.isfinite(cloud).all(-1), gap)
             unfit = self._unfit(frame.data)
             if unfit is not None:
@@ -287,10 +287,10 @@ class Tracker:
             if int(near.sum()) > len(distance):
                 data = (frame.cloud[near] - fit.view.origin)[None]
                 distance = problem.surface.distance(data, fit.pose)[0]
-            posed = problem.skin(fit.pose)
-            registered = posed[0] + fit.view.origin
+            posed = problem.skin.place(fit.rows)
+            registered = posed + fit.view.origin
             distances[near] = distance
-            posterior[near] = expectation(posed, data, sigma[None]).inlier_posterior[0]
+            posterior[near] = expectation(posed, data[0], sigma).inlier_posterior
         inliers = distances.abs() < self._fitter.inlier_distance
         count = int(frame.finite.sum())
         return FrameResult(

@@ -112,6 +112,7 @@ class FrameFit:
         pose: (1, num_dofs).
         distance: (1, M) of the data.
         jacobian: (1, M, num_dofs) of the distances.
+        transforms: (P, 4, 4) of the parts.
         noise: () standard deviation of the data near the surface, metres.
         change: of the last step.
         cost: that ranks fits to a frame.
@@ -127,6 +128,7 @@ class FrameFit:
     pose: Tensor
     distance: Tensor
     jacobian: Tensor
+    transforms: Tensor
     noise: Tensor
     change: float
     cost: float
@@ -146,6 +148,11 @@ class FrameFit:
     def explained(self) -> float:
         """How many data in reach lie on the surface, softly counted, less the prior's cost."""
         return (1 - self.cost / max(1, self.distance.shape[-1])) * int(self.view.near.sum())
+
+    @property
+    def rows(self) -> Tensor:
+        """The transforms (4 P, 3) as skins place their points with, see `LinearBlendSkin.place`."""
+        return self.transforms[:, :3].mT.flatten(0, 1)
 
     @property
     def world(self) -> Tensor:

@@ -47,11 +47,14 @@ def is_lost(state: TrackState, fit: FrameFit) -> bool:
     # What moved far must bring most of its data along; what stayed may be hidden but for a little.
     few = fit.inliers < max(_MIN_INLIERS, _LOST_COUNT * state.inliers if state.lost else 0)
     stray = is_far(state, fit) and fit.inliers < _LOST_RATIO * state.inliers
-    # Data of something else lie beside a surface that was drawn to them.
-    loose = _DOUBT_RESIDUAL if state.lost else _LOST_RESIDUAL
-    usual = max(loose * state.residual, _FINE_RESIDUAL * fit.view.problem.size)
-    vague = state.tracked and float(fit.noise) > usual
+    vague = state.tracked and is_vague(state, fit)
     return few or stray or vague or fit.ratio < _LOST_RATIO * state.ratio
+
+
+def is_vague(state: TrackState, fit: FrameFit) -> bool:
+    """Return whether data lie beside the surface, as those of something else do that the surface was drawn to."""
+    loose = _DOUBT_RESIDUAL if state.lost else _LOST_RESIDUAL
+    return float(fit.noise) > max(loose * state.residual, _FINE_RESIDUAL * fit.view.problem.size)
 
 
 def is_doubtful(state: TrackState, fit: FrameFit) -> bool:
@@ -148,11 +151,11 @@ class LimbReach:
         cells[index.unbind(-1)] = 1.0
         self.cells = torch.nn.functional.max_pool3d(cells[None, None], 3, 1, 1)[0, 0] > 0
 
-    def __call__(self, points: Tensor, pose: Tensor) -> Tensor:
-        """Return which points (N, 3) a limb may reach in a pose (num_dofs,), as (N,)."""
+    def __call__(self, points: Tensor, trunk: Tensor) -> Tensor:
+        """Return which points (N, 3) a limb may reach where the trunk lies at (4, 4), as (N,)."""
         if self.cells is None:
             return torch.ones_like(points[:, 0], dtype=torch.bool)
-        local = transform_points(invert_rigid(self.shape.part_transforms(pose)[0]), points)
+        local = transform_points(invert_rigid(trunk), points)
         index = ((local - self.low) / self.cell).floor().long()
         size = torch.tensor(self.cells.shape, device=index.device)
         inside = ((index >= 0) & (index < size)).all(-1)

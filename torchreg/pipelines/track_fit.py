@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -16,8 +17,7 @@ from torchreg.models.skin import LinearBlendSkin, sample_skin
 from torchreg.pipelines.align import AlignConfig
 from torchreg.pipelines.align_objectives import PosePrior
 from torchreg.pipelines.align_problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem, shifted
-from torchreg.pipelines.align_stages import SIGMA_PER_NOISE, fit_surface, register, surface_noise
-from torchreg.pipelines.pose_search import fit_candidates, score_candidates
+from torchreg.pipelines.align_stages import SIGMA_PER_NOISE, register, settle_surface, surface_noise
 from torchreg.pipelines.track_config import Frame, FrameFit, FrameView, TrackConfig, thinned
 from torchreg.pipelines.track_evidence import (
     LimbReach,
@@ -27,6 +27,7 @@ from torchreg.pipelines.track_evidence import (
     pose_covariance,
     share_at_limits,
 )
+from torchreg.pipelines.track_limbs import fit_limbs, scattered
 from torchreg.pipelines.track_motion import moves_fast, predicted, prior_std, spread
 from torchreg.results import TrackState
 
@@ -40,10 +41,8 @@ _START_RANGE, _START_PER_ERROR, _SIGMA_RATIO = (0.03, 0.08), 2.0, 2.2
 _SURFACE_SIGMAS = (0.022,)
 # Joints about the last pose where nothing is sure, radians.
 _WIDE_PRIOR = 0.3
-# Paces at which fast joints go on instead: they stopped, or double; kernel widths of their surface fits, and steps.
-_PACES, _FAST_WIDTHS, _FAST_STEPS = (0.0, 2.0), (0.06, 0.04, 0.03), 2
-# More data tell them apart no better.
-_FAST_DATA = 300
+# Paces at which fast joints go on instead: they stopped, or double; others are scattered by this, radians, so often.
+_PACES, _SCATTER, _NUM_SCATTERED = (0.0, 2.0), 0.3, 8
 # Data that lie this near the bounds of the predicted model count, as a share of its size.
 _REACH = 0.12
 # A limb is shown by this many data at least, this far from its joints, as a share of the size.
@@ -118,40 +117,49 @@ class FrameFitter:
     def descend(self, view: FrameView, state: TrackState, gap: float) -> FrameFit:
         """Return the fit that descent from the prediction leads to: annealed EM, then the surface."""
         problem = replace(view.problem, prior=self._tight_prior(view.problem.prior, state, gap))
-        starts = problem.prior.mean
-        fast = moves_fast(state, self.size) and self.config.prediction == "velocity"
-        if fast:
+        view = replace(view, problem=problem)
+        if not moves_fast(state, self.size):
+            schedule = self._schedule(state, gap)
+            moved = register(problem, problem.prior.mean, schedule, em_steps=self.config.em_steps, m_steps=1).pose
+            return self.fit(view, state, "tracked", moved)
+        drawn = generator(state)
+        starts = [problem.prior.mean, self._scattered(problem, drawn)]
+        if self.config.prediction == "velocity":
             # Joints that fast turn back or speed up within a frame, each at another time.
-            others = predicted(self.shape, state, gap, starts.new_tensor(_PACES))
-            starts = torch.cat([starts, view.local(others)[0]])
-        rows = problem.rows(torch.zeros(len(starts), dtype=torch.long, device=starts.device))
-        moved = register(rows, starts, self._schedule(state, gap), em_steps=self.config.em_steps, m_steps=1).pose
-        if fast:
-            free = problem.prior.precision.clone()
-            free[:6] = 0
-            few = replace(problem, prior=PosePrior(problem.prior.mean, free)).draw(_FAST_DATA, generator(state))
-            wide = fit_candidates(few, starts[None], _FAST_WIDTHS, _FAST_STEPS)[0]
-            moved = self._mixed(few, torch.cat([moved, wide]))
-        return self.fit(replace(view, problem=problem), state, "tracked", moved)
+            others = predicted(self.shape, state, gap, problem.prior.mean.new_tensor(_PACES))
+            starts.append(view.local(others)[0])
+        free = problem.prior.precision.clone()
+        free[:6] = 0
+        open_ = replace(problem, prior=PosePrior(problem.prior.mean, free))
+        moved = fit_limbs(open_, torch.cat(starts), self.limbs, drawn)
+        return self.fit(view, state, "tracked", moved, sigmas=())
 
-    def fit(self, view: FrameView, state: TrackState, how: str, pose: Tensor) -> FrameFit:
+    def fit(
+        self,
+        view: FrameView,
+        state: TrackState,
+        how: str,
+        pose: Tensor,
+        sigmas: Sequence[float] = _SURFACE_SIGMAS,
+    ) -> FrameFit:
         """Return the fit of the surface from a pose (1, num_dofs), and the evidence for it."""
         problem = view.problem
-        fitted = fit_surface(problem, pose, steps=self.config.surface_steps, sigmas=_SURFACE_SIGMAS)
-        distance, jacobian = problem.surface.distance_jacobian(problem.data, fitted.pose)
+        fitted = settle_surface(problem, pose, steps=self.config.surface_steps, sigmas=sigmas)
+        distance, jacobian = fitted.distance, fitted.jacobian
         noise = surface_noise(distance, problem.valid, self.size)
         pose = fitted.pose
         if state.tracked:
             pose = self._modest(problem, fitted.pose, distance, jacobian, noise)
         if pose is not fitted.pose:
             distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
+        transforms = self.shape.part_transforms(pose[0])
         strays = dense_strays(problem.data[0], distance[0].abs() < _FAR_NOISES * noise, self.size)
-        known = transform_points(self.shape.part_transforms(pose[0])[0], state.strays)
-        novel = (nearest_distance(strays, known) > _SAME_STRAY * self.size) & self._reach(strays, pose[0])
-        moved = (problem.skin(pose) - problem.skin(problem.prior.mean)).norm(dim=-1)
+        known = transform_points(transforms[0], state.strays)
+        novel = (nearest_distance(strays, known) > _SAME_STRAY * self.size) & self._reach(strays, transforms[0])
+        moved = (problem.skin.place(transforms[:, :3].mT.flatten(0, 1)) - problem.skin(problem.prior.mean)).norm(dim=-1)
         wide = replace(problem, prior=PosePrior(problem.prior.mean, self._precision(_WIDE_PRIOR)))
         return FrameFit(
-            view, pose, distance, jacobian, noise=noise[0], change=float(fitted.change),
+            view, pose, distance, jacobian, transforms, noise=noise[0], change=float(fitted.change),
             cost=float(alignment_cost(wide, pose, distance)),
             inliers=int((distance.abs() < self.inlier_distance).sum()), strays=strays, novel=int(novel.sum()),
             held=share_at_limits(problem, pose), jump=float(moved.quantile(_MOST)), how=how,
@@ -174,8 +182,7 @@ class FrameFitter:
         """
         if in_doubt(state) and fit.how != "found":
             return state.strays
-        trunk = self.shape.part_transforms(fit.pose[0])[0]
-        strays = transform_points(invert_rigid(trunk), fit.strays)
+        strays = transform_points(invert_rigid(fit.transforms[0]), fit.strays)
         # Where there are some still, those of earlier frames show better how far they reach.
         lasting = state.strays[nearest_distance(state.strays, strays) < _SAME_STRAY * self.size]
         return torch.cat([strays, lasting])[:_MAX_STRAYS]
@@ -196,21 +203,9 @@ class FrameFitter:
         stop = STOP_SIGMA * self.size
         return SigmaSchedule.geometric(start, stop, 2 if start < _SIGMA_RATIO * stop else 3)
 
-    def _mixed(self, problem: AlignProblem, poses: Tensor) -> Tensor:
-        """Return the best of poses (S, num_dofs), (1, num_dofs), each limb as where it explains most data."""
-        best = poses[score_candidates(problem, poses[None], STOP_SIGMA)[0].argmin()]
-        if not self.limbs:
-            return best[None]
-        hybrids = best.repeat(len(self.limbs), len(poses), 1)
-        for number, limb in enumerate(self.limbs):
-            hybrids[number][:, limb.dofs] = poses[:, limb.dofs]
-        scores = score_candidates(problem, hybrids.flatten(0, 1)[None], STOP_SIGMA)[0].reshape(hybrids.shape[:2])
-        mixed = best.clone()
-        for limb, chosen in zip(self.limbs, scores.argmin(1).tolist(), strict=True):
-            mixed[limb.dofs] = poses[chosen, limb.dofs]
-        # Limbs chosen one by one may share their data.
-        options = torch.stack([mixed, hybrids.flatten(0, 1)[scores.argmin()]])
-        return options[score_candidates(problem, options[None], STOP_SIGMA)[0].argmin()][None]
+    def _scattered(self, problem: AlignProblem, drawn: torch.Generator) -> Tensor:
+        std = _SCATTER * self._template.prior.precision[6:].rsqrt()
+        return problem.clamp(scattered(problem.prior.mean, std, _NUM_SCATTERED, drawn))
 
     def _modest(self, problem: AlignProblem, pose: Tensor, distance: Tensor, jacobian: Tensor, noise: Tensor) -> Tensor:
         """Return a pose (1, num_dofs) with limbs where they are expected that hardly any data show.

@@ -32,7 +32,7 @@ _SURE_SHARE = 0.5
 # Frames ahead that a velocity is trusted, and that uncertainty grows.
 _MAX_AHEAD, _MAX_SPREAD = 3.0, 4.0
 # Where predictions are off by more than this share of the size, motion is fast.
-_FAST = 0.04
+_FAST = 0.032
 
 
 def timed(state: TrackState, time: float | None) -> tuple[TrackState, float]:

@@ -35,7 +35,7 @@ def points_after(fitter: FrameFitter, state: TrackState, fit: FrameFit) -> Model
     data = data[fit.distance[0].abs() < _HARVEST_SHARE * size]
     if fitter.config.model_points == "shape" or len(data) < MIN_DATA:
         return skin.points, skin.weights, skin.reference_pose
-    posed = skin(pose)
+    posed = skin.place(fit.rows)
     near = torch.cdist(posed, data, compute_mode="donot_use_mm_for_euclid_dist")
     if fitter.config.model_points == "data":
         return _harvested(fitter, state, data, pose, posed, near)
