@@ -119,7 +119,24 @@ def test_first_frames_take_the_best_of_what_is_found(tracking, searches):
     state, frame = tracking.state(inliers=0.0, ratio=0.0), tracking.frame(torch.cat([tracking.cloud] * 11))
     assert Recovery(fitter).everywhere(state, frame) is None
     # The best is half a metre away, where no data are; no more data are searched than tell anything.
-    assert searches == [(3000, 0)]
+    assert searches == [(3000, seed) for seed in range(4)]
+
+
+def test_what_lies_beside_its_data_is_sought_again_until_a_pose_explains_them(tracking, monkeypatch):
+    """The first search leads to the arm half a radian off, the second to the truth, and there is no third."""
+    poses, asked = [bent(tracking.pose, 0.9), tracking.pose, tracking.pose], []
+
+    def find(shape, data, **options):
+        asked.append(options["config"])
+        return PoseStarts(poses[len(asked) - 1][None], torch.tensor([10.0]), torch.tensor(0.1, dtype=torch.float64))
+
+    monkeypatch.setattr(recovery, "find_pose", find)
+    state = tracking.state(inliers=0.0, ratio=0.0, residual=0.0)
+    monkeypatch.setattr(recovery, "is_vague", lambda state, fit: len(asked) < 2)
+    fit = Recovery(tracking.fitter()).everywhere(state, tracking.frame())
+    assert [config.seed for config in asked] == [0, 1]
+    assert asked[1].num_candidates == 2 * asked[0].num_candidates
+    torch.testing.assert_close(fit.world, tracking.pose, atol=5e-3, rtol=0)
 
 
 def test_noise_is_no_shape_and_a_hidden_one_is_not_sought(tracking, searches):

@@ -14,7 +14,7 @@ from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.find_pose import FindPoseConfig, find_pose
 from torchreg.pipelines.pose_search import PoseSearch, fit_candidates, score_candidates
 from torchreg.pipelines.track_config import Frame, FrameFit, FrameView, thinned
-from torchreg.pipelines.track_evidence import is_doubtful, is_lost
+from torchreg.pipelines.track_evidence import is_doubtful, is_lost, is_vague
 from torchreg.pipelines.track_fit import STOP_SIGMA, FrameFitter, generator
 from torchreg.results import TrackState
 
@@ -34,6 +34,8 @@ _WIDTHS, _STEPS, _NUM_SEARCHED = (0.06, 0.04, 0.03), 2, 2
 _MAX_FOUND_DATA = 3000
 # Found poses compete by how near they are if they leave at most this share of the data more unexplained than the best.
 _AS_GOOD = 0.03
+# Searches everywhere in one frame, beyond the first, with other draws and twice the candidates.
+_MORE_SEARCHES = 3
 
 
 class Recovery:
@@ -66,10 +68,23 @@ class Recovery:
         return fit, rested(state, good) if good or tried else waited(state)
 
     def everywhere(self, state: TrackState, frame: Frame) -> FrameFit | None:
-        """Return the fit that a search everywhere leads to; among poses as good, the one nearest to the last."""
+        """Return the fit that a search everywhere leads to; among poses as good, the one nearest to the last.
+
+        A fit whose data lie off the surface is no pose of the shape, and is sought again with more effort.
+        """
+        best = self._found(state, frame, FindPoseConfig(seed=state.seed))
+        for again in range(1, _MORE_SEARCHES + 1):
+            if state.lost or (best is not None and not is_vague(state, best)):
+                break
+            config = FindPoseConfig(seed=state.seed + again, num_candidates=128, num_placed=32)
+            other = self._found(state, frame, config)
+            best = max((fit for fit in (best, other) if fit is not None), key=lambda fit: fit.explained, default=None)
+        return best
+
+    def _found(self, state: TrackState, frame: Frame, config: FindPoseConfig) -> FrameFit | None:
         shape = self.fitter.shape
         data = thinned(frame.data, _MAX_FOUND_DATA, generator(state))
-        starts = find_pose(shape, data, config=FindPoseConfig(seed=state.seed))
+        starts = find_pose(shape, data, config=config)
         poses = starts.poses
         if state.lost:
             poses = poses[starts.costs <= starts.costs.min() + _AS_GOOD * len(data)]
