@@ -35,7 +35,9 @@ def draw_alignment(folder, smoke):
     found = {}
     for name, steps in (("5 steps of sigma", 5), ("10 steps of sigma", 10)):
         schedule = tr.SigmaSchedule.geometric(0.03, 0.003, 2 if smoke else steps)
-        found[name] = tr.align(hand, cloud.points, start, config=tr.AlignConfig(schedule=schedule))
+        found[name] = tr.align(
+            hand, cloud.points, start, config=tr.AlignConfig(schedule=schedule, search="never" if smoke else "auto")
+        )
     skin = None if smoke else surface_skin(hand)
     first = found["10 steps of sigma"]
     annealing_strip(folder / "annealing.png", hand, cloud.points, first, start=start, skin=skin)
