@@ -96,7 +96,7 @@ def test_errors_name_the_files(folders, pair, tmp_path):
     with pytest.raises(FormatError, match="holds no pictures"):
         StereoFrames(folders / "left", tmp_path / "one", pair)
     save_image(tmp_path / "one" / "0.png", torch.zeros(120, 160))
-    with pytest.raises(FormatError, match=r"holds 2 pictures, .* 1; they go by pairs"):
+    with pytest.raises(FormatError, match=r"equally many pictures, one per frame; got .*left 2, .*one 1"):
         StereoFrames(folders / "left", tmp_path / "one", pair)
     with pytest.raises(FormatError, match="hardly match"):
         StereoFrames(tmp_path / "one", tmp_path / "one", pair, config=CONFIG)[0]

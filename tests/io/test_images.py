@@ -8,7 +8,7 @@ from PIL import Image
 
 from torchreg.errors import FormatError, MissingExtraError
 from torchreg.geometry.camera import Camera
-from torchreg.io.images import list_pictures, load_depth, load_image, load_mask, save_depth, save_image
+from torchreg.io.images import list_frames, list_pictures, load_depth, load_image, load_mask, save_depth, save_image
 from torchreg.io.limits import FileLimits
 
 STEPS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 1000
@@ -199,3 +199,23 @@ def test_pictures_of_a_folder_in_the_order_of_their_numbers(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(FormatError, match="holds no pictures"):
         list_pictures(tmp_path / "empty")
+
+
+def test_frames_of_several_folders_go_together(tmp_path):
+    def folder(name, *files):
+        (tmp_path / name).mkdir()
+        for file in files:
+            (tmp_path / name / file).touch()
+        return tmp_path / name
+
+    left, right = folder("l", "cam0_1.png", "cam0_12.png"), folder("r", "cam1_1.png", "cam1_12.png")
+    frames = list_frames((left, right))
+    assert [[file.name for file in frame] for frame in frames] == [
+        ["cam0_1.png", "cam1_1.png"], ["cam0_12.png", "cam1_12.png"],
+    ]  # fmt: skip
+    stamps = folder("s", "1700.png", "1733.png")
+    assert len(list_frames((left, stamps))) == 2
+    with pytest.raises(FormatError, match=r"a frame is missing: .*cam0_12.png and .*2.png have different numbers"):
+        list_frames((left, folder("m", "1.png", "2.png")))
+    with pytest.raises(FormatError, match=r"equally many pictures, one per frame; got .*l 2, .*n 1"):
+        list_frames((left, folder("n", "1.png")))

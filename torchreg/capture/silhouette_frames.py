@@ -14,7 +14,7 @@ from torchreg.capture.silhouettes import chroma_key, visual_hull
 from torchreg.errors import FormatError, InputError
 from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.mesh import TriangleMesh
-from torchreg.io.images import list_pictures, load_image, load_mask
+from torchreg.io.images import list_frames, load_image, load_mask
 from torchreg.io.tensors import load_tensors, save_tensors
 
 
@@ -29,7 +29,7 @@ class SilhouetteFrames:
         resolution: see `visual_hull`.
 
     Raises:
-        FormatError: if a folder holds no pictures, or they are not equally many.
+        FormatError: if a folder holds no pictures, or they do not go together, see `list_frames`.
         FileNotFoundError: if a folder does not exist.
         InputError: if folders and cameras do not go together.
     """
@@ -45,12 +45,7 @@ class SilhouetteFrames:
         check_count(resolution, "resolution", 8)
         places = [Path(folder) for folder in folders]
         self.cameras, self.screen, self.resolution = _matched(places, cameras), screen, resolution
-        files = [list_pictures(place) for place in places]
-        counts = {str(place): len(found) for place, found in zip(places, files, strict=True)}
-        if len(set(counts.values())) > 1:
-            listed = ", ".join(f"{name} {count}" for name, count in counts.items())
-            raise FormatError(f"folders must hold equally many pictures, one per frame; got {listed}")
-        self._files = list(zip(*files, strict=True))
+        self._files = list_frames(places)
         self.names = tuple(str(frame[0]) for frame in self._files)
 
     def __len__(self) -> int:

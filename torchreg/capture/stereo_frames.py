@@ -14,7 +14,7 @@ from torchreg._checks import check_positive
 from torchreg.capture.stereo import StereoConfig, StereoPoints, as_gray, rectify, stereo_points
 from torchreg.errors import FormatError, InputError
 from torchreg.geometry.camera_rig import StereoPair
-from torchreg.io.images import list_pictures, load_image
+from torchreg.io.images import list_frames, load_image
 
 # Nearer to the border of what both cameras see, pixels, a thing may go on beyond it.
 _BORDER = 12
@@ -53,7 +53,7 @@ class StereoFrames(Sequence[Tensor]):
         reach: see `far_end`; None keeps all.
 
     Raises:
-        FormatError: if a folder holds no pictures, or they are not equally many.
+        FormatError: if a folder holds no pictures, or they do not go together, see `list_frames`.
         FileNotFoundError: if a folder does not exist.
         InputError: if ``reach`` is not positive.
     """
@@ -68,13 +68,7 @@ class StereoFrames(Sequence[Tensor]):
         box: Tensor | None = None,
         reach: float | None = None,
     ) -> None:
-        first, second = list_pictures(left), list_pictures(right)
-        if len(first) != len(second):
-            raise FormatError(
-                f"{os.fspath(left)} holds {len(first)} pictures, {os.fspath(right)} {len(second)}; they go by pairs, "
-                f"in the order of the numbers in their names"
-            )
-        self._files = list(zip(first, second, strict=True))
+        self._files = list_frames((left, right))
         if reach is not None:
             check_positive(reach, "reach")
         self.names = tuple(str(first) for first, _ in self._files)

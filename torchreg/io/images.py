@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +43,31 @@ def list_pictures(folder: str | os.PathLike[str]) -> list[Path]:
     if not files:
         raise FormatError(f"{place} holds no pictures: no file ends in one of {', '.join(ENDINGS)}")
     return sorted(files, key=natural_key)
+
+
+def list_frames(folders: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, ...]]:
+    """Return the pictures of several cameras frame by frame: one folder per camera, in the order of their numbers.
+
+    Raises:
+        FormatError: as `list_pictures`, if the folders do not hold equally many pictures, or a frame is missing in
+            some: the last numbers in the names are partly the same, but not frame by frame.
+        FileNotFoundError: if there is no such folder.
+    """
+    files = [list_pictures(folder) for folder in folders]
+    if len({len(found) for found in files}) > 1:
+        counts = ", ".join(f"{os.fspath(folder)} {len(found)}" for folder, found in zip(folders, files, strict=True))
+        raise FormatError(f"folders must hold equally many pictures, one per frame; got {counts}")
+    numbers = [[_last_number(file) for file in found] for found in files]
+    for own, found in zip(numbers, files, strict=True):
+        if own != numbers[0] and set(own) & set(numbers[0]):
+            place = next(k for k, (one, two) in enumerate(zip(own, numbers[0], strict=True)) if one != two)
+            raise FormatError(f"a frame is missing: {files[0][place]} and {found[place]} have different numbers")
+    return list(zip(*files, strict=True))
+
+
+def _last_number(file: Path) -> int | None:
+    digits = re.findall(r"\d+", file.stem)
+    return int(digits[-1]) if digits else None
 
 
 def load_image(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Tensor:
