@@ -88,6 +88,15 @@ def test_arguments_are_checked(monkeypatch):
         match_disparity(left, right, 20, method="opencv")
 
 
+def test_whole_and_other_penalties_come_to_the_same():
+    left, right, _ = scene()
+    whole = match_disparity(left, right, 20)
+    nearly = match_disparity(left, right, 20, small_step=6.0 + 1e-9)
+    assert torch.equal(whole.nan_to_num(-1), nearly.nan_to_num(-1))
+    steep = match_disparity(left, right, 20, small_step=6.0, large_step=1e6)
+    assert steep.isfinite().double().mean() > 0.5
+
+
 def test_opencv_matches_up_to_the_left_border():
     pytest.importorskip("cv2")
     left, right, truth = scene()
