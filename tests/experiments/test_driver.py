@@ -1,6 +1,5 @@
 import errno
 import os
-import threading
 import time
 
 import pytest
@@ -87,22 +86,6 @@ def test_a_disk_that_fills_up_stops_the_sweep_and_loses_nothing(store, probe_swe
     assert 0 < kept < 6
     summary = run(sweep, store, inline_engine)
     assert (summary.kept, summary.ran, summary.unfinished) == (kept, 6 - kept, 0)
-
-
-def test_two_drivers_at_once_share_the_work(store, probe_sweep, inline_engine, tmp_path):
-    log = tmp_path / "log"
-    sweep = probe_sweep(trial=ProbeTrial(size=0, seconds=0.02, log=str(log)), seeds=4)
-    summaries = []
-    drivers = [
-        threading.Thread(target=lambda: summaries.append(run(sweep, store, type(inline_engine)()))) for _ in range(2)
-    ]
-    for one in drivers:
-        one.start()
-    for one in drivers:
-        one.join()
-    assert [one.unfinished for one in summaries] == [0, 0]
-    assert sum(one.ran for one in summaries) == 12
-    assert len(log.read_text().splitlines()) == 12
 
 
 class StubbornEngine:

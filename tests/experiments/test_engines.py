@@ -5,6 +5,7 @@ import os
 import random
 import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -117,7 +118,12 @@ def kill_jobs(store):
 def again_in_processor_time(command):
     """Return the processor time of the finished sweep, which other programs on a busy machine spare."""
     before = os.times()
-    subprocess.run(["python", "-m", "experiments", *map(str, command)], check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-m", "experiments", *map(str, command)],
+        check=True,
+        capture_output=True,
+        cwd=Path(__file__).parents[2],
+    )
     after = os.times()
     return after.children_user + after.children_system - before.children_user - before.children_system
 
