@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -24,7 +26,14 @@ from torchreg.cli.outputs import Force, Quiet, with_ending
 from torchreg.cli.reporting import UNUSABLE, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, load_shape
 from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary, track_job
+from torchreg.cli.view import Browser, Port, tell_url
 from torchreg.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchreg.models.skin import LinearBlendSkin
+    from torchreg.results import FrameResult
 
 MOVIES = ("gif", "mp4", "none")
 
@@ -83,6 +92,11 @@ def track(
     overlay: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Also draw each frame as soon as it is done (frame_0000.png).")
     ] = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Show each frame in the browser as soon as it is done (extra viewer).")
+    ] = False,
+    port: Port = 8080,
+    browser: Browser = True,
     movie: Annotated[str, typer.Option(help="The moving picture: gif, mp4 (needs ffmpeg), or none.")] = "gif",
     gltf: Annotated[bool, typer.Option("--gltf/--no-gltf", help="Whether to write the moving shape.")] = True,
     save_every: Annotated[int, typer.Option(min=1, help="Frames after which RESULT.progress is written anew.")] = 50,
@@ -127,7 +141,10 @@ def track(
 
     from tqdm import tqdm
 
-    with tqdm(total=len(clouds), unit="frame", desc="tracking", leave=False, disable=quiet) as bar:
+    with (
+        ExitStack() as pages,
+        tqdm(total=len(clouds), unit="frame", desc="tracking", leave=False, disable=quiet) as bar,
+    ):
         model = model if stereo else load_shape(shape, parents, package_dir, free_base)
         from torchreg.pipelines.storage import load_pose
         from torchreg.pipelines.track import TrackConfig, Tracker
@@ -145,6 +162,18 @@ def track(
 
             run.job |= stereo_job(source)
             run.seen = lambda skin: StereoPictures(source, skin, pictures)
+        if view:
+            from torchreg.viz.live_track import LiveTrack
+            from torchreg.viz.viser_server import import_viser
+
+            import_viser()  # a missing extra is told before the first frame
+
+            def begin(skin: LinearBlendSkin) -> Callable[[Tensor, FrameResult], None]:
+                page = pages.enter_context(LiveTrack(skin, port=port))
+                tell_url(page.url, browser, quiet)
+                return page.show
+
+            run.live = begin
         if resumed:
             run.go_on(load_progress(files.progress))
         complete = run.run()

@@ -169,6 +169,7 @@ class TrackRun:
         report: tells how it goes on.
         save_every: frames between two writings.
         seen: draws what the cameras saw of a frame, or None.
+        live: shows a frame in the browser, or None.
         parts: results of the frames done.
         state: after them.
     """
@@ -181,6 +182,7 @@ class TrackRun:
     report: Report
     save_every: int
     seen: Callable[[LinearBlendSkin], OnFrame] | None = None
+    live: Callable[[LinearBlendSkin], OnFrame] | None = None
     parts: list[TrackResult] = field(default_factory=list)
     state: TrackState = field(init=False)
 
@@ -260,7 +262,7 @@ class TrackRun:
 
     def _overlays(self) -> list[OnFrame]:
         """Return what draws each frame as soon as it is done."""
-        drawn: list[OnFrame] = [] if self.seen is None else [self.seen(self.surface)]
+        drawn = [begin(self.surface) for begin in (self.seen, self.live) if begin is not None]
         if self.files.overlay is not None:
             from torchreg.viz.tracking import FrameOverlays
 

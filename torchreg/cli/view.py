@@ -96,14 +96,19 @@ def with_up(scene: Scene, up: tuple[float, float, float] | None) -> Scene:
     return scene if up is None else replace(scene, up=up)
 
 
-def wait_for_interrupt(url: str, browser: bool, quiet: bool) -> None:
-    """Tell where a page is, open it if asked to, and wait until Ctrl-C."""
+def tell_url(url: str, browser: bool, quiet: bool) -> None:
+    """Tell where a page is, and open it if asked to."""
     if not quiet:
         typer.echo(f"{url} (Ctrl-C ends)")
     if browser:
         import webbrowser
 
         webbrowser.open(url)
+
+
+def wait_for_interrupt(url: str, browser: bool, quiet: bool) -> None:
+    """Tell where a page is, open it if asked to, and wait until Ctrl-C."""
+    tell_url(url, browser, quiet)
     try:
         while True:
             time.sleep(3600)

@@ -80,7 +80,7 @@ def _align_scene(result: AlignResult, shape: ArticulatedShape | None, data: Data
     for frame, cloud in enumerate(clouds):
         check_shape(masks[frame], "result.inliers", (len(cloud),))
     if clouds:
-        paints = [_posterior_paint(mask, share) for mask, share in zip(masks, posterior, strict=True)]
+        paints = [inlier_paint(mask, share) for mask, share in zip(masks, posterior, strict=True)]
         layers.append(_cloud("data", clouds, paints))
     return Scene(f"alignment: {', '.join(sorted({status.value for status in result.statuses}))}", tuple(layers))
 
@@ -100,7 +100,7 @@ def _track_scene(result: TrackResult, shape: ArticulatedShape | None, data: Data
 @_scene.register
 def _demo_scene(result: DemoResult, shape: ArticulatedShape | None, data: Data) -> Scene:
     hand = Hand() if shape is None else shape
-    paints = [_posterior_paint(mask, torch.ones(len(mask))) for mask in result.inliers]
+    paints = [inlier_paint(mask, torch.ones(len(mask))) for mask in result.inliers]
     layers = [*_shape_layers(hand, result.track.poses), _cloud("data", result.clouds, paints)]
     return Scene(f"demo, seed {result.seed}", tuple(layers), result.track.times)
 
@@ -251,7 +251,7 @@ def _points(
     return Cloud(name, frames, color, size=size, visible=visible)
 
 
-def _posterior_paint(inliers: Tensor, posterior: Tensor) -> Tensor:
+def inlier_paint(inliers: Tensor, posterior: Tensor) -> Tensor:
     """Return colors (M, 3): outliers gray, inliers from pale to full blue by their posterior."""
     share = posterior.double().nan_to_num(0.0)
     share = (share / share.max().clamp(min=1e-12) if len(share) else share).unsqueeze(-1).clamp(0, 1)
@@ -269,7 +269,7 @@ def _nearness(shape: ArticulatedShape | None, cloud: Tensor, pose: Tensor) -> Te
             points = shape.keypoints(shape.rest_pose())
             reach = _NEAR * float((points.amax(0) - points.amin(0)).norm())
             near[known] = (shape.distance(cloud[known].to(shape.rest), pose.to(shape.rest)).abs() < reach).cpu()
-    return _posterior_paint(near | torch.tensor(shape is None), torch.ones(len(cloud)))
+    return inlier_paint(near | torch.tensor(shape is None), torch.ones(len(cloud)))
 
 
 def _clouds(data: Data, count: int) -> list[Tensor]:

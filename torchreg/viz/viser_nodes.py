@@ -127,7 +127,7 @@ def _draw_cloud(api: viser.SceneApi, name: str, layer: Cloud, size: float) -> _D
     )  # fmt: skip
 
     def update(frame: int) -> list[Any]:
-        node.points, node.colors = as_floats(layer.points(frame)), _bytes(layer.paint(frame))
+        node.points, node.colors = as_floats(layer.points(frame)), as_bytes(layer.paint(frame))
         return [node] if len(layer.points(frame)) else []
 
     return _DrawnLayer([node], update, layer.num_frames)
@@ -162,5 +162,6 @@ def as_floats(values: Tensor) -> NDArray[np.float32]:
     return values.detach().cpu().float().numpy()
 
 
-def _bytes(colors: Tensor) -> NDArray[np.uint8]:
+def as_bytes(colors: Tensor) -> NDArray[np.uint8]:
+    """Return colors in [0, 1] as numpy's bytes, on the CPU."""
     return (255 * colors.detach().cpu().float().clamp(0, 1)).round().byte().numpy()

@@ -1,0 +1,111 @@
+"""A tracker in the browser while it runs: every frame is shown as soon as it is done."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchreg.errors import InputError
+from torchreg.models.skin import LinearBlendSkin
+from torchreg.results import FrameResult
+from torchreg.viz.figures import SKIN_COLOR
+from torchreg.viz.result_scenes import inlier_paint
+from torchreg.viz.scene import Cloud, Layer, Scene, Surface
+from torchreg.viz.tracking import frame_label
+from torchreg.viz.viser_nodes import as_bytes, as_floats
+from torchreg.viz.viser_server import page_url, point_camera, start_server, stop_server
+
+if TYPE_CHECKING:
+    import viser
+
+# A pose that no data support is drawn in gray.
+_HELD = (0.72, 0.73, 0.76)
+
+
+class LiveTrack:
+    """A page that shows the last frame of a tracker; usable in a ``with`` statement, at whose end the server stops.
+
+    Args:
+        skin: the surface to draw, with faces.
+        port: where to listen on 127.0.0.1; where it is taken, a later one.
+
+    Raises:
+        InputError: if the skin has no faces.
+        MissingExtraError: if viser is not installed.
+    """
+
+    def __init__(self, skin: LinearBlendSkin, *, port: int = 8080) -> None:
+        if skin.faces is None:
+            raise InputError("skin must have faces to be shown; make it with surface_skin(shape)")
+        self._skin, self._faces = skin, skin.faces.cpu()
+        self.server = start_server("torchreg track", port)
+        self._label = self.server.gui.add_markdown("waiting for the first frame")
+        self._surface: viser.MeshHandle | None = None
+        self._cloud: viser.PointCloudHandle | None = None
+
+    @property
+    def url(self) -> str:
+        """Where a browser on this machine finds it."""
+        return page_url(self.server)
+
+    def show(self, points: Tensor, frame: FrameResult) -> None:
+        """Show a frame: the data (M, 3) and what the tracker made of them.
+
+        The camera stays where the first frame with anything in it put it.
+        """
+        known = points.isfinite().all(-1).cpu()
+        data = points.detach().cpu()[known]
+        paint = inlier_paint(frame.inliers.cpu()[known], torch.ones(len(data)))
+        found = bool(frame.pose.isfinite().all())
+        usable = frame.statuses[0].usable
+        vertices = None
+        if found:
+            with torch.no_grad():
+                vertices = self._skin(frame.pose).detach().cpu()
+        if self._cloud is None and (len(data) or found):
+            self._begin(data, paint, vertices)
+        with self.server.atomic():
+            self._update_surface(vertices, usable)
+            if self._cloud is not None:
+                self._cloud.points, self._cloud.colors = as_floats(data), as_bytes(paint)
+        self._label.content = frame_label(frame.frame, frame.statuses[0], frame.acquired)
+
+    def close(self) -> None:
+        """Stop the server."""
+        stop_server(self.server)
+
+    def __enter__(self) -> LiveTrack:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _begin(self, data: Tensor, paint: Tensor, vertices: Tensor | None) -> None:
+        """Draw the first frame that has anything in it and let the camera see it."""
+        layers: list[Layer] = [Cloud("data", [data], [paint])]
+        if vertices is not None:
+            layers.append(Surface("shape", vertices, self._faces))
+        scene = Scene("track", tuple(layers))
+        self._cloud = self.server.scene.add_point_cloud(
+            "/data", as_floats(data), as_floats(paint), point_size=0.006 * scene.diagonal, point_shape="circle",
+            precision="float32", point_shading="flat",
+        )  # fmt: skip
+        point_camera(self.server, scene)
+
+    def _update_surface(self, vertices: Tensor | None, usable: bool) -> None:
+        if vertices is not None and self._surface is None:
+            options: dict[str, Any] = {"side": "double", "cast_shadow": False, "receive_shadow": False}
+            self._surface = self.server.scene.add_mesh_simple(
+                "/shape", as_floats(vertices), self._faces.numpy(), color=SKIN_COLOR, **options
+            )
+        if self._surface is not None:
+            self._surface.visible = vertices is not None
+            if vertices is not None:
+                self._surface.vertices = as_floats(vertices)
+                red, green, blue = SKIN_COLOR if usable else _HELD
+                self._surface.color = round(255 * red), round(255 * green), round(255 * blue)
