@@ -3,9 +3,15 @@
 import subprocess
 import sys
 
+import torch
+
+import torchreg.pipelines.track_recovery as recovery_module
+from torchreg.datasets.hand import hand_motion
 from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.hand import Hand
 from torchreg.pipelines.storage import load
 from torchreg.pipelines.track import Tracker
+from torchreg.results import PoseStarts
 
 
 def test_the_demonstration_runs(run, tmp_path):
@@ -42,6 +48,10 @@ def test_an_interrupted_demonstration_writes_what_is_done(run, tmp_path, monkeyp
             raise KeyboardInterrupt
         return step(self, points, time)
 
+    # Where the hand is in the first frame is told, not searched for.
+    truth = hand_motion(Hand(), "bending_palm", 2)[:1]
+    starts = PoseStarts(truth, torch.zeros(1), torch.ones(()))
+    monkeypatch.setattr(recovery_module, "find_pose", lambda *arguments, **options: starts)
     monkeypatch.setattr(Tracker, "step", interrupted)
     answer = run("demo", "--frames", "2", "-o", tmp_path, "--no-picture")
     assert answer.exit_code == 130

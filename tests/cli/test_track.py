@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 
 import torchreg.pipelines.track as track_module
+import torchreg.pipelines.track_fit as fit_module
 import torchreg.pipelines.track_recovery as recovery_module
 from torchreg.datasets.hand import hand_motion
 from torchreg.datasets.sequences import range_clouds
@@ -16,6 +17,7 @@ from torchreg.io.frames import save_frames
 from torchreg.io.points import load_points, save_points
 from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.hand import Hand
+from torchreg.models.skin import LinearBlendSkin, sample_skin
 from torchreg.pipelines.storage import load
 from torchreg.pipelines.track import TrackConfig, Tracker
 from torchreg.results import PoseStarts, Status
@@ -45,8 +47,25 @@ def command(sequence, tmp_path):
     )  # fmt: skip
 
 
+@pytest.fixture(scope="module", autouse=True)
+def sampled_once():
+    """Sample the points of the right hand once for all its trackers."""
+    known = {}
+
+    def sampled(shape, count, **options):
+        if not isinstance(shape, Hand) or shape.side != "right":
+            return sample_skin(shape, count, **options)
+        key = (count, *options.items())
+        first = known[key] = known.get(key) or sample_skin(shape, count, **options)
+        return LinearBlendSkin(shape, first.points, first.weights, first.reference_pose, normals=first.normals)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(fit_module, "sample_skin", sampled)
+        yield
+
+
 @pytest.fixture(scope="module")
-def whole(sequence, plain_hand):
+def whole(sequence, plain_hand, sampled_once):
     """What the library makes of the sequence."""
     frames = [load_points(path).points for path in sorted((sequence / "frames").iterdir())]
     start = torch.tensor(json.loads((sequence / "start.json").read_text(encoding="utf-8")))
