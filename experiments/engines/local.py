@@ -28,6 +28,7 @@ class LocalEngine:
         self.gpus = visible_gpus() if config.gpus != 0 else []
         share_code()
         self._pools: list[ProcessPoolExecutor | None] = [None] * config.jobs
+        self._busy: set[int] = set()
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
         """Yield one outcome per job; see `Engine`."""
@@ -38,17 +39,20 @@ class LocalEngine:
             while waiting and free:
                 slot, job = free.pop(), waiting.popleft()
                 running[self._submit(slot, job)] = slot, job
+                self._busy.add(slot)
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 slot, job = running.pop(future)
                 free.append(slot)
                 try:
-                    yield future.result()
+                    outcome = future.result()
                 except BrokenProcessPool:
                     self._drop(slot)
-                    yield Outcome(job.id, "lost")
+                    outcome = Outcome(job.id, "lost")
+                self._busy.discard(slot)
+                yield outcome
 
     def close(self) -> None:
-        """End all processes."""
+        """End all processes: those that are idle by themselves, the others at once."""
         for slot in range(len(self._pools)):
             self._drop(slot)
 
@@ -74,12 +78,16 @@ class LocalEngine:
         pool, self._pools[slot] = self._pools[slot], None
         if pool is None:
             return
+        if slot not in self._busy:
+            pool.shutdown()
+            return
         processes = list((getattr(pool, "_processes", None) or {}).values())
         pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
             process.kill()
         for process in processes:
             process.join()
+        self._busy.discard(slot)
 
 
 def _begin(threads: int, gpu: str | None) -> None:

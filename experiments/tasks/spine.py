@@ -135,7 +135,7 @@ def _peer_tips(mesh: tr.TriangleMesh) -> int:
     import trimesh
 
     body = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
-    table = skeletor.skeletonize.by_wavefront(body, waves=1, step_size=1).swc
+    table = skeletor.skeletonize.by_wavefront(body, waves=1, step_size=1, progress=False).swc
     return int((~table.node_id.isin(table.parent_id)).sum())
 
 
