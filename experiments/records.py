@@ -36,7 +36,7 @@ class TrialRecord:
         seed: of it.
         status: "done", "failed" or "skipped".
         metrics: that depend on the configuration alone; None stands for a number that is not finite.
-        seconds: by stage.
+        seconds: by stage; "cpu" is the processor time of the whole trial.
         curves: values per step.
         artifacts: files kept, relative to the trial's folder of artifacts.
         note: of a failure the last line, of a skipped trial the reason.

@@ -217,6 +217,7 @@ def _facts(store: Store, records: dict[str, TrialRecord]) -> list[tuple[str, str
         ("engine", seen("engine")),
         ("first and last start", f"{min(one.started for one in every)} to {max(one.started for one in every)}"),
         ("time of all trials", f"{sum(one.wall_seconds for one in every):.1f} s"),
+        ("processor time of all trials", f"{sum(float(one.seconds.get('cpu') or 0) for one in every):.1f} s"),
         ("largest peak memory", f"{max(one.peak_memory_mb for one in every):.0f} MB"),
         ("records", str(store.trials)),
     ]
