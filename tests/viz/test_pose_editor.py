@@ -1,6 +1,7 @@
 """Posing without a window: handles come to their targets, pins hold, undo brings back every number."""
 
 import numpy as np
+import pygltflib
 import pytest
 import torch
 
@@ -134,6 +135,19 @@ def test_files_hold_the_pose(editor, registration, tmp_path):
     np.testing.assert_allclose(cloud.points, editor.moved(), atol=1e-6)
     assert len(cloud.faces) == len(registration.faces)
     assert editor.save_gltf(tmp_path / "pose.glb").exists()
+
+
+def test_blends_that_gltf_does_not_know_are_written_vertex_by_vertex(registration, tmp_path):
+    from dataclasses import replace
+
+    record = replace(registration.model.record(), blend="dual_quaternion")
+    twisted = replace(registration, model=type(registration.model).from_record(record))
+    editor = PoseEditor(twisted)
+    path = editor.save_gltf(tmp_path / "twisted.glb")
+    gltf = pygltflib.GLTF2().load(str(path))
+    assert not gltf.skins
+    assert len(gltf.meshes[0].primitives[0].targets) == 10
+    np.testing.assert_allclose(load_points(path).points, registration.points, atol=1e-5)
 
 
 def test_frames_of_sequences(sequence, registration):

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from torchreg.datasets.hand import hand_motion
 from torchreg.geometry.mesh import unit_sphere
+from torchreg.io.gltf_morph import save_vertex_animation
 from torchreg.models.hand import Hand
 from torchreg.models.spine import Spine
 from torchreg.viz.animation import coarse_skin
@@ -25,7 +26,7 @@ from torchreg.viz.spine_gltf import save_spine_animation
 HERE = Path(__file__).parent
 DTYPES = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-KINDS = ("track", "registration", "poses", "sequence", "spine")
+KINDS = ("track", "registration", "poses", "sequence", "spine", "vertices")
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +73,13 @@ def files(tmp_path_factory, registered_toy):
         path = save_grid_animation(place / "sequence.glb", model, points, faces, keys, hierarchy="flat").path
         found["sequence"] = path, torch.tensor([0.0, 1.0]), model.move(points, weights, keys)
         found["spine"] = spine_file(place / "spine.glb")
+        frames = torch.stack([points, registered_toy.deformed, points + 0.1])
+        path = save_vertex_animation(place / "vertices.glb", frames, faces, torch.arange(3.0))
+        found["vertices"] = (
+            path,
+            torch.tensor([0.0, 0.5, 1.0, 2.0]),
+            torch.stack([frames[0], frames[:2].mean(0), *frames[1:]]),
+        )
     return found
 
 
@@ -107,6 +115,8 @@ class Player:
             sampler = self.gltf.animations[0].samplers[channel.sampler]
             keys, values = self.read(sampler.input)[:, 0].astype(float), self.read(sampler.output).astype(float)
             at = float(np.clip(time, keys[0], keys[-1]))
+            if channel.target.path == "weights":
+                continue
             if channel.target.path == "translation":
                 local[channel.target.node][:3, 3] = [np.interp(at, keys, row) for row in values.T]
             else:
@@ -120,6 +130,8 @@ class Player:
 
         for root in self.gltf.scenes[0].nodes:
             visit(root, np.eye(4))
+        if not self.gltf.skins:
+            return self.morphed(time)
         skin = self.gltf.skins[0]
         inverse = self.read(skin.inverseBindMatrices).astype(float).reshape(-1, 4, 4).transpose(0, 2, 1)
         joints = np.stack([world[node] @ bind for node, bind in zip(skin.joints, inverse, strict=True)])
@@ -130,6 +142,16 @@ class Player:
         weights = self.read(attributes.WEIGHTS_0)
         moved = np.einsum("vsij,vj->vsi", joints[self.read(attributes.JOINTS_0)], points)
         return np.einsum("vs,vsi->vi", weights, moved)[:, :3]
+
+    def morphed(self, time):
+        primitive, (sampler,) = self.gltf.meshes[0].primitives[0], self.gltf.animations[0].samplers
+        keys = self.read(sampler.input)[:, 0]
+        shares = self.read(sampler.output).reshape(len(keys), -1)
+        moves = [
+            np.interp(time, keys, row) * self.read(move["POSITION"])
+            for row, move in zip(shares.T, primitive.targets, strict=True)
+        ]
+        return self.read(primitive.attributes.POSITION) + sum(moves)
 
     @staticmethod
     def local(node):

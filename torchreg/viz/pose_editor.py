@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg.errors import InputError
+from torchreg.io.gltf_morph import save_vertex_animation
 from torchreg.models.grid_lbs import GridLBS
 from torchreg.pipelines.solve_pose import PoseConfig, PoseSolver
 from torchreg.results import PoseSolution, ScanRegistration, SequenceRegistration
@@ -21,6 +22,8 @@ from torchreg.viz.scan_gltf import save_grid_animation
 
 # Frames between two key poses when they are played.
 _FRAMES_PER_KEY = 30
+# The same in files that hold every vertex of every frame.
+_BAKED_PER_KEY = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,6 +275,8 @@ class PoseEditor:
     def save_gltf(self, path: str | Path, *, seconds_per_key: float = 1.0) -> Path:
         """Return the path of the skinned scan (.glb): its key poses as an animation, or from rest to the current pose.
 
+        A blend of dual quaternions, which glTF does not know, is written vertex by vertex.
+
         Raises:
             InputError: if the scan has no triangles, or the ending is another.
         """
@@ -280,6 +285,10 @@ class PoseEditor:
         rest = torch.eye(4).to(self._state.transforms).expand_as(self._state.transforms)
         poses = torch.stack(self._keys if self._keys else [rest, self._state.transforms])
         times = torch.arange(len(poses), dtype=torch.float64) * seconds_per_key
+        if self.model.blend != "linear" and len(poses) > 1:
+            at = torch.linspace(0, len(poses) - 1, _BAKED_PER_KEY * (len(poses) - 1) + 1)
+            frames = self.moved(between_poses(self.model, poses, at))
+            return save_vertex_animation(path, frames, self.faces, at * seconds_per_key, self.colors)
         return save_grid_animation(path, self.model, self.points, self.faces, poses, times).path
 
     def _check(self, number: int) -> None:
