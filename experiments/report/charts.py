@@ -14,7 +14,20 @@ from experiments.schema import SweepConfig
 
 _MAX_MAPS, _MAX_DOTS, _MAX_LINES = 6, 60, 12
 _HEIGHT, _CELL_PIXELS = 380, 46
-_COLORS = ("#3366aa", "#dd7733", "#339966", "#aa3355", "#7755bb", "#888833", "#33a0b5", "#775544", "#555555", "#cc66aa")
+_COLORS = (
+    "#3366aa",
+    "#dd7733",
+    "#339966",
+    "#aa3355",
+    "#7755bb",
+    "#888833",
+    "#33a0b5",
+    "#775544",
+    "#555555",
+    "#cc66aa",
+    "#bbaa00",
+    "#2f4f9f",
+)
 
 
 def heat_maps(sweep: SweepConfig, cells: Sequence[Cell], metric: str) -> list[str]:
