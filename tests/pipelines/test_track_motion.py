@@ -134,8 +134,8 @@ def test_velocities_that_data_do_not_confirm_fade(arm_tracking):
 def test_motions_begin_at_rest_and_no_surer_than_before(arm_tracking):
     begun = first_motion(arm_tracking.pose, 0.5)
     assert not begun.velocity.any()
-    assert begun.error == pytest.approx(0.02)
-    torch.testing.assert_close(begun.surprise, arm_tracking.pose.new_tensor([0.02, 0.15, 0.15]))
+    assert begun.error == pytest.approx(0.016)
+    torch.testing.assert_close(begun.surprise, arm_tracking.pose.new_tensor([0.016, 0.15, 0.15]))
     state = arm_tracking.state(error=0.1, surprise=arm_tracking.pose.new_tensor([0.1, 0.0, 0.5]))
     both = merged(state, begun)
     assert both.error == pytest.approx(0.09)

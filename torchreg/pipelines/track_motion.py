@@ -16,7 +16,7 @@ from torchreg.pipelines.track_config import Frame, FrameFit
 from torchreg.results import TrackState
 
 # Errors of the prediction before any is known: joints and turns in radians, points as a share of the size.
-NEW_TURN_ERROR, NEW_ERROR = 0.15, 0.04
+NEW_TURN_ERROR, NEW_ERROR = 0.15, 0.032
 # Share of the largest errors of the prediction kept from frame to frame: a burst is remembered for half a second.
 _ERROR_MEMORY = 0.9
 # The prior's standard deviations are this many times the errors of the prediction, which covers 95 % of them...
