@@ -75,6 +75,18 @@ def test_the_camera_sees_everything(offset, up):
         assert upright.tolist() == list(up)
 
 
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (-0.6, 0.0, -0.8)])
+def test_a_scan_from_one_side_is_seen_from_there(direction):
+    towards = torch.tensor(direction)
+    seen = (BALL.vertices[BALL.faces].mean(1) @ towards) > 0.2
+    scan = Surface("scan", BALL.vertices, BALL.faces[seen])
+    for up in ((0.0, 1.0, 0.0), (0.0, -1.0, 0.0)):
+        position, target, _ = Scene("scan", (scan,), up=up).camera()
+        looking = (position - target) / (position - target).norm()
+        assert float(looking @ towards.double()) > 0.8
+        assert float(looking[1] * up[1]) > 0.1  # from above
+
+
 def test_outliers_do_not_decide_where_the_camera_stands():
     far = Cloud("data", [100 * POINTS], (0.0, 0.0, 0.0))
     ball = Meshes("ball", [BALL])

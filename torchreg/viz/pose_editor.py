@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -93,7 +94,7 @@ class PoseEditor:
         """Colors (N, 3) of the points by their bones."""
         return weight_colors(self._weights).clamp(0, 1)
 
-    @property
+    @cached_property
     def diagonal(self) -> float:
         """Length of the diagonal of the scan."""
         return float((self.points.amax(0) - self.points.amin(0)).norm())

@@ -18,6 +18,8 @@ Color = tuple[float, float, float]
 FIELD_OF_VIEW = math.radians(45)
 # Points whose middle is farther from the origin than this share of their diagonal were measured from there.
 _FAR_SHARE = 0.75
+# Surfaces whose normals have a longer mean were seen from one side.
+_ONE_SIDED = 0.3
 # Points that decide about the camera.
 _FEW_POINTS = 4000
 # Levels per color channel that are tried, most first, until a painted surface has few enough colors.
@@ -275,10 +277,13 @@ class Scene:
         size = (upper - lower).norm().clamp(min=1e-9)
         from_camera = bool(middle.norm() > _FAR_SHARE * size)
         up = torch.tensor(self.up or ((0.0, -1.0, 0.0) if from_camera else (0.0, 0.0, 1.0))).to(middle)
-        if from_camera and self.up is None:
-            # From a little right of and above where it was measured.
-            away = middle.norm()
-            direction = middle - away * middle.new_tensor([0.35, -0.25, 0.0])
+        facing = self._facing()
+        side = torch.linalg.cross(up, facing)
+        if facing.norm() > _ONE_SIDED and side.norm() > 0.2 * facing.norm():
+            # A scan from one side is seen from there, from a little right of and above it.
+            direction = -facing / facing.norm() - 0.3 * side / side.norm() - 0.2 * up
+        elif from_camera and self.up is None:
+            direction = middle - middle.norm() * middle.new_tensor([0.35, -0.25, 0.0])
         else:
             side = torch.linalg.cross(up, middle.new_tensor([1.0, 0.0, 0.0]) if abs(up[0]) < 0.5 else up.roll(1))
             direction = -(0.5 * up - 0.6 * torch.linalg.cross(side, up) - side)
@@ -295,6 +300,16 @@ class Scene:
         """Length of the diagonal of `bounds`."""
         lower, upper = self.bounds()
         return float((upper - lower).norm()) or 1.0
+
+    def _facing(self) -> Tensor:
+        """Return the mean normal (3,) of the surfaces shown at first: zero if closed, long if seen from one side."""
+        total, area = torch.zeros(3, dtype=torch.float64), 0.0
+        for layer in self.layers:
+            if isinstance(layer, Surface) and layer.visible:
+                corner, second, third = layer.points(0).detach().cpu().double()[layer.faces.cpu()].unbind(1)
+                normal = torch.linalg.cross(second - corner, third - corner).nan_to_num()
+                total, area = total + normal.sum(0), area + float(normal.norm(dim=-1).sum())
+        return total / area if area > 0 else total
 
     def _few_points(self) -> Tensor:
         # Outliers reach far: where there is more than points, they do not decide.
