@@ -166,9 +166,9 @@ def test_a_search_ends_when_a_round_gains_nothing(problem, exact, monkeypatch):
     rounds = []
     searched = PoseSearch._searched
 
-    def counted(search, candidates):
+    def counted(search, candidates, number):
         rounds.append(candidates.shape[1])
-        return searched(search, candidates)
+        return searched(search, candidates, number)
 
     monkeypatch.setattr(PoseSearch, "_searched", counted)
     PoseSearch(problem, generator()).settle(exact.unsqueeze(1).repeat(1, 2, 1), 6)

@@ -116,7 +116,11 @@ def explore(
     """
     per_problem = candidates * _DATA_PER_CANDIDATE * problem.skin.shape.num_parts
     rows = torch.arange(len(start), device=start.device).split(max(1, _CHUNK_ENTRIES // per_problem))
-    found = [_explore(problem.rows(row), start[row], descended[row], candidates, rounds, generator) for row in rows]
+    state, found = generator.get_state(), []
+    for row in rows:
+        # What is drawn for a problem does not depend on the others.
+        generator.set_state(state)
+        found.append(_explore(problem.rows(row), start[row], descended[row], candidates, rounds, generator))
     return torch.cat(found)
 
 
@@ -163,14 +167,15 @@ def _scatter(search: PoseSearch, center: Tensor, count: int, generator: torch.Ge
     shape = problem.skin.shape
     scale = (_JOINT_SCATTER * (shape.upper - shape.lower)).clamp_max(_MAX_JOINT_SCATTER)
     scale[:3], scale[3:6] = _SHIFT_SCATTER * problem.size, _TURN_SCATTER
-    noise = torch.randn(len(center), count, shape.num_dofs, generator=generator).to(center) * scale
-    noise[:, 0] = 0
-    around = shape.retract(center.unsqueeze(1).expand_as(noise), noise)
+    noise = torch.randn(count, shape.num_dofs, generator=generator).to(center) * scale
+    noise[0] = 0
+    wide = center.unsqueeze(1).expand(-1, count, -1)
+    around = shape.retract(wide, noise.expand_as(wide))
     reach = (shape.upper - shape.lower).clamp_max(2 * _FRESH_REACH)
     low = torch.maximum(center - _FRESH_REACH, shape.lower).clamp_max(shape.upper - reach)
     fresh = low.unsqueeze(1) + reach * torch.rand(noise.shape, generator=generator).to(center)
     for limb in search.limbs.limbs:
-        redraw = torch.rand(*noise.shape[:2], 1, generator=generator).to(center) < _FRESH_LIMBS
-        redraw[:, 0] = False
+        redraw = torch.rand(count, 1, generator=generator).to(center) < _FRESH_LIMBS
+        redraw[0] = False
         around[..., limb.dofs] = torch.where(redraw, fresh[..., limb.dofs], around[..., limb.dofs])
     return problem.clamp(around.transpose(0, 1)).transpose(0, 1)

@@ -126,7 +126,8 @@ class LimbSearch:
             return poses.unsqueeze(1)
         per_row = effort.num_data * _MAX_GROWN
         rows = torch.arange(len(poses), device=poses.device).split(max(1, _CHUNK_ENTRIES // per_row))
-        found = [_Search(self, problem.rows(row), effort, generator).run(poses[row]) for row in rows]
+        few = problem.draw(effort.num_data, generator)
+        found = [_Search(self, problem.rows(row), few.rows(row), effort).run(poses[row]) for row in rows]
         return torch.cat(found)
 
     def _leader(self, follower: Limb) -> Limb:
@@ -181,9 +182,8 @@ class _Search:
     Samples are tried on few data with a wide kernel (``lost`` of a beam); combinations are judged on ``problem``.
     """
 
-    def __init__(self, limbs: LimbSearch, problem: AlignProblem, effort: Effort, generator: torch.Generator) -> None:
-        self.limbs, self.shape, self.effort = limbs, limbs.shape, effort
-        self.few = problem.draw(effort.num_data, generator)
+    def __init__(self, limbs: LimbSearch, problem: AlignProblem, few: AlignProblem, effort: Effort) -> None:
+        self.limbs, self.shape, self.effort, self.few = limbs, limbs.shape, effort, few
         self.problem = problem if effort.polish else self.few
         self.width = effort.width * problem.size
         self.score_width = effort.score_width * problem.size

@@ -36,6 +36,7 @@ _MAX_DATA, _NUM_MODEL = 800, 120
 _NOISE = 0.01
 # A search that explains no more than this many data more has ended.
 _MIN_GAIN = 0.5
+_SEEDS = 2**31
 
 
 class PoseSearch:
@@ -43,7 +44,7 @@ class PoseSearch:
 
     Args:
         problem: the batch; it is searched with few data, few model points and the shape's solids for its surface.
-        generator: draws data.
+        generator: draws data, the same for every problem: a batch gives what its problems give alone.
     """
 
     def __init__(self, problem: AlignProblem, generator: torch.Generator) -> None:
@@ -52,7 +53,7 @@ class PoseSearch:
         self.problem = replace(problem, skin=skin, surface=FusedSurface(shape)).draw(_MAX_DATA, generator)
         self.few = self.problem.draw(_COARSE_DATA, generator)
         self.limbs = LimbSearch(shape)
-        self.generator = generator
+        self.seed = int(torch.randint(_SEEDS, (), generator=generator))
 
     def rows(self, index: Tensor) -> PoseSearch:
         """Return the search for some rows of the batch."""
@@ -75,7 +76,7 @@ class PoseSearch:
 
     def narrow(self, pool: Tensor, count: int) -> Tensor:
         """Return the best ``count`` of candidates (B, N, num_dofs), each with its limbs placed anew or as it came."""
-        placed = self._placed(self.few, pool, _COARSE)
+        placed = self._placed(self.few, pool, _COARSE, 0)
         options = torch.cat([placed, pool.unsqueeze(2)], dim=2)
         fitted = fit_candidates(self.few, options.flatten(1, 2), _COARSE_FIT, 1)
         scores = score_candidates(self.few, fitted, _COARSE_SCORE).unflatten(1, options.shape[1:3])
@@ -93,31 +94,34 @@ class PoseSearch:
         Returns:
             poses (B, H, num_dofs) and scores (B, H): data that are not explained, and the prior.
         """
-        poses, scores = self._searched(candidates)
+        poses, scores = self._searched(candidates, 1)
         order = scores.argsort(1)
         poses, scores = take_rows(poses, order), scores.gather(1, order)
-        for _ in range(rounds - 1):
-            best, score = self._searched(poses[:, :1])
-            gain = scores[:, 0] - score[:, 0]
+        active = torch.arange(len(poses), device=poses.device)
+        for number in range(2, rounds + 1):
+            best, score = self.rows(active)._searched(poses[active, :1], number)
+            gain = scores[active, 0] - score[:, 0]
             better = (gain > 0).unsqueeze(-1)
-            poses[:, 0] = torch.where(better, best[:, 0], poses[:, 0])
-            scores[:, 0] = torch.minimum(score[:, 0], scores[:, 0])
-            if not bool((gain > _MIN_GAIN).any()):
+            poses[active, 0] = torch.where(better, best[:, 0], poses[active, 0])
+            scores[active, 0] = torch.minimum(score[:, 0], scores[active, 0])
+            active = active[gain > _MIN_GAIN]
+            if len(active) == 0:
                 break
         return poses, scores
 
-    def _searched(self, candidates: Tensor) -> tuple[Tensor, Tensor]:
-        options = torch.cat([self._placed(self.problem, candidates, _FINE), candidates.unsqueeze(2)], dim=2)
+    def _searched(self, candidates: Tensor, number: int) -> tuple[Tensor, Tensor]:
+        options = torch.cat([self._placed(self.problem, candidates, _FINE, number), candidates.unsqueeze(2)], dim=2)
         fitted = fit_candidates(self.problem, options.flatten(1, 2), _FINE_FIT, _FINE_STEPS)
         scores = score_candidates(self.problem, fitted, _FINE_SCORE).unflatten(1, options.shape[1:3])
         best, which = scores.min(-1)
         first = torch.arange(which.shape[1], device=which.device) * options.shape[2]
         return take_rows(fitted, first + which), best
 
-    def _placed(self, problem: AlignProblem, candidates: Tensor, effort: Effort) -> Tensor:
-        """Return candidates (B, N, C, num_dofs) with their limbs placed in the C best ways."""
+    def _placed(self, problem: AlignProblem, candidates: Tensor, effort: Effort, number: int) -> Tensor:
+        """Return candidates (B, N, C, num_dofs) with their limbs placed in the C best ways, on data of their own."""
+        generator = torch.Generator().manual_seed(self.seed + number)
         wide = repeated(problem, candidates.shape[1])
-        return self.limbs(wide, candidates.flatten(0, 1), effort, self.generator).unflatten(0, candidates.shape[:2])
+        return self.limbs(wide, candidates.flatten(0, 1), effort, generator).unflatten(0, candidates.shape[:2])
 
 
 def _coarse_skin(skin: LinearBlendSkin) -> LinearBlendSkin:
