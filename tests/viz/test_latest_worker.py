@@ -57,6 +57,8 @@ def test_what_waits_can_be_dropped(gate):
     worker.drop()
     assert done == [{"a": 0}]
     worker.close()
+    worker.submit("a", 2)
+    assert worker.flush(5)  # nothing is waited for that will never be done
     assert done == [{"a": 0}]
 
 

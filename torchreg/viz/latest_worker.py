@@ -7,14 +7,17 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping
-from typing import Any
+from typing import Generic, TypeVar
 
 from torchreg.errors import TorchregError
 
 _REMEMBERED = 1000
 
+Key = TypeVar("Key", bound=Hashable)
+Value = TypeVar("Value")
 
-class LatestWorker:
+
+class LatestWorker(Generic[Key, Value]):
     """Calls ``work`` with the newest value of every key that has changed since the last call, on a thread of its own.
 
     Whoever submits never waits: a mouse that moves faster than poses are solved makes no queue.
@@ -27,13 +30,13 @@ class LatestWorker:
 
     def __init__(
         self,
-        work: Callable[[Mapping[Hashable, Any]], None],
+        work: Callable[[Mapping[Key, Value]], None],
         on_error: Callable[[TorchregError], None],
         name: str = "torchreg worker",
     ) -> None:
         self._work, self._on_error = work, on_error
         self._condition = threading.Condition()
-        self._waiting: dict[Hashable, Any] = {}
+        self._waiting: dict[Key, Value] = {}
         self._busy, self._closed = False, False
         self._seconds: deque[float] = deque(maxlen=_REMEMBERED)
         self._num_submitted = 0
@@ -56,9 +59,11 @@ class LatestWorker:
         """Median of `seconds`; NaN before the first call."""
         return statistics.median(self.seconds or (float("nan"),))
 
-    def submit(self, key: Hashable, value: Any) -> None:
-        """Let the work be done for a value, unless a newer one of the same key comes first."""
+    def submit(self, key: Key, value: Value) -> None:
+        """Let the work be done for a value, unless a newer one of the same key comes first, or it was closed."""
         with self._condition:
+            if self._closed:
+                return
             self._waiting[key] = value
             self._num_submitted += 1
             self._condition.notify_all()

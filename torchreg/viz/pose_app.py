@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -66,7 +66,7 @@ class PoseApp:
         self._balls: list[viser.IcosphereHandle] = []
         self._selected = -1
         self._stopped, self._playing = threading.Event(), threading.Event()
-        self.worker = LatestWorker(self._solve, self._tell_error, "torchreg pose solver")
+        self.worker: LatestWorker[int, Tensor] = LatestWorker(self._solve, self._tell_error, "torchreg pose solver")
         self._update_shape = self._draw_shape()
         self._add_controls()
         point_camera(self.server, self._scene(up))
@@ -137,9 +137,9 @@ class PoseApp:
         if not self._stopped.is_set():
             self._update_shape(self.editor.moved())
 
-    def _solve(self, targets: Mapping[Hashable, Any]) -> None:
+    def _solve(self, targets: Mapping[int, Tensor]) -> None:
         """Solve for the newest targets and show what is found; runs on the worker's thread alone."""
-        self.editor.drag({int(str(number)): target for number, target in targets.items()})
+        self.editor.drag(targets)
         self._update_shape(self.editor.moved())
         with self._lock:
             for number, gizmo in enumerate(self._gizmos):
