@@ -147,7 +147,7 @@ def _joint_gaps(found: tr.ScanRegistration, pair: ScanPair) -> list[float]:
 
 
 def _artifacts(problem: Problem, faces: Tensor, found: tr.ScanRegistration, bench: Bench) -> dict[str, str]:
-    """Keep a picture of the moved source, white where it is right and red from the bound of near on, and the model."""
+    """Keep the model, and a picture of the moved source: blue where it is right, red from the bound of near on."""
     errors = (found.deformed - problem.truth).norm(dim=-1) / problem.diagonal
     mesh = tr.TriangleMesh(found.deformed.cpu(), faces)
     view = watch(mesh.vertices, size=PICTURE_PIXELS)
