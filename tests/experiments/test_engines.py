@@ -147,7 +147,7 @@ def test_a_killed_worker_does_not_stop_the_sweep(engine_name, store, probe_sweep
 def test_all_engines_find_the_same_bit_for_bit(tmp_path, ray_cluster, monkeypatch, inline_engine):
     monkeypatch.setenv("RAY_ADDRESS", ray_cluster)
     trial = AlignmentTrial(
-        scene=HandScene(num_points=60),
+        scene=HandScene(view="tracked", num_points=60),
         schedule=ScheduleConfig(steps=2),
         solver=AlignSolver(em_steps=1, num_model_points=60),
     )
