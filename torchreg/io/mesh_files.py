@@ -119,6 +119,8 @@ def _read_mesh(path: Path, limits: FileLimits) -> TriangleMesh:
     try:
         if kind == ".dae":
             content, unit = _bare_collada(content)
+        elif kind == ".stl":
+            _check_stl(content)
         # From memory and without a resolver, so that no material or texture file is opened.
         scene = trimesh.load_scene(io.BytesIO(content), file_type=kind[1:], process=False, maintain_order=True)
         parts = [
@@ -140,6 +142,15 @@ def _read_mesh(path: Path, limits: FileLimits) -> TriangleMesh:
     if not pieces:
         raise FormatError(f"{path}: holds no triangles")
     return concatenate(pieces)
+
+
+def _check_stl(content: bytes) -> None:
+    """Raise a ValueError unless a file is as long as its binary header says, or text.
+
+    What trimesh makes of others depends on which detectors of encodings happen to be installed.
+    """
+    if len(content) != 84 + 50 * int.from_bytes(content[80:84], "little"):
+        content.decode("utf-8")
 
 
 def _bare_collada(content: bytes) -> tuple[bytes, float]:
