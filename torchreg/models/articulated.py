@@ -342,7 +342,20 @@ class ArticulatedShape(nn.Module):
 
         Differentiable: in ``pose`` and `log_length_scales`.
         """
-        return self.part_transforms(pose)[..., :3, 3]
+        return self.placed_keypoints(self.part_transforms(pose))
+
+    def placed_keypoints(self, transforms: Tensor) -> Tensor:
+        """Return the keypoints for given part transforms.
+
+        Args:
+            transforms: (..., P, 4, 4) ``T_world_part``.
+
+        Returns:
+            (..., K, 3), metres, as `keypoints`.
+
+        Differentiable: in ``transforms`` and `log_length_scales`.
+        """
+        return transforms[..., :3, 3]
 
     def part_twists(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
         """Return the part transforms and the twist each degree of freedom gives to each part.

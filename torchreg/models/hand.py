@@ -139,24 +139,20 @@ class Hand(ArticulatedShape):
             points = self.keypoints(self.rest_pose())
         return float((points - points[0]).norm(dim=-1).max())
 
-    def keypoints(self, pose: Tensor) -> Tensor:
+    def placed_keypoints(self, transforms: Tensor) -> Tensor:
         """Return 21 keypoints: wrist, then thumb to little finger, each from its base joint to its tip.
 
         Args:
-            pose: (..., 27).
+            transforms: (..., 16, 4, 4) ``T_world_part``.
 
         Returns:
-            (..., 21, 3), metres.
+            (..., 21, 3), metres, as `keypoints`.
 
-        Raises:
-            InputError: if the pose has the wrong size.
-
-        Differentiable: in ``pose`` and the bone lengths.
+        Differentiable: in ``transforms`` and the bone lengths.
         """
-        parts = self.part_transforms(pose)
-        origins = parts[..., :3, 3]
+        origins = transforms[..., :3, 3]
         distal = list(self.fingertip_parts)
-        tips = origins[..., distal, :] + parts[..., distal, :3, 2] * self.bone_lengths[distal].unsqueeze(-1)
+        tips = origins[..., distal, :] + transforms[..., distal, :3, 2] * self.bone_lengths[distal].unsqueeze(-1)
         fingers = torch.cat([origins[..., 1:, :].unflatten(-2, (5, 3)), tips.unsqueeze(-2)], dim=-2)
         return torch.cat([origins[..., :1, :], fingers.flatten(-3, -2)], dim=-2)
 

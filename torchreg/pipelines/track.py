@@ -279,8 +279,10 @@ class Tracker:
         nothing = pose.new_tensor(torch.nan)
         distances = torch.where(frame.finite, torch.inf, torch.nan).to(pose)
         posterior = torch.zeros_like(distances)
-        sigma, cost, registered = nothing, nothing, self._fitter.skin(pose)
-        if fit is not None:
+        sigma = cost = nothing
+        if fit is None:
+            registered, keypoints = self._fitter.skin(pose), self.shape.keypoints(pose)
+        else:
             problem, near = fit.view.problem, fit.view.near
             cost, sigma = nothing.new_tensor(fit.cost), nothing.new_tensor(STOP_SIGMA * problem.size)
             data, distance = problem.data, fit.distance[0]
@@ -289,12 +291,13 @@ class Tracker:
                 distance = problem.surface.distance(data, fit.pose)[0]
             posed = problem.skin.place(fit.rows)
             registered = posed + fit.view.origin
+            keypoints = self.shape.placed_keypoints(fit.transforms) + fit.view.origin
             distances[near] = distance
             posterior[near] = expectation(posed, data[0], sigma).inlier_posterior
         inliers = distances.abs() < self._fitter.inlier_distance
         count = int(frame.finite.sum())
         return FrameResult(
-            pose=pose, registered=registered, keypoints=self.shape.keypoints(pose), distances=distances,
+            pose=pose, registered=registered, keypoints=keypoints, distances=distances,
             inliers=inliers, posterior=posterior, sigma=sigma, cost=cost, status=status, history=(),
             covariance=covariance, acquired=how, frame=state.frame - 1, time=state.time,
             inlier_ratio=int(inliers.sum()) / max(1, count),

@@ -91,11 +91,13 @@ class FrameView:
     Args:
         problem: one alignment; its prior's mean is the pose.
         origin: (3,) of its coordinates.
+        posed: (4 P, 3) the prior's mean as skins place their points with, see `LinearBlendSkin.place`.
         near: (M,) which points of the cloud are in reach; the problem may hold a part of them.
     """
 
     problem: AlignProblem
     origin: Tensor
+    posed: Tensor
     near: Tensor
 
     def local(self, poses: Tensor) -> Tensor:

@@ -85,7 +85,8 @@ class FrameFitter:
         """Return the frame as seen from a pose (num_dofs,), if any data are in reach; the prior holds joints there."""
         origin = pose[:3].clone()
         local = shifted(pose, -origin)
-        posed, reach = self.skin(local), _REACH * self.size * spread(state, frame.gap)
+        rows = self.shape.part_transforms(local)[:, :3].mT.flatten(0, 1)
+        posed, reach = self.skin.place(rows), _REACH * self.size * spread(state, frame.gap)
         data = frame.cloud - origin
         near = ((data > posed.amin(0) - reach) & (data < posed.amax(0) + reach)).all(-1)
         data = thinned(data[near], self.config.max_points, generator(state))
@@ -98,7 +99,7 @@ class FrameFitter:
             lower=self.shape.lower - shift, upper=self.shape.upper - shift,
             prior=PosePrior(local[None], self._precision(_WIDE_PRIOR)),
         )  # fmt: skip
-        return FrameView(problem, origin, near)
+        return FrameView(problem, origin, rows, near)
 
     def view_ahead(self, state: TrackState, frame: Frame) -> FrameView | None:
         """Return the frame as seen from the prediction, with the model points that were seen last."""
@@ -156,7 +157,8 @@ class FrameFitter:
         strays = dense_strays(problem.data[0], distance[0].abs() < _FAR_NOISES * noise, self.size)
         known = transform_points(transforms[0], state.strays)
         novel = (nearest_distance(strays, known) > _SAME_STRAY * self.size) & self._reach(strays, transforms[0])
-        moved = (problem.skin.place(transforms[:, :3].mT.flatten(0, 1)) - problem.skin(problem.prior.mean)).norm(dim=-1)
+        rows = transforms[:, :3].mT.flatten(0, 1)
+        moved = (problem.skin.place(rows) - problem.skin.place(view.posed)).norm(dim=-1)
         wide = replace(problem, prior=PosePrior(problem.prior.mean, self._precision(_WIDE_PRIOR)))
         return FrameFit(
             view, pose, distance, jacobian, transforms, noise=noise[0], change=float(fitted.change),
