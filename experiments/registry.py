@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.errors import ConfigError
-from experiments.schema import AlignmentTrial, ProbeTrial, RegistrationTrial, SpineTrial
+from experiments.schema import AlignmentTrial, NeuralTrial, ProbeTrial, RegistrationTrial, SpineTrial
 
 
 @dataclass
@@ -79,6 +79,7 @@ _TASKS = (
     Task("alignment", AlignmentTrial, "experiments.tasks.alignment", accelerated=True),
     Task("registration", RegistrationTrial, "experiments.tasks.registration"),
     Task("spine", SpineTrial, "experiments.tasks.spine"),
+    Task("neural_init", NeuralTrial, "experiments.tasks.neural_init"),
     Task("probe", ProbeTrial, "experiments.tasks.probe"),
 )
 TASKS = {task.name: task for task in _TASKS}

@@ -200,6 +200,74 @@ class SpineTrial:
 
 
 @dataclass(frozen=True)
+class CloudScene:
+    """Clouds of hands before a camera that networks learn poses from.
+
+    Args:
+        train: number of clouds to learn from.
+        held_out: number of clouds to measure with.
+        num_points: of a cloud, outliers among them.
+        noise_mm: standard deviation of each coordinate.
+        outlier_ratio: share of all points, uniform in the hand's box grown by 5 cm.
+        tilt_deg: hands are turned by up to this from upright with the palm to the camera, about any axis.
+        bend: share of its range by which each joint is bent at most.
+        seed: of all clouds.
+        folder: where they are kept once they are made, relative to where the experiment is run; if empty, every trial
+            makes them anew.
+    """
+
+    train: int = 2048
+    held_out: int = 512
+    num_points: int = 512
+    noise_mm: float = 1.0
+    outlier_ratio: float = 0.1
+    tilt_deg: float = 45.0
+    bend: float = 0.5
+    seed: int = 0
+    folder: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("train", "held_out", "num_points"):
+            _require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
+        _require(0 <= self.outlier_ratio < 1, f"outlier_ratio must be at least 0 and below 1, got {self.outlier_ratio}")
+        _require(0 <= self.bend <= 1, f"bend must be from 0 to 1, got {self.bend}")
+
+
+@dataclass(frozen=True)
+class NeuralTrial:
+    """A network that learns hand poses from clouds.
+
+    Args:
+        seed: of its first weights, and of the order of the clouds.
+        variant: how it is trained, see experiments/neural_init/train.py. "initializer" is no network but
+            `PoseInitializer` alone.
+        scene: the clouds.
+        width: of its first layer; the others are 2 to 8 times as wide.
+        steps: of the optimizer.
+        batch: clouds per step.
+        learning_rate: of AdamW, after a short warm-up.
+        averaging: share of the old weights in the moving average that is measured.
+        report_every: steps between points of the learning curve.
+    """
+
+    seed: int = 0
+    variant: Literal["scratch", "head", "labels", "refiner", "em", "initializer"] = "scratch"
+    scene: CloudScene = field(default_factory=CloudScene)
+    width: int = 32
+    steps: int = 1000
+    batch: int = 32
+    learning_rate: float = 1e-3
+    averaging: float = 0.98
+    report_every: int = 50
+
+    def __post_init__(self) -> None:
+        for name in ("width", "steps", "batch", "report_every"):
+            _require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
+        _require(self.learning_rate > 0, f"learning_rate must be positive, got {self.learning_rate}")
+        _require(0 <= self.averaging < 1, f"averaging must be at least 0 and below 1, got {self.averaging}")
+
+
+@dataclass(frozen=True)
 class ProbeTrial:
     """A trial that costs what it is told to: what the runner itself is measured and tested with.
 
@@ -231,6 +299,8 @@ class ReportConfig:
         heat: two axes; the first goes to the right.
         heat_metrics: of the heat maps; the first of the table if empty.
         curves: that are drawn; all if empty.
+        curve_steps: curve that tells at which steps the values of the others were taken; 1, 2, ... if empty.
+        curve_spread: whether curves are means over trials in bands from the lowest to the highest, instead of medians.
         group: axis by which curves are colored; the first one if empty.
         share: metrics that are shares or counts, for which the mean over seeds is told instead of the median.
         higher: metrics of which more is better; of others, less.
@@ -241,6 +311,8 @@ class ReportConfig:
     heat: tuple[str, ...] = ()
     heat_metrics: tuple[str, ...] = ()
     curves: tuple[str, ...] = ()
+    curve_steps: str = ""
+    curve_spread: bool = False
     group: str = ""
     share: tuple[str, ...] = ()
     higher: tuple[str, ...] = ()

@@ -107,42 +107,62 @@ def _whiskers(spreads: Sequence[Spread]) -> dict[str, Any]:
 def curve_names(sweep: SweepConfig, records: dict[str, TrialRecord]) -> list[str]:
     """Return the curves to draw."""
     found = dict.fromkeys(name for record in records.values() for name in record.curves)
-    return [name for name in sweep.report.curves or found if name in found]
+    drawn = sweep.report.curves or [name for name in found if name != sweep.report.curve_steps]
+    return [name for name in drawn if name in found]
 
 
 def curves(
     sweep: SweepConfig, trials: Sequence[PlannedTrial], records: dict[str, TrialRecord], name: str
 ) -> str:  # fmt: skip
-    """Return the median of a curve per step, a line per value of the axis that groups them."""
+    """Return a curve over the steps, a line per value of the axis that groups them: the median, or mean and band."""
     import plotly.graph_objects as go
 
-    axis = sweep.report.group or next(iter(axes_of(sweep)), "")
-    groups: dict[str, list[list[float | None]]] = {}
+    report = sweep.report
+    axis = report.group or next(iter(axes_of(sweep)), "")
+    groups: dict[str, list[TrialRecord]] = {}
     for trial in trials:
         record = records.get(trial.id)
-        if record is not None and name in record.curves:
-            groups.setdefault(label(trial.axes.get(axis, "")), []).append(record.curves[name])
+        if record is not None and record.curves.get(name):
+            groups.setdefault(label(trial.axes.get(axis, "")), []).append(record)
     figure = go.Figure()
-    for (value, lines), color in zip(itertools.islice(groups.items(), _MAX_LINES), itertools.cycle(_COLORS)):
-        middle = _median_line(lines)
+    for (value, members), color in zip(itertools.islice(groups.items(), _MAX_LINES), itertools.cycle(_COLORS)):
+        columns = _columns([record.curves[name] for record in members])
+        places = _places(members, report.curve_steps, len(columns))
+        if report.curve_spread:
+            _add_band(figure, places, columns, color)
+        middle = statistics.fmean if report.curve_spread else statistics.median
         figure.add_scatter(
-            x=list(range(1, len(middle) + 1)), y=middle, name=value or name, mode="lines+markers",
-            line={"color": color}, marker={"size": 4},
+            x=places, y=[middle(column) if column else None for column in columns], name=value or name,
+            mode="lines+markers", line={"color": color}, marker={"size": 4},
         )  # fmt: skip
-    figure.update_xaxes(title="step")
+    figure.update_xaxes(title=short(report.curve_steps) or "step")
     figure.update_yaxes(title=named(name), rangemode="tozero")
     figure.update_layout(legend_title_text=short(axis), showlegend=True)
-    return _html(
-        figure, f"{named(name)} along the steps: median over all trials of a {short(axis) or 'sweep'}", _HEIGHT
-    )
+    kind = "mean, lowest and highest" if report.curve_spread else "median"
+    heading = f"{named(name)} along the steps: {kind} over all trials of a {short(axis) or 'sweep'}"
+    return _html(figure, heading, _HEIGHT)
 
 
-def _median_line(lines: Sequence[Sequence[float | None]]) -> list[float | None]:
-    """Return the median at every step; trials that ended before stay at their last value."""
+def _add_band(figure: Any, places: Sequence[float], columns: Sequence[Sequence[float]], color: str) -> None:
+    known = [(place, min(column), max(column)) for place, column in zip(places, columns, strict=True) if column]
+    across, low, high = (list(side) for side in zip(*known, strict=True)) if known else ([], [], [])
+    figure.add_scatter(
+        x=across + across[::-1], y=high + low[::-1], fill="toself", fillcolor=color, opacity=0.15,
+        mode="lines", line={"width": 0}, hoverinfo="skip", showlegend=False,
+    )  # fmt: skip
+
+
+def _places(members: Sequence[TrialRecord], steps: str, count: int) -> list[float]:
+    """Return where the values of curves lie: as the longest trial tells, otherwise at 1, 2, ..."""
+    told = max((record.curves.get(steps, []) for record in members), key=len)
+    return list(told) if len(told) == count else [float(number) for number in range(1, count + 1)]
+
+
+def _columns(lines: Sequence[Sequence[float | None]]) -> list[list[float]]:
+    """Return the known values at every step; trials that ended before stay at their last value."""
     length = max(map(len, lines))
-    padded = [[*line, *[line[-1]] * (length - len(line))] for line in lines if line]
-    steps = ([value for value in step if value is not None] for step in zip(*padded, strict=True))
-    return [statistics.median(step) if step else None for step in steps]
+    padded = [[*line, *[line[-1]] * (length - len(line))] for line in lines]
+    return [[value for value in step if value is not None] for step in zip(*padded, strict=True)]
 
 
 def told(sweep: SweepConfig, cell: Cell, metric: str) -> float | None:

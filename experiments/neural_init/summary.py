@@ -1,0 +1,75 @@
+"""Final errors of the variants beside the baseline's, and how soon they reach what it ends with."""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+
+from experiments.records import TrialRecord
+from experiments.store import Store
+
+BASELINE, METRIC = "scratch", "tips_mm"
+# The baseline is also cut off at these shares of its steps: what help is worth depends on how long one trains.
+SHARES = (0.1, 0.25, 0.5, 1.0)
+
+
+def steps_to(record: TrialRecord, error: float) -> float | None:
+    """Return the steps after which a trial's error is that low, between points of the curve by interpolation.
+
+    None if it never is.
+    """
+    steps, errors = record.curves["steps"], record.curves[METRIC]
+    for number, value in enumerate(errors):
+        if value <= error:
+            if number == 0:
+                return float(steps[0])
+            share = (errors[number - 1] - error) / (errors[number - 1] - value)
+            return float(steps[number - 1] + share * (steps[number] - steps[number - 1]))
+    return None
+
+
+def error_at(records: Sequence[TrialRecord], steps: float) -> float:
+    """Return the mean error of trials after so many steps, at the nearest point of their curves."""
+    rows = [
+        min(range(len(one.curves["steps"])), key=lambda row: abs(one.curves["steps"][row] - steps)) for one in records
+    ]
+    return statistics.fmean(one.curves[METRIC][row] for one, row in zip(records, rows, strict=True))
+
+
+def table(records: Sequence[TrialRecord]) -> list[str]:
+    """Return lines: per variant the final error, its ratio to the baseline's, and the share of steps it takes."""
+    groups: dict[str, list[TrialRecord]] = {}
+    for record in records:
+        if record.status == "done":
+            groups.setdefault(str(record.config["variant"]), []).append(record)
+    baseline = groups[BASELINE]
+    total = float(baseline[0].config["steps"])
+    heads = "  ".join(f"{f'of {share * total:g}':>18}" for share in SHARES)
+    lines = [f"{'variant':12} {'tips, mm':>22} {'ratio':>6}  steps to the baseline's error after: {heads}"]
+    for variant, members in groups.items():
+        final = [float(one.metrics[METRIC]) for one in members]
+        ratio = statistics.fmean(final) / error_at(baseline, total)
+        shown = [_share(members, error_at(baseline, share * total), share * total) for share in SHARES]
+        spread = f"{statistics.fmean(final):.2f} ({min(final):.2f} to {max(final):.2f})"
+        lines.append(f"{variant:12} {spread:>22} {ratio:6.2f}  {'':37} " + "  ".join(f"{text:>18}" for text in shown))
+    return lines
+
+
+def _share(members: Sequence[TrialRecord], error: float, steps: float) -> str:
+    """Return the share of steps, mean and spread over seeds, that trials need for an error."""
+    found = [steps_to(one, error) for one in members]
+    known = [one / steps for one in found if one is not None]
+    if len(known) < len(found):
+        return f"not by {len(found) - len(known)} of {len(found)}"
+    return f"{statistics.fmean(known):.2f} ({min(known):.2f} to {max(known):.2f})"
+
+
+def main(arguments: Sequence[str] | None = None) -> list[str]:
+    """Print the table of a folder of results."""
+    parser = argparse.ArgumentParser(prog="python -m experiments.neural_init", description=__doc__)
+    parser.add_argument("results", nargs="?", type=Path, default=Path("results/neural_init/variants"))
+    lines = table(Store(parser.parse_args(arguments).results).records()[0])
+    print("\n".join(lines))  # noqa: T201 - what the command is for
+    return lines
