@@ -10,6 +10,7 @@ from experiments.driver import run_sweep
 from experiments.errors import ConfigError, StoreError
 from experiments.plan import planned_trials
 from experiments.records import TrialRecord, provenance
+from experiments.report import charts
 from experiments.report.cells import cells_of, marginal
 from experiments.report.page import write_report
 from experiments.schema import ProbeTrial, ReportConfig
@@ -189,6 +190,23 @@ def test_a_page_that_cannot_be_written_is_named(store, grid, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot be written"):
         write_report(grid, store, tmp_path / "file" / "report.html")
+
+
+def test_curves_lie_at_their_steps_with_a_band_over_the_seeds(store, probe_sweep):
+    report = ReportConfig(curves=("error_mm",), curve_steps="steps", curve_spread=True)
+    sweep = probe_sweep(grid={"scale": [1.0]}, seeds=3, report=report)
+    fill(store, sweep, lambda config: 1.0 + config["seed"])
+    found = {one.id: replace(one, curves=one.curves | {"steps": [0.0, 50.0]}) for one in store.records()[0]}
+    chart = charts.curves(sweep, planned_trials(sweep), found, "error_mm")
+    # Errors end at 1, 2 and 3, and begin at their doubles.
+    assert '"x":[0.0,50.0],"y":[4.0,2.0]' in chart
+    assert '"x":[0.0,50.0,50.0,0.0],"y":[6.0,3.0,1.0,2.0]' in chart
+    assert "mean, lowest and highest over all trials" in chart
+    assert charts.curve_names(replace(sweep, report=replace(report, curves=())), found) == ["error_mm"]
+    plain = replace(sweep, report=replace(report, curve_steps="", curve_spread=False))
+    chart = charts.curves(plain, planned_trials(plain), found, "error_mm")
+    assert '"x":[1.0,2.0],"y":[4.0,2.0]' in chart
+    assert chart.count('"type":"scatter","x"') + chart.count('"y":[') <= 2
 
 
 def test_numbers_that_are_not_finite_leave_gaps(store, probe_sweep):
