@@ -243,6 +243,7 @@ class NeuralTrial:
             `PoseInitializer` alone.
         scene: the clouds.
         width: of its first layer; the others are 2 to 8 times as wide.
+        normalized: whether what the last layer sees has zero mean and unit variance, as `PosePrior.init_head_` assumes.
         steps: of the optimizer.
         batch: clouds per step.
         learning_rate: of AdamW, after a short warm-up.
@@ -254,6 +255,7 @@ class NeuralTrial:
     variant: Literal["scratch", "head", "labels", "refiner", "em", "initializer"] = "scratch"
     scene: CloudScene = field(default_factory=CloudScene)
     width: int = 32
+    normalized: bool = False
     steps: int = 1000
     batch: int = 32
     learning_rate: float = 1e-3

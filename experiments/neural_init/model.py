@@ -25,11 +25,12 @@ class PointNet(nn.Module):
         num_further: numbers per cloud.
         num_outputs: of the last layer, `last`.
         width: of the first layer.
+        normalized: whether what the last layer sees has zero mean and unit variance.
 
     References: Qi et al. 2017, PointNet.
     """
 
-    def __init__(self, num_channels: int, num_further: int, num_outputs: int, width: int) -> None:
+    def __init__(self, num_channels: int, num_further: int, num_outputs: int, width: int, normalized: bool) -> None:
         super().__init__()
         self.points = nn.Sequential(
             nn.Linear(num_channels, width), nn.ReLU(), nn.Linear(width, 2 * width), nn.ReLU(),
@@ -39,12 +40,13 @@ class PointNet(nn.Module):
         self.cloud = nn.Sequential(
             nn.Linear(4 * width + num_further, 8 * width), nn.ReLU(), nn.Linear(8 * width, 4 * width), nn.ReLU()
         )
+        self.even = nn.LayerNorm(4 * width, elementwise_affine=False) if normalized else nn.Identity()
         self.last = nn.Linear(4 * width, num_outputs)
 
     def forward(self, channels: Tensor, further: Tensor) -> Tensor:
         """Return (B, num_outputs) of channels (B, M, num_channels) and further numbers (B, num_further)."""
         pooled = torch.relu(self.norm(self.points(channels).amax(dim=1)))
-        return self.last(self.cloud(torch.cat([pooled, further], dim=-1)))
+        return self.last(self.even(self.cloud(torch.cat([pooled, further], dim=-1))))
 
 
 class PoseRegressor(nn.Module):
@@ -53,14 +55,15 @@ class PoseRegressor(nn.Module):
     Args:
         hand: whose poses.
         width: of the network.
+        normalized: see `PointNet`.
     """
 
     unit: Tensor
 
-    def __init__(self, hand: tr.Hand, width: int) -> None:
+    def __init__(self, hand: tr.Hand, width: int, normalized: bool = False) -> None:
         super().__init__()
         self.head = tr.PoseHead(hand, rotation="6d")
-        self.net = PointNet(3, 0, self.head.num_features, width)
+        self.net = PointNet(3, 0, self.head.num_features, width, normalized)
         unit = torch.ones(self.head.num_features)
         unit[:3] = UNIT
         self.register_buffer("unit", unit, persistent=False)
@@ -89,14 +92,15 @@ class PoseRefiner(nn.Module):
     Args:
         hand: whose poses; called without gradients, its parameters are not the refiner's.
         width: of the network.
+        normalized: see `PointNet`.
     """
 
     unit: Tensor
 
-    def __init__(self, hand: tr.Hand, width: int) -> None:
+    def __init__(self, hand: tr.Hand, width: int, normalized: bool = False) -> None:
         super().__init__()
         self._hand = (hand,)
-        self.net = PointNet(3 + hand.num_parts, hand.num_dofs - 5, hand.num_dofs, width)
+        self.net = PointNet(3 + hand.num_parts, hand.num_dofs - 5, hand.num_dofs, width, normalized)
         nn.init.zeros_(self.net.last.weight)
         nn.init.zeros_(self.net.last.bias)
         unit = torch.full((hand.num_dofs,), STEP_TURN)

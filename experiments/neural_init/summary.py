@@ -38,13 +38,11 @@ def error_at(records: Sequence[TrialRecord], steps: float) -> float:
     return statistics.fmean(one.curves[METRIC][row] for one, row in zip(records, rows, strict=True))
 
 
-def table(records: Sequence[TrialRecord]) -> list[str]:
+def table(records: Sequence[TrialRecord], baseline: Sequence[TrialRecord]) -> list[str]:
     """Return lines: per variant the final error, its ratio to the baseline's, and the share of steps it takes."""
     groups: dict[str, list[TrialRecord]] = {}
     for record in records:
-        if record.status == "done":
-            groups.setdefault(str(record.config["variant"]), []).append(record)
-    baseline = groups[BASELINE]
+        groups.setdefault(str(record.config["variant"]), []).append(record)
     total = float(baseline[0].config["steps"])
     heads = "  ".join(f"{f'of {share * total:g}':>18}" for share in SHARES)
     lines = [f"{'variant':12} {'tips, mm':>22} {'ratio':>6}  steps to the baseline's error after: {heads}"]
@@ -66,10 +64,22 @@ def _share(members: Sequence[TrialRecord], error: float, steps: float) -> str:
     return f"{statistics.fmean(known):.2f} ({min(known):.2f} to {max(known):.2f})"
 
 
+def finished(folder: Path) -> list[TrialRecord]:
+    """Return the finished trials in a folder of results, variant by variant in the order of their names."""
+    done = [record for record in Store(folder).records()[0] if record.status == "done"]
+    return sorted(done, key=lambda record: (str(record.config["variant"]), record.seed))
+
+
 def main(arguments: Sequence[str] | None = None) -> list[str]:
     """Print the table of a folder of results."""
     parser = argparse.ArgumentParser(prog="python -m experiments.neural_init", description=__doc__)
     parser.add_argument("results", nargs="?", type=Path, default=Path("results/neural_init/variants"))
-    lines = table(Store(parser.parse_args(arguments).results).records()[0])
+    parser.add_argument("--baseline", type=Path, help="other results that hold the baseline")
+    options = parser.parse_args(arguments)
+    folder = options.baseline or options.results
+    baseline = [record for record in finished(folder) if record.config["variant"] == BASELINE]
+    if not baseline:
+        parser.error(f"{folder} holds no finished trial of the variant {BASELINE}; run its sweep first")
+    lines = table(finished(options.results), baseline)
     print("\n".join(lines))  # noqa: T201 - what the command is for
     return lines

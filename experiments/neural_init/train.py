@@ -33,12 +33,14 @@ class Setup:
         hand: whose poses.
         clouds: to learn from.
         width: of the network.
+        normalized: see `PointNet`.
         generator: of draws.
     """
 
     hand: tr.Hand
     clouds: Clouds
     width: int
+    normalized: bool
     generator: torch.Generator
 
 
@@ -48,12 +50,12 @@ Loss = Callable[[Tensor, Clouds, float], Tensor]
 
 def scratch(setup: Setup) -> tuple[nn.Module, Loss]:
     """(a) The truth is known; the network knows nothing."""
-    return PoseRegressor(setup.hand, setup.width), to_truth(setup)
+    return PoseRegressor(setup.hand, setup.width, setup.normalized), to_truth(setup)
 
 
 def head(setup: Setup) -> tuple[nn.Module, Loss]:
     """(b) The truth is known; the last layer starts from what poses torchreg found."""
-    model = PoseRegressor(setup.hand, setup.width)
+    model = PoseRegressor(setup.hand, setup.width, setup.normalized)
     model.start_from_(prior_of(setup))
     return model, to_truth(setup)
 
@@ -65,18 +67,18 @@ def labels(setup: Setup) -> tuple[nn.Module, Loss]:
     def loss(poses: Tensor, clouds: Clouds, share: float) -> Tensor:
         return (clouds.confidence / mean * apart(setup.hand, poses, clouds.found).mean(-1)).mean() / LOSS_UNIT
 
-    return PoseRegressor(setup.hand, setup.width), loss
+    return PoseRegressor(setup.hand, setup.width, setup.normalized), loss
 
 
 def refiner(setup: Setup) -> tuple[nn.Module, Loss]:
     """(d) The truth is known; the network moves on from what torchreg found."""
-    return PoseRefiner(setup.hand, setup.width), to_truth(setup)
+    return PoseRefiner(setup.hand, setup.width, setup.normalized), to_truth(setup)
 
 
 def em(setup: Setup) -> tuple[nn.Module, Loss]:
     """(e) No labels at all: the posed hand should explain the cloud, and poses be likely."""
     prior, skin = prior_of(setup), tr.sample_skin(setup.hand, EM_POINTS)
-    model = PoseRegressor(setup.hand, setup.width)
+    model = PoseRegressor(setup.hand, setup.width, setup.normalized)
     model.start_from_(prior)
 
     def loss(poses: Tensor, clouds: Clouds, share: float) -> Tensor:
@@ -143,7 +145,7 @@ def train(hand: tr.Hand, clouds: Clouds, held_out: Clouds, config: NeuralTrial) 
     generator = torch.Generator().manual_seed(config.seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)  # torch.nn draws its first weights from the global generator
-        model, loss = VARIANTS[config.variant](Setup(hand, known, config.width, generator))
+        model, loss = VARIANTS[config.variant](Setup(hand, known, config.width, config.normalized, generator))
     average = AveragedModel(model, multi_avg_fn=get_ema_multi_avg_fn(config.averaging))
     optimizer = torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=0.0)
     warm_up = torch.optim.lr_scheduler.LinearLR(optimizer, 1 / _WARM_UP, 1.0, _WARM_UP)

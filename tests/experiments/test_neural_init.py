@@ -39,7 +39,7 @@ def held_out(hand):
 
 
 def setup_of(hand, clouds):
-    return Setup(hand, clouds, 8, torch.Generator().manual_seed(0))
+    return Setup(hand, clouds, 8, False, torch.Generator().manual_seed(0))
 
 
 def final(hand, clouds, held_out, config):
@@ -130,6 +130,22 @@ def test_an_initialized_head_gives_the_mean_of_what_was_found(hand, clouds):
         poses = model(clouds)
     expected = prior.mean + torch.nn.functional.pad(clouds.centers, (0, 24))
     assert apart(hand, poses, expected).max() < 1e-5
+
+
+def test_normalized_features_give_the_spread_of_the_prior_too(hand, clouds):
+    """Features of zero mean and unit variance are what `init_head_` assumes; ReLUs alone give smaller ones."""
+    prior, spreads = prior_of(setup_of(hand, clouds)), []
+    for normalized in (False, True):
+        torch.manual_seed(0)
+        model = PoseRegressor(hand, 32, normalized)
+        model.start_from_(prior)
+        with torch.no_grad():
+            outputs = (
+                model.net.last(torch.randn(500, 128)) if normalized else model.net(clouds.points, torch.zeros(16, 0))
+            )
+        spreads.append(outputs[:, 9:].std(0) / (clouds.found[:, 6:].std(0) + 1e-3))
+    assert spreads[1].median() == pytest.approx(1.0, abs=0.2)
+    assert spreads[0].median() < 0.3
 
 
 def test_a_refiner_starts_from_what_was_found(hand, clouds):
@@ -223,6 +239,14 @@ def test_the_summary_compares_with_the_mean_of_the_baseline(tmp_path, capsys):
     assert lines["head"].endswith("0.62 (0.50 to 0.75)")
     assert lines["em"].endswith("not by 2 of 2")
     assert lines["em"] in capsys.readouterr().out
+    other = Store(tmp_path / "other")
+    other.prepare()
+    other.write(record("head", 0, [40.0, 20.0, 16.0]))
+    told = summary.main([str(other.root), "--baseline", str(tmp_path)])
+    assert "16.00 (16.00 to 16.00)   0.80" in told[1]
+    with pytest.raises(SystemExit):
+        summary.main([str(other.root)])
+    assert "holds no finished trial of the variant scratch" in capsys.readouterr().err
 
 
 def test_the_lines_that_the_readme_prints_run(capsys):
