@@ -289,6 +289,19 @@ def test_hands_are_found_from_scratch(plain_hand, plain_hand_skin, plain_hand_su
     torch.testing.assert_close(shift, torch.ones(3), atol=5e-2, rtol=0)
 
 
+def test_from_scratch_a_cloud_of_a_batch_may_be_empty(shape, skin, points):
+    quick = FindPoseConfig(num_candidates=4, num_placed=2, num_searched=1, search_rounds=1)
+    layer = PoseInitializer(shape, PoseInitializerConfig(search=quick), model_points=skin)
+    mask = torch.ones(3, 60, dtype=torch.bool)
+    mask[1] = False
+    with torch.no_grad():
+        result, alone = layer(points, mask), layer(points[2])
+    assert result.pose.isfinite().all()
+    assert result.confidence[1] == 0
+    torch.testing.assert_close(result.keypoints[2], alone.keypoints, atol=1e-6, rtol=0)
+    torch.testing.assert_close(result.confidence[2], alone.confidence, atol=1e-6, rtol=0)
+
+
 def test_bad_input_is_told(shape, skin, points, start):
     layer = PoseInitializer(shape, EXACT, model_points=skin)
     with pytest.raises(InputError, match="start must have shape"):

@@ -18,7 +18,6 @@ from torchreg.geometry.rigid import fit_rigid, rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.sampling import farthest_points
 from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.limbs import find_limbs
 from torchreg.models.skin import LinearBlendSkin, sample_skin
 from torchreg.pipelines.align_problem import (
     AlignProblem,
@@ -29,9 +28,9 @@ from torchreg.pipelines.align_problem import (
     shifted,
     warn_about_units,
 )
-from torchreg.pipelines.align_search import clustered_data
 from torchreg.pipelines.align_stages import fit_surface
 from torchreg.pipelines.limb_search import distinct_first, take_rows
+from torchreg.pipelines.pose_confidence import is_misfit, pose_confidence
 from torchreg.pipelines.pose_search import PoseSearch
 from torchreg.results import PoseStarts
 
@@ -44,12 +43,6 @@ _RIGID_POINTS, _RIGID_DATA = 60, 120
 _RIGID_SCORE, _MODEL_SHARE = 0.05, 0.5
 # The best so many are compared; two whose points differ by less than this share of the size are one.
 _MAX_COMPARED, _SAME_ROUGH, _SAME_POSE = 300, 0.045, 0.05
-# Data whose nearest model point lies on a limb, within this share of the size, show it; fewer may be outliers.
-_SHOWN_SHARE, _MIN_SHOWN = 0.03, 3
-# More data show no more limbs.
-_SHOWN_DATA = 2000
-# A lead of this many data over a different pose makes sure; clusters of this share of the data on the surface do not.
-_SURE_LEAD, _DOUBTFUL_SHARE = 4.0, 0.1
 _FIT_STEPS, _FINAL_SIGMAS, _FINAL_STEPS = 3, (0.022,), 4
 # Few model points share a datum here, so the outlier class is taken smaller.
 _OUTLIERS = 0.3 * OUTLIER_CONSTANT
@@ -114,6 +107,7 @@ class FindPoseConfig:
         num_placed: of those, the best, whose limbs are placed coarsely.
         num_searched: of those, the best, whose limbs are placed thoroughly.
         search_rounds: of the thorough search, at most.
+        num_retries: searches with other draws, at most, where the best pose leaves many data beside the surface.
         prior_std: standard deviation of a weak prior that draws joints to a typical pose, radians; None for none.
         num_model_points: points sampled on the shape.
         nan_policy: "raise", or "omit" to leave out non-finite data.
@@ -124,6 +118,7 @@ class FindPoseConfig:
     num_placed: int = 16
     num_searched: int = 4
     search_rounds: int = 2
+    num_retries: int = 0
     prior_std: float | None = 0.4
     num_model_points: int = 500
     nan_policy: str = "raise"
@@ -132,6 +127,7 @@ class FindPoseConfig:
     def __post_init__(self) -> None:
         for name in ("num_candidates", "num_placed", "num_searched", "search_rounds", "num_model_points"):
             check_count(getattr(self, name), name, 1)
+        check_count(self.num_retries, "num_retries", 0)
         if self.prior_std is not None:
             check_positive(self.prior_std, "prior_std")
         check_choice(self.nan_policy, "nan_policy", ("raise", "omit"))
@@ -164,7 +160,7 @@ def find_pose(
 
     Returns:
         a `PoseStarts`; with a batch of clouds its tensors have a leading dimension B. The confidence falls with every
-        limb that no data show.
+        limb of which no data tell where it ends.
 
     Raises:
         InputError: if the data are empty or not finite, or there is no source.
@@ -192,7 +188,7 @@ def find_pose(
             skin, batch_data, batch_valid, shifted(typical, origin), origin, prior_std=config.prior_std, pose_atol=0.0
         )
         warn_about_units(problem)
-        poses, costs = _find(problem, sources, config)
+        poses, costs = _found(problem, sources, config)
         starts = _ranked(problem, poses, costs, num_starts)
         starts = replace(starts, poses=shifted(starts.poses, origin.unsqueeze(1)))
     return starts if checked.ndim == 3 else starts.row(0)
@@ -207,8 +203,24 @@ def _check_skin(shape: ArticulatedShape, skin: LinearBlendSkin | None) -> None:
         raise InputError("model_points is a skin of another shape; build it from the shape whose pose is sought")
 
 
+def _found(problem: AlignProblem, sources: Sequence[PoseSource], config: FindPoseConfig) -> tuple[Tensor, Tensor]:
+    """Return candidates (B, H, num_dofs), best first, and their costs, after as many searches as each cloud needs."""
+    poses, costs = _find(problem, sources, config)
+    active = is_misfit(problem, poses[:, 0]).nonzero()[:, 0]
+    for number in range(1, config.num_retries + 1):
+        if len(active) == 0:
+            break
+        again = problem.rows(active)
+        other, other_costs = _find(again, sources, replace(config, seed=config.seed + number))
+        merged, merged_costs = torch.cat([poses[active], other], 1), torch.cat([costs[active], other_costs], 1)
+        order = merged_costs.argsort(dim=1, stable=True)[:, : poses.shape[1]]
+        poses[active], costs[active] = take_rows(merged, order), merged_costs.gather(1, order)
+        active = active[is_misfit(again, poses[active, 0])]
+    return poses, costs
+
+
 def _find(problem: AlignProblem, sources: Sequence[PoseSource], config: FindPoseConfig) -> tuple[Tensor, Tensor]:
-    """Return candidates (B, H, num_dofs) after the search and their costs."""
+    """Return candidates (B, H, num_dofs) after one search, best first, and their costs."""
     generator = torch.Generator().manual_seed(config.seed)
     search = PoseSearch(problem, generator)
     rough = torch.cat([source(search.problem, generator) for source in sources], dim=1)
@@ -220,7 +232,9 @@ def _find(problem: AlignProblem, sources: Sequence[PoseSource], config: FindPose
     count = poses.shape[1]
     wide = problem.rows(torch.arange(len(poses), device=poses.device).repeat_interleave(count))
     fitted = fit_surface(wide, poses.flatten(0, 1), steps=_FINAL_STEPS, sigmas=_FINAL_SIGMAS).pose
-    return fitted.reshape(poses.shape), alignment_cost(wide, fitted).reshape(len(poses), count)
+    costs = alignment_cost(wide, fitted).reshape(len(poses), count)
+    order = costs.argsort(dim=1, stable=True)
+    return take_rows(fitted.reshape(poses.shape), order), costs.gather(1, order)
 
 
 def typical_poses(shape: ArticulatedShape) -> Tensor:
@@ -315,36 +329,8 @@ def _mean_distances(problem: AlignProblem, poses: Tensor) -> Tensor:
 
 def _ranked(problem: AlignProblem, poses: Tensor, costs: Tensor, count: int) -> PoseStarts:
     """Return the candidates, best first; those that fell together with a better one come last."""
-    order = costs.argsort(1)
-    poses, costs = take_rows(poses, order), costs.gather(1, order)
     apart = _mean_distances(problem, poses) > _SAME_POSE * problem.size
     rival = torch.where(apart[:, 0], costs, torch.inf).amin(1)
-    confidence = _confidence(problem, poses[:, 0], rival - costs[:, 0])
+    confidence = pose_confidence(problem, poses[:, 0], rival - costs[:, 0])
     order = distinct_first(~apart)[:, :count]
     return PoseStarts(take_rows(poses, order), costs.gather(1, order), confidence)
-
-
-def _confidence(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor:
-    """Return how surely poses (B, num_dofs) are right, (B,) from 0 to 1.
-
-    A pose is doubtful if a different one explains nearly as many data, if it leaves dense clusters of data over, or if
-    no data show some of its limbs, which may be anywhere hidden.
-    """
-    clustered, near = clustered_data(problem, pose)
-    left_over = clustered / near.clamp_min(1)
-    return (1 - (-lead / _SURE_LEAD).exp()) * (-left_over / _DOUBTFUL_SHARE).exp() * _shown_share(problem, pose)
-
-
-def _shown_share(problem: AlignProblem, pose: Tensor) -> Tensor:
-    """Return the share (B,) of the limbs that data show in poses (B, num_dofs); 1 without limbs."""
-    skin = problem.skin
-    limbs = [limb.parts for limb in find_limbs(skin.shape)[0]]
-    if not limbs:
-        return torch.ones_like(pose[:, 0])
-    if problem.data.shape[-2] > _SHOWN_DATA:
-        problem = problem.draw(_SHOWN_DATA, torch.Generator().manual_seed(0))
-    distance, nearest = torch.cdist(problem.data, skin(pose)).min(-1)
-    part = skin.weights.argmax(-1)[nearest]
-    on = (distance < _SHOWN_SHARE * problem.size) & problem.valid
-    counts = torch.stack([(on & torch.isin(part, part.new_tensor(parts))).sum(-1) for parts in limbs], dim=-1)
-    return (counts >= _MIN_SHOWN).to(pose).mean(-1)

@@ -34,8 +34,8 @@ _TINY = 0.02
 _SAME = 0.25
 # Standard deviation of the data for the weight of the prior, as a share of the model's size; longest step, radians.
 _NOISE, _MAX_STEP = 0.006, 0.3
-# Entries of a table held at a time.
-_CHUNK_ENTRIES = 1_500_000
+# Entries of a table held at a time: what a CPU's caches hold, and what keeps other devices busy.
+_CHUNK_ENTRIES, _WIDE_ENTRIES = 1_500_000, 150_000_000
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,8 @@ class LimbSearch:
         if not self.limbs:
             return poses.unsqueeze(1)
         per_row = effort.num_data * _MAX_GROWN
-        rows = torch.arange(len(poses), device=poses.device).split(max(1, _CHUNK_ENTRIES // per_row))
+        entries = _CHUNK_ENTRIES if poses.device.type == "cpu" else _WIDE_ENTRIES
+        rows = torch.arange(len(poses), device=poses.device).split(max(1, entries // per_row))
         few = problem.draw(effort.num_data, generator)
         found = [_Search(self, problem.rows(row), few.rows(row), effort).run(poses[row]) for row in rows]
         return torch.cat(found)

@@ -26,6 +26,9 @@ _TURN_STD, _SHIFT_STD = 1.0, 0.5
 # A datum counts as explained about this share of the size from the surface; clusters of this share of the data do not.
 _EXPLAINED, _DOUBTFUL_SHARE = 0.02, 0.1
 _LEVER = 0.25
+# Clouds that are searched, and whose poses are fitted, at a time.
+_CHUNK, _WIDE_CHUNK = {"cpu": 1}, 256
+_ROWS, _WIDE_ROWS = {"cpu": 64}, 4096
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ class PoseInitializerConfig:
             held when gradients are taken.
         num_model_points: points sampled on the shape for the EM.
         search: of poses from scratch.
-        chunk: clouds that are searched at a time.
+        chunk: clouds that are searched at a time; by default one on a CPU, whose caches hold no more, else 256.
         nan_policy: "raise", or "omit" to leave out non-finite data.
     """
 
@@ -57,16 +60,18 @@ class PoseInitializerConfig:
     prior_std: float = 0.3
     noise: float | None = None
     num_model_points: int = 300
-    search: FindPoseConfig = field(default_factory=FindPoseConfig)
-    chunk: int = 16
+    search: FindPoseConfig = field(default_factory=lambda: FindPoseConfig(num_retries=3))
+    chunk: int | None = None
     nan_policy: str = "raise"
 
     def __post_init__(self) -> None:
         check_choice(self.nan_policy, "nan_policy", ("raise", "omit"))
         for name in ("sigma_steps", "em_steps", "surface_steps", "newton_steps"):
             check_count(getattr(self, name), name, int(name == "em_steps"))
-        for name in ("fit_steps", "num_model_points", "chunk"):
+        for name in ("fit_steps", "num_model_points"):
             check_count(getattr(self, name), name, 1)
+        if self.chunk is not None:
+            check_count(self.chunk, "chunk", 1)
         check_positive(self.prior_std, "prior_std")
         if self.noise is not None:
             check_positive(self.noise, "noise")
@@ -78,7 +83,8 @@ class InitialPose:
 
     Args:
         pose: (B, num_dofs), metres and radians.
-        confidence: (B,) from 0 to 1, without gradients.
+        confidence: (B,) from 0 to 1, without gradients: the share of the data that the pose explains; from scratch
+            times how surely the search found the pose, and the data tell where its limbs end.
         keypoints: (B, K, 3) of the shape in the pose, metres.
         registered: (B, N, 3) model points in the pose, metres.
     """
@@ -144,14 +150,22 @@ class PoseInitializer(nn.Module):
         Differentiable: in ``points``, ``start`` and the shape's parameters, once; not in which points are outliers to
             be ignored, nor in the estimated noise.
 
-        Cost: of the forward pass O(B M) per step; from scratch about a second per hand on one CPU core.
+        Cost: of the forward pass O(B M) per step; from scratch about two seconds per hand on one CPU core.
         """
         with torch.autocast(device_type=self.shape.rest.device.type, enabled=False):
             data, valid = check_data(self.shape, points, mask, self.config.nan_policy)
             batch, allowed = (data, valid) if data.ndim == 3 else (data.unsqueeze(0), valid.unsqueeze(0))
             origin = masked_mean(batch, allowed).detach()
             given = None if start is None else self._given(start, len(batch))
-            pose, confidence = self._poses(batch, allowed, given, origin)
+            if torch.is_grad_enabled():
+                pose, confidence = self._poses(batch, allowed, given, origin)
+            else:
+                # More clouds at a time are no faster, and would not fit into memory.
+                rows = torch.arange(len(batch), device=batch.device).split(_ROWS.get(batch.device.type, _WIDE_ROWS))
+                parts = [
+                    self._poses(batch[r], allowed[r], None if given is None else given[r], origin[r]) for r in rows
+                ]
+                pose, confidence = (torch.cat(part) for part in zip(*parts, strict=True))
             keypoints, registered = self.shape.keypoints(pose), self.skin(pose)
         result = InitialPose(pose, confidence, keypoints, registered)
         return result if data.ndim == 3 else InitialPose(pose[0], confidence[0], keypoints[0], registered[0])
@@ -194,15 +208,17 @@ class PoseInitializer(nn.Module):
 
     @torch.no_grad()
     def _search(self, data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the best poses (B, num_dofs) that a search finds, and how sure they are (B,)."""
-        found = []
-        for rows in torch.arange(len(data), device=data.device).split(self.config.chunk):
+        """Return the best poses (B, num_dofs) that a search finds, and how sure they are (B,); without points, not."""
+        pose = typical_poses(self.shape).mean(0).repeat(len(data), 1)
+        sure = torch.zeros_like(pose[:, 0])
+        chunk = self.config.chunk or _CHUNK.get(data.device.type, _WIDE_CHUNK)
+        for rows in valid.any(-1).nonzero()[:, 0].split(chunk):
             starts = find_pose(
                 self.shape, data[rows], mask=valid[rows], num_starts=1, model_points=self.skin,
                 config=self.config.search,
             )  # fmt: skip
-            found.append((starts.poses[:, 0], starts.confidence))
-        return torch.cat([pose for pose, _ in found]), torch.cat([sure for _, sure in found])
+            pose[rows], sure[rows] = starts.poses[:, 0], starts.confidence
+        return pose, sure
 
     def _descend(self, problem: AlignProblem, pose: Tensor) -> Tensor:
         """Return the poses after annealed EM, and the surface fit down to the noise."""
