@@ -1,14 +1,18 @@
 """How fast and how right `PoseInitializer` is on batches of hands, from starts and from scratch, and its gradients.
 
-    python benchmarks/pose_initializer.py            # every figure, some minutes
-    python benchmarks/pose_initializer.py --smoke    # a few clouds, to see that it runs
+    python benchmarks/pose_initializer.py                  # every figure; half an hour or more on one core
+    python benchmarks/pose_initializer.py --device cuda    # on a GPU, where there is one
+    python benchmarks/pose_initializer.py --smoke          # a cloud of each, to see that it runs
 
 Data: 512 points of the side of a hand that a camera half a metre away sees, 10 % of them outliers, 1 mm noise, any
 rotation, each joint bent by up to half its range. A cloud is right if its fingertips are off by at most 10 mm on
 average.
 
-- start: from starts that are off by 0.1 rad in every joint and 5 mm in place, batch by batch.
-- scratch: without starts. Bars: 85 % right, and confidence that ranks the failures, AUROC of 0.9.
+- start: from starts that are off by 0.1 rad in every joint and 5 mm in place; clouds per second by size of the batch.
+- scratch: without starts. Bars: 85 % right, and confidence that ranks the failures, AUROC of 0.9. Beside it, without a
+  bar, fingers bent over their full range. The second table says of how many clouds of a confidence are right.
+- roofline: evaluations of a point against a solid per second, beside the exponentials per second that the device
+  reaches, one of which each evaluation needs; and the operations that take most time.
 - gradient: of a random function of the keypoints in the points of one whole hand, float64, against central differences
   of fourth order. Bar: 1e-5 relative.
 """
@@ -16,8 +20,11 @@ average.
 from __future__ import annotations
 
 import argparse
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -27,18 +34,29 @@ from torchreg.datasets.hand import make_hand_cloud, surface_skin
 from torchreg.geometry.rotation import so3_log
 from torchreg.geometry.rotation_representations import rotation_from_quaternion
 
-NUM_POINTS, NOISE, OUTLIERS, DISTANCE, BEND = 512, 0.001, 0.1, 0.5, 0.5
+NUM_POINTS, NOISE, OUTLIERS, DISTANCE = 512, 0.001, 0.1, 0.5
+HALF, FULL = 0.5, 1.0
 TIPS, RIGHT = [4, 8, 12, 16, 20], 0.01
 JOINT_STD, PLACE_STD = 0.1, 0.005
+BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+# Elements of the vector, and columns of the matrices, on which the device is measured; how often.
+VECTOR, COLUMNS, REPEATS = {"cpu": 2**15, "cuda": 2**26}, {"cpu": 1024, "cuda": 8192}, 20
+QUICK = tr.FindPoseConfig(num_candidates=8, num_placed=2, num_searched=1, search_rounds=1)
 BAR_RIGHT, BAR_AUROC, BAR_GRADIENT = 0.85, 0.9, 1e-5
 
 
 def draw(
-    hand: tr.Hand, count: int, generator: torch.Generator, *, front: bool = True, num_points: int = NUM_POINTS
+    hand: tr.Hand,
+    count: int,
+    generator: torch.Generator,
+    *,
+    front: bool = True,
+    num_points: int = NUM_POINTS,
+    bend: float = HALF,
 ) -> tuple[Tensor, Tensor]:
-    """Return clouds (count, M, 3) and their poses (count, num_dofs)."""
+    """Return clouds (count, M, 3) and their poses (count, num_dofs), each joint bent by up to a share of its range."""
     poses = hand.rest_pose().repeat(count, 1)
-    share = BEND * torch.rand(count, hand.num_dofs - 6, generator=generator).to(poses)
+    share = bend * torch.rand(count, hand.num_dofs - 6, generator=generator).to(poses)
     poses[:, 6:] = share * hand.upper[6:].clamp_min(0)
     quaternions = torch.randn(count, 4, generator=generator, dtype=torch.float64)
     poses[:, 3:6] = so3_log(rotation_from_quaternion(quaternions)).to(poses)
@@ -72,38 +90,164 @@ def auroc(confidence: Tensor, right: Tensor) -> float:
     return float(((gaps > 0).double() + 0.5 * (gaps == 0)).mean())
 
 
+def auroc_error(area: float, num_right: int, num_wrong: int) -> float:
+    """Return the standard error of an AUROC. References: Hanley and McNeil 1982."""
+    if not num_right or not num_wrong:
+        return math.nan
+    first, second = area / (2 - area), 2 * area**2 / (1 + area)
+    spread = area * (1 - area) + (num_right - 1) * (first - area**2) + (num_wrong - 1) * (second - area**2)
+    return math.sqrt(max(spread, 0.0) / (num_right * num_wrong))
+
+
+def now(device: torch.device) -> float:
+    """Return the time in seconds, once the device has done all that it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter()
+
+
 @torch.no_grad()
-def from_starts(hand: tr.Hand, count: int, batch: int, generator: torch.Generator) -> dict[str, float]:
-    layer = tr.PoseInitializer(hand)
+def from_starts(
+    hand: tr.Hand, batches: Sequence[int], generator: torch.Generator, device: torch.device
+) -> dict[str, float]:
+    """Return how good poses from starts are, and ``per_second_B`` for every size B of the batch."""
+    count = min(max(batches), 512)
     clouds, poses = draw(hand, count, generator)
     starts = disturbed(hand, poses, generator)
+    hand, clouds, poses, starts = (value.to(device) for value in (hand, clouds, poses, starts))
+    layer = tr.PoseInitializer(hand)
     layer(clouds[:1], start=starts[:1])
-    begin, errors = time.perf_counter(), []
-    for rows in torch.arange(count).split(batch):
-        errors.append(tip_errors(hand, layer(clouds[rows], start=starts[rows]).pose, poses[rows]))
-    seconds, error = time.perf_counter() - begin, torch.cat(errors)
-    return {
-        "clouds_per_second": count / seconds,
-        "start_mm": 1e3 * float(tip_errors(hand, starts, poses).mean()),
-        "median_mm": 1e3 * float(error.median()),
-        "right": float((error <= RIGHT).double().mean()),
-    }
+    figures: dict[str, float] = {"start_mm": 1e3 * float(tip_errors(hand, starts, poses).mean())}
+    for batch in batches:
+        # A few small batches for one of the smallest would measure the clock.
+        some = max(batch, min(count, 16))
+        index = torch.arange(some, device=device) % count
+        errors, begin = [], now(device)
+        for rows in index.split(batch):
+            errors.append(tip_errors(hand, layer(clouds[rows], start=starts[rows]).pose, poses[rows]))
+        figures[f"per_second_{batch}"] = some / (now(device) - begin)
+        error = torch.cat(errors)
+    return figures | {"median_mm": 1e3 * float(error.median()), "right": float((error <= RIGHT).double().mean())}
 
 
 @torch.no_grad()
-def from_scratch(hand: tr.Hand, count: int, generator: torch.Generator) -> dict[str, float]:
-    layer = tr.PoseInitializer(hand)
-    clouds, poses = draw(hand, count, generator)
-    begin = time.perf_counter()
+def from_scratch(
+    hand: tr.Hand,
+    count: int,
+    generator: torch.Generator,
+    device: torch.device,
+    bend: float,
+    config: tr.PoseInitializerConfig,
+) -> tuple[dict[str, float], Tensor, Tensor]:
+    """Return figures, confidences (count,) and which clouds are right."""
+    clouds, poses = draw(hand, count, generator, bend=bend)
+    hand, clouds, poses = (value.to(device) for value in (hand, clouds, poses))
+    layer = tr.PoseInitializer(hand, config)
+    begin = now(device)
     found = layer(clouds)
-    seconds, error = time.perf_counter() - begin, tip_errors(hand, found.pose, poses)
+    seconds, error = now(device) - begin, tip_errors(hand, found.pose, poses)
     right = error <= RIGHT
-    return {
+    area, num_right = auroc(found.confidence, right), int(right.sum())
+    share = num_right / count
+    figures = {
+        "clouds": float(count),
         "clouds_per_second": count / seconds,
         "median_mm": 1e3 * float(error.median()),
-        "right": float(right.double().mean()),
-        "auroc": auroc(found.confidence, right),
+        "right": share,
+        "right_error": math.sqrt(share * (1 - share) / count),
+        "auroc": area,
+        "auroc_error": auroc_error(area, num_right, count - num_right),
     }
+    return figures, found.confidence.cpu(), right.cpu()
+
+
+def reliability(confidence: Tensor, right: Tensor) -> str:
+    """Return of how many clouds of a confidence are right, a line per bin."""
+    lines = [f"  {'confidence':12} {'clouds':>6} {'right':>6}"]
+    for low, high in pairwise(BINS):
+        inside = (confidence >= low) & ((confidence < high) | (high == BINS[-1]))
+        if bool(inside.any()):
+            lines.append(f"  {low:.1f} to {high:.1f}   {int(inside.sum()):6} {right[inside].double().mean():6.1%}")
+    return "\n".join(lines)
+
+
+@contextmanager
+def counted(hand: tr.Hand) -> Iterator[list[int]]:
+    """Count the evaluations of a point against a solid: their number is in the list."""
+    solids, total = hand.primitives, [0]
+    distance, gradient = solids.plane_distance, solids.plane_gradient
+
+    def counting_distance(*args: object) -> Tensor:
+        result = distance(*args)
+        total[0] += result.numel()
+        return result
+
+    def counting_gradient(*args: object) -> tuple[Tensor, ...]:
+        result = gradient(*args)
+        total[0] += result[0].numel()
+        return result
+
+    solids.plane_distance, solids.plane_gradient = counting_distance, counting_gradient
+    try:
+        yield total
+    finally:
+        del solids.plane_distance, solids.plane_gradient
+
+
+def device_limits(device: torch.device) -> dict[str, float]:
+    """Return exponentials, and floating-point operations of a matrix product, per second that the device reaches."""
+    vector = torch.rand(VECTOR[device.type], device=device)
+    columns = COLUMNS[device.type]
+    matrix = torch.rand(columns, columns, device=device)
+    out, product = torch.empty_like(vector), torch.empty_like(matrix)
+    rates = {}
+    for name, run, work in (
+        ("exp", lambda: torch.exp(vector, out=out), vector.numel()),
+        ("flop", lambda: torch.mm(matrix, matrix, out=product), 2 * columns**3),
+    ):
+        run()
+        times = []
+        for _ in range(REPEATS):
+            begin = now(device)
+            run()
+            times.append(now(device) - begin)
+        rates[name] = work / min(times)
+    return rates
+
+
+@torch.no_grad()
+def roofline(
+    hand: tr.Hand, batch: int, generator: torch.Generator, device: torch.device, config: tr.PoseInitializerConfig
+) -> tuple[dict[str, float], list[str]]:
+    """Return evaluations per second from starts and from scratch beside the limits, and where the time goes."""
+    clouds, poses = draw(hand, batch, generator)
+    starts = disturbed(hand, poses, generator)
+    hand, clouds, starts = hand.to(device), clouds.to(device), starts.to(device)
+    layer = tr.PoseInitializer(hand, config)
+    activities = [torch.profiler.ProfilerActivity.CPU]
+    if device.type == "cuda":
+        activities.append(torch.profiler.ProfilerActivity.CUDA)
+    figures, lines = device_limits(device), []
+    few = clouds[: 1 if device.type == "cpu" else batch]
+    for name, run in (("start", lambda: layer(clouds, start=starts)), ("scratch", lambda: layer(few))):
+        with torch.profiler.profile(activities=activities) as profile:
+            run()
+        lines.append(f"  {name:8} {top_operations(profile, device)}")
+        with counted(hand) as total:
+            begin = now(device)
+            run()
+            seconds = now(device) - begin
+        figures[f"{name}_evaluations"] = total[0] / seconds
+        figures[f"{name}_share"] = total[0] / seconds / figures["exp"]
+    return figures, lines
+
+
+def top_operations(profile: torch.profiler.profile, device: torch.device) -> str:
+    """Return the operations that take most time of the device itself, with their shares."""
+    own = "self_device_time_total" if device.type == "cuda" else "self_cpu_time_total"
+    averages = sorted(profile.key_averages(), key=lambda item: -getattr(item, own))
+    total = sum(getattr(item, own) for item in averages)
+    return ", ".join(f"{item.key.removeprefix('aten::')} {getattr(item, own) / total:.0%}" for item in averages[:6])
 
 
 def gradient_error(generator: torch.Generator, num_points: int = NUM_POINTS) -> dict[str, float]:
@@ -130,22 +274,49 @@ def gradient_error(generator: torch.Generator, num_points: int = NUM_POINTS) -> 
     return {"relative_error": abs(float((gradient * direction).sum()) / slope - 1), "backward_seconds": seconds}
 
 
+def show(case: str, row: dict[str, float]) -> None:
+    print(f"{case:9}" + "  ".join(f"{name} {value:.4g}" for name, value in row.items()), flush=True)
+
+
 def main(arguments: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--clouds", type=int, default=500, help="from starts, and from scratch (default 500)")
-    parser.add_argument("--batch", type=int, default=64, help="of clouds from starts (default 64)")
+    parser.add_argument("--clouds", type=int, default=500, help="from scratch, bent half (default 500)")
+    parser.add_argument("--full-clouds", type=int, default=100, help="from scratch, bent fully (default 100)")
+    parser.add_argument("--batches", type=int, nargs="+", default=[1, 8, 64, 512, 4096], help="sizes, from starts")
     parser.add_argument("--threads", type=int, default=2, help="of torch (default 2)")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--smoke", action="store_true", help="one cloud")
+    parser.add_argument("--smoke", action="store_true", help="one cloud of each")
     options = parser.parse_args(arguments)
+    device = torch.device(options.device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        print("skipped: this machine has no CUDA device")
+        return {}
     torch.set_num_threads(options.threads)
-    count, hand = 1 if options.smoke else options.clouds, tr.Hand().requires_grad_(False)
-    generator = torch.Generator().manual_seed(options.seed)
-    figures = {"gradient": gradient_error(generator, 150 if options.smoke else NUM_POINTS)}
-    figures["start"] = from_starts(hand, count, options.batch, generator)
-    figures["scratch"] = from_scratch(hand, count, generator)
-    for case, row in figures.items():
-        print(f"{case:9}" + "  ".join(f"{name} {value:.4g}" for name, value in row.items()))
+    counts = (1, 1) if options.smoke else (options.clouds, options.full_clouds)
+    config = tr.PoseInitializerConfig(search=QUICK) if options.smoke else tr.PoseInitializerConfig()
+    batches = [1, 2] if options.smoke else options.batches
+    print(
+        f"device {device.type}, {options.threads} threads, seed {options.seed}; right: tips within {1e3 * RIGHT:g} mm"
+    )
+
+    def generator(case: int) -> torch.Generator:
+        return torch.Generator().manual_seed(10 * options.seed + case)
+
+    def hand() -> tr.Hand:
+        return tr.Hand().requires_grad_(False)
+
+    figures = {"gradient": gradient_error(generator(0), 150 if options.smoke else NUM_POINTS)}
+    show("gradient", figures["gradient"])
+    figures["start"] = from_starts(hand(), batches, generator(1), device)
+    show("start", figures["start"])
+    figures["roofline"], profile = roofline(hand(), 2 if options.smoke else 8, generator(2), device, config)
+    show("roofline", figures["roofline"])
+    print("\n".join(profile), flush=True)
+    for case, count, bend, number in (("scratch", counts[0], HALF, 3), ("full", counts[1], FULL, 4)):
+        figures[case], confidence, right = from_scratch(hand(), count, generator(number), device, bend, config)
+        show(case, figures[case])
+        print(reliability(confidence, right), flush=True)
     passed = {
         f"gradient within {BAR_GRADIENT:g}": figures["gradient"]["relative_error"] <= BAR_GRADIENT,
         f"right from scratch >= {BAR_RIGHT:.0%}": figures["scratch"]["right"] >= BAR_RIGHT,

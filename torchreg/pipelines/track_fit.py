@@ -41,8 +41,8 @@ _START_RANGE, _START_PER_ERROR, _SIGMA_RATIO = (0.03, 0.08), 2.0, 2.2
 _SURFACE_SIGMAS = (0.022,)
 # Joints about the last pose where nothing is sure, radians.
 _WIDE_PRIOR = 0.3
-# Paces at which fast joints go on instead: they stopped, or double; others are scattered by this, radians, so often.
-_PACES, _SCATTER, _NUM_SCATTERED = (0.0, 2.0), 0.3, 8
+# Paces at which fast joints go on instead, back to three times as fast; others are scattered by this, so often.
+_PACES, _SCATTER, _NUM_SCATTERED = (-1.0, 0.0, 0.5, 1.5, 2.0, 3.0), 0.3, 2
 # Data that lie this near the bounds of the predicted model count, as a share of its size.
 _REACH = 0.12
 # A limb is shown by this many data at least, this far from its joints, as a share of the size.
