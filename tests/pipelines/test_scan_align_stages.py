@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from torchreg.correspondence.oriented_samples import OrientedSamples
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.geometry.rigid import se3_exp
@@ -18,6 +19,7 @@ from torchreg.pipelines.scan_align_stages import (
     agree,
     fit_first_matches,
     judge,
+    mismatch,
     pull_one_to_one,
     refine,
     soft_matches,
@@ -95,11 +97,25 @@ def test_better_hypotheses_are_judged_better(problem, reporter):
     still, better = judge(problem, "still", rest, config), judge(problem, "better", moved, config)
     assert better.energy < still.energy
     assert still.bend == 0
-    assert still.energy == pytest.approx(still.forward + still.backward)
+    assert still.energy == pytest.approx(still.forward + still.backward + still.unlike)
     far = rest.clone()
     far[:, :3, 3] += 10
     lost = judge(problem, "lost", far, config)
     assert (lost.forward, lost.backward) == (1, 1)
+    # Where nothing lies on the target, features are as unlike as they usually are.
+    assert lost.unlike == pytest.approx(0.4 * config.unlike)
+
+
+def test_likeness_counts_where_surfaces_meet(problem):
+    config, target = ChoiceConfig(), problem.target
+    apart, unlike = mismatch(problem, target, config)
+    assert float(apart.max()) == float(unlike.max()) == 0
+    other = OrientedSamples(target.points, target.normals, target.features + 10, target.boundary)
+    torch.testing.assert_close(mismatch(problem, other, config)[1], torch.full_like(apart, 2 * config.unlike))
+    away = OrientedSamples(target.points + 10, target.normals, target.features, target.boundary)
+    apart, unlike = mismatch(problem, away, config)
+    assert float(apart.min()) == 1
+    torch.testing.assert_close(unlike, torch.full_like(apart, 0.4 * config.unlike))
 
 
 def test_hypotheses_agree_where_nearly_all_samples_do(problem):

@@ -57,7 +57,7 @@ def test_the_result_is_what_its_parts_say(pair, aligned):
     assert aligned.chosen == aligned.hypotheses[0]
     assert [each.energy for each in aligned.hypotheses] == sorted(each.energy for each in aligned.hypotheses)
     assert aligned.chosen.energy == pytest.approx(
-        aligned.chosen.forward + aligned.chosen.backward + aligned.chosen.bend
+        aligned.chosen.forward + aligned.chosen.backward + aligned.chosen.unlike + aligned.chosen.bend
     )
 
 
@@ -86,7 +86,7 @@ def test_hypotheses_are_followed_until_two_agree(pair):
     torch.testing.assert_close(same.points, pair.source.points, rtol=0, atol=5e-3 * pair.source.diagonal)
     stubborn = replace(QUICK, choice=replace(QUICK.choice, same=1e-12))
     every = align_scans(pair.source, pair.target, stubborn)
-    assert {each.name for each in every.hypotheses} == {"rest", "stiff matches", "matches", "one to one"}
+    assert {each.name for each in every.hypotheses} == {"rest", "stiff matches", "matches", "one to one", "fused"}
     assert {record.stage for record in every.history} == {"match", "assign", "refine"}
 
 

@@ -90,7 +90,8 @@ class RefineConfig:
         num_steps: while sigma shrinks.
         final_steps: at the last sigma.
         sigma: first and last, length; the first from a rough start, and
-        near_sigma: from one that should be near.
+        near_sigma: from one that should be near,
+        fused_sigma: from motions that have been refined and put together.
         stiffness: of the graph, first and last.
         give: nodes that disagree by more than this hold each other less, length.
         feature_weight: see `ScanEMConfig`, first and last: bending and hidden surroundings change features a little.
@@ -107,6 +108,7 @@ class RefineConfig:
     final_steps: int = 1
     sigma: tuple[float, float] = (0.025, 0.006)
     near_sigma: float = 0.02
+    fused_sigma: float = 0.012
     stiffness: tuple[float, float] = (0.2, 0.006)
     give: float = 0.01
     feature_weight: tuple[float, float] = (8.0, 1.0)
@@ -124,7 +126,7 @@ class RefineConfig:
         check_count(self.final_steps, "final_steps", 0)
         for name in ("sigma", "stiffness", "slide", "feature_weight"):
             _check_ends(getattr(self, name), name)
-        for name in ("near_sigma", "give"):
+        for name in ("near_sigma", "fused_sigma", "give"):
             check_positive(getattr(self, name), name)
         for name in ("both_ways_above", "boundary_above", "density"):
             check_positive(getattr(self, name), name, allow_zero=True)
@@ -137,6 +139,7 @@ class ChoiceConfig:
     Args:
         cap: distances count up to this, length.
         normal_scale: how many caps normals count as that are one apart.
+        unlike: what it costs that features differ by one, squared, where the moved source lies on the target.
         bend: what it costs that neighboring nodes disagree by one size in the mean,
         slack: of which less than this hardly counts, length.
         same: hypotheses agree where their samples are this near each other, length,
@@ -145,6 +148,7 @@ class ChoiceConfig:
 
     cap: float = 0.03
     normal_scale: float = 0.5
+    unlike: float = 2.0
     bend: float = 20.0
     slack: float = 1e-3
     same: float = 0.005
@@ -153,7 +157,7 @@ class ChoiceConfig:
     def __post_init__(self) -> None:
         for name in ("cap", "same", "same_share"):
             check_positive(getattr(self, name), name)
-        for name in ("normal_scale", "bend", "slack"):
+        for name in ("normal_scale", "unlike", "bend", "slack"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
 
@@ -237,9 +241,10 @@ class Hypothesis:
 
     Args:
         name: what it started from.
-        energy: ``forward + backward + bend``, by which hypotheses are compared; lower is better.
+        energy: ``forward + backward + unlike + bend``, by which hypotheses are compared; lower is better.
         forward: mean squared distance of moved samples to the target, capped at one.
         backward: mean squared distance of target samples to the moved source, capped at one.
+        unlike: weighted mean squared difference of features of moved samples and the target.
         bend: weighted disagreement of neighboring nodes.
     """
 
@@ -247,6 +252,7 @@ class Hypothesis:
     energy: float
     forward: float
     backward: float
+    unlike: float
     bend: float
 
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchreg.correspondence.one_to_one import count_of_spacing, match_one_to_one, typical_spacing
+from torchreg.correspondence.oriented_samples import OrientedSamples
 from torchreg.correspondence.scan_em import SoftMatches, match_softly
 from torchreg.geometry.neighbors import nearest_few
 from torchreg.pipelines.graph_fit import GraphFit, GraphMatches, fit_graph
@@ -22,6 +23,9 @@ from torchreg.pipelines.scan_align_config import (
     between,
 )
 from torchreg.pipelines.scan_align_problem import ScanAlignProblem
+
+# Right matches differ by so much in their features, squared, in the mean; more than samples at random tells no more.
+_USUALLY_UNLIKE, _UNLIKE = 0.4, 2.0
 
 
 @dataclass(frozen=True)
@@ -132,17 +136,27 @@ def soft_matches(
 
 
 def judge(problem: ScanAlignProblem, name: str, transforms: Tensor, config: ChoiceConfig) -> Hypothesis:
-    """Return how well the moved source and the target cover each other, and how much the graph bends for that."""
-    scale = config.normal_scale * config.cap
+    """Return how well the moved source and the target cover each other, how alike they are there, and the bend."""
     moved = problem.moved(transforms)
-    here = torch.cat((moved.points, scale * moved.normals), dim=1)
-    there = torch.cat((problem.target.points, scale * problem.target.normals), dim=1)
-    forward, backward = (
-        float((nearest_few(one, other, 1)[1] / config.cap).clamp(max=1).square().mean())
-        for one, other in ((here, there), (there, here))
-    )
+    forward, unlike = (float(cost.mean()) for cost in mismatch(problem, moved, config))
+    apart = nearest_few(embedded(problem.target, config), embedded(moved, config), 1)[1]
+    backward = float((apart / config.cap).clamp(max=1).square().mean())
     bend = config.bend * float(problem.graph.bend(transforms, config.slack))
-    return Hypothesis(name, forward + backward + bend, forward, backward, bend)
+    return Hypothesis(name, forward + backward + unlike + bend, forward, backward, unlike, bend)
+
+
+def mismatch(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> tuple[Tensor, Tensor]:
+    """Return what moved samples cost (S,) by their distance from the target, and by unlike features there."""
+    index, apart = nearest_few(embedded(moved, config), embedded(problem.target, config), 1)
+    apart = (apart[:, 0] / config.cap).clamp(max=1).square()
+    unlike = (moved.features - problem.target.features[index[:, 0]]).square().sum(-1).clamp(max=_UNLIKE)
+    # Where there is nothing to be like, a sample is as unlike as right matches usually are: leaving must not pay.
+    return apart, config.unlike * torch.lerp(unlike, torch.full_like(unlike, _USUALLY_UNLIKE), apart)
+
+
+def embedded(samples: OrientedSamples, config: ChoiceConfig) -> Tensor:
+    """Return (S, 6): places and normals, whose distances count for a choice."""
+    return torch.cat((samples.points, config.normal_scale * config.cap * samples.normals), dim=1)
 
 
 def agree(problem: ScanAlignProblem, one: Tensor, other: Tensor, config: ChoiceConfig) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -28,9 +28,12 @@ from torchreg.pipelines.scan_align_stages import (
     refine,
     soft_matches,
 )
+from torchreg.pipelines.scan_fusion import fuse_motions
 
 # What opposite normals count as when points take over the motion of the samples around them, length.
 _NORMAL_SCALE = 0.03
+# Two hypotheses that agree need no fusion.
+_LEAST_FUSED = 3
 
 
 @torch.no_grad()
@@ -47,8 +50,9 @@ def align_scans(
     Both scans are described by even samples, their curvature at several sizes and spin images. Hypotheses start from
     rest; from matches of spin images that agree on distances along the surface, fitted stiffly, or softly and then
     pulled by one-to-one matches; and from one-to-one matches alone. Each ends by an EM with an outlier class, while
-    edges of the graph give where its parts disagree. The best covers the target, is covered by it, and bends least.
-    Where the first two agree, the others are left out.
+    edges of the graph give where its parts disagree. Then each part moves as in the hypothesis that suits it, and the
+    EM ends that as well. The best covers the target, is covered by it, is like it, and bends least. Where the first
+    two agree, the others are left out.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -80,6 +84,8 @@ def align_scans(
 
     problem = describe(source, target, config, generator)
     found = sorted(_hypotheses(problem, config, report), key=_energy)
+    if len(found) >= _LEAST_FUSED:
+        found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
     chosen, transforms = found[0]
     weights = spread_weights(
         problem.unit.of_points(source.points),
@@ -131,6 +137,16 @@ def _hypotheses(
         yield refined(pull_one_to_one(problem, fitted, config.reassign, soft), far, soft)
     alone = reporter("one to one")
     yield refined(pull_one_to_one(problem, rest, config.assign, alone), far, alone)
+
+
+def _fused(
+    problem: ScanAlignProblem, found: Sequence[tuple[Hypothesis, Tensor]], config: ScanAlignConfig, on_step: OnStep
+) -> tuple[Hypothesis, Tensor]:
+    """Return the hypothesis that takes the best of several, and its motions."""
+    reporter = Reporter("fused", problem.unit.size, on_step)
+    begin = fuse_motions(problem, torch.stack([motions for _, motions in found]), config.choice)
+    transforms = refine(problem, begin, config.refine, reporter, config.refine.fused_sigma)
+    return judge(problem, reporter.name, transforms, config.choice), transforms
 
 
 def _energy(found: tuple[Hypothesis, Tensor]) -> float:
