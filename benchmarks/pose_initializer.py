@@ -42,6 +42,8 @@ BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 # Elements of the vector, and columns of the matrices, on which the device is measured; how often.
 VECTOR, COLUMNS, REPEATS = {"cpu": 2**15, "cuda": 2**26}, {"cpu": 1024, "cuda": 8192}, 20
 QUICK = tr.FindPoseConfig(num_candidates=8, num_placed=2, num_searched=1, search_rounds=1)
+# Clouds of a profile.
+PROFILED = {"cpu": 8, "cuda": 512}
 BAR_RIGHT, BAR_AUROC, BAR_GRADIENT = 0.85, 0.9, 1e-5
 
 
@@ -217,19 +219,21 @@ def device_limits(device: torch.device) -> dict[str, float]:
 
 @torch.no_grad()
 def roofline(
-    hand: tr.Hand, batch: int, generator: torch.Generator, device: torch.device, config: tr.PoseInitializerConfig
+    hand: tr.Hand, batch: int, generator: torch.Generator, device: torch.device, cases: Sequence[str]
 ) -> tuple[dict[str, float], list[str]]:
-    """Return evaluations per second from starts and from scratch beside the limits, and where the time goes."""
+    """Return evaluations per second in the cases "start" and "scratch" beside the limits, and where the time goes."""
     clouds, poses = draw(hand, batch, generator)
     starts = disturbed(hand, poses, generator)
     hand, clouds, starts = hand.to(device), clouds.to(device), starts.to(device)
-    layer = tr.PoseInitializer(hand, config)
+    layer = tr.PoseInitializer(hand)
     activities = [torch.profiler.ProfilerActivity.CPU]
     if device.type == "cuda":
         activities.append(torch.profiler.ProfilerActivity.CUDA)
     figures, lines = device_limits(device), []
     few = clouds[: 1 if device.type == "cpu" else batch]
-    for name, run in (("start", lambda: layer(clouds, start=starts)), ("scratch", lambda: layer(few))):
+    runs = {"start": lambda: layer(clouds, start=starts), "scratch": lambda: layer(few)}
+    for name in cases:
+        run = runs[name]
         with torch.profiler.profile(activities=activities) as profile:
             run()
         lines.append(f"  {name:8} {top_operations(profile, device)}")
@@ -310,7 +314,10 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
     show("gradient", figures["gradient"])
     figures["start"] = from_starts(hand(), batches, generator(1), device)
     show("start", figures["start"])
-    figures["roofline"], profile = roofline(hand(), 2 if options.smoke else 8, generator(2), device, config)
+    # The profile of a search holds so many operations that a smoke run leaves it out.
+    cases = ("start",) if options.smoke else ("start", "scratch")
+    batch = 2 if options.smoke else PROFILED[device.type]
+    figures["roofline"], profile = roofline(hand(), batch, generator(2), device, cases)
     show("roofline", figures["roofline"])
     print("\n".join(profile), flush=True)
     for case, count, bend, number in (("scratch", counts[0], HALF, 3), ("full", counts[1], FULL, 4)):
