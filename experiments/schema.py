@@ -303,6 +303,7 @@ class ReportConfig:
         curves: that are drawn; all if empty.
         curve_steps: curve that tells at which steps the values of the others were taken; 1, 2, ... if empty.
         curve_spread: whether curves are means over trials in bands from the lowest to the highest, instead of medians.
+        curve_log: whether the values of curves are drawn on a logarithmic axis.
         group: axis by which curves are colored; the first one if empty.
         share: metrics that are shares or counts, for which the mean over seeds is told instead of the median.
         higher: metrics of which more is better; of others, less.
@@ -315,6 +316,7 @@ class ReportConfig:
     curves: tuple[str, ...] = ()
     curve_steps: str = ""
     curve_spread: bool = False
+    curve_log: bool = False
     group: str = ""
     share: tuple[str, ...] = ()
     higher: tuple[str, ...] = ()

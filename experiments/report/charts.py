@@ -136,7 +136,7 @@ def curves(
             mode="lines+markers", line={"color": color}, marker={"size": 4},
         )  # fmt: skip
     figure.update_xaxes(title=short(report.curve_steps) or "step")
-    figure.update_yaxes(title=named(name), rangemode="tozero")
+    figure.update_yaxes(title=named(name), rangemode="tozero", type="log" if report.curve_log else "linear")
     figure.update_layout(legend_title_text=short(axis), showlegend=True)
     kind = "mean, lowest and highest" if report.curve_spread else "median"
     heading = f"{named(name)} along the steps: {kind} over all trials of a {short(axis) or 'sweep'}"

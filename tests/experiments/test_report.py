@@ -202,6 +202,9 @@ def test_curves_lie_at_their_steps_with_a_band_over_the_seeds(store, probe_sweep
     assert '"x":[0.0,50.0],"y":[4.0,2.0]' in chart
     assert '"x":[0.0,50.0,50.0,0.0],"y":[6.0,3.0,1.0,2.0]' in chart
     assert "mean, lowest and highest over all trials" in chart
+    assert '"type":"log"' not in chart
+    steep = replace(sweep, report=replace(report, curve_log=True))
+    assert '"type":"log"' in charts.curves(steep, planned_trials(steep), found, "error_mm")
     assert charts.curve_names(replace(sweep, report=replace(report, curves=())), found) == ["error_mm"]
     plain = replace(sweep, report=replace(report, curve_steps="", curve_spread=False))
     chart = charts.curves(plain, planned_trials(plain), found, "error_mm")
