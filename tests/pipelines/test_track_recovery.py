@@ -151,3 +151,23 @@ def test_noise_is_no_shape_and_a_hidden_one_is_not_sought(tracking, searches):
     assert fit is None or is_lost(state, fit)
     assert len(searches) == 1
     assert after == replace(state, fails=1)
+
+
+def test_no_attempt_takes_the_trunk_farther_than_it_gets(tracking):
+    state, frame, fitter = tracking.state(), tracking.frame(tracking.cloud), tracking.fitter()
+    recover = Recovery(fitter)
+    view = fitter.view_ahead(state, frame)
+    fit = fitter.fit(view, state, "surface", view.problem.prior.mean)
+    for dof, step, far in (
+        (0, 0.3 * fitter.size, False),
+        (0, 0.5 * fitter.size, True),
+        (3, 1.0, False),
+        (3, 2.0, True),
+    ):
+        moved = fit.pose.clone()
+        moved[0, dof] += step
+        gone = replace(fit, pose=moved)
+        assert recover._leaps(state, frame, gone) == far
+        # What was lost for a while may be anywhere, and a search everywhere takes nothing from the prediction.
+        assert not recover._leaps(replace(state, lost=3), frame, gone)
+        assert not recover._leaps(state, frame, replace(gone, how="found"))

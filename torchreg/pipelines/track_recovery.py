@@ -16,6 +16,7 @@ from torchreg.pipelines.pose_search import PoseSearch, fit_candidates, score_can
 from torchreg.pipelines.track_config import Frame, FrameFit, FrameView, thinned
 from torchreg.pipelines.track_evidence import is_doubtful, is_lost, is_vague
 from torchreg.pipelines.track_fit import STOP_SIGMA, FrameFitter, generator
+from torchreg.pipelines.track_motion import difference, spread
 from torchreg.results import TrackState
 
 # Data that another pose must explain beyond those that the prediction led to.
@@ -34,6 +35,8 @@ _WIDTHS, _STEPS, _NUM_SEARCHED = (0.06, 0.04, 0.03), 2, 2
 _MAX_FOUND_DATA = 3000
 # Found poses compete by how near they are if they leave at most this share of the data more unexplained than the best.
 _AS_GOOD = 0.03
+# How far a trunk gets from where it is expected in one frame, and the lever at which turns count; shares of the size.
+_LONGEST_LEAP, _TURN_LEVER = 0.4, 0.25
 # Searches everywhere in one frame, beyond the first, with other draws and twice the candidates.
 _MORE_SEARCHES = 3
 
@@ -97,7 +100,7 @@ class Recovery:
     ) -> FrameFit | None:
         best = fit
         for attempt in self._attempts(state, frame, view, fit):
-            if attempt is None:
+            if attempt is None or self._leaps(state, frame, attempt):
                 continue
             # What is hidden may be anywhere; only what explains more data is worth a jump.
             if (
@@ -110,6 +113,14 @@ class Recovery:
             if not is_lost(state, best) and (was_lost or not is_doubtful(state, best)):
                 break
         return best
+
+    def _leaps(self, state: TrackState, frame: Frame, fit: FrameFit) -> bool:
+        """Return whether a fit takes the trunk farther than it gets: where little is seen, much seems to fit."""
+        if fit.how == "found":
+            return False
+        base = difference(fit.view.problem.prior.mean[0], fit.pose[0])[:6]
+        gone = base[:3].norm() + _TURN_LEVER * self.fitter.size * base[3:].norm()
+        return bool(gone > _LONGEST_LEAP * self.fitter.size * spread(state, frame.gap))
 
     def _attempts(
         self, state: TrackState, frame: Frame, view: FrameView | None, fit: FrameFit | None
