@@ -51,7 +51,7 @@ def test_overrides_reach_every_field(folder):
         ("~trial.size=1", "write key=value"),
         ("trial.size=[1", "big.yaml cannot be read"),
         ("task=sculpture", "unknown task 'sculpture'; known tasks: alignment, neural_init, probe, registration, spine"),
-        ("report.colour=red", "unknown key report.colour; known keys of report: curves"),
+        ("report.colour=red", "unknown key report.colour; known keys of report: curve_log"),
     ],
 )
 def test_wrong_overrides_are_named(folder, override, message):
