@@ -9,14 +9,14 @@ import math
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import safetensors.torch
 import torch
 from torch import Tensor
 
 import torchreg as tr
 from experiments.schema import CloudScene
 from torchreg.datasets.hand import make_hand_cloud, placed, surface_skin
-from torchreg.geometry.rotation import compose_rotation_vectors
-from torchreg.io.tensors import load_tensors, save_tensors
+from torchreg.io.atomic import write_atomic
 
 # Fingers up, palm to the camera at the origin, which looks along +z with -y up; half a metre away, up to 3 cm off.
 FACING, DISTANCE, SPREAD = (math.pi / 2, 0.0, 0.0), 0.5, 0.03
@@ -75,12 +75,12 @@ def _kept_clouds(hand: tr.Hand, scene: CloudScene) -> Clouds:
     settings = {**asdict(scene), "folder": "", "version": tr.__version__}
     name = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
     path = Path(scene.folder) / f"clouds_{name}.safetensors"
-    # The second file is written last.
-    if not path.with_suffix(".json").exists():
+    if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         made = _made_clouds(hand, scene)
-        save_tensors(path, {key: value for key, value in vars(made).items() if value is not None}, settings)
-    return Clouds(**load_tensors(path)[0])
+        tensors = {key: value.contiguous() for key, value in vars(made).items() if value is not None}
+        write_atomic(path, safetensors.torch.save(tensors, {"settings": json.dumps(settings)}))
+    return Clouds(**safetensors.torch.load_file(path))
 
 
 def _made_clouds(hand: tr.Hand, scene: CloudScene) -> Clouds:
@@ -96,9 +96,10 @@ def draw_poses(hand: tr.Hand, scene: CloudScene, generator: torch.Generator) -> 
     count = scene.train + scene.held_out
     poses = hand.rest_pose().repeat(count, 1)
     poses[:, 6:] = scene.bend * torch.rand(count, hand.num_dofs - 6, generator=generator) * hand.upper[6:]
+    poses[:, 3:6] = torch.tensor(FACING)
     axes = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
     tilts = math.radians(scene.tilt_deg) * torch.rand(count, 1, generator=generator) * axes
-    poses[:, 3:6] = compose_rotation_vectors(tilts, torch.tensor(FACING).expand(count, 3))
+    poses = hand.retract(poses, torch.nn.functional.pad(tilts, (3, hand.num_dofs - 6)))
     shift = SPREAD * (2 * torch.rand(count, 3, generator=generator) - 1)
     return placed(hand, poses, torch.tensor([0.0, 0.0, DISTANCE]) + shift)
 

@@ -7,7 +7,6 @@ from torch import Tensor, nn
 
 import torchreg as tr
 from experiments.neural_init.data import Clouds
-from torchreg.geometry.rotation import so3_exp
 
 # The unit of places in the network, so that they are as large as rotations and joints: metres.
 UNIT = 0.1
@@ -110,7 +109,7 @@ class PoseRefiner(nn.Module):
     def forward(self, clouds: Clouds) -> Tensor:
         """Return poses (B, num_dofs)."""
         (hand,), first = self._hand, clouds.found
-        turn = so3_exp(first[:, 3:6])
+        turn = hand.part_transforms(first)[:, 0, :3, :3]
         own = (clouds.points - first[:, None, :3]) @ turn / UNIT
         with torch.no_grad():
             apart = (hand.part_distances(clouds.points, first) / NEAR).clamp(-1, 2)

@@ -19,6 +19,7 @@ from torchreg.pipelines.align_problem import AlignProblem
 from torchreg.pipelines.align_stages import (
     SURFACE_SIGMAS,
     fit_surface,
+    pose_covariance,
     register,
     residual_noise,
     settle_surface,
@@ -335,3 +336,24 @@ def test_change_counts_metres_as_shares_of_the_size(skin, truths):
     step = torch.zeros(2, DOFS).double()
     step[0, 1], step[1, 7] = 0.5 * problem.size, -0.2
     torch.testing.assert_close(problem.change(step), torch.tensor([0.5, 0.2]).double())
+
+
+def test_covariance_of_linear_problems_is_exact():
+    generator = torch.Generator().manual_seed(2)
+    jacobian = torch.randn(40, 5, generator=generator, dtype=torch.float64)
+    jacobian[:, 4] = 0
+    weights = torch.rand(40, generator=generator, dtype=torch.float64)
+    precision = torch.tensor([0.0, 1.0, 0.0, 0.0, 4.0], dtype=torch.float64)
+    noise = torch.tensor(0.1, dtype=torch.float64)
+    covariance = pose_covariance(jacobian, weights, noise, precision)
+    expected = torch.linalg.inv(jacobian.T @ weights.diag() @ jacobian / 0.01 + precision.diag())
+    torch.testing.assert_close(covariance, expected)
+    # What no datum says is what the prior says.
+    assert covariance[4, 4].sqrt() == pytest.approx(0.5)
+    # A batch gives what its problems give alone.
+    other = torch.randn(40, 5, generator=generator, dtype=torch.float64)
+    both = pose_covariance(
+        torch.stack([jacobian, other]), weights.expand(2, -1), noise.expand(2), (precision + 1).expand(2, -1)
+    )
+    for row, alone in zip(both, (jacobian, other), strict=True):
+        torch.testing.assert_close(row, pose_covariance(alone, weights, noise, precision + 1))

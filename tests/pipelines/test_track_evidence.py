@@ -13,7 +13,7 @@ from torchreg.models.limbs import find_limbs
 from torchreg.models.primitives import Primitive
 from torchreg.models.skin import sample_skin
 from torchreg.pipelines.align_objectives import PosePrior
-from torchreg.pipelines.track_evidence import LimbReach, dense_strays, nearest_distance, pose_covariance
+from torchreg.pipelines.track_evidence import LimbReach, dense_strays, nearest_distance
 
 CELL = 0.01
 
@@ -82,17 +82,3 @@ def test_turns_compose_where_the_prior_holds_the_base():
     prior = PosePrior(mean, torch.full((7,), 4.0, dtype=torch.float64), holds_base=True)
     assert pose[0, 3] < 0
     assert torch.allclose(prior.cost(pose), 2 * step.square().sum(-1))
-
-
-def test_covariance_of_linear_problems_is_exact():
-    generator = torch.Generator().manual_seed(2)
-    jacobian = torch.randn(40, 5, generator=generator, dtype=torch.float64)
-    jacobian[:, 4] = 0
-    weights = torch.rand(40, generator=generator, dtype=torch.float64)
-    precision = torch.tensor([0.0, 1.0, 0.0, 0.0, 4.0], dtype=torch.float64)
-    noise = torch.tensor(0.1, dtype=torch.float64)
-    covariance = pose_covariance(jacobian, weights, noise, precision)
-    expected = torch.linalg.inv(jacobian.T @ weights.diag() @ jacobian / 0.01 + precision.diag())
-    torch.testing.assert_close(covariance, expected)
-    # What no datum says is what the prior says.
-    assert covariance[4, 4].sqrt() == pytest.approx(0.5)

@@ -102,13 +102,13 @@ class LinearBlendSkin(nn.Module):
 
         References: Dewaele et al. 2006, eq. 3.
         """
-        return self.place(self.shape.part_transforms(pose)[..., :3, :].mT.flatten(-3, -2))
+        return self.place(stacked_rows(self.shape.part_transforms(pose)))
 
     def place(self, rows: Tensor) -> Tensor:
         """Return the points for given part transforms.
 
         Args:
-            rows: (..., 4 P, 3) as `ArticulatedShape.transform_jacobian` stacks the transforms.
+            rows: (..., 4 P, 3) transforms as `stacked_rows` and `ArticulatedShape.transform_jacobian` stack them.
 
         Returns:
             (..., N, 3), metres; in memory all x come first, then all y, then all z.
@@ -146,7 +146,7 @@ class LinearBlendSkin(nn.Module):
         Raises:
             InputError: if the skin has no normals.
         """
-        return self.turn_normals(self.shape.part_transforms(pose)[..., :3, :].mT.flatten(-3, -2))
+        return self.turn_normals(stacked_rows(self.shape.part_transforms(pose)))
 
     def turn_normals(self, rows: Tensor) -> Tensor:
         """Return the unit normals (..., N, 3) for given part transforms, see `place`.
@@ -158,6 +158,11 @@ class LinearBlendSkin(nn.Module):
             raise InputError("this skin has no normals; pass normals= when building it")
         turned = nn.functional.linear(rows.mT, self.normal_basis)
         return nn.functional.normalize(turned, dim=-2).mT
+
+
+def stacked_rows(transforms: Tensor) -> Tensor:
+    """Return part transforms (..., P, 4, 4) as the rows (..., 4 P, 3) that skins are linear in."""
+    return transforms[..., :3, :].mT.flatten(-3, -2)
 
 
 def _weighted(local: Tensor, weights: Tensor, last: float) -> Tensor:

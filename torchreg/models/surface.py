@@ -11,7 +11,7 @@ from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.skin import LinearBlendSkin
+from torchreg.models.skin import LinearBlendSkin, stacked_rows
 
 # Meshes with this many vertices carry their own sampling.
 _MIN_VERTICES, _MAX_VERTICES, _NUM_SAMPLES = 800, 6000, 4000
@@ -62,7 +62,7 @@ class SkinSurface:
 
     def distance(self, points: Tensor, pose: Tensor) -> Tensor:
         """Return the signed distances (..., N) of points (..., N, 3) in poses (..., num_dofs), metres."""
-        rows = self.skin.shape.part_transforms(pose)[..., :3, :].mT.flatten(-3, -2)
+        rows = stacked_rows(self.skin.shape.part_transforms(pose))
         return self._plane_distance(points, self.skin.place(rows), self.skin.turn_normals(rows))[0]
 
     def distance_jacobian(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:

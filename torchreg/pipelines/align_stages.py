@@ -278,3 +278,25 @@ def surface_noise(distance: Tensor, valid: Tensor, size: float) -> Tensor:
     median = torch.where(near, distance, torch.nan).nanmedian(-1).values
     low, high = (share * size / SIGMA_PER_NOISE for share in FINAL_SIGMA_RANGE)
     return torch.nan_to_num(_MAD_TO_STD * median, nan=high).clamp(low, high)
+
+
+def pose_covariance(jacobian: Tensor, weights: Tensor, noise: Tensor, precision: Tensor) -> Tensor:
+    """Return the covariance of fitted poses, ``(J^T W J / noise^2 + diag(precision))^-1``.
+
+    Args:
+        jacobian: (..., M, D) of the residuals.
+        weights: (..., M) of the residuals, from 0 to 1.
+        noise: (...) standard deviation of the residuals.
+        precision: (..., D) or (D,) of the prior; positive wherever residuals do not tell.
+
+    Returns:
+        (..., D, D), in the coordinates of the Jacobian.
+
+    Differentiable: in all.
+    """
+    rows = (jacobian * (weights.sqrt() / noise.unsqueeze(-1)).unsqueeze(-1)).double()
+    information = rows.mT @ rows + torch.diag_embed(precision.double())
+    scale = information.diagonal(dim1=-2, dim2=-1).rsqrt()
+    outer = scale.unsqueeze(-1) * scale.unsqueeze(-2)
+    inverse = torch.cholesky_inverse(torch.linalg.cholesky(information * outer))
+    return (inverse * outer).to(jacobian)

@@ -9,7 +9,7 @@ from torchreg.models.limbs import Limb, find_limbs
 from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.align_problem import INLIER_SHARE, AlignProblem
 from torchreg.pipelines.align_search import clustered_data
-from torchreg.pipelines.align_stages import SIGMA_PER_NOISE, surface_noise
+from torchreg.pipelines.align_stages import SIGMA_PER_NOISE, pose_covariance, surface_noise
 
 # A pose is right if the ends of its limbs lie within this share of the size of where they are, on average.
 _TOLERANCE = 0.04
@@ -77,7 +77,8 @@ def known_ends(problem: AlignProblem, pose: Tensor) -> Tensor:
     joints = prior.reciprocal()
     joints[..., :6] = 0
     loose = (moves.square() * joints[..., None, None, :]).sum((-2, -1))
-    fitted = _variances(_information(problem, pose) + torch.diag_embed(prior), moves)
+    covariance = _covariance(problem, pose, prior)
+    fitted = ((moves.flatten(-3, -2) @ covariance).unflatten(-2, moves.shape[-3:-1]) * moves).sum((-2, -1)).clamp_min(0)
     alone = (-_own_data(problem, pose) / _SURE_DATA).exp()
     spread = (fitted + alone * (loose - fitted).clamp_min(0)).clamp_min(torch.finfo(pose.dtype).tiny).sqrt().mean(-1)
     return 1 - (-(_TOLERANCE * problem.size / spread).square()).exp()
@@ -112,19 +113,12 @@ def _precision(problem: AlignProblem) -> Tensor:
     return torch.maximum(problem.prior.precision, least)
 
 
-def _information(problem: AlignProblem, pose: Tensor) -> Tensor:
-    """Return what the data near the surface tell of the pose, (B, num_dofs, num_dofs)."""
+def _covariance(problem: AlignProblem, pose: Tensor, prior: Tensor) -> Tensor:
+    """Return (B, num_dofs, num_dofs): how poses spread, given the data near the surface and the prior's precision."""
     distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
-    noise = surface_noise(distance, problem.valid, problem.size).unsqueeze(-1)
-    beta = (-(distance / (SIGMA_PER_NOISE * noise)).square()).exp() * problem.valid
-    return (jacobian * (beta / noise.square()).unsqueeze(-1)).mT @ jacobian
-
-
-def _variances(information: Tensor, moves: Tensor) -> Tensor:
-    """Return the variances (B, L) of points that move by (B, L, 3, num_dofs), given the information on the pose."""
-    flat = moves.flatten(-3, -2).double()
-    spread = torch.linalg.solve(information.double(), flat.mT)
-    return (flat * spread.mT).sum(-1).unflatten(-1, moves.shape[-3:-1]).sum(-1).clamp_min(0).to(moves)
+    noise = surface_noise(distance, problem.valid, problem.size)
+    near = (-(distance / (SIGMA_PER_NOISE * noise).unsqueeze(-1)).square()).exp() * problem.valid
+    return pose_covariance(jacobian, near, noise, prior)
 
 
 def _own_data(problem: AlignProblem, pose: Tensor) -> Tensor:

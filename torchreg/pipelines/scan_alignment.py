@@ -69,7 +69,7 @@ def align_scans(
 
     Differentiable: no.
 
-    Cost: about 1.5 s for scans of 8,000 points on one core.
+    Cost: about 2 s for scans of 8,000 points on one core.
 
     References: Chang and Zwicker 2009, section 5, on where to start; Sumner, Schmid and Pauly 2007 for the graph;
     Myronenko and Song 2010 for the EM with outliers.

@@ -17,7 +17,7 @@ from torchreg.pipelines.scan_align_stages import embedded, mismatch
 # Target samples looked at, and for each of them moved samples that may cover it.
 _NUM_TARGETS, _NUM_COVERS = 400, 2
 # Patches are the nodes within so many edges of a node; so many rounds at most, in each of which one changes hands.
-_RINGS, _MAX_MOVES = 4, 30
+_RINGS, _MAX_ROUNDS = 4, 30
 # A move must save this much.
 _LEAST_GAIN = 1e-4
 
@@ -47,7 +47,7 @@ def fuse_motions(problem: ScanAlignProblem, options: Tensor, config: ChoiceConfi
     least = energy(labels.unsqueeze(0))[0]
     # Moves that have not paid are tried again only when no other pays any more.
     everywhere = worthwhile = torch.arange(len(offers), device=labels.device)
-    for _ in range(_MAX_MOVES):
+    for _ in range(_MAX_ROUNDS):
         moves = torch.where(patches[worthwhile], offers[worthwhile, None], labels)
         energies = energy(moves)
         pays = energies < least - _LEAST_GAIN

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_choice, check_count, check_positive
+from torchreg.models.skin import stacked_rows
 from torchreg.pipelines.align_problem import AlignProblem, shifted
 
 MODEL_POINTS = ("seen", "data", "shape")
@@ -91,13 +92,13 @@ class FrameView:
     Args:
         problem: one alignment; its prior's mean is the pose.
         origin: (3,) of its coordinates.
-        posed: (4 P, 3) the prior's mean as skins place their points with, see `LinearBlendSkin.place`.
+        rows: (4 P, 3) the prior's mean as skins place their points with, see `LinearBlendSkin.place`.
         near: (M,) which points of the cloud are in reach; the problem may hold a part of them.
     """
 
     problem: AlignProblem
     origin: Tensor
-    posed: Tensor
+    rows: Tensor
     near: Tensor
 
     def local(self, poses: Tensor) -> Tensor:
@@ -154,7 +155,7 @@ class FrameFit:
     @property
     def rows(self) -> Tensor:
         """The transforms (4 P, 3) as skins place their points with, see `LinearBlendSkin.place`."""
-        return self.transforms[:, :3].mT.flatten(0, 1)
+        return stacked_rows(self.transforms)
 
     @property
     def world(self) -> Tensor:

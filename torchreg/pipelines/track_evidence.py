@@ -160,25 +160,3 @@ class LimbReach:
         size = torch.tensor(self.cells.shape, device=index.device)
         inside = ((index >= 0) & (index < size)).all(-1)
         return inside & self.cells[torch.minimum(index.clamp_min(0), size - 1).unbind(-1)]
-
-
-def pose_covariance(jacobian: Tensor, weights: Tensor, noise: Tensor, precision: Tensor) -> Tensor:
-    """Return the covariance of a fitted pose, ``(J^T W J / noise^2 + diag(precision))^-1``.
-
-    Args:
-        jacobian: (M, D) of the residuals.
-        weights: (M,) of the residuals, from 0 to 1.
-        noise: () standard deviation of the residuals.
-        precision: (D,) of the prior; positive wherever residuals do not tell.
-
-    Returns:
-        (D, D), in the coordinates of the Jacobian.
-
-    Differentiable: in all.
-    """
-    rows = (jacobian * (weights.sqrt() / noise).unsqueeze(-1)).double()
-    information = rows.mT @ rows + torch.diag_embed(precision.double())
-    scale = information.diagonal().rsqrt()
-    scaled = information * scale.unsqueeze(-1) * scale
-    inverse = torch.cholesky_inverse(torch.linalg.cholesky(scaled))
-    return (inverse * scale.unsqueeze(-1) * scale).to(jacobian)

@@ -13,18 +13,23 @@ from torchreg.correspondence.sigma import SigmaSchedule
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.limbs import find_limbs
-from torchreg.models.skin import LinearBlendSkin, sample_skin
+from torchreg.models.skin import LinearBlendSkin, sample_skin, stacked_rows
 from torchreg.pipelines.align import AlignConfig
 from torchreg.pipelines.align_objectives import PosePrior
 from torchreg.pipelines.align_problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem, shifted
-from torchreg.pipelines.align_stages import SIGMA_PER_NOISE, register, settle_surface, surface_noise
+from torchreg.pipelines.align_stages import (
+    SIGMA_PER_NOISE,
+    pose_covariance,
+    register,
+    settle_surface,
+    surface_noise,
+)
 from torchreg.pipelines.track_config import Frame, FrameFit, FrameView, TrackConfig, thinned
 from torchreg.pipelines.track_evidence import (
     LimbReach,
     dense_strays,
     in_doubt,
     nearest_distance,
-    pose_covariance,
     share_at_limits,
 )
 from torchreg.pipelines.track_limbs import fit_limbs, scattered
@@ -85,7 +90,7 @@ class FrameFitter:
         """Return the frame as seen from a pose (num_dofs,), if any data are in reach; the prior holds joints there."""
         origin = pose[:3].clone()
         local = shifted(pose, -origin)
-        rows = self.shape.part_transforms(local)[:, :3].mT.flatten(0, 1)
+        rows = stacked_rows(self.shape.part_transforms(local))
         posed, reach = self.skin.place(rows), _REACH * self.size * spread(state, frame.gap)
         data = frame.cloud - origin
         near = ((data > posed.amin(0) - reach) & (data < posed.amax(0) + reach)).all(-1)
@@ -157,8 +162,7 @@ class FrameFitter:
         strays = dense_strays(problem.data[0], distance[0].abs() < _FAR_NOISES * noise, self.size)
         known = transform_points(transforms[0], state.strays)
         novel = (nearest_distance(strays, known) > _SAME_STRAY * self.size) & self._reach(strays, transforms[0])
-        rows = transforms[:, :3].mT.flatten(0, 1)
-        moved = (problem.skin.place(rows) - problem.skin.place(view.posed)).norm(dim=-1)
+        moved = (problem.skin.place(stacked_rows(transforms)) - problem.skin.place(view.rows)).norm(dim=-1)
         wide = replace(problem, prior=PosePrior(problem.prior.mean, self._precision(_WIDE_PRIOR)))
         return FrameFit(
             view, pose, distance, jacobian, transforms, noise=noise[0], change=float(fitted.change),
