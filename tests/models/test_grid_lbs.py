@@ -260,3 +260,13 @@ def test_rigidity_is_checked_to_single_precision():
     check_rigid(torch.zeros(0, 4, 4), "motions")
     with pytest.raises(InputError, match="motions must hold rigid motions"):
         check_rigid(torch.ones(4, 4)[None], "motions")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@BLENDS
+def test_on_a_graphics_card(blend):
+    model, points = random_model(blend), bar(50, 1)
+    there = copy.deepcopy(model).to("cuda")
+    moved = there(points.cuda())
+    assert moved.is_cuda
+    torch.testing.assert_close(moved.cpu(), model(points))

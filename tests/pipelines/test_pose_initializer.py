@@ -1,6 +1,7 @@
 """PoseInitializer as a function and as a layer: gradients against finite differences and unrolling, batches, limits."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
 from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.hand import Hand
 from torchreg.models.primitives import Primitive
-from torchreg.models.skin import bending_weights, sample_skin
+from torchreg.models.skin import LinearBlendSkin, bending_weights, sample_skin
 from torchreg.pipelines.find_pose import FindPoseConfig
 from torchreg.pipelines.pose_initializer import InitialPose, PoseInitializer, PoseInitializerConfig
 
@@ -300,6 +301,33 @@ def test_from_scratch_a_cloud_of_a_batch_may_be_empty(shape, skin, points):
     assert result.confidence[1] == 0
     torch.testing.assert_close(result.keypoints[2], alone.keypoints, atol=1e-6, rtol=0)
     torch.testing.assert_close(result.confidence[2], alone.confidence, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "device",
+    [
+        "cpu",
+        pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")),
+    ],
+)
+def test_a_copy_on_any_device_finds_the_same(shape, skin, points, start, device):
+    """From starts with gradients, and from scratch without."""
+    other = finger().requires_grad_(False).to(device)
+    quick = FindPoseConfig(num_candidates=4, num_placed=2, num_searched=1, search_rounds=1)
+    config = replace(EXACT, search=quick)
+    layer, there = PoseInitializer(shape, config, model_points=skin), PoseInitializer(other, config)
+    there.skin = LinearBlendSkin(other, skin.points.to(device), skin.weights.to(device), other.rest_pose())
+    leaf, leaf_there = points.clone().requires_grad_(), points.to(device).requires_grad_()
+    found, found_there = layer(leaf, start=start), there(leaf_there, start=start.to(device))
+    assert found_there.pose.device.type == device
+    torch.testing.assert_close(found_there.keypoints.cpu(), found.keypoints, atol=1e-6, rtol=0)
+    results = ((found, leaf), (found_there, leaf_there))
+    gradients = [torch.autograd.grad(one.keypoints.sum(), at)[0] for one, at in results]
+    torch.testing.assert_close(gradients[1].cpu(), gradients[0], atol=1e-4, rtol=1e-4)
+    with torch.no_grad():
+        search, search_there = layer(points), there(points.to(device))
+    torch.testing.assert_close(search_there.keypoints.cpu(), search.keypoints, atol=1e-4, rtol=0)
+    torch.testing.assert_close(search_there.confidence.cpu(), search.confidence, atol=1e-3, rtol=0)
 
 
 def test_bad_input_is_told(shape, skin, points, start):
