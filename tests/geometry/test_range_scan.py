@@ -414,3 +414,15 @@ def test_on_a_graphics_card():
         assert scan.uniform_subsample(20).is_cuda
         assert scan.subset(scan.boundary, mark_cut=True).normals.is_cuda
     assert RangeScan.from_depth(torch.ones(5, 5).cuda(), (5.0, 5.0, 2.0, 2.0)).boundary.is_cuda
+
+
+def test_even_samples_that_were_asked_for_before_are_the_same_and_cannot_be_spoilt():
+    scan = RangeScan(torch.rand(300, 3, generator=torch.Generator().manual_seed(3)))
+    first = scan.uniform_subsample(50)
+    expected = first.clone()
+    first.zero_()
+    assert torch.equal(scan.uniform_subsample(50), expected)
+    assert torch.equal(expected, RangeScan(scan.points).uniform_subsample(50))
+    drawn = scan.uniform_subsample(50, generator=torch.Generator().manual_seed(1))
+    assert not torch.equal(drawn, expected)
+    assert torch.equal(drawn, scan.uniform_subsample(50, generator=torch.Generator().manual_seed(1)))

@@ -40,7 +40,7 @@ def poisson_disk(points: Tensor, radius: float, generator: torch.Generator | Non
     """
     check_positive(radius, "radius")
     points, places, index = _prepare(points, generator)
-    few = _thin(places, np.arange(len(places)), radius)
+    few = _thin(places, np.arange(len(places)), radius, _typical_distance(places))
     return torch.from_numpy(np.sort(index[few])).to(points.device)
 
 
@@ -89,9 +89,9 @@ def _typical_distance(places: np.ndarray) -> float:
     return float(np.median(cKDTree(places).query(places, 2)[0][:, 1])) if len(places) > 1 else np.inf
 
 
-def _thin(places: np.ndarray, few: np.ndarray, radius: float) -> np.ndarray:
-    """Return those of the indices ``few``, ascending, that stay, thinned by growing radii up to the last."""
-    steps = int(np.log(max(radius / _typical_distance(places[few]), 1.0)) / np.log(_GROWTH))
+def _thin(places: np.ndarray, few: np.ndarray, radius: float, step: float) -> np.ndarray:
+    """Return those of the indices ``few``, ascending, that stay, thinned by radii growing from their ``step``."""
+    steps = int(np.log(max(radius / step, 1.0)) / np.log(_GROWTH))
     for power in range(steps, -1, -1):
         few = few[_undisputed(places[few], radius / _GROWTH**power)]
     return few
@@ -122,10 +122,11 @@ def _search(places: np.ndarray, count: int) -> np.ndarray:
     lower, upper = 0.0, np.inf
     if radius > _GROWTH * step:
         # Shared by all tries below.
-        thinned = _thin(places, start, radius / _GROWTH)
-        start = thinned if len(thinned) >= count else start
+        thinned = _thin(places, start, radius / _GROWTH, step)
+        if len(thinned) >= count:
+            start, step = thinned, _typical_distance(places[thinned])
     for _ in range(_MAX_TRIES):
-        few = _thin(places, start, radius)
+        few = _thin(places, start, radius, step)
         if count <= len(few) < len(best):
             best = few
         if count <= len(few) <= _SURPLUS * count + 1:

@@ -27,6 +27,7 @@ from torchreg.pipelines.align_problem import (
 )
 from torchreg.pipelines.align_search import FINAL_SIGMAS, explore, needs_search
 from torchreg.pipelines.align_stages import CORRESPONDENCES, OnStep, StageResult, fit_surface, register
+from torchreg.pipelines.threads import one_thread
 from torchreg.results import AlignRecord, AlignResult, FrameResult, Status, TrackState
 
 # Shares of the model's size, the diagonal of its rest pose.
@@ -35,7 +36,8 @@ _START_SIGMA, _STOP_SIGMA = 0.08, 0.02
 _MIN_INLIERS, _MIN_INLIER_SHARE = 10, 0.02
 # Steps of the surface fit after a search, whose time they hardly add to.
 _SEARCHED_STEPS = 4
-
+# With as many data or more, all threads of torch are of use.
+_MANY = 10_000
 
 _Record = TypeVar("_Record", AlignRecord, AlignResult, FrameResult, TrackState)
 
@@ -165,12 +167,13 @@ def align(
         warn_about_units(problem)
         pose = shifted(pose, -origin)
         record = _Recorder(on_step, origin)
-        final = _descend(problem, pose, config, record)
-        if starts:
-            best = alignment_cost(problem, final.pose).argmin().unsqueeze(0)
-            problem, pose, origin, record = problem.rows(best), pose[best], origin[best], record.rows(best)
-            final = StageResult(final.pose[best], final.sigma[best], final.change[best])
-        final = _search_where_needed(problem, final, pose, config, record)
+        with one_thread(batch_valid.numel() < _MANY):
+            final = _descend(problem, pose, config, record)
+            if starts:
+                best = alignment_cost(problem, final.pose).argmin().unsqueeze(0)
+                problem, pose, origin, record = problem.rows(best), pose[best], origin[best], record.rows(best)
+                final = StageResult(final.pose[best], final.sigma[best], final.change[best])
+            final = _search_where_needed(problem, final, pose, config, record)
         result = _result(problem, final, origin, config, tuple(record.history))
         return ordinary(_unbatched(result, 0) if data.ndim == 2 else result)
 

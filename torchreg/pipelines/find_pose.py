@@ -32,6 +32,7 @@ from torchreg.pipelines.align_stages import fit_surface
 from torchreg.pipelines.limb_search import distinct_first, take_rows
 from torchreg.pipelines.pose_confidence import is_misfit, pose_confidence
 from torchreg.pipelines.pose_search import PoseSearch
+from torchreg.pipelines.threads import one_thread
 from torchreg.results import PoseStarts
 
 # Typical poses lie at these shares of the way from the rest pose to the middle of the joint limits.
@@ -188,7 +189,8 @@ def find_pose(
             skin, batch_data, batch_valid, shifted(typical, origin), origin, prior_std=config.prior_std, pose_atol=0.0
         )
         warn_about_units(problem)
-        poses, costs = _found(problem, sources, config)
+        with one_thread():
+            poses, costs = _found(problem, sources, config)
         starts = _ranked(problem, poses, costs, num_starts)
         starts = replace(starts, poses=shifted(starts.poses, origin.unsqueeze(1)))
     return starts if checked.ndim == 3 else starts.row(0)

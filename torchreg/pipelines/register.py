@@ -20,6 +20,7 @@ from torchreg.pipelines.reduced_fit import ReducedFit, Samples
 from torchreg.pipelines.register_config import OnRegisterStep, RegisterConfig
 from torchreg.pipelines.scan_alignment import align_scans
 from torchreg.pipelines.scan_unit import ScanUnit
+from torchreg.pipelines.threads import one_thread
 from torchreg.results import RegisterRecord, ScanRegistration, Status
 
 # Points that the dense alignment is unsure of count this much at least: they follow what is around them.
@@ -27,6 +28,7 @@ LEAST_CONFIDENCE = 0.1
 
 
 @torch.no_grad()
+@one_thread()
 def register(
     source: RangeScan,
     target: RangeScan,

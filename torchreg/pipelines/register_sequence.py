@@ -26,10 +26,12 @@ from torchreg.pipelines.register import (
 from torchreg.pipelines.register_config import OnRegisterStep, RegisterConfig
 from torchreg.pipelines.scan_alignment import align_scans
 from torchreg.pipelines.scan_unit import ScanUnit
+from torchreg.pipelines.threads import one_thread
 from torchreg.results import SequenceRegistration
 
 
 @torch.no_grad()
+@one_thread()
 def register_sequence(
     scans: Sequence[RangeScan],
     num_bones: int = 10,

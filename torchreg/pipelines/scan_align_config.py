@@ -112,7 +112,7 @@ class RefineConfig:
     stiffness: tuple[float, float] = (0.2, 0.006)
     give: float = 0.01
     feature_weight: tuple[float, float] = (8.0, 1.0)
-    slide: tuple[float, float] = (1.0, 0.1)
+    slide: tuple[float, float] = (1.0, 0.03)
     fits_per_step: int = 2
     both_ways_above: float = 0.012
     boundary_above: float = 0.02

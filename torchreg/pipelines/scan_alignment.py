@@ -29,6 +29,7 @@ from torchreg.pipelines.scan_align_stages import (
     soft_matches,
 )
 from torchreg.pipelines.scan_fusion import fuse_motions
+from torchreg.pipelines.threads import one_thread
 
 # What opposite normals count as when points take over the motion of the samples around them, length.
 _NORMAL_SCALE = 0.03
@@ -37,6 +38,7 @@ _LEAST_FUSED = 3
 
 
 @torch.no_grad()
+@one_thread()
 def align_scans(
     source: RangeScan,
     target: RangeScan,

@@ -26,6 +26,7 @@ from torchreg.geometry.rigid import transform_points
 from torchreg.models.grid_lbs import GridLBS, check_rigid
 from torchreg.pipelines.bone_fit import BoneFit, fit_bones
 from torchreg.pipelines.bone_problem import BoneProblem, bind, bone_bodies
+from torchreg.pipelines.threads import one_thread
 from torchreg.results import PoseSolution, Status
 
 HELD_JOINTS = ("tree", "all")
@@ -139,6 +140,7 @@ class PoseSolver:
         self._held = JointMoments(joints.pairs[kept], joints.mass[kept], joints.centers[kept], spread).to(torch.float64)
 
     @torch.no_grad()
+    @one_thread()
     def solve(
         self,
         handles: Tensor,

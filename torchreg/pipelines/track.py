@@ -18,6 +18,7 @@ from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.align import AlignConfig, align, ordinary
+from torchreg.pipelines.threads import one_thread
 from torchreg.pipelines.track_config import Frame, FrameFit, TrackConfig, thinned
 from torchreg.pipelines.track_evidence import is_doubtful, is_far, is_lost, usual_after
 from torchreg.pipelines.track_fit import MIN_DATA, STOP_SIGMA, FrameFitter, generator
@@ -118,7 +119,7 @@ class Tracker:
         cloud = self._checked(points)
         state, gap = timed(self._state, time)
         # A tenth faster than without gradients alone, as most of the time goes to small operations.
-        with torch.inference_mode(), self.shape.held_sizes():
+        with torch.inference_mode(), one_thread(), self.shape.held_sizes():
             frame = Frame(cloud, torch.isfinite(cloud).all(-1), gap)
             unfit = self._unfit(frame.data)
             if unfit is not None:
