@@ -186,13 +186,20 @@ def print_set(title: str, problems: list[Problem], recipes: list[Recipe], verbos
         print_row(recipe.name, scores)
 
 
-def chained(scans: list[tr.RangeScan], recipe: Recipe) -> list[Tensor]:
+def adjacent(scans: list[tr.RangeScan], recipe: Recipe) -> list[Tensor]:
+    """Return where each scan's points but the last one's go in the next frame, registered in pairs."""
+    return [
+        tr.register(source, target, recipe.bones, recipe.grid, recipe.config).deformed
+        for source, target in pairwise(scans)
+    ]
+
+
+def chained(scans: list[tr.RangeScan], pairs: list[Tensor]) -> list[Tensor]:
     """Return where the first scan's points go in every frame by pairs alone: each carries what is nearest to it."""
     places = [scans[0].points]
-    for source, target in pairwise(scans):
-        found = tr.register(source, target, recipe.bones, recipe.grid, recipe.config)
+    for source, moved in zip(scans, pairs, strict=False):
         near, _ = nearest_neighbor(places[-1], source.points)
-        places.append(places[-1] + (found.deformed - source.points)[near])
+        places.append(places[-1] + (moved - source.points)[near])
     return places
 
 
@@ -200,15 +207,23 @@ def print_sequence(sequence: ScanSequence, recipe: Recipe) -> None:
     """Print mean errors of the first frame's points in every frame, shares of the diagonal."""
     scans = list(sequence)
     together = tr.register_sequence(scans, recipe.bones, recipe.grid, recipe.config).deformed
-    apart, size = chained(scans, recipe), scans[0].diagonal
-    print(f"\nsequence of {len(scans)} frames, mean % from the first\n{'frame':>6s} together chained")
-    errors = []
-    for frame in range(1, len(scans)):
-        truth = sequence.truth(0, frame)
-        pair = [100 * float((way[frame] - truth).norm(dim=-1).mean()) / size for way in (together, apart)]
-        errors.append(pair)
-        print(f"{frame:6d} {pair[0]:8.2f} {pair[1]:7.2f}", flush=True)
-    print(f"last over first: {errors[-1][0] / errors[0][0]:.2f} together, {errors[-1][1] / errors[0][1]:.2f} chained")
+    pairs = adjacent(scans, recipe)
+    ways, size = (together, chained(scans, pairs)), scans[0].diagonal
+
+    def error(places: Tensor, source: int, target: int) -> float:
+        return 100 * float((places - sequence.truth(source, target)).norm(dim=-1).mean()) / size
+
+    print(f"\nsequence of {len(scans)} frames, mean % from the first, and of the pair that ends there")
+    print(f"{'frame':>6s} together chained   pair")
+    alone = [error(moved, frame, frame + 1) for frame, moved in enumerate(pairs)]
+    errors = [[error(way[frame], 0, frame) for way in ways] for frame in range(1, len(scans))]
+    for frame, (row, pair) in enumerate(zip(errors, alone, strict=True), 1):
+        print(f"{frame:6d} {row[0]:8.2f} {row[1]:7.2f} {pair:6.2f}")
+    last, mean = errors[-1], float(np.mean(alone))
+    print(f"last over the mean pair: {last[0] / mean:.2f} together, {last[1] / mean:.2f} chained")
+    print(
+        f"last over the first: {last[0] / errors[0][0]:.2f} together, {last[1] / errors[0][1]:.2f} chained", flush=True
+    )
 
 
 def main(arguments: list[str] | None = None) -> int:
