@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -33,7 +34,7 @@ def table(source, target, sigma, config):
 @pytest.mark.parametrize("boundary", [True, False])
 def test_posteriors_are_those_of_the_full_table(both_ways, boundary):
     config, sigma = ScanEMConfig(num_candidates=20), 0.04
-    source, target = samples(12, 0), samples(15, 1)
+    source, target = samples(12, 0), replace(samples(15, 1), cut_off=torch.arange(15) % 4 == 0)
     likelihood = table(source, target, sigma, config)
 
     def outlier(count):
@@ -47,6 +48,7 @@ def test_posteriors_are_those_of_the_full_table(both_ways, boundary):
         weights += likelihood / (likelihood.sum(0) + outlier(12)) * 12 / 15
     found = match_softly(source, target, sigma, config, both_ways=both_ways, boundary=boundary)
     torch.testing.assert_close(found.posterior, chosen.sum(1))
+    torch.testing.assert_close(found.cut_off, chosen @ target.cut_off.double() / chosen.sum(1))
     torch.testing.assert_close(found.weights, weights.sum(1))
     torch.testing.assert_close(found.targets, weights @ target.points / weights.sum(1, keepdim=True))
     normals = torch.nn.functional.normalize(weights @ target.normals, dim=-1)

@@ -41,8 +41,11 @@ def energy(graph, transforms, matches, stiffness):
     return misses, gaps, misses + stiffness * gaps
 
 
-def test_steps_are_those_of_a_dense_gauss_newton(graph):
+@pytest.mark.parametrize("each", [False, True])
+def test_steps_are_those_of_a_dense_gauss_newton(graph, each):
     transforms, matches = problem(graph)
+    slide = torch.linspace(0, 0.6, 40, dtype=F64) if each else torch.full((40,), 0.3, dtype=F64)
+    matches = replace(matches, slide=slide if each else 0.3)
     middles = transform_points(transforms, graph.centers.unsqueeze(1)).squeeze(1)
 
     def residuals(twists):
@@ -51,7 +54,7 @@ def test_steps_are_those_of_a_dense_gauss_newton(graph):
         root = (matches.weights / 40).sqrt().unsqueeze(-1)
         across = root * (miss * matches.normals).sum(-1, keepdim=True)
         gap = graph.edge_gaps(moved).flatten(1) * (0.7 / 6 * graph.edge_weights).sqrt().unsqueeze(-1)
-        return torch.cat([across.reshape(-1), (root * 0.3**0.5 * miss).reshape(-1), gap.reshape(-1)])
+        return torch.cat([across.reshape(-1), (root * slide.sqrt().unsqueeze(-1) * miss).reshape(-1), gap.reshape(-1)])
 
     zero = torch.zeros(36, dtype=F64)
     jacobian = torch.autograd.functional.jacobian(residuals, zero)

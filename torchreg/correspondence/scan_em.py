@@ -53,12 +53,14 @@ class SoftMatches:
         targets: (S, 3) mean places of the matches.
         normals: (S, 3) unit mean normals of the matches; zero where there is none.
         posterior: (S,) in [0, 1], mass by the samples' own choice alone.
+        cut_off: (S,) in [0, 1], share of that on targets near which the scan ends behind something nearer.
     """
 
     weights: Tensor
     targets: Tensor
     normals: Tensor
     posterior: Tensor
+    cut_off: Tensor
 
 
 def match_softly(
@@ -104,6 +106,8 @@ def match_softly(
     if not boundary:
         chosen = chosen * ~target.boundary[index]
     posterior = chosen.sum(1)
+    tiny = torch.finfo(posterior.dtype).tiny
+    cut_off = (chosen * target.cut_off[index]).sum(1) / posterior.clamp_min(tiny)
     ends = torch.cat((target.points, target.normals), dim=1)
     sums = torch.einsum("sk,skd->sd", chosen, ends[index])
     weights = posterior
@@ -113,9 +117,9 @@ def match_softly(
         flat = index.reshape(-1)
         weights = weights.index_add(0, flat, chosen.reshape(-1))
         sums = sums.index_add(0, flat, (chosen.unsqueeze(-1) * ends.unsqueeze(1)).flatten(0, 1))
-    targets = sums[:, :3] / weights.clamp_min(torch.finfo(weights.dtype).tiny).unsqueeze(-1)
+    targets = sums[:, :3] / weights.clamp_min(tiny).unsqueeze(-1)
     targets = torch.where(weights.unsqueeze(-1) > 0, targets, source.points)
-    return SoftMatches(weights, targets, torch.nn.functional.normalize(sums[:, 3:], dim=-1), posterior)
+    return SoftMatches(weights, targets, torch.nn.functional.normalize(sums[:, 3:], dim=-1), posterior, cut_off)
 
 
 def _choices(chooser: Tensor, offered: Tensor, sigma: float, config: ScanEMConfig) -> tuple[Tensor, Tensor]:

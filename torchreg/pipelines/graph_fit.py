@@ -29,14 +29,15 @@ class GraphMatches:
         targets: (n, 3).
         weights: (n,) how much each counts, not negative.
         normals: (n, 3) of the targets, or None for targets that hold in all directions alike.
-        slide: how much a miss along the surface counts against one across it, squared; 1 without normals.
+        slide: how much a miss along the surface counts against one across it, squared; one number, or (n,) of each; 1
+            without normals.
     """
 
     which: Tensor | slice
     targets: Tensor
     weights: Tensor
     normals: Tensor | None = None
-    slide: float = 1.0
+    slide: float | Tensor = 1.0
 
 
 @dataclass(frozen=True)
@@ -117,8 +118,9 @@ def _of_matches(graph: DeformationGraph, transforms: Tensor, middles: Tensor, ma
     identity = torch.eye(3).to(points).expand(count, few, 3, 3)
     blocks = torch.cat((identity, -skew(ends - middles[nearest])), dim=-1) * weights[..., None, None]
     blocks = blocks.transpose(1, 2).flatten(2)
-    pulled = matches.slide * blocks
-    pull = matches.slide * miss
+    slide = torch.as_tensor(matches.slide).to(points).reshape(-1, 1)
+    pulled = slide.unsqueeze(-1) * blocks
+    pull = slide * miss
     if matches.normals is not None:
         normal = matches.normals.unsqueeze(-1)
         pulled = pulled + normal * (normal.mT @ blocks)

@@ -171,6 +171,8 @@ class ScanAlignConfig:
         num_nodes: of the graph.
         num_nearest: nodes that each sample hangs on.
         curvature_radii: of the features, lengths.
+        occluder_depth: a surface this much nearer to the camera beside an edge hides what is behind, length.
+        occluder_reach: spacings of samples within which of such an edge matches hold across the surface alone.
         match: the first matches.
         assign: matches one to one from the unmoved source.
         reassign: the same from the first matches.
@@ -186,6 +188,8 @@ class ScanAlignConfig:
     num_nodes: int = 60
     num_nearest: int = 4
     curvature_radii: tuple[float, ...] = (0.02, 0.035, 0.06)
+    occluder_depth: float = 0.03
+    occluder_reach: float = 2.5
     match: MatchConfig = field(default_factory=MatchConfig)
     assign: AssignConfig = field(default_factory=AssignConfig)
     reassign: AssignConfig = field(
@@ -198,6 +202,8 @@ class ScanAlignConfig:
         for name in ("num_samples", "num_target_samples", "num_nodes", "num_nearest"):
             check_count(getattr(self, name), name, 1)
         _check_values(self.curvature_radii, "curvature_radii")
+        check_positive(self.occluder_depth, "occluder_depth")
+        check_positive(self.occluder_reach, "occluder_reach", allow_zero=True)
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,14 @@ from torch import Tensor
 
 from torchreg.correspondence.descriptor_matching import match_descriptors
 from torchreg.correspondence.isometry import consistent_matches
+from torchreg.correspondence.one_to_one import typical_spacing
 from torchreg.correspondence.oriented_samples import OrientedSamples, scaled_together
 from torchreg.correspondence.spin_images import spin_images
 from torchreg.geometry.curvature import curvature_features
 from torchreg.geometry.geodesics import GeodesicGraph
+from torchreg.geometry.neighbors import nearest_few
 from torchreg.geometry.node_graph import build_node_graph
+from torchreg.geometry.occlusion import likely_viewpoint, occlusion_edges
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.sample_graph import sample_graph
 from torchreg.geometry.sampling import even_order
@@ -80,7 +83,7 @@ def describe(
         *(curvature_features(*pair, *pair, config.curvature_radii, num_neighbors=_AROUND) for pair in places)
     )
     one, other = (
-        OrientedSamples(*pair, feature, scan.boundary[which].cpu())
+        OrientedSamples(*pair, feature, scan.boundary[which].cpu(), _cut_off(scan, unit, *pair, config))
         for pair, feature, scan, which in zip(places, features, (source, target), (here, there), strict=True)
     )
     samples = here[: config.num_samples].cpu()
@@ -89,6 +92,18 @@ def describe(
     nodes = build_node_graph(ways, 0, config.num_nodes, config.num_nearest)
     graph = DeformationGraph(one.points[: len(samples)], one.normals[: len(samples)], nodes)
     return ScanAlignProblem(graph, one, other, samples, samples[nodes.nodes], unit)
+
+
+def _cut_off(scan: RangeScan, unit: ScanUnit, points: Tensor, normals: Tensor, config: ScanAlignConfig) -> Tensor:
+    """Return which samples (S,) are near edges of a scan behind which the surface goes on, hidden."""
+    eye = None if scan.viewpoint is None else unit.of_points(scan.viewpoint.unsqueeze(0))[0]
+    eye = likely_viewpoint(points, normals) if eye is None else eye
+    edges = unit.of_points(scan.points[scan.boundary])
+    if eye is not None:
+        edges = edges[occlusion_edges(edges, points, eye, config.occluder_depth)]
+    if eye is None or len(edges) == 0:
+        return torch.zeros(len(points), dtype=torch.bool)
+    return nearest_few(points, edges, 1)[1][:, 0] < config.occluder_reach * typical_spacing(points)
 
 
 def first_matches(problem: ScanAlignProblem, config: MatchConfig) -> GraphMatches:

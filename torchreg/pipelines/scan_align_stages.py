@@ -111,7 +111,9 @@ def refine(
         sigma, stiffness, slide = (between(ends, share) for ends in (widths, config.stiffness, config.slide))
         for _ in range(config.fits_per_step):
             found = soft_matches(problem, transforms, sigma, config, share)
-            matches = GraphMatches(slice(0, len(found.weights)), found.targets, found.weights, found.normals, slide)
+            # A sample beside an edge, whose own place may be hidden behind, must not be pulled to what is still seen.
+            free = slide * (1 - found.cut_off) if sigma < config.boundary_above else slide
+            matches = GraphMatches(slice(0, len(found.weights)), found.targets, found.weights, found.normals, free)
             fit = fit_graph(problem.graph, transforms, matches, stiffness, give=config.give)
             transforms = fit.transforms
         reporter.report("refine", step, number, sigma, fit, stiffness, float(found.weights.mean()))

@@ -1,0 +1,82 @@
+"""Where a range scan ends although the surface goes on: behind something nearer to the camera."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import check_positive, check_same_kind, check_shape
+from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.visibility import view_rotation
+
+# Neighbors in the picture that are looked at, and how many spacings of the samples there they may be away.
+_NEIGHBORS, _BESIDE = 8, 2.5
+# A camera of which nothing is known stands so many times the scan's radius away: its rays are nearly parallel.
+_FAR = 6.0
+# Mean of unit normals below which the scan was not seen from one side; half a ball has a half.
+_ONE_SIDE = 0.2
+# Points nearer to the camera's plane than this share of its distance, or behind it, count as that near.
+_LEAST_DEPTH = 1e-3
+
+
+def likely_viewpoint(points: Tensor, normals: Tensor) -> Tensor | None:
+    """Return about where the camera (3,) was that saw a surface: in front of it, by the mean normal; None if unclear.
+
+    Args:
+        points: (S, 3) spread evenly.
+        normals: (S, 3) unit vectors.
+
+    Differentiable: no.
+    """
+    check_shape(points, "points", ("S", 3))
+    check_shape(normals, "normals", tuple(points.shape))
+    facing = normals.detach().mean(0)
+    if len(points) == 0 or float(facing.norm()) < _ONE_SIDE:
+        return None
+    middle = points.detach().mean(0)
+    radius = (points.detach() - middle).norm(dim=-1).max()
+    return middle + _FAR * radius * torch.nn.functional.normalize(facing, dim=0)
+
+
+@torch.no_grad()
+def occlusion_edges(edges: Tensor, surface: Tensor, viewpoint: Tensor, depth: float) -> Tensor:
+    """Return the edge points (E,) bool beside which, in the picture, the surface is nearer to the camera.
+
+    There the scan ends since something hides the rest. Where it ends because the surface turns away, or is at its end,
+    nothing nearer lies beside.
+
+    Args:
+        edges: (E, 3) points on the scan's boundary.
+        surface: (S, 3) samples of the whole scan, spread evenly.
+        viewpoint: (3,) where the camera was.
+        depth: how much nearer it must be, in the unit of the points: more than the surface slopes from edge to sample.
+
+    Raises:
+        InputError: if a shape does not fit or the depth is not positive.
+        InputTypeError: if dtypes or devices differ.
+
+    Differentiable: no.
+    """
+    check_shape(edges, "edges", ("E", 3))
+    check_shape(surface, "surface", ("S", 3))
+    check_shape(viewpoint, "viewpoint", (3,))
+    check_same_kind(edges, "edges", surface, "surface")
+    check_same_kind(viewpoint, "viewpoint", surface, "surface")
+    check_positive(depth, "depth")
+    if len(edges) == 0 or len(surface) < 2:
+        return torch.zeros(len(edges), dtype=torch.bool, device=edges.device)
+    middle = surface.mean(0)
+    distance = (middle - viewpoint).norm()
+    if not float(distance) > 0:
+        return torch.zeros(len(edges), dtype=torch.bool, device=edges.device)
+    rotation = view_rotation(viewpoint, middle).to(surface)
+
+    def seen(points: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the places (..., 2) in the plane through the middle, and the depths."""
+        local = (points - viewpoint) @ rotation.mT
+        return local[:, :2] * (distance / local[:, 2:].clamp_min(_LEAST_DEPTH * distance)), local[:, 2]
+
+    (flat, far), (flat_edges, far_edges) = seen(surface), seen(edges)
+    spacing = nearest_few(flat, flat, 2)[1][:, 1].median()
+    index, apart = nearest_few(flat_edges, flat, min(_NEIGHBORS, len(flat)))
+    return ((apart < _BESIDE * spacing) & (far[index] < far_edges.unsqueeze(1) - depth)).any(1)
