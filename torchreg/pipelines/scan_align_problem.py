@@ -116,12 +116,13 @@ def first_matches(problem: ScanAlignProblem, config: MatchConfig) -> GraphMatche
     here = problem.source.first(min(config.num_points, len(problem.samples)))
     there = problem.target.first(config.num_points)
     images, ways = [], []
-    for few, scan in ((here, problem.source), (there, problem.target)):
+    # Voters are within the radius; the targets of two points that vote may be farther apart.
+    for few, scan, limit in ((here, problem.source, config.radius), (there, problem.target, 2 * config.radius)):
         scene = scan.first(_SCENE)
         surface = (few.points, few.normals, scene.points, scene.normals)
         images.append(spin_images(*(value.float() for value in surface), bin_size=config.bin_size))
         graph = GeodesicGraph.from_points(few.points, min(_NEIGHBORS, len(few.points) - 1))
-        ways.append(graph.distances(limit=2 * config.radius).float())
+        ways.append(graph.distances(limit=limit).float())
     matches = match_descriptors(
         *images,
         num_candidates=config.num_candidates,

@@ -52,7 +52,8 @@ def align_scans(
     Both scans are described by even samples, their curvature at several sizes and spin images. Hypotheses start from
     rest; from matches of spin images that agree on distances along the surface, fitted stiffly, or softly and then
     pulled by one-to-one matches; and from one-to-one matches alone. Each ends by an EM with an outlier class, while
-    edges of the graph give where its parts disagree. Then each part moves as in the hypothesis that suits it, and the
+    edges of the graph give where its parts disagree, and matches beside what something nearer hides hold across the
+    surface alone. Then each part moves as in the hypothesis that suits it, and the
     EM ends that as well. The best covers the target, is covered by it, is like it, and bends least. Where the first
     two agree, the others are left out.
 
