@@ -9,7 +9,8 @@ Sets are a folder of NPZ files (source_points, source_faces, target_points, targ
 walking figure's adjacent frames, and frames four apart; a toy, one part of which is missing in one scan of every pair.
 For made-up pairs the adjusted Rand index compares parts found with parts that moved apart by more than 0.5 % of the
 diagonal, about the sampling distance, and joints are right within 5 % of the diagonal.
-A sequence of the figure is registered together, and beside it chained: adjacent pairs, one after the other.
+A sequence of the figure is registered together, and beside it chained: adjacent pairs, one after the other. Its last
+frame is compared with the first pair, whose motion is the least, and with the mean of its adjacent pairs.
 
     python benchmarks/scan_registration.py --data FOLDER --pairs 189 --ablations --growth --frames 10
 """

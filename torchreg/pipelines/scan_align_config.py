@@ -98,7 +98,8 @@ class RefineConfig:
         slide: how much misses along the surface count, squared, first and last.
         fits_per_step: rounds of matching and fitting at each sigma.
         both_ways_above: sigma from which targets choose among sources too, length.
-        boundary_above: sigma from which targets on a boundary may be matched, length.
+        boundary_above: sigma from which targets on a boundary may be matched, and matches beside what hides the rest of
+            the target hold along the surface too, length.
         density: samples used per squared sigma.
         least_samples: used of each scan, where there are as many.
         compatible: see `ScanEMConfig`; its feature weight gives way to the one above.
