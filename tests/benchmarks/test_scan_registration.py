@@ -31,7 +31,8 @@ def test_tables_are_printed_for_files_and_without(benchmark, problem, capsys, tm
     assert benchmark.main(["--smoke", "--verbose"]) == 0
     printed = capsys.readouterr().out
     assert "default" in printed
-    assert "last over first" in printed
+    assert "last over the first" in printed
+    assert "last over the mean pair" in printed
     np.savez(
         tmp_path / "one.npz", source_points=problem.source.points, source_faces=problem.source.faces,
         target_points=problem.target.points, target_faces=problem.target.faces, source_truth=problem.truth,
