@@ -198,7 +198,7 @@ def adjacent(scans: list[tr.RangeScan], recipe: Recipe) -> list[Tensor]:
 def chained(scans: list[tr.RangeScan], pairs: list[Tensor]) -> list[Tensor]:
     """Return where the first scan's points go in every frame by pairs alone: each carries what is nearest to it."""
     places = [scans[0].points]
-    for source, moved in zip(scans, pairs, strict=False):
+    for source, moved in zip(scans[:-1], pairs, strict=True):
         near, _ = nearest_neighbor(places[-1], source.points)
         places.append(places[-1] + (moved - source.points)[near])
     return places

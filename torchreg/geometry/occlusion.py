@@ -78,5 +78,5 @@ def occlusion_edges(edges: Tensor, surface: Tensor, viewpoint: Tensor, depth: fl
 
     (flat, far), (flat_edges, far_edges) = seen(surface), seen(edges)
     spacing = nearest_few(flat, flat, 2)[1][:, 1].median()
-    index, apart = nearest_few(flat_edges, flat, min(_NEIGHBORS, len(flat)))
-    return ((apart < _BESIDE * spacing) & (far[index] < far_edges.unsqueeze(1) - depth)).any(1)
+    index, apart = (found.to(edges.device) for found in nearest_few(flat_edges, flat, min(_NEIGHBORS, len(flat))))
+    return ((apart < _BESIDE * float(spacing)) & (far[index] < far_edges.unsqueeze(1) - depth)).any(1)

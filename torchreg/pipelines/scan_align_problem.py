@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -83,9 +83,10 @@ def describe(
         *(curvature_features(*pair, *pair, config.curvature_radii, num_neighbors=_AROUND) for pair in places)
     )
     one, other = (
-        OrientedSamples(*pair, feature, scan.boundary[which].cpu(), _cut_off(scan, unit, *pair, config))
+        OrientedSamples(*pair, feature, scan.boundary[which].cpu())
         for pair, feature, scan, which in zip(places, features, (source, target), (here, there), strict=True)
     )
+    other = replace(other, cut_off=_cut_off(target, unit, other, config))
     samples = here[: config.num_samples].cpu()
     faces = None if source.faces is None else source.faces.cpu()
     ways = sample_graph(unit.of_points(source.points), samples, faces)
@@ -94,10 +95,13 @@ def describe(
     return ScanAlignProblem(graph, one, other, samples, samples[nodes.nodes], unit)
 
 
-def _cut_off(scan: RangeScan, unit: ScanUnit, points: Tensor, normals: Tensor, config: ScanAlignConfig) -> Tensor:
+def _cut_off(scan: RangeScan, unit: ScanUnit, samples: OrientedSamples, config: ScanAlignConfig) -> Tensor:
     """Return which samples (S,) are near edges of a scan behind which the surface goes on, hidden."""
-    eye = None if scan.viewpoint is None else unit.of_points(scan.viewpoint.unsqueeze(0))[0]
-    eye = likely_viewpoint(points, normals) if eye is None else eye
+    points = samples.points
+    if scan.viewpoint is None:
+        eye = likely_viewpoint(points, samples.normals)
+    else:
+        eye = unit.of_points(scan.viewpoint.unsqueeze(0))[0]
     edges = unit.of_points(scan.points[scan.boundary])
     if eye is not None:
         edges = edges[occlusion_edges(edges, points, eye, config.occluder_depth)]

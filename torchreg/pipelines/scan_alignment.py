@@ -53,9 +53,9 @@ def align_scans(
     rest; from matches of spin images that agree on distances along the surface, fitted stiffly, or softly and then
     pulled by one-to-one matches; and from one-to-one matches alone. Each ends by an EM with an outlier class, while
     edges of the graph give where its parts disagree, and matches beside what something nearer hides hold across the
-    surface alone. Then each part moves as in the hypothesis that suits it, and the
-    EM ends that as well. The best covers the target, is covered by it, is like it, and bends least. Where the first
-    two agree, the others are left out.
+    surface alone. Then each part moves as in the hypothesis that suits it, and the EM ends that as well. The best
+    covers the target, is covered by it, is like it, and bends least. Where the first two agree, the others are left
+    out.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
