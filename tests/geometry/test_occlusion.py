@@ -67,6 +67,22 @@ def test_the_camera_stands_where_the_normals_look():
     assert likely_viewpoint(ball[:0], ball[:0]) is None
 
 
+def test_the_camera_is_found_though_most_of_what_it_sees_is_turned_aside():
+    generator = torch.Generator().manual_seed(0)
+    ball = torch.nn.functional.normalize(torch.randn(4000, 3, generator=generator, dtype=F64), dim=-1)
+    half = ball[ball[:, 2] < -0.2]
+    slope = torch.nn.functional.normalize(torch.tensor([0.6, 0.3, -0.7], dtype=F64), dim=0)
+    plane = torch.randn(2000, 3, generator=generator, dtype=F64)
+    plane = plane - (plane @ slope).unsqueeze(1) * slope
+    points, normals = torch.cat([half, plane]), torch.cat([half, slope.expand_as(plane)])
+    mean = torch.nn.functional.normalize(normals.mean(0), dim=0)
+    found = likely_viewpoint(points, normals)
+    away = torch.nn.functional.normalize(found - points.mean(0), dim=0)
+    straight = torch.tensor([0.0, 0.0, -1.0], dtype=F64)
+    assert float(mean @ straight) < 0.95
+    assert float(away @ straight) > 0.995
+
+
 def test_bad_input_is_named(scene):
     surface, edges, _ = scene
     with pytest.raises(InputError, match="edges must have shape"):

@@ -9,7 +9,7 @@ from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.node_graph import build_node_graph
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.models.deformation_graph import DeformationGraph
-from torchreg.pipelines.graph_fit import GraphMatches, fit_graph
+from torchreg.pipelines.graph_fit import GraphMatches, fit_graph, joined
 
 F64 = torch.float64
 
@@ -136,3 +136,19 @@ def test_bad_input_is_named(graph):
         fit_graph(graph, transforms, matches, 1.0, give=0.0)
     with pytest.raises(InputError, match="num_steps must be at least 1"):
         fit_graph(graph, transforms, matches, 1.0, 0)
+
+
+def test_joined_matches_cost_what_all_cost(graph):
+    generator = torch.Generator().manual_seed(1)
+
+    def random(*shape):
+        return torch.rand(*shape, generator=generator, dtype=F64)
+
+    targets, normals = random(40, 3), torch.nn.functional.normalize(random(30, 3), dim=-1)
+    along = GraphMatches(slice(0, 30), targets[:30], random(30), normals, random(30))
+    points = GraphMatches(torch.arange(5, 15), targets[30:], random(10))
+    rest = graph.rest()
+    costs = [fit_graph(graph, rest, matches, 1.0).misses for matches in (along, points)]
+    both = joined(along, points)
+    assert fit_graph(graph, rest, both, 1.0).misses == pytest.approx(costs[0] + costs[1] * 10 / 30)
+    assert joined(along) is along

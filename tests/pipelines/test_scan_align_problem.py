@@ -62,7 +62,10 @@ def test_samples_beside_what_hides_the_rest_are_cut_off(pair, problem):
 
 def test_a_whole_surface_is_not_cut_off(pair):
     ball = torch.nn.functional.normalize(torch.randn(900, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
-    assert not describe(pair.source, RangeScan(ball, normals=ball), CONFIG).target.cut_off.any()
+    whole = describe(pair.source, RangeScan(ball, normals=ball), CONFIG)
+    assert not whole.target.cut_off.any()
+    # Nor is there a side from which it was seen.
+    assert whole.free is None
 
 
 def test_moved_samples_are_those_of_the_graph(problem):

@@ -22,7 +22,7 @@ from torchreg.pipelines.scan_align_stages import (
     mismatch,
     pull_one_to_one,
     refine,
-    soft_matches,
+    used_samples,
 )
 
 CONFIG = ScanAlignConfig(num_samples=400, num_target_samples=800, num_nodes=30)
@@ -80,9 +80,9 @@ def test_stages_come_nearer_and_report(pair, problem, reporter, stage):
 
 def test_small_sigmas_use_more_samples(problem):
     config = RefineConfig(density=0.1, least_samples=50)
-    assert len(soft_matches(problem, problem.graph.rest(), 0.1, config).weights) == 50
-    assert len(soft_matches(problem, problem.graph.rest(), 0.02, config).weights) == 250
-    assert len(soft_matches(problem, problem.graph.rest(), 0.001, config).weights) == 400
+    assert len(used_samples(problem, problem.graph.rest(), 0.1, config)) == 50
+    assert len(used_samples(problem, problem.graph.rest(), 0.02, config)) == 250
+    assert len(used_samples(problem, problem.graph.rest(), 0.001, config)) == 400
 
 
 def test_a_near_start_begins_with_a_smaller_sigma(problem, reporter):
@@ -126,3 +126,22 @@ def test_hypotheses_agree_where_nearly_all_samples_do(problem):
     one[3, 0, 3] += 0.05
     assert not agree(problem, rest, one, ChoiceConfig(same_share=1.0))
     assert not agree(problem, rest, 3 * whole - 2 * rest, config)
+
+
+def test_samples_are_taken_back_from_where_the_camera_saw_nothing(problem, reporter):
+    aside = problem.free.picture.rotation[0]
+    start = problem.graph.rest()
+    start[:, :3, 3] += 0.1 * aside
+
+    def apart(transforms):
+        distance, _, trust = problem.free.beyond(problem.graph(transforms), 0.02)
+        return float((distance * trust).mean())
+
+    def refined(beyond):
+        # A sigma so small that next to nothing is matched.
+        config = RefineConfig(num_steps=4, final_steps=0, sigma=(1e-4, 1e-4), beyond=beyond)
+        return refine(problem, start, config, reporter[0])
+
+    assert apart(start) > 0.003
+    assert apart(refined(1.0)) < 0.2 * apart(start)
+    assert apart(refined(0.0)) > 0.8 * apart(start)

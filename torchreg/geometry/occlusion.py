@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -15,12 +17,47 @@ _NEIGHBORS, _BESIDE = 8, 2.5
 _FAR = 6.0
 # Mean of unit normals below which the scan was not seen from one side; half a ball has a half.
 _ONE_SIDE = 0.2
+# Share of the normals that count as the most slanted; how many steps follow them, and how long.
+_SLANTED, _STEPS, _STEP = 0.1, 30, 0.2
 # Points nearer to the camera's plane than this share of its distance, or behind it, count as that near.
 _LEAST_DEPTH = 1e-3
 
 
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """What a camera sees, as places in the plane through the middle of what it looks at.
+
+    Args:
+        viewpoint: (3,).
+        rotation: (3, 3) ``R_camera_world``, rows right, down, forward.
+        distance: of the plane.
+    """
+
+    viewpoint: Tensor
+    rotation: Tensor
+    distance: Tensor
+
+    @classmethod
+    def of(cls, points: Tensor, viewpoint: Tensor) -> Picture:
+        """Return what a camera sees that looks at the middle of points (S, 3); along z if it is there."""
+        middle = points.mean(0)
+        distance = (middle - viewpoint).norm()
+        rotation = view_rotation(viewpoint, middle) if float(distance) > 0 else torch.eye(3)
+        return cls(viewpoint, rotation.to(points), distance)
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Return places (..., 2) in the plane, in the unit of the points, and depths (...)."""
+        local = (points - self.viewpoint) @ self.rotation.mT
+        depth = local[..., 2]
+        nearest = (_LEAST_DEPTH * self.distance).clamp_min(torch.finfo(local.dtype).tiny)
+        return local[..., :2] * (self.distance / depth.clamp_min(nearest)).unsqueeze(-1), depth
+
+
 def likely_viewpoint(points: Tensor, normals: Tensor) -> Tensor | None:
-    """Return about where the camera (3,) was that saw a surface: in front of it, by the mean normal; None if unclear.
+    """Return about where the camera (3,) was that saw a surface; None if unclear.
+
+    It was where nothing is seen from behind: from the mean normal the direction goes on such that the most slanted
+    normals slant to all sides alike.
 
     Args:
         points: (S, 3) spread evenly.
@@ -33,9 +70,15 @@ def likely_viewpoint(points: Tensor, normals: Tensor) -> Tensor | None:
     facing = normals.detach().mean(0)
     if len(points) == 0 or float(facing.norm()) < _ONE_SIDE:
         return None
+    normals = normals.detach()
+    facing = torch.nn.functional.normalize(facing, dim=0)
+    number = max(1, round(_SLANTED * len(normals)))
+    for _ in range(_STEPS):
+        slanted = normals[(normals @ facing).topk(number, largest=False).indices].mean(0)
+        facing = torch.nn.functional.normalize(facing + _STEP * (slanted - (slanted @ facing) * facing), dim=0)
     middle = points.detach().mean(0)
     radius = (points.detach() - middle).norm(dim=-1).max()
-    return middle + _FAR * radius * torch.nn.functional.normalize(facing, dim=0)
+    return middle + _FAR * radius * facing
 
 
 @torch.no_grad()
@@ -65,18 +108,8 @@ def occlusion_edges(edges: Tensor, surface: Tensor, viewpoint: Tensor, depth: fl
     check_positive(depth, "depth")
     if len(edges) == 0 or len(surface) < 2:
         return torch.zeros(len(edges), dtype=torch.bool, device=edges.device)
-    middle = surface.mean(0)
-    distance = (middle - viewpoint).norm()
-    if not float(distance) > 0:
-        return torch.zeros(len(edges), dtype=torch.bool, device=edges.device)
-    rotation = view_rotation(viewpoint, middle).to(surface)
-
-    def seen(points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the places (..., 2) in the plane through the middle, and the depths."""
-        local = (points - viewpoint) @ rotation.mT
-        return local[:, :2] * (distance / local[:, 2:].clamp_min(_LEAST_DEPTH * distance)), local[:, 2]
-
-    (flat, far), (flat_edges, far_edges) = seen(surface), seen(edges)
+    picture = Picture.of(surface, viewpoint)
+    (flat, far), (flat_edges, far_edges) = picture.project(surface), picture.project(edges)
     spacing = nearest_few(flat, flat, 2)[1][:, 1].median()
     index, apart = (found.to(edges.device) for found in nearest_few(flat_edges, flat, min(_NEIGHBORS, len(flat))))
     return ((apart < _BESIDE * float(spacing)) & (far[index] < far_edges.unsqueeze(1) - depth)).any(1)

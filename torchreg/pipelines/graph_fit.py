@@ -40,6 +40,27 @@ class GraphMatches:
     slide: float | Tensor = 1.0
 
 
+def joined(first: GraphMatches, *others: GraphMatches) -> GraphMatches:
+    """Return matches that cost what several cost, all of them over the number of the first."""
+    if not others:
+        return first
+    parts = zip(*(_tensors(matches) for matches in (first, *others)), strict=True)
+    which, targets, weights, normals, slide = (torch.cat(values) for values in parts)
+    # What is fitted is a mean over the matches.
+    return GraphMatches(which, targets, weights * (len(which) / max(1, len(first.weights))), normals, slide)
+
+
+def _tensors(matches: GraphMatches) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Return samples, targets, weights, normals and slides of matches, one of each per match."""
+    which, count = matches.which, len(matches.weights)
+    if isinstance(which, slice):
+        stop = count if which.stop is None else which.stop
+        which = torch.arange(*which.indices(stop), device=matches.targets.device)
+    normals = torch.zeros_like(matches.targets) if matches.normals is None else matches.normals
+    slide = torch.as_tensor(matches.slide).to(matches.weights).expand(count)
+    return which, matches.targets, matches.weights, normals, slide
+
+
 @dataclass(frozen=True)
 class GraphFit:
     """Where steps have led.

@@ -100,6 +100,9 @@ class RefineConfig:
         both_ways_above: sigma from which targets choose among sources too, length.
         boundary_above: sigma from which targets on a boundary may be matched, and matches beside what hides the rest of
             the target hold along the surface too, length.
+        beyond: how much it counts, beside a match, that a sample is where the target's camera saw nothing.
+        beyond_scale: those farther from the outline than this count ever less, length.
+        beyond_margin: spacings of the target's samples up to which that is nothing.
         density: samples used per squared sigma.
         least_samples: used of each scan, where there are as many.
         compatible: see `ScanEMConfig`; its feature weight gives way to the one above.
@@ -117,6 +120,9 @@ class RefineConfig:
     fits_per_step: int = 2
     both_ways_above: float = 0.012
     boundary_above: float = 0.02
+    beyond: float = 1.0
+    beyond_scale: float = 0.05
+    beyond_margin: float = 1.5
     density: float = 0.3
     least_samples: int = 300
     compatible: ScanEMConfig = field(default_factory=ScanEMConfig)
@@ -127,9 +133,9 @@ class RefineConfig:
         check_count(self.final_steps, "final_steps", 0)
         for name in ("sigma", "stiffness", "slide", "feature_weight"):
             _check_ends(getattr(self, name), name)
-        for name in ("near_sigma", "fused_sigma", "give"):
+        for name in ("near_sigma", "fused_sigma", "give", "beyond_scale"):
             check_positive(getattr(self, name), name)
-        for name in ("both_ways_above", "boundary_above", "density"):
+        for name in ("both_ways_above", "boundary_above", "beyond", "beyond_margin", "density"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
 
@@ -174,6 +180,8 @@ class ScanAlignConfig:
         curvature_radii: of the features, lengths.
         occluder_depth: a surface this much nearer to the camera beside an edge hides what is behind, length.
         occluder_reach: spacings of samples within which of such an edge matches hold across the surface alone.
+        most_cut: share of its outline at which a target may face the camera, if what the camera did not see is to count
+            as empty: with more, the target lacks data.
         match: the first matches.
         assign: matches one to one from the unmoved source.
         reassign: the same from the first matches.
@@ -191,6 +199,7 @@ class ScanAlignConfig:
     curvature_radii: tuple[float, ...] = (0.02, 0.035, 0.06)
     occluder_depth: float = 0.03
     occluder_reach: float = 2.5
+    most_cut: float = 0.125
     match: MatchConfig = field(default_factory=MatchConfig)
     assign: AssignConfig = field(default_factory=AssignConfig)
     reassign: AssignConfig = field(
@@ -204,6 +213,7 @@ class ScanAlignConfig:
             check_count(getattr(self, name), name, 1)
         _check_values(self.curvature_radii, "curvature_radii")
         check_positive(self.occluder_depth, "occluder_depth")
+        check_positive(self.most_cut, "most_cut")
         check_positive(self.occluder_reach, "occluder_reach", allow_zero=True)
 
 

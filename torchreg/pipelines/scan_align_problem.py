@@ -13,6 +13,7 @@ from torchreg.correspondence.one_to_one import typical_spacing
 from torchreg.correspondence.oriented_samples import OrientedSamples, scaled_together
 from torchreg.correspondence.spin_images import spin_images
 from torchreg.geometry.curvature import curvature_features
+from torchreg.geometry.free_space import FreeSpace
 from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.neighbors import nearest_few
 from torchreg.geometry.node_graph import build_node_graph
@@ -39,6 +40,7 @@ class ScanAlignProblem:
         graph: of the source's first samples, which it moves.
         source: samples of the source, evenly spread in any first few of them.
         target: samples of the target.
+        free: where the camera saw nothing when the target was scanned; None if it is not known where the camera was.
         samples: (S,) source points that are samples of the graph.
         nodes: (J,) source points that are nodes.
         unit: in which coordinates are given.
@@ -47,6 +49,7 @@ class ScanAlignProblem:
     graph: DeformationGraph
     source: OrientedSamples
     target: OrientedSamples
+    free: FreeSpace | None
     samples: Tensor
     nodes: Tensor
     unit: ScanUnit
@@ -86,23 +89,26 @@ def describe(
         OrientedSamples(*pair, feature, scan.boundary[which].cpu())
         for pair, feature, scan, which in zip(places, features, (source, target), (here, there), strict=True)
     )
-    other = replace(other, cut_off=_cut_off(target, unit, other, config))
+    eye = _viewpoint(target, unit, other)
+    free = None if eye is None else FreeSpace.of(other.points, other.normals, eye, config.most_cut)
+    other = replace(other, cut_off=_cut_off(unit.of_points(target.points[target.boundary]), other.points, eye, config))
     samples = here[: config.num_samples].cpu()
     faces = None if source.faces is None else source.faces.cpu()
     ways = sample_graph(unit.of_points(source.points), samples, faces)
     nodes = build_node_graph(ways, 0, config.num_nodes, config.num_nearest)
     graph = DeformationGraph(one.points[: len(samples)], one.normals[: len(samples)], nodes)
-    return ScanAlignProblem(graph, one, other, samples, samples[nodes.nodes], unit)
+    return ScanAlignProblem(graph, one, other, free, samples, samples[nodes.nodes], unit)
 
 
-def _cut_off(scan: RangeScan, unit: ScanUnit, samples: OrientedSamples, config: ScanAlignConfig) -> Tensor:
-    """Return which samples (S,) are near edges of a scan behind which the surface goes on, hidden."""
-    points = samples.points
+def _viewpoint(scan: RangeScan, unit: ScanUnit, samples: OrientedSamples) -> Tensor | None:
+    """Return where the camera (3,) was, if that is known or clear."""
     if scan.viewpoint is None:
-        eye = likely_viewpoint(points, samples.normals)
-    else:
-        eye = unit.of_points(scan.viewpoint.unsqueeze(0))[0]
-    edges = unit.of_points(scan.points[scan.boundary])
+        return likely_viewpoint(samples.points, samples.normals)
+    return unit.of_points(scan.viewpoint.unsqueeze(0))[0]
+
+
+def _cut_off(edges: Tensor, points: Tensor, eye: Tensor | None, config: ScanAlignConfig) -> Tensor:
+    """Return which samples (S,) are near edges (E, 3) of a scan behind which the surface goes on, hidden."""
     if eye is not None:
         edges = edges[occlusion_edges(edges, points, eye, config.occluder_depth)]
     if eye is None or len(edges) == 0:

@@ -11,7 +11,7 @@ from torchreg.correspondence.one_to_one import count_of_spacing, match_one_to_on
 from torchreg.correspondence.oriented_samples import OrientedSamples
 from torchreg.correspondence.scan_em import SoftMatches, match_softly
 from torchreg.geometry.neighbors import nearest_few
-from torchreg.pipelines.graph_fit import GraphFit, GraphMatches, fit_graph
+from torchreg.pipelines.graph_fit import GraphFit, GraphMatches, fit_graph, joined
 from torchreg.pipelines.scan_align_config import (
     AssignConfig,
     ChoiceConfig,
@@ -110,31 +110,58 @@ def refine(
         share = step / max(config.num_steps - 1, 1)
         sigma, stiffness, slide = (between(ends, share) for ends in (widths, config.stiffness, config.slide))
         for _ in range(config.fits_per_step):
-            found = soft_matches(problem, transforms, sigma, config, share)
-            # A sample beside an edge, whose own place may be hidden behind, must not be pulled to what is still seen.
-            free = slide * (1 - found.cut_off) if sigma < config.boundary_above else slide
-            matches = GraphMatches(slice(0, len(found.weights)), found.targets, found.weights, found.normals, free)
+            moved = used_samples(problem, transforms, sigma, config)
+            found = soft_matches(problem, moved, sigma, config, share)
+            matches = joined(
+                _along_surface(found, slide, sigma < config.boundary_above),
+                *_out_of_empty_space(problem, moved, config),
+            )
             fit = fit_graph(problem.graph, transforms, matches, stiffness, give=config.give)
             transforms = fit.transforms
         reporter.report("refine", step, number, sigma, fit, stiffness, float(found.weights.mean()))
     return transforms
 
 
+def used_samples(problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: RefineConfig) -> OrientedSamples:
+    """Return as many moved samples as the sigma asks for."""
+    return problem.moved(transforms, max(round(config.density / sigma**2), config.least_samples))
+
+
 def soft_matches(
-    problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: RefineConfig, share: float = 1.0
+    problem: ScanAlignProblem, moved: OrientedSamples, sigma: float, config: RefineConfig, share: float = 1.0
 ) -> SoftMatches:
-    """Return the matches of an E-step, a share of the way through, on as many samples as the sigma asks for."""
+    """Return the matches of an E-step, a share of the way through, of moved samples."""
     first, last = config.feature_weight
     compatible = replace(config.compatible, feature_weight=first + (last - first) * min(share, 1.0))
     count = max(round(config.density / sigma**2), config.least_samples)
     return match_softly(
-        problem.moved(transforms, count),
+        moved,
         problem.target.first(count),
         sigma,
         compatible,
         both_ways=sigma > config.both_ways_above,
         boundary=sigma >= config.boundary_above,
     )
+
+
+def _along_surface(found: SoftMatches, slide: float, beside_edges: bool) -> GraphMatches:
+    """Return matches of the first samples, that may slide; beside edges that something hides the more."""
+    # A sample beside an edge, whose own place may be hidden behind, must not be pulled to what is still seen.
+    free = slide * (1 - found.cut_off) if beside_edges else slide
+    return GraphMatches(slice(0, len(found.weights)), found.targets, found.weights, found.normals, free)
+
+
+def _out_of_empty_space(
+    problem: ScanAlignProblem, moved: OrientedSamples, config: RefineConfig
+) -> tuple[GraphMatches, ...]:
+    """Return what takes samples back that are where the target's camera saw nothing, along the picture alone."""
+    if problem.free is None or config.beyond == 0:
+        return ()
+    apart, back, trust = problem.free.beyond(moved.points, config.beyond_margin * problem.free.spacing)
+    weights = config.beyond * trust / (1 + (apart / config.beyond_scale).square()).square()
+    which = weights.nonzero()[:, 0]
+    targets = moved.points[which] + apart[which].unsqueeze(1) * back[which]
+    return (GraphMatches(which, targets, weights[which], back[which], 0.0),)
 
 
 def judge(problem: ScanAlignProblem, name: str, transforms: Tensor, config: ChoiceConfig) -> Hypothesis:

@@ -27,6 +27,7 @@ from torchreg.pipelines.scan_align_stages import (
     pull_one_to_one,
     refine,
     soft_matches,
+    used_samples,
 )
 from torchreg.pipelines.scan_fusion import fuse_motions
 from torchreg.pipelines.threads import one_thread
@@ -52,9 +53,10 @@ def align_scans(
     Both scans are described by even samples, their curvature at several sizes and spin images. Hypotheses start from
     rest; from matches of spin images that agree on distances along the surface, fitted stiffly, or softly and then
     pulled by one-to-one matches; and from one-to-one matches alone. Each ends by an EM with an outlier class, while
-    edges of the graph give where its parts disagree, and matches beside what something nearer hides hold across the
-    surface alone. Then each part moves as in the hypothesis that suits it, and the EM ends that as well. The best
-    covers the target, is covered by it, is like it, and bends least. Where the first two agree, the others are left
+    edges of the graph give where its parts disagree, matches beside what something nearer hides hold across the
+    surface alone, and samples where the target's camera saw nothing are taken back into its picture. Then each part
+    moves as in the hypothesis that suits it, and the EM ends that as well. The best covers the target, is covered by
+    it, is like it, and bends least. Where the first two agree, the others are left
     out.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
@@ -158,6 +160,8 @@ def _energy(found: tuple[Hypothesis, Tensor]) -> float:
 
 def _confidence(problem: ScanAlignProblem, transforms: Tensor, config: ScanAlignConfig, points: Tensor) -> Tensor:
     """Return the posterior mass (N,) of matches at points, by that of the nearest samples."""
-    own = soft_matches(problem, transforms, config.refine.sigma[1], config.refine).posterior
+    sigma = config.refine.sigma[1]
+    moved = used_samples(problem, transforms, sigma, config.refine)
+    own = soft_matches(problem, moved, sigma, config.refine).posterior
     index, _ = nearest_few(problem.unit.of_points(points), problem.graph.points[: len(own)], min(3, len(own)))
     return own[index].mean(1)
