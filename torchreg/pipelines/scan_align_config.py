@@ -101,6 +101,7 @@ class RefineConfig:
         boundary_above: sigma from which targets on a boundary may be matched, and matches beside what hides the rest of
             the target hold along the surface too, length.
         beyond: how much it counts, beside a match, that a sample is where the target's camera saw nothing.
+        beyond_below: sigma below which that counts, length: before, a limb on its way may leave the outline.
         beyond_scale: those farther from the outline than this count ever less, length.
         beyond_margin: spacings of the target's samples up to which that is nothing.
         density: samples used per squared sigma.
@@ -121,6 +122,7 @@ class RefineConfig:
     both_ways_above: float = 0.012
     boundary_above: float = 0.02
     beyond: float = 1.0
+    beyond_below: float = 0.012
     beyond_scale: float = 0.05
     beyond_margin: float = 1.5
     density: float = 0.3
@@ -135,7 +137,7 @@ class RefineConfig:
             _check_ends(getattr(self, name), name)
         for name in ("near_sigma", "fused_sigma", "give", "beyond_scale"):
             check_positive(getattr(self, name), name)
-        for name in ("both_ways_above", "boundary_above", "beyond", "beyond_margin", "density"):
+        for name in ("both_ways_above", "boundary_above", "beyond", "beyond_below", "beyond_margin", "density"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
 

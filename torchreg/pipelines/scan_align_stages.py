@@ -114,7 +114,7 @@ def refine(
             found = soft_matches(problem, moved, sigma, config, share)
             matches = joined(
                 _along_surface(found, slide, sigma < config.boundary_above),
-                *_out_of_empty_space(problem, moved, config),
+                *_out_of_empty_space(problem, moved, sigma, config),
             )
             fit = fit_graph(problem.graph, transforms, matches, stiffness, give=config.give)
             transforms = fit.transforms
@@ -152,10 +152,10 @@ def _along_surface(found: SoftMatches, slide: float, beside_edges: bool) -> Grap
 
 
 def _out_of_empty_space(
-    problem: ScanAlignProblem, moved: OrientedSamples, config: RefineConfig
+    problem: ScanAlignProblem, moved: OrientedSamples, sigma: float, config: RefineConfig
 ) -> tuple[GraphMatches, ...]:
     """Return what takes samples back that are where the target's camera saw nothing, along the picture alone."""
-    if problem.free is None or config.beyond == 0:
+    if problem.free is None or config.beyond == 0 or sigma >= config.beyond_below:
         return ()
     apart, back, trust = problem.free.beyond(moved.points, config.beyond_margin * problem.free.spacing)
     weights = config.beyond * trust / (1 + (apart / config.beyond_scale).square()).square()
