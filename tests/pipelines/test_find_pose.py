@@ -379,10 +379,10 @@ def test_a_symmetric_object_is_doubtful():
     shape = ArticulatedShape(tree, ["egg"], [Primitive("ellipsoid", (0.2, 0.12, 0.07), offset(0, 0, 0))], nu=0.01)
     skin = sample_skin(shape.requires_grad_(False), 300, seed=3)
     starts = find_pose(
-        shape, skin(torch.tensor([0.3, 0.0, 0.5, 1.0, 0.4, -0.8])), config=replace(QUICK, num_searched=3)
+        shape, skin(torch.tensor([0.3, 0.0, 0.5, 1.0, 0.4, -0.8])), config=replace(QUICK, num_searched=8)
     )
     assert float(starts.confidence) < 0.3
-    assert starts.poses.shape == (3, 6)
+    assert starts.poses.shape == (4, 6)
     assert float(starts.costs.max() - starts.costs.min()) < 3.0
 
 
