@@ -7,7 +7,7 @@ import torch
 
 from torchreg.models.surface import FusedSurface
 from torchreg.pipelines.align_problem import PRIOR_SHARE, centered_problem, masked_mean, shifted
-from torchreg.pipelines.pose_search import PoseSearch, fit_candidates, repeated, score_candidates
+from torchreg.pipelines.pose_search import PoseSearch, fit_candidates, mean_distances, repeated, score_candidates
 
 TIPS = [4, 8, 12, 16, 20]
 
@@ -121,6 +121,21 @@ def test_few_of_many_are_kept_and_their_limbs_are_placed(plain_hand, search, poo
     before, after = (independent_score(search.problem, poses, 0.022).amin(1) for poses in (pool, narrowed))
     assert bool((after < 0.7 * before).all())
     assert search.narrow(pool[:, :2], 5).shape == (2, 2, 27)
+
+
+def test_different_candidates_come_before_twins(search, exact, pool):
+    """Twins of the best would crowd out every rival."""
+    twins = torch.cat([exact.unsqueeze(1).repeat(1, 3, 1), pool[:, -1:]], dim=1)
+    for found in (search.narrow(twins, 2), search.attract(twins, 1)[:, :2]):
+        apart = (search.problem.skin(found[:, 0]) - search.problem.skin(found[:, 1])).square().sum(-1).mean(-1).sqrt()
+        assert bool((apart > 0.01 * search.problem.size).all())
+
+
+def test_distances_of_candidates_are_those_of_their_points(search, pool):
+    points = search.problem.skin(pool)[..., ::2, :]
+    offset = points.unsqueeze(1) - points.unsqueeze(2)
+    expected = offset.square().sum(-1).mean(-1).sqrt()
+    torch.testing.assert_close(mean_distances(search.problem, pool), expected, rtol=0, atol=1e-4)
 
 
 def test_limbs_that_fit_are_kept_as_they_came(plain_hand, search, exact):

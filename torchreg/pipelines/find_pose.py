@@ -31,7 +31,7 @@ from torchreg.pipelines.align_problem import (
 from torchreg.pipelines.align_stages import fit_surface
 from torchreg.pipelines.limb_search import distinct_first, take_rows
 from torchreg.pipelines.pose_confidence import is_misfit, pose_confidence
-from torchreg.pipelines.pose_search import PoseSearch
+from torchreg.pipelines.pose_search import PoseSearch, mean_distances
 from torchreg.pipelines.threads import one_thread
 from torchreg.results import PoseStarts
 
@@ -319,19 +319,13 @@ def _kernel(points: Tensor, data: Tensor, sigma: float) -> Tensor:
 def _best_distinct(problem: AlignProblem, poses: Tensor, costs: Tensor, count: int) -> Tensor:
     """Return the best ``count`` of poses (B, K, num_dofs) whose points differ; then others of them."""
     poses = take_rows(poses, costs.argsort(1)[:, :_MAX_COMPARED])
-    order = distinct_first(_mean_distances(problem, poses) < _SAME_ROUGH * problem.size)
+    order = distinct_first(mean_distances(problem, poses) < _SAME_ROUGH * problem.size)
     return take_rows(poses, order[:, :count])
-
-
-def _mean_distances(problem: AlignProblem, poses: Tensor) -> Tensor:
-    """Return how far apart model points are, (B, K, K) root mean squares, in poses (B, K, num_dofs)."""
-    points = problem.skin(poses)[..., :: max(1, len(problem.skin) // _RIGID_POINTS), :]
-    return torch.cdist(points.flatten(2), points.flatten(2)) / math.sqrt(points.shape[-2])
 
 
 def _ranked(problem: AlignProblem, poses: Tensor, costs: Tensor, count: int) -> PoseStarts:
     """Return the candidates, best first; those that fell together with a better one come last."""
-    apart = _mean_distances(problem, poses) > _SAME_POSE * problem.size
+    apart = mean_distances(problem, poses) > _SAME_POSE * problem.size
     rival = torch.where(apart[:, 0], costs, torch.inf).amin(1)
     confidence = pose_confidence(problem, poses[:, 0], rival - costs[:, 0])
     order = distinct_first(~apart)[:, :count]

@@ -5,6 +5,7 @@ Every candidate's limbs are placed coarsely and all is fitted to the surface; th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
@@ -17,7 +18,7 @@ from torchreg.models.skin import LinearBlendSkin
 from torchreg.models.surface import FusedSurface
 from torchreg.pipelines.align_problem import PRIOR_SHARE, AlignProblem
 from torchreg.pipelines.align_stages import surface_steps
-from torchreg.pipelines.limb_search import Effort, LimbSearch, take_rows
+from torchreg.pipelines.limb_search import Effort, LimbSearch, distinct_first, take_rows
 
 _COARSE = Effort(
     num_data=150, width=0.05, beam=82, configurations=41, polish=(), score_width=0.05, combinations=2, exchanged=0
@@ -32,6 +33,8 @@ _COARSE_FIT, _COARSE_SCORE, _COARSE_DATA = (0.04, 0.03, 0.025), 0.022, 250
 _FINE_FIT, _FINE_SCORE, _FINE_STEPS = (0.03, 0.022, 0.018), 0.018, 2
 # More data and model points than these tell candidates apart no better.
 _MAX_DATA, _NUM_MODEL = 800, 120
+# Candidates whose points differ by less than this share of the size have fallen together; so many points tell.
+_SAME, _COMPARED_POINTS = 0.005, 60
 # Standard deviation of the data, as a share of the size, for the weight of the prior.
 _NOISE = 0.01
 # A search that explains no more than this many data more has ended.
@@ -69,20 +72,24 @@ class PoseSearch:
     def attract(self, pool: Tensor, steps: int) -> Tensor:
         """Return rough candidates (B, N, num_dofs) after surface fits from a wide kernel to a narrow one, best first.
 
-        Data of one side only would draw an EM into the shape; the surface they do not.
+        Data of one side only would draw an EM into the shape; the surface they do not. Those that fell together with
+        a better one come last.
         """
         fitted = fit_candidates(self.few, pool, _ROUGH_FIT, steps)
-        return take_rows(fitted, score_candidates(self.few, fitted, _COARSE_SCORE).argsort(1))
+        return self._best_first(fitted, score_candidates(self.few, fitted, _COARSE_SCORE))
 
     def narrow(self, pool: Tensor, count: int) -> Tensor:
-        """Return the best ``count`` of candidates (B, N, num_dofs), each with its limbs placed anew or as it came."""
+        """Return the best ``count`` of candidates (B, N, num_dofs), each with its limbs placed anew or as it came.
+
+        Different ones first: where all rivals but one fall together, a symmetric shape would look certain.
+        """
         placed = self._placed(self.few, pool, _COARSE, 0)
         options = torch.cat([placed, pool.unsqueeze(2)], dim=2)
         fitted = fit_candidates(self.few, options.flatten(1, 2), _COARSE_FIT, 1)
         scores = score_candidates(self.few, fitted, _COARSE_SCORE).unflatten(1, options.shape[1:3])
         best, which = scores.min(-1)
-        index = best.topk(min(count, best.shape[1]), largest=False).indices
-        return take_rows(fitted, index * options.shape[2] + which.gather(1, index))
+        first = torch.arange(which.shape[1], device=which.device) * options.shape[2]
+        return self._best_first(take_rows(fitted, first + which), best)[:, :count]
 
     def settle(self, candidates: Tensor, rounds: int) -> tuple[Tensor, Tensor]:
         """Return what a thorough search makes of each candidate, best first, and the scores.
@@ -109,6 +116,10 @@ class PoseSearch:
                 break
         return poses, scores
 
+    def _best_first(self, poses: Tensor, scores: Tensor) -> Tensor:
+        poses = take_rows(poses, scores.argsort(1))
+        return take_rows(poses, distinct_first(mean_distances(self.problem, poses) < _SAME * self.problem.size))
+
     def _searched(self, candidates: Tensor, number: int) -> tuple[Tensor, Tensor]:
         options = torch.cat([self._placed(self.problem, candidates, _FINE, number), candidates.unsqueeze(2)], dim=2)
         fitted = fit_candidates(self.problem, options.flatten(1, 2), _FINE_FIT, _FINE_STEPS)
@@ -128,6 +139,12 @@ def _coarse_skin(skin: LinearBlendSkin) -> LinearBlendSkin:
     """Return a skin of few points that cover the given one's."""
     index = farthest_points(skin.points, min(_NUM_MODEL, len(skin)))
     return LinearBlendSkin(skin.shape, skin.points[index], skin.weights[index], skin.reference_pose)
+
+
+def mean_distances(problem: AlignProblem, poses: Tensor) -> Tensor:
+    """Return how far apart model points are, (B, K, K) root mean squares, in poses (B, K, num_dofs)."""
+    points = problem.skin(poses)[..., :: max(1, len(problem.skin) // _COMPARED_POINTS), :]
+    return torch.cdist(points.flatten(2), points.flatten(2)) / math.sqrt(points.shape[-2])
 
 
 def repeated(problem: AlignProblem, count: int) -> AlignProblem:
