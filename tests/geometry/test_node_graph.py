@@ -29,6 +29,26 @@ def test_weights_fall_with_distance():
     torch.testing.assert_close(dense.sum(1), torch.ones(17, dtype=torch.float64))
 
 
+@pytest.mark.parametrize("apart", [0.0, 50.0])
+@pytest.mark.parametrize("num_nearest", [1, 4, 20])
+def test_nodes_and_weights_follow_from_all_distances(num_nearest, apart):
+    """Distances are looked for near nodes alone; nothing may be missed, with two islands either."""
+    points = torch.randn(150, 3, generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+    points[:60, 0] += apart
+    ways = GeodesicGraph.from_points(points, 6)
+    graph = build_node_graph(ways, 3, 12, num_nearest)
+    every = ways.distances()
+    nodes = [3]
+    while len(nodes) < 12:
+        nodes.append(int(every[nodes].amin(0).argmax()))
+    assert graph.nodes.tolist() == nodes
+    ordered = every[nodes].mT.sort(dim=1, stable=True)
+    few = min(num_nearest, 11)
+    share = (1 - ordered.values[:, :few] / ordered.values[:, few : few + 1]).nan_to_num(0.0).clamp_min(1e-6).square()
+    assert torch.equal(graph.nearest, ordered.indices[:, :few])
+    torch.testing.assert_close(graph.weights, share / share.sum(1, keepdim=True))
+
+
 def test_neighbors_share_samples():
     graph = build_node_graph(line(33), 0, 9, 2)
     places = graph.nodes[graph.edges]

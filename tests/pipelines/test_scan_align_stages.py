@@ -90,6 +90,15 @@ def test_a_near_start_begins_with_a_smaller_sigma(problem, reporter):
     assert [record.width for record in reporter[1]] == pytest.approx([0.02, 0.012, 0.012])
 
 
+def test_refinement_can_be_taken_in_parts(problem, reporter):
+    config, rest = RefineConfig(num_steps=4, final_steps=1), problem.graph.rest()
+    whole = refine(problem, rest, config, reporter[0], 0.02)
+    records = reporter[1].copy()
+    begun = refine(problem, rest, config, reporter[0], 0.02, slice(2))
+    assert torch.equal(refine(problem, begun, config, reporter[0], 0.02, slice(2, None)), whole)
+    assert reporter[1][len(records) :] == records
+
+
 def test_better_hypotheses_are_judged_better(problem, reporter):
     rest = problem.graph.rest()
     moved = refine(problem, rest, RefineConfig(num_steps=3, final_steps=1), reporter[0])

@@ -90,6 +90,17 @@ def test_hypotheses_are_followed_until_two_agree(pair):
     assert {record.stage for record in every.history} == {"match", "assign", "refine"}
 
 
+def test_the_best_alone_is_taken_to_the_end(pair):
+    config = replace(QUICK, refine=replace(QUICK.refine, compared_after=2), choice=replace(QUICK.choice, same=1e-12))
+    result = align_scans(pair.source, pair.target, config)
+    steps = {each.name: [] for each in result.hypotheses}
+    for record in result.history:
+        if record.stage == "refine":
+            steps[record.hypothesis].append(record.step)
+    assert steps.pop(result.chosen.name) == list(range(6))
+    assert all(each == [0, 1] for each in steps.values())
+
+
 def test_the_same_call_gives_the_same_bits(pair, aligned):
     again = align_scans(pair.source, pair.target, QUICK)
     assert torch.equal(again.points, aligned.points)

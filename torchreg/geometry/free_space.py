@@ -70,7 +70,7 @@ class FreeSpace:
             return cls(picture, flat, 0.0, trust)
         index, apart = nearest_few(flat, flat, _MANY)
         spacing = float(apart[:, 1].median())
-        if share_cut(flat, depth, normals @ picture.rotation.mT, index.to(flat.device), spacing) > most_cut:
+        if _share_cut(flat, depth, normals @ picture.rotation.mT, index.to(flat.device), spacing) > most_cut:
             return cls(picture, flat, spacing, trust)
         facing = -(normals @ picture.rotation[2])[index[:, :_FEW]].mean(1)
         return cls(picture, flat, spacing, ((_FACING[0] - facing) / (_FACING[0] - _FACING[1])).clamp(0, 1))
@@ -99,7 +99,7 @@ class FreeSpace:
         return distance, back @ self.picture.rotation[:2], self.trust[index] * (distance > 0)
 
 
-def share_cut(flat: Tensor, depth: Tensor, normals: Tensor, index: Tensor, spacing: float) -> float:
+def _share_cut(flat: Tensor, depth: Tensor, normals: Tensor, index: Tensor, spacing: float) -> float:
     """Return the share of an outline at which the surface does not end by turning away.
 
     Args:

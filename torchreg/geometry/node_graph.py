@@ -16,6 +16,8 @@ from torchreg.geometry.neighbors import nearest_few
 _LEAST_SHARED = 1e-3
 # Shares below this count as this: a sample as far from its nearest node as from the next but four has any.
 _LEAST_SHARE = 1e-6
+# The few nodes nearest to a sample are mostly within so many times the distance of any sample from its nearest one.
+_REACHES = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +60,7 @@ def build_node_graph(graph: GeodesicGraph, start: int, num_nodes: int, num_neare
 
     Differentiable: no.
 
-    Cost: one run of Dijkstra's algorithm per node.
+    Cost: one run of Dijkstra's algorithm per node, over what is nearer to it than nodes are apart.
 
     References: Sumner, Schmid and Pauly 2007, section 3.
     """
@@ -66,16 +68,28 @@ def build_node_graph(graph: GeodesicGraph, start: int, num_nodes: int, num_neare
     check_count(num_nearest, "num_nearest", 1)
     if not 0 <= start < len(graph):
         raise InputError(f"start must be one of {len(graph)} samples, got {start}")
-    num_nodes = min(num_nodes, len(graph))
-    nodes, rows = [start], [graph.distances(torch.tensor([start]))[0]]
-    nearest = rows[0].clone()
-    while len(nodes) < num_nodes:
+    nodes, reach = _spread(graph, start, min(num_nodes, len(graph)))
+    index, weights = _shares(_distances(graph, nodes, reach, num_nearest), num_nearest)
+    edges, edge_weights = _neighbors(index, weights, len(nodes))
+    return NodeGraph(nodes, index, weights, edges, edge_weights)
+
+
+def _spread(graph: GeodesicGraph, start: int, count: int) -> tuple[Tensor, float]:
+    """Return ``count`` samples (J,), each farthest from those before it, and how far any sample is from all of them."""
+    nodes, nearest = [start], graph.distances(torch.tensor([start]))[0]
+    while len(nodes) < count:
         nodes.append(int(nearest.argmax()))
-        rows.append(graph.distances(torch.tensor(nodes[-1:]))[0])
-        nearest = torch.minimum(nearest, rows[-1])
-    index, weights = _shares(torch.stack(rows, dim=1), num_nearest)
-    edges, edge_weights = _neighbors(index, weights, num_nodes)
-    return NodeGraph(torch.tensor(nodes), index, weights, edges, edge_weights)
+        # Farther away than this, another node is nearer.
+        nearest = torch.minimum(nearest, graph.distances(torch.tensor(nodes[-1:]), limit=float(nearest.max()))[0])
+    return torch.tensor(nodes), float(nearest.max())
+
+
+def _distances(graph: GeodesicGraph, nodes: Tensor, reach: float, num_nearest: int) -> Tensor:
+    """Return distances (S, J) of samples from nodes; infinite for some that are not among the nearest of a sample."""
+    near = graph.distances(nodes, limit=_REACHES * reach).mT
+    if int(near.isfinite().sum(1).min()) > min(num_nearest, len(nodes) - 1):
+        return near
+    return graph.distances(nodes).mT
 
 
 def _shares(distance: Tensor, count: int) -> tuple[Tensor, Tensor]:

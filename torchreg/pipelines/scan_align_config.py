@@ -89,6 +89,7 @@ class RefineConfig:
     Args:
         num_steps: while sigma shrinks.
         final_steps: at the last sigma.
+        compared_after: steps after which hypotheses are compared; the rest are for the best alone.
         sigma: first and last, length; the first from a rough start, and
         near_sigma: from one that should be near,
         fused_sigma: from motions that have been refined and put together.
@@ -111,6 +112,7 @@ class RefineConfig:
 
     num_steps: int = 6
     final_steps: int = 1
+    compared_after: int = 5
     sigma: tuple[float, float] = (0.025, 0.006)
     near_sigma: float = 0.02
     fused_sigma: float = 0.012
@@ -130,7 +132,7 @@ class RefineConfig:
     compatible: ScanEMConfig = field(default_factory=ScanEMConfig)
 
     def __post_init__(self) -> None:
-        for name in ("num_steps", "fits_per_step", "least_samples"):
+        for name in ("num_steps", "compared_after", "fits_per_step", "least_samples"):
             check_count(getattr(self, name), name, 1)
         check_count(self.final_steps, "final_steps", 0)
         for name in ("sigma", "stiffness", "slide", "feature_weight"):
@@ -287,7 +289,7 @@ class ScanAlignment:
         nodes: (J,) source points that are nodes.
         weights: (N, J) of the nodes at all points, rows sum to one.
         transforms: (J, 4, 4) motions of the nodes, in the unit and frame of the scans.
-        chosen: the best hypothesis.
+        chosen: the best hypothesis, as it was compared with the others.
         hypotheses: all of them, the best first.
         history: one `ScanAlignRecord` per step.
     """

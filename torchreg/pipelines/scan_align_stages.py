@@ -102,21 +102,29 @@ def refine(
     config: RefineConfig,
     reporter: Reporter,
     first_sigma: float | None = None,
+    steps: slice = slice(None),
 ) -> Tensor:
-    """Return motions refined by EM: sigma shrinks, the graph softens, matches may slide along the surface ever more."""
+    """Return motions refined by EM: sigma shrinks, the graph softens, matches may slide along the surface ever more.
+
+    Args:
+        problem: the scans.
+        transforms: (J, 4, 4) to start from.
+        config: see `RefineConfig`.
+        reporter: takes a record of each step.
+        first_sigma: instead of that of the configuration.
+        steps: which of them to take.
+    """
     number = config.num_steps + config.final_steps
     widths = (config.sigma[0] if first_sigma is None else first_sigma, config.sigma[1])
-    for step in range(number):
+    for step in range(number)[steps]:
         share = step / max(config.num_steps - 1, 1)
         sigma, stiffness, slide = (between(ends, share) for ends in (widths, config.stiffness, config.slide))
         for _ in range(config.fits_per_step):
             moved = used_samples(problem, transforms, sigma, config)
             found = soft_matches(problem, moved, sigma, config, share)
-            matches = joined(
-                _along_surface(found, slide, sigma < config.boundary_above),
-                *_out_of_empty_space(problem, moved, sigma, config),
-            )
-            fit = fit_graph(problem.graph, transforms, matches, stiffness, give=config.give)
+            along = _along_surface(found, slide, sigma < config.boundary_above)
+            back = _out_of_empty_space(problem, moved, sigma, config)
+            fit = fit_graph(problem.graph, transforms, joined(along, *back), stiffness, give=config.give)
             transforms = fit.transforms
         reporter.report("refine", step, number, sigma, fit, stiffness, float(found.weights.mean()))
     return transforms
@@ -124,7 +132,11 @@ def refine(
 
 def used_samples(problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: RefineConfig) -> OrientedSamples:
     """Return as many moved samples as the sigma asks for."""
-    return problem.moved(transforms, max(round(config.density / sigma**2), config.least_samples))
+    return problem.moved(transforms, _num_used(sigma, config))
+
+
+def _num_used(sigma: float, config: RefineConfig) -> int:
+    return max(round(config.density / sigma**2), config.least_samples)
 
 
 def soft_matches(
@@ -133,10 +145,9 @@ def soft_matches(
     """Return the matches of an E-step, a share of the way through, of moved samples."""
     first, last = config.feature_weight
     compatible = replace(config.compatible, feature_weight=first + (last - first) * min(share, 1.0))
-    count = max(round(config.density / sigma**2), config.least_samples)
     return match_softly(
         moved,
-        problem.target.first(count),
+        problem.target.first(_num_used(sigma, config)),
         sigma,
         compatible,
         both_ways=sigma > config.both_ways_above,

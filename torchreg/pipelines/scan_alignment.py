@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -52,12 +53,12 @@ def align_scans(
 
     Both scans are described by even samples, their curvature at several sizes and spin images. Hypotheses start from
     rest; from matches of spin images that agree on distances along the surface, fitted stiffly, or softly and then
-    pulled by one-to-one matches; and from one-to-one matches alone. Each ends by an EM with an outlier class, while
+    pulled by one-to-one matches; and from one-to-one matches alone. Each goes on by an EM with an outlier class, while
     edges of the graph give where its parts disagree, matches beside what something nearer hides hold across the
     surface alone, and samples where the target's camera saw nothing are taken back into its picture. Then each part
-    moves as in the hypothesis that suits it, and the EM ends that as well. The best covers the target, is covered by
-    it, is like it, and bends least. Where the first two agree, the others are left
-    out.
+    moves as in the hypothesis that suits it, and the EM goes on from there as well. The best covers the target, is
+    covered by it, is like it, and bends least; its EM is taken to the end. Where the first two agree, the others are
+    left out.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -88,10 +89,11 @@ def align_scans(
             on_step(record)
 
     problem = describe(source, target, config, generator)
-    found = sorted(_hypotheses(problem, config, report), key=_energy)
+    found = sorted(_candidates(problem, config, report), key=_energy)
     if len(found) >= _LEAST_FUSED:
         found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
-    chosen, transforms = found[0]
+    chosen = found[0].hypothesis
+    transforms = _finished(problem, found[0], config)
     weights = spread_weights(
         problem.unit.of_points(source.points),
         source.normals.detach().cpu().double(),
@@ -109,53 +111,81 @@ def align_scans(
         weights.to(source.points),
         problem.unit.transforms_back(transforms).to(source.points),
         chosen,
-        tuple(hypothesis for hypothesis, _ in found),
+        tuple(candidate.hypothesis for candidate in found),
         tuple(history),
     )
 
 
-def _hypotheses(
-    problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep
-) -> Iterator[tuple[Hypothesis, Tensor]]:
-    """Yield hypotheses and their motions, until two that started apart agree."""
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """Motions (J, 4, 4) on their way.
+
+    Args:
+        hypothesis: how they compare.
+        transforms: the motions.
+        sigma: with which their EM began.
+        reporter: of their steps.
+    """
+
+    hypothesis: Hypothesis
+    transforms: Tensor
+    sigma: float
+    reporter: Reporter
+
+
+def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> Iterator[_Candidate]:
+    """Yield candidates until two that started apart agree."""
     rest = problem.graph.rest()
     far, near = config.refine.sigma[0], config.refine.near_sigma
 
-    def refined(transforms: Tensor, sigma: float, reporter: Reporter) -> tuple[Hypothesis, Tensor]:
-        transforms = refine(problem, transforms, config.refine, reporter, sigma)
-        return judge(problem, reporter.name, transforms, config.choice), transforms
+    def candidate(transforms: Tensor, sigma: float, reporter: Reporter) -> _Candidate:
+        return _compared(problem, transforms, sigma, config, reporter)
 
     def reporter(name: str) -> Reporter:
         return Reporter(name, problem.unit.size, on_step)
 
-    still = refined(rest, near, reporter("rest"))
+    still = candidate(rest, near, reporter("rest"))
     yield still
     matches = first_matches(problem, config.match)
     if len(matches.weights) >= config.match.min_matches:
         stiff = reporter("stiff matches")
-        other = refined(fit_first_matches(problem, matches, config.match.stiffer, config.match, stiff), near, stiff)
+        other = candidate(fit_first_matches(problem, matches, config.match.stiffer, config.match, stiff), near, stiff)
         yield other
-        if agree(problem, still[1], other[1], config.choice):
+        if agree(problem, still.transforms, other.transforms, config.choice):
             return
         soft = reporter("matches")
         fitted = fit_first_matches(problem, matches, config.match.stiffness, config.match, soft)
-        yield refined(pull_one_to_one(problem, fitted, config.reassign, soft), far, soft)
+        yield candidate(pull_one_to_one(problem, fitted, config.reassign, soft), far, soft)
     alone = reporter("one to one")
-    yield refined(pull_one_to_one(problem, rest, config.assign, alone), far, alone)
+    yield candidate(pull_one_to_one(problem, rest, config.assign, alone), far, alone)
 
 
 def _fused(
-    problem: ScanAlignProblem, found: Sequence[tuple[Hypothesis, Tensor]], config: ScanAlignConfig, on_step: OnStep
-) -> tuple[Hypothesis, Tensor]:
-    """Return the hypothesis that takes the best of several, and its motions."""
+    problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig, on_step: OnStep
+) -> _Candidate:
+    """Return the candidate that takes the best of several."""
+    begin = fuse_motions(problem, torch.stack([candidate.transforms for candidate in found]), config.choice)
     reporter = Reporter("fused", problem.unit.size, on_step)
-    begin = fuse_motions(problem, torch.stack([motions for _, motions in found]), config.choice)
-    transforms = refine(problem, begin, config.refine, reporter, config.refine.fused_sigma)
-    return judge(problem, reporter.name, transforms, config.choice), transforms
+    return _compared(problem, begin, config.refine.fused_sigma, config, reporter)
 
 
-def _energy(found: tuple[Hypothesis, Tensor]) -> float:
-    return found[0].energy
+def _compared(
+    problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: ScanAlignConfig, reporter: Reporter
+) -> _Candidate:
+    """Return the candidate after the first steps of its EM."""
+    steps = slice(config.refine.compared_after)
+    transforms = refine(problem, transforms, config.refine, reporter, sigma, steps)
+    return _Candidate(judge(problem, reporter.name, transforms, config.choice), transforms, sigma, reporter)
+
+
+def _finished(problem: ScanAlignProblem, candidate: _Candidate, config: ScanAlignConfig) -> Tensor:
+    """Return the motions (J, 4, 4) after the last steps."""
+    steps = slice(config.refine.compared_after, None)
+    return refine(problem, candidate.transforms, config.refine, candidate.reporter, candidate.sigma, steps)
+
+
+def _energy(candidate: _Candidate) -> float:
+    return candidate.hypothesis.energy
 
 
 def _confidence(problem: ScanAlignProblem, transforms: Tensor, config: ScanAlignConfig, points: Tensor) -> Tensor:
