@@ -9,10 +9,11 @@ Sets are a folder of NPZ files (source_points, source_faces, target_points, targ
 walking figure's adjacent frames, and frames four apart; a toy, one part of which is missing in one scan of every pair.
 For made-up pairs the adjusted Rand index compares parts found with parts that moved apart by more than 0.5 % of the
 diagonal, about the sampling distance, and joints are right within 5 % of the diagonal.
+Turned and made larger, both scans of a pair must end where they did: beside each set, "moved" counts that.
 A sequence of the figure is registered together, and beside it chained: adjacent pairs, one after the other. Its last
 frame is compared with the first pair, whose motion is the least, and with the mean of its adjacent pairs.
 
-    python benchmarks/scan_registration.py --data FOLDER --pairs 189 --ablations --growth --frames 10
+    python benchmarks/scan_registration.py --data FOLDER --pairs 189 --ablations --moved --growth --frames 10
 """
 
 from __future__ import annotations
@@ -32,9 +33,11 @@ import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import ScanPair, ScanSequence, jointed_toy, walking_figure
 from torchreg.geometry.neighbors import nearest_neighbor
+from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.metrics import adjusted_rand
 
 NEAR, REGISTERED, JOINT, APART = 0.025, 0.9, 0.05, 0.005
+SCALE = 100
 STAGES = ("setup", "initialization", "align", "refine")
 
 
@@ -121,6 +124,15 @@ def made_up_problems(kind: str, count: int, num_points: int = 4500, apart: int =
     )
     for number, pair in enumerate(sequence.pairs(apart)):
         yield Problem(f"{kind} {number}", pair.source, pair.target, pair.truth, pair.source.diagonal, pair)
+
+
+def moved(problem: Problem) -> Problem:
+    """Return the problem turned about an oblique axis, shifted, and 100 times as large."""
+    motion = se3_exp(torch.tensor([0.3, -0.7, 1.1, 0.4, 1.3, -2.0], dtype=torch.float64))
+    motion[:3] = SCALE * motion[:3]
+    source, target = (scan.transformed(motion.to(scan.points)) for scan in (problem.source, problem.target))
+    truth = transform_points(motion.to(problem.truth), problem.truth)
+    return Problem(problem.name, source, target, truth, SCALE * problem.diagonal)
 
 
 def score(problem: Problem, recipe: Recipe) -> Score:
@@ -234,6 +246,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--pairs", type=int, default=20, help="made-up pairs per set; 189 as in the paper; 0 for none")
     parser.add_argument("--sets", nargs="+", help="names of the sets to be run, such as toy; all by default")
     parser.add_argument("--ablations", action="store_true", help="leave out one step after the other")
+    parser.add_argument("--moved", action="store_true", help="each set also turned and 100 times as large")
     parser.add_argument("--growth", action="store_true", help="seconds from 2,000 to 100,000 points")
     parser.add_argument(
         "--frames", type=int, default=0, help="length of a sequence to be registered together, 2 or more"
@@ -243,7 +256,9 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.smoke:
         small = [Recipe("default", 6, 20, tr.RegisterConfig(num_samples=500))]
-        print_set("toy", list(made_up_problems("toy", 1, 600)), small, options.verbose)
+        toys = list(made_up_problems("toy", 1, 600))
+        print_set("toy", toys, small, options.verbose)
+        print_set("toy, moved", [moved(toy) for toy in toys], small, options.verbose)
         print_sequence(walking_figure(2, scanner=DepthScanner(num_points=600)), small[0])
         return 0
     sets: dict[str, list[Problem]] = {}
@@ -259,6 +274,8 @@ def main(arguments: list[str] | None = None) -> int:
         if options.sets and title not in options.sets:
             continue
         print_set(title, problems, _ablations() if options.ablations else _ablations()[:1], options.verbose)
+        if options.moved:
+            print_set(f"{title}, moved", [moved(problem) for problem in problems], _ablations()[:1], options.verbose)
     if options.frames:
         print_sequence(walking_figure(options.frames), Recipe("default"))
     if options.growth:

@@ -27,10 +27,21 @@ def test_truth_is_scored_as_such(benchmark, problem):
     benchmark.print_row("", [benchmark.Score(1.0, 1.0, 0.0, math.nan, (), (0.0,) * 4, 1)])
 
 
+def test_moved_problems_are_the_same_a_hundred_times_as_large(benchmark, problem):
+    moved = benchmark.moved(problem)
+    assert moved.diagonal == pytest.approx(100 * problem.diagonal)
+    for before, after in ((problem.source.points, moved.source.points), (problem.truth, moved.truth)):
+        torch.testing.assert_close(torch.pdist(after), 100 * torch.pdist(before), rtol=1e-4, atol=1e-3)
+    between = (problem.truth - problem.source.points).norm(dim=-1)
+    torch.testing.assert_close((moved.truth - moved.source.points).norm(dim=-1), 100 * between, rtol=1e-3, atol=1e-3)
+    assert moved.pair is None
+
+
 def test_tables_are_printed_for_files_and_without(benchmark, problem, capsys, tmp_path, monkeypatch):
     assert benchmark.main(["--smoke", "--verbose"]) == 0
     printed = capsys.readouterr().out
     assert "default" in printed
+    assert "toy, moved" in printed
     assert "last over the first" in printed
     assert "last over the mean pair" in printed
     np.savez(

@@ -166,7 +166,8 @@ def _out_of_empty_space(
     problem: ScanAlignProblem, moved: OrientedSamples, sigma: float, config: RefineConfig
 ) -> tuple[GraphMatches, ...]:
     """Return what takes samples back that are where the target's camera saw nothing, along the picture alone."""
-    if problem.free is None or config.beyond == 0 or sigma >= config.beyond_below:
+    idle = config.beyond == 0 or sigma >= config.beyond_below
+    if idle or problem.free is None or not problem.free.trust.any():
         return ()
     apart, back, trust = problem.free.beyond(moved.points, config.beyond_margin * problem.free.spacing)
     weights = config.beyond * trust / (1 + (apart / config.beyond_scale).square()).square()
