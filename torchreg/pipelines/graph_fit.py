@@ -10,7 +10,6 @@ from torch import Tensor
 from torchreg._checks import check_count, check_positive
 from torchreg.geometry.blend import turn_about
 from torchreg.geometry.rigid import transform_points
-from torchreg.geometry.rotation import skew
 from torchreg.models.deformation_graph import DeformationGraph
 from torchreg.solvers.levenberg_marquardt import Linearization
 
@@ -159,11 +158,11 @@ def _of_matches(graph: DeformationGraph, transforms: Tensor, middles: Tensor, ma
 
 
 def _by_twists(arms: Tensor, weights: Tensor) -> Tensor:
-    """Return derivatives (n, 3, K, 6) of blended places by the nodes' twists: shift by v, turn about the middle by w.
+    """Return derivatives (n, 3, K, 6) of weighted places by nodes' twists: shift by v, turn about the middle by w.
 
     Args:
-        arms: (n, K, 3) from the nodes' middles.
-        weights: (n, K).
+        arms: (n, K, 3) of the places, from the nodes' middles.
+        weights: (n, K) of the places.
     """
     x, y, z = (weights.unsqueeze(-1) * arms).unbind(-1)
     # Filled in: stacking matrices of three by three takes four times as long.
@@ -182,11 +181,10 @@ def _of_edges(graph: DeformationGraph, transforms: Tensor, middles: Tensor, give
     if give is not None:
         weight = weight / (1 + gap.square().sum((1, 2), keepdim=True) / (2 * give**2))
     # Derivatives of the two gaps (E, 6) by the twists of one node and, with the other sign, the other: (E, 6, 12).
-    identity = torch.eye(3).to(both).expand(*both.shape, 3)
     sides = []
     for node, sign in zip(ends.unbind(-1), (1.0, -1.0), strict=True):
         arms = transform_points(transforms[node], both) - middles[node].unsqueeze(1)
-        sides.append(sign * torch.cat((identity, -skew(arms)), dim=-1).flatten(1, 2))
+        sides.append(_by_twists(arms, arms.new_tensor(sign).expand(arms.shape[:-1])).transpose(1, 2).flatten(1, 2))
     blocks = torch.cat(sides, dim=-1)
     weighted = (weight * blocks).mT
     square = (weighted @ blocks).unflatten(2, (2, 6)).unflatten(1, (2, 6)).transpose(2, 3)
