@@ -108,7 +108,9 @@ def test_bones_that_meet_and_move_alike_are_one_part():
     blend = torch.tensor([[1, 0, 0], [0.6, 0.4, 0], [0, 0.6, 0.4], [0, 0, 1]])
     assert bones(0.0, 0.01, 1.0, weights=blend).parts().tolist() == [0, 0, 0, 1]
     assert bones(0.0, 0.5, 1.0, weights=blend).parts().tolist() == [0, 0, 1, 2]
-    assert bones(0.0, 0.5, 1.0, weights=blend).parts(0.2).tolist() == [0, 0, 0, 0]
+    # The second bone joins the first, larger one and moves like it then: too far from the third.
+    assert bones(0.0, 0.5, 1.0, weights=blend).parts(0.2).tolist() == [0, 0, 0, 1]
+    assert bones(0.0, 0.5, 1.0, weights=blend).parts(0.3).tolist() == [0, 0, 0, 0]
     apart = torch.tensor([[1.0, 0, 0], [1, 0, 0], [0, 0, 1], [0, 0, 1]])
     assert bones(0.0, 0.0, 0.0, weights=apart).parts().tolist() == [0, 0, 1, 1]
 

@@ -526,8 +526,9 @@ class ScanRegistration(Result, Generic[Shape]):
     def parts(self, tolerance: float = 0.01) -> Tensor:
         """Return labels (N,) int64 in which bones that meet and moved as one are one part, numbered from 0.
 
-        Bones outnumber parts where a surface stretches, or where two scans do not tell parts apart: two bones moved as
-        one if the motion of either takes the other's points within ``tolerance`` of where they went, in the mean.
+        Bones outnumber parts where a surface stretches, or where two scans do not tell parts apart. The two that moved
+        most alike are joined again and again and move as the larger one then, until the motion of either takes the
+        other's points farther than ``tolerance`` from where they went, in the mean.
 
         Args:
             tolerance: share of the diagonal of the moved points.
@@ -538,14 +539,37 @@ class ScanRegistration(Result, Generic[Shape]):
         # Of every bone's points, how far the motion of every other bone takes them from where they went.
         between = motions.unsqueeze(1) @ torch.linalg.inv(motions).unsqueeze(0)
         places = torch.einsum("abij,nj->abni", between[..., :3, :3], points) + between[..., None, :3, 3]
-        apart = torch.einsum("abn,nb->ab", (places - points).norm(dim=-1), own) / own.sum(0)
+        apart = torch.einsum("abn,nb->ab", (places - points).norm(dim=-1), own)
         weights = self.weights.double()
         meet = weights.mT @ weights > _MEETING * len(points)
-        one = meet & (apart.nan_to_num(torch.inf) <= tolerance * size)
-        reach = (one | one.mT | torch.eye(len(motions), dtype=torch.bool, device=one.device)).double()
-        for _ in range(len(motions)):
-            reach = ((reach @ reach) > 0).double()
-        return reach.argmax(1)[self.labels].unique(return_inverse=True)[1]
+        part = _joined_alike(apart, own.sum(0), meet, tolerance * size)
+        return part[self.labels].unique(return_inverse=True)[1]
+
+
+def _joined_alike(apart: Tensor, counts: Tensor, meet: Tensor, tolerance: float) -> Tensor:
+    """Return the part (B,) of each bone; by the motion of bone a, the points of bone b miss by ``apart[a, b]`` in all.
+
+    Chains of bones, each of which moves much like the next, do not make one part of all: the larger bone's motion
+    counts for both, not the nearest one's.
+    """
+    apart, counts, meet = apart.clone(), counts.clone(), meet.clone().fill_diagonal_(False)
+    part = torch.arange(len(counts), device=counts.device)
+    meet &= (counts > 0) & (counts > 0).unsqueeze(1)
+    while bool(meet.any()):
+        mean = apart / counts.clamp_min(1)
+        gap = torch.minimum(mean, mean.mT).masked_fill(~meet, torch.inf)
+        one, other = divmod(int(gap.argmin()), len(counts))
+        if float(gap[one, other]) > tolerance:
+            break
+        if counts[other] > counts[one]:
+            one, other = other, one
+        apart[:, one] += apart[:, other]
+        counts[one] += counts[other]
+        meet[one] |= meet[other]
+        meet[:, one] |= meet[:, other]
+        meet[other], meet[:, other], meet[one, one] = False, False, False
+        part[part == other] = one
+    return part
 
 
 @dataclass(frozen=True)
