@@ -7,8 +7,8 @@ import torch
 
 from torchreg.errors import InputError
 from torchreg.geometry.joint_moments import JointMoments
-from torchreg.geometry.joints import bone_tree, find_joints
-from torchreg.geometry.rigid import rigid_matrix, se3_exp
+from torchreg.geometry.joints import bone_tree, bridged, find_joints
+from torchreg.geometry.rigid import rigid_matrix, se3_exp, transform_points
 from torchreg.geometry.rotation import so3_exp
 
 
@@ -95,6 +95,68 @@ def test_bones_without_joints_are_roots():
     moments = moments_at([], torch.zeros(0, 3))
     joints = find_joints(moments, torch.eye(4, dtype=torch.float64).repeat(2, 1, 1))
     assert bone_tree(joints, torch.zeros(2, 3), torch.ones(2)).parents == (-1, -1)
+
+
+def rows_of_corners(*spans):
+    """Corners in rows along x, one row per bone from ``(first, last, y)``, and their weights."""
+    corners, owner = [], []
+    for bone, (first, last, y) in enumerate(spans):
+        corners += [[float(x), float(y), 0.0] for x in range(first, last + 1)]
+        owner += [bone] * (last - first + 1)
+    weights = torch.nn.functional.one_hot(torch.tensor(owner)).double()
+    return torch.tensor(corners, dtype=torch.float64), weights
+
+
+REST = torch.eye(4, dtype=torch.float64)
+
+
+def test_a_gap_is_bridged_where_bones_come_nearest():
+    corners, weights = rows_of_corners((0, 4, 0), (5, 9, 0), (12, 15, 0), (12, 15, 8))
+    found = bridged(moments_at([[0, 1]], [[4.5, 0, 0]], [3.0]), corners, weights, REST.repeat(4, 1, 1))
+    assert found.pairs.tolist() == [[0, 1], [1, 2], [2, 3]]
+    assert found.mass.tolist() == [3.0, 0.0, 0.0]
+    torch.testing.assert_close(found.center[1], torch.tensor([10.5, 0, 0], dtype=torch.float64))
+    assert float(found.center[2, 1]) == 4.0
+    assert float(found.spread.abs().max()) == 0.0
+    joints = find_joints(found, REST.repeat(4, 1, 1))
+    assert bone_tree(joints, torch.zeros(4, 3, dtype=torch.float64), [1.0, 4.0, 1.0, 1.0]).parents == (1, -1, 1, 2)
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_a_gap_is_bridged_to_what_moves_alike_though_another_bone_is_nearer(batch):
+    # Two shins side by side; the thigh of the second is hidden, and its hip is on the trunk above.
+    corners, weights = rows_of_corners((0, 9, 0), (0, 9, 2), (0, 9, 5))
+    trunk, near = REST, turned_about([0.0, 0, 0], [0, 0, 1.0])
+    transforms = torch.stack([near, turned_about([0.0, 3.5, 0], [0, 0, -1.0]), trunk]).expand(*batch, 3, 4, 4)
+    moments = moments_at([[0, 2]], [[0.0, 0, 0]])
+    assert bridged(moments, corners, weights, transforms).pairs.tolist() == [[0, 2], [1, 2]]
+    still = REST.repeat(3, 1, 1)
+    assert bridged(moments, corners, weights, still).pairs.tolist() == [[0, 1], [0, 2]]
+
+
+def test_bridges_move_and_grow_with_the_space():
+    corners, weights = rows_of_corners((0, 4, 0), (8, 12, 1), (0, 4, 7))
+    # No two distances alike.
+    corners = corners + 0.3 * torch.rand(corners.shape, generator=torch.Generator().manual_seed(0)).double()
+    transforms = se3_exp(0.1 * torch.randn(3, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64))
+    none = moments_at([], torch.zeros(0, 3))
+    found = bridged(none, corners, weights, transforms)
+    start = se3_exp(torch.tensor([0.3, 2, 1, 1, -0.5, 0.2], dtype=torch.float64))
+    moved = bridged(none, transform_points(start, corners), weights, transforms @ torch.linalg.inv(start))
+    assert torch.equal(moved.pairs, found.pairs)
+    torch.testing.assert_close(moved.center, transform_points(start, found.center))
+    wide = transforms.clone()
+    wide[:, :3, 3] *= 50
+    scaled = bridged(none, 50 * corners, weights, wide)
+    assert torch.equal(scaled.pairs, found.pairs)
+    torch.testing.assert_close(scaled.center, 50 * found.center)
+
+
+def test_one_group_and_bones_without_weight_are_left_alone():
+    corners, weights = rows_of_corners((0, 4, 0), (5, 9, 0))
+    weights = torch.nn.functional.pad(weights, (0, 1))
+    moments = moments_at([[0, 1]], [[4.5, 0, 0]])
+    assert bridged(moments, corners, weights, REST.repeat(3, 1, 1)) is moments
 
 
 def test_bad_input_is_named():

@@ -187,6 +187,20 @@ def test_the_elbow_is_found(angle):
     torch.testing.assert_close(tree.origins[1 - child], model.middles[1 - child])
 
 
+def test_a_hidden_elbow_is_found_across_the_gap():
+    points, turn = bar(4000), so3_exp(torch.tensor([0, 0, 1.0], dtype=torch.float64))
+    grid = SparseGrid.from_points(points[(points[:, 0] - 1.5).abs() > 0.4], 24, frame="world")
+    pivot = torch.tensor([1.5, 0.25, 0.2], dtype=torch.float64)
+    transforms = torch.stack([torch.eye(4, dtype=torch.float64), rigid_matrix(turn, pivot - turn @ pivot)])
+    model = GridLBS.from_labels(grid, (grid.cell_centers()[:, 0] > 1.5).long(), 2, transforms)
+    assert len(model.joint_moments().pairs) == 0
+    joints = model.joints()
+    assert joints.pairs.tolist() == [[0, 1]]
+    assert joints.mass.tolist() == [0.0]
+    torch.testing.assert_close(joints.centers[0, :2], pivot[:2], atol=0.03, rtol=0)
+    assert sorted(model.skeleton().parents) in ([-1, 0], [-1, 1])
+
+
 def test_moments_are_those_of_the_normalized_weights():
     model = random_model()
     with torch.no_grad():

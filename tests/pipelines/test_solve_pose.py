@@ -9,6 +9,7 @@ import torchreg as tr
 from torchreg.errors import InputError
 from torchreg.geometry.blend import turn_about
 from torchreg.geometry.rigid import se3_exp, transform_points
+from torchreg.geometry.sparse_grid import SparseGrid
 from torchreg.models.grid_lbs import GridLBS
 from torchreg.pipelines.solve_pose import PoseConfig, PoseSolver, solve_pose
 from torchreg.results import Status
@@ -48,6 +49,19 @@ def test_poses_that_joints_allow_are_reached(bones, blend):
     assert float(solution.misses.max()) < 0.01
     torch.testing.assert_close(solution.misses, (solution.placed - model(handles, wanted).detach()).norm(dim=-1))
     assert float((model(points, solution.transforms) - model(points, wanted)).detach().norm(dim=-1).max()) < 0.05
+
+
+def test_pieces_that_hidden_joints_cut_off_follow():
+    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    points = points * torch.tensor([3.0, 0.5, 0.4])
+    grid = SparseGrid.from_points(points[(points[:, 0] - 1.5).abs() > 0.3], 24)
+    model = GridLBS.from_labels(grid, (grid.cell_centers()[:, 0] > 1.5).long(), 2)
+    handles = torch.tensor([[0.1, 0.1, 0.1], [0.1, 0.4, 0.3], [0.8, 0.3, 0.0]], dtype=torch.float64)
+    shift = torch.tensor([0.3, 0.2, -0.1], dtype=torch.float64)
+    solution = solve_pose(model, handles, handles + shift)
+    assert float(solution.misses.max()) < 0.03
+    far = torch.tensor([[1.9, 0.25, 0.2]], dtype=torch.float64)
+    torch.testing.assert_close(model(far, solution.transforms).detach(), far + shift, atol=0.1, rtol=0)
 
 
 def test_a_dragged_end_moves_what_it_hangs_on(limb, bones):

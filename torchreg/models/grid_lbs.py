@@ -17,7 +17,7 @@ from torchreg.geometry.blend import (
     turn_about,
 )
 from torchreg.geometry.joint_moments import JointMoments, joint_moments
-from torchreg.geometry.joints import BoneTree, Joints, bone_tree, find_joints
+from torchreg.geometry.joints import BoneTree, Joints, bone_tree, bridged, find_joints
 from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.sparse_grid import SparseGrid, locate
 
@@ -298,7 +298,10 @@ class GridLBS(nn.Module):
     def joints(
         self, transforms: Tensor | None = None, *, min_mass: float = 1e-6, regularization: float = 0.01
     ) -> Joints:
-        """Return where bones that share weight meet, in the space of the points before they are moved.
+        """Return where bones meet, in the space of the points before they are moved.
+
+        Bones that share weight meet; where hidden joints cut the points in pieces, so do bones that come near each
+        other and move alike there, see `bridged`.
 
         Args:
             transforms: (..., B, 4, 4) poses to estimate the joints from, all together; the model's own by default.
@@ -310,8 +313,21 @@ class GridLBS(nn.Module):
 
         Differentiable: in ``transforms`` and ``twists``.
         """
-        moments = self.joint_moments(min_mass=min_mass)
+        moments = self.bridged_moments(transforms, min_mass=min_mass, regularization=regularization)
         return self.joints_of(moments, transforms, regularization=regularization)
+
+    @torch.no_grad()
+    def bridged_moments(
+        self, transforms: Tensor | None = None, *, min_mass: float = 1e-6, regularization: float = 0.01
+    ) -> JointMoments:
+        """Return what bones share, and pairs that hold pieces together which share nothing; arguments as in `joints`.
+
+        Differentiable: no.
+        """
+        transforms = self.transforms if transforms is None else transforms
+        weights = self.corner_weights()
+        moments = joint_moments(self.grid, weights, min_mass=min_mass)
+        return bridged(moments, self.grid.corner_points(), weights, transforms, regularization=regularization)
 
     def joints_of(
         self, moments: JointMoments, transforms: Tensor | None = None, *, regularization: float = 0.01
@@ -323,7 +339,7 @@ class GridLBS(nn.Module):
 
     @torch.no_grad()
     def skeleton(self, transforms: Tensor | None = None, *, min_mass: float = 1e-6) -> BoneTree:
-        """Return the tree of the strongest joints; the heaviest bone of each connected group is its root.
+        """Return the tree of the strongest joints; the heaviest bone is its root, and each without weight alone.
 
         Args:
             transforms: see `joints`.

@@ -131,7 +131,7 @@ class PoseSolver:
         self._bodies = bone_bodies(grid.corner_points().double(), weights.double())
         corners = grid.corner_points()
         self._size = float((corners - corners.mean(0)).square().sum(-1).mean().sqrt())
-        moments = model.joint_moments()
+        moments = model.bridged_moments()
         joints = model.joints_of(moments)
         tree = bone_tree(joints, model.middles, weights.sum(0))
         self._chains = _Chains(tree, self._bodies.middle)
