@@ -81,7 +81,7 @@ class Recipe:
     """How pairs are registered."""
 
     name: str
-    bones: int = 10
+    bones: int = 20
     grid: int = 50
     config: tr.RegisterConfig = field(default_factory=tr.RegisterConfig)
 
@@ -95,7 +95,7 @@ def _ablations() -> list[Recipe]:
         Recipe("without refinement", config=replace(plain, refine_steps=0)),
         Recipe("without descriptors", config=replace(plain, align=replace(plain.align, match=_no_matches(plain)))),
         *(Recipe(f"grid {size}", grid=size) for size in (20, 35, 65, 80)),
-        *(Recipe(f"bones {size}", bones=size) for size in (4, 6, 15, 20)),
+        *(Recipe(f"bones {size}", bones=size) for size in (4, 7, 10, 15)),
     ]
 
 
@@ -143,7 +143,7 @@ def score(problem: Problem, recipe: Recipe) -> Score:
     rand, joints, seen = float("nan"), (), near
     if pair is not None:
         seen = near[~pair.missing]
-        rand = float(adjusted_rand(found.parts(), pair.moving_labels(APART)))
+        rand = float(adjusted_rand(found.parts(APART), pair.moving_labels(APART)))
         joints = joint_errors(found, pair)
     seconds = tuple(found.seconds.tolist())
     return Score(

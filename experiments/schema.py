@@ -158,11 +158,11 @@ class RegistrationTrial:
     seed: int = 0
     pair: ScanPairConfig = field(default_factory=ScanPairConfig)
     method: Literal["reduced", "cpd", "gicp"] = "reduced"
-    num_bones: int = 10
+    num_bones: int = 20
     grid_resolution: int = 50
     joint_weight: float = 0.0
     reuse: bool = True
-    refine_steps: int = 3
+    refine_steps: int = 1
     num_samples: int = 2500
     pictures: bool = False
 

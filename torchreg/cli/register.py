@@ -38,7 +38,7 @@ def register(
             ".safetensors: the result alone, which scans without triangles need.",
         ),
     ] = Path("registered.glb"),
-    bones: Annotated[int, typer.Option(help="Most bones.")] = 10,
+    bones: Annotated[int, typer.Option(help="Most bones.")] = 20,
     grid: Annotated[int, typer.Option(help="Cells of the grid along the longest side.")] = 50,
     depth: Annotated[
         bool, typer.Option("--depth", help="SOURCE and TARGET are depth images (16-bit .png or .tif, .exr, .npy).")

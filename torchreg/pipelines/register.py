@@ -32,7 +32,7 @@ LEAST_CONFIDENCE = 0.1
 def register(
     source: RangeScan,
     target: RangeScan,
-    num_bones: int = 10,
+    num_bones: int = 20,
     grid_resolution: int = 50,
     config: RegisterConfig | None = None,
     generator: torch.Generator | None = None,

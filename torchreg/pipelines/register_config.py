@@ -34,7 +34,7 @@ class RegisterConfig:
         motion_steps: most linear systems of a T-step.
         smoothness: mu of the W-step: of neighboring cells with different labels, in squared cells.
         label_cost: of each label in use: its square is what it must take from the mean squared distance. ``num_bones``
-            is a cap.
+            is a cap. Many small bones miss fewer joints; see `ScanRegistration.parts` for what moved as one.
         truncation: samples are never farther off in the W-step, in cells.
         reuse: give labels that lost all their cells to the regions that fit worst.
         joint_weight: beta, of the joints against the mean squared distance. It holds bones together where matches do
@@ -58,11 +58,11 @@ class RegisterConfig:
     align: ScanAlignConfig = field(default_factory=ScanAlignConfig)
     num_samples: int = 2500
     num_patches: int = 100
-    label_steps: int = 4
-    refine_steps: int = 3
+    label_steps: int = 2
+    refine_steps: int = 1
     motion_steps: int = 5
-    smoothness: float = 0.2
-    label_cost: float = 0.001
+    smoothness: float = 0.05
+    label_cost: float = 0.0003
     truncation: float = 4.0
     reuse: bool = True
     joint_weight: float = 0.0

@@ -34,7 +34,7 @@ from torchreg.results import SequenceRegistration
 @one_thread()
 def register_sequence(
     scans: Sequence[RangeScan],
-    num_bones: int = 10,
+    num_bones: int = 20,
     grid_resolution: int = 50,
     config: RegisterConfig | None = None,
     generator: torch.Generator | None = None,
