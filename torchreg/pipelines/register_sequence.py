@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -29,6 +30,9 @@ from torchreg.pipelines.scan_unit import ScanUnit
 from torchreg.pipelines.threads import one_thread
 from torchreg.results import SequenceRegistration
 
+# From frame to frame few large bones carry the reference: what many small ones take over from noise adds up.
+_CARRIED_LABEL_COST, _CARRIED_SMOOTHNESS = 0.002, 0.2
+
 
 @torch.no_grad()
 @one_thread()
@@ -44,7 +48,7 @@ def register_sequence(
 ) -> SequenceRegistration:
     """Return one set of bones and weights that takes a reference scan onto all scans, and what all of them show.
 
-    Going from the reference outward, the reference as moved for one frame is aligned with the next, and bones are
+    Going from the reference outward, the reference as moved for one frame is aligned with the next, and a few bones are
     fitted to that: every frame is reached by bending the reference itself, not what earlier frames made of it, so that
     errors do not pile up. Then labels, weights and the motions of all frames are solved together.
 
@@ -82,7 +86,12 @@ def register_sequence(
     source = scans[reference]
     index = source_samples(source, config, generator)
     unit = ScanUnit.of(source.points[index])
-    moved, confidence = _chain(scans, reference, num_bones, grid_resolution, config, generator, on_step)
+    few = replace(
+        config,
+        label_cost=max(config.label_cost, _CARRIED_LABEL_COST),
+        smoothness=max(config.smoothness, _CARRIED_SMOOTHNESS),
+    )
+    moved, confidence = _chain(scans, reference, num_bones, grid_resolution, few, generator, on_step)
     scan = unit.of_scan(source)
     data = CellData(SparseGrid.from_points(scan.points, grid_resolution), scan.points[index], config.num_patches)
     places = unit.of_points(moved)[:, index]
