@@ -95,7 +95,7 @@ def _ablations() -> list[Recipe]:
         Recipe("without refinement", config=replace(plain, refine_steps=0)),
         Recipe("without descriptors", config=replace(plain, align=replace(plain.align, match=_no_matches(plain)))),
         *(Recipe(f"grid {size}", grid=size) for size in (20, 35, 65, 80)),
-        *(Recipe(f"bones {size}", bones=size) for size in (4, 7, 10, 15)),
+        *(Recipe(f"bones {size}", bones=size) for size in (4, 6, 10, 15)),
     ]
 
 

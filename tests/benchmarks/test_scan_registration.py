@@ -58,7 +58,7 @@ def test_tables_are_printed_for_files_and_without(benchmark, problem, capsys, tm
     assert benchmark.main(["--data", str(tmp_path), "--pairs", "0", "--ablations"]) == 0
     printed = capsys.readouterr().out
     assert "without label reuse" in printed
-    assert "bones 20" in printed
+    assert "bones 15" in printed
     assert benchmark.main(["--pairs", "0"]) == 0
     assert "skipped: pairs from files" in capsys.readouterr().out
     assert torch.isfinite(problem.truth).all()

@@ -110,8 +110,7 @@ class ReducedFit:
         """Make weights continuous, alternating with motions and correspondences; return whether the fit settled."""
         base, steps = self.model.weights.detach(), self.config.refine_steps
         settings = replace(self.config.refine, point_to_point=self.pull.point_to_point)
-        energy = float("inf")
-        self.solve_motions()
+        energy = self.solve_motions()
         for step in range(steps):
             labeled = GridLBS(self.data.grid, base, self.model.transforms.detach())
             pull = self.pull

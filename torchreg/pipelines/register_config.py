@@ -58,7 +58,7 @@ class RegisterConfig:
     align: ScanAlignConfig = field(default_factory=ScanAlignConfig)
     num_samples: int = 2500
     num_patches: int = 100
-    label_steps: int = 2
+    label_steps: int = 4
     refine_steps: int = 1
     motion_steps: int = 5
     smoothness: float = 0.05
@@ -72,7 +72,7 @@ class RegisterConfig:
     point_to_point: float = 0.1
     unmatched: float = 0.3
     min_matched: float = 0.1
-    rtol: float = 0.01
+    rtol: float = 0.2
     refine: RefineConfig = field(default_factory=_refinement)
     blend: str = "linear"
 

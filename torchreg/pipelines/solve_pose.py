@@ -83,7 +83,8 @@ def solve_pose(
     """Return the pose in which points of the space come to lie at targets, joints hold, and the rest moves little.
 
     ``argmin_T mean_h |D(x_h; T) - y_h|^2 + hold sum_joints |T_i c - T_j c|^2 + ...``, a joint being the point c that
-    the model's own motions move alike.
+    the model's own motions move alike. Pieces of a scan that hidden joints cut apart hold together as well, see
+    `GridLBS.joints`.
 
     Whoever drags handles solves many poses of one model: a `PoseSolver` finds the joints once.
 
