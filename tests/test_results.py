@@ -115,6 +115,41 @@ def test_bones_that_meet_and_move_alike_are_one_part():
     assert bones(0.0, 0.0, 0.0, weights=apart).parts().tolist() == [0, 0, 1, 1]
 
 
+def chain(order, step):
+    """Eight bones in a row of three points each, every one shifted by ``step`` more along y than the one before."""
+    row = torch.arange(8).repeat_interleave(3)
+    blend = (1 - 0.6 * (row.unsqueeze(1) - torch.arange(8)).abs()).clamp(min=0)
+    weights = (blend / blend.sum(1, keepdim=True))[:, order]
+    motions = torch.eye(4).repeat(8, 1, 1)
+    motions[:, 1, 3] = step * torch.as_tensor(order)
+    labels = weights.argmax(1)
+    deformed = torch.stack([torch.arange(24.0), motions[labels, 1, 3], torch.zeros(24)], dim=1)
+    empty = torch.zeros(24)
+    return results.ScanRegistration(
+        torch.nn.Identity(), deformed, None, deformed, labels, motions, weights, empty, empty > 0,
+        Status.CONVERGED, empty,
+    )  # fmt: skip
+
+
+def test_a_chain_that_moves_ever_more_is_not_one_part():
+    order = list(range(8))
+    found, size = chain(order, 0.1), 23.0
+    assert found.parts(0.0).tolist() == found.labels.tolist()
+    few = found.parts(0.15 / size)
+    # Along the row, no bone of a part is farther than the tolerance from its largest one.
+    assert 3 <= len(few.unique()) <= 4
+    assert bool((few.diff() >= 0).all())
+    assert found.parts(0.8 / size).tolist() == [0] * 24
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_parts_do_not_depend_on_the_order_of_the_bones(seed):
+    order = torch.randperm(8, generator=torch.Generator().manual_seed(seed)).tolist()
+    assert len(chain(order, 0.0).parts(1e-6).unique()) == 1
+    assert len(chain(order, 0.1).parts(0.05 / 23).unique()) == 8
+    assert len(chain(order, 0.1).parts(0.8 / 23).unique()) == 1
+
+
 def test_results_print_in_one_line_without_their_numbers():
     text = repr(result())
     assert text.startswith("AlignResult(pose=float32 (27,), registered=float32 (5, 3)")

@@ -1,4 +1,4 @@
-"""Joints of bones that move separately: where two motions agree, and the tree that the strongest joints make."""
+"""Joints of bones that move separately: where two motions agree, also across gaps, and the tree of the strongest."""
 
 from __future__ import annotations
 

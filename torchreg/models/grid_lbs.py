@@ -325,9 +325,8 @@ class GridLBS(nn.Module):
         Differentiable: no.
         """
         transforms = self.transforms if transforms is None else transforms
-        weights = self.corner_weights()
-        moments = joint_moments(self.grid, weights, min_mass=min_mass)
-        return bridged(moments, self.grid.corner_points(), weights, transforms, regularization=regularization)
+        moments, corners = self.joint_moments(min_mass=min_mass), self.grid.corner_points()
+        return bridged(moments, corners, self.corner_weights(), transforms, regularization=regularization)
 
     def joints_of(
         self, moments: JointMoments, transforms: Tensor | None = None, *, regularization: float = 0.01
