@@ -115,6 +115,26 @@ def test_bones_that_meet_and_move_alike_are_one_part():
     assert bones(0.0, 0.0, 0.0, weights=apart).parts().tolist() == [0, 0, 1, 1]
 
 
+def test_parts_of_a_sequence_moved_as_one_in_every_frame():
+    blend = torch.tensor([[1, 0, 0], [0.6, 0.4, 0], [0, 0.6, 0.4], [0, 0, 1]])
+    frames = [bones(0.0, 0.0, 1.0, weights=blend), bones(0.0, 1.0, 1.0, weights=blend)]
+    assert [frame.parts().tolist() for frame in frames] == [[0, 0, 0, 1], [0, 0, 1, 1]]
+
+    def parts(*frames):
+        deformed, transforms = (
+            torch.stack([getattr(each, name) for each in frames]) for name in ("deformed", "transforms")
+        )
+        first = frames[0]
+        nothing = torch.zeros(0, 3)
+        return results.SequenceRegistration(
+            torch.nn.Identity(), first.points, None, deformed, first.labels, transforms, first.weights,
+            nothing, nothing, nothing[:, 0].long(), 0, Status.CONVERGED,
+        ).parts()  # fmt: skip
+
+    assert parts(*frames).tolist() == parts(*frames[::-1]).tolist() == [0, 0, 1, 2]
+    assert parts(frames[1]).tolist() == parts(frames[1], frames[1]).tolist() == frames[1].parts().tolist()
+
+
 def chain(order, step):
     """Eight bones in a row of three points each, every one shifted by ``step`` more along y than the one before."""
     row = torch.arange(8).repeat_interleave(3)

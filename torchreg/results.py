@@ -533,21 +533,27 @@ class ScanRegistration(Result, Generic[Shape]):
         Args:
             tolerance: share of the diagonal of the moved points.
         """
-        points, motions = self.deformed.double(), self.transforms.double()
-        size = float((points.amax(0) - points.amin(0)).norm())
-        own = nn.functional.one_hot(self.labels, len(motions)).double()
-        # Of every bone's points, how far the motion of every other bone takes them from where they went.
-        between = motions.unsqueeze(1) @ torch.linalg.inv(motions).unsqueeze(0)
-        places = torch.einsum("abij,nj->abni", between[..., :3, :3], points) + between[..., None, :3, 3]
-        apart = torch.einsum("abn,nb->ab", (places - points).norm(dim=-1), own)
-        weights = self.weights.double()
-        meet = weights.mT @ weights > _MEETING * len(points)
-        part = _joined_alike(apart, own.sum(0), meet, tolerance * size)
-        return part[self.labels].unique(return_inverse=True)[1]
+        return _parts(self.deformed.unsqueeze(0), self.transforms.unsqueeze(0), self.labels, self.weights, tolerance)
+
+
+def _parts(moved: Tensor, transforms: Tensor, labels: Tensor, weights: Tensor, tolerance: float) -> Tensor:
+    """Return the parts (N,) of points moved to (T, N, 3) by transforms (T, B, 4, 4), alike in all T frames."""
+    points, motions = moved.double(), transforms.double()
+    sizes = (points.amax(1) - points.amin(1)).norm(dim=-1)
+    own = nn.functional.one_hot(labels, motions.shape[1]).double()
+    # Of every bone's points, how far the motion of every other bone takes them from where they went.
+    back = torch.linalg.inv(motions)[:, labels]
+    rest = (back[..., :3, :3] @ points.unsqueeze(-1)).squeeze(-1) + back[..., :3, 3]
+    places = torch.einsum("taij,tnj->tani", motions[..., :3, :3], rest) + motions[..., None, :3, 3]
+    apart = (places - points.unsqueeze(1)).norm(dim=-1) @ own / sizes[:, None, None]
+    blends = weights.double()
+    meet = blends.mT @ blends > _MEETING * len(labels)
+    part = _joined_alike(apart, own.sum(0), meet, tolerance)
+    return part[labels].unique(return_inverse=True)[1]
 
 
 def _joined_alike(apart: Tensor, counts: Tensor, meet: Tensor, tolerance: float) -> Tensor:
-    """Return the part (B,) of each bone; by the motion of bone a, the points of bone b miss by ``apart[a, b]`` in all.
+    """Return the part (B,) of each bone; by bone a's motion, bone b's points miss by ``apart[t, a, b]`` in all.
 
     Chains of bones, each of which moves much like the next, do not make one part of all: the larger bone's motion
     counts for both, not the nearest one's.
@@ -557,13 +563,13 @@ def _joined_alike(apart: Tensor, counts: Tensor, meet: Tensor, tolerance: float)
     meet &= (counts > 0) & (counts > 0).unsqueeze(1)
     while bool(meet.any()):
         mean = apart / counts.clamp_min(1)
-        gap = torch.minimum(mean, mean.mT).masked_fill(~meet, torch.inf)
+        gap = torch.minimum(mean, mean.mT).amax(0).masked_fill(~meet, torch.inf)
         one, other = divmod(int(gap.argmin()), len(counts))
         if float(gap[one, other]) > tolerance:
             break
         if counts[other] > counts[one]:
             one, other = other, one
-        apart[:, one] += apart[:, other]
+        apart[..., one] += apart[..., other]
         counts[one] += counts[other]
         meet[one] |= meet[other]
         meet[:, one] |= meet[:, other]
@@ -605,3 +611,11 @@ class SequenceRegistration(Result, Generic[Shape]):
     reference: int
     status: Status
     history: tuple[RegisterRecord, ...] = ()
+
+    def parts(self, tolerance: float = 0.01) -> Tensor:
+        """Return labels (N,) int64 of parts, as `ScanRegistration.parts` does: bones that moved as one in every frame.
+
+        Args:
+            tolerance: share of the diagonal of the moved points.
+        """
+        return _parts(self.deformed, self.transforms, self.labels, self.weights, tolerance)

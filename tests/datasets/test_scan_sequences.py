@@ -98,6 +98,18 @@ def test_parts_that_move_alike_get_one_moving_label(toy):
         pair.moving_labels(-1.0)
 
 
+def test_parts_of_a_sequence_are_those_that_no_pair_tells_apart(walk):
+    some = ScanSequence(walk.figure, walk.transforms[40:44], walk.scanner, dtype=torch.float64)
+    together = some.moving_labels(1, 0.01)
+    pairs = torch.stack([some.pair(1, frame).moving_labels(0.01) for frame in range(4)])
+    # Parts hang on each other as a tree: two are one part exactly where every pair says so.
+    expected = pairs.unique(dim=1, return_inverse=True)[1]
+    assert adjusted_rand(together, expected) == pytest.approx(1.0)
+    assert len(together.unique()) > len(some.pair(1, 2).moving_labels(0.01).unique())
+    with pytest.raises(InputError, match="tolerance"):
+        some.moving_labels(1, -1.0)
+
+
 def test_every_way_to_ask_gives_the_same(toy):
     pairs = list(toy.pairs(2))
     assert len(pairs) == 6

@@ -1,6 +1,7 @@
 """Many scans together: every frame reached, one set of weights, all points in one pose, bad input."""
 
 import math
+import sys
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.pipelines.register_config import RegisterConfig
 from torchreg.pipelines.register_sequence import register_sequence
 from torchreg.pipelines.scan_align_config import ScanAlignConfig
+from torchreg.pipelines.scan_alignment import align_scans
 
 QUICK = RegisterConfig(align=ScanAlignConfig(num_samples=300, num_target_samples=400), num_samples=500)
 
@@ -56,6 +58,26 @@ def test_results_are_the_same_on_disk(found, tmp_path):
     for name in ("deformed", "transforms", "weights", "fused", "fused_frames"):
         assert torch.equal(getattr(back, name), getattr(found, name))
     assert back.history == found.history
+
+
+def test_points_are_expected_to_go_on_as_they_went(toy, monkeypatch):
+    calls = []
+
+    def watched(source, target, config, **options):
+        aligned = align_scans(source, target, config, **options)
+        calls.append((source.points, options["expected"]))
+        return aligned
+
+    # The package has a function of the module's name.
+    monkeypatch.setattr(sys.modules[register_sequence.__module__], "align_scans", watched)
+    register_sequence([toy[frame] for frame in (0, 1, 2, 1)], 8, 30, QUICK, reference=1)
+    (first, nothing), (second, ahead), (third, back) = calls
+    assert nothing is None
+    assert torch.equal(first, toy[1].points)
+    torch.testing.assert_close(ahead, second + (second - first))
+    # Towards earlier frames, against the way that later ones were reached.
+    assert torch.equal(third, first)
+    torch.testing.assert_close(back, first - (second - first))
 
 
 def test_bad_arguments_are_refused_by_name(toy):

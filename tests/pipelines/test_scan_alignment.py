@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 
 import pytest
@@ -5,6 +6,7 @@ import torch
 
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy, walking_animal, walking_figure
+from torchreg.errors import InputError
 from torchreg.geometry.blend import blend_linear
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import se3_exp, transform_points
@@ -59,6 +61,8 @@ def test_the_result_is_what_its_parts_say(pair, aligned):
     assert aligned.chosen.energy == pytest.approx(
         aligned.chosen.forward + aligned.chosen.backward + aligned.chosen.unlike + aligned.chosen.bend
     )
+    ahead = align_scans(pair.source, pair.target, QUICK, expected=aligned.points).chosen
+    assert ahead.energy == pytest.approx(ahead.forward + ahead.backward + ahead.unlike + ahead.bend + ahead.leap)
 
 
 def test_confidence_tells_the_seen_from_the_hidden(pair, aligned):
@@ -99,6 +103,44 @@ def test_the_best_alone_is_taken_to_the_end(pair):
             steps[record.hypothesis].append(record.step)
     assert steps.pop(result.chosen.name) == list(range(6))
     assert all(each == [0, 1] for each in steps.values())
+
+
+def tube(seed):
+    """Return a scan of a tube, whose turns about its axis nobody can see, as sampled by a seed."""
+    generator = torch.Generator().manual_seed(seed)
+    angle, height = torch.rand(2, 900, generator=generator) * torch.tensor([[2 * math.pi], [2.0]])
+    normals = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), dim=1)
+    return RangeScan(0.5 * normals + height.unsqueeze(1) * torch.tensor([0.0, 0, 1]), normals=normals)
+
+
+def test_where_scans_do_not_tell_what_is_expected_does():
+    source, target = tube(0), tube(1)
+    turn = se3_exp(torch.tensor([0.0, 0, 0, 0, 0, 0.4]))
+    expected = transform_points(turn, source.points)
+    known = align_scans(source, target, QUICK, expected=expected)
+    plain = align_scans(source, target, QUICK)
+    near = 0.02 * source.diagonal
+    assert float((known.points - expected).norm(dim=-1).mean()) < near
+    assert float((plain.points - expected).norm(dim=-1).mean()) > 2 * near
+    leaps = {each.name: each.leap for each in known.hypotheses}
+    assert leaps["expected"] < 0.1 * leaps["rest"]
+    assert {each.leap for each in plain.hypotheses} == {0.0}
+    unmoved = align_scans(source, target, replace(QUICK, choice=replace(QUICK.choice, leap=0.0)), expected=expected)
+    assert {each.leap for each in unmoved.hypotheses} == {0.0}
+
+
+def test_expectations_that_are_wrong_do_not_harm(pair):
+    generator = torch.Generator().manual_seed(0)
+    astray = pair.source.points + 0.1 * pair.source.diagonal * torch.randn(3, generator=generator)
+    assert share_near(pair, align_scans(pair.source, pair.target, QUICK, expected=astray).points) > 0.9
+
+
+def test_expectations_of_another_scan_are_refused(pair):
+    points = pair.source.points
+    with pytest.raises(InputError, match=r"expected must have shape"):
+        align_scans(pair.source, pair.target, QUICK, expected=points[1:])
+    with pytest.raises(InputError, match="expected must be finite"):
+        align_scans(pair.source, pair.target, QUICK, expected=points.log())
 
 
 def test_the_same_call_gives_the_same_bits(pair, aligned):

@@ -74,17 +74,25 @@ class ScanPair:
         Args:
             tolerance: share of the source's diagonal.
         """
-        check_positive(tolerance, "tolerance", allow_zero=True)
-        points, group = self.source.points, list(range(len(self.part_names)))
-        for parent, child in self.joint_parts.tolist():
-            offset = self.transforms[parent] - self.transforms[child]
-            gaps = []
-            for part in (parent, child):
-                own = points[self.labels == part]
-                gaps.append(float(transform_points(offset, own).norm(dim=-1).mean()) if len(own) else math.inf)
-            if min(gaps) <= tolerance * self.source.diagonal:
-                group = [group[parent] if number == group[child] else number for number in group]
-        return torch.tensor(group, device=self.labels.device)[self.labels]
+        return _moving_labels(self.source, self.labels, self.joint_parts, self.transforms.unsqueeze(0), tolerance)
+
+
+def _moving_labels(
+    scan: RangeScan, labels: Tensor, joint_parts: Tensor, transforms: Tensor, tolerance: float
+) -> Tensor:
+    """Return labels (N,) in which parts that move as one in all of the motions (T, P, 4, 4) are one."""
+    check_positive(tolerance, "tolerance", allow_zero=True)
+    group = list(range(transforms.shape[1]))
+    for parent, child in joint_parts.tolist():
+        offset = transforms[:, parent] - transforms[:, child]
+        gaps = torch.full((2, len(transforms)), torch.inf)
+        for side, part in enumerate((parent, child)):
+            own = scan.points[labels == part]
+            if len(own):
+                gaps[side] = transform_points(offset, own).norm(dim=-1).mean(-1)
+        if float(gaps.amin(0).max()) <= tolerance * scan.diagonal:
+            group = [group[parent] if number == group[child] else number for number in group]
+    return torch.tensor(group, device=labels.device)[labels]
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +173,23 @@ class ScanSequence(Sequence[RangeScan]):
         """Return the true part (N,) of each scanned point of a frame."""
         return self._labels(self.scanned(frame))
 
+    def moving_labels(self, frame: int, tolerance: float = 0.01) -> Tensor:
+        """Return labels (N,) of a frame's points in which parts that moved as one, there and in all others, are one.
+
+        Args:
+            frame: from which motions are counted.
+            tolerance: see `ScanPair.moving_labels`.
+        """
+        found = self.scanned(frame)
+        motions = (self.transforms @ invert_rigid(self.transforms[frame])).to(self.dtype)
+        return _moving_labels(found.scan, self._labels(found), self.joint_parts, motions, tolerance)
+
+    @property
+    def joint_parts(self) -> Tensor:
+        """(P - 1, 2) parts that meet at the joints, the parent first."""
+        children = torch.arange(1, self.figure.num_parts)
+        return torch.stack((torch.tensor(self.figure.parents[1:], dtype=torch.int64), children), dim=-1)
+
     def joints(self, frame: int) -> Tensor:
         """Return where the joints (P - 1, 3) are in a frame, in the order of the parts that hang on them."""
         return self.figure.joint_positions(self.transforms[frame]).to(self.dtype)
@@ -176,7 +201,6 @@ class ScanSequence(Sequence[RangeScan]):
         left = self._present(target)
         visible = visible_points(TriangleMesh(mesh.vertices, mesh.faces[left]), truth, torch.zeros(3))
         missing = ~left[here.face]
-        numbers = torch.arange(1, figure.num_parts)
         return ScanPair(
             here.scan,
             there.scan,
@@ -185,7 +209,7 @@ class ScanSequence(Sequence[RangeScan]):
             self._labels(there),
             self.joints(source),
             self.joints(target),
-            torch.stack((torch.tensor(figure.parents[1:], dtype=torch.int64), numbers), dim=-1),
+            self.joint_parts,
             motion.to(self.dtype),
             figure.part_names,
             visible & ~missing,

@@ -114,13 +114,14 @@ def _chain(
 ) -> tuple[Tensor, Tensor]:
     """Return where the reference's points are in every frame, (T, N, 3), and how far that can be trusted, (T, N)."""
     source, ones = scans[reference], torch.ones(len(scans[reference]))
-    places, trust = [source.points] * len(scans), [ones] * len(scans)
-    for steps in (range(reference + 1, len(scans)), range(reference - 1, -1, -1)):
+    places, trust = {reference: source.points}, {reference: ones}
+    for step, end in ((1, len(scans)), (-1, -1)):
         current = source
-        for frame in steps:
+        for frame in range(reference + step, end, step):
             aligned = align_scans(
-                current, scans[frame], config.align, generator=generator, on_step=initial_records(on_step)
-            )
+                current, scans[frame], config.align,
+                generator=generator, on_step=initial_records(on_step), expected=_expected(places, frame, step),
+            )  # fmt: skip
             found = register(
                 source, scans[frame], num_bones, grid_resolution, config, generator,
                 start=aligned.points, confidence=aligned.confidence,
@@ -128,7 +129,14 @@ def _chain(
             places[frame], trust[frame] = found.deformed, aligned.confidence
             normals = turned_normals(source.normals, found.weights, found.transforms)
             current = RangeScan(found.deformed, source.faces, normals)
-    return torch.stack(places), torch.stack([row.cpu() for row in trust])
+    frames = range(len(scans))
+    return torch.stack([places[frame] for frame in frames]), torch.stack([trust[frame].cpu() for frame in frames])
+
+
+def _expected(places: dict[int, Tensor], frame: int, step: int) -> Tensor | None:
+    """Return where points (N, 3) are in a frame if they go on as in the step before, if that is known."""
+    last, before = places[frame - step], places.get(frame - 2 * step)
+    return None if before is None else 2 * last - before
 
 
 def _result(

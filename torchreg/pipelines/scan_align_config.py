@@ -153,6 +153,8 @@ class ChoiceConfig:
         unlike: what it costs that features differ by one, squared, where the moved source lies on the target.
         bend: what it costs that neighboring nodes disagree by one size in the mean,
         slack: of which less than this hardly counts, length.
+        leap: what it costs that samples are far from where they were expected, if that is known, squared,
+        leap_cap: up to this distance, length.
         same: hypotheses agree where their samples are this near each other, length,
         same_share: for at least this share of the samples.
     """
@@ -162,13 +164,15 @@ class ChoiceConfig:
     unlike: float = 2.0
     bend: float = 20.0
     slack: float = 1e-3
+    leap: float = 1.0
+    leap_cap: float = 0.1
     same: float = 0.005
     same_share: float = 0.95
 
     def __post_init__(self) -> None:
-        for name in ("cap", "same", "same_share"):
+        for name in ("cap", "leap_cap", "same", "same_share"):
             check_positive(getattr(self, name), name)
-        for name in ("normal_scale", "unlike", "bend", "slack"):
+        for name in ("normal_scale", "unlike", "bend", "slack", "leap"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
 
@@ -262,11 +266,13 @@ class Hypothesis:
 
     Args:
         name: what it started from.
-        energy: ``forward + backward + unlike + bend``, by which hypotheses are compared; lower is better.
+        energy: ``forward + backward + unlike + bend + leap``, by which hypotheses are compared; lower is better.
         forward: mean squared distance of moved samples to the target, capped at one.
         backward: mean squared distance of target samples to the moved source, capped at one.
         unlike: weighted mean squared difference of features of moved samples and the target.
         bend: weighted disagreement of neighboring nodes.
+        leap: weighted mean squared distance of samples from where they were expected, capped at one; 0 if that is not
+            known.
     """
 
     name: str
@@ -275,6 +281,7 @@ class Hypothesis:
     backward: float
     unlike: float
     bend: float
+    leap: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

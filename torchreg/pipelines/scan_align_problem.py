@@ -44,6 +44,7 @@ class ScanAlignProblem:
         samples: (S,) source points that are samples of the graph.
         nodes: (J,) source points that are nodes.
         unit: in which coordinates are given.
+        expected: (S, 3) where the samples of the graph are expected; None if that is not known.
     """
 
     graph: DeformationGraph
@@ -53,6 +54,7 @@ class ScanAlignProblem:
     samples: Tensor
     nodes: Tensor
     unit: ScanUnit
+    expected: Tensor | None = None
 
     def moved(self, transforms: Tensor, count: int | None = None) -> OrientedSamples:
         """Return the first ``count`` samples of the graph where its nodes take them."""
@@ -61,7 +63,11 @@ class ScanAlignProblem:
 
 
 def describe(
-    source: RangeScan, target: RangeScan, config: ScanAlignConfig, generator: torch.Generator | None = None
+    source: RangeScan,
+    target: RangeScan,
+    config: ScanAlignConfig,
+    generator: torch.Generator | None = None,
+    expected: Tensor | None = None,
 ) -> ScanAlignProblem:
     """Return the problem of aligning two scans.
 
@@ -70,6 +76,7 @@ def describe(
         target: the scan to be reached.
         config: see `ScanAlignConfig`.
         generator: source of the samples' randomness.
+        expected: (N, 3) where the source's points are expected.
 
     Cost: 0.3 s for scans of 8,000 points.
     """
@@ -97,7 +104,8 @@ def describe(
     ways = sample_graph(unit.of_points(source.points), samples, faces)
     nodes = build_node_graph(ways, 0, config.num_nodes, config.num_nearest)
     graph = DeformationGraph(one.points[: len(samples)], one.normals[: len(samples)], nodes)
-    return ScanAlignProblem(graph, one, other, free, samples, samples[nodes.nodes], unit)
+    ahead = None if expected is None else unit.of_points(expected)[samples]
+    return ScanAlignProblem(graph, one, other, free, samples, samples[nodes.nodes], unit, ahead)
 
 
 def _viewpoint(scan: RangeScan, unit: ScanUnit, samples: OrientedSamples) -> Tensor | None:

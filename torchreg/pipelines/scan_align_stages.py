@@ -183,7 +183,16 @@ def judge(problem: ScanAlignProblem, name: str, transforms: Tensor, config: Choi
     apart = nearest_few(embedded(problem.target, config), embedded(moved, config), 1)[1]
     backward = float((apart / config.cap).clamp(max=1).square().mean())
     bend = config.bend * float(problem.graph.bend(transforms, config.slack))
-    return Hypothesis(name, forward + backward + unlike + bend, forward, backward, unlike, bend)
+    leap = float(leaps(problem, moved.points, config).mean())
+    return Hypothesis(name, forward + backward + unlike + bend + leap, forward, backward, unlike, bend, leap)
+
+
+def leaps(problem: ScanAlignProblem, places: Tensor, config: ChoiceConfig) -> Tensor:
+    """Return what it costs samples (S,) to be elsewhere than expected."""
+    if problem.expected is None:
+        return torch.zeros_like(places[:, 0])
+    apart = (places - problem.expected).norm(dim=-1) / config.leap_cap
+    return config.leap * apart.clamp(max=1).square()
 
 
 def mismatch(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> tuple[Tensor, Tensor]:

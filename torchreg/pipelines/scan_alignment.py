@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg.geometry.blend import blend_linear
 from torchreg.geometry.neighbors import nearest_few
 from torchreg.geometry.node_graph import spread_weights
 from torchreg.geometry.range_scan import RangeScan
+from torchreg.pipelines.graph_fit import GraphMatches, fit_graph
 from torchreg.pipelines.scan_align_config import (
     Hypothesis,
     OnStep,
@@ -35,8 +38,10 @@ from torchreg.pipelines.threads import one_thread
 
 # What opposite normals count as when points take over the motion of the samples around them, length.
 _NORMAL_SCALE = 0.03
-# Two hypotheses that agree need no fusion.
+# Fewer hypotheses are not fused.
 _LEAST_FUSED = 3
+# How a graph is taken to where points are expected: that may be wrong in parts, and limbs turn far.
+_EXPECTED_STIFFNESS, _EXPECTED_FITS = 0.02, 4
 
 
 @torch.no_grad()
@@ -48,17 +53,18 @@ def align_scans(
     *,
     generator: torch.Generator | None = None,
     on_step: OnStep | None = None,
+    expected: Tensor | None = None,
 ) -> ScanAlignment:
     """Return the source moved onto the target: a deformation graph of many small nodes, without bones yet.
 
     Both scans are described by even samples, their curvature at several sizes and spin images. Hypotheses start from
-    rest; from matches of spin images that agree on distances along the surface, fitted stiffly, or softly and then
-    pulled by one-to-one matches; and from one-to-one matches alone. Each goes on by an EM with an outlier class, while
-    edges of the graph give where its parts disagree, matches beside what something nearer hides hold across the
-    surface alone, and samples where the target's camera saw nothing are taken back into its picture. Then each part
-    moves as in the hypothesis that suits it, and the EM goes on from there as well. The best covers the target, is
-    covered by it, is like it, and bends least; its EM is taken to the end. Where the first two agree, the others are
-    left out.
+    rest; from where points are expected, if that is known; from matches of spin images that agree on distances along
+    the surface, fitted stiffly, or softly and then pulled by one-to-one matches; and from one-to-one matches alone.
+    Each goes on by an EM with an outlier class, while edges of the graph give where its parts disagree, matches beside
+    what something nearer hides hold across the surface alone, and samples where the target's camera saw nothing are
+    taken back into its picture. Then each part moves as in the hypothesis that suits it, and the EM goes on from there
+    as well. The best covers the target, is covered by it, is like it, bends least, and is nearest to what is expected;
+    its EM is taken to the end. Where rest and stiff matches agree, the softer ones are left out.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -69,9 +75,13 @@ def align_scans(
         config: see `ScanAlignConfig`.
         generator: source of randomness; None draws the same numbers at every call.
         on_step: called with a `ScanAlignRecord` after each step.
+        expected: (N, 3) where the source's points are expected, such as by their velocity.
 
     Returns:
         a `ScanAlignment`.
+
+    Raises:
+        InputError: if ``expected`` is not finite or its shape does not fit.
 
     Differentiable: no.
 
@@ -88,9 +98,9 @@ def align_scans(
         if on_step is not None:
             on_step(record)
 
-    problem = describe(source, target, config, generator)
+    problem = describe(source, target, config, generator, None if expected is None else _checked(expected, source))
     found = sorted(_candidates(problem, config, report), key=_energy)
-    if len(found) >= _LEAST_FUSED:
+    if len(found) >= _LEAST_FUSED and not _all_agree(problem, found, config):
         found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
     chosen = found[0].hypothesis
     transforms = _finished(problem, found[0], config)
@@ -146,6 +156,9 @@ def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnS
 
     still = candidate(rest, near, reporter("rest"))
     yield still
+    if problem.expected is not None:
+        ahead = reporter("expected")
+        yield candidate(_fitted_to_expected(problem, problem.expected), near, ahead)
     matches = first_matches(problem, config.match)
     if len(matches.weights) >= config.match.min_matches:
         stiff = reporter("stiff matches")
@@ -158,6 +171,19 @@ def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnS
         yield candidate(pull_one_to_one(problem, fitted, config.reassign, soft), far, soft)
     alone = reporter("one to one")
     yield candidate(pull_one_to_one(problem, rest, config.assign, alone), far, alone)
+
+
+def _fitted_to_expected(problem: ScanAlignProblem, expected: Tensor) -> Tensor:
+    """Return the motions (J, 4, 4) that take samples nearly to where they are expected."""
+    everywhere = GraphMatches(slice(0, len(expected)), expected, torch.ones_like(expected[:, 0]))
+    return fit_graph(problem.graph, problem.graph.rest(), everywhere, _EXPECTED_STIFFNESS, _EXPECTED_FITS).transforms
+
+
+def _checked(expected: Any, source: RangeScan) -> Tensor:
+    expected = as_float_tensor(expected, "expected")
+    check_shape(expected, "expected", tuple(source.points.shape))
+    check_finite(expected, "expected")
+    return expected.detach()
 
 
 def _fused(
@@ -182,6 +208,11 @@ def _finished(problem: ScanAlignProblem, candidate: _Candidate, config: ScanAlig
     """Return the motions (J, 4, 4) after the last steps."""
     steps = slice(config.refine.compared_after, None)
     return refine(problem, candidate.transforms, config.refine, candidate.reporter, candidate.sigma, steps)
+
+
+def _all_agree(problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig) -> bool:
+    best = found[0].transforms
+    return all(agree(problem, best, other.transforms, config.choice) for other in found[1:])
 
 
 def _energy(candidate: _Candidate) -> float:

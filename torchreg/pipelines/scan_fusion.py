@@ -12,7 +12,7 @@ from torchreg.geometry.rigid import transform_points
 from torchreg.models.deformation_graph import DeformationGraph
 from torchreg.pipelines.scan_align_config import ChoiceConfig
 from torchreg.pipelines.scan_align_problem import ScanAlignProblem
-from torchreg.pipelines.scan_align_stages import embedded, mismatch
+from torchreg.pipelines.scan_align_stages import embedded, leaps, mismatch
 
 # Target samples looked at, and for each of them moved samples that may cover it.
 _NUM_TARGETS, _NUM_COVERS = 400, 2
@@ -91,7 +91,7 @@ class _Energy:
         for option in options:
             moved = problem.moved(option)
             forward, unlike = mismatch(problem, moved, config)
-            costs.append(forward + unlike)
+            costs.append(forward + unlike + leaps(problem, moved.points, config))
             index, apart = nearest_few(there, embedded(moved, config), min(_NUM_COVERS, len(owner)))
             covers.append((apart / config.cap).clamp(max=1).square())
             by.append(owner[index])
