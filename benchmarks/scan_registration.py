@@ -10,8 +10,9 @@ walking figure's adjacent frames, and frames four apart; a toy, one part of whic
 For made-up pairs the adjusted Rand index compares parts found with parts that moved apart by more than 0.5 % of the
 diagonal, about the sampling distance, and joints are right within 5 % of the diagonal.
 Turned and made larger, both scans of a pair must end where they did: beside each set, "moved" counts that.
-A sequence of the figure is registered together, and beside it chained: adjacent pairs, one after the other. Its last
-frame is compared with the first pair, whose motion is the least, and with the mean of its adjacent pairs.
+A sequence of the figure and one of the toy are registered together, and beside that chained: adjacent pairs, one after
+the other. The last frame is compared with the first pair, whose motion is the least, and with the mean of the adjacent
+pairs; parts and joints are judged by what moved apart in any frame.
 
     python benchmarks/scan_registration.py --data FOLDER --pairs 189 --ablations --moved --growth --frames 10
 """
@@ -74,6 +75,29 @@ class Score:
     joints: tuple[float, ...]
     seconds: tuple[float, ...]
     bones: int
+
+
+@dataclass(frozen=True)
+class PartTruth:
+    """What is known of the points of a made-up scan: parts that moved apart, all parts, and the joints between them."""
+
+    moving: Tensor
+    labels: Tensor
+    joint_parts: Tensor
+    joints: Tensor
+    size: float
+
+    @classmethod
+    def of_pair(cls, pair: ScanPair) -> PartTruth:
+        """Return the truth of a pair's source."""
+        moving = pair.moving_labels(APART)
+        return cls(moving, pair.labels, pair.joint_parts, pair.joints, pair.source.diagonal)
+
+    @classmethod
+    def of_sequence(cls, sequence: ScanSequence) -> PartTruth:
+        """Return the truth of the first frame; parts moved apart if they did in any."""
+        moving, size = sequence.moving_labels(0, APART), sequence[0].diagonal
+        return cls(moving, sequence.labels(0), sequence.joint_parts, sequence.joints(0), size)
 
 
 @dataclass(frozen=True)
@@ -143,8 +167,7 @@ def score(problem: Problem, recipe: Recipe) -> Score:
     rand, joints, seen = float("nan"), (), near
     if pair is not None:
         seen = near[~pair.missing]
-        rand = float(adjusted_rand(found.parts(APART), pair.moving_labels(APART)))
-        joints = joint_errors(found, pair)
+        rand, joints = parts_and_joints(found, PartTruth.of_pair(pair))
     seconds = tuple(found.seconds.tolist())
     return Score(
         float(near.mean()), float(seen.mean()), float(errors.mean()), rand, joints, seconds, len(found.transforms)
@@ -152,16 +175,18 @@ def score(problem: Problem, recipe: Recipe) -> Score:
 
 
 @torch.no_grad()
-def joint_errors(found: tr.ScanRegistration, pair: ScanPair) -> tuple[float, ...]:
-    """Return how far the true joints, of parts that moved apart, are from the nearest found joint."""
-    moving, labels = pair.moving_labels(APART), pair.labels
+def parts_and_joints(
+    found: tr.ScanRegistration | tr.SequenceRegistration, truth: PartTruth
+) -> tuple[float, tuple[float, ...]]:
+    """Return the adjusted Rand index, and how far joints of parts that moved apart are from the nearest found one."""
+    moving, labels = truth.moving, truth.labels
     part = {int(label): int(moving[labels == label][0]) for label in labels.unique()}
     centers, errors = found.model.joints().centers, []
-    for (parent, child), place in zip(pair.joint_parts.tolist(), pair.joints, strict=True):
+    for (parent, child), place in zip(truth.joint_parts.tolist(), truth.joints, strict=True):
         if parent in part and child in part and part[parent] != part[child]:
             near = (centers - place).norm(dim=-1).min() if len(centers) else torch.tensor(torch.inf)
-            errors.append(float(near) / pair.source.diagonal)
-    return tuple(errors)
+            errors.append(float(near) / truth.size)
+    return float(adjusted_rand(found.parts(APART), moving)), tuple(errors)
 
 
 def print_row(name: str, scores: list[Score]) -> None:
@@ -216,17 +241,17 @@ def chained(scans: list[tr.RangeScan], pairs: list[Tensor]) -> list[Tensor]:
     return places
 
 
-def print_sequence(sequence: ScanSequence, recipe: Recipe) -> None:
-    """Print mean errors of the first frame's points in every frame, shares of the diagonal."""
+def print_sequence(kind: str, sequence: ScanSequence, recipe: Recipe) -> None:
+    """Print mean errors of the first frame's points in every frame, shares of the diagonal, and parts and joints."""
     scans = list(sequence)
-    together = tr.register_sequence(scans, recipe.bones, recipe.grid, recipe.config).deformed
+    found = tr.register_sequence(scans, recipe.bones, recipe.grid, recipe.config)
     pairs = adjacent(scans, recipe)
-    ways, size = (together, chained(scans, pairs)), scans[0].diagonal
+    ways, size = (found.deformed, chained(scans, pairs)), scans[0].diagonal
 
     def error(places: Tensor, source: int, target: int) -> float:
         return 100 * float((places - sequence.truth(source, target)).norm(dim=-1).mean()) / size
 
-    print(f"\nsequence of {len(scans)} frames, mean % from the first, and of the pair that ends there")
+    print(f"\n{kind}, sequence of {len(scans)} frames, mean % from the first, and of the pair that ends there")
     print(f"{'frame':>6s} together chained   pair")
     alone = [error(moved, frame, frame + 1) for frame, moved in enumerate(pairs)]
     errors = [[error(way[frame], 0, frame) for way in ways] for frame in range(1, len(scans))]
@@ -234,9 +259,10 @@ def print_sequence(sequence: ScanSequence, recipe: Recipe) -> None:
         print(f"{frame:6d} {row[0]:8.2f} {row[1]:7.2f} {pair:6.2f}")
     last, mean = errors[-1], float(np.mean(alone))
     print(f"last over the mean pair: {last[0] / mean:.2f} together, {last[1] / mean:.2f} chained")
-    print(
-        f"last over the first: {last[0] / errors[0][0]:.2f} together, {last[1] / errors[0][1]:.2f} chained", flush=True
-    )
+    print(f"last over the first: {last[0] / errors[0][0]:.2f} together, {last[1] / errors[0][1]:.2f} chained")
+    rand, joints = parts_and_joints(found, PartTruth.of_sequence(sequence))
+    right = np.mean(np.array(joints) < JOINT)
+    print(f"parts: adjusted Rand index {rand:.2f}; joints within {JOINT:.0%}: {right:.0%} of {len(joints)}", flush=True)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -259,7 +285,7 @@ def main(arguments: list[str] | None = None) -> int:
         toys = list(made_up_problems("toy", 1, 600))
         print_set("toy", toys, small, options.verbose)
         print_set("toy, moved", [moved(toy) for toy in toys], small, options.verbose)
-        print_sequence(walking_figure(2, scanner=DepthScanner(num_points=600)), small[0])
+        print_sequence("figure", walking_figure(2, scanner=DepthScanner(num_points=600)), small[0])
         return 0
     sets: dict[str, list[Problem]] = {}
     if options.data is None or not options.data.is_dir():
@@ -277,7 +303,8 @@ def main(arguments: list[str] | None = None) -> int:
         if options.moved:
             print_set(f"{title}, moved", [moved(problem) for problem in problems], _ablations()[:1], options.verbose)
     if options.frames:
-        print_sequence(walking_figure(options.frames), Recipe("default"))
+        print_sequence("figure", walking_figure(options.frames), Recipe("default"))
+        print_sequence("toy", jointed_toy(options.frames), Recipe("default"))
     if options.growth:
         for count in (2000, 5000, 10_000, 20_000, 50_000, 100_000):
             print_set(f"figure, {count} points", list(made_up_problems("figure", 1, count)), _ablations()[:1])

@@ -74,10 +74,10 @@ def test_points_are_expected_to_go_on_as_they_went(toy, monkeypatch):
     (first, nothing), (second, ahead), (third, back) = calls
     assert nothing is None
     assert torch.equal(first, toy[1].points)
-    torch.testing.assert_close(ahead, second + (second - first))
+    torch.testing.assert_close(ahead, second + 0.5 * (second - first))
     # Towards earlier frames, against the way that later ones were reached.
     assert torch.equal(third, first)
-    torch.testing.assert_close(back, first - (second - first))
+    torch.testing.assert_close(back, first - 0.5 * (second - first))
 
 
 def test_bad_arguments_are_refused_by_name(toy):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -19,6 +21,7 @@ from torchreg.pipelines.scan_align_stages import (
     agree,
     fit_first_matches,
     judge,
+    leaps,
     mismatch,
     pull_one_to_one,
     refine,
@@ -97,6 +100,31 @@ def test_refinement_can_be_taken_in_parts(problem, reporter):
     begun = refine(problem, rest, config, reporter[0], 0.02, slice(2))
     assert torch.equal(refine(problem, begun, config, reporter[0], 0.02, slice(2, None)), whole)
     assert reporter[1][len(records) :] == records
+
+
+def test_samples_without_a_match_stay_about_where_they_are_expected(problem, reporter):
+    rest = problem.graph.rest()
+    shift = torch.tensor([0.02, -0.01, 0.03], dtype=torch.float64)
+    waiting = replace(problem, expected=problem.graph(rest) + shift)
+    # Nothing is matched by a sigma so small; when all is matched, next to nothing holds it.
+    alone = RefineConfig(num_steps=4, final_steps=0, sigma=(1e-4, 1e-4), beyond=0)
+    held = refine(waiting, rest, alone, reporter[0])
+    torch.testing.assert_close(problem.graph(held), waiting.expected, rtol=0, atol=1e-3)
+    free = problem.graph(refine(waiting, rest, replace(alone, expected=0.0), reporter[0]))
+    assert float((free - problem.graph(rest)).norm(dim=-1).median()) < 0.1 * float(shift.norm())
+    matched = RefineConfig(num_steps=3, final_steps=1)
+    plain, aware = (problem.graph(refine(each, rest, matched, reporter[0])) for each in (problem, waiting))
+    assert float((plain - aware).norm(dim=-1).median()) < 0.1 * float(shift.norm())
+
+
+def test_leaps_cost_their_distance_up_to_a_cap(problem):
+    config, rest = ChoiceConfig(leap=2.0, leap_cap=0.1), problem.graph.rest()
+    places = problem.graph(rest)
+    assert float(leaps(problem, places, config).max()) == 0
+    for distance, cost in ((0.0, 0.0), (0.05, 0.5), (0.1, 2.0), (7.0, 2.0)):
+        away = replace(problem, expected=places + distance * torch.tensor([0.6, 0.0, -0.8]))
+        torch.testing.assert_close(leaps(away, places, config), torch.full_like(places[:, 0], cost))
+        assert judge(away, "", rest, config).leap == pytest.approx(cost)
 
 
 def test_better_hypotheses_are_judged_better(problem, reporter):

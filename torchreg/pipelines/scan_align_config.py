@@ -105,6 +105,9 @@ class RefineConfig:
         beyond_below: sigma below which that counts, length: before, a limb on its way may leave the outline.
         beyond_scale: those farther from the outline than this count ever less, length.
         beyond_margin: spacings of the target's samples up to which that is nothing.
+        expected: how much it counts, beside a match, that a sample without one leaves where it was expected, if that is
+            known; those farther off count ever less:
+        expected_scale: length.
         density: samples used per squared sigma.
         least_samples: used of each scan, where there are as many.
         compatible: see `ScanEMConfig`; its feature weight gives way to the one above.
@@ -127,6 +130,8 @@ class RefineConfig:
     beyond_below: float = 0.012
     beyond_scale: float = 0.05
     beyond_margin: float = 1.5
+    expected: float = 0.002
+    expected_scale: float = 0.05
     density: float = 0.3
     least_samples: int = 300
     compatible: ScanEMConfig = field(default_factory=ScanEMConfig)
@@ -137,9 +142,11 @@ class RefineConfig:
         check_count(self.final_steps, "final_steps", 0)
         for name in ("sigma", "stiffness", "slide", "feature_weight"):
             _check_ends(getattr(self, name), name)
-        for name in ("near_sigma", "fused_sigma", "give", "beyond_scale"):
+        for name in ("near_sigma", "fused_sigma", "give", "beyond_scale", "expected_scale"):
             check_positive(getattr(self, name), name)
-        for name in ("both_ways_above", "boundary_above", "beyond", "beyond_below", "beyond_margin", "density"):
+        for name in ("both_ways_above", "boundary_above", "density"):
+            check_positive(getattr(self, name), name, allow_zero=True)
+        for name in ("beyond", "beyond_below", "beyond_margin", "expected"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
 

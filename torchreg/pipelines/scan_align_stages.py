@@ -26,6 +26,8 @@ from torchreg.pipelines.scan_align_problem import ScanAlignProblem
 
 # Right matches differ by so much in their features, squared, in the mean; more than samples at random tells no more.
 _USUALLY_UNLIKE, _UNLIKE = 0.4, 2.0
+# With less posterior mass a sample has no match: it may be hidden.
+_HARDLY_MATCHED = 0.05
 
 
 @dataclass(frozen=True)
@@ -123,8 +125,8 @@ def refine(
             moved = used_samples(problem, transforms, sigma, config)
             found = soft_matches(problem, moved, sigma, config, share)
             along = _along_surface(found, slide, sigma < config.boundary_above)
-            back = _out_of_empty_space(problem, moved, sigma, config)
-            fit = fit_graph(problem.graph, transforms, joined(along, *back), stiffness, give=config.give)
+            others = _out_of_empty_space(problem, moved, sigma, config) + _as_expected(problem, moved, found, config)
+            fit = fit_graph(problem.graph, transforms, joined(along, *others), stiffness, give=config.give)
             transforms = fit.transforms
         reporter.report("refine", step, number, sigma, fit, stiffness, float(found.weights.mean()))
     return transforms
@@ -174,6 +176,19 @@ def _out_of_empty_space(
     which = weights.nonzero()[:, 0]
     targets = moved.points[which] + apart[which].unsqueeze(1) * back[which]
     return (GraphMatches(which, targets, weights[which], back[which], 0.0),)
+
+
+def _as_expected(
+    problem: ScanAlignProblem, moved: OrientedSamples, found: SoftMatches, config: RefineConfig
+) -> tuple[GraphMatches, ...]:
+    """Return what holds samples without a match near where they are expected."""
+    if problem.expected is None or config.expected == 0:
+        return ()
+    count = len(moved.points)
+    expected = problem.expected[:count]
+    apart = (moved.points - expected).square().sum(-1) / config.expected_scale**2
+    weights = config.expected * (1 - found.weights / _HARDLY_MATCHED).clamp(min=0) / (1 + apart).square()
+    return (GraphMatches(slice(0, count), expected, weights),)
 
 
 def judge(problem: ScanAlignProblem, name: str, transforms: Tensor, config: ChoiceConfig) -> Hypothesis:
