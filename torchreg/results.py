@@ -538,18 +538,25 @@ class ScanRegistration(Result, Generic[Shape]):
 
 def _parts(moved: Tensor, transforms: Tensor, labels: Tensor, weights: Tensor, tolerance: float) -> Tensor:
     """Return the parts (N,) of points moved to (T, N, 3) by transforms (T, B, 4, 4), alike in all T frames."""
-    points, motions = moved.double(), transforms.double()
-    sizes = (points.amax(1) - points.amin(1)).norm(dim=-1)
-    own = nn.functional.one_hot(labels, motions.shape[1]).double()
-    # Of every bone's points, how far the motion of every other bone takes them from where they went.
-    back = torch.linalg.inv(motions)[:, labels]
-    rest = (back[..., :3, :3] @ points.unsqueeze(-1)).squeeze(-1) + back[..., :3, 3]
-    places = torch.einsum("taij,tnj->tani", motions[..., :3, :3], rest) + motions[..., None, :3, 3]
-    apart = (places - points.unsqueeze(1)).norm(dim=-1) @ own / sizes[:, None, None]
-    blends = weights.double()
+    blends, own = weights.double(), nn.functional.one_hot(labels, weights.shape[1]).double()
+    # Frame by frame: all at once would need T B N places.
+    apart = torch.stack(
+        [_misses(*frame, labels, own) for frame in zip(moved.double(), transforms.double(), strict=True)]
+    )
     meet = blends.mT @ blends > _MEETING * len(labels)
     part = _joined_alike(apart, own.sum(0), meet, tolerance)
     return part[labels].unique(return_inverse=True)[1]
+
+
+def _misses(points: Tensor, motions: Tensor, labels: Tensor, own: Tensor) -> Tensor:
+    """Return how far the motion of every bone takes every bone's points (B, B) from where they went, in all.
+
+    In diagonals of the moved points (N, 3); ``own`` (N, B) tells whose each of them is.
+    """
+    size = (points.amax(0) - points.amin(0)).norm()
+    rest = (torch.linalg.inv(motions)[labels] @ nn.functional.pad(points, (0, 1), value=1.0).unsqueeze(-1))[:, :3, 0]
+    places = rest @ motions[:, :3, :3].mT + motions[:, None, :3, 3]
+    return (places - points).norm(dim=-1) @ own / size
 
 
 def _joined_alike(apart: Tensor, counts: Tensor, meet: Tensor, tolerance: float) -> Tensor:
