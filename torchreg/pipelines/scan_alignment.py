@@ -64,7 +64,8 @@ def align_scans(
     what something nearer hides hold across the surface alone, and samples where the target's camera saw nothing are
     taken back into its picture. Then each part moves as in the hypothesis that suits it, and the EM goes on from there
     as well. The best covers the target, is covered by it, is like it, bends least, and is nearest to what is expected;
-    its EM is taken to the end. Where rest and stiff matches agree, the softer ones are left out.
+    its EM is taken to the end. Where rest and stiff matches agree, the softer ones are left out; where all agree, so is
+    what would be put together.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
