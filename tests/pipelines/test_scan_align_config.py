@@ -33,6 +33,10 @@ from torchreg.pipelines.scan_align_config import (
         (ScanAlignConfig, {"curvature_radii": (-0.1,)}, "curvature_radii must be positive"),
         (RefineConfig, {"near_sigma": 0.0}, "near_sigma must be positive"),
         (MatchConfig, {"stiffer": ()}, "stiffer must hold"),
+        (RefineConfig, {"expected": -1.0}, "expected must be"),
+        (RefineConfig, {"expected_scale": 0.0}, "expected_scale must be positive"),
+        (ChoiceConfig, {"leap": -1.0}, "leap must be"),
+        (ChoiceConfig, {"leap_cap": 0.0}, "leap_cap must be positive"),
     ],
 )
 def test_values_out_of_range_are_named(kind, arguments, message):

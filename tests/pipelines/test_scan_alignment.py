@@ -88,6 +88,8 @@ def test_hypotheses_are_followed_until_two_agree(pair):
     same = align_scans(pair.source, pair.source, QUICK)
     assert {each.name for each in same.hypotheses} == {"rest", "stiff matches"}
     torch.testing.assert_close(same.points, pair.source.points, rtol=0, atol=5e-3 * pair.source.diagonal)
+    known = align_scans(pair.source, pair.source, QUICK, expected=pair.source.points)
+    assert {each.name for each in known.hypotheses} == {"rest", "expected", "stiff matches"}
     stubborn = replace(QUICK, choice=replace(QUICK.choice, same=1e-12))
     every = align_scans(pair.source, pair.target, stubborn)
     assert {each.name for each in every.hypotheses} == {"rest", "stiff matches", "matches", "one to one", "fused"}
@@ -160,6 +162,20 @@ def test_other_frames_and_units_give_the_same_motion(pair, aligned):
     apart = (moved.points - expected).norm(dim=-1) / source.diagonal
     assert float(apart.median()) < 1e-4
     assert moved.chosen.energy == pytest.approx(plain.chosen.energy, rel=0.05)
+
+
+def test_expectations_hold_in_other_frames_and_units():
+    # Nothing but what is expected says how far the tube turned.
+    turn = se3_exp(torch.tensor([0.0, 0, 0, 0, 0, 0.4], dtype=torch.float64))
+    motion = se3_exp(torch.tensor([30.0, -80, 50, 1.0, 2.0, -0.5], dtype=torch.float64))
+    source, target = (tube(seed).to(torch.float64) for seed in range(2))
+    expected = transform_points(turn, source.points)
+    for scale in (0.001, 100.0):
+        scans = (RangeScan(scale * scan.points, normals=scan.normals).transformed(motion) for scan in (source, target))
+        ahead = transform_points(motion, scale * expected)
+        moved = align_scans(*scans, QUICK, expected=ahead)
+        apart = (moved.points - ahead).norm(dim=-1) / (scale * source.diagonal)
+        assert float(apart.mean()) < 0.02
 
 
 def test_scans_without_faces_align(pair):

@@ -144,9 +144,8 @@ class RefineConfig:
             _check_ends(getattr(self, name), name)
         for name in ("near_sigma", "fused_sigma", "give", "beyond_scale", "expected_scale"):
             check_positive(getattr(self, name), name)
-        for name in ("both_ways_above", "boundary_above", "density"):
-            check_positive(getattr(self, name), name, allow_zero=True)
-        for name in ("beyond", "beyond_below", "beyond_margin", "expected"):
+        optional = "both_ways_above", "boundary_above", "beyond", "beyond_below", "beyond_margin", "expected", "density"
+        for name in optional:
             check_positive(getattr(self, name), name, allow_zero=True)
 
 

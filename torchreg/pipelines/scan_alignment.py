@@ -181,6 +181,7 @@ def _fitted_to_expected(problem: ScanAlignProblem, expected: Tensor) -> Tensor:
 
 
 def _checked(expected: Any, source: RangeScan) -> Tensor:
+    """Return where points (N, 3) are expected; raise unless it fits the source."""
     expected = as_float_tensor(expected, "expected")
     check_shape(expected, "expected", tuple(source.points.shape))
     check_finite(expected, "expected")
