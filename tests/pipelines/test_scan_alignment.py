@@ -1,5 +1,6 @@
 import math
 from dataclasses import replace
+from threading import get_ident
 
 import pytest
 import torch
@@ -150,6 +151,26 @@ def test_the_same_call_gives_the_same_bits(pair, aligned):
     assert torch.equal(again.points, aligned.points)
     seeded = [align_scans(*scans(pair), QUICK, generator=torch.Generator().manual_seed(5)) for _ in range(2)]
     assert torch.equal(seeded[0].points, seeded[1].points)
+
+
+@pytest.mark.parametrize("apart", [1, 4])
+def test_threads_change_neither_bits_nor_reports(apart):
+    pair = walking_figure(6, scanner=SCANNER).pair(0, apart)
+    before, runs = torch.get_num_threads(), []
+    try:
+        for number in (1, 2, 4):
+            torch.set_num_threads(number)
+            told = []
+            found = align_scans(*scans(pair), QUICK, on_step=lambda record, to=told: to.append((get_ident(), record)))
+            assert {thread for thread, _ in told} == {get_ident()}
+            assert tuple(record for _, record in told) == found.history
+            runs.append(found)
+    finally:
+        torch.set_num_threads(before)
+    for other in runs[1:]:
+        assert torch.equal(runs[0].points, other.points)
+        assert runs[0].hypotheses == other.hypotheses
+        assert runs[0].history == other.history
 
 
 def test_other_frames_and_units_give_the_same_motion(pair, aligned):

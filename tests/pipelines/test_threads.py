@@ -5,7 +5,7 @@ import threading
 import pytest
 import torch
 
-from torchreg.pipelines.threads import one_thread
+from torchreg.pipelines.threads import both, one_thread
 
 
 @pytest.fixture(autouse=True)
@@ -63,3 +63,70 @@ def test_large_work_keeps_all_threads():
         assert torch.get_num_threads() == 2
     with one_thread(), one_thread(False):
         assert torch.get_num_threads() == 1
+
+
+def who():
+    return (
+        threading.current_thread(),
+        torch.get_num_threads(),
+        torch.is_grad_enabled(),
+        torch.is_inference_mode_enabled(),
+    )
+
+
+def test_two_calls_are_made_side_by_side():
+    meet = threading.Barrier(2, timeout=10)
+
+    def call():
+        meet.wait()
+        return who()
+
+    with one_thread(), torch.no_grad():
+        (here, *own), (there, *others) = both(call, call)
+    assert here is threading.current_thread()
+    assert there is not here
+    assert own == others == [1, False, False]
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.enable_grad, torch.inference_mode])
+def test_gradients_are_recorded_beside_as_here(mode):
+    with mode():
+        (_, *own), (_, *others) = both(who, who)
+    assert own == others
+
+
+def test_one_thread_makes_both_calls_where_torch_has_one():
+    torch.set_num_threads(1)
+    with one_thread():
+        one, other = both(who, who)
+    assert one == other
+    assert one[0] is threading.current_thread()
+
+
+@pytest.mark.parametrize(("allowed", "most"), [(2, 2), (3, 3), (4, 4), (5, 4)])
+def test_calls_within_calls_share_what_is_left(allowed, most):
+    torch.set_num_threads(allowed)
+
+    def pair():
+        return both(who, who)
+
+    with one_thread():
+        found = [each[0] for two in both(pair, pair) for each in two]
+        again = [each[0] for each in pair()]
+    assert len(set(found)) == most
+    assert len(set(again)) == 2
+
+
+def test_an_error_of_either_call_is_raised_once_both_have_ended():
+    ended = threading.Event()
+
+    def fails():
+        raise RuntimeError("inside")
+
+    with pytest.raises(RuntimeError, match="inside"):
+        both(fails, ended.set)
+    assert ended.is_set()
+    with pytest.raises(RuntimeError, match="inside"):
+        both(int, fails)
+    with one_thread():
+        assert both(who, who)[1][0] is not threading.current_thread()

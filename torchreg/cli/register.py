@@ -64,6 +64,8 @@ def register(
     With --depth A B --intrinsics FILE the scans are depth images in metres, steps cut and flying pixels left out. What
     was kept of each goes to OUT_seen, red where it was cut, and the moved source over the picture of the target.
 
+    OMP_NUM_THREADS=2 in the environment makes a second core help to find where the source goes.
+
     Exit codes: 0; 1 if too few points match to mean anything; 2 for an error; 130 for Ctrl-C.
     """
     output = with_ending(output, (".glb", ".safetensors"))

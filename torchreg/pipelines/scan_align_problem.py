@@ -25,6 +25,7 @@ from torchreg.models.deformation_graph import DeformationGraph
 from torchreg.pipelines.graph_fit import GraphMatches
 from torchreg.pipelines.scan_align_config import MatchConfig, ScanAlignConfig
 from torchreg.pipelines.scan_unit import ScanUnit
+from torchreg.pipelines.threads import both
 
 # Points that spin images look at, and neighbors that curvature looks at.
 _SCENE, _AROUND = 1250, 100
@@ -89,9 +90,11 @@ def describe(
         (unit.of_points(scan.points[which]), scan.normals[which].detach().cpu().double())
         for scan, which in ((source, here), (target, there))
     ]
-    features = scaled_together(
-        *(curvature_features(*pair, *pair, config.curvature_radii, num_neighbors=_AROUND) for pair in places)
-    )
+
+    def curvature(pair: tuple[Tensor, Tensor]) -> Tensor:
+        return curvature_features(*pair, *pair, config.curvature_radii, num_neighbors=_AROUND)
+
+    features = scaled_together(*both(lambda: curvature(places[0]), lambda: curvature(places[1])))
     one, other = (
         OrientedSamples(*pair, feature, scan.boundary[which].cpu())
         for pair, feature, scan, which in zip(places, features, (source, target), (here, there), strict=True)
@@ -133,21 +136,27 @@ def first_matches(problem: ScanAlignProblem, config: MatchConfig) -> GraphMatche
     """
     here = problem.source.first(min(config.num_points, len(problem.samples)))
     there = problem.target.first(config.num_points)
-    images, ways = [], []
     # Voters are within the radius; the targets of two points that vote may be farther apart.
-    for few, scan, limit in ((here, problem.source, config.radius), (there, problem.target, 2 * config.radius)):
-        scene = scan.first(_SCENE)
-        surface = (few.points, few.normals, scene.points, scene.normals)
-        images.append(spin_images(*(value.float() for value in surface), bin_size=config.bin_size))
-        graph = GeodesicGraph.from_points(few.points, min(_NEIGHBORS, len(few.points) - 1))
-        ways.append(graph.distances(limit=limit).float())
+    (image, ways), (other_image, other_ways) = both(
+        lambda: _described(here, problem.source, config, config.radius),
+        lambda: _described(there, problem.target, config, 2 * config.radius),
+    )
     matches = match_descriptors(
-        *images,
+        image,
+        other_image,
         num_candidates=config.num_candidates,
         source_points=here.points.float(),
         target_points=there.points.float(),
         max_distance=config.max_distance,
     )
-    found = consistent_matches(matches, *ways, radius=config.radius, slack=config.slack)
+    found = consistent_matches(matches, ways, other_ways, radius=config.radius, slack=config.slack)
     kept = (found.support > config.min_support).nonzero()[:, 0]
     return GraphMatches(kept, there.points[found.index[kept]], found.support[kept].double())
+
+
+def _described(few: OrientedSamples, scan: OrientedSamples, config: MatchConfig, limit: float) -> tuple[Tensor, Tensor]:
+    """Return spin images of a few samples of a scan, and their distances along the surface up to a limit."""
+    scene = scan.first(_SCENE)
+    surface = (value.float() for value in (few.points, few.normals, scene.points, scene.normals))
+    graph = GeodesicGraph.from_points(few.points, min(_NEIGHBORS, len(few.points) - 1))
+    return spin_images(*surface, bin_size=config.bin_size), graph.distances(limit=limit).float()
