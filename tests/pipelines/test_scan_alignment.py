@@ -108,6 +108,16 @@ def test_the_best_alone_is_taken_to_the_end(pair):
     assert all(each == [0, 1] for each in steps.values())
 
 
+@pytest.mark.parametrize(
+    ("sequence", "first", "second"), [(walking_figure, 0, 1), (walking_animal, 0, 2), (jointed_toy, 1, 4)]
+)
+def test_last_steps_are_told_of_whichever_hypothesis_is_best(sequence, first, second):
+    # Rest, stiff matches and one-to-one matches are best in these pairs: some were followed by another thread.
+    result = align_scans(*scans(sequence(7, scanner=SCANNER).pair(first, second)), QUICK)
+    told = [each.step for each in result.history if (each.hypothesis, each.stage) == (result.chosen.name, "refine")]
+    assert told == list(range(6))
+
+
 def tube(seed):
     """Return a scan of a tube, whose turns about its axis nobody can see, as sampled by a seed."""
     generator = torch.Generator().manual_seed(seed)

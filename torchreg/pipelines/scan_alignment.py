@@ -108,7 +108,7 @@ def align_scans(
     if len(found) >= _LEAST_FUSED and not _all_agree(problem, found, config):
         found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
     chosen = found[0].hypothesis
-    transforms = _finished(problem, found[0], config)
+    transforms = _finished(problem, found[0], config, report)
     weights = spread_weights(
         problem.unit.of_points(source.points),
         source.normals.detach().cpu().double(),
@@ -139,13 +139,11 @@ class _Candidate:
         hypothesis: how they compare.
         transforms: the motions.
         sigma: with which their EM began.
-        reporter: of their steps.
     """
 
     hypothesis: Hypothesis
     transforms: Tensor
     sigma: float
-    reporter: Reporter
 
 
 def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
@@ -242,13 +240,14 @@ def _compared(
     """Return the candidate after the first steps of its EM."""
     steps = slice(config.refine.compared_after)
     transforms = refine(problem, transforms, config.refine, reporter, sigma, steps)
-    return _Candidate(judge(problem, reporter.name, transforms, config.choice), transforms, sigma, reporter)
+    return _Candidate(judge(problem, reporter.name, transforms, config.choice), transforms, sigma)
 
 
-def _finished(problem: ScanAlignProblem, candidate: _Candidate, config: ScanAlignConfig) -> Tensor:
+def _finished(problem: ScanAlignProblem, candidate: _Candidate, config: ScanAlignConfig, on_step: OnStep) -> Tensor:
     """Return the motions (J, 4, 4) after the last steps."""
     steps = slice(config.refine.compared_after, None)
-    return refine(problem, candidate.transforms, config.refine, candidate.reporter, candidate.sigma, steps)
+    reporter = Reporter(candidate.hypothesis.name, problem.unit.size, on_step)
+    return refine(problem, candidate.transforms, config.refine, reporter, candidate.sigma, steps)
 
 
 def _all_agree(problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig) -> bool:
