@@ -78,7 +78,8 @@ def align_scans(
         target: the scan to be reached, M points, in the same frame and unit.
         config: see `ScanAlignConfig`.
         generator: source of randomness; None draws the same numbers at every call.
-        on_step: called with a `ScanAlignRecord` after each step.
+        on_step: called with a `ScanAlignRecord` for each step, by the calling thread; when a hypothesis that another
+            thread follows is done, for all of its steps.
         expected: (N, 3) where the source's points are expected, such as by their velocity.
 
     Returns:
@@ -89,8 +90,8 @@ def align_scans(
 
     Differentiable: no.
 
-    Cost: about 2 s for scans of 8,000 points on one core; two thirds of it where torch may use two threads, which then
-    follow two hypotheses side by side: the result is the same to the bit.
+    Cost: about 2 s for scans of 8,000 points on one core; three quarters of it where torch may use two threads, which
+    then follow two hypotheses side by side: the result is the same to the bit.
 
     References: Chang and Zwicker 2009, section 5, on where to start; Sumner, Schmid and Pauly 2007 for the graph;
     Myronenko and Song 2010 for the EM with outliers.
