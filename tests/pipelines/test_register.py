@@ -4,12 +4,13 @@ import math
 
 import pytest
 import torch
+import trimesh
 
 import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
 from torchreg.errors import InputError, InputTypeError
-from torchreg.geometry.rigid import rigid_matrix
+from torchreg.geometry.rigid import rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.metrics import adjusted_rand
 from torchreg.pipelines.register import register
@@ -144,6 +145,39 @@ def test_flat_and_tiny_scans_and_duplicates_are_sound():
         assert found.deformed.shape == source.points.shape
     same = register(flat, flat, 4, 10, QUICK, start=flat.points)
     assert float((same.deformed - flat.points).norm(dim=-1).max()) < 0.01
+
+
+def block(size, middle, seed, turned):
+    """Return samples of a box's surface and their normals, before and after a motion (4, 4)."""
+    box = trimesh.creation.box(size).apply_translation(middle)
+    points, faces = trimesh.sample.sample_surface(box, 1000, seed=seed)
+    points, normals = torch.from_numpy(points), torch.from_numpy(box.face_normals[faces])
+    return points, normals, transform_points(turned, points), normals @ turned[:3, :3].mT
+
+
+def test_an_arm_that_lies_along_the_body_is_parted_from_it():
+    shoulder = torch.tensor([0.315, 0.85, 0.0], dtype=torch.float64)
+    turned = rigid_matrix(so3_exp(torch.tensor([0.0, 0.0, 0.8], dtype=torch.float64)), torch.zeros_like(shoulder))
+    turned[:3, 3] = shoulder - turned[:3, :3] @ shoulder
+    still = torch.eye(4, dtype=torch.float64)
+    scans, truth = [], []
+    for seed in (0, 2):
+        # A cell is wider than the gap of 0.005 between the two.
+        body = block((0.5, 1.0, 0.25), (0.0, 0.5, 0.0), seed, still)
+        arm = block((0.12, 0.85, 0.14), (0.315, 0.475, 0.0), seed + 1, turned)
+        points, normals, moved, after = (torch.cat(both) for both in zip(body, arm, strict=True))
+        scans.append((tr.RangeScan(points, normals=normals), tr.RangeScan(moved, normals=after)))
+        truth.append(moved)
+    source, target = scans[0][0], scans[1][1]
+    found = register(source, target, start=truth[0])
+    # Where the two face each other, a cell has points of both and follows one; all others go with their part.
+    gaps = torch.cdist(source.points[:1000], source.points[1000:])
+    alone = torch.cat((gaps.amin(1), gaps.amin(0))) > 2 * found.model.grid.spacing
+    near = (found.deformed - truth[0]).norm(dim=-1) < 0.025 * source.diagonal
+    assert float(near[alone].double().mean()) > 0.99
+    assert adjusted_rand(found.parts(0.01)[alone], torch.arange(2).repeat_interleave(1000)[alone]) > 0.95
+    apart = (found.model.joints().centers.detach() - shoulder).norm(dim=-1)
+    assert float(apart.min()) < 0.05 * source.diagonal
 
 
 def test_normals_of_unknown_sides_are_oriented(pair, known):
