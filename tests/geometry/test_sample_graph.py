@@ -1,3 +1,5 @@
+import math
+
 import pytest
 import torch
 
@@ -12,6 +14,50 @@ def sheet(count, spacing=1.0):
     corner = torch.arange(count * count).reshape(count, count)
     a, b, c, d = (part.reshape(-1) for part in (corner[:-1, :-1], corner[1:, :-1], corner[:-1, 1:], corner[1:, 1:]))
     return points, torch.cat((torch.stack((a, b, c), 1), torch.stack((b, d, c), 1)))
+
+
+def loop():
+    """Return points and inner normals of a band along half a lemniscate, and their number along it: its ends meet."""
+    turn = torch.linspace(-1.53, 1.53, 121, dtype=torch.float64)
+    across = turn.sin()
+    curve = (turn.cos() / (1 + across.square())).unsqueeze(1) * torch.stack((torch.ones_like(turn), across), dim=-1)
+    angle = 3 * across.atan()
+    normals = -torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), dim=-1)
+    width = 0.02 * torch.arange(5, dtype=torch.float64).repeat_interleave(len(turn))
+    return torch.cat((curve.repeat(5, 1), width.unsqueeze(1)), dim=1), normals.repeat(5, 1), len(turn)
+
+
+def test_surfaces_that_face_each_other_do_not_meet():
+    points, normals, length = loop()
+    near, around = (
+        float(sample_graph(points, torch.arange(length), **told).distances(torch.tensor([0]))[0, -1])
+        for told in ({}, {"normals": normals, "normal_scale": 0.03})
+    )
+    assert near < 0.1
+    # The loop is 2.622 long, and begins and ends 0.04 from the middle.
+    assert around == pytest.approx(2.622 - 0.08, rel=0.01)
+
+
+def test_where_nothing_leads_around_parts_hang_together_across_a_valley():
+    line = torch.arange(11, dtype=torch.float64) * 0.1
+    floor = torch.stack((*torch.meshgrid(line, line, indexing="ij"), torch.zeros(11, 11)), dim=-1).reshape(-1, 3)
+    wall = floor[:, [2, 1, 0]] + torch.tensor([0.0, 0.0, 0.05])
+    points = torch.cat((floor, wall))
+    normals = torch.eye(3, dtype=torch.float64)[[2] * len(floor) + [0] * len(wall)]
+    samples = torch.arange(len(points))
+    plain = sample_graph(points, samples, bridge=None)
+    told = sample_graph(points, samples, normals=normals, normal_scale=0.03, bridge=None)
+    torch.testing.assert_close(told.distances(), plain.distances())
+
+
+def test_a_smooth_surface_is_joined_as_without_normals():
+    generator = torch.Generator().manual_seed(0)
+    points = torch.nn.functional.normalize(torch.randn(800, 3, generator=generator, dtype=torch.float64), dim=1)
+    samples = torch.arange(150)
+    plain = sample_graph(points, samples)
+    for side in (1.0, -1.0):
+        told = sample_graph(points, samples, normals=side * points)
+        assert torch.equal(told.steps()[0], plain.steps()[0])
 
 
 def test_steps_join_neighbors_alone():
@@ -72,8 +118,9 @@ def test_motion_and_order_change_nothing():
     points = points + 0.2 * torch.rand(points.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64))[0]
     samples = torch.tensor([0, 4, 12, 20, 24, 7])
-    graph = sample_graph(points, samples, faces)
-    other = sample_graph(points @ turn.mT + 3, samples.flip(0), faces)
+    normals = torch.nn.functional.normalize(points - points.mean(0), dim=-1)
+    graph = sample_graph(points, samples, faces, normals=normals, normal_scale=0.1)
+    other = sample_graph(points @ turn.mT + 3, samples.flip(0), faces, normals=normals @ turn.mT, normal_scale=0.1)
     torch.testing.assert_close(other.distances().flip(0, 1), graph.distances())
 
 
@@ -87,7 +134,9 @@ def test_one_sample_has_no_steps():
 @pytest.mark.parametrize(
     ("change", "message"),
     [({"samples": torch.zeros(0, dtype=torch.long)}, "samples must be"), ({"bridge": 0.0}, "bridge must be"),
-     ({"num_neighbors": 0}, "num_neighbors must be"), ({"points": torch.zeros(3, 2)}, "points must have shape")],
+     ({"num_neighbors": 0}, "num_neighbors must be"), ({"normals": torch.zeros(8, 3)}, "normals must have shape"),
+     ({"normals": torch.full((9, 3), math.nan)}, "normals must"), ({"normal_scale": -1.0}, "normal_scale must be"),
+     ({"points": torch.zeros(3, 2)}, "points must have shape")],
 )  # fmt: skip
 def test_bad_input_is_named(change, message):
     points, faces = sheet(3)

@@ -22,6 +22,7 @@ from torchreg.pipelines.scan_align_stages import (
     fit_first_matches,
     judge,
     leaps,
+    loses_limb,
     mismatch,
     pull_one_to_one,
     refine,
@@ -153,6 +154,22 @@ def test_likeness_counts_where_surfaces_meet(problem):
     apart, unlike = mismatch(problem, away, config)
     assert float(apart.min()) == 1
     torch.testing.assert_close(unlike, torch.full_like(apart, 0.4 * config.unlike))
+
+
+def test_a_limb_is_lost_where_samples_of_both_scans_are_left_over(problem):
+    rest, config = problem.graph.rest(), ChoiceConfig(cap=0.02)
+    here = replace(problem, target=problem.source)
+    assert not loses_limb(here, rest, config)
+    # The target hides the left tenth of what is moved: there is nothing of its own left over.
+    left = here.target.points[:, 0] < here.target.points[:, 0].quantile(0.1)
+    values = {
+        name: getattr(here.target, name)[~left] for name in ("points", "normals", "features", "boundary", "cut_off")
+    }
+    assert not loses_limb(replace(here, target=OrientedSamples(**values)), rest, config)
+    shift = torch.where(left.unsqueeze(1), torch.tensor([0.0, 0.0, 0.3]), torch.zeros(3)).double()
+    elsewhere = replace(here.target, points=here.target.points + shift)
+    assert loses_limb(replace(here, target=elsewhere), rest, config)
+    assert not loses_limb(replace(here, target=elsewhere), rest, replace(config, lost_share=0.2))
 
 
 def test_hypotheses_agree_where_nearly_all_samples_do(problem):

@@ -214,6 +214,63 @@ def test_scans_without_faces_align(pair):
     assert share_near(pair, align_scans(source, target, QUICK).points) > 0.85
 
 
+def capsule(start, end, radius, count, generator):
+    """Return even points of a capsule, and normals."""
+    start, end = (torch.tensor(place, dtype=torch.float64) for place in (start, end))
+    length = float((end - start).norm())
+    axis = (end - start) / length
+    side = torch.linalg.cross(axis, torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))
+    frame = torch.stack((axis, side, torch.linalg.cross(axis, side)))
+    along, about = torch.rand(2, count, generator=generator, dtype=torch.float64)
+    along, about = (length + 2 * radius) * along - radius, 2 * torch.pi * about
+    on_axis = along.clamp(0, length)
+    slant = (along - on_axis) / radius
+    round_ = (1 - slant.square()).sqrt()
+    normals = torch.stack((slant, round_ * about.cos(), round_ * about.sin()), dim=-1) @ frame
+    return start + on_axis.unsqueeze(1) * axis + radius * normals, normals
+
+
+# Torso, head, legs, left arm; right upper arm and forearm, whose hand touches the hip.
+BODY = (
+    ((0, 0.15, 0), (0, 0.55, 0), 0.16, 1200), ((0, 0.78, 0), (0, 0.86, 0), 0.1, 400),
+    ((-0.09, 0, 0), (-0.11, -0.75, 0), 0.075, 800), ((0.09, 0, 0), (0.11, -0.75, 0), 0.075, 800),
+    ((-0.2, 0.58, 0), (-0.45, 0.3, 0), 0.05, 400), ((-0.45, 0.3, 0), (-0.62, 0.05, 0), 0.045, 350),
+    ((0.2, 0.58, 0), (0.46, 0.34, 0), 0.05, 400), ((0.46, 0.34, 0), (0.205, 0.12, 0), 0.045, 450),
+)  # fmt: skip
+UPPER_ARM, FOREARM = 6, 7
+
+
+def body(raised, bent, seed):
+    """Return points, normals and parts of a body with a hand on its hip, and points and normals with the arm moved."""
+    generator = torch.Generator().manual_seed(seed)
+    surfaces = [capsule(*part, generator) for part in BODY]
+    part = torch.arange(len(BODY)).repeat_interleave(torch.tensor([count for *_, count in BODY]))
+    motions = torch.eye(4, dtype=torch.float64).repeat(len(BODY), 1, 1)
+    shoulder, elbow = (about(BODY[UPPER_ARM][end], angle) for end, angle in ((0, raised), (1, bent)))
+    motions[UPPER_ARM], motions[FOREARM] = shoulder, shoulder @ elbow
+    points, normals = (torch.cat(values) for values in zip(*surfaces, strict=True))
+    moved = transform_points(motions[part], points.unsqueeze(1)).squeeze(1)
+    return points, normals, part, moved, (motions[part, :3, :3] @ normals.unsqueeze(-1)).squeeze(-1)
+
+
+def about(place, angle):
+    """Return the turn (4, 4) about an axis that looks out of the picture."""
+    turn = se3_exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, angle], dtype=torch.float64))
+    place = torch.tensor(place, dtype=torch.float64)
+    turn[:3, 3] = place - turn[:3, :3] @ place
+    return turn
+
+
+@pytest.mark.parametrize(("raised", "bent"), [(0.2, 0.4), (0.3, 0.9)])
+def test_a_hand_leaves_the_hip_that_it_touches(raised, bent):
+    points, normals, part, moved, _ = body(raised, bent, 0)
+    _, _, _, there, facing = body(raised, bent, 1)
+    found = align_scans(RangeScan(points, normals=normals), RangeScan(there, normals=facing))
+    error = (found.points - moved).norm(dim=-1) / float((points.amax(0) - points.amin(0)).norm())
+    assert float(error[part == FOREARM].mean()) < 0.02
+    assert float(error.mean()) < 0.005
+
+
 def test_tiny_and_disjoint_scans_have_sound_results(pair):
     tiny = RangeScan(torch.rand(6, 3, generator=torch.Generator().manual_seed(0)))
     assert bool(align_scans(tiny, tiny, QUICK).points.isfinite().all())

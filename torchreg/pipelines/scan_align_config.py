@@ -162,7 +162,9 @@ class ChoiceConfig:
         leap: what it costs that samples are far from where they were expected, if that is known, squared,
         leap_cap: up to this distance, length.
         same: hypotheses agree where their samples are this near each other, length,
-        same_share: for at least this share of the samples.
+        same_share: for at least this share of the samples,
+        lost_share: unless more of the samples of both scans are as far as the cap from the other scan: of one alone
+            they may be hidden, of both a limb went elsewhere.
     """
 
     cap: float = 0.03
@@ -174,11 +176,12 @@ class ChoiceConfig:
     leap_cap: float = 0.1
     same: float = 0.005
     same_share: float = 0.95
+    lost_share: float = 0.02
 
     def __post_init__(self) -> None:
         for name in ("cap", "leap_cap", "same", "same_share"):
             check_positive(getattr(self, name), name)
-        for name in ("normal_scale", "unlike", "bend", "slack", "leap"):
+        for name in ("normal_scale", "unlike", "bend", "slack", "leap", "lost_share"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
 

@@ -27,6 +27,8 @@ from torchreg.pipelines.scan_align_config import MatchConfig, ScanAlignConfig
 from torchreg.pipelines.scan_unit import ScanUnit
 from torchreg.pipelines.threads import both
 
+# What opposite normals count as where a point takes over from the samples around it, length.
+NORMAL_SCALE = 0.03
 # Points that spin images look at, and neighbors that curvature looks at.
 _SCENE, _AROUND = 1250, 100
 # Neighbors of a sample in the graph that distances for the matches are measured on.
@@ -104,7 +106,8 @@ def describe(
     other = replace(other, cut_off=_cut_off(unit.of_points(target.points[target.boundary]), other.points, eye, config))
     samples = here[: config.num_samples].cpu()
     faces = None if source.faces is None else source.faces.cpu()
-    ways = sample_graph(unit.of_points(source.points), samples, faces)
+    normals = source.normals.detach().cpu().double()
+    ways = sample_graph(unit.of_points(source.points), samples, faces, normals=normals, normal_scale=NORMAL_SCALE)
     nodes = build_node_graph(ways, 0, config.num_nodes, config.num_nearest)
     graph = DeformationGraph(one.points[: len(samples)], one.normals[: len(samples)], nodes)
     ahead = None if expected is None else unit.of_points(expected)[samples]

@@ -224,6 +224,16 @@ def embedded(samples: OrientedSamples, config: ChoiceConfig) -> Tensor:
     return torch.cat((samples.points, config.normal_scale * config.cap * samples.normals), dim=1)
 
 
+def loses_limb(problem: ScanAlignProblem, transforms: Tensor, config: ChoiceConfig) -> bool:
+    """Return whether samples of both scans are left over."""
+    here, there = embedded(problem.moved(transforms), config), embedded(problem.target, config)
+    left = [
+        float((nearest_few(one, other, 1)[1] >= config.cap).double().mean())
+        for one, other in ((here, there), (there, here))
+    ]
+    return min(left) > config.lost_share
+
+
 def agree(problem: ScanAlignProblem, one: Tensor, other: Tensor, config: ChoiceConfig) -> bool:
     """Return whether two hypotheses take nearly all samples to nearly the same places."""
     apart = (problem.graph(one) - problem.graph(other)).norm(dim=-1)

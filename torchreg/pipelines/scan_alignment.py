@@ -23,12 +23,13 @@ from torchreg.pipelines.scan_align_config import (
     ScanAlignment,
     ScanAlignRecord,
 )
-from torchreg.pipelines.scan_align_problem import ScanAlignProblem, describe, first_matches
+from torchreg.pipelines.scan_align_problem import NORMAL_SCALE, ScanAlignProblem, describe, first_matches
 from torchreg.pipelines.scan_align_stages import (
     Reporter,
     agree,
     fit_first_matches,
     judge,
+    loses_limb,
     pull_one_to_one,
     refine,
     soft_matches,
@@ -39,8 +40,6 @@ from torchreg.pipelines.threads import both, one_thread
 
 _One = TypeVar("_One")
 _Other = TypeVar("_Other")
-# What opposite normals count as when points take over the motion of the samples around them, length.
-_NORMAL_SCALE = 0.03
 # Fewer hypotheses are not fused.
 _LEAST_FUSED = 3
 # How a graph is taken to where points are expected: that may be wrong in parts, and limbs turn far.
@@ -67,8 +66,8 @@ def align_scans(
     what something nearer hides hold across the surface alone, and samples where the target's camera saw nothing are
     taken back into its picture. Then each part moves as in the hypothesis that suits it, and the EM goes on from there
     as well. The best covers the target, is covered by it, is like it, bends least, and is nearest to what is expected;
-    its EM is taken to the end. Where rest and stiff matches agree, the softer ones are left out; where all agree, so is
-    what would be put together.
+    its EM is taken to the end. Where rest and stiff matches agree and leave little of both scans over, the softer ones
+    are left out; where all agree, so is what would be put together.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -116,7 +115,7 @@ def align_scans(
         problem.graph.points,
         problem.graph.normals,
         problem.graph.dense_weights,
-        _NORMAL_SCALE,
+        NORMAL_SCALE,
     )
     moved = blend_linear(problem.unit.of_points(source.points), weights, transforms)
     return ScanAlignment(
@@ -148,13 +147,14 @@ class _Candidate:
 
 
 def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
-    """Return candidates; where two that started apart agree, others are left out."""
+    """Return candidates; where two that started apart agree and no limb is lost, others are left out."""
     near, (matches, stiff) = _both_told(
         on_step, partial(_near, problem, config), partial(_by_stiff_matches, problem, config)
     )
     if stiff is None:
         return [*near, _one_to_one(problem, config, on_step)]
-    if agree(problem, near[0].transforms, stiff.transforms, config.choice):
+    settled = agree(problem, near[0].transforms, stiff.transforms, config.choice)
+    if settled and not loses_limb(problem, stiff.transforms, config.choice):
         return [*near, stiff]
     soft, alone = _both_told(
         on_step, partial(_by_matches, problem, config, matches), partial(_one_to_one, problem, config)
