@@ -1,4 +1,4 @@
-"""Range scans of things that no setting was chosen on: public robots and a rigged hand, registered with the defaults.
+"""Range scans of other kinds of things, public robots and a rigged hand, registered with the defaults.
 
 The robots come with example-robot-data (`pip install "torchreg[benchmark]"`; those with COLLADA meshes need the extra
 `urdf` too), the hand with ``--data FOLDER``, which holds webxr_hand_right.glb. Each pair is two random poses: the first
