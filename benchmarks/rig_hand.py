@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from public_shapes import hand_parents
 from torch import Tensor
 
 import torchreg as tr
@@ -76,18 +77,6 @@ class Row:
     def passed(self) -> bool:
         """Return True if the worst seed meets every bar."""
         return self.mean[0] <= MEAN_BAR and self.p95[0] <= P95_BAR and self.seconds < SECONDS_BAR
-
-
-def hand_parents() -> dict[str, str | None]:
-    """Return the joint above each joint: the file's nodes are all on one level."""
-    parents: dict[str, str | None] = {"wrist": None}
-    for finger in ("thumb", "index-finger", "middle-finger", "ring-finger", "pinky-finger"):
-        middle = () if finger == "thumb" else ("phalanx-intermediate",)
-        above = "wrist"
-        for segment in ("metacarpal", "phalanx-proximal", *middle, "phalanx-distal", "tip"):
-            parents[f"{finger}-{segment}"] = above
-            above = f"{finger}-{segment}"
-    return parents
 
 
 def flexed_pose(shape: tr.ArticulatedShape, angle: float) -> Tensor:

@@ -20,12 +20,12 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-import sysconfig
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from public_shapes import robots_folder
 from torch import Tensor
 
 import torchreg as tr
@@ -91,12 +91,6 @@ class Outcome:
     def passed(self) -> bool:
         """Return True if the median over determined joints meets the bar."""
         return float(self.errors[self.seen].median()) <= MEDIAN_BAR
-
-
-def robots_folder() -> Path | None:
-    """Return the folder of example-robot-data, or None if it is not installed."""
-    folder = Path(sysconfig.get_path("purelib"), "cmeel.prefix", "share", "example-robot-data", "robots")
-    return folder if folder.is_dir() else None
 
 
 def turning_joints(shape: tr.ArticulatedShape) -> Tensor:

@@ -15,13 +15,13 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-import sysconfig
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from public_shapes import hand_parents, robots_folder
 from torch import Tensor
 
 import torchreg as tr
@@ -73,18 +73,12 @@ class Pair:
     truth: Tensor
 
 
-def robots_folder() -> Path | None:
-    """Return the folder of example-robot-data, or None if it is not installed."""
-    folder = Path(sysconfig.get_path("purelib"), "cmeel.prefix", "share", "example-robot-data", "robots")
-    return folder if folder.is_dir() else None
-
-
 def robots(folder: Path) -> Iterator[Thing]:
     """Yield the robots that are there and can be read."""
     for name, file in ROBOTS.items():
         try:
             if (folder / file).is_file():
-                shape = tr.ArticulatedShape.from_urdf(folder / file, package_dirs=[folder.parent, folder.parent.parent])
+                shape = tr.ArticulatedShape.from_urdf(folder / file, package_dirs=[folder.parent.parent])
                 yield Thing(name, shape, robot_poses(shape), 2)
         except MissingExtraError as error:
             print(f"{name} is left out: {error}")
@@ -105,15 +99,8 @@ def robot_poses(shape: tr.ArticulatedShape) -> Poser:
 
 
 def hand(path: Path) -> Thing:
-    """Return the hand of a file whose nodes are all on one level."""
-    parents: dict[str, str | None] = {"wrist": None}
-    for finger in ("thumb", "index-finger", "middle-finger", "ring-finger", "pinky-finger"):
-        above = "wrist"
-        middle = () if finger == "thumb" else ("phalanx-intermediate",)
-        for segment in ("metacarpal", "phalanx-proximal", *middle, "phalanx-distal", "tip"):
-            parents[f"{finger}-{segment}"] = above
-            above = f"{finger}-{segment}"
-    shape = tr.ArticulatedShape.from_gltf(path, parents=parents)
+    """Return the hand of a file."""
+    shape = tr.ArticulatedShape.from_gltf(path, parents=hand_parents())
     flexed = torch.tensor(["phalanx" in name and name.endswith("_x") for name in shape.dof_names])
     spread = torch.tensor(["proximal" in name and not name.endswith("_x") for name in shape.dof_names])
 

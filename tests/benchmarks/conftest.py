@@ -19,6 +19,8 @@ def loaded_benchmark():
         spec = importlib.util.spec_from_file_location(f"benchmark_{name}", FOLDER / f"{name}.py")
         module = importlib.util.module_from_spec(spec)
         with pytest.MonkeyPatch.context() as patch:
+            # As when they are run: what they share lies beside them.
+            patch.syspath_prepend(FOLDER)
             # dataclasses look their module up by name.
             patch.setitem(sys.modules, spec.name, module)
             spec.loader.exec_module(module)

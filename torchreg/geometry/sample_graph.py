@@ -125,28 +125,24 @@ def _across_valleys(places: np.ndarray, normals: np.ndarray, steps: np.ndarray) 
     return lean > 2 * _VALLEY * np.linalg.norm(way, axis=1)
 
 
-def _around_valleys(edges: np.ndarray, count: int, valley: np.ndarray) -> np.ndarray:
-    """Return distinct edges, without those that often (E,) lead across a valley which some way leads around."""
-    distinct, which = _distinct(edges, count)
-    inside = which >= 0
-    repeated = np.bincount(which[inside], minlength=len(distinct))
-    across = np.bincount(which[inside], weights=valley[inside], minlength=len(distinct)) > _MOST_VALLEYS * repeated
-    part = _connected(distinct[~across], count)
-    return distinct[~across | (part[distinct[:, 0]] != part[distinct[:, 1]])]
+def _around_valleys(steps: np.ndarray, count: int, valley: np.ndarray) -> np.ndarray:
+    """Return the distinct edges (E, 2) that steps (S, 2) make, the smaller index first, without loops.
+
+    Those are left out whose steps often (S,) lead across a valley, if some way leads around it.
+    """
+    low, high = steps.min(axis=1).astype(np.int64), steps.max(axis=1).astype(np.int64)
+    apart = low != high
+    key, which = np.unique((low * count + high)[apart], return_inverse=True)
+    edges = np.stack((key // count, key % count), axis=1)
+    across = np.bincount(which, weights=valley[apart]) > _MOST_VALLEYS * np.bincount(which)
+    part = _parts(edges[~across], count)
+    return edges[~across | (part[edges[:, 0]] != part[edges[:, 1]])]
 
 
-def _connected(edges: np.ndarray, count: int) -> np.ndarray:
-    """Return numbers (S,) of the parts that edges leave of so many samples."""
+def _parts(edges: np.ndarray, count: int) -> np.ndarray:
+    """Return numbers (S,) from 0 of the parts that edges leave of so many samples."""
     graph = coo_array((np.ones(len(edges)), tuple(edges.T)), shape=(count, count))
     return connected_components(graph, directed=False)[1]
-
-
-def _distinct(edges: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return edges (E, 2), the smaller index first, without loops and repetitions, and which each was, -1 for loops."""
-    low, high = edges.min(axis=1).astype(np.int64), edges.max(axis=1).astype(np.int64)
-    which = np.full(len(edges), -1)
-    key, which[low != high] = np.unique((low * count + high)[low != high], return_inverse=True)
-    return np.stack((key // count, key % count), axis=1), which
 
 
 def _lengths(places: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -158,10 +154,9 @@ def _lengths(places: np.ndarray, edges: np.ndarray) -> np.ndarray:
 def _bridged(places: np.ndarray, edges: np.ndarray, lengths: np.ndarray, cost: float) -> tuple[np.ndarray, np.ndarray]:
     """Return edges and lengths with each part linked to what has grown from the largest, the nearest part first."""
     count = len(places)
-    matrix = coo_array((lengths, tuple(edges.T)), shape=(count, count))
-    number, label = connected_components(matrix, directed=False)
+    label = _parts(edges, count)
     joined = label == np.bincount(label).argmax()
-    for _ in range(number - 1):
+    for _ in range(label.max()):
         inside, outside = np.flatnonzero(joined), np.flatnonzero(~joined)
         tree = cKDTree(places[inside])
         nearest = outside[tree.query(places[outside])[0].argmin()]

@@ -1,0 +1,24 @@
+"""Shapes that others published, as several benchmarks use them: where the robots are, and how a hand's nodes hang."""
+
+from __future__ import annotations
+
+import sysconfig
+from pathlib import Path
+
+
+def robots_folder() -> Path | None:
+    """Return the folder of example-robot-data, or None if it is not installed."""
+    folder = Path(sysconfig.get_path("purelib"), "cmeel.prefix", "share", "example-robot-data", "robots")
+    return folder if folder.is_dir() else None
+
+
+def hand_parents() -> dict[str, str | None]:
+    """Return the joint above each joint of webxr_hand_right.glb: the file's nodes are all on one level."""
+    parents: dict[str, str | None] = {"wrist": None}
+    for finger in ("thumb", "index-finger", "middle-finger", "ring-finger", "pinky-finger"):
+        middle = () if finger == "thumb" else ("phalanx-intermediate",)
+        above = "wrist"
+        for segment in ("metacarpal", "phalanx-proximal", *middle, "phalanx-distal", "tip"):
+            parents[f"{finger}-{segment}"] = above
+            above = f"{finger}-{segment}"
+    return parents
