@@ -18,8 +18,8 @@ from torchreg._checks import (
     check_shape,
 )
 
-# Pairs of a point and a scan point looked at in one go: in cache on a CPU, and 100 MB at most.
-_CHUNK_ENTRIES = 1_000_000
+# Pairs of a point and a scan point looked at in one go: in cache on a CPU.
+_CHUNK_ENTRIES = 200_000
 # From here on two images count as equal; atanh(1) is infinite.
 _LARGEST_R = 0.999
 SIMILARITIES = ("correlation", "overlap", "l2")
@@ -129,29 +129,30 @@ class _Scene:
         seen = flat - image * len(self._points)
         row = size / 2 - height.reshape(-1).index_select(0, flat)
         column = square.reshape(-1).index_select(0, flat).clamp_min_(0).sqrt_()
-        counts = points.new_zeros(len(points) * size * size)
         share = self._weights[seen]
         if self._interpolate:
-            self._share_out(counts, image, row - 0.5, column - 0.5, share)
-        else:
-            row, column = (value.long().clamp_(0, size - 1) for value in (row, column))
-            counts.scatter_add_(0, (image * size + row) * size + column, share)
-        return counts.reshape(-1, size, size)
+            return self._shared_out(len(points), image, row - 0.5, column - 0.5, share)
+        row, column = (value.long().clamp_(0, size - 1) for value in (row, column))
+        counts = points.new_zeros(len(points) * size * size)
+        return counts.scatter_add_(0, (image * size + row) * size + column, share).reshape(-1, size, size)
 
-    def _share_out(self, counts: Tensor, image: Tensor, row: Tensor, column: Tensor, share: Tensor) -> None:
-        """Add every point to the four bins whose middles surround it."""
-        size = self._size
+    def _shared_out(self, count: int, image: Tensor, row: Tensor, column: Tensor, share: Tensor) -> Tensor:
+        """Return images to which every point gave to the four bins whose middles surround it."""
+        # A frame of bins around each image takes what falls beyond its rims.
+        framed = self._size + 2
         upper, left = row.floor(), column.floor()
-        below, right = row - upper, column - left
-        upper, left = upper.long(), left.long()
-        for down in (0, 1):
-            line = upper + down
-            part = share * (below if down else 1 - below) * ((line >= 0) & (line < size))
-            line = (image * size + line.clamp(0, size - 1)) * size
-            for across in (0, 1):
-                place = left + across
-                amount = part * (right if across else 1 - right) * (place < size)
-                counts.scatter_add_(0, line + place.clamp(0, size - 1), amount)
+        below, right = (row - upper).mul_(share), column - left
+        above = share - below
+        place = image.mul_(framed).add_(upper.long()).add_(1).mul_(framed).add_(left.long()).add_(1)
+        counts = share.new_zeros(count * framed * framed)
+        for part, line in ((above, 0), (below, framed)):
+            far = part * right
+            counts.scatter_add_(0, place + line if line else place, part - far)
+            counts.scatter_add_(0, place + (line + 1), far)
+        counts = counts.view(count, framed, framed)[:, 1:-1]
+        images = counts[:, :, 1:-1].clone()
+        images[:, :, 0] += counts[:, :, 0]
+        return images
 
 
 def image_similarity(

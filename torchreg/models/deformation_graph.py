@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import torch
 from torch import Tensor, nn
 
 from torchreg._checks import as_float_tensor, check_finite, check_points, check_shape
 from torchreg.errors import InputError
 from torchreg.geometry.blend import blend_linear
+from torchreg.geometry.blend_sums import BlendSums
 from torchreg.geometry.node_graph import NodeGraph
 from torchreg.geometry.rigid import transform_points
 
@@ -72,6 +75,22 @@ class DeformationGraph(nn.Module):
     def rest(self) -> Tensor:
         """Return the motions (J, 4, 4) that move nothing."""
         return torch.eye(4).to(self.points).repeat(self.num_nodes, 1, 1)
+
+    @cached_property
+    def sums(self) -> BlendSums:
+        """The samples, and after them both nodes of each edge as points whose places by one node and the other differ.
+
+        As the graph is when first asked; on the CPU.
+        """
+        edges = self.edges.repeat_interleave(2, dim=0)
+        signs = self.weights.new_tensor([1.0, -1.0]).expand(len(edges), 2)
+        width = max(self.nearest.shape[1], 2)
+        nearest, weights = (
+            torch.cat([nn.functional.pad(part, (0, width - part.shape[1])) for part in parts])
+            for parts in ((self.nearest, edges), (self.weights, signs))
+        )
+        points = torch.cat((self.points, self.centers[self.edges].flatten(0, 1)))
+        return BlendSums(points, nearest, weights, self.num_nodes)
 
     def forward(self, transforms: Tensor, which: Tensor | slice = slice(None)) -> Tensor:
         """Return moved samples (..., n, 3).

@@ -9,14 +9,12 @@ from torch import Tensor
 
 from torchreg._checks import check_count, check_positive
 from torchreg.geometry.blend import turn_about
+from torchreg.geometry.blend_sums import upper_triangles
 from torchreg.geometry.rigid import transform_points
 from torchreg.models.deformation_graph import DeformationGraph
-from torchreg.solvers.levenberg_marquardt import Linearization
 
 # Relative damping: nodes that carry no match follow their neighbors; alone they stay.
 _DAMPING = 1e-9
-# Samples whose blocks are added in one go: in cache.
-_CHUNK = 200
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,7 @@ def fit_graph(
     rigid, and what they do not share, joints take up.
 
     Args:
-        graph: what is moved, float64.
+        graph: what is moved, float64 on the CPU.
         transforms: (J, 4, 4) to start from.
         matches: see `GraphMatches`.
         stiffness: see above.
@@ -104,7 +102,7 @@ def fit_graph(
 
     Differentiable: no.
 
-    Cost: 4 ms a step for 1,200 samples on 4 of 60 nodes each, on one core.
+    Cost: 2 ms a step for 1,200 samples on 4 of 60 nodes each, on one core, half of it for the linear system.
 
     References: Sumner, Schmid and Pauly 2007, section 4; Chang and Zwicker 2009, eq. 5, for the steps on twists.
     """
@@ -115,94 +113,42 @@ def fit_graph(
     misses = gaps = 0.0
     for _ in range(num_steps):
         middles = transform_points(transforms, graph.centers.unsqueeze(1)).squeeze(1)
-        one, other = _of_matches(graph, transforms, middles, matches), _of_edges(graph, transforms, middles, give)
-        misses, gaps = 2 * float(one.cost), 2 * float(other.cost) / graph.num_nodes
-        share = stiffness / graph.num_nodes
-        twists = _solved(one.hessian + share * other.hessian, one.gradient + share * other.gradient)
+        metrics, pulls, misses, gaps = _costs(graph, graph.sums.places(transforms), matches, stiffness, give)
+        twists = _solved(*graph.sums.normal_equations(transforms, middles, metrics, pulls))
         transforms = turn_about(transforms, twists, middles)
     return GraphFit(transforms, misses, gaps)
 
 
-def _of_matches(graph: DeformationGraph, transforms: Tensor, middles: Tensor, matches: GraphMatches) -> Linearization:
-    """Return the first term, its gradient (J, 6) and Hessian (J, J, 6, 6)."""
-    nearest, weights = graph.nearest[matches.which], graph.weights[matches.which]
-    points = graph.points[matches.which]
-    count, few = nearest.shape
-    # Where each node alone would take the sample.
-    rows = transforms[:, :3].flatten(1)[nearest].unflatten(-1, (3, 4))
-    ends = rows[..., 3]
-    for axis in range(3):  # sums over three numbers are slow
-        ends = torch.addcmul(ends, rows[..., axis], points[:, axis, None, None])
-    miss = (weights.unsqueeze(-1) * ends).sum(1) - matches.targets
-    blocks = _by_twists(ends - middles[nearest], weights).flatten(2)
-    slide = torch.as_tensor(matches.slide).to(points).reshape(-1, 1)
-    pulled = slide.unsqueeze(-1) * blocks
-    pull = slide * miss
+def _costs(
+    graph: DeformationGraph, places: Tensor, matches: GraphMatches, stiffness: float, give: float | None
+) -> tuple[Tensor, Tensor, float, float]:
+    """Return metrics (S + 2 E, 6) and pulls (S + 2 E, 3) of samples and of gaps, their misses and their gaps."""
+    count, shares = len(graph.points), matches.weights / max(1, len(matches.weights))
+    metrics, pulls = places.new_zeros(len(places), 6), places.new_zeros(len(places), 3)
+    miss = places[:count][matches.which] - matches.targets
+    pull = torch.as_tensor(matches.slide).to(miss).reshape(-1, 1) * miss
     if matches.normals is not None:
-        normal = matches.normals.unsqueeze(-1)
-        pulled = pulled + normal * (normal.mT @ blocks)
         pull = pull + matches.normals * (matches.normals * miss).sum(-1, keepdim=True)
-    share = (matches.weights / count)[:, None, None]
-    blocks = share * blocks
-    slope = (blocks.mT @ pull.unsqueeze(-1)).reshape(-1, 6)
-    size = graph.num_nodes
-    pair = nearest.unsqueeze(2) * size + nearest.unsqueeze(1)
-    hessian = points.new_zeros(size * size, 36)
-    for start in range(0, count, _CHUNK):
-        part = slice(start, start + _CHUNK)
-        square = (blocks[part].mT @ pulled[part]).unflatten(2, (few, 6)).unflatten(1, (few, 6)).transpose(2, 3)
-        hessian.index_add_(0, pair[part].reshape(-1), square.reshape(-1, 36))
-    gradient = points.new_zeros(size, 6).index_add_(0, nearest.reshape(-1), slope)
-    cost = 0.5 * (share[:, 0] * miss * pull).sum()
-    return Linearization(cost, gradient, hessian.view(size, size, 6, 6))
+    pull = shares.unsqueeze(1) * pull
+    for sums, part in ((metrics, upper_triangles(shares, matches.normals, matches.slide)), (pulls, pull)):
+        if isinstance(matches.which, slice):
+            sums[:count][matches.which] = part
+        else:
+            sums.index_add_(0, matches.which, part)
+    gap = places[count:].view(-1, 2, 3)
+    apart = gap.square().sum((1, 2))
+    weights = graph.edge_weights if give is None else graph.edge_weights / (1 + apart / (2 * give**2))
+    held = (stiffness / graph.num_nodes * weights).repeat_interleave(2)
+    metrics[count:] = upper_triangles(held, None, 1.0)
+    pulls[count:] = held.unsqueeze(1) * places[count:]
+    return metrics, pulls, float((miss * pull).sum()), float((weights * apart).sum()) / graph.num_nodes
 
 
-def _by_twists(arms: Tensor, weights: Tensor) -> Tensor:
-    """Return derivatives (n, 3, K, 6) of weighted places by nodes' twists: shift by v, turn about the middle by w.
-
-    Args:
-        arms: (n, K, 3) of the places, from the nodes' middles.
-        weights: (n, K) of the places.
-    """
-    x, y, z = (weights.unsqueeze(-1) * arms).unbind(-1)
-    # Filled in: stacking matrices of three by three takes four times as long.
-    blocks = arms.new_zeros(len(arms), 3, arms.shape[1], 6)
-    blocks[:, 0, :, 0] = blocks[:, 1, :, 1] = blocks[:, 2, :, 2] = weights
-    blocks[:, 0, :, 4], blocks[:, 1, :, 5], blocks[:, 2, :, 3] = z, x, y
-    blocks[:, 0, :, 5], blocks[:, 1, :, 3], blocks[:, 2, :, 4] = -y, -z, -x
-    return blocks
-
-
-def _of_edges(graph: DeformationGraph, transforms: Tensor, middles: Tensor, give: float | None) -> Linearization:
-    """Return the sum of squared gaps, its gradient (J, 6) and Hessian (J, J, 6, 6)."""
-    size, ends = graph.num_nodes, graph.edges
-    both, gap = graph.centers[ends], graph.edge_gaps(transforms)
-    weight = graph.edge_weights[:, None, None]
-    if give is not None:
-        weight = weight / (1 + gap.square().sum((1, 2), keepdim=True) / (2 * give**2))
-    # Derivatives of the two gaps (E, 6) by the twists of one node and, with the other sign, the other: (E, 6, 12).
-    sides = []
-    for node, sign in zip(ends.unbind(-1), (1.0, -1.0), strict=True):
-        arms = transform_points(transforms[node], both) - middles[node].unsqueeze(1)
-        sides.append(_by_twists(arms, arms.new_tensor(sign).expand(arms.shape[:-1])).transpose(1, 2).flatten(1, 2))
-    blocks = torch.cat(sides, dim=-1)
-    weighted = (weight * blocks).mT
-    square = (weighted @ blocks).unflatten(2, (2, 6)).unflatten(1, (2, 6)).transpose(2, 3)
-    pair = ends.unsqueeze(2) * size + ends.unsqueeze(1)
-    hessian = transforms.new_zeros(size * size, 36).index_add_(0, pair.reshape(-1), square.reshape(-1, 36))
-    slope = (weighted @ gap.flatten(1).unsqueeze(-1)).reshape(-1, 6)
-    gradient = transforms.new_zeros(size, 6).index_add_(0, ends.reshape(-1), slope)
-    cost = 0.5 * (weight * gap.square()).sum()
-    return Linearization(cost, gradient, hessian.view(size, size, 6, 6))
-
-
-def _solved(hessian: Tensor, gradient: Tensor) -> Tensor:
+def _solved(gradient: Tensor, matrix: Tensor) -> Tensor:
     """Return the twists (J, 6) of a step; none where the system has no Cholesky factor."""
-    size = len(gradient)
-    matrix = hessian.transpose(1, 2).reshape(6 * size, 6 * size)
     diagonal = matrix.diagonal()
     diagonal += _DAMPING * diagonal.mean() + torch.finfo(matrix.dtype).tiny
     factor, info = torch.linalg.cholesky_ex(matrix)
     if int(info):
         return torch.zeros_like(gradient)
-    return -torch.cholesky_solve(gradient.reshape(-1, 1), factor).view(size, 6)
+    return -torch.cholesky_solve(gradient.reshape(-1, 1), factor).view_as(gradient)

@@ -49,7 +49,9 @@ def fuse_motions(problem: ScanAlignProblem, options: Tensor, config: ChoiceConfi
     everywhere = worthwhile = torch.arange(len(offers), device=labels.device)
     for _ in range(_MAX_ROUNDS):
         moves = torch.where(patches[worthwhile], offers[worthwhile, None], labels)
-        energies = energy(moves)
+        changes = (moves != labels).any(1)
+        energies = torch.full_like(moves[:, 0], torch.inf, dtype=least.dtype)
+        energies[changes] = energy(moves[changes])
         pays = energies < least - _LEAST_GAIN
         if pays.any():
             best = energies.argmin()
@@ -121,11 +123,11 @@ def _edge_bends(graph: DeformationGraph, options: Tensor, slack: float) -> Tenso
 
 
 def _patches(graph: DeformationGraph) -> Tensor:
-    """Return (P, J) which nodes each patch holds."""
+    """Return (P, J) which nodes each patch holds, no two alike."""
     alone = torch.eye(graph.num_nodes, dtype=torch.bool, device=graph.edges.device)
     near = alone.clone()
     near[graph.edges[:, 0], graph.edges[:, 1]] = near[graph.edges[:, 1], graph.edges[:, 0]] = True
     rings = [alone]
     for _ in range(_RINGS):
         rings.append((rings[-1].double() @ near.double()) > 0)
-    return torch.cat(rings)
+    return torch.cat(rings).unique(dim=0)
