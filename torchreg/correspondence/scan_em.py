@@ -35,7 +35,7 @@ class ScanEMConfig:
     normal_weight: float = 5.0
     feature_weight: float = 8.0
     outliers: float = 0.3
-    num_candidates: int = 10
+    num_candidates: int = 6
 
     def __post_init__(self) -> None:
         check_positive(self.normal_weight, "normal_weight", allow_zero=True)
