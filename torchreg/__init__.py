@@ -44,19 +44,11 @@ if TYPE_CHECKING:
     from torchreg.pipelines.storage import load
     from torchreg.pipelines.track import Tracker
     from torchreg.pipelines.track_config import TrackConfig
-    from torchreg.results import (
-        AlignResult,
-        Calibration,
-        FrameResult,
-        PoseSolution,
-        PoseStarts,
-        ScanRegistration,
-        SequenceRegistration,
-        SpineSequence,
-        Status,
-        TrackResult,
-        TrackState,
-    )
+    from torchreg.results.alignment import AlignResult, Calibration, PoseStarts
+    from torchreg.results.base import Status
+    from torchreg.results.scans import PoseSolution, ScanRegistration, SequenceRegistration
+    from torchreg.results.spines import SpineSequence
+    from torchreg.results.tracking import FrameResult, TrackResult, TrackState
     from torchreg.viz.conversions import to_open3d, to_pyvista, to_trimesh
 
 __version__ = "0.1.0"
@@ -132,15 +124,15 @@ _MODULES = frozenset({"errors", "metrics"})
 
 _OWNERS = {
     "AlignConfig": "pipelines.align",
-    "AlignResult": "results",
+    "AlignResult": "results.alignment",
     "ArticulatedShape": "models.articulated",
     "BendingSkin": "models.skin",
-    "Calibration": "results",
+    "Calibration": "results.alignment",
     "Camera": "geometry.camera",
     "CameraRig": "geometry.camera_rig",
     "EMLoss": "losses.em",
     "FindPoseConfig": "pipelines.find_pose",
-    "FrameResult": "results",
+    "FrameResult": "results.tracking",
     "GridLBS": "models.grid_lbs",
     "Hand": "models.hand",
     "InitialPose": "pipelines.pose_initializer",
@@ -149,26 +141,26 @@ _OWNERS = {
     "PoseInitializer": "pipelines.pose_initializer",
     "PoseInitializerConfig": "pipelines.pose_initializer",
     "PosePrior": "models.pose_prior",
-    "PoseSolution": "results",
-    "PoseStarts": "results",
+    "PoseSolution": "results.scans",
+    "PoseStarts": "results.alignment",
     "RangeScan": "geometry.range_scan",
     "RegisterConfig": "pipelines.register_config",
-    "ScanRegistration": "results",
-    "SequenceRegistration": "results",
+    "ScanRegistration": "results.scans",
+    "SequenceRegistration": "results.scans",
     "SigmaSchedule": "correspondence.sigma",
     "SilhouetteFrames": "capture.silhouette_frames",
     "Skeleton": "geometry.skeleton",
     "SkeletonizeConfig": "pipelines.skeletonize",
     "Spine": "models.spine",
     "SpineConfig": "pipelines.extract_spine",
-    "SpineSequence": "results",
-    "Status": "results",
+    "SpineSequence": "results.spines",
+    "Status": "results.base",
     "StereoConfig": "capture.stereo",
     "StereoFrames": "capture.stereo_frames",
     "StereoPair": "geometry.camera_rig",
     "TrackConfig": "pipelines.track_config",
-    "TrackResult": "results",
-    "TrackState": "results",
+    "TrackResult": "results.tracking",
+    "TrackState": "results.tracking",
     "Tracker": "pipelines.track",
     "TriangleMesh": "geometry.mesh",
     "align": "pipelines.align",

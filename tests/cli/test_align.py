@@ -13,7 +13,7 @@ from torchreg.io.points import load_points, save_points
 from torchreg.models.hand import Hand
 from torchreg.pipelines.align import AlignConfig
 from torchreg.pipelines.storage import load
-from torchreg.results import Status
+from torchreg.results.base import Status
 
 QUICK = ("--search", "never")
 

@@ -10,7 +10,8 @@ from torchreg.cli.align_options import read_cloud, read_schedule, summary, write
 from torchreg.correspondence.sigma import SigmaSchedule
 from torchreg.errors import FormatError, InputError
 from torchreg.io.points import save_points
-from torchreg.results import AlignResult, Status
+from torchreg.results.alignment import AlignResult
+from torchreg.results.base import Status
 
 
 def test_schedules_are_start_stop_steps():

@@ -11,7 +11,7 @@ from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.hand import Hand
 from torchreg.pipelines.storage import load
 from torchreg.pipelines.track import Tracker
-from torchreg.results import PoseStarts
+from torchreg.results.alignment import PoseStarts
 
 
 def test_the_demonstration_runs(run, tmp_path):

@@ -9,7 +9,7 @@ from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
 from torchreg.io.points import load_points
 from torchreg.pipelines.register import register
-from torchreg.results import PoseStarts
+from torchreg.results.alignment import PoseStarts
 from torchreg.viz.pose_editor import PoseEditor
 
 

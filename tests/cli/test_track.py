@@ -20,7 +20,8 @@ from torchreg.models.hand import Hand
 from torchreg.models.skin import LinearBlendSkin, sample_skin
 from torchreg.pipelines.storage import load
 from torchreg.pipelines.track import TrackConfig, Tracker
-from torchreg.results import PoseStarts, Status
+from torchreg.results.alignment import PoseStarts
+from torchreg.results.base import Status
 
 FRAMES = 6
 FAST = ("--movie", "none", "--no-gltf")

@@ -7,7 +7,7 @@ from torchreg.cli import view as module
 from torchreg.io.points import save_points
 from torchreg.models.hand import Hand
 from torchreg.pipelines.storage import save_result
-from torchreg.results import PoseStarts
+from torchreg.results.alignment import PoseStarts
 
 pytest.importorskip("viser", reason="the viewer needs viser")
 

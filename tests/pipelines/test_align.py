@@ -17,7 +17,7 @@ from torchreg.models.hand import Hand
 from torchreg.models.primitives import Primitive
 from torchreg.models.skin import BendingSkin, sample_skin
 from torchreg.pipelines.align import AlignConfig, align
-from torchreg.results import Status
+from torchreg.results.base import Status
 
 # Without a search an alignment is one descent: fast, and the same whatever else is in the batch.
 DESCENT = AlignConfig(search="never")

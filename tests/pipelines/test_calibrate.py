@@ -16,7 +16,8 @@ from torchreg.models.skin import BendingSkin, sample_skin
 from torchreg.pipelines.align import AlignConfig, align
 from torchreg.pipelines.calibrate import CalibrateConfig, calibrate, scale_jacobian
 from torchreg.pipelines.storage import load
-from torchreg.results import Calibration, Status
+from torchreg.results.alignment import Calibration
+from torchreg.results.base import Status
 
 
 def offset(*place):

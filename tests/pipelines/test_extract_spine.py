@@ -9,7 +9,7 @@ from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
 from torchreg.geometry.rotation import so3_exp
 from torchreg.pipelines.extract_spine import SpineConfig, extract_spine
 from torchreg.pipelines.storage import load
-from torchreg.results import Status
+from torchreg.results.base import Status
 
 STAR = "(()()()()())"
 FRAMES = 6

@@ -25,7 +25,7 @@ from torchreg.pipelines.find_pose import (
     typical_poses,
 )
 from torchreg.pipelines.storage import load
-from torchreg.results import PoseStarts
+from torchreg.results.alignment import PoseStarts
 
 QUICK = FindPoseConfig(num_candidates=16, num_placed=5, num_searched=2, search_rounds=1, num_model_points=200)
 # Enough for most tests; the default is tried by the first ones.

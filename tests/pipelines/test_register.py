@@ -16,7 +16,8 @@ from torchreg.metrics import adjusted_rand
 from torchreg.pipelines.register import register
 from torchreg.pipelines.register_config import RegisterConfig
 from torchreg.pipelines.scan_align_config import ScanAlignConfig
-from torchreg.results import ScanRegistration, Status
+from torchreg.results.base import Status
+from torchreg.results.scans import ScanRegistration
 
 QUICK = RegisterConfig(align=ScanAlignConfig(num_samples=400, num_target_samples=600), num_samples=800)
 FEW = RegisterConfig(align=ScanAlignConfig(num_samples=150, num_target_samples=200, num_nodes=15))

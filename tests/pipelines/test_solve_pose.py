@@ -12,7 +12,7 @@ from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.geometry.sparse_grid import SparseGrid
 from torchreg.models.grid_lbs import GridLBS
 from torchreg.pipelines.solve_pose import PoseConfig, PoseSolver, solve_pose
-from torchreg.results import Status
+from torchreg.results.base import Status
 
 
 @pytest.fixture(scope="module")

@@ -17,16 +17,10 @@ from torchreg.models.primitives import Primitive
 from torchreg.models.spine import Spine
 from torchreg.pipelines.align import AlignConfig, align
 from torchreg.pipelines.storage import load, load_pose, save_result
-from torchreg.results import (
-    AlignRecord,
-    AlignResult,
-    Calibration,
-    DemoResult,
-    Result,
-    SpineSequence,
-    Status,
-    TrackResult,
-)
+from torchreg.results.alignment import AlignRecord, AlignResult, Calibration
+from torchreg.results.base import Result, Status
+from torchreg.results.spines import SpineSequence
+from torchreg.results.tracking import DemoResult, TrackResult
 
 
 def record(step, batch=1, dtype=torch.float32):

@@ -15,7 +15,8 @@ from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.pipelines.storage import load
 from torchreg.pipelines.track import TrackConfig, Tracker
 from torchreg.pipelines.track_motion import difference
-from torchreg.results import PoseStarts, Status
+from torchreg.results.alignment import PoseStarts
+from torchreg.results.base import Status
 
 TIPS = [4, 8, 12, 16, 20]
 FRAMES = 8

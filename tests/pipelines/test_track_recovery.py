@@ -10,7 +10,7 @@ import torchreg.pipelines.track_recovery as recovery
 from torchreg.datasets.hand import hand_motion
 from torchreg.pipelines.track_evidence import is_lost
 from torchreg.pipelines.track_recovery import Recovery, rested, waited
-from torchreg.results import PoseStarts
+from torchreg.results.alignment import PoseStarts
 
 HINGE = 6
 

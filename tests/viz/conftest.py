@@ -10,17 +10,11 @@ from torchreg.geometry.sparse_grid import SparseGrid
 from torchreg.models.grid_lbs import GridLBS
 from torchreg.models.hand import Hand
 from torchreg.models.spine import Spine
-from torchreg.results import (
-    AlignResult,
-    Calibration,
-    DemoResult,
-    PoseStarts,
-    ScanRegistration,
-    SequenceRegistration,
-    SpineSequence,
-    Status,
-    TrackResult,
-)
+from torchreg.results.alignment import AlignResult, Calibration, PoseStarts
+from torchreg.results.base import Status
+from torchreg.results.scans import ScanRegistration, SequenceRegistration
+from torchreg.results.spines import SpineSequence
+from torchreg.results.tracking import DemoResult, TrackResult
 
 
 def _bar_model(num_bones=3):

@@ -8,7 +8,8 @@ import torch
 
 from torchreg.errors import InputError
 from torchreg.models.skin import LinearBlendSkin
-from torchreg.results import FrameResult, Status
+from torchreg.results.base import Status
+from torchreg.results.tracking import FrameResult
 from torchreg.viz.animation import coarse_skin
 from torchreg.viz.live_track import LiveTrack
 

@@ -8,7 +8,7 @@ import torch
 from torchreg.errors import InputError
 from torchreg.io.points import load_points
 from torchreg.pipelines.storage import load
-from torchreg.results import PoseSolution
+from torchreg.results.scans import PoseSolution
 from torchreg.viz.pose_editor import PoseEditor
 
 

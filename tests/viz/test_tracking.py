@@ -13,7 +13,7 @@ from torchreg.errors import InputError
 from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.track import TrackConfig, Tracker
-from torchreg.results import Status
+from torchreg.results.base import Status
 from torchreg.viz import tracking
 from torchreg.viz.figures import new_figure, watch
 from torchreg.viz.tracking import FrameOverlays, animate_track, draw_track_frame, frame_label, save_track_gltf

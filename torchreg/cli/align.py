@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from torchreg.models.articulated import ArticulatedShape
     from torchreg.models.skin import LinearBlendSkin
     from torchreg.pipelines.align import AlignConfig
-    from torchreg.results import AlignResult
+    from torchreg.results.alignment import AlignResult
 
 
 @dataclass(frozen=True)

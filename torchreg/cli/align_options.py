@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from torchreg.correspondence.sigma import SigmaSchedule
     from torchreg.models.articulated import ArticulatedShape
-    from torchreg.results import AlignResult
+    from torchreg.results.alignment import AlignResult
 
 Sigma = Annotated[
     str | None, typer.Option(metavar="START:STOP:STEPS", help="Widths of the EM, metres, as in 0.02:0.005:5.")

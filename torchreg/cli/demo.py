@@ -13,7 +13,7 @@ from torchreg.cli.reporting import interruption, reporting
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchreg.results import DemoResult
+    from torchreg.results.tracking import DemoResult
 
 
 @reporting

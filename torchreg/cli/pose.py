@@ -12,7 +12,7 @@ from torchreg.cli.reporting import reporting
 from torchreg.cli.view import Browser, Port, Up, check_up, wait_for_interrupt
 
 if TYPE_CHECKING:
-    from torchreg.results import PoseSolution, ScanRegistration, SequenceRegistration
+    from torchreg.results.scans import PoseSolution, ScanRegistration, SequenceRegistration
     from torchreg.viz.pose_editor import PoseEditor
 
 
@@ -70,7 +70,7 @@ def _load(result: Path, start: Path | None) -> tuple[ScanRegistration | Sequence
     """Return a registration and, if one is given, a pose to start from."""
     from torchreg.errors import FormatError
     from torchreg.pipelines.storage import load
-    from torchreg.results import PoseSolution, ScanRegistration, SequenceRegistration
+    from torchreg.results.scans import PoseSolution, ScanRegistration, SequenceRegistration
 
     place = result if result.suffix else result.with_suffix(".safetensors")
     found = load(place)

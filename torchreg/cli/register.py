@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from torchreg.geometry.camera import Camera
     from torchreg.geometry.range_scan import RangeScan
-    from torchreg.results import ScanRegistration
+    from torchreg.results.scans import ScanRegistration
 
 # Pictures of what was kept of source and target.
 _KEPT = ("source.png", "target.png")

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torchreg.capture.silhouette_frames import SilhouetteFrames
     from torchreg.geometry.mesh import TriangleMesh
     from torchreg.models.spine import Spine
-    from torchreg.results import SpineSequence
+    from torchreg.results.spines import SpineSequence
 
 
 @reporting

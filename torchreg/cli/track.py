@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchreg.models.skin import LinearBlendSkin
-    from torchreg.results import FrameResult
+    from torchreg.results.tracking import FrameResult
 
 MOVIES = ("gif", "mp4", "none")
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from torchreg.models.skin import LinearBlendSkin
     from torchreg.pipelines.track import TrackConfig, Tracker
     from torchreg.pipelines.track_progress import TrackProgress
-    from torchreg.results import FrameResult, TrackResult, TrackState
+    from torchreg.results.tracking import FrameResult, TrackResult, TrackState
 
     OnFrame = Callable[[Tensor, FrameResult], object]
 

@@ -28,7 +28,9 @@ from torchreg.pipelines.align_problem import (
 from torchreg.pipelines.align_search import FINAL_SIGMAS, explore, needs_search
 from torchreg.pipelines.align_stages import CORRESPONDENCES, OnStep, StageResult, fit_surface, register
 from torchreg.pipelines.threads import one_thread
-from torchreg.results import AlignRecord, AlignResult, FrameResult, Status, TrackState
+from torchreg.results.alignment import AlignRecord, AlignResult
+from torchreg.results.base import Status
+from torchreg.results.tracking import FrameResult, TrackState
 
 # Shares of the model's size, the diagonal of its rest pose.
 _START_SIGMA, _STOP_SIGMA = 0.08, 0.02

@@ -14,7 +14,7 @@ from torchreg.correspondence.sigma import SigmaSchedule, estimate_sigma
 from torchreg.correspondence.softassign import softassign
 from torchreg.pipelines.align_objectives import PosePrior, RegistrationObjective, SurfaceObjective
 from torchreg.pipelines.align_problem import AlignProblem
-from torchreg.results import AlignRecord
+from torchreg.results.alignment import AlignRecord
 from torchreg.solvers.levenberg_marquardt import (
     LMResult,
 )

@@ -17,7 +17,8 @@ from torchreg.models.primitives import fuse
 from torchreg.models.skin import sample_skin
 from torchreg.pipelines.align import AlignConfig, align
 from torchreg.pipelines.align_stages import FINAL_SIGMA_RANGE, SIGMA_PER_NOISE, SURFACE_SIGMAS, surface_noise
-from torchreg.results import Calibration, Status
+from torchreg.results.alignment import Calibration
+from torchreg.results.base import Status
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
 
 # Residuals near each other share what the model gets wrong: they weigh as if their noise were this much larger.

@@ -13,7 +13,7 @@ from torchreg.datasets.sequences import hand_sequence
 from torchreg.models.hand import Hand
 from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.track import TrackConfig, Tracker
-from torchreg.results import DemoResult, FrameResult, TrackResult
+from torchreg.results.tracking import DemoResult, FrameResult, TrackResult
 
 DEMO_FPS = 20.0
 

@@ -29,7 +29,8 @@ from torchreg.pipelines.spine_imposing import (
     usual_lengths,
 )
 from torchreg.pipelines.spine_names import TipNames, has_loops, name_tips
-from torchreg.results import SpineRecord, SpineSequence, Status
+from torchreg.results.base import Status
+from torchreg.results.spines import SpineRecord, SpineSequence
 
 # A limb between junctions shorter than this share of the whole is none.
 _NO_LIMB = 1e-3

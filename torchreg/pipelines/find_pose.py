@@ -33,7 +33,7 @@ from torchreg.pipelines.limb_search import distinct_first, take_rows
 from torchreg.pipelines.pose_confidence import is_misfit, pose_confidence
 from torchreg.pipelines.pose_search import PoseSearch, mean_distances
 from torchreg.pipelines.threads import one_thread
-from torchreg.results import PoseStarts
+from torchreg.results.alignment import PoseStarts
 
 # Typical poses lie at these shares of the way from the rest pose to the middle of the joint limits.
 _BENT_SHARES, _TYPICAL_SHARE = (0.2, 0.8), 0.5

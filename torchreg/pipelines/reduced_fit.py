@@ -19,7 +19,7 @@ from torchreg.pipelines.bone_problem import BoneProblem, bind
 from torchreg.pipelines.refine_weights import refine_weights
 from torchreg.pipelines.register_config import OnRegisterStep, RegisterConfig
 from torchreg.pipelines.scan_align_config import between
-from torchreg.results import RegisterRecord
+from torchreg.results.scans import RegisterRecord
 
 # Sampling distances of the target below which the threshold for matches never falls.
 _LEAST_REACH = 2.0

@@ -21,7 +21,8 @@ from torchreg.pipelines.register_config import OnRegisterStep, RegisterConfig
 from torchreg.pipelines.scan_alignment import align_scans
 from torchreg.pipelines.scan_unit import ScanUnit
 from torchreg.pipelines.threads import one_thread
-from torchreg.results import RegisterRecord, ScanRegistration, Status
+from torchreg.results.base import Status
+from torchreg.results.scans import RegisterRecord, ScanRegistration
 
 # Points that the dense alignment is unsure of count this much at least: they follow what is around them.
 LEAST_CONFIDENCE = 0.1

@@ -11,7 +11,7 @@ from torchreg.losses.scan import check_share
 from torchreg.models.grid_lbs import BLENDS
 from torchreg.pipelines.refine_weights import RefineConfig
 from torchreg.pipelines.scan_align_config import ScanAlignConfig
-from torchreg.results import RegisterRecord
+from torchreg.results.scans import RegisterRecord
 
 OnRegisterStep = Callable[[RegisterRecord], None]
 

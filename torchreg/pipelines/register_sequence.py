@@ -28,7 +28,7 @@ from torchreg.pipelines.register_config import OnRegisterStep, RegisterConfig
 from torchreg.pipelines.scan_alignment import align_scans
 from torchreg.pipelines.scan_unit import ScanUnit
 from torchreg.pipelines.threads import one_thread
-from torchreg.results import SequenceRegistration
+from torchreg.results.scans import SequenceRegistration
 
 # From frame to frame few large bones carry the reference: what many small ones take over from noise adds up.
 _CARRIED_LABEL_COST, _CARRIED_SMOOTHNESS = 0.002, 0.2

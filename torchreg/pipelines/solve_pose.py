@@ -27,7 +27,8 @@ from torchreg.models.grid_lbs import GridLBS, check_rigid
 from torchreg.pipelines.bone_fit import BoneFit, fit_bones
 from torchreg.pipelines.bone_problem import BoneProblem, bind, bone_bodies
 from torchreg.pipelines.threads import one_thread
-from torchreg.results import PoseSolution, Status
+from torchreg.results.base import Status
+from torchreg.results.scans import PoseSolution
 
 HELD_JOINTS = ("tree", "all")
 # Where handles are this share of the model's size off, steps pay at first about as much as handles pull; less, nearer.

@@ -21,7 +21,7 @@ from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.io.tensors import load_tensors, save_tensors
 from torchreg.pipelines.skeletonize import SkeletonizeConfig, skeletonize
-from torchreg.results import SpineRecord
+from torchreg.results.spines import SpineRecord
 
 # Fewer frames than this are not worth the start of a process.
 _WORTH_PROCESSES = 4

@@ -28,24 +28,11 @@ from torchreg.models.primitives import Primitive
 from torchreg.models.rigs import RigSurface, ShapeSpec
 from torchreg.models.shape_record import HandSpec, ShapeRecord, build_shape, record_shape
 from torchreg.models.spine import Spine, SpineFields
-from torchreg.results import (
-    AlignRecord,
-    AlignResult,
-    Calibration,
-    DemoResult,
-    FrameResult,
-    PoseSolution,
-    PoseStarts,
-    RegisterRecord,
-    Result,
-    ScanRegistration,
-    SequenceRegistration,
-    SpineSequence,
-    Status,
-    TrackResult,
-    TrackState,
-    register_writer,
-)
+from torchreg.results.alignment import AlignRecord, AlignResult, Calibration, PoseStarts
+from torchreg.results.base import Result, Status, register_writer
+from torchreg.results.scans import PoseSolution, RegisterRecord, ScanRegistration, SequenceRegistration
+from torchreg.results.spines import SpineSequence
+from torchreg.results.tracking import DemoResult, FrameResult, TrackResult, TrackState
 
 # What a file may name: nothing else is ever built from it.
 _RESULTS: dict[str, type[Result]] = {

@@ -25,7 +25,8 @@ from torchreg.pipelines.track_fit import MIN_DATA, STOP_SIGMA, FrameFitter, gene
 from torchreg.pipelines.track_motion import first_motion, merged, motion_after, slowed, timed
 from torchreg.pipelines.track_points import points_after
 from torchreg.pipelines.track_recovery import MIN_GAIN, Recovery, rested, waited
-from torchreg.results import FrameResult, Status, TrackResult, TrackState
+from torchreg.results.base import Status
+from torchreg.results.tracking import FrameResult, TrackResult, TrackState
 
 OnFrame = Callable[[Tensor, FrameResult], None]
 

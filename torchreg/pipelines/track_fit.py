@@ -34,7 +34,7 @@ from torchreg.pipelines.track_evidence import (
 )
 from torchreg.pipelines.track_limbs import fit_limbs, scattered
 from torchreg.pipelines.track_motion import moves_fast, predicted, prior_std, spread
-from torchreg.results import TrackState
+from torchreg.results.tracking import TrackState
 
 # Less data are none.
 MIN_DATA = 10

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchreg.models.skin import bending_weights
 from torchreg.pipelines.track_config import FrameFit
 from torchreg.pipelines.track_fit import MIN_DATA, FrameFitter, generator
-from torchreg.results import TrackState
+from torchreg.results.tracking import TrackState
 
 # Data this near the surface, as a share of the size, are harvested (5 mm on a hand); they show model points this near.
 _HARVEST_SHARE, _SHOWN_SHARE = 0.022, 0.03

@@ -19,7 +19,7 @@ from torchreg.io.atomic import write_atomic
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, open_zip, read_bytes
 from torchreg.io.points import PARSER_ERRORS
 from torchreg.pipelines.storage import load, save_result
-from torchreg.results import TrackResult, TrackState
+from torchreg.results.tracking import TrackResult, TrackState
 
 _RESULT, _STATE, _JOB = "result.safetensors", "state.safetensors", "job.json"
 _MEMBERS = (_RESULT, "result.json", _STATE, "state.json", _JOB)

@@ -17,7 +17,7 @@ from torchreg.pipelines.track_config import Frame, FrameFit, FrameView, thinned
 from torchreg.pipelines.track_evidence import is_doubtful, is_lost, is_vague
 from torchreg.pipelines.track_fit import STOP_SIGMA, FrameFitter, generator
 from torchreg.pipelines.track_motion import difference, spread
-from torchreg.results import TrackState
+from torchreg.results.tracking import TrackState
 
 # Data that another pose must explain beyond those that the prediction led to.
 MIN_GAIN = 4.0

@@ -16,7 +16,9 @@ from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.io.points import PointCloud
-from torchreg.results import AlignResult, ScanRegistration, SequenceRegistration, SpineSequence
+from torchreg.results.alignment import AlignResult
+from torchreg.results.scans import ScanRegistration, SequenceRegistration
+from torchreg.results.spines import SpineSequence
 from torchreg.viz.bone_colors import bone_palette, weight_colors
 
 Array = NDArray[Any]

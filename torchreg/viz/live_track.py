@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchreg.errors import InputError
 from torchreg.models.skin import LinearBlendSkin
-from torchreg.results import FrameResult
+from torchreg.results.tracking import FrameResult
 from torchreg.viz.figures import SKIN_COLOR
 from torchreg.viz.result_scenes import inlier_paint
 from torchreg.viz.scene import Cloud, Layer, Scene, Surface

@@ -16,7 +16,7 @@ from torchreg.errors import InputError
 from torchreg.io.gltf_morph import save_vertex_animation
 from torchreg.models.grid_lbs import GridLBS
 from torchreg.pipelines.solve_pose import PoseConfig, PoseSolver
-from torchreg.results import PoseSolution, ScanRegistration, SequenceRegistration
+from torchreg.results.scans import PoseSolution, ScanRegistration, SequenceRegistration
 from torchreg.viz.bone_colors import weight_colors
 from torchreg.viz.key_poses import between_poses
 from torchreg.viz.scan_gltf import save_grid_animation

@@ -16,7 +16,9 @@ from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.visibility import View
 from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.skin import LinearBlendSkin
-from torchreg.results import AlignRecord, AlignResult, ScanRegistration, SpineSequence
+from torchreg.results.alignment import AlignRecord, AlignResult
+from torchreg.results.scans import ScanRegistration
+from torchreg.results.spines import SpineSequence
 from torchreg.viz.animation import coarse_skin
 from torchreg.viz.bone_colors import error_colors, weight_colors
 from torchreg.viz.figures import (

@@ -15,7 +15,8 @@ from torchreg.geometry.visibility import View
 from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.align_problem import INLIER_SHARE
-from torchreg.results import FrameResult, Status, TrackResult
+from torchreg.results.base import Status
+from torchreg.results.tracking import FrameResult, TrackResult
 from torchreg.viz.animation import check_animation_path, coarse_skin, common_view, save_animation
 from torchreg.viz.figures import (
     INLIER_COLOR,

@@ -1,0 +1,1 @@
+"""What pipelines return: frozen records of tensors."""
