@@ -56,7 +56,6 @@ def merge_rigid(moments: RigidMoments, edges: Tensor, num_parts: int, *, toleran
             break
         left -= 1
         sums[:, first] += sums[:, second]
-        own[first] = _cost(sums[:, first])
         part[part == second] = first
         touching[first] |= touching[second]
         touching[:, first] |= touching[second]
@@ -65,9 +64,10 @@ def merge_rigid(moments: RigidMoments, edges: Tensor, num_parts: int, *, toleran
         for gone in (first, second):
             price[gone], price[:, gone] = torch.inf, torch.inf
         others = touching[first].nonzero()[:, 0]
-        if len(others):
-            low, high = others.clamp(max=first), others.clamp(min=first)
-            price[low, high] = _cost(sums[:, [first]] + sums[:, others]) - own[first] - own[others]
+        costs = _cost(sums[:, [first]] + torch.cat((torch.zeros_like(sums[:, :1]), sums[:, others]), dim=1))
+        own[first] = costs[0]
+        low, high = others.clamp(max=first), others.clamp(min=first)
+        price[low, high] = costs[1:] - own[first] - own[others]
     return part.unique(return_inverse=True)[1]
 
 
