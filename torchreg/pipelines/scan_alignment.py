@@ -35,6 +35,7 @@ from torchreg.pipelines.scan_align_stages import (
     soft_matches,
     used_samples,
 )
+from torchreg.pipelines.scan_exchange import exchanged_limbs
 from torchreg.pipelines.scan_fusion import fuse_motions
 from torchreg.pipelines.threads import both, one_thread
 
@@ -65,7 +66,8 @@ def align_scans(
     Each goes on by an EM with an outlier class, while edges of the graph give where its parts disagree, matches beside
     what something nearer hides hold across the surface alone, and samples where the target's camera saw nothing are
     taken back into its picture. Then each part moves as in the hypothesis that suits it, and the EM goes on from there
-    as well. The best covers the target, is covered by it, is like it, bends least, and is nearest to what is expected;
+    as well; so it does where two limbs of the best change places, if one-to-one matches show that to be better. The
+    best covers the target, is covered by it, is like it, bends least, and is nearest to what is expected;
     its EM is taken to the end. Where rest and stiff matches agree and leave little of both scans over, the softer ones
     are left out; where all agree, so is what would be put together.
 
@@ -107,6 +109,7 @@ def align_scans(
     found = sorted(_candidates(problem, config, report), key=_energy)
     if len(found) >= _LEAST_FUSED and not _all_agree(problem, found, config):
         found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
+        found = sorted([*found, *_exchanged(problem, found[0], config, report)], key=_energy)
     chosen = found[0].hypothesis
     transforms = _finished(problem, found[0], config, report)
     weights = spread_weights(
@@ -233,6 +236,24 @@ def _fused(
     begin = fuse_motions(problem, torch.stack([candidate.transforms for candidate in found]), config.choice)
     reporter = Reporter("fused", problem.unit.size, on_step)
     return _compared(problem, begin, config.refine.fused_sigma, config, reporter)
+
+
+def _exchanged(
+    problem: ScanAlignProblem, best: _Candidate, config: ScanAlignConfig, on_step: OnStep
+) -> list[_Candidate]:
+    """Return the candidate in which two limbs of the best one change places; none unless that looks better."""
+
+    def energy(motion: Tensor) -> float:
+        return judge(problem, reporter.name, motion, config.choice).energy
+
+    reporter = Reporter("exchanged", problem.unit.size, on_step)
+    options = exchanged_limbs(problem, best.transforms)
+    if not options:
+        return []
+    pulled = pull_one_to_one(problem, min(options, key=energy), config.reassign, reporter)
+    if energy(pulled) >= _energy(best):
+        return []
+    return [_compared(problem, pulled, config.refine.near_sigma, config, reporter)]
 
 
 def _compared(

@@ -1,0 +1,82 @@
+import pytest
+import torch
+
+from torchreg.datasets.depth_scanner import DepthScanner
+from torchreg.datasets.scan_sequences import walking_figure
+from torchreg.geometry.range_scan import RangeScan
+from torchreg.geometry.rigid import se3_exp, transform_points
+from torchreg.pipelines.graph_fit import GraphMatches, fit_graph
+from torchreg.pipelines.scan_align_config import ScanAlignConfig
+from torchreg.pipelines.scan_align_problem import describe
+from torchreg.pipelines.scan_alignment import align_scans
+from torchreg.pipelines.scan_exchange import exchanged_limbs
+
+CONFIG = ScanAlignConfig(num_samples=600, num_target_samples=1200, num_nodes=40)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    """A walking person whose legs pass each other between two scans."""
+    return walking_figure(12, scanner=DepthScanner(num_points=4500)).pair(3, 7)
+
+
+@pytest.fixture(scope="module")
+def problem(pair):
+    return describe(pair.source, pair.target, CONFIG)
+
+
+def lower_legs(problem, pair):
+    """Return the samples (S,) of the left and of the right lower leg and foot."""
+    labels, names = pair.labels[problem.samples], pair.part_names
+    below = ("shin", "foot", "calf", "lower leg")
+    sides = [[i for i, name in enumerate(names) if side in name and any(part in name for part in below)]
+             for side in ("left", "right")]  # fmt: skip
+    return [torch.isin(labels, torch.tensor(side)) for side in sides]
+
+
+def test_limbs_lie_where_the_others_lay(problem, pair):
+    rest = problem.graph.rest()
+    left, right = lower_legs(problem, pair)
+    assert int(left.sum()) > 10
+    assert int(right.sum()) > 10
+    places = problem.graph(rest)
+    middles = places[left].mean(0), places[right].mean(0)
+    apart = (middles[0] - middles[1]).norm()
+    off = [
+        max((moved[left].mean(0) - middles[1]).norm(), (moved[right].mean(0) - middles[0]).norm()) / apart
+        for moved in (problem.graph(motion) for motion in exchanged_limbs(problem, rest))
+    ]
+    assert float(min(off)) < 0.4
+    # All else stays about where it was.
+    moved = problem.graph(exchanged_limbs(problem, rest)[int(torch.stack(off).argmin())])
+    others = ~(left | right)
+    assert float((moved - places)[others].norm(dim=-1).median()) < 0.01
+
+
+def test_turning_everything_turns_the_exchange(problem, pair):
+    whole = se3_exp(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.4, -0.6], dtype=torch.float64))
+    rest = problem.graph.rest()
+    for plain, turned in zip(exchanged_limbs(problem, rest), exchanged_limbs(problem, whole @ rest), strict=True):
+        expected = transform_points(whole, problem.graph(plain))
+        torch.testing.assert_close(problem.graph(turned), expected, rtol=0, atol=1e-6)
+
+
+def test_legs_that_passed_each_other_find_their_places(pair):
+    found = align_scans(pair.source, pair.target)
+    assert found.chosen.name == "exchanged"
+    off = (found.points - pair.truth).norm(dim=-1) / pair.source.diagonal
+    assert float((off < 0.025).double().mean()) > 0.95
+
+
+def test_without_limbs_there_is_nothing_to_exchange():
+    across = torch.linspace(-1, 1, 20)
+    x, y = (value.flatten() for value in torch.meshgrid(across, across, indexing="ij"))
+    points = torch.stack((x, y, 0.5 * (x.square() + y.square())), dim=1)
+    scan = RangeScan(points, normals=torch.nn.functional.normalize(torch.stack((-x, -y, torch.ones_like(x)), 1), dim=1))
+    few = describe(scan, scan, ScanAlignConfig(num_samples=200, num_target_samples=200, num_nodes=1))
+    assert exchanged_limbs(few, few.graph.rest()) == []
+    # Limbs of a sample or two are none.
+    matches = GraphMatches(slice(0, 200), few.graph.points, torch.ones(200, dtype=torch.float64))
+    tiny = describe(scan, scan, ScanAlignConfig(num_samples=12, num_target_samples=200, num_nodes=6))
+    assert exchanged_limbs(tiny, tiny.graph.rest()) == []
+    assert fit_graph(few.graph, few.graph.rest(), matches, 1.0).misses < 1e-12
