@@ -108,8 +108,10 @@ def align_scans(
     problem = describe(source, target, config, generator, None if expected is None else _checked(expected, source))
     found = sorted(_candidates(problem, config, report), key=_energy)
     if len(found) >= _LEAST_FUSED and not _all_agree(problem, found, config):
-        found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
-        found = sorted([*found, *_exchanged(problem, found[0], config, report)], key=_energy)
+        fused, exchanged = _both_told(
+            report, partial(_fused, problem, found, config), partial(_exchanged, problem, found[0], config)
+        )
+        found = sorted([*found, fused, *exchanged], key=_energy)
     chosen = found[0].hypothesis
     transforms = _finished(problem, found[0], config, report)
     weights = spread_weights(
