@@ -2,16 +2,12 @@
 
 import pytest
 import torch
-from hypothesis import settings
 
 from torchreg.datasets.hand import surface_skin
 from torchreg.models.hand import Hand
 from torchreg.models.skin import sample_skin
 
 torch.set_num_threads(1)
-# How long an example takes is the machine's affair: a busy one would fail tests at random.
-settings.register_profile("untimed", deadline=None)
-settings.load_profile("untimed")
 
 
 @pytest.fixture(scope="session")

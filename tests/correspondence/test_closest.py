@@ -36,7 +36,7 @@ def test_matches_by_hand():
     assert closest_point(model, data, torch.tensor(0.2), trim=1.1).inlier_posterior.tolist() == [1, 0, 1, 0]
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 40), st.floats(0.005, 0.5), st.integers(0, 1000))
 def test_matches_are_those_of_a_tree(n, m, sigma, seed):
     model, data = cloud(n, seed=seed), cloud(m, seed=seed + 1)

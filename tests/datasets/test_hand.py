@@ -170,7 +170,7 @@ def test_a_skin_without_faces_is_refused(hand, skin):
         make_hand_cloud(hand, hand.rest_pose(), skin=bare)
 
 
-@settings(max_examples=15)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10_000), st.floats(0, 1))
 def test_random_poses_keep_the_limits_and_stand_before_the_camera(seed, bend):
     hand = HANDS[seed % 2]

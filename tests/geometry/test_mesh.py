@@ -82,7 +82,7 @@ def test_gradients(quantity):
     assert torch.autograd.gradcheck(lambda v: getattr(TriangleMesh(v, sphere.faces), quantity)(), (vertices,))
 
 
-@settings(max_examples=20)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 1000))
 def test_normals_turn_with_the_mesh(seed):
     generator = torch.Generator().manual_seed(seed)

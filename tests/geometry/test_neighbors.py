@@ -22,7 +22,7 @@ def by_loop(points, targets):
     return [min(range(len(targets)), key=lambda k: math.dist(x, targets[k])) for x in points.tolist()]
 
 
-@settings(max_examples=40)
+@settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6), st.integers(0, 20), st.integers(1, 30))
 def test_neighbors_are_those_of_a_loop_over_all_pairs(seed, count, size):
     points, targets = clouds(seed, count, size)

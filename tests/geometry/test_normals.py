@@ -119,7 +119,7 @@ def test_separate_closed_bodies_all_look_outward():
     assert float(cosines(normals[1500:], small).min()) > 0
 
 
-@settings(max_examples=15)
+@settings(max_examples=15, deadline=None)
 @given(
     turn=st.lists(st.floats(-3, 3), min_size=3, max_size=3),
     scale=st.sampled_from([1e-6, 1e-3, 1.0, 1e3, 1e6]),

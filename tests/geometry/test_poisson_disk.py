@@ -31,7 +31,7 @@ def test_the_rule_walked_point_by_point():
     assert poisson_disk(points, radius).tolist() == sorted(kept)
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(
     count=st.integers(1, 300), radius=st.floats(1e-3, 3), seed=st.integers(0, 99), scale=st.sampled_from([1e-3, 1e3])
 )
@@ -46,7 +46,7 @@ def test_no_two_are_within_the_radius_and_no_other_point_is_out_of_reach(count, 
     assert torch.equal(poisson_disk(points * scale, radius * scale), few)
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(size=st.integers(1, 300), count=st.integers(1, 300), seed=st.integers(0, 99), doubles=st.booleans())
 def test_as_many_as_asked_for(size, count, seed, doubles):
     points = cloud(size, seed)

@@ -107,7 +107,7 @@ def test_auto_tells_the_kinds_apart():
     }
 
 
-@settings(max_examples=15)
+@settings(max_examples=15, deadline=None)
 @given(st.integers(0, 1000), st.floats(0.1, 1000))
 def test_fits_move_and_scale_with_the_points(seed, scale):
     points = CLOUDS["cone"]

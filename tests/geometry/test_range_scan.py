@@ -170,7 +170,7 @@ def test_faces_of_no_use_count_as_none():
     assert bool(flat.boundary.all())
 
 
-@settings(max_examples=10)
+@settings(max_examples=10, deadline=None)
 @given(
     turn=st.lists(st.floats(-3, 3), min_size=3, max_size=3),
     scale=st.sampled_from([1e-3, 1.0, 1e3]),

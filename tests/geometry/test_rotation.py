@@ -55,7 +55,7 @@ def test_exp_agrees_with_scipy_and_the_matrix_exponential(angle):
     torch.testing.assert_close(so3_exp(vector.float()).double(), rotation, atol=3e-6, rtol=0)
 
 
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)
 @given(vectors)
 def test_exp_gives_rotations_that_log_brings_back(vector):
     rotation = so3_exp(vector)
@@ -113,7 +113,7 @@ def test_second_derivatives_of_exp_at_zero():
     torch.testing.assert_close(second, expected, atol=1e-14, rtol=0)
 
 
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)
 @given(vectors, vectors)
 def test_composition_agrees_with_scipy(first, second):
     composed = compose_rotation_vectors(first, second)

@@ -30,7 +30,7 @@ def test_the_cover_is_within_twice_the_best():
     assert sorted(groups.tolist()) == [0, 1, 2, 3]
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(st.integers(1, 30), st.data())
 def test_indices_are_all_different_also_among_duplicates(size, data):
     count = data.draw(st.integers(1, size))

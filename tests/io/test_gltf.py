@@ -480,7 +480,7 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [path for path in [path] if path] + [leaf for key, inner in items for leaf in leaves(inner, (*path, key))]
 
 
-@settings(max_examples=150)
+@settings(max_examples=150, deadline=None)
 @given(
     st.integers(0, 10**6),
     st.sampled_from([None, True, -1, 0, 1, 7, 2**31, 10**30, 0.5, 1e308, float("nan"), "", "x", [], [0], [None], {}]),

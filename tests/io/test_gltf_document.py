@@ -256,7 +256,7 @@ def test_entries_have_types_and_null_is_missing():
         document.index("nodes", -1, "a child")
 
 
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)
 @given(st.lists(st.floats(-3, 3), min_size=10, max_size=10))
 def test_node_transforms_are_those_of_an_independent_library(numbers):
     rotation, scale, translation = numbers[:4], numbers[4:7], numbers[7:]

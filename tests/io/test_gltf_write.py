@@ -168,7 +168,7 @@ def test_quaternions_take_the_short_way_through_full_turns(tmp_path: Path) -> No
     np.testing.assert_allclose(np.linalg.norm(rotations, axis=1), 1, atol=1e-6)
 
 
-@settings(max_examples=30)
+@settings(max_examples=30, deadline=None)
 @given(st.lists(st.floats(-4, 4), min_size=3, max_size=3))
 def test_node_rotations_agree_with_scipy(tmp_path_factory: pytest.TempPathFactory, vector: list[float]) -> None:
     transform = np.eye(4)[None, None]

@@ -133,14 +133,14 @@ def test_lzf_of_known_blocks():
         decompress_lzf(packed, 27)
 
 
-@settings(max_examples=50)
+@settings(max_examples=50, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 255), st.integers(1, 600)), max_size=8))
 def test_lzf_undoes_a_run_length_encoder(runs):
     data = b"".join(bytes([value]) * count for value, count in runs)
     assert decompress_lzf(compress(data), len(data)) == data
 
 
-@settings(max_examples=100)
+@settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=200), st.integers(0, 500))
 def test_lzf_of_noise_ends(noise, size):
     with contextlib.suppress(FormatError):

@@ -53,7 +53,7 @@ def test_meshes_written_by_trimesh(tmp_path, name, content):
         torch.testing.assert_close(mesh.vertices, SPHERE.vertices.float())
 
 
-@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     points=hnp.arrays(
         np.float64, st.tuples(st.integers(1, 6), st.just(3)), elements=st.floats(-1e6, 1e6, allow_subnormal=False)

@@ -94,7 +94,7 @@ def test_primitives_have_size_and_place(tmp_path: Path) -> None:
     assert record.link_meshes == (None,) * 4
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(st.lists(st.floats(-10, 10), min_size=3, max_size=3))
 def test_origins_agree_with_scipy(tmp_path_factory: pytest.TempPathFactory, rpy: list[float]) -> None:
     folder = tmp_path_factory.mktemp("origin")

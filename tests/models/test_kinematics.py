@@ -92,7 +92,7 @@ def reference(tree, values):
     return np.stack([world(index) for index in range(len(tree))])
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 14))
 def test_frames_equal_a_plain_walk_of_the_tree(seed, count):
     tree = random_tree(seed, count, mimics=True)
@@ -131,7 +131,7 @@ def their_chain(tree):
     return pk.Chain(frames[0], dtype=torch.float64)
 
 
-@settings(max_examples=20)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 40))
 def test_frames_equal_those_of_pytorch_kinematics_on_any_tree(seed, count):
     tree = random_tree(seed, count)

@@ -54,7 +54,7 @@ def labeling_problem(seed, num_nodes=6, num_labels=3, num_edges=9):
 
 
 @given(SEEDS, st.integers(1, 7), st.sampled_from([1.0, 1e-6, 1e9]))
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 def test_a_cut_costs_the_least_of_all_cuts(seed, num_nodes, scale):
     edges, generator = random_graph(seed, num_nodes, 12)
     source, sink = torch.rand(2, num_nodes, generator=generator, dtype=torch.float64) * scale
@@ -71,7 +71,7 @@ def test_a_cut_costs_the_least_of_all_cuts(seed, num_nodes, scale):
 
 
 @given(SEEDS)
-@settings(max_examples=40)
+@settings(max_examples=40, deadline=None)
 def test_integers_are_exact_and_a_tie_puts_the_fewest_nodes_at_the_sink(seed):
     edges, generator = random_graph(seed, 6, 10)
     source, sink = torch.randint(0, 4, (2, 6), generator=generator)
@@ -150,7 +150,7 @@ def test_a_flow_that_differs_from_the_cut_is_an_error(monkeypatch):
 
 @given(SEEDS, st.booleans(), st.booleans())
 @example(237, False, True)  # leaves open nodes that nothing holds on either side
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 def test_no_expansion_of_any_label_lowers_the_energy_and_the_bound_holds(seed, general, costly):
     unary, edges, weights = labeling_problem(seed)
     generator = torch.Generator().manual_seed(seed)
@@ -174,7 +174,7 @@ def test_no_expansion_of_any_label_lowers_the_energy_and_the_bound_holds(seed, g
 
 
 @given(SEEDS)
-@settings(max_examples=40)
+@settings(max_examples=40, deadline=None)
 def test_two_labels_end_in_the_least_energy_from_any_start(seed):
     unary, edges, weights = labeling_problem(seed, num_labels=2)
     initial = torch.randint(0, 2, (6,), generator=torch.Generator().manual_seed(seed))

@@ -110,7 +110,7 @@ def test_scores_counts_and_inliers_follow_their_definitions():
 
 
 @given(st.integers(0, 1000), st.booleans())
-@settings(max_examples=15)
+@settings(max_examples=15, deadline=None)
 def test_motions_are_rigid_and_distinct(seed, with_normals):
     source, target, normals, _ = matched(seed, (0.3, 0.2), count=60, noise=0.004)
     result = ransac_rigid(source, target, threshold=THRESHOLD, num_trials=80, **(normals if with_normals else {}))
