@@ -30,13 +30,26 @@ def blended(points, nearest, weights, transforms):
     return (weights.unsqueeze(-1) * ends).sum(1)
 
 
-def dense(nearest, weights, points, transforms, middles):
-    """Return derivatives (R, 3, 6 J) of the places by twists, from autograd."""
+def dense(points, nearest, weights, transforms, middles):
+    """Return derivatives (R, 3, 6 J) of the places by twists, entry by entry."""
+    arms = transform_points(transforms[nearest], points[:, None, None]).squeeze(2) - middles[nearest]
+    axes = torch.eye(3, dtype=F64)
+    turns = torch.linalg.cross(axes.expand(*arms.shape, 3), arms.unsqueeze(-2).expand(*arms.shape, 3), dim=-1).mT
+    blocks = weights[..., None, None] * torch.cat((axes.expand_as(turns), turns), dim=-1)
+    slope = torch.zeros(len(points), len(transforms), 3, 6, dtype=F64)
+    rows = torch.arange(len(points)).unsqueeze(1).expand_as(nearest)
+    slope.index_put_((rows, nearest), blocks, accumulate=True)
+    return slope.transpose(1, 2).flatten(2)
+
+
+def test_derivatives_are_those_of_turning_about_the_middles():
+    points, nearest, weights, transforms, middles = problem(few=2, count=6)
 
     def places(twists):
         return blended(points, nearest, weights, turn_about(transforms, twists.view(-1, 6), middles))
 
-    return torch.autograd.functional.jacobian(places, torch.zeros(6 * len(transforms), dtype=F64))
+    expected = torch.autograd.functional.jacobian(places, torch.zeros(30, dtype=F64))
+    torch.testing.assert_close(dense(points, nearest, weights, transforms, middles), expected)
 
 
 @pytest.mark.parametrize("distinct", [True, False])
@@ -56,7 +69,7 @@ def test_normal_equations_are_those_of_the_jacobian(seed, distinct, few):
     metric = normals.unsqueeze(2) * normals.unsqueeze(1) + slides[:, None, None] * torch.eye(3, dtype=F64)
     metric = scales[:, None, None] * metric
     pulls = (metric @ points.unsqueeze(-1)).squeeze(-1)
-    slope = dense(nearest, weights, points, transforms, middles)
+    slope = dense(points, nearest, weights, transforms, middles)
     gradient, hessian = BlendSums(points, nearest, weights, 4).normal_equations(
         transforms, middles, upper_triangles(scales, normals, slides), pulls
     )

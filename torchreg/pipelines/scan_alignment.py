@@ -66,10 +66,10 @@ def align_scans(
     Each goes on by an EM with an outlier class, while edges of the graph give where its parts disagree, matches beside
     what something nearer hides hold across the surface alone, and samples where the target's camera saw nothing are
     taken back into its picture. Then each part moves as in the hypothesis that suits it, and the EM goes on from there
-    as well; so it does where two limbs of the best change places, if one-to-one matches show that to be better. The
-    best covers the target, is covered by it, is like it, bends least, and is nearest to what is expected;
-    its EM is taken to the end. Where rest and stiff matches agree and leave little of both scans over, the softer ones
-    are left out; where all agree, so is what would be put together.
+    as well, and from the best with two limbs exchanged, if one-to-one matches then make that better still. The best
+    covers the target, is covered by it, is like it, bends least, and is nearest to what is expected; its EM is taken to
+    the end. Where rest and stiff matches agree and leave little of both scans over, the softer ones are left out; where
+    all agree, so is what would be put together or exchanged.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
