@@ -45,6 +45,8 @@ _Other = TypeVar("_Other")
 _LEAST_FUSED = 3
 # How a graph is taken to where points are expected: that may be wrong in parts, and limbs turn far.
 _EXPECTED_STIFFNESS, _EXPECTED_FITS = 0.02, 4
+# Exchanged limbs that one-to-one matches leave worse than the best by more than this energy are not gone on with.
+_HARDLY_WORSE = 0.05
 
 
 @torch.no_grad()
@@ -66,9 +68,9 @@ def align_scans(
     Each goes on by an EM with an outlier class, while edges of the graph give where its parts disagree, matches beside
     what something nearer hides hold across the surface alone, and samples where the target's camera saw nothing are
     taken back into its picture. Then each part moves as in the hypothesis that suits it, and the EM goes on from there
-    as well, and from the best with two limbs exchanged, if one-to-one matches then make that better still. The best
-    covers the target, is covered by it, is like it, bends least, and is nearest to what is expected; its EM is taken to
-    the end. Where rest and stiff matches agree and leave little of both scans over, the softer ones are left out; where
+    as well, and from the best with two limbs exchanged, if one-to-one matches then make that as good. The best covers
+    the target, is covered by it, is like it, bends least, and is nearest to what is expected; its EM is taken to the
+    end. Where rest and stiff matches agree and leave little of both scans over, the softer ones are left out; where
     all agree, so is what would be put together or exchanged.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
@@ -108,10 +110,8 @@ def align_scans(
     problem = describe(source, target, config, generator, None if expected is None else _checked(expected, source))
     found = sorted(_candidates(problem, config, report), key=_energy)
     if len(found) >= _LEAST_FUSED and not _all_agree(problem, found, config):
-        fused, exchanged = _both_told(
-            report, partial(_fused, problem, found, config), partial(_exchanged, problem, found[0], config)
-        )
-        found = sorted([*found, fused, *exchanged], key=_energy)
+        found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
+        found = sorted([*found, *_exchanged(problem, found[0], config, report)], key=_energy)
     chosen = found[0].hypothesis
     transforms = _finished(problem, found[0], config, report)
     weights = spread_weights(
@@ -243,7 +243,7 @@ def _fused(
 def _exchanged(
     problem: ScanAlignProblem, best: _Candidate, config: ScanAlignConfig, on_step: OnStep
 ) -> list[_Candidate]:
-    """Return the candidate in which two limbs of the best one change places; none unless that looks better."""
+    """Return the candidate in which two limbs of the best one change places; none if that looks worse."""
 
     def energy(motion: Tensor) -> float:
         return judge(problem, reporter.name, motion, config.choice).energy
@@ -253,7 +253,7 @@ def _exchanged(
     if not options:
         return []
     pulled = pull_one_to_one(problem, min(options, key=energy), config.reassign, reporter)
-    if energy(pulled) >= _energy(best):
+    if energy(pulled) > _energy(best) + _HARDLY_WORSE:
         return []
     return [_compared(problem, pulled, config.refine.near_sigma, config, reporter)]
 

@@ -14,11 +14,11 @@ from torchreg.pipelines.scan_align_problem import ScanAlignProblem
 # Limbs whose tips are farther apart than this are not exchanged, and no more of a limb than this: lengths.
 _FARTHEST, _LONGEST = 0.45, 0.45
 # Pairs of limbs at most, those with the nearest tips, and samples of a limb at least.
-_MOST_PAIRS, _LEAST_SAMPLES = 4, 10
+_MOST_PAIRS, _LEAST_SAMPLES = 8, 10
 # Width of what counts as equally far from the tip, length.
 _LEVEL = 0.04
-# How a graph is taken to where limbs have changed places: stiffness and Gauss-Newton steps, one fit after the other.
-_FITS = ((0.05, 2), (0.005, 3))
+# How a graph is taken to where limbs have changed places: stiffness and Gauss-Newton steps.
+_STIFFNESS, _FITS = 0.01, 2
 
 
 def exchanged_limbs(problem: ScanAlignProblem, transforms: Tensor) -> list[Tensor]:
@@ -36,7 +36,7 @@ def exchanged_limbs(problem: ScanAlignProblem, transforms: Tensor) -> list[Tenso
     Returns:
         motions (J, 4, 4), those of limbs whose tips are nearest to each other first; none without two limbs.
 
-    Cost: 20 ms for each pair of limbs of a graph of 60 nodes.
+    Cost: 10 ms for each pair of limbs of a graph of 60 nodes.
     """
     graph, ways = problem.graph, _ways(problem.graph)
     tips = _tips(graph, ways)
@@ -78,9 +78,7 @@ def _swapped(graph: DeformationGraph, transforms: Tensor, ways: Tensor, apart: f
         here, there = (_middles(at, levels[side, limbs[side]], moved[limbs[side]]) for side in (one, other))
         targets[limbs[one]] += (1 - at / length).sqrt().unsqueeze(1) * (there - here)
     matches = GraphMatches(slice(0, len(targets)), targets, torch.ones_like(targets[:, 0]))
-    for stiffness, steps in _FITS:
-        transforms = fit_graph(graph, transforms, matches, stiffness, steps).transforms
-    return transforms
+    return fit_graph(graph, transforms, matches, _STIFFNESS, _FITS).transforms
 
 
 def _middles(at: Tensor, levels: Tensor, points: Tensor) -> Tensor:
