@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import pytest
@@ -98,16 +99,38 @@ def test_parts_that_move_alike_get_one_moving_label(toy):
         pair.moving_labels(-1.0)
 
 
-def test_parts_of_a_sequence_are_those_that_no_pair_tells_apart(walk):
-    some = ScanSequence(walk.figure, walk.transforms[40:44], walk.scanner, dtype=torch.float64)
-    together = some.moving_labels(1, 0.01)
-    pairs = torch.stack([some.pair(1, frame).moving_labels(0.01) for frame in range(4)])
-    # Parts hang on each other as a tree: two are one part exactly where every pair says so.
-    expected = pairs.unique(dim=1, return_inverse=True)[1]
-    assert adjusted_rand(together, expected) == pytest.approx(1.0)
-    assert len(together.unique()) > len(some.pair(1, 2).moving_labels(0.01).unique())
-    with pytest.raises(InputError, match="tolerance"):
-        some.moving_labels(1, -1.0)
+@pytest.mark.parametrize("frames", [(40, 41), (40, 42), (3, 4), (40, 41, 42, 43)])
+@pytest.mark.parametrize("tolerance", [0.005, 0.01])
+def test_what_is_one_part_moves_as_its_largest_does_and_what_is_not_does_not(walk, frames, tolerance):
+    some = ScanSequence(walk.figure, walk.transforms[list(frames)], walk.scanner, dtype=torch.float64)
+    scan, moving, true = some[0], some.moving_labels(0, tolerance), some.labels(0)
+    if len(frames) == 2:
+        assert torch.equal(moving, some.pair(0, 1).moving_labels(tolerance))
+    sizes = true.bincount(minlength=some.figure.num_parts)
+    group = {int(part): int(moving[true == part][0]) for part in true.unique()}
+
+    def gap(mover, part):
+        """Return how far, in shares of the size, one part's motion takes another's points from where they went."""
+        own = scan.points[true == part]
+        steps = [motion @ torch.linalg.inv(some.transforms[0]) for motion in some.transforms]
+        ends = [transform_points(step[mover], own) - transform_points(step[part], own) for step in steps]
+        return max(float(end.norm(dim=-1).mean()) for end in ends) / scan.diagonal
+
+    for label in set(group.values()):
+        joined = [part for part in group if group[part] == label]
+        largest = max(joined, key=lambda part: sizes[part])
+        assert all(min(gap(largest, part), gap(part, largest)) < 2 * tolerance for part in joined)
+    for one, other in some.joint_parts.tolist():
+        if one in group and other in group and max(gap(one, other), gap(other, one)) < tolerance / 2:
+            assert group[one] == group[other]
+    assert len(set(group.values())) < len(group)
+
+
+def test_a_part_that_is_not_seen_tells_nothing_apart(toy):
+    pair = toy.pair(0, 0)
+    parent, child = next((a, b) for a, b in pair.joint_parts.tolist() if b in pair.joint_parts[:, 0])
+    hidden = dataclasses.replace(pair, labels=torch.where(pair.labels == child, parent, pair.labels))
+    assert len(hidden.moving_labels().unique()) == 1
 
 
 def test_every_way_to_ask_gives_the_same(toy):

@@ -21,6 +21,7 @@ from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.visibility import View, visible_points
+from torchreg.results.parts import joined_alike
 
 # The camera stands this many diagonals of the rest pose away.
 _DISTANCE = 1.7
@@ -68,8 +69,9 @@ class ScanPair:
     def moving_labels(self, tolerance: float = 0.01) -> Tensor:
         """Return labels (N,) in which parts that moved as one between the two poses are one.
 
-        Two parts that meet are one if the motion of either moves the other's scanned points within ``tolerance`` of
-        where they went, in the mean; a pair of scans does not tell such parts apart.
+        The two that meet and moved most alike are joined again and again, and move as the one with more scanned points
+        then, until the motion of either takes the other's farther than ``tolerance`` from where they went, in the mean:
+        a pair of scans does not tell parts apart that are joined. It is how `ScanRegistration.parts` joins bones.
 
         Args:
             tolerance: share of the source's diagonal.
@@ -82,17 +84,18 @@ def _moving_labels(
 ) -> Tensor:
     """Return labels (N,) in which parts that move as one in all of the motions (T, P, 4, 4) are one."""
     check_positive(tolerance, "tolerance", allow_zero=True)
-    group = list(range(transforms.shape[1]))
-    for parent, child in joint_parts.tolist():
-        offset = transforms[:, parent] - transforms[:, child]
-        gaps = torch.full((2, len(transforms)), torch.inf)
-        for side, part in enumerate((parent, child)):
-            own = scan.points[labels == part]
-            if len(own):
-                gaps[side] = transform_points(offset, own).norm(dim=-1).mean(-1)
-        if float(gaps.amin(0).max()) <= tolerance * scan.diagonal:
-            group = [group[parent] if number == group[child] else number for number in group]
-    return torch.tensor(group, device=labels.device)[labels]
+    counts = torch.bincount(labels, minlength=transforms.shape[1])
+    apart = torch.zeros(len(transforms), len(counts), len(counts), dtype=scan.points.dtype, device=labels.device)
+    for part in counts.nonzero()[:, 0]:
+        own = scan.points[labels == part]
+        beside = invert_rigid(transforms[:, part]).unsqueeze(1) @ transforms
+        apart[:, :, part] = (transform_points(beside, own) - own).norm(dim=-1).sum(-1) / scan.diagonal
+    meet = torch.zeros(len(counts), len(counts), dtype=torch.bool, device=labels.device)
+    meet[joint_parts[:, 0], joint_parts[:, 1]] = meet[joint_parts[:, 1], joint_parts[:, 0]] = True
+    for hidden in (counts == 0).nonzero()[:, 0]:
+        # Nothing seen tells apart what hangs on either side of a part that is not seen.
+        meet |= meet[hidden].unsqueeze(1) & meet[hidden]
+    return joined_alike(apart, counts, meet, tolerance)[labels]
 
 
 @dataclass(frozen=True, eq=False)

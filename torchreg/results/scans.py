@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchreg.results.base import Result, Shape, Status
+from torchreg.results.parts import joined_alike
 
 # Shared weight, as a share of all points, from which two bones meet.
 _MEETING = 1e-3
@@ -99,7 +100,7 @@ def _parts(moved: Tensor, transforms: Tensor, labels: Tensor, weights: Tensor, t
         [_misses(*frame, labels, own) for frame in zip(moved.double(), transforms.double(), strict=True)]
     )
     meet = blends.mT @ blends > _MEETING * len(labels)
-    part = _joined_alike(apart, own.sum(0), meet, tolerance)
+    part = joined_alike(apart, own.sum(0), meet, tolerance)
     return part[labels].unique(return_inverse=True)[1]
 
 
@@ -112,32 +113,6 @@ def _misses(points: Tensor, motions: Tensor, labels: Tensor, own: Tensor) -> Ten
     rest = (torch.linalg.inv(motions)[labels] @ nn.functional.pad(points, (0, 1), value=1.0).unsqueeze(-1))[:, :3, 0]
     places = rest @ motions[:, :3, :3].mT + motions[:, None, :3, 3]
     return (places - points).norm(dim=-1) @ own / size
-
-
-def _joined_alike(apart: Tensor, counts: Tensor, meet: Tensor, tolerance: float) -> Tensor:
-    """Return the part (B,) of each bone; by bone a's motion, bone b's points miss by ``apart[t, a, b]`` in all.
-
-    Chains of bones, each of which moves much like the next, do not make one part of all: the larger bone's motion
-    counts for both, not the nearest one's.
-    """
-    apart, counts, meet = apart.clone(), counts.clone(), meet.clone().fill_diagonal_(False)
-    part = torch.arange(len(counts), device=counts.device)
-    meet &= (counts > 0) & (counts > 0).unsqueeze(1)
-    while bool(meet.any()):
-        mean = apart / counts.clamp_min(1)
-        gap = torch.minimum(mean, mean.mT).amax(0).masked_fill(~meet, torch.inf)
-        one, other = divmod(int(gap.argmin()), len(counts))
-        if float(gap[one, other]) > tolerance:
-            break
-        if counts[other] > counts[one]:
-            one, other = other, one
-        apart[..., one] += apart[..., other]
-        counts[one] += counts[other]
-        meet[one] |= meet[other]
-        meet[:, one] |= meet[:, other]
-        meet[other], meet[:, other], meet[one, one] = False, False, False
-        part[part == other] = one
-    return part
 
 
 @dataclass(frozen=True)
