@@ -21,7 +21,7 @@ def test_smoke_prints_every_row_and_the_reliability(bench, capsys):
     assert printed.count("right >= 95%: ") == 1
     assert printed.count("right >= 80%: ") == 1
     assert "confidence" in printed
-    assert all(row.errors.shape == (2, 5) and bool(torch.isfinite(row.errors).all()) for row in rows)
+    assert all(row.errors.shape == (1, 5) and bool(torch.isfinite(row.errors).all()) for row in rows)
     assert all(bool(((row.confidence >= 0) & (row.confidence <= 1)).all()) for row in rows)
 
 
