@@ -70,8 +70,8 @@ class ScanPair:
         """Return labels (N,) in which parts that moved as one between the two poses are one.
 
         The two that meet and moved most alike are joined again and again, and move as the one with more scanned points
-        then, until the motion of either takes the other's farther than ``tolerance`` from where they went, in the mean:
-        a pair of scans does not tell parts apart that are joined. It is how `ScanRegistration.parts` joins bones.
+        then, as long as the motion of one leaves the other's within ``tolerance`` of where they went, in the mean: a
+        pair of scans does not tell parts apart that are joined. It is how `ScanRegistration.parts` joins bones.
 
         Args:
             tolerance: share of the source's diagonal.

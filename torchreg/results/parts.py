@@ -10,7 +10,8 @@ def joined_alike(apart: Tensor, counts: Tensor, meet: Tensor, tolerance: float) 
     """Return the part of each piece when the two that meet and moved most alike are joined again and again.
 
     What was joined moves as its larger piece then. So chains of pieces, each of which moves much like the next, do not
-    make one part of all. It ends when the motion of either of any two takes the other's points too far, in the mean.
+    make one part of all. It ends when, of any two that meet, the motion of neither leaves the other's points within the
+    tolerance of where they went, in the mean.
 
     Args:
         apart: (T, B, B) how far the motion of piece a takes the points of piece b from where they went, ``[t, a, b]``,

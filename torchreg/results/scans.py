@@ -83,8 +83,8 @@ class ScanRegistration(Result, Generic[Shape]):
         """Return labels (N,) int64 in which bones that meet and moved as one are one part, numbered from 0.
 
         Bones outnumber parts where a surface stretches, or where two scans do not tell parts apart. The two that moved
-        most alike are joined again and again and move as the larger one then, until the motion of either takes the
-        other's points farther than ``tolerance`` from where they went, in the mean.
+        most alike are joined again and again and move as the larger one then, as long as the motion of one leaves the
+        other's points within ``tolerance`` of where they went, in the mean.
 
         Args:
             tolerance: share of the diagonal of the moved points.
