@@ -67,6 +67,18 @@ def test_gaps_are_where_neighbors_disagree(graph):
     torch.testing.assert_close(graph.edge_gaps(transforms)[2], there[0] - there[1])
 
 
+def test_nodes_within_some_edges(graph):
+    steps = {node: {node} for node in range(graph.num_nodes)}
+    for one, other in graph.edges.tolist():
+        steps[one].add(other)
+        steps[other].add(one)
+    reached = {node: {node} for node in steps}
+    for num_edges in range(4):
+        near = graph.within(num_edges)
+        assert [set(row.nonzero()[:, 0].tolist()) for row in near] == [reached[node] for node in steps]
+        reached = {node: set().union(*(steps[each] for each in reached[node])) for node in steps}
+
+
 def test_batches_are_loops(graph):
     transforms = motions(graph, batch=(2,))
     for both, one in zip(graph.edge_gaps(transforms), transforms, strict=True):

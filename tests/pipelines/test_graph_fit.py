@@ -152,3 +152,12 @@ def test_joined_matches_cost_what_all_cost(graph):
     both = joined(along, points)
     assert fit_graph(graph, rest, both, 1.0).misses == pytest.approx(costs[0] + costs[1] * 10 / 30)
     assert joined(along) is along
+
+
+def test_matches_with_places_pull_the_first_samples_there_alike(graph):
+    motion = se3_exp(torch.tensor([0.1, -0.2, 0.3, 0.4, 0.1, -0.3], dtype=F64))
+    places = transform_points(motion, graph.points[:20])
+    matches = GraphMatches.of_places(places)
+    assert torch.equal(matches.weights, torch.ones(20, dtype=F64))
+    moved = graph(fit_graph(graph, graph.rest(), matches, 1.0, 15).transforms)
+    torch.testing.assert_close(moved[:20], places, rtol=0, atol=1e-6)

@@ -92,6 +92,13 @@ class DeformationGraph(nn.Module):
         points = torch.cat((self.points, self.centers[self.edges].flatten(0, 1)))
         return BlendSums(points, nearest, weights, self.num_nodes)
 
+    def within(self, num_edges: int) -> Tensor:
+        """Return which nodes (J, J) are at most so many edges from each other; every node is from itself."""
+        alone = torch.eye(self.num_nodes, dtype=torch.float64, device=self.edges.device)
+        near = alone.clone()
+        near[self.edges[:, 0], self.edges[:, 1]] = near[self.edges[:, 1], self.edges[:, 0]] = 1.0
+        return torch.linalg.matrix_power(near, num_edges) > 0
+
     def forward(self, transforms: Tensor, which: Tensor | slice = slice(None)) -> Tensor:
         """Return moved samples (..., n, 3).
 

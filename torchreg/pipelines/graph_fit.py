@@ -36,6 +36,11 @@ class GraphMatches:
     normals: Tensor | None = None
     slide: float | Tensor = 1.0
 
+    @classmethod
+    def of_places(cls, places: Tensor) -> GraphMatches:
+        """Return matches of the first samples with places (n, 3), that all count alike."""
+        return cls(slice(0, len(places)), places, torch.ones_like(places[:, 0]))
+
 
 def joined(first: GraphMatches, *others: GraphMatches) -> GraphMatches:
     """Return matches that cost what several cost, all of them over the number of the first."""

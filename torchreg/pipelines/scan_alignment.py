@@ -68,9 +68,9 @@ def align_scans(
     Each goes on by an EM with an outlier class, while edges of the graph give where its parts disagree, matches beside
     what something nearer hides hold across the surface alone, and samples where the target's camera saw nothing are
     taken back into its picture. Then each part moves as in the hypothesis that suits it, and the EM goes on from there
-    as well, and from the best with two limbs exchanged, if one-to-one matches then make that as good. The best covers
-    the target, is covered by it, is like it, bends least, and is nearest to what is expected; its EM is taken to the
-    end. Where rest and stiff matches agree and leave little of both scans over, the softer ones are left out; where
+    as well, and from the best with two limbs exchanged, if one-to-one matches make that about as good. The best
+    covers the target, is covered by it, is like it, bends least, and is nearest to what is expected; its EM is taken to
+    the end. Where rest and stiff matches agree and leave little of both scans over, the softer ones are left out; where
     all agree, so is what would be put together or exchanged.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
@@ -172,7 +172,8 @@ def _near(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -
     sigma, rest = config.refine.near_sigma, problem.graph.rest()
     found = [_compared(problem, rest, sigma, config, Reporter("rest", problem.unit.size, on_step))]
     if problem.expected is not None:
-        ahead = _fitted_to_expected(problem, problem.expected)
+        there = GraphMatches.of_places(problem.expected)
+        ahead = fit_graph(problem.graph, rest, there, _EXPECTED_STIFFNESS, _EXPECTED_FITS).transforms
         found.append(_compared(problem, ahead, sigma, config, Reporter("expected", problem.unit.size, on_step)))
     return found
 
@@ -217,12 +218,6 @@ def _both_told(
     return found
 
 
-def _fitted_to_expected(problem: ScanAlignProblem, expected: Tensor) -> Tensor:
-    """Return the motions (J, 4, 4) that take samples nearly to where they are expected."""
-    everywhere = GraphMatches(slice(0, len(expected)), expected, torch.ones_like(expected[:, 0]))
-    return fit_graph(problem.graph, problem.graph.rest(), everywhere, _EXPECTED_STIFFNESS, _EXPECTED_FITS).transforms
-
-
 def _checked(expected: Any, source: RangeScan) -> Tensor:
     """Return where points (N, 3) are expected; raise unless it fits the source."""
     expected = as_float_tensor(expected, "expected")
@@ -243,12 +238,12 @@ def _fused(
 def _exchanged(
     problem: ScanAlignProblem, best: _Candidate, config: ScanAlignConfig, on_step: OnStep
 ) -> list[_Candidate]:
-    """Return the candidate in which two limbs of the best one change places; none if that looks worse."""
+    """Return the candidate in which two limbs of the best one change places; none if that looks clearly worse."""
+    reporter = Reporter("exchanged", problem.unit.size, on_step)
 
     def energy(motion: Tensor) -> float:
         return judge(problem, reporter.name, motion, config.choice).energy
 
-    reporter = Reporter("exchanged", problem.unit.size, on_step)
     options = exchanged_limbs(problem, best.transforms)
     if not options:
         return []

@@ -39,14 +39,16 @@ def exchanged_limbs(problem: ScanAlignProblem, transforms: Tensor) -> list[Tenso
     Cost: 10 ms for each pair of limbs of a graph of 60 nodes.
     """
     graph, ways = problem.graph, _ways(problem.graph)
-    tips = _tips(graph, ways)
+    tips, moved = _tips(graph, ways), graph(transforms)
+    levels = ways[tips][:, graph.dense_weights.argmax(1)]
     places = transform_points(transforms[tips], graph.centers[tips].unsqueeze(1)).squeeze(1)
     apart = torch.cdist(places, places)
     pairs = torch.combinations(torch.arange(len(tips)))
     pairs = pairs[apart[pairs[:, 0], pairs[:, 1]] < _FARTHEST]
     pairs = pairs[apart[pairs[:, 0], pairs[:, 1]].argsort(stable=True)[:_MOST_PAIRS]]
-    swapped = [_swapped(graph, transforms, ways[tips[pair]], float(ways[tuple(tips[pair])])) for pair in pairs]
-    return [motion for motion in swapped if motion is not None]
+    targets = [_swapped(moved, levels[pair], float(ways[tuple(tips[pair])])) for pair in pairs]
+    matches = [GraphMatches.of_places(there) for there in targets if there is not None]
+    return [fit_graph(graph, transforms, each, _STIFFNESS, _FITS).transforms for each in matches]
 
 
 def _ways(graph: DeformationGraph) -> Tensor:
@@ -58,27 +60,28 @@ def _ways(graph: DeformationGraph) -> Tensor:
 
 def _tips(graph: DeformationGraph, ways: Tensor) -> Tensor:
     """Return the nodes (K,) farthest from all others, in the mean, among those within two edges."""
-    near = torch.eye(graph.num_nodes, dtype=ways.dtype)
-    near[graph.edges[:, 0], graph.edges[:, 1]] = near[graph.edges[:, 1], graph.edges[:, 0]] = 1.0
     mean = ways.mean(1)
-    return (mean >= torch.where(near @ near > 0, mean, 0.0).amax(1)).nonzero()[:, 0]
+    return (mean >= torch.where(graph.within(2), mean, 0.0).amax(1)).nonzero()[:, 0]
 
 
-def _swapped(graph: DeformationGraph, transforms: Tensor, ways: Tensor, apart: float) -> Tensor | None:
-    """Return the motions (J, 4, 4) with two limbs exchanged, from ways (2, J) to their tips, which are so far apart."""
-    length = min(apart / 2, _LONGEST)
-    levels = ways[:, graph.dense_weights.argmax(1)]
+def _swapped(moved: Tensor, levels: Tensor, between: float) -> Tensor | None:
+    """Return places (S, 3) of samples with two limbs exchanged, none if there is too little of one.
+
+    Args:
+        moved: (S, 3) where they are.
+        levels: (2, S) their distances from both tips along the graph.
+        between: that of the tips from each other.
+    """
+    length = min(between / 2, _LONGEST)
     limbs = [(level < length).nonzero()[:, 0] for level in levels]
     if min(len(limb) for limb in limbs) < _LEAST_SAMPLES:
         return None
-    moved = graph(transforms)
     targets = moved.clone()
     for one, other in ((0, 1), (1, 0)):
         at = levels[one, limbs[one]]
         here, there = (_middles(at, levels[side, limbs[side]], moved[limbs[side]]) for side in (one, other))
         targets[limbs[one]] += (1 - at / length).sqrt().unsqueeze(1) * (there - here)
-    matches = GraphMatches(slice(0, len(targets)), targets, torch.ones_like(targets[:, 0]))
-    return fit_graph(graph, transforms, matches, _STIFFNESS, _FITS).transforms
+    return targets
 
 
 def _middles(at: Tensor, levels: Tensor, points: Tensor) -> Tensor:

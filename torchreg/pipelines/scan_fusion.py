@@ -124,10 +124,4 @@ def _edge_bends(graph: DeformationGraph, options: Tensor, slack: float) -> Tenso
 
 def _patches(graph: DeformationGraph) -> Tensor:
     """Return (P, J) which nodes each patch holds, no two alike."""
-    alone = torch.eye(graph.num_nodes, dtype=torch.bool, device=graph.edges.device)
-    near = alone.clone()
-    near[graph.edges[:, 0], graph.edges[:, 1]] = near[graph.edges[:, 1], graph.edges[:, 0]] = True
-    rings = [alone]
-    for _ in range(_RINGS):
-        rings.append((rings[-1].double() @ near.double()) > 0)
-    return torch.cat(rings).unique(dim=0)
+    return torch.cat([graph.within(rings) for rings in range(_RINGS + 1)]).unique(dim=0)
