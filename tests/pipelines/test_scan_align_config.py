@@ -24,6 +24,7 @@ from torchreg.pipelines.scan_align_config import (
         (AssignConfig, {"stiffness": (0.1,)}, "stiffness must be two numbers"),
         (AssignConfig, {"feature_weight": -0.1}, "feature_weight must be"),
         (RefineConfig, {"final_steps": -1}, "final_steps must be at least 0"),
+        (RefineConfig, {"slow_steps": -1}, "slow_steps must be at least 0"),
         (RefineConfig, {"slide": (1.0, 0.0)}, "slide must be positive"),
         (RefineConfig, {"density": -1.0}, "density must be"),
         (ChoiceConfig, {"cap": 0.0}, "cap must be positive"),
@@ -51,6 +52,12 @@ def test_defaults_are_shared_by_nobody():
 
 def test_values_between_ends_are_in_even_ratios():
     assert [between((8.0, 0.5), share) for share in (0, 0.5, 1, 2)] == pytest.approx([8, 2, 0.5, 0.5])
+
+
+def test_slowly_matches_slide_from_the_beginning():
+    config = RefineConfig(slow_steps=9, slide=(0.5, 0.1), sigma=(0.02, 0.004))
+    slow = config.slower()
+    assert (slow.num_steps, slow.slide, slow.sigma) == (9, (0.1, 0.1), (0.02, 0.004))
 
 
 def test_the_energy_of_a_record_is_that_of_its_terms():

@@ -12,6 +12,8 @@ from torchreg.geometry.blend import blend_linear
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.pipelines.scan_align_config import RefineConfig, ScanAlignConfig
+from torchreg.pipelines.scan_align_problem import describe
+from torchreg.pipelines.scan_align_stages import judge
 from torchreg.pipelines.scan_alignment import align_scans
 
 SCANNER = DepthScanner(num_points=1000)
@@ -32,6 +34,16 @@ def pair():
 @pytest.fixture(scope="module")
 def aligned(pair):
     return align_scans(pair.source, pair.target, QUICK)
+
+
+def final_energy(pair, config, result):
+    """Return the energy of an alignment, by its motions alone."""
+    problem = describe(pair.source, pair.target, config)
+    middle, size = problem.unit.middle, problem.unit.size
+    outwards = torch.eye(4, dtype=torch.float64) * torch.tensor([size, size, size, 1.0])
+    outwards[:3, 3] = middle
+    motions = torch.linalg.inv(outwards) @ result.transforms.double() @ outwards
+    return judge(problem, "end", motions, config.choice).energy
 
 
 def share_near(pair, points):
@@ -94,7 +106,7 @@ def test_hypotheses_are_followed_until_two_agree(pair):
     stubborn = replace(QUICK, choice=replace(QUICK.choice, same=1e-12))
     every = align_scans(pair.source, pair.target, stubborn)
     assert {each.name for each in every.hypotheses} == {"rest", "stiff matches", "matches", "one to one", "fused"}
-    assert {record.stage for record in every.history} == {"match", "assign", "refine"}
+    assert {record.stage for record in every.history} == {"match", "assign", "refine", "slide"}
 
 
 def test_the_best_alone_is_taken_to_the_end(pair):
@@ -106,6 +118,21 @@ def test_the_best_alone_is_taken_to_the_end(pair):
             steps[record.hypothesis].append(record.step)
     assert steps.pop(result.chosen.name) == list(range(6))
     assert all(each == [0, 1] for each in steps.values())
+
+
+def test_the_best_is_refined_once_more_and_the_better_end_is_kept(pair):
+    doubtful = replace(QUICK, choice=replace(QUICK.choice, same=1e-12))
+    ends = {}
+    for slow_steps in (0, 4, 12):
+        config = replace(doubtful, refine=replace(doubtful.refine, slow_steps=slow_steps))
+        result = align_scans(pair.source, pair.target, config)
+        told = [each.step for each in result.history if each.stage == "slide"]
+        assert told == list(range(slow_steps + config.refine.final_steps if slow_steps else 0))
+        ends[slow_steps] = final_energy(pair, config, result)
+    assert max(ends[4], ends[12]) < ends[0] + 1e-4
+    # Where all hypotheses agree there is no doubt.
+    same = align_scans(pair.source, pair.source, QUICK)
+    assert "slide" not in {each.stage for each in same.history}
 
 
 @pytest.mark.parametrize(
@@ -126,15 +153,15 @@ def tube(seed):
     return RangeScan(0.5 * normals + height.unsqueeze(1) * torch.tensor([0.0, 0, 1]), normals=normals)
 
 
-def test_where_scans_do_not_tell_what_is_expected_does():
+@pytest.mark.parametrize("angle", [-0.4, 0.4])
+def test_where_scans_do_not_tell_what_is_expected_does(angle):
+    # Both ways, each 20 % of the tube's length from the other: only the expectation can tell which.
     source, target = tube(0), tube(1)
-    turn = se3_exp(torch.tensor([0.0, 0, 0, 0, 0, 0.4]))
-    expected = transform_points(turn, source.points)
+    expected = transform_points(se3_exp(torch.tensor([0.0, 0, 0, 0, 0, angle])), source.points)
     known = align_scans(source, target, QUICK, expected=expected)
     plain = align_scans(source, target, QUICK)
-    near = 0.02 * source.diagonal
-    assert float((known.points - expected).norm(dim=-1).mean()) < near
-    assert float((plain.points - expected).norm(dim=-1).mean()) > 2 * near
+    assert float((known.points - expected).norm(dim=-1).mean()) < 0.02 * source.diagonal
+    assert float((plain.points - expected).norm(dim=-1).mean()) > 0.03 * source.diagonal
     leaps = {each.name: each.leap for each in known.hypotheses}
     assert leaps["expected"] < 0.1 * leaps["rest"]
     assert {each.leap for each in plain.hypotheses} == {0.0}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
@@ -90,6 +90,7 @@ class RefineConfig:
         num_steps: while sigma shrinks.
         final_steps: at the last sigma.
         compared_after: steps after which hypotheses are compared; the rest are for the best alone.
+        slow_steps: instead of num_steps when the best is refined once more, see `slower`; none to leave that out.
         sigma: first and last, length; the first from a rough start, and
         near_sigma: from one that should be near,
         fused_sigma: from motions that have been refined and put together.
@@ -116,6 +117,7 @@ class RefineConfig:
     num_steps: int = 6
     final_steps: int = 1
     compared_after: int = 5
+    slow_steps: int = 20
     sigma: tuple[float, float] = (0.025, 0.006)
     near_sigma: float = 0.02
     fused_sigma: float = 0.012
@@ -139,7 +141,8 @@ class RefineConfig:
     def __post_init__(self) -> None:
         for name in ("num_steps", "compared_after", "fits_per_step", "least_samples"):
             check_count(getattr(self, name), name, 1)
-        check_count(self.final_steps, "final_steps", 0)
+        for name in ("final_steps", "slow_steps"):
+            check_count(getattr(self, name), name, 0)
         for name in ("sigma", "stiffness", "slide", "feature_weight"):
             _check_ends(getattr(self, name), name)
         for name in ("near_sigma", "fused_sigma", "give", "beyond_scale", "expected_scale"):
@@ -147,6 +150,13 @@ class RefineConfig:
         optional = "both_ways_above", "boundary_above", "beyond", "beyond_below", "beyond_margin", "expected", "density"
         for name in optional:
             check_positive(getattr(self, name), name, allow_zero=True)
+
+    def slower(self) -> RefineConfig:
+        """Return the settings of a second, slower EM: matches slide along the surface from its beginning.
+
+        Held along the surface, samples go where the first matches were; cloth and round limbs have farther to go.
+        """
+        return replace(self, num_steps=self.slow_steps, slide=(self.slide[1], self.slide[1]))
 
 
 @dataclass(frozen=True)
@@ -240,7 +250,7 @@ class ScanAlignRecord:
 
     Args:
         hypothesis: name of what is being followed, such as "rest" or "matches".
-        stage: "match", "assign" or "refine".
+        stage: "match", "assign", "refine" or, once more and slowly, "slide".
         step: number of the step in its stage.
         num_steps: steps planned in the stage.
         width: reach or sigma, in the user's unit.

@@ -105,6 +105,7 @@ def refine(
     reporter: Reporter,
     first_sigma: float | None = None,
     steps: slice = slice(None),
+    stage: str = "refine",
 ) -> Tensor:
     """Return motions refined by EM: sigma shrinks, the graph softens, matches may slide along the surface ever more.
 
@@ -115,6 +116,7 @@ def refine(
         reporter: takes a record of each step.
         first_sigma: instead of that of the configuration.
         steps: which of them to take.
+        stage: what records call it.
     """
     number = config.num_steps + config.final_steps
     widths = (config.sigma[0] if first_sigma is None else first_sigma, config.sigma[1])
@@ -128,7 +130,7 @@ def refine(
             others = _out_of_empty_space(problem, moved, sigma, config) + _as_expected(problem, moved, found, config)
             fit = fit_graph(problem.graph, transforms, joined(along, *others), stiffness, give=config.give)
             transforms = fit.transforms
-        reporter.report("refine", step, number, sigma, fit, stiffness, float(found.weights.mean()))
+        reporter.report(stage, step, number, sigma, fit, stiffness, float(found.weights.mean()))
     return transforms
 
 

@@ -35,6 +35,7 @@ from torchreg.pipelines.scan_align_stages import (
     soft_matches,
     used_samples,
 )
+from torchreg.pipelines.scan_cover import covering_limbs
 from torchreg.pipelines.scan_exchange import exchanged_limbs
 from torchreg.pipelines.scan_fusion import fuse_motions
 from torchreg.pipelines.threads import both, one_thread
@@ -45,7 +46,7 @@ _Other = TypeVar("_Other")
 _LEAST_FUSED = 3
 # How a graph is taken to where points are expected: that may be wrong in parts, and limbs turn far.
 _EXPECTED_STIFFNESS, _EXPECTED_FITS = 0.02, 4
-# Exchanged limbs that one-to-one matches leave worse than the best by more than this energy are not gone on with.
+# Rearranged limbs that one-to-one matches leave worse than the best by more than this energy are not gone on with.
 _HARDLY_WORSE = 0.05
 
 
@@ -68,10 +69,11 @@ def align_scans(
     Each goes on by an EM with an outlier class, while edges of the graph give where its parts disagree, matches beside
     what something nearer hides hold across the surface alone, and samples where the target's camera saw nothing are
     taken back into its picture. Then each part moves as in the hypothesis that suits it, and the EM goes on from there
-    as well, and from the best with two limbs exchanged, if one-to-one matches make that about as good. The best
-    covers the target, is covered by it, is like it, bends least, and is nearest to what is expected; its EM is taken to
-    the end. Where rest and stiff matches agree and leave little of both scans over, the softer ones are left out; where
-    all agree, so is what would be put together or exchanged.
+    as well, and from the best with two limbs exchanged or with one laid where nothing covers the target, if one-to-one
+    matches make that about as good. The best covers the target, is covered by it, is like it, bends least, and is
+    nearest to what is expected; its EM is taken to the end, and beside that once more from the beginning, slowly and
+    with matches that may slide, and the better end is kept. Where rest and stiff matches agree and leave little of both
+    scans over, the softer ones are left out; where all agree, so is all that follows but the end.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -93,7 +95,7 @@ def align_scans(
 
     Differentiable: no.
 
-    Cost: about 2 s for scans of 8,000 points on one core; three quarters of it where torch may use two threads, which
+    Cost: 1 to 2.5 s for scans of 8,000 points on one core; three quarters of it where torch may use two threads, which
     then follow two hypotheses side by side: the result is the same to the bit.
 
     References: Chang and Zwicker 2009, section 5, on where to start; Sumner, Schmid and Pauly 2007 for the graph;
@@ -109,11 +111,13 @@ def align_scans(
 
     problem = describe(source, target, config, generator, None if expected is None else _checked(expected, source))
     found = sorted(_candidates(problem, config, report), key=_energy)
-    if len(found) >= _LEAST_FUSED and not _all_agree(problem, found, config):
+    doubtful = len(found) >= _LEAST_FUSED and not _all_agree(problem, found, config)
+    if doubtful:
         found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
-        found = sorted([*found, *_exchanged(problem, found[0], config, report)], key=_energy)
+        for rearranged in (_exchanged, _covering):
+            found = sorted([*found, *rearranged(problem, found[0], config, report)], key=_energy)
     chosen = found[0].hypothesis
-    transforms = _finished(problem, found[0], config, report)
+    transforms = _finished(problem, found[0], config, doubtful, report)
     weights = spread_weights(
         problem.unit.of_points(source.points),
         source.normals.detach().cpu().double(),
@@ -240,14 +244,27 @@ def _exchanged(
 ) -> list[_Candidate]:
     """Return the candidate in which two limbs of the best one change places; none if that looks clearly worse."""
     reporter = Reporter("exchanged", problem.unit.size, on_step)
-
-    def energy(motion: Tensor) -> float:
-        return judge(problem, reporter.name, motion, config.choice).energy
-
     options = exchanged_limbs(problem, best.transforms)
+    likeliest = sorted(options, key=partial(_energy_of, problem, config, reporter.name))[:1]
+    return _pulled(problem, likeliest, best, config, reporter)
+
+
+def _covering(
+    problem: ScanAlignProblem, best: _Candidate, config: ScanAlignConfig, on_step: OnStep
+) -> list[_Candidate]:
+    """Return the candidate in which a limb covers what the best one leaves bare; none if that looks clearly worse."""
+    reporter = Reporter("covering", problem.unit.size, on_step)
+    return _pulled(problem, covering_limbs(problem, best.transforms, config.choice), best, config, reporter)
+
+
+def _pulled(
+    problem: ScanAlignProblem, options: Sequence[Tensor], best: _Candidate, config: ScanAlignConfig, reporter: Reporter
+) -> list[_Candidate]:
+    """Return the candidate from the option that one-to-one matches make the best; none if it looks clearly worse."""
     if not options:
         return []
-    pulled = pull_one_to_one(problem, min(options, key=energy), config.reassign, reporter)
+    energy = partial(_energy_of, problem, config, reporter.name)
+    pulled = min((pull_one_to_one(problem, each, config.reassign, reporter) for each in options), key=energy)
     if energy(pulled) > _energy(best) + _HARDLY_WORSE:
         return []
     return [_compared(problem, pulled, config.refine.near_sigma, config, reporter)]
@@ -262,11 +279,23 @@ def _compared(
     return _Candidate(judge(problem, reporter.name, transforms, config.choice), transforms, sigma)
 
 
-def _finished(problem: ScanAlignProblem, candidate: _Candidate, config: ScanAlignConfig, on_step: OnStep) -> Tensor:
-    """Return the motions (J, 4, 4) after the last steps."""
-    steps = slice(config.refine.compared_after, None)
-    reporter = Reporter(candidate.hypothesis.name, problem.unit.size, on_step)
-    return refine(problem, candidate.transforms, config.refine, reporter, candidate.sigma, steps)
+def _finished(
+    problem: ScanAlignProblem, candidate: _Candidate, config: ScanAlignConfig, doubtful: bool, on_step: OnStep
+) -> Tensor:
+    """Return the motions (J, 4, 4) after the last steps; in doubt, those of a slower EM if they are better."""
+    name, refining = candidate.hypothesis.name, config.refine
+
+    def to_the_end(told: OnStep) -> Tensor:
+        steps, reporter = slice(refining.compared_after, None), Reporter(name, problem.unit.size, told)
+        return refine(problem, candidate.transforms, refining, reporter, candidate.sigma, steps)
+
+    def slowly(told: OnStep) -> Tensor:
+        slow, reporter = refining.slower(), Reporter(name, problem.unit.size, told)
+        return refine(problem, candidate.transforms, slow, reporter, refining.near_sigma, stage="slide")
+
+    if not doubtful or refining.slow_steps == 0:
+        return to_the_end(on_step)
+    return min(_both_told(on_step, slowly, to_the_end), key=partial(_energy_of, problem, config, name))
 
 
 def _all_agree(problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig) -> bool:
@@ -276,6 +305,11 @@ def _all_agree(problem: ScanAlignProblem, found: Sequence[_Candidate], config: S
 
 def _energy(candidate: _Candidate) -> float:
     return candidate.hypothesis.energy
+
+
+def _energy_of(problem: ScanAlignProblem, config: ScanAlignConfig, name: str, transforms: Tensor) -> float:
+    """Return the energy of motions (J, 4, 4) of a hypothesis."""
+    return judge(problem, name, transforms, config.choice).energy
 
 
 def _confidence(problem: ScanAlignProblem, transforms: Tensor, config: ScanAlignConfig, points: Tensor) -> Tensor:
