@@ -114,8 +114,10 @@ def align_scans(
     doubtful = len(found) >= _LEAST_FUSED and not _all_agree(problem, found, config)
     if doubtful:
         found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
-        for rearranged in (_exchanged, _covering):
-            found = sorted([*found, *rearranged(problem, found[0], config, report)], key=_energy)
+        exchanged, covering = _both_told(
+            report, partial(_exchanged, problem, found[0], config), partial(_covering, problem, found[0], config)
+        )
+        found = sorted([*found, *exchanged, *covering], key=_energy)
     chosen = found[0].hypothesis
     transforms = _finished(problem, found[0], config, doubtful, report)
     weights = spread_weights(
