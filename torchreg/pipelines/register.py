@@ -75,7 +75,7 @@ def register(
 
     Differentiable: no; `GridLBS` is, for refining what was found.
 
-    Cost: about 2 s for scans of 8,000 points on one core, the alignment two thirds of it.
+    Cost: 1.3 to 3.5 s for scans of 8,000 points on one core, the alignment three quarters of it.
 
     References: Chang and Zwicker 2009, algorithm 1; Le and Deng 2012, for motions and weights in turn.
     """
