@@ -120,3 +120,15 @@ def arm_tracking(arm):
         return Frame(points, points.isfinite().all(-1), gap)
 
     return SimpleNamespace(pose=pose, cloud=cloud, skin=skin, fitter=fitter, state=state, frame=frame)
+
+
+@pytest.fixture(scope="session")
+def lower_legs():
+    """Return a function of a problem and its pair of a figure: samples (S,) of the left and of the right lower leg."""
+
+    def find(problem, pair):
+        names, labels = pair.part_names, pair.labels[problem.samples]
+        below = [[names.index(f"{side} {part}") for part in ("shin", "foot")] for side in ("left", "right")]
+        return [torch.isin(labels, torch.tensor(parts)) for parts in below]
+
+    return find

@@ -23,13 +23,6 @@ def problem(pair):
     return describe(pair.source, pair.target, CONFIG)
 
 
-def lower_legs(problem, pair):
-    """Return the samples (S,) of the left and of the right lower leg and foot."""
-    names, labels = pair.part_names, pair.labels[problem.samples]
-    below = [[names.index(f"{side} {part}") for part in ("shin", "foot")] for side in ("left", "right")]
-    return [torch.isin(labels, torch.tensor(parts)) for parts in below]
-
-
 def legs_together(problem, left, right):
     """Return motions (J, 4, 4) that lay the left leg on the right one."""
     limbs, points = Limbs.of(problem.graph), problem.graph.points
@@ -38,7 +31,7 @@ def legs_together(problem, left, right):
     return limbs.laid(problem.graph.rest(), points + shift)
 
 
-def test_a_leg_laid_on_the_other_returns_to_its_own(problem, pair):
+def test_a_leg_laid_on_the_other_returns_to_its_own(problem, pair, lower_legs):
     left, right = lower_legs(problem, pair)
     wrong = legs_together(problem, left, right)
     places, truth = problem.graph(wrong), problem.unit.of_points(pair.truth)[problem.samples]

@@ -24,14 +24,7 @@ def problem(pair):
     return describe(pair.source, pair.target, CONFIG)
 
 
-def lower_legs(problem, pair):
-    """Return the samples (S,) of the left and of the right lower leg and foot."""
-    names, labels = pair.part_names, pair.labels[problem.samples]
-    below = [[names.index(f"{side} {part}") for part in ("shin", "foot")] for side in ("left", "right")]
-    return [torch.isin(labels, torch.tensor(parts)) for parts in below]
-
-
-def test_limbs_lie_where_the_others_lay(problem, pair):
+def test_limbs_lie_where_the_others_lay(problem, pair, lower_legs):
     rest = problem.graph.rest()
     left, right = lower_legs(problem, pair)
     assert int(left.sum()) > 10

@@ -42,7 +42,7 @@ from torchreg.pipelines.threads import both, one_thread
 
 _One = TypeVar("_One")
 _Other = TypeVar("_Other")
-# Fewer hypotheses are not fused.
+# Fewer hypotheses are not fused, nor are limbs of the best rearranged.
 _LEAST_FUSED = 3
 # How a graph is taken to where points are expected: that may be wrong in parts, and limbs turn far.
 _EXPECTED_STIFFNESS, _EXPECTED_FITS = 0.02, 4
@@ -73,7 +73,8 @@ def align_scans(
     matches make that about as good. The best covers the target, is covered by it, is like it, bends least, and is
     nearest to what is expected; its EM is taken to the end, and beside that once more from the beginning, slowly and
     with matches that may slide, and the better end is kept. Where rest and stiff matches agree and leave little of both
-    scans over, the softer ones are left out; where all agree, so is all that follows but the end.
+    scans over, the softer ones are left out; where all agree, or there are only two, the best is taken to the end
+    without more ado.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.

@@ -10,7 +10,7 @@ from torchreg.geometry.neighbors import nearest_few
 from torchreg.pipelines.scan_align_config import ChoiceConfig
 from torchreg.pipelines.scan_align_problem import ScanAlignProblem
 from torchreg.pipelines.scan_align_stages import embedded
-from torchreg.pipelines.scan_limbs import LONGEST, Limbs, finite_ways, shift_onto
+from torchreg.pipelines.scan_limbs import FARTHEST, LONGEST, Limbs, finite_ways, shift_onto
 
 # Target samples looked at, and neighbors of each on its surface.
 _NUM_TARGETS, _NEIGHBORS = 800, 8
@@ -18,8 +18,6 @@ _NUM_TARGETS, _NEIGHBORS = 800, 8
 _NUM_FROM = 60
 # Patches that nothing covers, at most and with at least this share of the samples, and limbs tried for each.
 _MOST_PATCHES, _LEAST_SHARE, _MOST_LIMBS = 2, 0.02, 3
-# Limbs whose tips are farther from the patch than this stay where they are, length.
-_FARTHEST = 0.45
 
 
 def covering_limbs(problem: ScanAlignProblem, transforms: Tensor, config: ChoiceConfig) -> list[Tensor]:
@@ -42,6 +40,8 @@ def covering_limbs(problem: ScanAlignProblem, transforms: Tensor, config: Choice
     target = problem.target.first(_NUM_TARGETS)
     moved = problem.moved(transforms)
     bare = nearest_few(embedded(target, config), embedded(moved, config), 1)[1][:, 0] >= config.cap
+    if not bare.any():
+        return []
     surface = GeodesicGraph.from_points(target.points, min(_NEIGHBORS, len(target) - 1))
     limbs = Limbs.of(problem.graph)
     # A limb ends half the way to the next tip.
@@ -50,9 +50,10 @@ def covering_limbs(problem: ScanAlignProblem, transforms: Tensor, config: Choice
     for tip in _bare_tips(surface, bare):
         levels = surface.distances([tip])[0]
         apart = (places - target.points[tip]).norm(dim=-1)
-        for limb in apart.argsort(stable=True)[:_MOST_LIMBS].tolist():
+        nearest = apart.argsort(stable=True)[:_MOST_LIMBS]
+        for limb in nearest[apart[nearest] < FARTHEST].tolist():
             shift = shift_onto(moved.points, limbs.levels[limb], target.points, levels, float(lengths[limb]))
-            if shift is not None and float(apart[limb]) < _FARTHEST:
+            if shift is not None:
                 found.append(limbs.laid(transforms, moved.points + shift))
     return found
 

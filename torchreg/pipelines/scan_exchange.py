@@ -6,10 +6,8 @@ import torch
 from torch import Tensor
 
 from torchreg.pipelines.scan_align_problem import ScanAlignProblem
-from torchreg.pipelines.scan_limbs import LONGEST, Limbs, shift_onto
+from torchreg.pipelines.scan_limbs import FARTHEST, LONGEST, Limbs, shift_onto
 
-# Limbs whose tips are farther apart than this are not exchanged, length.
-_FARTHEST = 0.45
 # Pairs of limbs at most, those with the nearest tips.
 _MOST_PAIRS = 8
 
@@ -33,7 +31,7 @@ def exchanged_limbs(problem: ScanAlignProblem, transforms: Tensor) -> list[Tenso
     places = limbs.places(transforms)
     apart = torch.cdist(places, places)
     pairs = torch.combinations(torch.arange(len(places)))
-    pairs = pairs[apart[pairs[:, 0], pairs[:, 1]] < _FARTHEST]
+    pairs = pairs[apart[pairs[:, 0], pairs[:, 1]] < FARTHEST]
     pairs = pairs[apart[pairs[:, 0], pairs[:, 1]].argsort(stable=True)[:_MOST_PAIRS]]
     targets = [_exchanged(limbs, moved, *pair.tolist()) for pair in pairs]
     return [limbs.laid(transforms, there) for there in targets if there is not None]

@@ -12,8 +12,8 @@ from torchreg.geometry.rigid import transform_points
 from torchreg.models.deformation_graph import DeformationGraph
 from torchreg.pipelines.graph_fit import GraphMatches, fit_graph
 
-# No more of a limb than this is laid elsewhere, length.
-LONGEST = 0.45
+# No more of a limb than this is laid elsewhere, and only on what has its tip within this: lengths.
+LONGEST, FARTHEST = 0.45, 0.45
 # Points of a limb, and of what it is laid on, at least.
 _LEAST_POINTS = 10
 # Width of what counts as equally far from the tip, length.
@@ -42,11 +42,11 @@ class Limbs:
     def of(cls, graph: DeformationGraph) -> Limbs:
         """Return the limbs of a graph."""
         one, other = graph.centers[graph.edges].unbind(1)
-        ways = GeodesicGraph.from_steps(graph.edges, (one - other).norm(dim=-1), graph.num_nodes).distances()
-        mean = finite_ways(ways).mean(1)
+        steps = GeodesicGraph.from_steps(graph.edges, (one - other).norm(dim=-1), graph.num_nodes)
+        ways = finite_ways(steps.distances())
+        mean = ways.mean(1)
         tips = (mean >= torch.where(graph.within(2), mean, 0.0).amax(1)).nonzero()[:, 0]
-        ways = finite_ways(ways)[tips]
-        return cls(graph, tips, ways[:, tips], ways[:, graph.dense_weights.argmax(1)])
+        return cls(graph, tips, ways[tips][:, tips], ways[tips][:, graph.dense_weights.argmax(1)])
 
     def places(self, transforms: Tensor) -> Tensor:
         """Return where motions (J, 4, 4) take the tips, (K, 3)."""
