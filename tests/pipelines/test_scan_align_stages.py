@@ -118,6 +118,20 @@ def test_samples_without_a_match_stay_about_where_they_are_expected(problem, rep
     assert float((plain - aware).norm(dim=-1).median()) < 0.1 * float(shift.norm())
 
 
+def test_wide_regions_are_strained_less_where_they_count(problem, reporter):
+    rest, config = problem.graph.rest(), RefineConfig(num_steps=4, final_steps=0)
+    strains = [
+        problem.regions.strain(problem.graph(refine(problem, rest, replace(config, regions=weight), reporter[0])))
+        for weight in (0.0, 0.01, 0.1)
+    ]
+    assert strains[0] > 1.1 * strains[1] > 1.1**2 * strains[2]
+    # At the last sigma they count no more.
+    last = RefineConfig(num_steps=1, final_steps=3)
+    begun = refine(problem, rest, replace(last, regions=0.1), reporter[0], steps=slice(1))
+    ends = [refine(problem, begun, replace(last, regions=each), reporter[0], steps=slice(1, None)) for each in (0, 0.1)]
+    assert torch.equal(*ends)
+
+
 def test_leaps_cost_their_distance_up_to_a_cap(problem):
     config, rest = ChoiceConfig(leap=2.0, leap_cap=0.1), problem.graph.rest()
     places = problem.graph(rest)
@@ -135,6 +149,7 @@ def test_better_hypotheses_are_judged_better(problem, reporter):
     still, better = judge(problem, "still", rest, config), judge(problem, "better", moved, config)
     assert better.energy < still.energy
     assert still.bend == 0
+    assert still.strain == pytest.approx(0, abs=1e-12)
     assert still.energy == pytest.approx(still.forward + still.backward + still.unlike)
     far = rest.clone()
     far[:, :3, 3] += 10

@@ -91,6 +91,7 @@ class RefineConfig:
         final_steps: at the last sigma.
         compared_after: steps after which hypotheses are compared; the rest are for the best alone.
         slow_steps: instead of num_steps when the best is refined once more, see `slower`; 0 leaves that out.
+        slow_regions: instead of ``regions`` then.
         sigma: first and last, length; the first from a rough start, and
         near_sigma: from one that should be near,
         fused_sigma: from motions that have been refined and put together.
@@ -98,6 +99,8 @@ class RefineConfig:
         give: nodes that disagree by more than this hold each other less, length.
         feature_weight: see `ScanEMConfig`, first and last: bending and hidden surroundings change features a little.
         slide: how much misses along the surface count, squared, first and last.
+        regions: how much it counts, beside a match, that a sample leaves the wide regions it is in, see `WideRegions`,
+            while sigma shrinks.
         fits_per_step: rounds of matching and fitting at each sigma.
         both_ways_above: sigma from which targets choose among sources too, length.
         boundary_above: sigma from which targets on a boundary may be matched, and matches beside what hides the rest of
@@ -118,6 +121,7 @@ class RefineConfig:
     final_steps: int = 1
     compared_after: int = 5
     slow_steps: int = 20
+    slow_regions: float = 0.01
     sigma: tuple[float, float] = (0.025, 0.006)
     near_sigma: float = 0.02
     fused_sigma: float = 0.012
@@ -125,6 +129,7 @@ class RefineConfig:
     give: float = 0.01
     feature_weight: tuple[float, float] = (8.0, 1.0)
     slide: tuple[float, float] = (1.0, 0.03)
+    regions: float = 0.0
     fits_per_step: int = 2
     both_ways_above: float = 0.012
     boundary_above: float = 0.02
@@ -147,16 +152,19 @@ class RefineConfig:
             _check_ends(getattr(self, name), name)
         for name in ("near_sigma", "fused_sigma", "give", "beyond_scale", "expected_scale"):
             check_positive(getattr(self, name), name)
-        optional = "both_ways_above", "boundary_above", "beyond", "beyond_below", "beyond_margin", "expected", "density"
-        for name in optional:
+        for name in ("both_ways_above", "boundary_above", "beyond", "beyond_below", "beyond_margin", "expected"):
+            check_positive(getattr(self, name), name, allow_zero=True)
+        for name in ("regions", "slow_regions", "density"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
     def slower(self) -> RefineConfig:
         """Return the settings of a second, slower EM: matches slide along the surface from its beginning.
 
-        Held along the surface, samples go where the first matches were; cloth and round limbs have farther to go.
+        Held along the surface, samples go where the first matches were; cloth and round limbs have farther to go. Wide
+        regions keep what may slide from following folds.
         """
-        return replace(self, num_steps=self.slow_steps, slide=(self.slide[1], self.slide[1]))
+        slide = (self.slide[1], self.slide[1])
+        return replace(self, num_steps=self.slow_steps, slide=slide, regions=self.slow_regions)
 
 
 @dataclass(frozen=True)
@@ -169,6 +177,7 @@ class ChoiceConfig:
         unlike: what it costs that features differ by one, squared, where the moved source lies on the target.
         bend: what it costs that neighboring nodes disagree by one size in the mean,
         slack: of which less than this hardly counts, length.
+        strain: what it costs that samples leave the wide regions they are in, see `WideRegions.strain`.
         leap: what it costs that samples are far from where they were expected, if that is known, squared,
         leap_cap: up to this distance, length.
         same: hypotheses agree where their samples are this near each other, length,
@@ -182,6 +191,7 @@ class ChoiceConfig:
     unlike: float = 2.0
     bend: float = 20.0
     slack: float = 1e-3
+    strain: float = 1.5
     leap: float = 1.0
     leap_cap: float = 0.1
     same: float = 0.005
@@ -191,7 +201,7 @@ class ChoiceConfig:
     def __post_init__(self) -> None:
         for name in ("cap", "leap_cap", "same", "same_share"):
             check_positive(getattr(self, name), name)
-        for name in ("normal_scale", "unlike", "bend", "slack", "leap", "lost_share"):
+        for name in ("normal_scale", "unlike", "bend", "slack", "strain", "leap", "lost_share"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
 
@@ -204,6 +214,9 @@ class ScanAlignConfig:
         num_target_samples: of the target.
         num_nodes: of the graph.
         num_nearest: nodes that each sample hangs on.
+        region_samples: of the source, that wide regions hold.
+        region_reach: radius of those along the surface, length.
+        region_give: samples off a region's rigid motion by more than this are free, length.
         curvature_radii: of the features, lengths.
         occluder_depth: a surface this much nearer to the camera beside an edge hides what is behind, length.
         occluder_reach: spacings of samples within which of such an edge matches hold across the surface alone.
@@ -223,6 +236,9 @@ class ScanAlignConfig:
     num_target_samples: int = 2500
     num_nodes: int = 60
     num_nearest: int = 4
+    region_samples: int = 200
+    region_reach: float = 0.5
+    region_give: float = 0.05
     curvature_radii: tuple[float, ...] = (0.02, 0.035, 0.06)
     occluder_depth: float = 0.03
     occluder_reach: float = 2.5
@@ -236,8 +252,10 @@ class ScanAlignConfig:
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
 
     def __post_init__(self) -> None:
-        for name in ("num_samples", "num_target_samples", "num_nodes", "num_nearest"):
+        for name in ("num_samples", "num_target_samples", "num_nodes", "num_nearest", "region_samples"):
             check_count(getattr(self, name), name, 1)
+        for name in ("region_reach", "region_give"):
+            check_positive(getattr(self, name), name)
         _check_values(self.curvature_radii, "curvature_radii")
         check_positive(self.occluder_depth, "occluder_depth")
         check_positive(self.most_cut, "most_cut")
@@ -285,11 +303,13 @@ class Hypothesis:
 
     Args:
         name: what it started from.
-        energy: ``forward + backward + unlike + bend + leap``, by which hypotheses are compared; lower is better.
+        energy: ``forward + backward + unlike + bend + strain + leap``, by which hypotheses are compared; lower is
+            better.
         forward: mean squared distance of moved samples to the target, capped at one.
         backward: mean squared distance of target samples to the moved source, capped at one.
         unlike: weighted mean squared difference of features of moved samples and the target.
         bend: weighted disagreement of neighboring nodes.
+        strain: weighted share by which wide regions do not move rigidly.
         leap: weighted mean squared distance of samples from where they were expected, capped at one; 0 if that is not
             known.
     """
@@ -300,6 +320,7 @@ class Hypothesis:
     backward: float
     unlike: float
     bend: float
+    strain: float
     leap: float = 0.0
 
 

@@ -24,6 +24,7 @@ from torchreg.geometry.sampling import even_order
 from torchreg.models.deformation_graph import DeformationGraph
 from torchreg.pipelines.graph_fit import GraphMatches
 from torchreg.pipelines.scan_align_config import MatchConfig, ScanAlignConfig
+from torchreg.pipelines.scan_regions import WideRegions
 from torchreg.pipelines.scan_unit import ScanUnit
 from torchreg.pipelines.threads import both
 
@@ -43,6 +44,7 @@ class ScanAlignProblem:
         graph: of the source's first samples, which it moves.
         source: samples of the source, evenly spread in any first few of them.
         target: samples of the target.
+        regions: of the graph's first samples, about its nodes, each of which mostly moves rigidly.
         free: where the camera saw nothing when the target was scanned; None if it is not known where the camera was.
         samples: (S,) source points that are samples of the graph.
         nodes: (J,) source points that are nodes.
@@ -53,6 +55,7 @@ class ScanAlignProblem:
     graph: DeformationGraph
     source: OrientedSamples
     target: OrientedSamples
+    regions: WideRegions
     free: FreeSpace | None
     samples: Tensor
     nodes: Tensor
@@ -111,7 +114,15 @@ def describe(
     nodes = build_node_graph(ways, 0, config.num_nodes, config.num_nearest)
     graph = DeformationGraph(one.points[: len(samples)], one.normals[: len(samples)], nodes)
     ahead = None if expected is None else unit.of_points(expected)[samples]
-    return ScanAlignProblem(graph, one, other, free, samples, samples[nodes.nodes], unit, ahead)
+    regions = _wide_regions(graph, ways, nodes.nodes, config)
+    return ScanAlignProblem(graph, one, other, regions, free, samples, samples[nodes.nodes], unit, ahead)
+
+
+def _wide_regions(graph: DeformationGraph, ways: GeodesicGraph, nodes: Tensor, config: ScanAlignConfig) -> WideRegions:
+    """Return regions about the nodes, samples of the graph."""
+    few = graph.points[: config.region_samples]
+    apart = ways.distances(nodes, limit=config.region_reach)[:, : len(few)].to(few)
+    return WideRegions.of(few, apart, config.region_reach, config.region_give)
 
 
 def _viewpoint(scan: RangeScan, unit: ScanUnit, samples: OrientedSamples) -> Tensor | None:

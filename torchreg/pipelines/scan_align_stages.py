@@ -128,6 +128,8 @@ def refine(
             found = soft_matches(problem, moved, sigma, config, share)
             along = _along_surface(found, slide, sigma < config.boundary_above)
             others = _out_of_empty_space(problem, moved, sigma, config) + _as_expected(problem, moved, found, config)
+            if config.regions > 0 and step < config.num_steps:
+                others += (problem.regions.matches(moved.points, config.regions),)
             fit = fit_graph(problem.graph, transforms, joined(along, *others), stiffness, give=config.give)
             transforms = fit.transforms
         reporter.report(stage, step, number, sigma, fit, stiffness, float(found.weights.mean()))
@@ -194,14 +196,16 @@ def _as_expected(
 
 
 def judge(problem: ScanAlignProblem, name: str, transforms: Tensor, config: ChoiceConfig) -> Hypothesis:
-    """Return how well the moved source and the target cover each other, how alike they are there, and the bend."""
+    """Return how well the moved source and the target cover each other, how alike they are there, bend and strain."""
     moved = problem.moved(transforms)
     forward, unlike = (float(cost.mean()) for cost in mismatch(problem, moved, config))
     apart = nearest_few(embedded(problem.target, config), embedded(moved, config), 1)[1]
     backward = float((apart / config.cap).clamp(max=1).square().mean())
     bend = config.bend * float(problem.graph.bend(transforms, config.slack))
+    strain = config.strain * problem.regions.strain(moved.points)
     leap = float(leaps(problem, moved.points, config).mean())
-    return Hypothesis(name, forward + backward + unlike + bend + leap, forward, backward, unlike, bend, leap)
+    costs = (forward, backward, unlike, bend, strain, leap)
+    return Hypothesis(name, sum(costs), *costs)
 
 
 def leaps(problem: ScanAlignProblem, places: Tensor, config: ChoiceConfig) -> Tensor:

@@ -70,11 +70,11 @@ def align_scans(
     what something nearer hides hold across the surface alone, and samples where the target's camera saw nothing are
     taken back into its picture. Then each part moves as in the hypothesis that suits it, and the EM goes on from there
     as well, and from the best with two limbs exchanged or with one laid where nothing covers the target, if one-to-one
-    matches make that about as good. The best covers the target, is covered by it, is like it, bends least, and is
-    nearest to what is expected; its EM is taken to the end, and beside that once more from the beginning, slowly and
-    with matches that may slide, and the better end is kept. Where rest and stiff matches agree and leave little of both
-    scans over, the softer ones are left out; where all agree, or there are only two, the best is taken to the end
-    without more ado.
+    matches make that about as good. The best covers the target, is covered by it, is like it, bends least, leaves the
+    larger part of each wide region rigid, and is nearest to what is expected; its EM is taken to the end, and beside
+    that once more from the beginning, slowly, with matches that may slide and wide regions that hold, and the better
+    end is kept. Where rest and stiff matches agree and leave little of both scans over, the softer ones are left out;
+    where all agree, or there are only two, the best is taken to the end without more ado.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.

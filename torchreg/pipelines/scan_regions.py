@@ -1,0 +1,79 @@
+"""Wide regions of a surface, most of each moving rigidly: folds wander over cloth, the cloth stays on the body."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.rigid import transform_points
+from torchreg.geometry.rigid_moments import rigid_moments
+from torchreg.pipelines.graph_fit import GraphMatches
+
+# Rounds of fitting and of trusting less what does not fit: within an EM, which goes on, and for a comparison.
+_FEW_ROUNDS, _ROUNDS = 3, 6
+
+
+@dataclass(frozen=True, eq=False)
+class WideRegions:
+    """Overlapping regions of the first samples of a surface.
+
+    The gaps between neighboring nodes of a graph cost little where each is small, however much they add up to over a
+    wide region. Here each region has one rigid motion, fitted robustly to where its samples are: of a bent limb it
+    takes the larger part, and what leaves that by more than ``give`` is free.
+
+    Args:
+        points: (M, 3) samples at rest.
+        shares: (J, M) how much each sample belongs to each region; columns sum to one in the mean.
+        give: samples that a region's motion misses by more than this follow it ever less, length.
+    """
+
+    points: Tensor
+    shares: Tensor
+    give: float
+
+    @classmethod
+    def of(cls, points: Tensor, ways: Tensor, reach: float, give: float) -> WideRegions:
+        """Return the regions about some places.
+
+        Args:
+            points: (M, 3) samples at rest.
+            ways: (J, M) their distances from the places along the surface; infinite for any beyond the reach.
+            reach: radius of a region, length, within which most samples have a place.
+            give: see above.
+        """
+        shares = (1 - (ways / reach).square()).clamp_min(0).square()
+        return cls(points, shares / shares.sum(0).mean().clamp_min(torch.finfo(shares.dtype).tiny), give)
+
+    def matches(self, places: Tensor, weight: float) -> GraphMatches:
+        """Return what takes samples along with their regions, from places (S, 3) of which the first are the regions'.
+
+        It costs ``weight`` times the mean over the M samples of the squared misses of the regions' motions, by share.
+
+        References: Geman and McClure 1985, for how a miss that is large counts less.
+        """
+        aims, trust, _ = self._fitted(places, _FEW_ROUNDS)
+        held = self.shares[:, : aims.shape[1]] * trust
+        total = held.sum(0)
+        targets = (held.unsqueeze(-1) * aims).sum(0) / total.clamp_min(torch.finfo(total.dtype).tiny).unsqueeze(-1)
+        targets = torch.where(total.unsqueeze(-1) > 0, targets, places[: len(total)])
+        return GraphMatches(slice(0, len(total)), targets, weight * total * (len(places) / len(total)))
+
+    def strain(self, places: Tensor) -> float:
+        """Return the mean, over samples and by share, of ``r^2 / (r^2 + give^2)``, r a miss of a region's motion."""
+        _, _, misses = self._fitted(places, _ROUNDS)
+        return float((self.shares[:, : misses.shape[1]] * misses / (misses + self.give**2)).sum(0).mean())
+
+    def _fitted(self, places: Tensor, rounds: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Return where the regions' motions take the samples (J, m, 3), how far that is trusted, and squared misses."""
+        count = min(len(self.points), len(places))
+        points, places, shares = self.points[:count], places[:count], self.shares[:, :count]
+        trust, each = torch.ones_like(shares), torch.arange(count, device=points.device)
+        alone = rigid_moments(points, places, torch.ones_like(points[:, 0]), each, count)
+        for _ in range(rounds):
+            fitted = replace(alone, sums=(shares * trust) @ alone.sums)
+            aims = transform_points(fitted.motions(), points)
+            misses = (aims - places).square().sum(-1)
+            trust = (1 + misses / self.give**2).pow(-2)
+        return aims, trust, misses
