@@ -36,6 +36,7 @@ from torchreg.datasets.scan_sequences import ScanPair, ScanSequence, jointed_toy
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.metrics import adjusted_rand
+from torchreg.pipelines.scan_align_config import ScanAlignConfig
 
 NEAR, REGISTERED, JOINT, APART = 0.025, 0.9, 0.05, 0.005
 SCALE = 100
@@ -118,6 +119,7 @@ def _ablations() -> list[Recipe]:
         Recipe("without label reuse", config=replace(plain, reuse=False)),
         Recipe("without refinement", config=replace(plain, refine_steps=0)),
         Recipe("without descriptors", config=replace(plain, align=replace(plain.align, match=_no_matches(plain)))),
+        Recipe("without wide regions", config=replace(plain, align=_no_regions(plain.align))),
         *(Recipe(f"grid {size}", grid=size) for size in (20, 35, 65, 80)),
         *(Recipe(f"bones {size}", bones=size) for size in (4, 6, 10, 15)),
     ]
@@ -126,6 +128,11 @@ def _ablations() -> list[Recipe]:
 def _no_matches(config: tr.RegisterConfig):
     """Return settings under which there are never enough matches of descriptors to start from."""
     return replace(config.align.match, min_matches=10**9)
+
+
+def _no_regions(align: ScanAlignConfig) -> ScanAlignConfig:
+    """Return settings under which wide regions may move in any way."""
+    return replace(align, refine=replace(align.refine, slow_regions=0.0), choice=replace(align.choice, strain=0.0))
 
 
 def file_problems(folder: Path) -> Iterator[Problem]:
