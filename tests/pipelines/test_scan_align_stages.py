@@ -132,6 +132,17 @@ def test_wide_regions_are_strained_less_where_they_count(problem, reporter):
     assert torch.equal(*ends)
 
 
+def test_strain_costs_as_much_as_it_weighs(problem):
+    bent = problem.graph.rest()
+    bent[::2, :3, 3] += 0.03
+    strain = problem.regions.strain(problem.graph(bent))
+    assert strain > 0.01
+    plain, dear = (judge(problem, "", bent, ChoiceConfig(strain=weight)) for weight in (0.0, 3.0))
+    assert dear.strain == pytest.approx(3 * strain)
+    assert dear.energy - plain.energy == pytest.approx(dear.strain)
+    assert replace(dear, energy=0, strain=0) == replace(plain, energy=0)
+
+
 def test_leaps_cost_their_distance_up_to_a_cap(problem):
     config, rest = ChoiceConfig(leap=2.0, leap_cap=0.1), problem.graph.rest()
     places = problem.graph(rest)

@@ -152,9 +152,8 @@ class RefineConfig:
             _check_ends(getattr(self, name), name)
         for name in ("near_sigma", "fused_sigma", "give", "beyond_scale", "expected_scale"):
             check_positive(getattr(self, name), name)
-        for name in ("both_ways_above", "boundary_above", "beyond", "beyond_below", "beyond_margin", "expected"):
-            check_positive(getattr(self, name), name, allow_zero=True)
-        for name in ("regions", "slow_regions", "density"):
+        weights, limits = ("regions", "slow_regions", "beyond", "expected"), ("both_ways_above", "boundary_above")
+        for name in (*weights, *limits, "beyond_below", "beyond_margin", "density"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
     def slower(self) -> RefineConfig:

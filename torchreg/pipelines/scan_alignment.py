@@ -267,10 +267,11 @@ def _pulled(
     if not options:
         return []
     energy = partial(_energy_of, problem, config, reporter.name)
-    pulled = min((pull_one_to_one(problem, each, config.reassign, reporter) for each in options), key=energy)
-    if energy(pulled) > _energy(best) + _HARDLY_WORSE:
+    pulled = [pull_one_to_one(problem, each, config.reassign, reporter) for each in options]
+    least, number = min((energy(each), number) for number, each in enumerate(pulled))
+    if least > _energy(best) + _HARDLY_WORSE:
         return []
-    return [_compared(problem, pulled, config.refine.near_sigma, config, reporter)]
+    return [_compared(problem, pulled[number], config.refine.near_sigma, config, reporter)]
 
 
 def _compared(

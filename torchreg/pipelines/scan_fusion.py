@@ -26,8 +26,8 @@ def fuse_motions(problem: ScanAlignProblem, options: Tensor, config: ChoiceConfi
     """Return motions of the nodes, each as in one of several hypotheses.
 
     The energy is that by which hypotheses are compared, without the strain of wide regions, every sample moved by the
-    node that it hangs on most.
-    Starting from the first hypothesis, the patch and hypothesis that lower it most change hands, until none does.
+    node that it hangs on most. Starting from the first hypothesis, the patch and hypothesis that lower it most change
+    hands, until none does.
 
     Args:
         problem: the scans.
