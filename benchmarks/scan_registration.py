@@ -132,7 +132,7 @@ def _no_matches(config: tr.RegisterConfig):
 
 def _no_regions(align: ScanAlignConfig) -> ScanAlignConfig:
     """Return settings under which wide regions may move in any way."""
-    return replace(align, refine=replace(align.refine, slow_regions=0.0), choice=replace(align.choice, strain=0.0))
+    return replace(align, refine=replace(align.refine, regions=0.0), choice=replace(align.choice, strain=0.0))
 
 
 def file_problems(folder: Path) -> Iterator[Problem]:

@@ -37,7 +37,9 @@ from torchreg.pipelines.scan_align_config import (
         (RefineConfig, {"expected": -1.0}, "expected must be"),
         (RefineConfig, {"expected_scale": 0.0}, "expected_scale must be positive"),
         (RefineConfig, {"regions": -0.1}, "regions must be"),
-        (RefineConfig, {"slow_regions": -0.1}, "slow_regions must be"),
+        (RefineConfig, {"unlike": (0.5,)}, "unlike must be two numbers"),
+        (RefineConfig, {"unlike": (0.8, 0.8)}, "unlike must grow, got 0.8 and 0.8"),
+        (RefineConfig, {"surrounding": 0}, "surrounding must be at least 1"),
         (ChoiceConfig, {"strain": -1.0}, "strain must be"),
         (ScanAlignConfig, {"region_samples": 0}, "region_samples must be at least 1"),
         (ScanAlignConfig, {"region_reach": 0.0}, "region_reach must be positive"),
@@ -61,9 +63,9 @@ def test_values_between_ends_are_in_even_ratios():
 
 
 def test_slowly_matches_slide_from_the_beginning():
-    config = RefineConfig(slow_steps=9, slow_regions=0.3, slide=(0.5, 0.1), sigma=(0.02, 0.004))
+    config = RefineConfig(slow_steps=9, slide=(0.5, 0.1), sigma=(0.02, 0.004))
     slow = config.slower()
-    assert (slow.num_steps, slow.slide, slow.regions, slow.sigma) == (9, (0.1, 0.1), 0.3, (0.02, 0.004))
+    assert (slow.num_steps, slow.slide, slow.sigma) == (9, (0.1, 0.1), (0.02, 0.004))
 
 
 def test_the_energy_of_a_record_is_that_of_its_terms():

@@ -1,11 +1,13 @@
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from torchreg.correspondence.oriented_samples import OrientedSamples
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import walking_figure
+from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import se3_exp
 from torchreg.pipelines.graph_fit import GraphMatches
 from torchreg.pipelines.scan_align_config import (
@@ -19,7 +21,9 @@ from torchreg.pipelines.scan_align_problem import describe
 from torchreg.pipelines.scan_align_stages import (
     Reporter,
     agree,
+    embedded,
     fit_first_matches,
+    follow_regions,
     judge,
     leaps,
     loses_limb,
@@ -118,18 +122,102 @@ def test_samples_without_a_match_stay_about_where_they_are_expected(problem, rep
     assert float((plain - aware).norm(dim=-1).median()) < 0.1 * float(shift.norm())
 
 
-def test_wide_regions_are_strained_less_where_they_count(problem, reporter):
+def test_wide_regions_are_strained_less_where_samples_follow(problem, reporter):
     rest, config = problem.graph.rest(), RefineConfig(num_steps=4, final_steps=0)
+    half = torch.full_like(problem.graph.points[:, 0], 0.5)
     strains = [
-        problem.regions.strain(problem.graph(refine(problem, rest, replace(config, regions=weight), reporter[0])))
-        for weight in (0.0, 0.01, 0.1)
+        problem.regions.strain(
+            problem.graph(refine(problem, rest, replace(config, regions=weight), reporter[0], follow=half))
+        )
+        for weight in (0.0, 0.05, 0.5)
     ]
     assert strains[0] > 1.1 * strains[1] > 1.1**2 * strains[2]
     # At the last sigma they count no more.
     last = RefineConfig(num_steps=1, final_steps=3)
-    begun = refine(problem, rest, replace(last, regions=0.1), reporter[0], steps=slice(1))
-    ends = [refine(problem, begun, replace(last, regions=each), reporter[0], steps=slice(1, None)) for each in (0, 0.1)]
+    begun = refine(problem, rest, last, reporter[0], steps=slice(1), follow=half)
+    ends = [
+        refine(problem, begun, replace(last, regions=each), reporter[0], steps=slice(1, None), follow=half)
+        for each in (0, 0.1)
+    ]
     assert torch.equal(*ends)
+
+
+def test_who_follows_nothing_is_refined_as_ever(problem, reporter):
+    rest, config = problem.graph.rest(), RefineConfig(num_steps=2, final_steps=1)
+    nobody = torch.zeros_like(problem.graph.points[:, 0])
+    plain, following = (refine(problem, rest, config, reporter[0], follow=each) for each in (None, nobody))
+    torch.testing.assert_close(problem.graph(following), problem.graph(plain))
+
+
+def test_followers_are_not_drawn_along_the_surface(reporter):
+    """Of a plane that went down and sideways, which its features alone tell, followers go down alone."""
+    flat = torch.rand(600, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    flat[:, 2] = 0
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(600, 3)
+    scan = RangeScan(flat, normals=up)
+    problem = describe(scan, scan, CONFIG)
+    features = torch.randn(len(problem.source), 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    source, shift = replace(problem.source, features=features), torch.tensor([0.01, 0.0, -0.01], dtype=torch.float64)
+    gone = replace(problem, source=source, target=replace(source, points=source.points + shift), free=None)
+    rest, config = problem.graph.rest(), RefineConfig(num_steps=6, final_steps=0, regions=0.0, slide=(1.0, 1.0))
+    for follow, expected in ((0.0, shift), (1.0, shift * torch.tensor([0.0, 0.0, 1.0]))):
+        everyone = torch.full_like(problem.graph.points[:, 0], follow)
+        moved = problem.graph(refine(gone, rest, config, reporter[0], follow=everyone))
+        went = (moved - problem.graph(rest)).median(0).values
+        torch.testing.assert_close(went, expected, rtol=0, atol=1e-3)
+
+
+def test_cloth_does_not_follow_its_folds(reporter):
+    """A tube that stands still, but for the features of its lower half, which wander around it."""
+    generator = torch.Generator().manual_seed(0)
+    angle, height = torch.rand(2, 1500, generator=generator, dtype=torch.float64) * torch.tensor([[2 * np.pi], [1.0]])
+    around = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), dim=1)
+    points = 0.25 * around + height.unsqueeze(1) * torch.tensor([0.0, 0.0, 1.0])
+    scan = RangeScan(points, normals=around)
+    problem = describe(scan, scan, CONFIG)
+
+    def pattern(places, turned):
+        x, y, z = problem.unit.points_back(places, points).unbind(-1)
+        phase = 3 * (torch.atan2(y, x) - turned * (z < 0.5))
+        return torch.stack((phase.cos(), phase.sin()), dim=1)
+
+    source = replace(problem.source, features=pattern(problem.source.points, 0.0))
+    target = replace(problem.target, features=pattern(problem.target.points, 0.4))
+    worn = replace(problem, source=source, target=target, free=None)
+    rest, config = problem.graph.rest(), RefineConfig(near_sigma=0.04).slower()
+    follow = follow_regions(worn, rest, config, ChoiceConfig())
+    drawn, held = (
+        (worn.graph(refine(worn, rest, config, reporter[0], 0.04, follow=each)) - worn.graph(rest)).norm(dim=-1)
+        for each in (None, follow)
+    )
+    below = problem.unit.points_back(worn.graph.points, points)[:, 2] < 0.4
+    assert float(follow[below].mean()) > 0.9
+    assert float(drawn[below].median()) > 0.02
+    assert float(held[below].median()) < 0.002
+
+
+def test_samples_follow_where_all_around_is_unlike(problem):
+    rest, choice, config = problem.graph.rest(), ChoiceConfig(), RefineConfig(surrounding=10, unlike=(0.5, 1.5))
+    moved, target = problem.moved(rest), problem.target
+    # By one nearest neighbor at a time.
+    away = torch.cdist(embedded(moved, choice), embedded(target, choice))
+    nearest = away.argmin(1)
+    unlike = (moved.features - target.features[nearest]).square().sum(-1).clamp(max=2)
+    unlike[away.amin(1) >= choice.cap] = 2
+    expected = [
+        (float(np.sort(unlike[(problem.graph.points - point).norm(dim=-1).argsort()[:10]].numpy())[4]) - 0.5) / 1.0
+        for point in problem.graph.points
+    ]
+    found = follow_regions(problem, rest, config, choice)
+    torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64).clamp(0, 1))
+    assert 0 < float(found.mean()) < 1
+    # Who is where he was is like himself.
+    alike = replace(problem, target=moved)
+    assert float(follow_regions(alike, rest, config, choice).max()) == 0
+    # Whose target is gone follows, however few there are.
+    gone = replace(problem, target=replace(target, points=target.points + 10))
+    everyone = follow_regions(gone, rest, replace(config, surrounding=10**6), choice)
+    torch.testing.assert_close(everyone, torch.ones_like(everyone))
 
 
 def test_strain_costs_as_much_as_it_weighs(problem):

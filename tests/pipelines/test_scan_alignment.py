@@ -12,8 +12,6 @@ from torchreg.geometry.blend import blend_linear
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.pipelines.scan_align_config import RefineConfig, ScanAlignConfig
-from torchreg.pipelines.scan_align_problem import describe
-from torchreg.pipelines.scan_align_stages import judge
 from torchreg.pipelines.scan_alignment import align_scans
 
 SCANNER = DepthScanner(num_points=1000)
@@ -34,16 +32,6 @@ def pair():
 @pytest.fixture(scope="module")
 def aligned(pair):
     return align_scans(pair.source, pair.target, QUICK)
-
-
-def final_energy(pair, config, result):
-    """Return the energy of an alignment, by its motions alone."""
-    problem = describe(pair.source, pair.target, config)
-    middle, size = problem.unit.middle, problem.unit.size
-    outwards = torch.eye(4, dtype=torch.float64) * torch.tensor([size, size, size, 1.0])
-    outwards[:3, 3] = middle
-    motions = torch.linalg.inv(outwards) @ result.transforms.double() @ outwards
-    return judge(problem, "end", motions, config.choice).energy
 
 
 def share_near(pair, points):
@@ -110,7 +98,8 @@ def test_hypotheses_are_followed_until_two_agree(pair):
 
 
 def test_the_best_alone_is_taken_to_the_end(pair):
-    config = replace(QUICK, refine=replace(QUICK.refine, compared_after=2), choice=replace(QUICK.choice, same=1e-12))
+    refining = replace(QUICK.refine, compared_after=2, slow_steps=0)
+    config = replace(QUICK, refine=refining, choice=replace(QUICK.choice, same=1e-12))
     result = align_scans(pair.source, pair.target, config)
     steps = {each.name: [] for each in result.hypotheses}
     for record in result.history:
@@ -120,16 +109,14 @@ def test_the_best_alone_is_taken_to_the_end(pair):
     assert all(each == [0, 1] for each in steps.values())
 
 
-def test_the_best_is_refined_once_more_and_the_better_end_is_kept(pair):
+def test_in_doubt_the_best_is_refined_anew_and_slowly(pair):
     doubtful = replace(QUICK, choice=replace(QUICK.choice, same=1e-12))
-    ends = {}
     for slow_steps in (0, 4, 12):
         config = replace(doubtful, refine=replace(doubtful.refine, slow_steps=slow_steps))
         result = align_scans(pair.source, pair.target, config)
         told = [each.step for each in result.history if each.stage == "slide"]
         assert told == list(range(slow_steps + config.refine.final_steps if slow_steps else 0))
-        ends[slow_steps] = final_energy(pair, config, result)
-    assert max(ends[4], ends[12]) < ends[0] + 1e-4
+        assert share_near(pair, result.points) > 0.9
     # Where all hypotheses agree there is no doubt.
     same = align_scans(pair.source, pair.source, QUICK)
     assert "slide" not in {each.stage for each in same.history}
@@ -140,7 +127,8 @@ def test_the_best_is_refined_once_more_and_the_better_end_is_kept(pair):
 )
 def test_last_steps_are_told_of_whichever_hypothesis_is_best(sequence, first, second):
     # Rest, stiff matches and one-to-one matches are best in these pairs: some were followed by another thread.
-    result = align_scans(*scans(sequence(7, scanner=SCANNER).pair(first, second)), QUICK)
+    config = replace(QUICK, refine=replace(QUICK.refine, slow_steps=0))
+    result = align_scans(*scans(sequence(7, scanner=SCANNER).pair(first, second)), config)
     told = [each.step for each in result.history if (each.hypothesis, each.stage) == (result.chosen.name, "refine")]
     assert told == list(range(6))
 

@@ -90,8 +90,8 @@ class RefineConfig:
         num_steps: while sigma shrinks.
         final_steps: at the last sigma.
         compared_after: steps after which hypotheses are compared; the rest are for the best alone.
-        slow_steps: instead of num_steps when the best is refined once more, see `slower`; 0 leaves that out.
-        slow_regions: instead of ``regions`` then.
+        slow_steps: instead of num_steps where the best of hypotheses that disagree is refined anew, see `slower`; 0
+            leaves that out.
         sigma: first and last, length; the first from a rough start, and
         near_sigma: from one that should be near,
         fused_sigma: from motions that have been refined and put together.
@@ -99,8 +99,11 @@ class RefineConfig:
         give: nodes that disagree by more than this hold each other less, length.
         feature_weight: see `ScanEMConfig`, first and last: bending and hidden surroundings change features a little.
         slide: how much misses along the surface count, squared, first and last.
-        regions: how much it counts, beside a match, that a sample leaves the wide regions it is in, see `WideRegions`,
-            while sigma shrinks.
+        regions: how much it counts there, beside a match, that a sample leaves the wide regions it follows, see
+            `WideRegions`, while sigma shrinks.
+        unlike: from which median squared difference of the features around it a sample follows wide regions, and from
+            which it does wholly.
+        surrounding: samples around each of which that is the median.
         fits_per_step: rounds of matching and fitting at each sigma.
         both_ways_above: sigma from which targets choose among sources too, length.
         boundary_above: sigma from which targets on a boundary may be matched, and matches beside what hides the rest of
@@ -120,8 +123,7 @@ class RefineConfig:
     num_steps: int = 6
     final_steps: int = 1
     compared_after: int = 5
-    slow_steps: int = 20
-    slow_regions: float = 0.01
+    slow_steps: int = 12
     sigma: tuple[float, float] = (0.025, 0.006)
     near_sigma: float = 0.02
     fused_sigma: float = 0.012
@@ -129,7 +131,9 @@ class RefineConfig:
     give: float = 0.01
     feature_weight: tuple[float, float] = (8.0, 1.0)
     slide: tuple[float, float] = (1.0, 0.03)
-    regions: float = 0.0
+    regions: float = 0.1
+    unlike: tuple[float, float] = (0.6, 1.0)
+    surrounding: int = 30
     fits_per_step: int = 2
     both_ways_above: float = 0.012
     boundary_above: float = 0.02
@@ -144,26 +148,26 @@ class RefineConfig:
     compatible: ScanEMConfig = field(default_factory=ScanEMConfig)
 
     def __post_init__(self) -> None:
-        for name in ("num_steps", "compared_after", "fits_per_step", "least_samples"):
+        for name in ("num_steps", "compared_after", "fits_per_step", "least_samples", "surrounding"):
             check_count(getattr(self, name), name, 1)
         for name in ("final_steps", "slow_steps"):
             check_count(getattr(self, name), name, 0)
-        for name in ("sigma", "stiffness", "slide", "feature_weight"):
+        for name in ("sigma", "stiffness", "slide", "feature_weight", "unlike"):
             _check_ends(getattr(self, name), name)
+        if self.unlike[0] >= self.unlike[1]:
+            raise InputError(f"unlike must grow, got {self.unlike[0]:g} and {self.unlike[1]:g}")
         for name in ("near_sigma", "fused_sigma", "give", "beyond_scale", "expected_scale"):
             check_positive(getattr(self, name), name)
-        weights, limits = ("regions", "slow_regions", "beyond", "expected"), ("both_ways_above", "boundary_above")
+        weights, limits = ("regions", "beyond", "expected"), ("both_ways_above", "boundary_above")
         for name in (*weights, *limits, "beyond_below", "beyond_margin", "density"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
     def slower(self) -> RefineConfig:
         """Return the settings of a second, slower EM: matches slide along the surface from its beginning.
 
-        Held along the surface, samples go where the first matches were; cloth and round limbs have farther to go. Wide
-        regions keep what may slide from following folds.
+        Held along the surface, samples go where the first matches were; cloth and round limbs have farther to go.
         """
-        slide = (self.slide[1], self.slide[1])
-        return replace(self, num_steps=self.slow_steps, slide=slide, regions=self.slow_regions)
+        return replace(self, num_steps=self.slow_steps, slide=(self.slide[1], self.slide[1]))
 
 
 @dataclass(frozen=True)
@@ -190,7 +194,7 @@ class ChoiceConfig:
     unlike: float = 2.0
     bend: float = 20.0
     slack: float = 1e-3
-    strain: float = 1.5
+    strain: float = 2.5
     leap: float = 1.0
     leap_cap: float = 0.1
     same: float = 0.005

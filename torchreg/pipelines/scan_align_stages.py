@@ -106,6 +106,7 @@ def refine(
     first_sigma: float | None = None,
     steps: slice = slice(None),
     stage: str = "refine",
+    follow: Tensor | None = None,
 ) -> Tensor:
     """Return motions refined by EM: sigma shrinks, the graph softens, matches may slide along the surface ever more.
 
@@ -117,6 +118,8 @@ def refine(
         first_sigma: instead of that of the configuration.
         steps: which of them to take.
         stage: what records call it.
+        follow: (S,) how far samples follow the wide regions they are in instead of what they match along the surface,
+            from 0 to 1; zeros by default.
     """
     number = config.num_steps + config.final_steps
     widths = (config.sigma[0] if first_sigma is None else first_sigma, config.sigma[1])
@@ -126,10 +129,10 @@ def refine(
         for _ in range(config.fits_per_step):
             moved = used_samples(problem, transforms, sigma, config)
             found = soft_matches(problem, moved, sigma, config, share)
-            along = _along_surface(found, slide, sigma < config.boundary_above)
+            along = _along_surface(found, slide, sigma < config.boundary_above, follow)
             others = _out_of_empty_space(problem, moved, sigma, config) + _as_expected(problem, moved, found, config)
-            if config.regions > 0 and step < config.num_steps:
-                others += (problem.regions.matches(moved.points, config.regions),)
+            if follow is not None and step < config.num_steps:
+                others += (problem.regions.matches(moved.points, follow, config.regions),)
             fit = fit_graph(problem.graph, transforms, joined(along, *others), stiffness, give=config.give)
             transforms = fit.transforms
         reporter.report(stage, step, number, sigma, fit, stiffness, float(found.weights.mean()))
@@ -161,10 +164,11 @@ def soft_matches(
     )
 
 
-def _along_surface(found: SoftMatches, slide: float, beside_edges: bool) -> GraphMatches:
-    """Return matches of the first samples, that may slide; beside edges that something hides the more."""
+def _along_surface(found: SoftMatches, slide: float, beside_edges: bool, follow: Tensor | None) -> GraphMatches:
+    """Return matches of the first samples, that may slide; the more beside what is hidden, and if they follow."""
     # A sample beside an edge, whose own place may be hidden behind, must not be pulled to what is still seen.
-    free = slide * (1 - found.cut_off) if beside_edges else slide
+    free = slide * (1 - found.cut_off) if beside_edges else torch.full_like(found.weights, slide)
+    free = free if follow is None else free * (1 - follow[: len(free)])
     return GraphMatches(slice(0, len(found.weights)), found.targets, found.weights, found.normals, free)
 
 
@@ -195,6 +199,19 @@ def _as_expected(
     return (GraphMatches(slice(0, count), expected, weights),)
 
 
+def follow_regions(problem: ScanAlignProblem, transforms: Tensor, config: RefineConfig, choice: ChoiceConfig) -> Tensor:
+    """Return how far samples (S,) had better follow wide regions than their own matches, from 0 to 1.
+
+    Where a surface is unlike all around, it has folded anew, or matches are wrong: features tell nothing there.
+    """
+    moved = problem.moved(transforms)
+    apart, unlike = differences(problem, moved, choice)
+    unlike = torch.where(apart < 1, unlike, _UNLIKE)
+    around, _ = nearest_few(problem.graph.points, problem.graph.points, min(config.surrounding, len(unlike)))
+    low, high = config.unlike
+    return ((unlike[around].median(dim=1).values - low) / (high - low)).clamp(0, 1)
+
+
 def judge(problem: ScanAlignProblem, name: str, transforms: Tensor, config: ChoiceConfig) -> Hypothesis:
     """Return how well the moved source and the target cover each other, how alike they are there, bend and strain."""
     moved = problem.moved(transforms)
@@ -218,11 +235,16 @@ def leaps(problem: ScanAlignProblem, places: Tensor, config: ChoiceConfig) -> Te
 
 def mismatch(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> tuple[Tensor, Tensor]:
     """Return what moved samples cost (S,) by their distance from the target, and by unlike features there."""
-    index, apart = nearest_few(embedded(moved, config), embedded(problem.target, config), 1)
-    apart = (apart[:, 0] / config.cap).clamp(max=1).square()
-    unlike = (moved.features - problem.target.features[index[:, 0]]).square().sum(-1).clamp(max=_UNLIKE)
+    apart, unlike = differences(problem, moved, config)
     # Where there is nothing to be like, a sample is as unlike as right matches usually are: leaving must not pay.
     return apart, config.unlike * torch.lerp(unlike, torch.full_like(unlike, _USUALLY_UNLIKE), apart)
+
+
+def differences(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> tuple[Tensor, Tensor]:
+    """Return how far moved samples (S,) are from the target, squared and capped at one, and how unlike it there."""
+    index, apart = nearest_few(embedded(moved, config), embedded(problem.target, config), 1)
+    unlike = (moved.features - problem.target.features[index[:, 0]]).square().sum(-1)
+    return (apart[:, 0] / config.cap).clamp(max=1).square(), unlike.clamp(max=_UNLIKE)
 
 
 def embedded(samples: OrientedSamples, config: ChoiceConfig) -> Tensor:

@@ -28,6 +28,7 @@ from torchreg.pipelines.scan_align_stages import (
     Reporter,
     agree,
     fit_first_matches,
+    follow_regions,
     judge,
     loses_limb,
     pull_one_to_one,
@@ -47,7 +48,7 @@ _LEAST_FUSED = 3
 # How a graph is taken to where points are expected: that may be wrong in parts, and limbs turn far.
 _EXPECTED_STIFFNESS, _EXPECTED_FITS = 0.02, 4
 # Rearranged limbs that one-to-one matches leave worse than the best by more than this energy are not gone on with.
-_HARDLY_WORSE = 0.05
+_HARDLY_WORSE = 0.1
 
 
 @torch.no_grad()
@@ -66,14 +67,14 @@ def align_scans(
     Both scans are described by even samples, their curvature at several sizes and spin images. Hypotheses start from
     rest; from where points are expected, if that is known; from matches of spin images that agree on distances along
     the surface, fitted stiffly, or softly and then pulled by one-to-one matches; and from one-to-one matches alone.
-    Each goes on by an EM with an outlier class, while edges of the graph give where its parts disagree, matches beside
-    what something nearer hides hold across the surface alone, and samples where the target's camera saw nothing are
-    taken back into its picture. Then each part moves as in the hypothesis that suits it, and the EM goes on from there
-    as well, and from the best with two limbs exchanged or with one laid where nothing covers the target, if one-to-one
-    matches make that about as good. The best covers the target, is covered by it, is like it, bends least, leaves the
-    larger part of each wide region rigid, and is nearest to what is expected; its EM is taken to the end, and beside
-    that once more from the beginning, slowly, with matches that may slide and wide regions that hold, and the better
-    end is kept. Where rest and stiff matches agree and leave little of both scans over, the softer ones are left out;
+    Each goes on by an EM with an outlier class, while edges of the graph give where its parts disagree, matches
+    beside what something nearer hides hold across the surface alone, and samples where the target's camera saw
+    nothing are taken back into its picture. Then each part moves as in the hypothesis that suits it, and the EM
+    goes on from there as well, and from the best with two limbs exchanged or with one laid where nothing covers the
+    target, if one-to-one matches make that about as good. The best covers the target, is covered by it, is like it,
+    bends least, leaves the larger part of each wide region rigid, and is nearest to what is expected. Its EM is run
+    anew, slowly, with matches that may slide, and what is unlike the target all around follows the wide regions it
+    is in. Where rest and stiff matches agree and leave little of both scans over, the softer ones are left out;
     where all agree, or there are only two, the best is taken to the end without more ado.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
@@ -286,20 +287,14 @@ def _compared(
 def _finished(
     problem: ScanAlignProblem, candidate: _Candidate, config: ScanAlignConfig, doubtful: bool, on_step: OnStep
 ) -> Tensor:
-    """Return the motions (J, 4, 4) after the last steps; in doubt, those of a slower EM if they are better."""
-    name, refining = candidate.hypothesis.name, config.refine
-
-    def to_the_end(told: OnStep) -> Tensor:
-        steps, reporter = slice(refining.compared_after, None), Reporter(name, problem.unit.size, told)
-        return refine(problem, candidate.transforms, refining, reporter, candidate.sigma, steps)
-
-    def slowly(told: OnStep) -> Tensor:
-        slow, reporter = refining.slower(), Reporter(name, problem.unit.size, told)
-        return refine(problem, candidate.transforms, slow, reporter, refining.near_sigma, stage="slide")
-
+    """Return the motions (J, 4, 4) after the last steps; in doubt, those of a slower EM."""
+    refining, reporter = config.refine, Reporter(candidate.hypothesis.name, problem.unit.size, on_step)
     if not doubtful or refining.slow_steps == 0:
-        return to_the_end(on_step)
-    return min(_both_told(on_step, slowly, to_the_end), key=partial(_energy_of, problem, config, name))
+        steps = slice(refining.compared_after, None)
+        return refine(problem, candidate.transforms, refining, reporter, candidate.sigma, steps)
+    follow = follow_regions(problem, candidate.transforms, refining, config.choice)
+    slow = refining.slower()
+    return refine(problem, candidate.transforms, slow, reporter, refining.near_sigma, stage="slide", follow=follow)
 
 
 def _all_agree(problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig) -> bool:

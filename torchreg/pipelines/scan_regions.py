@@ -46,29 +46,40 @@ class WideRegions:
         shares = (1 - (ways / reach).square()).clamp_min(0).square()
         return cls(points, shares / shares.sum(0).mean().clamp_min(torch.finfo(shares.dtype).tiny), give)
 
-    def matches(self, places: Tensor, weight: float) -> GraphMatches:
+    def matches(self, places: Tensor, follow: Tensor, weight: float) -> GraphMatches:
         """Return what takes samples along with their regions, from places (S, 3) of which the first are the regions'.
 
-        It costs ``weight`` times the mean over the M samples of the squared misses of the regions' motions, by share.
+        Regions move as those samples do that need not follow. It costs ``weight`` times the mean over the M samples of
+        the squared misses of the regions' motions, by share, by how far the sample follows, and by the share of the
+        region that shows how it moves.
+
+        Args:
+            places: where samples are now.
+            follow: (S,) from 0, for a sample whose own match is to be trusted, to 1.
+            weight: see above.
 
         References: Geman and McClure 1985, for how a miss that is large counts less.
         """
-        aims, trust, _ = self._fitted(places, _FEW_ROUNDS)
-        held = self.shares[:, : aims.shape[1]] * trust
+        count, tiny = min(len(self.points), len(places)), torch.finfo(places.dtype).tiny
+        follow, shares = follow[:count], self.shares[:, :count]
+        aims, trust, _ = self._fitted(places, _FEW_ROUNDS, 1 - follow)
+        held = shares * trust
+        shown = (held * (1 - follow)).sum(1) / shares.sum(1).clamp_min(tiny)
+        held = held * torch.outer(shown, follow)
         total = held.sum(0)
-        targets = (held.unsqueeze(-1) * aims).sum(0) / total.clamp_min(torch.finfo(total.dtype).tiny).unsqueeze(-1)
+        targets = (held.unsqueeze(-1) * aims).sum(0) / total.clamp_min(tiny).unsqueeze(-1)
         targets = torch.where(total.unsqueeze(-1) > 0, targets, places[: len(total)])
         return GraphMatches(slice(0, len(total)), targets, weight * total * (len(places) / len(total)))
 
     def strain(self, places: Tensor) -> float:
         """Return the mean, over samples and by share, of ``r^2 / (r^2 + give^2)``, r a miss of a region's motion."""
-        _, _, misses = self._fitted(places, _ROUNDS)
+        _, _, misses = self._fitted(places, _ROUNDS, torch.ones_like(places[:, 0]))
         return float((self.shares[:, : misses.shape[1]] * misses / (misses + self.give**2)).sum(0).mean())
 
-    def _fitted(self, places: Tensor, rounds: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _fitted(self, places: Tensor, rounds: int, sure: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return where the regions' motions take the samples (J, m, 3), how far that is trusted, and squared misses."""
         count = min(len(self.points), len(places))
-        points, places, shares = self.points[:count], places[:count], self.shares[:, :count]
+        points, places, shares = self.points[:count], places[:count], self.shares[:, :count] * sure[:count]
         trust, each = torch.ones_like(shares), torch.arange(count, device=points.device)
         alone = rigid_moments(points, places, torch.ones_like(points[:, 0]), each, count)
         for _ in range(rounds):
