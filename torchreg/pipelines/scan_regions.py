@@ -11,8 +11,8 @@ from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.rigid_moments import rigid_moments
 from torchreg.pipelines.graph_fit import GraphMatches
 
-# Rounds of fitting and of trusting less what does not fit: within an EM, which goes on, and for a comparison.
-_FEW_ROUNDS, _ROUNDS = 3, 6
+# Rounds of fitting and of trusting less what does not fit.
+_ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +62,7 @@ class WideRegions:
         """
         count, tiny = min(len(self.points), len(places)), torch.finfo(places.dtype).tiny
         follow, shares = follow[:count], self.shares[:, :count]
-        aims, trust, _ = self._fitted(places, _FEW_ROUNDS, 1 - follow)
+        aims, trust, _ = self._fitted(places, 1 - follow)
         held = shares * trust
         shown = (held * (1 - follow)).sum(1) / shares.sum(1).clamp_min(tiny)
         held = held * torch.outer(shown, follow)
@@ -73,16 +73,16 @@ class WideRegions:
 
     def strain(self, places: Tensor) -> float:
         """Return the mean, over samples and by share, of ``r^2 / (r^2 + give^2)``, r a miss of a region's motion."""
-        _, _, misses = self._fitted(places, _ROUNDS, torch.ones_like(places[:, 0]))
+        _, _, misses = self._fitted(places, torch.ones_like(places[:, 0]))
         return float((self.shares[:, : misses.shape[1]] * misses / (misses + self.give**2)).sum(0).mean())
 
-    def _fitted(self, places: Tensor, rounds: int, sure: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _fitted(self, places: Tensor, sure: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return where the regions' motions take the samples (J, m, 3), how far that is trusted, and squared misses."""
         count = min(len(self.points), len(places))
         points, places, shares = self.points[:count], places[:count], self.shares[:, :count] * sure[:count]
         trust, each = torch.ones_like(shares), torch.arange(count, device=points.device)
         alone = rigid_moments(points, places, torch.ones_like(points[:, 0]), each, count)
-        for _ in range(rounds):
+        for _ in range(_ROUNDS):
             fitted = replace(alone, sums=(shares * trust) @ alone.sums)
             aims = transform_points(fitted.motions(), points)
             misses = (aims - places).square().sum(-1)
