@@ -90,7 +90,7 @@ class RefineConfig:
         num_steps: while sigma shrinks.
         final_steps: at the last sigma.
         compared_after: steps after which hypotheses are compared; the rest are for the best alone.
-        slow_steps: instead of num_steps where the best of hypotheses that disagree is refined anew, see `slower`; 0
+        slow_steps: instead of num_steps when the best of hypotheses that disagree is refined once more, see `slower`; 0
             leaves that out.
         sigma: first and last, length; the first from a rough start, and
         near_sigma: from one that should be near,

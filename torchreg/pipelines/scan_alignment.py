@@ -49,6 +49,8 @@ _LEAST_FUSED = 3
 _EXPECTED_STIFFNESS, _EXPECTED_FITS = 0.02, 4
 # Rearranged limbs that one-to-one matches leave worse than the best by more than this energy are not gone on with.
 _HARDLY_WORSE = 0.1
+# By so much energy cloth that follows its folds may look better than where it truly is.
+_NOT_LIKE_ITS_FOLDS = 0.05
 
 
 @torch.no_grad()
@@ -72,10 +74,11 @@ def align_scans(
     nothing are taken back into its picture. Then each part moves as in the hypothesis that suits it, and the EM
     goes on from there as well, and from the best with two limbs exchanged or with one laid where nothing covers the
     target, if one-to-one matches make that about as good. The best covers the target, is covered by it, is like it,
-    bends least, leaves the larger part of each wide region rigid, and is nearest to what is expected. Its EM is run
-    anew, slowly, with matches that may slide, and what is unlike the target all around follows the wide regions it
-    is in. Where rest and stiff matches agree and leave little of both scans over, the softer ones are left out;
-    where all agree, or there are only two, the best is taken to the end without more ado.
+    bends least, leaves the larger part of each wide region rigid, and is nearest to what is expected; its EM is
+    taken to the end, and beside that run anew, slowly, with matches that may slide, while what is unlike the target
+    all around follows the wide regions it is in: that end is kept unless it is clearly worse. Where rest and stiff
+    matches agree and leave little of both scans over, the softer ones are left out; where all agree, or there are
+    only two, the best is taken to the end without more ado.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -287,14 +290,23 @@ def _compared(
 def _finished(
     problem: ScanAlignProblem, candidate: _Candidate, config: ScanAlignConfig, doubtful: bool, on_step: OnStep
 ) -> Tensor:
-    """Return the motions (J, 4, 4) after the last steps; in doubt, those of a slower EM."""
-    refining, reporter = config.refine, Reporter(candidate.hypothesis.name, problem.unit.size, on_step)
-    if not doubtful or refining.slow_steps == 0:
-        steps = slice(refining.compared_after, None)
+    """Return the motions (J, 4, 4) after the last steps; in doubt, those of a slower EM, unless they are far worse."""
+    name, refining = candidate.hypothesis.name, config.refine
+
+    def to_the_end(told: OnStep) -> Tensor:
+        steps, reporter = slice(refining.compared_after, None), Reporter(name, problem.unit.size, told)
         return refine(problem, candidate.transforms, refining, reporter, candidate.sigma, steps)
-    follow = follow_regions(problem, candidate.transforms, refining, config.choice)
-    slow = refining.slower()
-    return refine(problem, candidate.transforms, slow, reporter, refining.near_sigma, stage="slide", follow=follow)
+
+    def slowly(told: OnStep) -> Tensor:
+        slow, reporter = refining.slower(), Reporter(name, problem.unit.size, told)
+        follow = follow_regions(problem, candidate.transforms, refining, config.choice)
+        return refine(problem, candidate.transforms, slow, reporter, refining.near_sigma, stage="slide", follow=follow)
+
+    if not doubtful or refining.slow_steps == 0:
+        return to_the_end(on_step)
+    slow, quick = _both_told(on_step, slowly, to_the_end)
+    energy = partial(_energy_of, problem, config, name)
+    return slow if energy(slow) < energy(quick) + _NOT_LIKE_ITS_FOLDS else quick
 
 
 def _all_agree(problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig) -> bool:
