@@ -49,8 +49,8 @@ _LEAST_FUSED = 3
 _EXPECTED_STIFFNESS, _EXPECTED_FITS = 0.02, 4
 # Rearranged limbs that one-to-one matches leave worse than the best by more than this energy are not gone on with.
 _HARDLY_WORSE = 0.1
-# By so much energy cloth that follows its folds may look better than where it truly is.
-_NOT_LIKE_ITS_FOLDS = 0.05
+# What the slow end may cost more than the quick one: cloth that follows its folds looks better by its features.
+_SLOW_COSTS_MORE = 0.05
 
 
 @torch.no_grad()
@@ -290,7 +290,7 @@ def _compared(
 def _finished(
     problem: ScanAlignProblem, candidate: _Candidate, config: ScanAlignConfig, doubtful: bool, on_step: OnStep
 ) -> Tensor:
-    """Return the motions (J, 4, 4) after the last steps; in doubt, those of a slower EM, unless they are far worse."""
+    """Return the motions (J, 4, 4) after the last steps; in doubt, those of a slower EM, unless it is clearly worse."""
     name, refining = candidate.hypothesis.name, config.refine
 
     def to_the_end(told: OnStep) -> Tensor:
@@ -306,7 +306,7 @@ def _finished(
         return to_the_end(on_step)
     slow, quick = _both_told(on_step, slowly, to_the_end)
     energy = partial(_energy_of, problem, config, name)
-    return slow if energy(slow) < energy(quick) + _NOT_LIKE_ITS_FOLDS else quick
+    return slow if energy(slow) < energy(quick) + _SLOW_COSTS_MORE else quick
 
 
 def _all_agree(problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig) -> bool:
