@@ -153,6 +153,21 @@ def test_of_two_ends_the_slow_one_is_kept_unless_it_is_clearly_worse(pair, monke
         assert final_energy(pair, doubtful, result) < final_energy(pair, doubtful, quick) + 0.05
 
 
+def test_without_wide_regions_nobody_follows(pair, monkeypatch):
+    followed = []
+
+    def noted(*rest, follow=None, **others):
+        followed.append(follow)
+        return refine(*rest, follow=follow, **others)
+
+    monkeypatch.setattr(scan_alignment, "refine", noted)
+    doubtful = replace(QUICK, choice=replace(QUICK.choice, same=1e-12))
+    align_scans(pair.source, pair.target, replace(doubtful, refine=replace(doubtful.refine, regions=0.0)))
+    assert all(each is None for each in followed)
+    align_scans(pair.source, pair.target, doubtful)
+    assert sum(each is not None for each in followed) == 1
+
+
 @pytest.mark.parametrize(
     ("sequence", "first", "second"), [(walking_figure, 0, 1), (walking_animal, 0, 2), (jointed_toy, 1, 4)]
 )

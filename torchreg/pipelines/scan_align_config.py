@@ -100,7 +100,7 @@ class RefineConfig:
         feature_weight: see `ScanEMConfig`, first and last: bending and hidden surroundings change features a little.
         slide: how much misses along the surface count, squared, first and last.
         regions: how much it counts in that, while sigma shrinks, that a sample leaves the wide regions it follows, see
-            `WideRegions`.
+            `WideRegions`; with 0 none follows any.
         unlike: from which median squared difference of the features around it a sample follows wide regions, and from
             which it does wholly.
         surrounding: samples around each of which that is the median.

@@ -299,7 +299,9 @@ def _finished(
 
     def slowly(told: OnStep) -> Tensor:
         slow, reporter = refining.slower(), Reporter(name, problem.unit.size, told)
-        follow = follow_regions(problem, candidate.transforms, refining, config.choice)
+        follow = None
+        if refining.regions > 0:
+            follow = follow_regions(problem, candidate.transforms, refining, config.choice)
         return refine(problem, candidate.transforms, slow, reporter, refining.near_sigma, stage="slide", follow=follow)
 
     if not doubtful or refining.slow_steps == 0:
