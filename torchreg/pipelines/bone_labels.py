@@ -184,8 +184,10 @@ def reuse_labels(data: CellData, pull: Pull, labels: Tensor, num_bones: int, cos
     if used >= num_bones:
         return labels
     scale = data.scale(pull.weights)
+    whole = rigid_moments(data.points, pull.targets, pull.weights, labels[data.cell], used).cost().sum(0)
     splits = []
-    for label in range(used):
+    # No split saves more than all that a region costs.
+    for label in (whole * scale > costs.label).nonzero()[:, 0].tolist():
         gain, other = _split(data, pull, labels == label)
         if gain * scale > costs.label:
             splits.append((gain, label, other))
