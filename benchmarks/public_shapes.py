@@ -1,7 +1,8 @@
-"""Shapes that others published, as several benchmarks use them: where the robots are, and how a hand's nodes hang."""
+"""Shapes that others published, as benchmarks use them: where robots and animals are, and how a hand's nodes hang."""
 
 from __future__ import annotations
 
+import importlib.util
 import sysconfig
 from pathlib import Path
 
@@ -10,6 +11,12 @@ def robots_folder() -> Path | None:
     """Return the folder of example-robot-data, or None if it is not installed."""
     folder = Path(sysconfig.get_path("purelib"), "cmeel.prefix", "share", "example-robot-data", "robots")
     return folder if folder.is_dir() else None
+
+
+def animals_folder() -> Path | None:
+    """Return the folder of dm_control, or None if it is not installed."""
+    found = importlib.util.find_spec("dm_control")
+    return None if found is None or found.origin is None else Path(found.origin).parent
 
 
 def hand_parents() -> dict[str, str | None]:

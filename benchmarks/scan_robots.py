@@ -122,17 +122,22 @@ def make_pair(thing: Thing, number: int, seed: int) -> Pair:
     generator = torch.Generator().manual_seed(1000 * seed + number)
     skin = thing.shape.file_skin()
     first, second = (skin(pose).double() for pose in thing.poses(number, generator))
+    return scan_pair(first, second, skin.faces, thing.up, generator)
+
+
+def scan_pair(first: Tensor, second: Tensor, faces: Tensor, up: int, generator: torch.Generator) -> Pair:
+    """Return two scans of a surface, in two poses of its vertices (V, 3), by a camera at a random place."""
     azimuth, elevation = torch.rand(2, generator=generator, dtype=torch.float64) * torch.tensor([2 * math.pi, 0.6])
     low, high = first.amin(0), first.amax(0)
-    frame = camera_frame(float(azimuth), float(elevation) - 0.1, thing.up)
+    frame = camera_frame(float(azimuth), float(elevation) - 0.1, up)
     away = torch.tensor([0.0, 0.0, DISTANCE], dtype=torch.float64)
     meshes = [
-        tr.TriangleMesh((vertices - (low + high) / 2) / (high - low).norm() @ frame.mT + away, skin.faces)
+        tr.TriangleMesh((vertices - (low + high) / 2) / (high - low).norm() @ frame.mT + away, faces)
         for vertices in (first, second)
     ]
     view = SCANNER.view(meshes[0], REACH)
     source, target = (SCANNER.scan(mesh, view, generator, torch.float64) for mesh in meshes)
-    return Pair(source.scan, target.scan, source.carried(meshes[1].vertices, skin.faces))
+    return Pair(source.scan, target.scan, source.carried(meshes[1].vertices, faces))
 
 
 def camera_frame(azimuth: float, elevation: float, up: int) -> Tensor:
