@@ -49,9 +49,9 @@ _LEAST_FUSED = 3
 _EXPECTED_STIFFNESS, _EXPECTED_FITS = 0.02, 4
 # Rearranged limbs that one-to-one matches leave worse than the best by more than this energy are not gone on with.
 _HARDLY_WORSE = 0.1
-# How much less of both scans the slow end may cover than the quick one: from far back it can lose what bends strongly.
-# Features are no judge of that, as cloth that follows its folds looks better by them, nor is how much it all bends.
-_COVERS_LESS = 0.01
+# What the slow end may cost more than the quick one: cloth that follows its folds looks better by its features.
+# Between the two it counts so much more that the target is left bare: from far back, what bends strongly can be lost.
+_SLOW_COSTS_MORE, _BARE = 0.05, 15.0
 
 
 @torch.no_grad()
@@ -77,9 +77,9 @@ def align_scans(
     target, if one-to-one matches make that about as good. The best covers the target, is covered by it, is like it,
     bends least, leaves the larger part of each wide region rigid, and is nearest to what is expected; its EM is
     taken to the end, and beside that run anew, slowly, with matches that may slide, while what is unlike the target
-    all around follows the wide regions it is in: that end is kept if both scans cover each other as well. Where rest
-    and stiff matches agree and leave little of both scans over, the softer ones are left out; where all agree, or
-    there are only two, the best is taken to the end without more ado.
+    all around follows the wide regions it is in: that end is kept unless it is clearly worse or leaves more of the
+    target bare. Where rest and stiff matches agree and leave little of both scans over, the softer ones are left out;
+    where all agree, or there are only two, the best is taken to the end without more ado.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -291,7 +291,7 @@ def _compared(
 def _finished(
     problem: ScanAlignProblem, candidate: _Candidate, config: ScanAlignConfig, doubtful: bool, on_step: OnStep
 ) -> Tensor:
-    """Return the motions (J, 4, 4) after the last steps; in doubt, those of a slower EM, if they cover as well."""
+    """Return the motions (J, 4, 4) after the last steps; in doubt, those of a slower EM unless they are worse."""
     name, refining = candidate.hypothesis.name, config.refine
 
     def to_the_end(told: OnStep) -> Tensor:
@@ -305,14 +305,15 @@ def _finished(
             follow = follow_regions(problem, candidate.transforms, refining, config.choice)
         return refine(problem, candidate.transforms, slow, reporter, refining.near_sigma, stage="slide", follow=follow)
 
-    def bare(end: Tensor) -> float:
-        found = judge(problem, name, end, config.choice)
-        return found.forward + found.backward
-
     if not doubtful or refining.slow_steps == 0:
         return to_the_end(on_step)
     slow, quick = _both_told(on_step, slowly, to_the_end)
-    return slow if bare(slow) < bare(quick) + _COVERS_LESS else quick
+    return slow if _slow_is_kept(*(judge(problem, name, end, config.choice) for end in (slow, quick))) else quick
+
+
+def _slow_is_kept(slow: Hypothesis, quick: Hypothesis) -> bool:
+    """Return whether the end of the slower EM is kept."""
+    return slow.energy + _BARE * slow.backward < quick.energy + _BARE * quick.backward + _SLOW_COSTS_MORE
 
 
 def _all_agree(problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig) -> bool:
