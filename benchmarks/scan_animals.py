@@ -13,6 +13,7 @@ diagonal of their true place, visible in the target or not.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import math
 import sys
 from collections.abc import Callable, Iterator
@@ -55,7 +56,9 @@ class Animal:
 
 
 def animals(folder: Path) -> Iterator[Animal]:
-    """Yield the animals that are there."""
+    """Yield the animals that are there; none without MuJoCo."""
+    if importlib.util.find_spec("mujoco") is None:
+        return
     import mujoco
 
     for name, file in ANIMALS.items():

@@ -70,13 +70,33 @@ def test_without_animals_it_says_so_and_succeeds(benchmark, capsys, monkeypatch)
     assert "skipped: no animals found" in capsys.readouterr().out
 
 
-def test_published_animals_are_at_rest_as_in_their_files(benchmark):
-    pytest.importorskip("mujoco")
+def test_without_mujoco_there_are_no_animals(benchmark, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(benchmark.ANIMALS, "dog", "dog.xml")
+    (tmp_path / "dog.xml").write_text("<mujoco/>")
+    monkeypatch.setattr(benchmark.importlib.util, "find_spec", lambda name: None)
+    assert benchmark.main(["--animals", str(tmp_path)]) == 0
+    assert "torchreg[benchmark]" in capsys.readouterr().out
+
+
+def test_skins_follow_their_bones_as_mujoco_draws_them(benchmark):
+    mujoco = pytest.importorskip("mujoco")
     folder = benchmark.animals_folder()
     if folder is None:
         pytest.skip("dm_control is not installed")
-    for animal in benchmark.animals(folder):
-        first, second = animal.poses(0.0, torch.Generator().manual_seed(0))
-        torch.testing.assert_close(first, second)
-        assert int(animal.faces.max()) == len(first) - 1
-        assert first.isfinite().all()
+    data = []
+    with pytest.MonkeyPatch.context() as patch:
+        made = mujoco.MjData
+        patch.setattr(mujoco, "MjData", lambda model: data.append((model, made(model))) or data[-1][1])
+        found = list(benchmark.animals(folder))
+    assert {each.name for each in found} == set(benchmark.ANIMALS)
+    for animal, (model, state) in zip(found, data, strict=True):
+        first, second = animal.poses(0.1, torch.Generator().manual_seed(0))
+        assert int(animal.faces.max()) == len(second) - 1
+        assert float((second - first).norm(dim=-1).max()) > 0.01
+        scene = mujoco.MjvScene(model, maxgeom=1000)
+        mujoco.mjv_updateScene(
+            model, state, mujoco.MjvOption(), None, mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL, scene
+        )
+        drawn = torch.from_numpy(np.array(scene.skinvert)).reshape(-1, 3).double()
+        # MuJoCo draws in single precision, and may inflate a skin.
+        torch.testing.assert_close(second, drawn, atol=1e-5 + float(model.skin_inflate[0]), rtol=0)
