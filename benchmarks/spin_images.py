@@ -4,7 +4,8 @@ A match is right if it lies within 5 % of the diagonal of the true place of its 
 matched with 1,000 target points, all spread evenly; bins are shares of the longest side of the source's box, images
 15 x 15, the support angle 90 degrees. The first row is what closest points would give. "RANSAC": kept are the inliers,
 within 4 % of the diagonal, of one rigid motion for each of ten regions. "isometry": of six candidates the one is kept
-that agrees with those around it on distances along the surface, if its support is above one half.
+that agrees with those around it on distances along the surface, if its support is above one half. "learned" are 32
+numbers by which registration matches, learned from images of two sizes and curvatures of other made-up scans.
 
 Pairs are those of a folder of NPZ files (source_points, source_faces, target_points, target_faces, source_truth,
 diagonal), and made-up ones: a person walking, another animal of random proportions, a robot whose joints are turned,
@@ -30,12 +31,16 @@ from torch import Tensor
 import torchreg as tr
 from torchreg.correspondence.descriptor_matching import DescriptorMatches, match_descriptors
 from torchreg.correspondence.isometry import consistent_matches
+from torchreg.correspondence.learned_descriptors import CURVATURE_RADII, learned_descriptors
+from torchreg.correspondence.oriented_samples import OrientedSamples, scaled_together
 from torchreg.correspondence.spin_images import spin_images
 from torchreg.datasets.bodies import Proportions
 from torchreg.datasets.scan_sequences import ScanSequence, jointed_toy, walking_animal, walking_figure
+from torchreg.geometry.curvature import curvature_features
 from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.sampling import farthest_points
+from torchreg.pipelines.scan_unit import ScanUnit
 from torchreg.solvers.ransac import ransac_rigid
 
 RIGHT = 0.05
@@ -55,10 +60,10 @@ class Pair:
 
 @dataclass(frozen=True)
 class Recipe:
-    """One way to match; ``divisions`` is the number of bins along the longest side of the source."""
+    """One way to match; ``divisions`` is the number of bins along the longest side of the source, None if learned."""
 
     label: str
-    divisions: float = 50
+    divisions: float | None = 50
     similarity: str = "correlation"
     num_candidates: int = 1
     mutual: bool = False
@@ -83,6 +88,8 @@ RECIPES = (
     Recipe("bin 1/25, within 30 %, RANSAC", 25, prune="ransac", max_distance=0.3),
     Recipe("bin 1/25, isometry", 25, num_candidates=6, prune="isometry"),
     Recipe("bin 1/25, within 30 %, isometry", 25, num_candidates=6, prune="isometry", max_distance=0.3),
+    Recipe("learned, within 30 %", None, "distance", max_distance=0.3),
+    Recipe("learned, within 30 %, isometry", None, "distance", 6, max_distance=0.3, prune="isometry"),
 )
 
 
@@ -117,25 +124,53 @@ def groups(folder: Path | None, count: int) -> Iterator[tuple[str, list[Pair]]]:
 
 @dataclass(frozen=True)
 class Described:
-    """Points ``here`` of the source and ``there`` of the target, their images, and the seconds these took."""
+    """Points ``here`` of the source and ``there`` of the target, their descriptors, and the seconds these took."""
 
     here: Tensor
     there: Tensor
-    images: tuple[Tensor, Tensor]
+    descriptors: tuple[Tensor, Tensor]
     seconds: float
 
 
-def described(pair: Pair, divisions: float) -> Described:
-    source, target = pair.source, pair.target
+def described(pair: Pair, divisions: float | None) -> Described:
+    """Return descriptors of points of a pair, see `Recipe`."""
     begin = time.perf_counter()
-    here, there = source.uniform_subsample(NUM_SOURCE), target.uniform_subsample(NUM_TARGET)
-    bin_size = float((source.points.amax(0) - source.points.amin(0)).max()) / divisions
-    images = []
-    for scan, which in ((source, here), (target, there)):
+    here, there = pair.source.uniform_subsample(NUM_SOURCE), pair.target.uniform_subsample(NUM_TARGET)
+    both = learned(pair, here, there) if divisions is None else images(pair, here, there, divisions)
+    return Described(here, there, both, time.perf_counter() - begin)
+
+
+def images(pair: Pair, here: Tensor, there: Tensor, divisions: float) -> tuple[Tensor, Tensor]:
+    """Return spin images (Q, 15, 15) of source and target points."""
+    size = float((pair.source.points.amax(0) - pair.source.points.amin(0)).max()) / divisions
+
+    def seen(scan: tr.RangeScan, which: Tensor) -> Tensor:
         scene = scan.uniform_subsample(NUM_SCENE)
-        surface = (scan.points[scene], scan.normals[scene])
-        images.append(spin_images(scan.points[which], scan.normals[which], *surface, bin_size=bin_size))
-    return Described(here, there, (images[0], images[1]), time.perf_counter() - begin)
+        return spin_images(
+            scan.points[which], scan.normals[which], scan.points[scene], scan.normals[scene], bin_size=size
+        )
+
+    return seen(pair.source, here), seen(pair.target, there)
+
+
+def learned(pair: Pair, here: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
+    """Return learned descriptors (Q, 32) of source and target points."""
+    unit = ScanUnit.of(pair.source.points[pair.source.uniform_subsample(NUM_SCENE)])
+    few, scenes = [], []
+    for scan, which in ((pair.source, here), (pair.target, there)):
+        for samples, rows in ((few, which), (scenes, scan.uniform_subsample(NUM_SCENE))):
+            samples.append((unit.of_points(scan.points[rows]), scan.normals[rows].double()))
+    curvature = [curvature_features(*one, *scene, CURVATURE_RADII) for one, scene in zip(few, scenes, strict=True)]
+    features = scaled_together(*curvature)
+    first, second = (
+        learned_descriptors(_samples(*one, feature), _samples(*scene, feature[:1].expand(len(scene[0]), -1)))
+        for one, scene, feature in zip(few, scenes, features, strict=True)
+    )
+    return first, second
+
+
+def _samples(points: Tensor, normals: Tensor, features: Tensor) -> OrientedSamples:
+    return OrientedSamples(points, normals, features, torch.zeros(len(points), dtype=torch.bool))
 
 
 def shares(pair: Pair, recipe: Recipe, found: Described) -> tuple[float, float, float]:
@@ -143,7 +178,7 @@ def shares(pair: Pair, recipe: Recipe, found: Described) -> tuple[float, float, 
     source, target, truth = pair.source.points[found.here], pair.target.points[found.there], pair.truth[found.here]
     begin = time.perf_counter()
     matches = match_descriptors(
-        *found.images,
+        *found.descriptors,
         num_candidates=recipe.num_candidates,
         similarity=recipe.similarity,
         mutual=recipe.mutual,
@@ -208,9 +243,9 @@ def print_table(name: str, pairs: list[Pair], recipes: tuple[Recipe, ...]) -> No
     closest = torch.tensor([closest_share(pair) for pair in pairs])
     print(f"  {'closest points':31s} {closest.mean():6.1%} {closest.min():6.1%} {closest.mean():7.1%}")
     for divisions, alike in itertools.groupby(recipes, key=lambda recipe: recipe.divisions):
-        images = [described(pair, divisions) for pair in pairs]
+        descriptors = [described(pair, divisions) for pair in pairs]
         for recipe in alike:
-            rows = [shares(pair, recipe, found) for pair, found in zip(pairs, images, strict=True)]
+            rows = [shares(pair, recipe, found) for pair, found in zip(pairs, descriptors, strict=True)]
             right, reached, seconds = torch.tensor(rows).nan_to_num(0.0).unbind(-1)
             line = f"  {recipe.label:31s} {right.mean():6.1%} {right.min():6.1%}"
             print(f"{line} {reached.mean():7.1%} {seconds.median():6.2f}", flush=True)

@@ -45,6 +45,13 @@ def test_agreement_with_the_surroundings_is_right_most_often(benchmark, pair):
     assert isometry[1] > 0.2
 
 
+def test_what_was_learned_is_right_more_often(benchmark, pair):
+    image, learned = (benchmark.described(pair, divisions) for divisions in (25, None))
+    assert learned.descriptors[0].shape == (len(learned.here), 32)
+    plain = benchmark.shares(pair, benchmark.Recipe("", 25), image)
+    assert benchmark.shares(pair, benchmark.Recipe("", None, "distance"), learned)[0] > plain[0]
+
+
 def test_tables_are_printed_for_files_and_without(benchmark, pair, capsys, tmp_path):
     assert torch.isfinite(torch.tensor(benchmark.closest_share(pair)))
     source, target = pair.source, pair.target
@@ -55,7 +62,7 @@ def test_tables_are_printed_for_files_and_without(benchmark, pair, capsys, tmp_p
     assert benchmark.main(["--data", str(tmp_path), "--smoke"]) == 0
     printed = capsys.readouterr().out
     assert f"{tmp_path.name}: 1 pairs" in printed
-    assert "within 30 %, isometry" in printed
+    assert "learned, within 30 %, isometry" in printed
     assert "skipped" not in printed
     assert benchmark.main(["--smoke", "--pairs", "1"]) == 0
     printed = capsys.readouterr().out

@@ -23,7 +23,7 @@ def places():
     return torch.rand(25, 3, generator=generator), torch.rand(40, 3, generator=generator)
 
 
-@pytest.mark.parametrize("similarity", ["correlation", "overlap", "l2"])
+@pytest.mark.parametrize("similarity", ["correlation", "overlap", "l2", "distance"])
 def test_candidates_are_the_most_similar_ones_best_first(descriptors, similarity):
     scores = image_similarity(*descriptors, similarity)
     matches = match_descriptors(*descriptors, num_candidates=3, similarity=similarity)
@@ -62,7 +62,12 @@ def test_far_targets_are_no_candidates(descriptors, places):
 
 @pytest.mark.parametrize(
     ("similarity", "dissimilar"),
-    [("correlation", lambda s: 1 - s), ("l2", lambda s: -s), ("overlap", lambda s: torch.exp(-s))],
+    [
+        ("correlation", lambda s: 1 - s),
+        ("l2", lambda s: -s),
+        ("distance", lambda s: -s),
+        ("overlap", lambda s: torch.exp(-s)),
+    ],
 )
 def test_matches_must_stand_out_from_all_but_their_surroundings(descriptors, places, similarity, dissimilar):
     scores = image_similarity(*descriptors, similarity)

@@ -98,7 +98,7 @@ def test_single_precision_far_from_zero():
     torch.testing.assert_close(single.double(), images, atol=0.01, rtol=0)
 
 
-@pytest.mark.parametrize("similarity", ["correlation", "overlap", "l2"])
+@pytest.mark.parametrize("similarity", ["correlation", "overlap", "l2", "distance"])
 def test_an_image_is_most_like_itself(similarity):
     points, normals = cloud(80)
     images = spin_images(points, normals, points, normals, bin_size=0.05)
@@ -111,11 +111,13 @@ def test_similarities_by_their_definitions():
     generator = torch.Generator().manual_seed(0)
     first, second = torch.rand(2, 5, 4, 4, generator=generator, dtype=torch.float64)
     first = torch.where(first < 0.3, 0.0, first)
-    correlation, alike, apart = (image_similarity(first, second, name) for name in ("correlation", "overlap", "l2"))
+    names = ("correlation", "overlap", "l2", "distance")
+    correlation, alike, apart, plain = (image_similarity(first, second, name) for name in names)
     for i, a in enumerate(first.flatten(1)):
         for j, b in enumerate(second.flatten(1)):
             torch.testing.assert_close(correlation[i, j], torch.corrcoef(torch.stack([a, b]))[0, 1])
             torch.testing.assert_close(apart[i, j], -(a / a.norm() - b / b.norm()).norm())
+            torch.testing.assert_close(plain[i, j], -(a - b).square().sum().sqrt())
             both = (a != 0) & (b != 0)
             r = torch.corrcoef(torch.stack([a[both], b[both]]))[0, 1]
             expected = r.sign() * torch.atanh(r) ** 2 - 3 / (both.sum() - 3)

@@ -17,6 +17,12 @@ from torchreg.pipelines.scan_align_config import (
     ("kind", "arguments", "message"),
     [
         (MatchConfig, {"num_points": 0}, "num_points must be at least 1"),
+        (MatchConfig, {"descriptor": "sift"}, "descriptor must be one of"),
+        (
+            ScanAlignConfig,
+            {"curvature_radii": (0.02, 0.05), "match": MatchConfig(descriptor="learned")},
+            "curvature_radii must be .*spin_image",
+        ),
         (MatchConfig, {"radius": 0.0}, "radius must be positive"),
         (MatchConfig, {"stiffness": ()}, "stiffness must hold"),
         (MatchConfig, {"stiffness": (1.0, -1.0)}, "stiffness must be positive"),

@@ -75,8 +75,9 @@ def test_moved_samples_are_those_of_the_graph(problem):
     assert len(problem.moved(problem.graph.rest())) == len(problem.moved(problem.graph.rest(), 9999)) == 400
 
 
-def test_most_first_matches_are_right(pair, problem):
-    matches = first_matches(problem, MatchConfig(num_points=400))
+@pytest.mark.parametrize("descriptor", ["learned", "spin_image"])
+def test_most_first_matches_are_right(pair, problem, descriptor):
+    matches = first_matches(problem, MatchConfig(num_points=400, descriptor=descriptor))
     truth = problem.unit.of_points(pair.truth[problem.samples])[matches.which]
     near = (matches.targets - truth).norm(dim=-1) < 0.05
     assert len(near) > 50

@@ -151,7 +151,12 @@ def _clear(
     others = scores.scatter(1, index, -math.inf)
     if separation > 0 and places is not None:
         others = others.masked_fill(_distances(places[index[:, 0]], places) < separation, -math.inf)
-    dissimilar = {"correlation": lambda value: 1 - value, "l2": torch.neg, "overlap": lambda value: torch.exp(-value)}
+    dissimilar = {
+        "correlation": lambda value: 1 - value,
+        "l2": torch.neg,
+        "distance": torch.neg,
+        "overlap": lambda value: torch.exp(-value),
+    }
     return dissimilar[similarity](best) <= max_ratio * dissimilar[similarity](others.amax(1, keepdim=True))
 
 

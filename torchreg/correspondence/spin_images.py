@@ -22,7 +22,7 @@ from torchreg._checks import (
 _CHUNK_ENTRIES = 200_000
 # From here on two images count as equal; atanh(1) is infinite.
 _LARGEST_R = 0.999
-SIMILARITIES = ("correlation", "overlap", "l2")
+SIMILARITIES = ("correlation", "overlap", "l2", "distance")
 
 
 def spin_images(
@@ -164,6 +164,7 @@ def image_similarity(
     - "overlap": ``sign(r) atanh(r)^2 - overlap / (N - 3)``, with r over the N bins in which both images see something:
       what one scan hides does not count, but little overlap is held against a pair (minus infinity below 4 bins).
     - "l2": minus the Euclidean distance of the images scaled to unit length, 0 at most.
+    - "distance": minus the Euclidean distance of the descriptors as they are, 0 at most.
 
     Args:
         source: (Q, ...) images, or other descriptors.
@@ -180,7 +181,7 @@ def image_similarity(
 
     Differentiable: in both, where the images have contrast.
 
-    Cost: one product of matrices, six for "overlap".
+    Cost: about one product of matrices, six for "overlap".
 
     References: Johnson 1997, section 2.4 for "overlap", his similarity measure C.
     """
@@ -191,6 +192,8 @@ def image_similarity(
     first, second = source.flatten(1), target.flatten(1)
     if similarity == "overlap":
         return _overlap_similarity(first, second, overlap)
+    if similarity == "distance":
+        return -torch.cdist(first, second)
     if similarity == "l2":
         first, second = (torch.nn.functional.normalize(value, dim=-1) for value in (first, second))
         return -(2 - 2 * first @ second.mT).clamp_min(0).sqrt()

@@ -7,18 +7,23 @@ from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
-from torchreg._checks import check_count, check_positive
+from torchreg._checks import check_choice, check_count, check_positive
+from torchreg.correspondence.learned_descriptors import CURVATURE_RADII
 from torchreg.correspondence.scan_em import ScanEMConfig
 from torchreg.errors import InputError
+
+DESCRIPTORS = ("spin_image", "learned")
 
 
 @dataclass(frozen=True)
 class MatchConfig:
-    """How first matches are found, by spin images, and kept, by distances along the surface.
+    """How first matches are found, by descriptors, and kept, by distances along the surface.
 
     Args:
         num_points: of each scan that are described.
-        bin_size: of the images, length.
+        descriptor: "spin_image", compared by correlation, or "learned", see `learned_descriptors`: right more often,
+            in half again the time; the stages that follow mend about as much either way.
+        bin_size: of the spin images, length; learned ones have their own.
         num_candidates: most similar targets of each point.
         max_distance: targets farther away are no candidates, length.
         radius: within which points vote on each other's candidates, length.
@@ -31,6 +36,7 @@ class MatchConfig:
     """
 
     num_points: int = 800
+    descriptor: str = "spin_image"
     bin_size: float = 0.034
     num_candidates: int = 6
     max_distance: float = 0.35
@@ -43,6 +49,7 @@ class MatchConfig:
     scale: float = 0.03
 
     def __post_init__(self) -> None:
+        check_choice(self.descriptor, "descriptor", DESCRIPTORS)
         for name in ("num_points", "num_candidates", "min_matches"):
             check_count(getattr(self, name), name, 1)
         for name in ("bin_size", "max_distance", "radius", "slack", "min_support", "scale"):
@@ -220,7 +227,7 @@ class ScanAlignConfig:
         region_samples: of the source, that wide regions hold.
         region_reach: radius of those along the surface, length.
         region_give: samples off a region's rigid motion by more than this are free, length.
-        curvature_radii: of the features, lengths.
+        curvature_radii: of the features, lengths; learned descriptors rest on the default ones.
         occluder_depth: a surface this much nearer to the camera beside an edge hides what is behind, length.
         occluder_reach: spacings of samples within which of such an edge matches hold across the surface alone.
         most_cut: share of its outline at which a target may face the camera, if what the camera did not see is to count
@@ -242,7 +249,7 @@ class ScanAlignConfig:
     region_samples: int = 200
     region_reach: float = 0.5
     region_give: float = 0.05
-    curvature_radii: tuple[float, ...] = (0.02, 0.035, 0.06)
+    curvature_radii: tuple[float, ...] = CURVATURE_RADII
     occluder_depth: float = 0.03
     occluder_reach: float = 2.5
     most_cut: float = 0.125
@@ -260,6 +267,11 @@ class ScanAlignConfig:
         for name in ("region_reach", "region_give"):
             check_positive(getattr(self, name), name)
         _check_values(self.curvature_radii, "curvature_radii")
+        if self.match.descriptor == "learned" and tuple(self.curvature_radii) != CURVATURE_RADII:
+            raise InputError(
+                f"curvature_radii must be {CURVATURE_RADII}, from which descriptors were learned, got "
+                f"{self.curvature_radii}; others go with match.descriptor='spin_image'"
+            )
         check_positive(self.occluder_depth, "occluder_depth")
         check_positive(self.most_cut, "most_cut")
         check_positive(self.occluder_reach, "occluder_reach", allow_zero=True)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchreg.correspondence.descriptor_matching import match_descriptors
 from torchreg.correspondence.isometry import consistent_matches
+from torchreg.correspondence.learned_descriptors import learned_descriptors
 from torchreg.correspondence.one_to_one import typical_spacing
 from torchreg.correspondence.oriented_samples import OrientedSamples, scaled_together
 from torchreg.correspondence.spin_images import spin_images
@@ -30,8 +31,8 @@ from torchreg.pipelines.threads import both
 
 # What opposite normals count as where a point takes over from the samples around it, length.
 NORMAL_SCALE = 0.03
-# Points that spin images look at, and neighbors that curvature looks at.
-_SCENE, _AROUND = 1250, 100
+# Points that descriptors look at, and neighbors that curvature looks at.
+SCENE, _AROUND = 1250, 100
 # Neighbors of a sample in the graph that distances for the matches are measured on.
 _NEIGHBORS = 8
 
@@ -142,7 +143,7 @@ def _cut_off(edges: Tensor, points: Tensor, eye: Tensor | None, config: ScanAlig
 
 
 def first_matches(problem: ScanAlignProblem, config: MatchConfig) -> GraphMatches:
-    """Return matches of spin images that agree on distances along the surface, weighted by how well they do.
+    """Return matches of descriptors that agree on distances along the surface, weighted by how well they do.
 
     Cost: 0.4 s.
 
@@ -151,13 +152,14 @@ def first_matches(problem: ScanAlignProblem, config: MatchConfig) -> GraphMatche
     here = problem.source.first(min(config.num_points, len(problem.samples)))
     there = problem.target.first(config.num_points)
     # Voters are within the radius; the targets of two points that vote may be farther apart.
-    (image, ways), (other_image, other_ways) = both(
+    (seen, ways), (other_seen, other_ways) = both(
         lambda: _described(here, problem.source, config, config.radius),
         lambda: _described(there, problem.target, config, 2 * config.radius),
     )
     matches = match_descriptors(
-        image,
-        other_image,
+        seen,
+        other_seen,
+        similarity="distance" if config.descriptor == "learned" else "correlation",
         num_candidates=config.num_candidates,
         source_points=here.points.float(),
         target_points=there.points.float(),
@@ -169,8 +171,10 @@ def first_matches(problem: ScanAlignProblem, config: MatchConfig) -> GraphMatche
 
 
 def _described(few: OrientedSamples, scan: OrientedSamples, config: MatchConfig, limit: float) -> tuple[Tensor, Tensor]:
-    """Return spin images of a few samples of a scan, and their distances along the surface up to a limit."""
-    scene = scan.first(_SCENE)
+    """Return descriptors of a few samples of a scan, and their distances along the surface up to a limit."""
+    scene = scan.first(SCENE)
+    ways = GeodesicGraph.from_points(few.points, min(_NEIGHBORS, len(few.points) - 1)).distances(limit=limit).float()
+    if config.descriptor == "learned":
+        return learned_descriptors(few, scene), ways
     surface = (value.float() for value in (few.points, few.normals, scene.points, scene.normals))
-    graph = GeodesicGraph.from_points(few.points, min(_NEIGHBORS, len(few.points) - 1))
-    return spin_images(*surface, bin_size=config.bin_size), graph.distances(limit=limit).float()
+    return spin_images(*surface, bin_size=config.bin_size), ways
