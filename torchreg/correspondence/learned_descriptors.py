@@ -18,7 +18,7 @@ BIN_SIZES = (0.02, 0.05)
 IMAGE_SIZE = 15
 # Radii of the curvature features beside them.
 CURVATURE_RADII = (0.02, 0.035, 0.06)
-# Learned by `experiments/descriptor_metric.py`.
+# Learned by `benchmarks/learn_descriptors.py`.
 METRIC_FILE = Path(__file__).with_name("learned_descriptors.safetensors")
 
 

@@ -1,9 +1,10 @@
 """Learn which numbers about a place of a scan stay the same while a thing moves, from made-up scans alone.
 
 Random toys, people and animals of random proportions move at random; wherever two scans show one place, descriptors
-should agree, elsewhere within reach they should not. This writes the file that comes with the package (8 minutes):
+should agree, elsewhere within reach they should not. This writes the file that comes with the package (8 minutes); what
+it is worth is printed by `benchmarks/spin_images.py`.
 
-    python -m experiments.descriptor_metric torchreg/correspondence/learned_descriptors.safetensors
+    python benchmarks/learn_descriptors.py torchreg/correspondence/learned_descriptors.safetensors
 """
 
 from __future__ import annotations
@@ -85,11 +86,13 @@ def learn(
 
 def main(arguments: list[str] | None = None) -> int:
     """Learn directions, in half precision, and write them."""
-    parser = argparse.ArgumentParser(prog="python -m experiments.descriptor_metric", description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", type=Path, help="to be written, ending in .safetensors")
     parser.add_argument("--sequences", type=int, default=NUM_SEQUENCES, help="of six frames each (default %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--smoke", action="store_true", help="learn from one toy, one person and one animal")
     options = parser.parse_args(arguments)
+    options.sequences = 3 if options.smoke else options.sequences
     with tqdm(total=options.sequences * _FRAMES // 2, unit="pair") as bar:
         directions, total = learn(options.sequences, seed=options.seed, on_pair=lambda pair: bar.update())
     learned = {"sequences": options.sequences, "seed": options.seed, "matches": total, "ridge": RIDGE}
