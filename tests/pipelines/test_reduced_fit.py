@@ -8,6 +8,7 @@ import torch
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
 from torchreg.geometry.sparse_grid import SparseGrid
+from torchreg.pipelines import reduced_fit
 from torchreg.pipelines.bone_labels import CellData
 from torchreg.pipelines.reduced_fit import ReducedFit, Samples
 from torchreg.pipelines.register_config import RegisterConfig
@@ -68,10 +69,26 @@ def test_two_frames_share_labels_and_weights(toy):
 def test_joints_hold_better_when_they_count(toy):
     gaps, few = [], RegisterConfig(smoothness=0.2, label_cost=0.001, label_steps=1)
     for weight in (1e-9, 1.0):
-        reduced, _ = fit(toy[1][:1], noise=0.01, config=replace(few, joint_weight=weight))
+        reduced, _ = fit(toy[1][:1], noise=0.01, config=replace(few, joint_weight=(weight, weight)))
         reduced.fit_labels()
         gaps.append(reduced.history[-1].joint)
     assert gaps[1] < 0.5 * gaps[0]
+
+
+def test_joints_count_less_from_round_to_round(toy, monkeypatch):
+    weights, solve = [], reduced_fit.fit_bones
+
+    def noted(problem, *args, **kwargs):
+        weights.append(problem.joint_weight)
+        return solve(problem, *args, **kwargs)
+
+    monkeypatch.setattr(reduced_fit, "fit_bones", noted)
+    reduced, _ = fit(toy[1][:1], config=RegisterConfig(joint_weight=(1.0, 0.05), rtol=0.0, label_steps=3))
+    reduced.fit_labels()
+    reduced.refine()
+    assert weights[:2] == pytest.approx([1.0, 0.05**0.5])
+    assert weights == sorted(weights, reverse=True)
+    assert weights[-2:] == pytest.approx([0.05, 0.05])
 
 
 @pytest.mark.parametrize("settings", [{"reuse": False}, {"refine_steps": 0}, {"blend": "dual_quaternion"}])

@@ -88,13 +88,16 @@ class ReducedFit:
         self.labels = labels
         self.model = self._labeled(data.moments(samples.moved, samples.confidence).joined(*self._parts()).motions())
         self._counts = (0, 0, 0, 0)
+        self._joint_weight = config.joint_weight_at(0)
 
     def fit_labels(self) -> bool:
         """Alternate T-step, correspondences and W-step, and return whether the energy settled."""
         energy, steps = float("inf"), self.config.label_steps
         for step in range(steps):
+            progress = step / max(1, steps - 1)
+            self._joint_weight = self.config.joint_weight_at(progress)
             self.solve_motions()
-            self.update_matches(0.5 * step / max(1, steps - 1))
+            self.update_matches(0.5 * progress)
             labels, found = relabel(self.data, self.pull, self.model.transforms.detach(), self.labels, self._costs)
             self._use(labels)
             settled = found >= (1 - self.config.rtol) * energy
@@ -110,6 +113,7 @@ class ReducedFit:
         """Make weights continuous, alternating with motions and correspondences; return whether the fit settled."""
         base, steps = self.model.weights.detach(), self.config.refine_steps
         settings = replace(self.config.refine, point_to_point=self.pull.point_to_point)
+        self._joint_weight = self.config.joint_weight_at(1)
         energy = self.solve_motions()
         for step in range(steps):
             labeled = GridLBS(self.data.grid, base, self.model.transforms.detach())
@@ -136,7 +140,7 @@ class ReducedFit:
             pull.weights,
             pull.point_to_point,
             moments=self._joints(),
-            joint_weight=self.config.joint_weight,
+            joint_weight=self._joint_weight,
             blend=self.config.blend,
         )
         fit = fit_bones(problem, self.model.transforms.detach(), max_steps=self.config.motion_steps, rtol=1e-3)
@@ -206,7 +210,7 @@ class ReducedFit:
 
     def _joints(self) -> JointMoments | None:
         """Return the joints that hold: points, not the regions that bones share, within which they must bend."""
-        if self.config.joint_weight == 0:
+        if self._joint_weight == 0:
             return None
         moments = self.model.joint_moments()
         centers = self.model.joints_of(moments).centers.detach()

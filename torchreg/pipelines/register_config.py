@@ -10,7 +10,7 @@ from torchreg.errors import InputError
 from torchreg.losses.scan import check_share
 from torchreg.models.grid_lbs import BLENDS
 from torchreg.pipelines.refine_weights import RefineConfig
-from torchreg.pipelines.scan_align_config import ScanAlignConfig
+from torchreg.pipelines.scan_align_config import ScanAlignConfig, between, check_ends
 from torchreg.results.scans import RegisterRecord
 
 OnRegisterStep = Callable[[RegisterRecord], None]
@@ -37,8 +37,9 @@ class RegisterConfig:
             is a cap. Many small bones miss fewer joints; see `ScanRegistration.parts` for what moved as one.
         truncation: samples are never farther off in the W-step, in cells.
         reuse: give labels that lost all their cells to the regions that fit worst.
-        joint_weight: beta, of the joints against the mean squared distance. It holds bones together where matches do
-            not; the dense alignment does so already, and joints that are no points resist it.
+        joint_weight: beta, of the joints against the mean squared distance, in the first and the last round of labels
+            and after it, in even ratios between; (1, 0.05) in the paper. It holds bones together where matches do not;
+            the dense alignment does so already, and joints that are no points resist it. Zeros leave it out.
         max_distance: of a match, first and last; never below two sampling distances of the target.
         max_angle: between normals of a match, first and last, radians.
         normal_scale: distance that counts as much as normals 60 degrees apart.
@@ -65,7 +66,7 @@ class RegisterConfig:
     label_cost: float = 0.0003
     truncation: float = 4.0
     reuse: bool = True
-    joint_weight: float = 0.0
+    joint_weight: tuple[float, float] = (0.0, 0.0)
     max_distance: tuple[float, float] = (0.03, 0.01)
     max_angle: tuple[float, float] = (1.05, 0.52)
     normal_scale: float = 0.025
@@ -82,18 +83,21 @@ class RegisterConfig:
         check_count(self.refine_steps, "refine_steps", 0)
         for name in ("truncation", "unmatched"):
             check_positive(getattr(self, name), name)
-        for name in ("smoothness", "label_cost", "joint_weight", "normal_scale", "rtol"):
+        for name in ("smoothness", "label_cost", "normal_scale", "rtol"):
             check_positive(getattr(self, name), name, allow_zero=True)
         for name in ("point_to_point", "min_matched"):
             check_share(getattr(self, name), name)
         if self.point_to_point == 0:
             raise InputError("point_to_point must be positive: along flat parts nothing else holds samples")
         for name in ("max_distance", "max_angle"):
-            ends = getattr(self, name)
-            if len(ends) != 2:
-                raise InputError(f"{name} must be two numbers, first and last, got {len(ends)}")
-            for value in ends:
-                check_positive(value, name)
+            check_ends(getattr(self, name), name)
+        check_ends(self.joint_weight, "joint_weight", allow_zero=True)
+        if min(self.joint_weight) == 0 < max(self.joint_weight):
+            raise InputError(f"joint_weight must be positive first and last, or zero, got {self.joint_weight}")
         if max(self.max_angle) > 3.1416:
             raise InputError(f"max_angle must be at most pi radians, got {max(self.max_angle)}")
         check_choice(self.blend, "blend", BLENDS)
+
+    def joint_weight_at(self, progress: float) -> float:
+        """Return beta a share of the way through the rounds of labels."""
+        return between(self.joint_weight, progress) if self.joint_weight[0] > 0 else 0.0

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchreg._checks import check_choice, check_count, check_positive
 from torchreg.correspondence.learned_descriptors import CURVATURE_RADII
 from torchreg.correspondence.scan_em import ScanEMConfig
-from torchreg.errors import InputError
+from torchreg.errors import InputError, InputTypeError
 
 DESCRIPTORS = ("spin_image", "learned")
 
@@ -84,7 +84,7 @@ class AssignConfig:
         for name in ("num_steps", "num_points", "fits_per_step"):
             check_count(getattr(self, name), name, 1)
         for name in ("reach", "stiffness"):
-            _check_ends(getattr(self, name), name)
+            check_ends(getattr(self, name), name)
         for name in ("normal_weight", "feature_weight"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
@@ -160,7 +160,7 @@ class RefineConfig:
         for name in ("final_steps", "slow_steps"):
             check_count(getattr(self, name), name, 0)
         for name in ("sigma", "stiffness", "slide", "feature_weight", "unlike"):
-            _check_ends(getattr(self, name), name)
+            check_ends(getattr(self, name), name)
         if self.unlike[0] >= self.unlike[1]:
             raise InputError(f"unlike must grow, got {self.unlike[0]:g} and {self.unlike[1]:g}")
         for name in ("near_sigma", "fused_sigma", "give", "beyond_scale", "expected_scale"):
@@ -379,8 +379,11 @@ def _check_values(values: tuple[float, ...], name: str) -> None:
         check_positive(value, name)
 
 
-def _check_ends(ends: tuple[float, float], name: str) -> None:
+def check_ends(ends: tuple[float, float], name: str, *, allow_zero: bool = False) -> None:
+    """Raise unless there are two positive numbers."""
+    if not isinstance(ends, (tuple, list)):
+        raise InputTypeError(f"{name} must be two numbers, first and last, got {type(ends).__name__}")
     if len(ends) != 2:
         raise InputError(f"{name} must be two numbers, first and last, got {len(ends)}")
     for value in ends:
-        check_positive(value, name)
+        check_positive(value, name, allow_zero=allow_zero)
