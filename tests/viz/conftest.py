@@ -1,7 +1,10 @@
-"""Small results of every kind, made without running a pipeline."""
+"""Small results of every kind, made without running a pipeline, and a viewer of files."""
 
+import numpy as np
+import pygltflib
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from torchreg.datasets.hand import hand_motion
 from torchreg.geometry.mesh import unit_sphere
@@ -15,6 +18,63 @@ from torchreg.results.base import Status
 from torchreg.results.scans import ScanRegistration, SequenceRegistration
 from torchreg.results.spines import SpineSequence
 from torchreg.results.tracking import DemoResult, TrackResult
+
+_DTYPES = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+
+
+class _GltfViewer:
+    """Evaluates a file as the specification says: tracks at the key frames, hierarchy, inverse bind matrices, skin."""
+
+    def __init__(self, path):
+        self.gltf = pygltflib.GLTF2().load(str(path))
+        self.blob = self.gltf.binary_blob()
+
+    def read(self, index):
+        accessor = self.gltf.accessors[index]
+        start = self.gltf.bufferViews[accessor.bufferView].byteOffset
+        width = _WIDTHS[accessor.type]
+        values = np.frombuffer(self.blob, _DTYPES[accessor.componentType], accessor.count * width, start)
+        return values.reshape(-1, width)
+
+    def vertices(self, frame):
+        local = [np.eye(4) for _ in self.gltf.nodes]
+        animation = self.gltf.animations[0]
+        for channel in animation.channels:
+            value = self.read(animation.samplers[channel.sampler].output)[frame].astype(np.float64)
+            matrix = local[channel.target.node]
+            if channel.target.path == "translation":
+                matrix[:3, 3] = value
+            else:
+                matrix[:3, :3] = Rotation.from_quat(value).as_matrix()
+        world = {}
+
+        def visit(node, above):
+            world[node] = above @ local[node]
+            for child in self.gltf.nodes[node].children:
+                visit(child, world[node])
+
+        for root in self.gltf.scenes[0].nodes:
+            visit(root, np.eye(4))
+        skin = self.gltf.skins[0]
+        inverse = self.read(skin.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1)
+        joints = np.stack([world[node] @ bind for node, bind in zip(skin.joints, inverse, strict=True)])
+        attributes = self.gltf.meshes[0].primitives[0].attributes
+        points = np.c_[self.read(attributes.POSITION), np.ones(self.gltf.accessors[attributes.POSITION].count)]
+        total = np.zeros_like(points)
+        for name in ("0", "1"):
+            index = getattr(attributes, f"JOINTS_{name}", None)
+            if index is not None:
+                weights = self.read(getattr(attributes, f"WEIGHTS_{name}"))
+                moved = np.einsum("vsij,vj->vsi", joints[self.read(index)], points)
+                total += np.einsum("vs,vsi->vi", weights, moved)
+        return total[:, :3]
+
+
+@pytest.fixture(scope="session")
+def gltf_viewer():
+    """Return the class that opens a binary glTF file, reads its arrays and plays its animation."""
+    return _GltfViewer
 
 
 def _bar_model(num_bones=3):

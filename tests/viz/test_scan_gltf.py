@@ -6,10 +6,8 @@ import shutil
 import subprocess
 
 import numpy as np
-import pygltflib
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import unit_sphere
@@ -19,8 +17,6 @@ from torchreg.models.grid_lbs import GridLBS
 from torchreg.viz.scan_gltf import save_grid_animation
 
 VALIDATOR = os.environ.get("GLTF_VALIDATOR", "")
-DTYPES = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
-WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 def scene(bones=6, blend="linear", smooth=False, scale=1.0, dtype=torch.float64):
@@ -38,62 +34,14 @@ def scene(bones=6, blend="linear", smooth=False, scale=1.0, dtype=torch.float64)
     return model.to(dtype), points.to(dtype), mesh.faces
 
 
-class Viewer:
-    """Evaluates a file as the specification says: tracks at the key frames, hierarchy, inverse bind matrices, skin."""
-
-    def __init__(self, path):
-        self.gltf = pygltflib.GLTF2().load(str(path))
-        self.blob = self.gltf.binary_blob()
-
-    def read(self, index):
-        accessor = self.gltf.accessors[index]
-        start = self.gltf.bufferViews[accessor.bufferView].byteOffset
-        width = WIDTHS[accessor.type]
-        values = np.frombuffer(self.blob, DTYPES[accessor.componentType], accessor.count * width, start)
-        return values.reshape(-1, width)
-
-    def vertices(self, frame):
-        local = [np.eye(4) for _ in self.gltf.nodes]
-        animation = self.gltf.animations[0]
-        for channel in animation.channels:
-            value = self.read(animation.samplers[channel.sampler].output)[frame].astype(np.float64)
-            matrix = local[channel.target.node]
-            if channel.target.path == "translation":
-                matrix[:3, 3] = value
-            else:
-                matrix[:3, :3] = Rotation.from_quat(value).as_matrix()
-        world = {}
-
-        def visit(node, above):
-            world[node] = above @ local[node]
-            for child in self.gltf.nodes[node].children:
-                visit(child, world[node])
-
-        for root in self.gltf.scenes[0].nodes:
-            visit(root, np.eye(4))
-        skin = self.gltf.skins[0]
-        inverse = self.read(skin.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1)
-        joints = np.stack([world[node] @ bind for node, bind in zip(skin.joints, inverse, strict=True)])
-        attributes = self.gltf.meshes[0].primitives[0].attributes
-        points = np.c_[self.read(attributes.POSITION), np.ones(self.gltf.accessors[attributes.POSITION].count)]
-        total = np.zeros_like(points)
-        for name in ("0", "1"):
-            index = getattr(attributes, f"JOINTS_{name}", None)
-            if index is not None:
-                weights = self.read(getattr(attributes, f"WEIGHTS_{name}"))
-                moved = np.einsum("vsij,vj->vsi", joints[self.read(index)], points)
-                total += np.einsum("vs,vsi->vi", weights, moved)
-        return total[:, :3]
-
-
 @pytest.mark.parametrize("hierarchy", ["tree", "flat"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-def test_both_poses_are_those_of_the_model(tmp_path, hierarchy, dtype, scale):
+def test_both_poses_are_those_of_the_model(gltf_viewer, tmp_path, hierarchy, dtype, scale):
     model, points, faces = scene(bones=4, scale=scale, dtype=dtype)
     written = save_grid_animation(tmp_path / "scan.glb", model, points, faces, hierarchy=hierarchy)
     assert written.path == tmp_path / "scan.glb"
-    viewer = Viewer(written.path)
+    viewer = gltf_viewer(written.path)
     size = float((points.amax(0) - points.amin(0)).norm())
     np.testing.assert_allclose(viewer.vertices(0), points.numpy(), atol=1e-5 * size)
     np.testing.assert_allclose(viewer.vertices(1), model(points).detach().numpy(), atol=1e-5 * size)
@@ -103,48 +51,48 @@ def test_both_poses_are_those_of_the_model(tmp_path, hierarchy, dtype, scale):
     assert names == [f"bone_{number}" for number in range(4)]
 
 
-def test_many_poses_are_played_at_their_times(tmp_path):
+def test_many_poses_are_played_at_their_times(gltf_viewer, tmp_path):
     model, points, faces = scene()
     generator = torch.Generator().manual_seed(1)
     poses = se3_exp(torch.randn(4, 6, 6, generator=generator, dtype=torch.float64))
     times = torch.tensor([0.0, 0.1, 0.5, 2.0])
     path = save_grid_animation(tmp_path / "a.glb", model, points, faces, poses, times, most_weights=8).path
-    viewer = Viewer(path)
+    viewer = gltf_viewer(path)
     seconds = viewer.read(viewer.gltf.animations[0].samplers[0].input)[:, 0]
     np.testing.assert_allclose(seconds, times.numpy())
     for frame in range(4):
         np.testing.assert_allclose(viewer.vertices(frame), model(points, poses[frame]).detach().numpy(), atol=1e-4)
     several = GridLBS(model.grid, model.weights, poses)
-    own = Viewer(save_grid_animation(tmp_path / "b.glb", several, points, faces, most_weights=8).path)
+    own = gltf_viewer(save_grid_animation(tmp_path / "b.glb", several, points, faces, most_weights=8).path)
     np.testing.assert_allclose(own.vertices(0), points.numpy(), atol=1e-5)
     np.testing.assert_allclose(own.vertices(3), viewer.vertices(2), atol=1e-5)
 
 
-def test_the_residual_is_what_dropped_weights_cost(tmp_path):
+def test_the_residual_is_what_dropped_weights_cost(gltf_viewer, tmp_path):
     model, points, faces = scene(bones=9, smooth=True)
     truth = model(points).detach().numpy()
     residuals = {}
     for most in (4, 8):
         written = save_grid_animation(tmp_path / f"{most}.glb", model, points, faces, most_weights=most)
-        off = np.linalg.norm(Viewer(written.path).vertices(1) - truth, axis=1).max()
+        off = np.linalg.norm(gltf_viewer(written.path).vertices(1) - truth, axis=1).max()
         assert written.residual == pytest.approx(off, abs=1e-5)
         residuals[most] = written.residual
     assert 0 < residuals[8] < residuals[4]
 
 
-def test_the_residual_of_dual_quaternions_is_that_of_the_linear_blend(tmp_path):
+def test_the_residual_of_dual_quaternions_is_that_of_the_linear_blend(gltf_viewer, tmp_path):
     model, points, faces = scene(blend="dual_quaternion")
     written = save_grid_animation(tmp_path / "a.glb", model, points, faces)
-    off = np.linalg.norm(Viewer(written.path).vertices(1) - model(points).detach().numpy(), axis=1).max()
+    off = np.linalg.norm(gltf_viewer(written.path).vertices(1) - model(points).detach().numpy(), axis=1).max()
     assert written.residual == pytest.approx(off, abs=1e-5)
     assert off > 1e-3
 
 
-def test_colors_and_normals_are_the_callers(tmp_path):
+def test_colors_and_normals_are_the_callers(gltf_viewer, tmp_path):
     model, points, faces = scene()
     red = torch.tensor([1.0, 0, 0]).expand(len(points), 3)
     up = torch.tensor([0.0, 0, 2.0]).expand(len(points), 3)
-    viewer = Viewer(save_grid_animation(tmp_path / "a.glb", model, points, faces, colors=red, normals=up).path)
+    viewer = gltf_viewer(save_grid_animation(tmp_path / "a.glb", model, points, faces, colors=red, normals=up).path)
     attributes = viewer.gltf.meshes[0].primitives[0].attributes
     np.testing.assert_allclose(viewer.read(attributes.COLOR_0)[:, :3], red.numpy())
     np.testing.assert_allclose(viewer.read(attributes.NORMAL), up.numpy() / 2)
