@@ -110,6 +110,25 @@ def test_hypotheses_are_followed_until_two_agree(pair):
     assert {record.stage for record in every.history} == {"match", "assign", "refine", "slide"}
 
 
+def test_the_best_is_believed_if_the_next_best_about_agrees(pair, monkeypatch):
+    """Where rest and stiff matches differ, but the two best do not, none is fused; the slow end is tried still."""
+    widths = []
+
+    def about(problem, one, other, config):
+        widths.append(config.same)
+        return len(widths) > 1
+
+    monkeypatch.setattr(scan_alignment, "agree", about)
+    result = align_scans(pair.source, pair.target, QUICK)
+    assert {each.name for each in result.hypotheses} == {"rest", "stiff matches", "matches", "one to one"}
+    assert {record.stage for record in result.history} == {"match", "assign", "refine", "slide"}
+    assert widths[0] < widths[1] <= 2 * widths[0]
+    # A limb that is lost is looked for, whoever agrees.
+    widths.clear()
+    monkeypatch.setattr(scan_alignment, "loses_limb", lambda *_: True)
+    assert "fused" in {each.name for each in align_scans(pair.source, pair.target, QUICK).hypotheses}
+
+
 def test_the_best_alone_is_taken_to_the_end(pair):
     config = replace(QUICK, refine=replace(QUICK.refine, compared_after=2), choice=replace(QUICK.choice, same=1e-12))
     result = align_scans(pair.source, pair.target, config)
@@ -131,7 +150,7 @@ def test_the_best_is_refined_once_more_and_about_as_well(pair):
         assert told == list(range(slow_steps + config.refine.final_steps if slow_steps else 0))
         ends[slow_steps] = judged_end(pair, config, result).energy
     assert max(ends[4], ends[12]) < ends[0] + 0.05
-    # Where all hypotheses agree there is no doubt.
+    # Where the first two agree there is no doubt.
     same = align_scans(pair.source, pair.source, QUICK)
     assert "slide" not in {each.stage for each in same.history}
 

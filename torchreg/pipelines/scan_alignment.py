@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -43,8 +43,10 @@ from torchreg.pipelines.threads import both, one_thread
 
 _One = TypeVar("_One")
 _Other = TypeVar("_Other")
-# Fewer hypotheses are not fused, nor are limbs of the best rearranged.
-_LEAST_FUSED = 3
+# Fewer are not fused, nor are limbs of the best rearranged: two that started apart agreed, or there are few matches.
+_LEAST_FUSED = 4
+# Nor where the two best take samples within so many times what makes hypotheses agree.
+_CONFIRMED = 2.0
 # How a graph is taken to where points are expected: that may be wrong in parts, and limbs turn far.
 _EXPECTED_STIFFNESS, _EXPECTED_FITS = 0.02, 4
 # Rearranged limbs that one-to-one matches leave worse than the best by more than this energy are not gone on with.
@@ -72,14 +74,14 @@ def align_scans(
     the surface, fitted stiffly, or softly and then pulled by one-to-one matches; and from one-to-one matches alone.
     Each goes on by an EM with an outlier class, while edges of the graph give where its parts disagree, matches
     beside what something nearer hides hold across the surface alone, and samples where the target's camera saw
-    nothing are taken back into its picture. Then each part moves as in the hypothesis that suits it, and the EM
-    goes on from there as well, and from the best with two limbs exchanged or with one laid where nothing covers the
-    target, if one-to-one matches make that about as good. The best covers the target, is covered by it, is like it,
-    bends least, leaves the larger part of each wide region rigid, and is nearest to what is expected; its EM is
-    taken to the end, and beside that run anew, slowly, with matches that may slide, while what is unlike the target
-    all around follows the wide regions it is in: that end is kept unless it is clearly worse or leaves more of the
-    target bare. Where rest and stiff matches agree and leave little of both scans over, the softer ones are left out;
-    where all agree, or there are only two, the best is taken to the end without more ado.
+    nothing are taken back into its picture. Then, unless the two best about agree and leave little of both scans over,
+    each part moves as in the hypothesis that suits it, and the EM goes on from there as well, and from the best with
+    two limbs exchanged or with one laid where nothing covers the target, if one-to-one matches make that about as
+    good. The best covers the target, is covered by it, is like it, bends least, leaves the larger part of each wide
+    region rigid, and is nearest to what is expected; its EM is taken to the end, and beside that run anew, slowly,
+    with matches that may slide, while what is unlike the target all around follows the wide regions it is in: that
+    end is kept unless it is clearly worse or leaves more of the target bare. Where rest and stiff matches agree and
+    leave little of both scans over, the softer ones are left out, and so is the slow EM.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -117,15 +119,15 @@ def align_scans(
 
     problem = describe(source, target, config, generator, None if expected is None else _checked(expected, source))
     found = sorted(_candidates(problem, config, report), key=_energy)
-    doubtful = len(found) >= _LEAST_FUSED and not _all_agree(problem, found, config)
-    if doubtful:
+    unsure = len(found) >= _LEAST_FUSED
+    if unsure and not _confirmed(problem, found[0], found[1], config):
         found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
         exchanged, covering = _both_told(
             report, partial(_exchanged, problem, found[0], config), partial(_covering, problem, found[0], config)
         )
         found = sorted([*found, *exchanged, *covering], key=_energy)
     chosen = found[0].hypothesis
-    transforms = _finished(problem, found[0], config, doubtful, report)
+    transforms = _finished(problem, found[0], config, unsure, report)
     weights = spread_weights(
         problem.unit.of_points(source.points),
         source.normals.detach().cpu().double(),
@@ -289,9 +291,9 @@ def _compared(
 
 
 def _finished(
-    problem: ScanAlignProblem, candidate: _Candidate, config: ScanAlignConfig, doubtful: bool, on_step: OnStep
+    problem: ScanAlignProblem, candidate: _Candidate, config: ScanAlignConfig, unsure: bool, on_step: OnStep
 ) -> Tensor:
-    """Return the motions (J, 4, 4) after the last steps; in doubt, those of a slower EM unless they are worse."""
+    """Return the motions (J, 4, 4) after the last steps; if unsure, those of a slower EM unless they are worse."""
     name, refining = candidate.hypothesis.name, config.refine
 
     def to_the_end(told: OnStep) -> Tensor:
@@ -305,7 +307,7 @@ def _finished(
             follow = follow_regions(problem, candidate.transforms, refining, config.choice)
         return refine(problem, candidate.transforms, slow, reporter, refining.near_sigma, stage="slide", follow=follow)
 
-    if not doubtful or refining.slow_steps == 0:
+    if not unsure or refining.slow_steps == 0:
         return to_the_end(on_step)
     slow, quick = _both_told(on_step, slowly, to_the_end)
     return slow if _slow_is_kept(*(judge(problem, name, end, config.choice) for end in (slow, quick))) else quick
@@ -316,9 +318,12 @@ def _slow_is_kept(slow: Hypothesis, quick: Hypothesis) -> bool:
     return slow.energy + _BARE * slow.backward < quick.energy + _BARE * quick.backward + _SLOW_COSTS_MORE
 
 
-def _all_agree(problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig) -> bool:
-    best = found[0].transforms
-    return all(agree(problem, best, other.transforms, config.choice) for other in found[1:])
+def _confirmed(problem: ScanAlignProblem, best: _Candidate, next_best: _Candidate, config: ScanAlignConfig) -> bool:
+    """Return whether the best of several candidates is believed: the next best goes there too, and no limb is lost."""
+    like = replace(config.choice, same=_CONFIRMED * config.choice.same)
+    if not agree(problem, best.transforms, next_best.transforms, like):
+        return False
+    return not loses_limb(problem, best.transforms, config.choice)
 
 
 def _energy(candidate: _Candidate) -> float:
