@@ -122,6 +122,7 @@ def _ablations() -> list[Recipe]:
         Recipe("without descriptors", config=replace(plain, align=replace(plain.align, match=_no_matches(plain)))),
         Recipe("learned descriptors", config=replace(plain, align=_learned(plain.align))),
         Recipe("without wide regions", config=replace(plain, align=_no_regions(plain.align))),
+        Recipe("without visibility", config=replace(plain, align=_blind(plain.align))),
         *(Recipe(f"grid {size}", grid=size) for size in (20, 35, 65, 80)),
         *(Recipe(f"bones {size}", bones=size) for size in (4, 6, 10, 15)),
     ]
@@ -140,6 +141,11 @@ def _learned(align: ScanAlignConfig) -> ScanAlignConfig:
 def _no_regions(align: ScanAlignConfig) -> ScanAlignConfig:
     """Return settings under which wide regions may move in any way."""
     return replace(align, refine=replace(align.refine, regions=0.0), choice=replace(align.choice, strain=0.0))
+
+
+def _blind(align: ScanAlignConfig) -> ScanAlignConfig:
+    """Return settings under which hypotheses may take points to where the camera would have seen them."""
+    return replace(align, choice=replace(align.choice, seen=0.0))
 
 
 def file_problems(folder: Path) -> Iterator[Problem]:

@@ -85,6 +85,53 @@ def test_motion_scale_and_order_change_nothing(space, ball):
     torch.testing.assert_close(found[2], trust)
 
 
+def draws(count, seed=0):
+    """Return points around the ball, and unit vectors."""
+    generator = torch.Generator().manual_seed(seed)
+    points, normals = torch.randn(2, count, 3, generator=generator, dtype=F64)
+    return 1.5 * points, torch.nn.functional.normalize(normals, dim=-1)
+
+
+def test_what_a_ball_hides_is_not_in_view(space):
+    points, _ = draws(4000)
+    reach = (points - EYE).norm(dim=-1)
+    rays = (points - EYE) / reach.unsqueeze(1)
+    # A ray meets the ball where the quadratic says, if it is not too far off.
+    along = -(rays * EYE).sum(-1)
+    off = EYE.square().sum() - along.square()
+    meets = along - (1 - off).clamp(min=0).sqrt()
+    hidden = (off < 1) & (reach - meets > 0.3)
+    clear = ((off.sqrt() - 1).abs() > 0.15) & ((reach - meets - 0.3).abs() > 0.1)
+    assert 0.05 < float(hidden[clear].double().mean()) < 0.95
+    assert torch.equal(space.in_view(points, -rays, 0.3)[clear], ~hidden[clear])
+
+
+def test_only_what_faces_the_camera_is_in_view(space):
+    points, normals = draws(1000)
+    points[:, 2] = -2
+    facing = ((EYE - points) * normals).sum(-1) / (EYE - points).norm(dim=-1)
+    assert torch.equal(space.in_view(points, normals, 0.1), facing >= 0.1)
+
+
+def test_a_scan_sees_itself(space, ball):
+    seen = space.in_view(ball, ball, 0.1)
+    # All but the outline, which is looked along.
+    assert bool(seen[ball[:, 2] < -0.3].all())
+    assert not bool(space.in_view(ball, -ball, 0.1).any())
+
+
+def test_motion_scale_and_order_change_nothing_in_view(space, ball):
+    points, normals = draws(300)
+    motion = se3_exp(torch.tensor([0.3, 2.0, -1.0, 0.5, 1.0, 2.0], dtype=F64))
+    turn = motion[:3, :3].mT
+    order = torch.randperm(len(ball), generator=torch.Generator().manual_seed(1))
+    surface, eye, moved = (7 * transform_points(motion, values) for values in (ball[order], EYE[None], points))
+    other = FreeSpace.of(surface, ball[order] @ turn, eye[0], MOST_CUT)
+    found = space.in_view(points, normals, 0.2)
+    assert 0.05 < float(found.double().mean()) < 0.95
+    assert torch.equal(other.in_view(moved, normals @ turn, 1.4), found)
+
+
 def test_few_points_say_nothing(ball):
     for count in (1, 5, 16):
         few = FreeSpace.of(ball[:count], ball[:count], EYE, MOST_CUT)
@@ -93,6 +140,9 @@ def test_few_points_say_nothing(ball):
     same = ball[:1].expand(50, 3)
     assert float(FreeSpace.of(same, same, EYE, MOST_CUT).beyond(3 * ball[:20], 0.1)[2].max()) == 0
     assert float(FreeSpace.of(same, same, same[0], MOST_CUT).beyond(3 * ball[:20], 0.1)[2].max()) == 0
+    # They hide no more than themselves: all that faces the camera may be seen.
+    for few in (ball[:1], ball[:5], same):
+        assert bool(FreeSpace.of(few, few, EYE, MOST_CUT).in_view(ball[-100:], ball[-100:], 0.1).all())
 
 
 def test_bad_input_is_named(ball):
@@ -106,3 +156,12 @@ def test_bad_input_is_named(ball):
         FreeSpace.of(ball, ball, EYE, 0.0)
     with pytest.raises(InputTypeError, match=r"normals is torch.float32"):
         FreeSpace.of(ball, ball.float(), EYE, MOST_CUT)
+
+
+def test_bad_questions_are_named(space, ball):
+    with pytest.raises(InputError, match="points must have shape"):
+        space.in_view(ball[0], ball[0], 0.1)
+    with pytest.raises(InputError, match="normals must have shape"):
+        space.in_view(ball, ball[1:], 0.1)
+    with pytest.raises(InputError, match="behind must be positive"):
+        space.in_view(ball, ball, 0.0)

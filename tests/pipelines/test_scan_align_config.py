@@ -35,6 +35,8 @@ from torchreg.pipelines.scan_align_config import (
         (RefineConfig, {"density": -1.0}, "density must be"),
         (ChoiceConfig, {"cap": 0.0}, "cap must be positive"),
         (ChoiceConfig, {"bend": -1.0}, "bend must be"),
+        (ChoiceConfig, {"seen": -1.0}, "seen must be"),
+        (ChoiceConfig, {"behind": 0.0}, "behind must be positive"),
         (ScanAlignConfig, {"num_nodes": 0}, "num_nodes must be at least 1"),
         (ScanAlignConfig, {"curvature_radii": ()}, "curvature_radii must hold"),
         (ScanAlignConfig, {"curvature_radii": (-0.1,)}, "curvature_radii must be positive"),

@@ -249,7 +249,7 @@ def test_better_hypotheses_are_judged_better(problem, reporter):
     assert better.energy < still.energy
     assert still.bend == 0
     assert still.strain == pytest.approx(0, abs=1e-12)
-    assert still.energy == pytest.approx(still.forward + still.backward + still.unlike)
+    assert still.energy == pytest.approx(still.forward + still.seen + still.backward + still.unlike)
     far = rest.clone()
     far[:, :3, 3] += 10
     lost = judge(problem, "lost", far, config)
@@ -260,14 +260,43 @@ def test_better_hypotheses_are_judged_better(problem, reporter):
 
 def test_likeness_counts_where_surfaces_meet(problem):
     config, target = ChoiceConfig(), problem.target
-    apart, unlike = mismatch(problem, target, config)
-    assert float(apart.max()) == float(unlike.max()) == 0
+    assert all(float(cost.max()) == 0 for cost in mismatch(problem, target, config))
     other = OrientedSamples(target.points, target.normals, target.features + 10, target.boundary)
-    torch.testing.assert_close(mismatch(problem, other, config)[1], torch.full_like(apart, 2 * config.unlike))
+    *_, unlike = mismatch(problem, other, config)
+    torch.testing.assert_close(unlike, torch.full_like(unlike, 2 * config.unlike))
     away = OrientedSamples(target.points + 10, target.normals, target.features, target.boundary)
-    apart, unlike = mismatch(problem, away, config)
+    apart, _, unlike = mismatch(problem, away, config)
     assert float(apart.min()) == 1
     torch.testing.assert_close(unlike, torch.full_like(apart, 0.4 * config.unlike))
+
+
+def test_what_the_camera_should_have_seen_costs_its_distance(problem):
+    config, moved = ChoiceConfig(seen=3.0, cap=0.05), problem.moved(problem.graph.rest())
+    apart = torch.cdist(embedded(moved, config), embedded(problem.target, config)).amin(1)
+    in_view = problem.free.in_view(moved.points, moved.normals, config.behind)
+    _, seen, _ = mismatch(problem, moved, config)
+    # Nothing up to a quarter of the cap, all from the whole cap on.
+    expected = 3 * ((apart - 0.0125) / 0.0375).clamp(0, 1)
+    torch.testing.assert_close(seen, expected * in_view)
+    assert 0 < float(seen.mean()) < 0.9 * float(expected.mean())
+    # Nearer to the camera all that faces it would have been seen, and is not there; behind the target it may be.
+    forward = problem.free.picture.rotation[2]
+    for shift, least, most in ((-1.0, 0.9, 1.0), (1.0, 0.0, 0.2)):
+        away = replace(problem.target, points=problem.target.points + shift * forward)
+        cost = mismatch(problem, away, replace(config, behind=0.01))[1]
+        assert 3 * least <= float(cost.mean()) <= 3 * most
+
+
+def test_where_no_camera_is_known_nothing_is_seen(problem):
+    config, rest = ChoiceConfig(), problem.graph.rest()
+    seen = judge(problem, "", rest, config)
+    assert seen.seen > 0
+    for blind in (
+        judge(replace(problem, free=None), "", rest, config),
+        judge(problem, "", rest, replace(config, seen=0.0)),
+    ):
+        assert blind.seen == 0
+        assert blind.energy == pytest.approx(seen.energy - seen.seen)
 
 
 def test_a_limb_is_lost_where_samples_of_both_scans_are_left_over(problem):

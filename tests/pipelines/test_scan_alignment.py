@@ -75,7 +75,8 @@ def test_the_result_is_what_its_parts_say(pair, aligned):
     ahead = align_scans(pair.source, pair.target, QUICK, expected=aligned.points).chosen
     assert aligned.chosen.leap == 0
     for one in (aligned.chosen, ahead):
-        assert one.energy == pytest.approx(one.forward + one.backward + one.unlike + one.bend + one.strain + one.leap)
+        terms = (one.forward, one.seen, one.backward, one.unlike, one.bend, one.strain, one.leap)
+        assert one.energy == pytest.approx(sum(terms))
         assert one.strain > 0
 
 
@@ -176,7 +177,7 @@ def test_of_two_ends_the_slow_one_is_kept_unless_it_is_clearly_worse(pair, monke
     ("energy", "backward", "kept"), [(0.04, 0.0, True), (0.06, 0.0, False), (0.04, 0.001, False), (-0.1, 0.005, True)]
 )
 def test_the_slow_end_may_cost_a_little_more_but_not_leave_the_target_bare(energy, backward, kept):
-    quick = Hypothesis("quick", 1.0, 0.1, 0.2, 0.3, 0.2, 0.2)
+    quick = Hypothesis("quick", 1.0, 0.1, 0.0, 0.2, 0.3, 0.2, 0.2)
     slow = replace(quick, energy=1.0 + energy, backward=0.2 + backward)
     assert scan_alignment._slow_is_kept(slow, quick) is kept
 

@@ -1,4 +1,4 @@
-"""Where a camera saw nothing: beyond the outline of a range scan, where no part of the thing can be."""
+"""Where a camera saw nothing, beyond the outline of a range scan, and what it would have seen."""
 
 from __future__ import annotations
 
@@ -19,21 +19,25 @@ _PROBE, _EMPTY, _SAME_DEPTH = 2.0, 1.4, 4.0
 _TURNED = 0.3
 # Cosine of the slant beside the outline: above the first nothing is known of what is beyond, below the other all.
 _FACING = (0.7, 0.5)
+# A sample hides what is behind it within so many spacings; with less than this cosine a surface may not be seen.
+_HIDES, _SEEN = 2.0, 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class FreeSpace:
-    """The space beyond the outline of a range scan, seen from its camera; made by `of`.
+    """The space in front of a range scan and beyond its outline, seen from its camera; made by `of`.
 
     Args:
         picture: what the camera sees.
         flat: (S, 2) places of the samples in it.
+        depth: (S,) of the samples, along the view.
         spacing: typical distance of those.
         trust: (S,) in [0, 1], whether beside a sample the surface ended by turning away from the camera.
     """
 
     picture: Picture
     flat: Tensor
+    depth: Tensor
     spacing: float
     trust: Tensor
 
@@ -67,13 +71,13 @@ class FreeSpace:
         flat, depth = picture.project(points)
         trust = torch.zeros_like(depth)
         if len(points) <= _MANY:
-            return cls(picture, flat, 0.0, trust)
+            return cls(picture, flat, depth, 0.0, trust)
         index, apart = nearest_few(flat, flat, _MANY)
         spacing = float(apart[:, 1].median())
         if _share_cut(flat, depth, normals @ picture.rotation.mT, index.to(flat.device), spacing) > most_cut:
-            return cls(picture, flat, spacing, trust)
+            return cls(picture, flat, depth, spacing, trust)
         facing = -(normals @ picture.rotation[2])[index[:, :_FEW]].mean(1)
-        return cls(picture, flat, spacing, ((_FACING[0] - facing) / (_FACING[0] - _FACING[1])).clamp(0, 1))
+        return cls(picture, flat, depth, spacing, ((_FACING[0] - facing) / (_FACING[0] - _FACING[1])).clamp(0, 1))
 
     @torch.no_grad()
     def beyond(self, points: Tensor, margin: float) -> tuple[Tensor, Tensor, Tensor]:
@@ -97,6 +101,31 @@ class FreeSpace:
         distance = (apart * depth / self.picture.distance).clamp_min(0)
         distance = torch.where(distance > margin, distance, 0.0)
         return distance, back @ self.picture.rotation[:2], self.trust[index] * (distance > 0)
+
+    @torch.no_grad()
+    def in_view(self, points: Tensor, normals: Tensor, behind: float) -> Tensor:
+        """Return which points (N,) bool the camera would have seen, had they been there.
+
+        Not those that are behind the scan, nor those that look away from the camera or along the picture.
+
+        Args:
+            points: (N, 3).
+            normals: (N, 3) unit vectors.
+            behind: from how far behind a sample points count as hidden, in their unit.
+
+        Raises:
+            InputError: if a shape does not fit, or the distance is not positive.
+
+        Differentiable: no.
+        """
+        check_shape(points, "points", ("N", 3))
+        check_shape(normals, "normals", tuple(points.shape))
+        check_positive(behind, "behind")
+        flat, depth = self.picture.project(points)
+        index, apart = (found[:, 0].to(points.device) for found in nearest_few(flat, self.flat, 1))
+        hidden = (apart < _HIDES * self.spacing) & (depth > self.depth[index] + behind)
+        rays = torch.nn.functional.normalize(points - self.picture.viewpoint, dim=-1)
+        return ~hidden & (-(normals * rays).sum(-1) >= _SEEN)
 
 
 def _share_cut(flat: Tensor, depth: Tensor, normals: Tensor, index: Tensor, spacing: float) -> float:

@@ -184,6 +184,8 @@ class ChoiceConfig:
     Args:
         cap: distances count up to this, length.
         normal_scale: how many caps normals count as that are one apart.
+        seen: what it costs that samples are off the target, by a cap or more, where its camera would have seen them,
+        behind: unless a sample of it is nearer to the camera by more than this, length.
         unlike: what it costs that features differ by one, squared, where the moved source lies on the target.
         bend: what it costs that neighboring nodes disagree by one size in the mean,
         slack: of which less than this hardly counts, length.
@@ -198,6 +200,8 @@ class ChoiceConfig:
 
     cap: float = 0.03
     normal_scale: float = 0.5
+    seen: float = 2.0
+    behind: float = 0.02
     unlike: float = 2.0
     bend: float = 20.0
     slack: float = 1e-3
@@ -209,9 +213,9 @@ class ChoiceConfig:
     lost_share: float = 0.02
 
     def __post_init__(self) -> None:
-        for name in ("cap", "leap_cap", "same", "same_share"):
+        for name in ("cap", "behind", "leap_cap", "same", "same_share"):
             check_positive(getattr(self, name), name)
-        for name in ("normal_scale", "unlike", "bend", "slack", "strain", "leap", "lost_share"):
+        for name in ("normal_scale", "seen", "unlike", "bend", "slack", "strain", "leap", "lost_share"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
 
@@ -318,9 +322,11 @@ class Hypothesis:
 
     Args:
         name: what it started from.
-        energy: ``forward + backward + unlike + bend + strain + leap``, by which hypotheses are compared; lower is
-            better.
+        energy: ``forward + seen + backward + unlike + bend + strain + leap``, by which hypotheses are compared; lower
+            is better.
         forward: mean squared distance of moved samples to the target, capped at one.
+        seen: weighted mean distance of moved samples to the target, less its spacing and capped at one, 0 where its
+            camera would not have seen them; 0 if it is not known where that was.
         backward: mean squared distance of target samples to the moved source, capped at one.
         unlike: weighted mean squared difference of features of moved samples and the target.
         bend: weighted disagreement of neighboring nodes.
@@ -332,6 +338,7 @@ class Hypothesis:
     name: str
     energy: float
     forward: float
+    seen: float
     backward: float
     unlike: float
     bend: float

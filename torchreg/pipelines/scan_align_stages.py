@@ -26,6 +26,8 @@ from torchreg.pipelines.scan_align_problem import ScanAlignProblem
 
 # Right matches differ by so much in their features, squared, in the mean; more than samples at random tells no more.
 _USUALLY_UNLIKE, _UNLIKE = 0.4, 2.0
+# Share of the cap up to which samples off the target are on it: it is not sampled more densely.
+_ON_TARGET = 0.25
 # With less posterior mass a sample has no match: it may be hidden.
 _HARDLY_MATCHED = 0.05
 
@@ -215,13 +217,13 @@ def follow_regions(problem: ScanAlignProblem, transforms: Tensor, config: Refine
 def judge(problem: ScanAlignProblem, name: str, transforms: Tensor, config: ChoiceConfig) -> Hypothesis:
     """Return how well the moved source and the target cover each other, how alike they are there, bend and strain."""
     moved = problem.moved(transforms)
-    forward, unlike = (float(cost.mean()) for cost in mismatch(problem, moved, config))
+    forward, seen, unlike = (float(cost.mean()) for cost in mismatch(problem, moved, config))
     apart = nearest_few(embedded(problem.target, config), embedded(moved, config), 1)[1]
     backward = float((apart / config.cap).clamp(max=1).square().mean())
     bend = config.bend * float(problem.graph.bend(transforms, config.slack))
     strain = config.strain * problem.regions.strain(moved.points)
     leap = float(leaps(problem, moved.points, config).mean())
-    costs = (forward, backward, unlike, bend, strain, leap)
+    costs = (forward, seen, backward, unlike, bend, strain, leap)
     return Hypothesis(name, sum(costs), *costs)
 
 
@@ -233,11 +235,19 @@ def leaps(problem: ScanAlignProblem, places: Tensor, config: ChoiceConfig) -> Te
     return config.leap * apart.clamp(max=1).square()
 
 
-def mismatch(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> tuple[Tensor, Tensor]:
-    """Return what moved samples cost (S,) by their distance from the target, and by unlike features there."""
+def mismatch(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what moved samples cost (S,): by distance from the target, by that where seen, by unlike features there.
+
+    What the target's camera would have seen, had it been there, but did not see, is not there. What it could not have
+    seen may be.
+    """
     apart, unlike = differences(problem, moved, config)
+    seen = torch.zeros_like(apart)
+    if problem.free is not None and config.seen > 0:
+        off = (apart.sqrt() - _ON_TARGET).clamp(min=0) / (1 - _ON_TARGET)
+        seen = config.seen * off * problem.free.in_view(moved.points, moved.normals, config.behind)
     # Where there is nothing to be like, a sample is as unlike as right matches usually are: leaving must not pay.
-    return apart, config.unlike * torch.lerp(unlike, torch.full_like(unlike, _USUALLY_UNLIKE), apart)
+    return apart, seen, config.unlike * torch.lerp(unlike, torch.full_like(unlike, _USUALLY_UNLIKE), apart)
 
 
 def differences(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> tuple[Tensor, Tensor]:

@@ -77,11 +77,12 @@ def align_scans(
     nothing are taken back into its picture. Then, unless the two best about agree and leave little of both scans over,
     each part moves as in the hypothesis that suits it, and the EM goes on from there as well, and from the best with
     two limbs exchanged or with one laid where nothing covers the target, if one-to-one matches make that about as
-    good. The best covers the target, is covered by it, is like it, bends least, leaves the larger part of each wide
-    region rigid, and is nearest to what is expected; its EM is taken to the end, and beside that run anew, slowly,
-    with matches that may slide, while what is unlike the target all around follows the wide regions it is in: that
-    end is kept unless it is clearly worse or leaves more of the target bare. Where rest and stiff matches agree and
-    leave little of both scans over, the softer ones are left out, and so is the slow EM.
+    good. The best covers the target, most of all where its camera would have seen it, is covered by it, is like it,
+    bends least, leaves the larger part of each wide region rigid, and is nearest to what is expected; its EM is taken
+    to the end, and beside that run anew, slowly, with matches that may slide, while what is unlike the target all
+    around follows the wide regions it is in: that end is kept unless it is clearly worse or leaves more of the target
+    bare. Where rest and stiff matches agree and leave little of both scans over, the softer ones are left out, and so
+    is the slow EM.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.

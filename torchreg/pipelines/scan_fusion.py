@@ -93,8 +93,7 @@ class _Energy:
         costs, covers, by = [], [], []
         for option in options:
             moved = problem.moved(option)
-            forward, unlike = mismatch(problem, moved, config)
-            costs.append(forward + unlike + leaps(problem, moved.points, config))
+            costs.append(sum(mismatch(problem, moved, config)) + leaps(problem, moved.points, config))
             index, apart = nearest_few(there, embedded(moved, config), min(_NUM_COVERS, len(owner)))
             covers.append((apart / config.cap).clamp(max=1).square())
             by.append(owner[index])
