@@ -130,6 +130,20 @@ def test_the_best_is_believed_if_the_next_best_about_agrees(pair, monkeypatch):
     assert "fused" in {each.name for each in align_scans(pair.source, pair.target, QUICK).hypotheses}
 
 
+def test_as_many_turns_are_followed_as_lie_better(pair, monkeypatch):
+    doubtful = replace(QUICK, choice=replace(QUICK.choice, same=1e-12))
+    turn = se3_exp(torch.tensor([0.0, 0.0, 0.0, 0.0, 0.5, 0.0], dtype=torch.float64))
+    for count, names in enumerate((set(), {"turned"}, {"turned", "turned otherwise"})):
+        turns = torch.stack([turn, turn.mT, turn])[:count]
+        monkeypatch.setattr(scan_alignment, "turned_motions", lambda *_, found=turns: found)
+        result = align_scans(pair.source, pair.target, doubtful)
+        assert names == {each.name for each in result.hypotheses if each.name.startswith("turned")}
+        told = {record.hypothesis for record in result.history if record.hypothesis.startswith("turned")}
+        assert told == names
+        # Wrong ones do no harm.
+        assert share_near(pair, result.points) > 0.9
+
+
 def test_the_best_alone_is_taken_to_the_end(pair):
     config = replace(QUICK, refine=replace(QUICK.refine, compared_after=2), choice=replace(QUICK.choice, same=1e-12))
     result = align_scans(pair.source, pair.target, config)

@@ -39,6 +39,7 @@ from torchreg.pipelines.scan_align_stages import (
 from torchreg.pipelines.scan_cover import covering_limbs
 from torchreg.pipelines.scan_exchange import exchanged_limbs
 from torchreg.pipelines.scan_fusion import fuse_motions
+from torchreg.pipelines.scan_turns import turned_motions
 from torchreg.pipelines.threads import both, one_thread
 
 _One = TypeVar("_One")
@@ -75,14 +76,14 @@ def align_scans(
     Each goes on by an EM with an outlier class, while edges of the graph give where its parts disagree, matches
     beside what something nearer hides hold across the surface alone, and samples where the target's camera saw
     nothing are taken back into its picture. Then, unless the two best about agree and leave little of both scans over,
-    each part moves as in the hypothesis that suits it, and the EM goes on from there as well, and from the best with
-    two limbs exchanged or with one laid where nothing covers the target, if one-to-one matches make that about as
-    good. The best covers the target, most of all where its camera would have seen it, is covered by it, is like it,
-    bends least, leaves the larger part of each wide region rigid, and is nearest to what is expected; its EM is taken
-    to the end, and beside that run anew, slowly, with matches that may slide, while what is unlike the target all
-    around follows the wide regions it is in: that end is kept unless it is clearly worse or leaves more of the target
-    bare. Where rest and stiff matches agree and leave little of both scans over, the softer ones are left out, and so
-    is the slow EM.
+    all of the source is turned, if it lies better on the target then, each part moves as in the hypothesis that suits
+    it, and the EM goes on from there as well, and from the best with two limbs exchanged or with one laid where nothing
+    covers the target, if one-to-one matches make that about as good. The best covers the target, most of all where its
+    camera would have seen it, is covered by it, is like it, bends least, leaves the larger part of each wide region
+    rigid, and is nearest to what is expected; its EM is taken to the end, and beside that run anew, slowly, with
+    matches that may slide, while what is unlike the target all around follows the wide regions it is in: that end is
+    kept unless it is clearly worse or leaves more of the target bare. Where rest and stiff matches agree and leave
+    little of both scans over, the softer ones are left out, and so is the slow EM.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -122,6 +123,7 @@ def align_scans(
     found = sorted(_candidates(problem, config, report), key=_energy)
     unsure = len(found) >= _LEAST_FUSED
     if unsure and not _confirmed(problem, found[0], found[1], config):
+        found = sorted([*found, *_turned(problem, config, report)], key=_energy)
         found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
         exchanged, covering = _both_told(
             report, partial(_exchanged, problem, found[0], config), partial(_covering, problem, found[0], config)
@@ -239,6 +241,20 @@ def _checked(expected: Any, source: RangeScan) -> Tensor:
     check_shape(expected, "expected", tuple(source.points.shape))
     check_finite(expected, "expected")
     return expected.detach()
+
+
+def _turned(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> Sequence[_Candidate]:
+    """Return the candidates from the likeliest turns of all of the source, two at most."""
+
+    def followed(name: str, motion: Tensor, told: OnStep) -> _Candidate:
+        everywhere = motion.repeat(problem.graph.num_nodes, 1, 1)
+        reporter = Reporter(name, problem.unit.size, told)
+        return _compared(problem, everywhere, config.refine.sigma[0], config, reporter)
+
+    starts = list(zip(("turned", "turned otherwise"), turned_motions(problem, config.choice, 2), strict=False))
+    if len(starts) < 2:
+        return [followed(*start, on_step) for start in starts]
+    return _both_told(on_step, *(partial(followed, *start) for start in starts))
 
 
 def _fused(

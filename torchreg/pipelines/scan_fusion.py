@@ -93,7 +93,7 @@ class _Energy:
         costs, covers, by = [], [], []
         for option in options:
             moved = problem.moved(option)
-            costs.append(sum(mismatch(problem, moved, config)) + leaps(problem, moved.points, config))
+            costs.append(torch.stack(mismatch(problem, moved, config)).sum(0) + leaps(problem, moved.points, config))
             index, apart = nearest_few(there, embedded(moved, config), min(_NUM_COVERS, len(owner)))
             covers.append((apart / config.cap).clamp(max=1).square())
             by.append(owner[index])
