@@ -19,9 +19,9 @@ from torchreg.pipelines.scan_align_stages import embedded, mismatch
 # Degrees by which the source is turned about each of 26 axes: what is between is near enough.
 _ANGLES = (20.0, 40.0, 60.0)
 # Samples that are laid on the target, samples that tell how well they lie there, and target samples looked at.
-_NUM_LAID, _NUM_JUDGED, _NUM_TARGETS = 120, 200, 500
+_NUM_LAID, _NUM_JUDGED, _NUM_TARGETS = 80, 150, 300
 # Steps of laying, width of what pulls, first and last, and what normals count as that are one apart: lengths.
-_STEPS, _WIDTHS, _NORMAL_SCALE = 6, (0.1, 0.02), 0.05
+_STEPS, _WIDTHS, _NORMAL_SCALE = 4, (0.1, 0.02), 0.05
 # Turns nearer to each other than this many degrees are one; one must save this much energy over none at all.
 _APART, _LEAST_GAIN = 12.0, 0.1
 
@@ -41,7 +41,7 @@ def turned_motions(problem: ScanAlignProblem, config: ChoiceConfig, count: int) 
     Returns:
         (K, 4, 4) rigid motions, the best first, K at most ``count``; none where a shift does as well.
 
-    Cost: 0.15 s.
+    Cost: 60 ms.
     """
     few = replace(problem, target=problem.target.first(_NUM_TARGETS))
     motions = _laid(few, _turns(problem.graph.points))
