@@ -165,3 +165,7 @@ def test_bad_questions_are_named(space, ball):
         space.in_view(ball, ball[1:], 0.1)
     with pytest.raises(InputError, match="behind must be positive"):
         space.in_view(ball, ball, 0.0)
+    with pytest.raises(InputTypeError, match=r"normals is torch.float32"):
+        space.in_view(ball, ball.float(), 0.1)
+    with pytest.raises(InputTypeError, match=r"points is torch.float32"):
+        space.in_view(ball.float(), ball.float(), 0.1)

@@ -115,11 +115,14 @@ class FreeSpace:
 
         Raises:
             InputError: if a shape does not fit, or the distance is not positive.
+            InputTypeError: if dtypes or devices differ, also from those of the scan.
 
         Differentiable: no.
         """
         check_shape(points, "points", ("N", 3))
         check_shape(normals, "normals", tuple(points.shape))
+        check_same_kind(normals, "normals", points, "points")
+        check_same_kind(points, "points", self.flat, "the scan")
         check_positive(behind, "behind")
         flat, depth = self.picture.project(points)
         index, apart = (found[:, 0].to(points.device) for found in nearest_few(flat, self.flat, 1))

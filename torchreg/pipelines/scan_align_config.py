@@ -184,7 +184,7 @@ class ChoiceConfig:
     Args:
         cap: distances count up to this, length.
         normal_scale: how many caps normals count as that are one apart.
-        seen: what it costs that samples are off the target, by a cap or more, where its camera would have seen them,
+        seen: what it costs that samples are off the target by a cap or more where its camera would have seen them,
         behind: unless a sample of it is nearer to the camera by more than this, length.
         unlike: what it costs that features differ by one, squared, where the moved source lies on the target.
         bend: what it costs that neighboring nodes disagree by one size in the mean,
@@ -325,8 +325,8 @@ class Hypothesis:
         energy: ``forward + seen + backward + unlike + bend + strain + leap``, by which hypotheses are compared; lower
             is better.
         forward: mean squared distance of moved samples to the target, capped at one.
-        seen: weighted mean distance of moved samples to the target, less its spacing and capped at one, 0 where its
-            camera would not have seen them; 0 if it is not known where that was.
+        seen: weighted mean distance of moved samples to the target, from 0 at a quarter of the cap to one at the cap; 0
+            where its camera would not have seen them, and everywhere if it is not known where that was.
         backward: mean squared distance of target samples to the moved source, capped at one.
         unlike: weighted mean squared difference of features of moved samples and the target.
         bend: weighted disagreement of neighboring nodes.

@@ -26,7 +26,7 @@ from torchreg.pipelines.scan_align_problem import ScanAlignProblem
 
 # Right matches differ by so much in their features, squared, in the mean; more than samples at random tells no more.
 _USUALLY_UNLIKE, _UNLIKE = 0.4, 2.0
-# Share of the cap up to which samples off the target are on it: it is not sampled more densely.
+# Share of the cap by which samples may be off the target and count as on it: about what its samples are apart.
 _ON_TARGET = 0.25
 # With less posterior mass a sample has no match: it may be hidden.
 _HARDLY_MATCHED = 0.05
