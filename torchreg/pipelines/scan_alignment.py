@@ -271,9 +271,7 @@ def _exchanged(
 ) -> list[_Candidate]:
     """Return the candidate in which two limbs of the best one change places; none if that looks clearly worse."""
     reporter = Reporter("exchanged", problem.unit.size, on_step)
-    options = exchanged_limbs(problem, best.transforms)
-    likeliest = sorted(options, key=partial(_energy_of, problem, config, reporter.name))[:1]
-    return _pulled(problem, likeliest, best, config, reporter)
+    return _pulled(problem, exchanged_limbs(problem, best.transforms), best, config, reporter)
 
 
 def _covering(
