@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from torchreg.datasets.bodies import Proportions
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.geometry.range_scan import RangeScan
@@ -64,6 +65,15 @@ def test_legs_that_passed_each_other_find_their_places(pair):
     assert found.chosen.name == "exchanged"
     off = (found.points - pair.truth).norm(dim=-1) / pair.source.diagonal
     assert float((off < 0.025).double().mean()) > 0.95
+
+
+def test_limbs_are_chosen_as_matches_pull_them_not_as_they_are_laid():
+    # Long legs: laid roughly, the right exchange of this one looks worse than a wrong one.
+    build = Proportions(legs=1.23, arms=1.02, trunk=0.78, shoulders=0.96, hips=1.3, belly=0.95, limbs=1.12, head=0.91)
+    pair = walking_figure(8, seed=105, proportions=build, scanner=DepthScanner(num_points=4500)).pair(1, 6)
+    found = align_scans(pair.source, pair.target)
+    assert found.chosen.name == "exchanged"
+    assert float((pair.error(found.points) < 0.025).double().mean()) > 0.9
 
 
 def test_without_limbs_there_is_nothing_to_exchange():
