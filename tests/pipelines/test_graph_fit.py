@@ -128,6 +128,31 @@ def test_edges_that_give_count_less(graph):
     torch.testing.assert_close(fit.transforms, fit_graph(softer, transforms, matches, 0.7).transforms)
 
 
+def test_pieces_that_hardly_anything_holds_are_not_flung_away():
+    generator = torch.Generator().manual_seed(0)
+    piece = torch.rand(60, 3, generator=generator, dtype=F64)
+    # Two samples of the second piece nearly touch, and are pulled apart: a turn without end would do.
+    piece[1] = piece[0] + torch.tensor([0.01, 0, 0], dtype=F64)
+    points = torch.cat((piece, piece + torch.tensor([6.0, 0, 0], dtype=F64)))
+    normals = torch.nn.functional.normalize(points - points.mean(0), dim=-1)
+    graph = DeformationGraph(points, normals, build_node_graph(GeodesicGraph.from_points(points, 5), 0, 12, 3))
+    which = torch.cat((torch.arange(60), torch.tensor([60, 61])))
+    targets = points[which]
+    targets[60:, 1] += torch.tensor([0.1, -0.1], dtype=F64)
+    size = (points.amax(0) - points.amin(0)).norm()
+    for steps in (1, 6):
+        matches = GraphMatches(which, targets, torch.ones(len(which), dtype=F64))
+        moved = graph(fit_graph(graph, graph.rest(), matches, 0.1, steps).transforms)
+        assert float((moved - points).norm(dim=-1).max()) < size
+        torch.testing.assert_close(moved[:60], points[:60], rtol=0, atol=1e-3)
+
+
+def test_what_is_far_away_is_reached_all_the_same(graph):
+    targets = graph.points + torch.tensor([30.0, 0, 0], dtype=F64)
+    moved = graph(fit_graph(graph, graph.rest(), GraphMatches.of_places(targets), 0.1).transforms)
+    torch.testing.assert_close(moved, targets, rtol=0, atol=1e-4)
+
+
 def test_bad_input_is_named(graph):
     transforms, matches = problem(graph)
     with pytest.raises(InputError, match="stiffness must be"):

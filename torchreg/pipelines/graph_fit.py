@@ -13,8 +13,9 @@ from torchreg.geometry.blend_sums import upper_triangles
 from torchreg.geometry.rigid import transform_points
 from torchreg.models.deformation_graph import DeformationGraph
 
-# Relative damping: nodes that carry no match follow their neighbors; alone they stay.
-_DAMPING = 1e-9
+# Relative damping: nodes that carry no match follow their neighbors; alone they stay. More is added where a step goes too
+# far: a piece of the graph that hardly any match holds could turn about it, and fly off along the tangent.
+_DAMPINGS = (1e-9, 1e-7, 1e-5, 1e-3)
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,8 @@ def fit_graph(
     ``E = mean_i w_i (d_i^T (n_i n_i^T + slide I) d_i) + stiffness / J sum_e w_e |gap_e|^2``, d_i a sample's miss and
     gap_e how far neighboring nodes disagree about each other, see `DeformationGraph.edge_gaps`. With a ``give``, w_e is
     divided by ``1 + r_e^2 / give^2`` before each step, r_e the root mean square of the edge's two gaps: parts stay
-    rigid, and what they do not share, joints take up.
+    rigid, and what they do not share, joints take up. No step shifts a node by more than the
+    diagonal of the samples or the farthest miss.
 
     Args:
         graph: what is moved, float64 on the CPU.
@@ -116,18 +118,19 @@ def fit_graph(
     if give is not None:
         check_positive(give, "give")
     misses = gaps = 0.0
+    size = float((graph.points.amax(0) - graph.points.amin(0)).norm())
     for _ in range(num_steps):
         middles = transform_points(transforms, graph.centers.unsqueeze(1)).squeeze(1)
-        metrics, pulls, misses, gaps = _costs(graph, graph.sums.places(transforms), matches, stiffness, give)
-        twists = _solved(*graph.sums.normal_equations(transforms, middles, metrics, pulls))
+        metrics, pulls, misses, gaps, farthest = _costs(graph, graph.sums.places(transforms), matches, stiffness, give)
+        twists = _solved(*graph.sums.normal_equations(transforms, middles, metrics, pulls), max(size, farthest))
         transforms = turn_about(transforms, twists, middles)
     return GraphFit(transforms, misses, gaps)
 
 
 def _costs(
     graph: DeformationGraph, places: Tensor, matches: GraphMatches, stiffness: float, give: float | None
-) -> tuple[Tensor, Tensor, float, float]:
-    """Return metrics (S + 2 E, 6) and pulls (S + 2 E, 3) of samples and of gaps, their misses and their gaps."""
+) -> tuple[Tensor, Tensor, float, float, float]:
+    """Return metrics (S + 2 E, 6) and pulls (S + 2 E, 3) of samples and gaps, both in all, and the farthest miss."""
     count, shares = len(graph.points), matches.weights / max(1, len(matches.weights))
     metrics, pulls = places.new_zeros(len(places), 6), places.new_zeros(len(places), 3)
     miss = places[:count][matches.which] - matches.targets
@@ -146,14 +149,20 @@ def _costs(
     held = (stiffness / graph.num_nodes * weights).repeat_interleave(2)
     metrics[count:] = upper_triangles(held, None, 1.0)
     pulls[count:] = held.unsqueeze(1) * places[count:]
-    return metrics, pulls, float((miss * pull).sum()), float((weights * apart).sum()) / graph.num_nodes
+    farthest = float(miss.norm(dim=-1).max()) if len(miss) else 0.0
+    return metrics, pulls, float((miss * pull).sum()), float((weights * apart).sum()) / graph.num_nodes, farthest
 
 
-def _solved(gradient: Tensor, matrix: Tensor) -> Tensor:
-    """Return the twists (J, 6) of a step; none where the system has no Cholesky factor."""
+def _solved(gradient: Tensor, matrix: Tensor, farthest: float) -> Tensor:
+    """Return the twists (J, 6) of a step that shifts no node by more than ``farthest``; none where there is no such."""
     diagonal = matrix.diagonal()
-    diagonal += _DAMPING * diagonal.mean() + torch.finfo(matrix.dtype).tiny
-    factor, info = torch.linalg.cholesky_ex(matrix)
-    if int(info):
-        return torch.zeros_like(gradient)
-    return -torch.cholesky_solve(gradient.reshape(-1, 1), factor).view_as(gradient)
+    mean = diagonal.mean()
+    for damping in _DAMPINGS:
+        diagonal += damping * mean + torch.finfo(matrix.dtype).tiny
+        factor, info = torch.linalg.cholesky_ex(matrix)
+        if int(info):
+            continue
+        twists = -torch.cholesky_solve(gradient.reshape(-1, 1), factor).view_as(gradient)
+        if bool(twists[:, :3].norm(dim=-1).max() <= farthest):
+            return twists
+    return torch.zeros_like(gradient)
