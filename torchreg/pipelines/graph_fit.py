@@ -13,8 +13,8 @@ from torchreg.geometry.blend_sums import upper_triangles
 from torchreg.geometry.rigid import transform_points
 from torchreg.models.deformation_graph import DeformationGraph
 
-# Relative damping: nodes that carry no match follow their neighbors; alone they stay. More is added where a step goes too
-# far: a piece of the graph that hardly any match holds could turn about it, and fly off along the tangent.
+# Relative damping: nodes that carry no match follow their neighbors; alone they stay. More is added where a step goes
+# too far: a piece of the graph that hardly any match holds could turn about it, and fly off along the tangent.
 _DAMPINGS = (1e-9, 1e-7, 1e-5, 1e-3)
 
 
