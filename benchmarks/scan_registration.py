@@ -115,7 +115,8 @@ def _ablations() -> list[Recipe]:
     plain = tr.RegisterConfig()
     return [
         Recipe("default"),
-        Recipe("with joint term 0.01", config=replace(plain, joint_weight=(0.01, 0.01))),
+        Recipe("without joint term", config=replace(plain, joint_weight=(0.0, 0.0))),
+        Recipe("joints 0.01 all along", config=replace(plain, joint_weight=(0.01, 0.01))),
         Recipe("joints 1 to 0.05", config=replace(plain, joint_weight=(1.0, 0.05))),
         Recipe("without label reuse", config=replace(plain, reuse=False)),
         Recipe("without refinement", config=replace(plain, refine_steps=0)),

@@ -37,4 +37,4 @@ def test_the_weight_of_joints_falls_in_even_ratios():
     # The paper's exp(k ln(0.05) / 5), constant after.
     expected = [math.exp(k * math.log(0.05) / 5) for k in range(6)] + [0.05, 0.05]
     assert weights == pytest.approx(expected)
-    assert RegisterConfig().joint_weight_at(0.5) == 0
+    assert RegisterConfig(joint_weight=(0.0, 0.0)).joint_weight_at(0.5) == 0

@@ -39,7 +39,7 @@ class RegisterConfig:
         reuse: give labels that lost all their cells to the regions that fit worst.
         joint_weight: beta, of the joints against the mean squared distance, in the first and the last round of labels
             and after it, in even ratios between; (1, 0.05) in the paper. It holds bones together where matches do not;
-            the dense alignment does so already, and joints that are no points resist it. Zeros leave it out.
+            the dense alignment does so already, and joints that are no points resist more of it. Zeros leave it out.
         max_distance: of a match, first and last; never below two sampling distances of the target.
         max_angle: between normals of a match, first and last, radians.
         normal_scale: distance that counts as much as normals 60 degrees apart.
@@ -66,11 +66,11 @@ class RegisterConfig:
     label_cost: float = 0.0003
     truncation: float = 4.0
     reuse: bool = True
-    joint_weight: tuple[float, float] = (0.0, 0.0)
+    joint_weight: tuple[float, float] = (0.001, 0.0001)
     max_distance: tuple[float, float] = (0.03, 0.01)
     max_angle: tuple[float, float] = (1.05, 0.52)
     normal_scale: float = 0.025
-    point_to_point: float = 0.1
+    point_to_point: float = 0.01
     unmatched: float = 0.3
     min_matched: float = 0.1
     rtol: float = 0.2
