@@ -12,7 +12,8 @@ diagonal, about the sampling distance, and joints are right within 5 % of the di
 Turned and made larger, both scans of a pair must end where they did: beside each set, "moved" counts that.
 A sequence of the figure and one of the toy are registered together, and beside that chained: adjacent pairs, one after
 the other. The last frame is compared with the first pair, whose motion is the least, and with the mean of the adjacent
-pairs; parts and joints are judged by what moved apart in any frame.
+pairs; parts and joints are judged by what moved apart in any frame. Several sequences, of figures, toys of random forms
+and animals, tell how often the last frame is reached: registered like a pair.
 
     python benchmarks/scan_registration.py --data FOLDER --pairs 189 --ablations --moved --growth --frames 10
 """
@@ -32,7 +33,8 @@ from torch import Tensor
 
 import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import ScanPair, ScanSequence, jointed_toy, walking_figure
+from torchreg.datasets.scan_sequences import ScanPair, ScanSequence, jointed_toy, walking_animal, walking_figure
+from torchreg.datasets.toys import random_toy
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.metrics import adjusted_rand
@@ -286,6 +288,34 @@ def print_sequence(kind: str, sequence: ScanSequence, recipe: Recipe) -> None:
     print(f"parts: adjusted Rand index {rand:.2f}; joints within {JOINT:.0%}: {right:.0%} of {len(joints)}", flush=True)
 
 
+def sequences_of(kind: str, count: int, frames: int) -> Iterator[ScanSequence]:
+    """Yield sequences of one kind with seeds from 0 on; toys are of random forms."""
+    for seed in range(count):
+        if kind == "toy":
+            yield jointed_toy(frames, seed, toy=random_toy(torch.Generator().manual_seed(seed)))
+        else:
+            yield {"figure": walking_figure, "animal": walking_animal}[kind](frames, seed)
+
+
+def print_many_sequences(count: int, frames: int, recipe: Recipe) -> None:
+    """Print mean errors of the first frame's points in all frames and in the last, and how often they are there."""
+    print(f"\n{count} sequences of {frames} frames, registered together")
+    print(f"{'':8s} mean %  last %  frames  last registered")
+    for kind in ("figure", "toy", "animal"):
+        rows = []
+        for sequence in sequences_of(kind, count, frames):
+            found = tr.register_sequence(list(sequence), recipe.bones, recipe.grid, recipe.config)
+            truth = torch.stack([sequence.truth(0, frame) for frame in range(1, frames)])
+            errors = (found.deformed[1:] - truth).norm(dim=-1) / sequence[0].diagonal
+            rows.append((errors.mean(1), (errors < NEAR).double().mean(1) >= REGISTERED))
+        error, there = (torch.stack(each) for each in zip(*rows, strict=True))
+        print(
+            f"{kind:8s} {100 * error.mean():6.2f} {100 * error[:, -1].mean():7.2f} {there.double().mean():7.0%}"
+            f" {int(there[:, -1].sum()):5d} /{count:4d}",
+            flush=True,
+        )
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Print the tables; return 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -298,6 +328,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--frames", type=int, default=0, help="length of a sequence to be registered together, 2 or more"
     )
+    parser.add_argument("--sequences", type=int, default=0, help="of --frames frames, of each kind")
     parser.add_argument("--verbose", action="store_true", help="a line per pair")
     parser.add_argument("--smoke", action="store_true", help="one small pair, for a quick look")
     options = parser.parse_args(arguments)
@@ -307,6 +338,7 @@ def main(arguments: list[str] | None = None) -> int:
         print_set("toy", toys, small, options.verbose)
         print_set("toy, moved", [moved(toy) for toy in toys], small, options.verbose)
         print_sequence("figure", walking_figure(2, scanner=DepthScanner(num_points=600)), small[0])
+        print_many_sequences(1, 2, small[0])
         return 0
     sets: dict[str, list[Problem]] = {}
     if options.data is None or not options.data.is_dir():
@@ -326,6 +358,8 @@ def main(arguments: list[str] | None = None) -> int:
     if options.frames:
         print_sequence("figure", walking_figure(options.frames), Recipe("default"))
         print_sequence("toy", jointed_toy(options.frames), Recipe("default"))
+        if options.sequences:
+            print_many_sequences(options.sequences, options.frames, Recipe("default"))
     if options.growth:
         for count in (2000, 5000, 10_000, 20_000, 50_000, 100_000):
             print_set(f"figure, {count} points", list(made_up_problems("figure", 1, count)), _ablations()[:1])

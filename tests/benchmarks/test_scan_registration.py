@@ -45,6 +45,7 @@ def test_tables_are_printed_for_files_and_without(benchmark, problem, capsys, tm
     assert "toy, moved" in printed
     assert "last over the first" in printed
     assert "last over the mean pair" in printed
+    assert "animal" in printed.split("last registered")[1]
     np.savez(
         tmp_path / "one.npz", source_points=problem.source.points, source_faces=problem.source.faces,
         target_points=problem.target.points, target_faces=problem.target.faces, source_truth=problem.truth,

@@ -30,8 +30,9 @@ from torchreg.pipelines.scan_unit import ScanUnit
 from torchreg.pipelines.threads import one_thread
 from torchreg.results.scans import SequenceRegistration
 
-# From frame to frame few large bones carry the reference: what many small ones take over from noise adds up.
-_CARRIED_LABEL_COST, _CARRIED_SMOOTHNESS = 0.002, 0.2
+# From frame to frame few large bones carry the reference: what many small ones take over from noise adds up, and so
+# does what slides along the surface.
+_CARRIED_LABEL_COST, _CARRIED_SMOOTHNESS, _CARRIED_POINT_TO_POINT = 0.002, 0.2, 0.1
 # Share of its last step by which a point is expected to move on: hidden limbs would run away with the whole.
 _GOES_ON = 0.5
 
@@ -93,6 +94,7 @@ def register_sequence(
         config,
         label_cost=max(config.label_cost, _CARRIED_LABEL_COST),
         smoothness=max(config.smoothness, _CARRIED_SMOOTHNESS),
+        point_to_point=max(config.point_to_point, _CARRIED_POINT_TO_POINT),
     )
     moved, confidence = _chain(scans, reference, num_bones, grid_resolution, few, generator, on_step)
     scan = unit.of_scan(source)

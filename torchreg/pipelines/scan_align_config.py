@@ -206,7 +206,7 @@ class ChoiceConfig:
     bend: float = 20.0
     slack: float = 1e-3
     strain: float = 2.5
-    leap: float = 1.0
+    leap: float = 3.0
     leap_cap: float = 0.1
     same: float = 0.005
     same_share: float = 0.95
