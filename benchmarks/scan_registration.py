@@ -15,7 +15,8 @@ the other. The last frame is compared with the first pair, whose motion is the l
 pairs; parts and joints are judged by what moved apart in any frame. Several sequences, of figures, toys of random forms
 and animals, tell how often the last frame is reached: registered like a pair.
 
-    python benchmarks/scan_registration.py --data FOLDER --pairs 189 --ablations --moved --growth --frames 10
+    python benchmarks/scan_registration.py --data FOLDER --pairs 189 --ablations --moved --growth
+    python benchmarks/scan_registration.py --pairs 0 --frames 10 --sequences 6
 """
 
 from __future__ import annotations
@@ -332,6 +333,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--verbose", action="store_true", help="a line per pair")
     parser.add_argument("--smoke", action="store_true", help="one small pair, for a quick look")
     options = parser.parse_args(arguments)
+    if options.sequences and not options.frames:
+        parser.error("--sequences needs --frames, how long they are")
     if options.smoke:
         small = [Recipe("default", 6, 20, tr.RegisterConfig(num_samples=500))]
         toys = list(made_up_problems("toy", 1, 600))

@@ -38,6 +38,12 @@ def test_moved_problems_are_the_same_a_hundred_times_as_large(benchmark, problem
     assert moved.pair is None
 
 
+def test_sequences_without_a_length_are_refused(benchmark, capsys):
+    with pytest.raises(SystemExit):
+        benchmark.main(["--sequences", "2"])
+    assert "--sequences needs --frames" in capsys.readouterr().err
+
+
 def test_tables_are_printed_for_files_and_without(benchmark, problem, capsys, tmp_path, monkeypatch):
     assert benchmark.main(["--smoke", "--verbose"]) == 0
     printed = capsys.readouterr().out

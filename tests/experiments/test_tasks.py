@@ -34,6 +34,11 @@ def bench(tmp_path):
     return Bench("cpu", tmp_path)
 
 
+def test_a_plain_registration_trial_has_the_library_s_own_settings():
+    assert registration._settings(RegistrationTrial()) == tr.RegisterConfig()
+    assert registration._settings(RegistrationTrial(joint_weight=0.0)).joint_weight == (0.0, 0.0)
+
+
 def test_all_tasks_can_be_loaded():
     assert all(callable(task.load()) for task in TASKS.values())
 

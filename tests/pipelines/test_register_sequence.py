@@ -2,6 +2,7 @@
 
 import math
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -78,6 +79,19 @@ def test_points_are_expected_to_go_on_as_they_went(toy, monkeypatch):
     # Towards earlier frames, against the way that later ones were reached.
     assert torch.equal(third, first)
     torch.testing.assert_close(back, first - 0.5 * (second - first))
+
+
+@pytest.mark.parametrize(("given", "carried"), [(0.01, 0.1), (0.5, 0.5)])
+def test_what_is_carried_is_held_along_the_surface(toy, monkeypatch, given, carried):
+    shares = []
+
+    def watched(source, target, num_bones, grid_resolution, config, generator, **start):
+        shares.append(config.point_to_point)
+        return tr.register(source, target, num_bones, grid_resolution, config, generator, **start)
+
+    monkeypatch.setattr(sys.modules[register_sequence.__module__], "register", watched)
+    register_sequence([toy[0], toy[1]], 8, 30, replace(QUICK, point_to_point=given))
+    assert shares == [carried]
 
 
 def test_bad_arguments_are_refused_by_name(toy):
