@@ -58,6 +58,66 @@ def test_the_w_step_finds_borders_and_its_energy_is_as_defined(bar):
     assert energy == pytest.approx(float(distance + 0.2 * borders + 4.0 * 3), rel=1e-6)
 
 
+def test_seams_cost_what_two_bones_tear_apart_up_to_a_cap(bar):
+    data, moved, weights, _, motions = bar
+    frames = torch.cat([data.points[None], moved])
+    both = torch.stack([torch.eye(4, dtype=torch.float64).expand(3, 4, 4), motions])
+    pull = Pull(frames, None, weights.expand(2, -1))
+    start = (data.grid.cell_centers()[:, 0] > 3).long()
+    spacing, pairs = data.grid.spacing, data.grid.neighbors()
+    plain, seamed = (LabelCosts(0.2, 4.0, 4.0, seam=seam, seam_cap=0.5) for seam in (0.0, 0.3))
+    labels, energy = relabel(data, pull, both, start, seamed)
+    centers, seams = data.grid.cell_centers(), 0.0
+    for one, other in pairs[labels[pairs[:, 0]] != labels[pairs[:, 1]]].tolist():
+        middle = 0.5 * (centers[one] + centers[other])
+        gaps = [
+            motion[labels[one], :3] @ torch.cat([middle, torch.ones(1).double()])
+            - motion[labels[other], :3] @ torch.cat([middle, torch.ones(1).double()])
+            for motion in both
+        ]
+        apart = torch.stack(gaps).square().sum(-1).mean().sqrt() / spacing
+        seams += 0.3 * min(float(apart), 0.5)
+    own = both[:, labels[data.cell], :3, :3] @ data.points[..., None]
+    squares = (own[..., 0] + both[:, labels[data.cell], :3, 3] - frames).square().sum(-1)
+    distance = data.grid.num_cells * squares.clamp(max=(4 * spacing) ** 2).mean() / spacing**2
+    borders = (labels[pairs[:, 0]] != labels[pairs[:, 1]]).sum()
+    expected = float(distance) + 0.2 * float(borders) + 4.0 * len(labels.unique()) + seams
+    assert energy == pytest.approx(expected, rel=1e-6)
+    assert seams > 0
+    assert relabel(data, pull, both, start, plain)[1] < energy
+
+
+def test_seams_draw_borders_to_the_joints(bar):
+    data, moved, weights, part, motions = bar
+    generator = torch.Generator().manual_seed(1)
+    start = torch.zeros(data.grid.num_cells, dtype=torch.int64)
+    wrong = {0.0: 0.0, 0.5: 0.0}
+    for _ in range(3):
+        pull = Pull(moved + 0.1 * torch.randn(moved.shape, generator=generator, dtype=torch.float64), None, weights)
+        for seam in wrong:
+            labels, _ = relabel(data, pull, motions[None], start, LabelCosts(0.02, 4.0, 4.0, seam=seam))
+            wrong[seam] += float((labels[data.cell] != part).double().mean())
+    assert wrong[0.5] < 0.75 * wrong[0.0]
+
+
+def test_what_merely_touches_can_part():
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(3000, 3, generator=generator, dtype=torch.float64) * torch.tensor([6.0, 1.0, 0.3])
+    lower = (points[:, 1] < 0.5).long()
+    motions = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    motions[1, 1, 3] = -0.4
+    moved = transform_points(motions[lower], points[:, None])[:, 0]
+    data = CellData(SparseGrid.from_points(points, 40), points, 60)
+    weights = torch.ones(1, len(points), dtype=torch.float64)
+    start = torch.zeros(data.grid.num_cells, dtype=torch.int64)
+    labels, _ = relabel(
+        data, Pull(moved[None], None, weights), motions[None], start, LabelCosts(0.02, 4.0, 4.0, seam=0.2)
+    )
+    assert float(adjusted_rand(labels[data.cell], lower)) > 0.8
+    stuck = LabelCosts(0.02, 4.0, 4.0, seam=50.0, seam_cap=20.0)
+    assert len(relabel(data, Pull(moved[None], None, weights), motions[None], start, stuck)[0].unique()) == 1
+
+
 def test_labels_that_cost_too_much_are_not_used(bar):
     data, moved, weights, _, motions = bar
     start = torch.zeros(data.grid.num_cells, dtype=torch.int64)

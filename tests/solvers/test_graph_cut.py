@@ -1,5 +1,6 @@
 """Graph cuts: cuts and labelings against trying them all and linear programs, ties, roundings, refusals."""
 
+import math
 from itertools import product
 
 import numpy as np
@@ -36,10 +37,13 @@ def cut_cost(side, source, sink, edges, capacities, reverse):
     return total
 
 
-def energy_of(labels, unary, edges, weights, metric, label_costs):
+def energy_of(labels, unary, edges, weights, metric, label_costs, places=None, place_weights=None):
     """Return the energy of a labeling, from the definition."""
     total = sum(float(unary[i, label]) for i, label in enumerate(labels))
     total += sum(w * metric[labels[i]][labels[j]] for (i, j), w in zip(edges.tolist(), weights.tolist(), strict=True))
+    if places is not None:
+        for (i, j), table, t in zip(edges.tolist(), places.tolist(), place_weights.tolist(), strict=True):
+            total += t * min(math.dist(table[labels[i]], table[labels[j]]), 1.0)
     return total + sum(float(label_costs[label]) for label in set(labels))
 
 
@@ -51,6 +55,12 @@ def labeling_problem(seed, num_nodes=6, num_labels=3, num_edges=9):
     edges, generator = random_graph(seed, num_nodes, num_edges)
     unary = torch.rand(num_nodes, num_labels, generator=generator, dtype=torch.float64)
     return unary, edges, torch.rand(len(edges), generator=generator, dtype=torch.float64)
+
+
+def seam_problem(edges, num_labels, generator):
+    """Return places whose distances are partly below and partly above one, and weights."""
+    places = 1.2 * torch.rand(len(edges), num_labels, 2, generator=generator, dtype=torch.float64)
+    return {"places": places, "place_weights": torch.rand(len(edges), generator=generator, dtype=torch.float64)}
 
 
 @given(SEEDS, st.integers(1, 7), st.sampled_from([1.0, 1e-6, 1e9]))
@@ -148,29 +158,36 @@ def test_a_flow_that_differs_from_the_cut_is_an_error(monkeypatch):
         min_cut(torch.tensor([1.0, 0.0]), torch.tensor([0.0, 0.9]), EDGES[:1], 4 * HALF[:1], 4 * HALF[:1])
 
 
-@given(SEEDS, st.booleans(), st.booleans())
-@example(237, False, True)  # leaves open nodes that nothing holds on either side
+@given(SEEDS, st.booleans(), st.booleans(), st.booleans())
+@example(237, False, True, False)  # leaves open nodes that nothing holds on either side
 @settings(max_examples=60, deadline=None)
-def test_no_expansion_of_any_label_lowers_the_energy_and_the_bound_holds(seed, general, costly):
+def test_no_expansion_of_any_label_lowers_the_energy_and_the_bound_holds(seed, general, costly, seams):
     unary, edges, weights = labeling_problem(seed)
     generator = torch.Generator().manual_seed(seed)
     places = torch.rand(3, 2, generator=generator, dtype=torch.float64)
     metric = torch.cdist(places, places) if general else 1 - torch.eye(3, dtype=torch.float64)
     costs = torch.rand(3, generator=generator, dtype=torch.float64) if costly else torch.zeros(3)
+    given_seams = seam_problem(edges, 3, generator) if seams else {}
     result = alpha_expansion(
-        unary, edges, weights, metric=metric if general else None, label_costs=costs if costly else None
+        unary,
+        edges,
+        weights,
+        metric=metric if general else None,
+        label_costs=costs if costly else None,
+        **given_seams,
     )
-    table, labels = metric.tolist(), result.labels.tolist()
+    problem = (unary, edges, weights, metric.tolist(), costs, *given_seams.values())
+    labels = result.labels.tolist()
     assert result.converged
-    assert result.energy == pytest.approx(energy_of(labels, unary, edges, weights, table, costs), rel=1e-12)
-    least = min(energy_of(f, unary, edges, weights, table, costs) for f in product(range(3), repeat=6))
-    if not costly:
+    assert result.energy == pytest.approx(energy_of(labels, *problem), rel=1e-12)
+    least = min(energy_of(f, *problem) for f in product(range(3), repeat=6))
+    if not costly and not seams:
         apart = metric[~torch.eye(3, dtype=torch.bool)]
         assert result.energy <= 2 * float(apart.max() / apart.min()) * least
     for alpha in range(3):
         for moves in product([False, True], repeat=6):
             moved = [alpha if move else label for move, label in zip(moves, labels, strict=True)]
-            assert energy_of(moved, unary, edges, weights, table, costs) >= result.energy - 1e-7
+            assert energy_of(moved, *problem) >= result.energy - 1e-7
 
 
 @given(SEEDS)
@@ -241,6 +258,35 @@ def test_strong_smoothness_and_label_costs_leave_one_label():
     assert lone.labels.tolist() == [best] * 6
 
 
+def test_seams_depend_on_distances_alone_and_are_potts_beyond_one():
+    unary, edges, weights = labeling_problem(5, num_nodes=40, num_labels=4, num_edges=120)
+    seams = seam_problem(edges, 4, torch.Generator().manual_seed(3))
+    plain = alpha_expansion(unary, edges, 0.1 * weights, **seams)
+    turn = torch.tensor([[0.6, -0.8], [0.8, 0.6]], dtype=torch.float64)
+    moved = alpha_expansion(unary, edges, 0.1 * weights, **(seams | {"places": seams["places"] @ turn + 7.0}))
+    assert torch.equal(moved.labels, plain.labels)
+    assert moved.energy == pytest.approx(plain.energy)
+    far = 5.0 * torch.arange(4, dtype=torch.float64)[None, :, None].expand(120, 4, 1)
+    potts_alone = alpha_expansion(unary, edges, 0.1 * weights + 0.2)
+    apart = alpha_expansion(unary, edges, 0.1 * weights, places=far, place_weights=torch.full((120,), 0.2))
+    assert torch.equal(apart.labels, potts_alone.labels)
+    assert apart.energy == pytest.approx(potts_alone.energy)
+    ones = alpha_expansion(unary, edges, weights, places=far, place_weights=torch.ones(120))
+    assert alpha_expansion(unary, edges, weights, places=far).energy == ones.energy
+
+
+def test_a_seam_runs_where_labels_agree():
+    # A chain whose ends want different labels, and whose middle does not care.
+    unary = torch.full((9, 2), 1.0)
+    unary[0, 0] = unary[8, 1] = -9.0
+    edges = torch.stack([torch.arange(8), torch.arange(1, 9)], dim=1)
+    for agree in (0, 3, 7):
+        places = torch.zeros(8, 2, 3)
+        places[:, 1, 0] = 0.1 + 0.1 * (torch.arange(8) - agree).abs()
+        labels = alpha_expansion(unary, edges, torch.full((8,), 0.01), places=places).labels
+        assert labels.tolist() == [0] * (agree + 1) + [1] * (8 - agree)
+
+
 def test_a_grid_of_5000_nodes_finds_its_noisy_regions():
     generator = torch.Generator().manual_seed(0)
     index = torch.arange(4970).reshape(70, 71)
@@ -285,6 +331,10 @@ def test_what_is_given_stays_as_it_was_and_dtypes_do_not_matter():
         ({"metric": torch.zeros(3, 3)}, InputError, r"metric must have shape \(2, 2\)"),
         ({"metric": torch.ones(2, 2)}, InputError, "zero on the diagonal"),
         ({"metric": torch.tensor([[0.0, 1.0], [2.0, 0.0]])}, InputError, "symmetric"),
+        ({"places": torch.zeros(2, 3, 1)}, InputError, r"places must have shape \(2, 2, D\)"),
+        ({"places": torch.full((2, 2, 1), torch.nan)}, InputError, "places must be finite"),
+        ({"places": torch.zeros(2, 2, 1), "place_weights": -HALF}, InputError, "place_weights must not be negative"),
+        ({"place_weights": HALF}, InputError, "place_weights are those of places"),
         ({"initial": torch.zeros(3)}, InputTypeError, "initial must hold integers"),
         ({"initial": torch.full((3,), 2)}, InputError, "initial must name labels 0 to 1, got 2 to 2"),
         ({"initial": torch.zeros(2, dtype=torch.long)}, InputError, r"initial must have shape \(3\)"),

@@ -17,7 +17,8 @@ from torchreg.solvers.rigid_parts import merge_rigid
 
 # Pieces of a scan that come this near, in cells, belong together: holes of scans cut limbs in two.
 _GAP = 3.0
-_MAX_SWEEPS = 3
+# Rounds of labels and motions take turns anyway.
+_MAX_SWEEPS = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +72,15 @@ class LabelCosts:
         smoothness: mu, of two neighboring cells with different labels.
         label: of each label in use: the number of bones is a cap, not a goal.
         truncation: no sample is farther off than this, in cells.
+        seam: of two neighboring cells with different labels, per cell by which these take the side between them apart,
+        seam_cap: up to this many cells.
     """
 
     smoothness: float
     label: float
     truncation: float
+    seam: float = 0.0
+    seam_cap: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -138,8 +143,11 @@ def first_labels(data: CellData, moved: Tensor, weights: Tensor, num_bones: int,
 def relabel(data: CellData, pull: Pull, transforms: Tensor, labels: Tensor, costs: LabelCosts) -> tuple[Tensor, float]:
     """Return labels (C,) of least distance, smooth and few: the W-step; and the energy.
 
-    ``sum_C W(C, f_C) + mu sum_{(C, D)} [f_C != f_D] + h |used labels|`` with W the sum of truncated squared distances
-    of the cell's samples under the motion of a bone, in all frames; correspondences stay while labels change.
+    ``sum_C W(C, f_C) + sum_{(C, D)} (mu [f_C != f_D] + nu min(|T_{f_C} x_CD - T_{f_D} x_CD|, cap)) + h |used labels|``
+    with W the sum of truncated squared distances of the cell's samples under the motion of a bone, in all frames, and
+    x_CD in the middle between two cells; correspondences stay while labels change. Near a joint both bones move a
+    sample alike, so that distances alone cut anywhere there: unlike in the paper, a cut where two bones would tear the
+    surface apart costs more, so that it passes through the joint. Where parts touch that are not joined this is capped.
 
     Args:
         data: the grid and its samples.
@@ -155,15 +163,28 @@ def relabel(data: CellData, pull: Pull, transforms: Tensor, labels: Tensor, cost
     share = data.scale(pull.weights) * pull.weights
     per_sample = (share.unsqueeze(1) * squares.clamp(max=(costs.truncation * grid.spacing) ** 2)).sum(0)
     unary = squares.new_zeros(grid.num_cells, size).index_add(0, data.cell, per_sample.mT)
+    count = len(data.neighbors)
     found = alpha_expansion(
         unary,
         data.neighbors,
-        unary.new_full((len(data.neighbors),), costs.smoothness),
+        unary.new_full((count,), costs.smoothness),
+        places=None if costs.seam == 0 else _seam_places(data, transforms, costs.seam_cap),
+        place_weights=None if costs.seam == 0 else unary.new_full((count,), costs.seam * costs.seam_cap),
         label_costs=unary.new_full((size,), costs.label),
         initial=labels,
         max_sweeps=_MAX_SWEEPS,
     )
     return found.labels, found.energy
+
+
+def _seam_places(data: CellData, transforms: Tensor, cap: float) -> Tensor:
+    """Return where motions (F, B, 4, 4) take the middles between neighboring cells, (A, B, 3 F), in caps.
+
+    Distances between them are root mean squares over the frames.
+    """
+    middles = data.grid.cell_centers()[data.neighbors].mean(1)
+    places = transform_points(transforms, middles) / (cap * data.grid.spacing * len(transforms) ** 0.5)
+    return places.permute(2, 1, 0, 3).flatten(2)
 
 
 def reuse_labels(data: CellData, pull: Pull, labels: Tensor, num_bones: int, costs: LabelCosts) -> Tensor:

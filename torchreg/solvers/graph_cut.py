@@ -111,23 +111,31 @@ def alpha_expansion(
     weights: Tensor,
     *,
     metric: Tensor | None = None,
+    places: Tensor | None = None,
+    place_weights: Tensor | None = None,
     label_costs: Tensor | None = None,
     initial: Tensor | None = None,
     max_sweeps: int = 20,
     generator: torch.Generator | None = None,
 ) -> Labeling:
-    """Return labels that lower ``sum_i U_i(f_i) + sum_ij w_ij V(f_i, f_j) + sum_l h_l [l is used]``.
+    """Return labels that lower ``sum_i U_i(f_i) + sum_ij V_ij(f_i, f_j) + sum_l h_l [l is used]``.
+
+    ``V_ij(a, b) = w_ij V(a, b) + t_ij min(|p_ij(a) - p_ij(b)|, 1)``: what all edges have in common, and how far apart
+    two labels take a place on the edge, as seams between pictures are judged.
 
     Each move lets every node keep its label or take one label, alpha, in the best way, by a minimum cut. Labels take
     turns until none of them brings the energy down; it never rises. Two labels end in the least energy, to the rounding
-    of `min_cut`; more labels, without label costs and with ``U >= 0``, within ``2 max V / min V`` times the least (V of
-    different labels; 2 for Potts).
+    of `min_cut`; more labels, without label costs and with ``U >= 0``, within ``2 max V_ij / min V_ij`` times the least
+    (of different labels, at the edge where that is most; 2 for Potts).
 
     Args:
         unary: (N, L) U.
         edges: (E, 2) integers, pairs of nodes, each pair once.
         weights: (E,) w, not negative.
         metric: (L, L) V, a metric; 1 for different labels (Potts) by default.
+        places: (E, L, D) p, where each label takes a place on the edge, in units of the distance up to which they
+            count; without them that is left out.
+        place_weights: (E,) t, not negative; ones by default.
         label_costs: (L,) h, not negative; zero by default.
         initial: (N,) labels to start from; the least U of each node by default.
         max_sweeps: most rounds in which every label has its turn.
@@ -144,7 +152,8 @@ def alpha_expansion(
 
     Cost: one minimum cut per label and sweep; labels are skipped while nothing changed since their last turn.
 
-    References: Boykov, Veksler and Zabih 2001; Kolmogorov and Zabih 2004; Delong et al. 2012 for label costs.
+    References: Boykov, Veksler and Zabih 2001; Kolmogorov and Zabih 2004; Delong et al. 2012 for label costs; Kwatra
+    et al. 2003 for seams.
     """
     unary = as_float_tensor(unary, "unary")
     check_shape(unary, "unary", ("N", "L"))
@@ -160,9 +169,25 @@ def alpha_expansion(
         _not_negative(weights, "weights", ("E",), len(pairs)),
         _metric(metric, num_labels),
         np.zeros(num_labels) if label_costs is None else _not_negative(label_costs, "label_costs", ("L",), num_labels),
+        _seams(places, place_weights, len(pairs), num_labels),
     )
     labels = energy.unary.argmin(1) if initial is None else _initial(initial, num_nodes, num_labels)
     return _sweep(energy, labels, max_sweeps, generator, unary.device)
+
+
+@dataclass(frozen=True)
+class _Seams:
+    """What it costs that two labels take the place on an edge apart."""
+
+    places: Floats
+    weights: Floats
+
+    def __call__(self, first: Integers, second: Integers) -> Floats:
+        """Return the costs (E,) of labels (E,) at the first and the second ends of the edges."""
+        every = np.arange(len(self.places))
+        offset = self.places[every, first] - self.places[every, second]
+        costs: Floats = self.weights * np.minimum(np.sqrt(np.einsum("ed,ed->e", offset, offset)), 1.0)
+        return costs
 
 
 @dataclass(frozen=True)
@@ -174,20 +199,21 @@ class _Energy:
     weights: Floats
     metric: Floats
     label_costs: Floats
+    seams: _Seams | None = None
 
     def __call__(self, labels: Integers) -> float:
         """Return the energy of labels (N,)."""
         first, second = labels[self.edges].T
         used = np.bincount(labels, minlength=len(self.label_costs)) > 0
-        smooth = (self.weights * self.metric[first, second]).sum()
+        smooth = self._between(first, second).sum()
         return float(self.unary[np.arange(len(labels)), labels].sum() + smooth + self.label_costs[used].sum())
 
     def expanded(self, labels: Integers, alpha: int) -> Integers:
         """Return the labels after the best move that gives ``alpha`` to any set of nodes, to the cut's rounding."""
         first, second = labels[self.edges].T
-        stay = self.weights * self.metric[first, second]
-        second_moves = self.weights * self.metric[first, alpha]
-        first_moves = self.weights * self.metric[alpha, second]
+        all_alpha = np.full_like(first, alpha)
+        stay, second_moves = self._between(first, second), self._between(first, all_alpha)
+        first_moves = self._between(all_alpha, second)
         # Splitting the excess evenly over both directions leaves the least for the terminals to carry.
         arc = 0.5 * np.maximum(second_moves + first_moves - stay, 0.0)
         num_nodes = len(labels)
@@ -202,6 +228,11 @@ class _Energy:
             np.concatenate([arc, np.zeros_like(extra_arcs)]),
         )
         return np.where(moved[:num_nodes], alpha, labels)
+
+    def _between(self, first: Integers, second: Integers) -> Floats:
+        """Return what labels (E,) at the first and the second ends of the edges cost."""
+        costs: Floats = self.weights * self.metric[first, second]
+        return costs if self.seams is None else costs + self.seams(first, second)
 
     def _label_nodes(self, labels: Integers, alpha: int) -> tuple[Floats, Integers, Floats]:
         """Return terminal costs, edges and arcs of one more node per label whose cost a move can save or incur.
@@ -352,6 +383,21 @@ def _not_negative(values: Any, name: str, shape: tuple[str], size: int) -> Float
         raise InputError(f"{name} must not be negative, got {float(values.min())}")
     array: Floats = values.detach().cpu().double().numpy()
     return array
+
+
+def _seams(places: Any, weights: Any, num_edges: int, num_labels: int) -> _Seams | None:
+    """Return the checked costs of places (E, L, D), if there are any."""
+    if places is None:
+        if weights is not None:
+            raise InputError("place_weights are those of places; give both or neither")
+        return None
+    places = as_float_tensor(places, "places")
+    check_shape(places, "places", (num_edges, num_labels, "D"))
+    check_finite(places, "places")
+    table: Floats = places.detach().cpu().double().numpy()
+    if weights is None:
+        return _Seams(table, np.ones(num_edges))
+    return _Seams(table, _not_negative(weights, "place_weights", ("E",), num_edges))
 
 
 def _metric(metric: Any, num_labels: int) -> Floats:
