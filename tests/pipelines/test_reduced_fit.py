@@ -7,6 +7,8 @@ import torch
 
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
+from torchreg.geometry.range_scan import RangeScan
+from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.sparse_grid import SparseGrid
 from torchreg.pipelines import reduced_fit
 from torchreg.pipelines.bone_labels import CellData
@@ -89,6 +91,58 @@ def test_joints_count_less_from_round_to_round(toy, monkeypatch):
     assert weights[:2] == pytest.approx([1.0, 0.05**0.5])
     assert weights == sorted(weights, reverse=True)
     assert weights[-2:] == pytest.approx([0.05, 0.05])
+
+
+@pytest.fixture(scope="module")
+def rod():
+    """A round rod whose second half bends, and was twisted by a wrong alignment: points, normals, bent, and twisted."""
+    generator = torch.Generator().manual_seed(0)
+    along, around = torch.rand(2, 4000, generator=generator, dtype=torch.float64)
+    along, around = along - 0.5, 2 * torch.pi * around
+    sides = torch.stack([0 * around, around.cos(), around.sin()], dim=-1)
+    points = 0.1 * sides
+    points[:, 0] = along
+    bend, twist = (so3_exp(torch.tensor(axis).double()) for axis in ([0.0, 0.0, 0.4], [0.3, 0.0, 0.0]))
+    end = along > 0
+    bent = torch.where(end[:, None], points @ bend.mT, points)
+    twisted = torch.where(end[:, None], points @ twist.mT @ bend.mT, points)
+    turned = torch.where(end[:, None], sides @ bend.mT, sides)
+    return points, sides, RangeScan(bent, normals=turned), twisted, bend
+
+
+@pytest.mark.parametrize(("weight", "least", "most"), [(0.0, 0.25, 0.35), (1e-4, 0.0, 0.06)])
+def test_bones_do_not_twist_unseen_but_bend_as_seen(rod, weight, least, most):
+    points, normals, target, twisted, bend = rod
+    data = CellData(SparseGrid.from_points(points, 30), points, 60)
+    samples = Samples(points, normals, twisted[None], torch.ones(1, len(points), dtype=torch.float64))
+    labels = (data.grid.cell_centers()[:, 0] > 0).long()
+    config = RegisterConfig(joint_weight=(1e-4, 1e-4), turn_weight=weight, turn_scale=10.0)
+    reduced = ReducedFit(data, samples, (target,), 2, config, labels=labels)
+    for _ in range(8):
+        reduced.update_matches(0.5)
+        reduced.solve_motions()
+    still, moving = reduced.model.transforms.detach()[0, :, :3, :3]
+    left = so3_log(bend.mT @ still.mT @ moving)
+    assert least < float(left[0].abs()) < most
+    assert float(left[1:].norm()) < 0.07
+
+
+def test_turns_count_less_the_wider_they_are_and_not_without_joints(toy, monkeypatch):
+    spreads, solve = [], reduced_fit.fit_bones
+
+    def noted(problem, *args, **kwargs):
+        spreads.append(None if problem.moments is None else problem.moments.spread)
+        return solve(problem, *args, **kwargs)
+
+    monkeypatch.setattr(reduced_fit, "fit_bones", noted)
+    for settings in ({"turn_scale": 1e-3}, {"turn_scale": 1e3}, {"turn_weight": 0.0}, {"joint_weight": (0.0, 0.0)}):
+        fit(toy[1], config=RegisterConfig(**settings))[0].solve_motions()
+    narrow, wide, none, without = spreads
+    assert without is None
+    assert not none.any()
+    whole = 0.5 * RegisterConfig().turn_weight / RegisterConfig().joint_weight[0]
+    torch.testing.assert_close(wide, (whole * torch.eye(3).double()).expand_as(wide), rtol=1e-4, atol=0.0)
+    assert (narrow.diagonal(dim1=-2, dim2=-1) < 0.01 * whole).any()
 
 
 @pytest.mark.parametrize("settings", [{"reuse": False}, {"refine_steps": 0}, {"blend": "dual_quaternion"}])

@@ -16,6 +16,7 @@ from torchreg.pipelines.register_config import RegisterConfig
         ("joint_weight", (-1.0, -1.0)), ("joint_weight", (1.0, 0.0)), ("joint_weight", (1.0,)), ("rtol", -1.0),
         ("point_to_point", 2.0), ("point_to_point", 0.0), ("min_matched", 1.5), ("max_distance", (0.1,)),
         ("max_distance", (0.1, 0.0)), ("max_angle", (4.0, 1.0)), ("blend", "cubic"),
+        ("seam", -1.0), ("seam_cap", 0.0), ("turn_weight", -1.0), ("turn_scale", 0.0),
     ],
 )  # fmt: skip
 def test_what_is_out_of_range_is_refused_by_name(name, value):

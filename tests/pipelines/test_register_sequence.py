@@ -12,10 +12,13 @@ from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.neighbors import nearest_neighbor
+from torchreg.pipelines.reduced_fit import ReducedFit
+from torchreg.pipelines.register import source_samples
 from torchreg.pipelines.register_config import RegisterConfig
 from torchreg.pipelines.register_sequence import register_sequence
 from torchreg.pipelines.scan_align_config import ScanAlignConfig
 from torchreg.pipelines.scan_alignment import align_scans
+from torchreg.pipelines.scan_unit import ScanUnit
 
 QUICK = RegisterConfig(align=ScanAlignConfig(num_samples=300, num_target_samples=400), num_samples=500)
 
@@ -90,8 +93,32 @@ def test_what_is_carried_is_held_along_the_surface(toy, monkeypatch, given, carr
         return tr.register(source, target, num_bones, grid_resolution, config, generator, **start)
 
     monkeypatch.setattr(sys.modules[register_sequence.__module__], "register", watched)
-    register_sequence([toy[0], toy[1]], 8, 30, replace(QUICK, point_to_point=given))
+    register_sequence([toy[0], toy[1], toy[2]], 8, 30, replace(QUICK, point_to_point=given))
     assert shares == [carried]
+
+
+@pytest.mark.parametrize(("given", "held"), [(0.1, 0.5), (2.0, 2.0)])
+def test_all_frames_are_fitted_to_the_dense_alignments_and_hold_wide_turns(toy, monkeypatch, given, held):
+    module, reached, fits = sys.modules[register_sequence.__module__], [], []
+
+    def aligned(*arguments, **options):
+        reached.append(align_scans(*arguments, **options))
+        return reached[-1]
+
+    class Watched(ReducedFit):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            fits.append(self)
+
+    monkeypatch.setattr(module, "align_scans", aligned)
+    monkeypatch.setattr(module, "ReducedFit", Watched)
+    config = replace(QUICK, turn_scale=given)
+    register_sequence([toy[0], toy[1], toy[2]], 8, 30, config)
+    assert fits[0].config.turn_scale == held
+    index = source_samples(toy[0], config, None)
+    unit = ScanUnit.of(toy[0].points[index])
+    expected = torch.stack([unit.of_points(points)[index] for points in (toy[0].points, *(r.points for r in reached))])
+    torch.testing.assert_close(fits[0].samples.moved, expected)
 
 
 def test_bad_arguments_are_refused_by_name(toy):

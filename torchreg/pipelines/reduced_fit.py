@@ -82,7 +82,7 @@ class ReducedFit:
         self.matchers = [CompatibleMatcher(target, config.normal_scale) for target in targets]
         self.pull = Pull(samples.moved, None, samples.confidence)
         per_label = data.grid.num_cells * (config.label_cost / data.grid.spacing) ** 2
-        self._costs = LabelCosts(config.smoothness, per_label, config.truncation)
+        self._costs = LabelCosts(config.smoothness, per_label, config.truncation, config.seam, config.seam_cap)
         if labels is None:
             labels = first_labels(data, samples.moved, samples.confidence, num_bones, self._costs)
         self.labels = labels
@@ -139,7 +139,7 @@ class ReducedFit:
             pull.normals,
             pull.weights,
             pull.point_to_point,
-            moments=self._joints(),
+            moments=self._turning(self._joints()),
             joint_weight=self._joint_weight,
             blend=self.config.blend,
         )
@@ -215,6 +215,17 @@ class ReducedFit:
         moments = self.model.joint_moments()
         centers = self.model.joints_of(moments).centers.detach()
         return JointMoments(moments.pairs, moments.mass, centers, torch.zeros_like(moments.spread))
+
+    def _turning(self, joints: JointMoments | None) -> JointMoments | None:
+        """Return the joints with a spread that makes bones pay a little for turning against each other."""
+        if joints is None:
+            return None
+        first, second = self.model.transforms.detach()[..., :3, :3][..., joints.pairs.mT, :, :].unbind(-4)
+        # The squared norm is about twice the squared angle, that of a small spread's misses.
+        turns = 0.5 * (first - second).square().sum((-1, -2)).flatten(0, -2).mean(0)
+        weight = 0.5 * self.config.turn_weight / (1 + turns / self.config.turn_scale**2)
+        identity = torch.eye(3, dtype=weight.dtype, device=weight.device)
+        return replace(joints, spread=(weight / self._joint_weight)[:, None, None] * identity)
 
     def _report(self, stage: str, step: int, num_steps: int) -> None:
         with torch.no_grad():

@@ -33,13 +33,19 @@ class RegisterConfig:
         refine_steps: rounds of refining weights, T-step and correspondences.
         motion_steps: most linear systems of a T-step.
         smoothness: mu of the W-step: of neighboring cells with different labels, in squared cells.
+        seam: what it costs there that these labels take the side between the cells apart, per cell,
+        seam_cap: up to this many cells: parts meet in joints, but what merely touches must be able to part.
         label_cost: of each label in use: its square is what it must take from the mean squared distance. ``num_bones``
             is a cap. Many small bones miss fewer joints; see `ScanRegistration.parts` for what moved as one.
         truncation: samples are never farther off in the W-step, in cells.
         reuse: give labels that lost all their cells to the regions that fit worst.
         joint_weight: beta, of the joints against the mean squared distance, in the first and the last round of labels
             and after it, in even ratios between; (1, 0.05) in the paper. It holds bones together where matches do not;
-            the dense alignment does so already, and joints that are no points resist more of it. Zeros leave it out.
+            the dense alignment does so already, and joints that are no points resist more of it. Zeros leave it out,
+            and with it:
+        turn_weight: what it costs that bones that meet turn against each other, per squared radian: what scans do not
+            tell, such as the twist of a round limb, stays as it was. Turns
+        turn_scale: beyond this many radians count ever less.
         max_distance: of a match, first and last; never below two sampling distances of the target.
         max_angle: between normals of a match, first and last, radians.
         normal_scale: distance that counts as much as normals 60 degrees apart.
@@ -62,15 +68,19 @@ class RegisterConfig:
     label_steps: int = 4
     refine_steps: int = 1
     motion_steps: int = 5
-    smoothness: float = 0.05
+    smoothness: float = 0.01
+    seam: float = 0.2
+    seam_cap: float = 0.5
     label_cost: float = 0.0003
     truncation: float = 4.0
     reuse: bool = True
     joint_weight: tuple[float, float] = (0.001, 0.0001)
+    turn_weight: float = 6e-7
+    turn_scale: float = 0.1
     max_distance: tuple[float, float] = (0.03, 0.01)
     max_angle: tuple[float, float] = (1.05, 0.52)
     normal_scale: float = 0.025
-    point_to_point: float = 0.01
+    point_to_point: float = 0.003
     unmatched: float = 0.3
     min_matched: float = 0.1
     rtol: float = 0.2
@@ -81,9 +91,9 @@ class RegisterConfig:
         for name in ("num_samples", "num_patches", "label_steps", "motion_steps"):
             check_count(getattr(self, name), name, 1)
         check_count(self.refine_steps, "refine_steps", 0)
-        for name in ("truncation", "unmatched"):
+        for name in ("truncation", "unmatched", "seam_cap", "turn_scale"):
             check_positive(getattr(self, name), name)
-        for name in ("smoothness", "label_cost", "normal_scale", "rtol"):
+        for name in ("smoothness", "seam", "label_cost", "turn_weight", "normal_scale", "rtol"):
             check_positive(getattr(self, name), name, allow_zero=True)
         for name in ("point_to_point", "min_matched"):
             check_share(getattr(self, name), name)

@@ -33,6 +33,8 @@ from torchreg.results.scans import SequenceRegistration
 # From frame to frame few large bones carry the reference: what many small ones take over from noise adds up, and so
 # does what slides along the surface.
 _CARRIED_LABEL_COST, _CARRIED_SMOOTHNESS, _CARRIED_POINT_TO_POINT = 0.002, 0.2, 0.1
+# What no frame tells is lost again in each of them: bones hold each other in wide turns too, radians.
+_HELD_TURNS = 0.5
 # Share of its last step by which a point is expected to move on: hidden limbs would run away with the whole.
 _GOES_ON = 0.5
 
@@ -96,13 +98,14 @@ def register_sequence(
         smoothness=max(config.smoothness, _CARRIED_SMOOTHNESS),
         point_to_point=max(config.point_to_point, _CARRIED_POINT_TO_POINT),
     )
-    moved, confidence = _chain(scans, reference, num_bones, grid_resolution, few, generator, on_step)
+    reached, confidence = _chain(scans, reference, num_bones, grid_resolution, few, generator, on_step)
     scan = unit.of_scan(source)
     data = CellData(SparseGrid.from_points(scan.points, grid_resolution), scan.points[index], config.num_patches)
-    places = unit.of_points(moved)[:, index]
+    places = unit.of_points(reached)[:, index]
     trust = confidence[:, index].double().clamp(min=LEAST_CONFIDENCE)
     samples = Samples(scan.points[index], scan.normals[index], places, trust)
-    fit = ReducedFit(data, samples, [unit.of_scan(other) for other in scans], num_bones, config, on_step)
+    held = replace(config, turn_scale=max(config.turn_scale, _HELD_TURNS))
+    fit = ReducedFit(data, samples, [unit.of_scan(other) for other in scans], num_bones, held, on_step)
     settled = fit.fit_labels()
     settled = fit.refine() and settled
     return _result(scans, reference, unit, fit, settled)
@@ -117,25 +120,31 @@ def _chain(
     generator: torch.Generator | None,
     on_step: OnRegisterStep | None,
 ) -> tuple[Tensor, Tensor]:
-    """Return where the reference's points are in every frame, (T, N, 3), and how far that can be trusted, (T, N)."""
+    """Return where the reference's points are in every frame, (T, N, 3), and how far that can be trusted, (T, N).
+
+    The dense alignments tell, in which small parts move that the few bones carried on have no room for.
+    """
     source, ones = scans[reference], torch.ones(len(scans[reference]))
-    places, trust = {reference: source.points}, {reference: ones}
+    carried, reached, trust = {reference: source.points}, {reference: source.points}, {reference: ones}
     for step, end in ((1, len(scans)), (-1, -1)):
         current = source
         for frame in range(reference + step, end, step):
             aligned = align_scans(
                 current, scans[frame], config.align,
-                generator=generator, on_step=initial_records(on_step), expected=_expected(places, frame, step),
+                generator=generator, on_step=initial_records(on_step), expected=_expected(carried, frame, step),
             )  # fmt: skip
+            reached[frame], trust[frame] = aligned.points, aligned.confidence
+            if frame + step == end:
+                break
             found = register(
                 source, scans[frame], num_bones, grid_resolution, config, generator,
                 start=aligned.points, confidence=aligned.confidence,
             )  # fmt: skip
-            places[frame], trust[frame] = found.deformed, aligned.confidence
+            carried[frame] = found.deformed
             normals = turned_normals(source.normals, found.weights, found.transforms)
             current = RangeScan(found.deformed, source.faces, normals)
     frames = range(len(scans))
-    return torch.stack([places[frame] for frame in frames]), torch.stack([trust[frame].cpu() for frame in frames])
+    return torch.stack([reached[frame] for frame in frames]), torch.stack([trust[frame].cpu() for frame in frames])
 
 
 def _expected(places: dict[int, Tensor], frame: int, step: int) -> Tensor | None:
