@@ -265,15 +265,20 @@ def chained(scans: list[tr.RangeScan], pairs: list[Tensor]) -> list[Tensor]:
     return places
 
 
+def misses(sequence: ScanSequence, places: Tensor, source: int, target: int) -> Tensor:
+    """Return how far moved points (N, 3) of a frame are from the truth in another, shares of the first's diagonal."""
+    return (places - sequence.truth(source, target)).norm(dim=-1) / sequence[0].diagonal
+
+
 def print_sequence(kind: str, sequence: ScanSequence, recipe: Recipe) -> None:
     """Print mean errors of the first frame's points in every frame, shares of the diagonal, and parts and joints."""
     scans = list(sequence)
     found = tr.register_sequence(scans, recipe.bones, recipe.grid, recipe.config)
     pairs = adjacent(scans, recipe)
-    ways, size = (found.deformed, chained(scans, pairs)), scans[0].diagonal
+    ways = (found.deformed, chained(scans, pairs))
 
     def error(places: Tensor, source: int, target: int) -> float:
-        return 100 * float((places - sequence.truth(source, target)).norm(dim=-1).mean()) / size
+        return 100 * float(misses(sequence, places, source, target).mean())
 
     print(f"\n{kind}, sequence of {len(scans)} frames, mean % from the first, and of the pair that ends there")
     print(f"{'frame':>6s} together chained   pair")
@@ -299,20 +304,32 @@ def sequences_of(kind: str, count: int, frames: int) -> Iterator[ScanSequence]:
 
 
 def print_many_sequences(count: int, frames: int, recipe: Recipe) -> None:
-    """Print mean errors of the first frame's points in all frames and in the last, and how often they are there."""
+    """Print mean errors of the first frame's points in all frames and in the last, and how often they are there.
+
+    Beside that errors of adjacent pairs, and parts and joints.
+    """
     print(f"\n{count} sequences of {frames} frames, registered together")
-    print(f"{'':8s} mean %  last %  frames  last registered")
+    print(f"{'':8s} mean %  last %  pair %  last/pair  frames  last registered   rand joints")
     for kind in ("figure", "toy", "animal"):
-        rows = []
+        rows, rands, joints = [], [], []
         for sequence in sequences_of(kind, count, frames):
-            found = tr.register_sequence(list(sequence), recipe.bones, recipe.grid, recipe.config)
-            truth = torch.stack([sequence.truth(0, frame) for frame in range(1, frames)])
-            errors = (found.deformed[1:] - truth).norm(dim=-1) / sequence[0].diagonal
-            rows.append((errors.mean(1), (errors < NEAR).double().mean(1) >= REGISTERED))
-        error, there = (torch.stack(each) for each in zip(*rows, strict=True))
+            scans = list(sequence)
+            found = tr.register_sequence(scans, recipe.bones, recipe.grid, recipe.config)
+            errors = torch.stack([misses(sequence, found.deformed[frame], 0, frame) for frame in range(1, frames)])
+            alone = [
+                float(misses(sequence, moved, frame, frame + 1).mean())
+                for frame, moved in enumerate(adjacent(scans, recipe))
+            ]
+            rows.append((errors.mean(1), (errors < NEAR).double().mean(1) >= REGISTERED, torch.tensor(alone).mean()))
+            rand, near = parts_and_joints(found, PartTruth.of_sequence(sequence))
+            rands.append(rand)
+            joints.extend(near)
+        error, there, pair = (torch.stack(each) for each in zip(*rows, strict=True))
+        last = error[:, -1].mean()
         print(
-            f"{kind:8s} {100 * error.mean():6.2f} {100 * error[:, -1].mean():7.2f} {there.double().mean():7.0%}"
-            f" {int(there[:, -1].sum()):5d} /{count:4d}",
+            f"{kind:8s} {100 * error.mean():6.2f} {100 * last:7.2f} {100 * pair.mean():7.2f} {last / pair.mean():10.2f}"
+            f" {there.double().mean():7.0%} {int(there[:, -1].sum()):9d} /{count:4d}"
+            f" {np.mean(rands):6.2f} {np.mean(np.array(joints) < JOINT):6.0%}",
             flush=True,
         )
 
