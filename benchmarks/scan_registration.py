@@ -121,6 +121,8 @@ def _ablations() -> list[Recipe]:
         Recipe("without joint term", config=replace(plain, joint_weight=(0.0, 0.0))),
         Recipe("joints 0.01 all along", config=replace(plain, joint_weight=(0.01, 0.01))),
         Recipe("joints 1 to 0.05", config=replace(plain, joint_weight=(1.0, 0.05))),
+        Recipe("without turns held", config=replace(plain, turn_weight=0.0)),
+        Recipe("borders anywhere", config=replace(plain, seam=0.0, smoothness=0.05)),
         Recipe("without label reuse", config=replace(plain, reuse=False)),
         Recipe("without refinement", config=replace(plain, refine_steps=0)),
         Recipe("without descriptors", config=replace(plain, align=replace(plain.align, match=_no_matches(plain)))),
