@@ -221,7 +221,7 @@ class ReducedFit:
         if joints is None:
             return None
         first, second = self.model.transforms.detach()[..., :3, :3][..., joints.pairs.mT, :, :].unbind(-4)
-        # The squared norm is about twice the squared angle, that of a small spread's misses.
+        # |R_i - R_j|^2 is about twice the squared angle between them; a spread s I costs s times as much.
         turns = 0.5 * (first - second).square().sum((-1, -2)).flatten(0, -2).mean(0)
         weight = 0.5 * self.config.turn_weight / (1 + turns / self.config.turn_scale**2)
         identity = torch.eye(3, dtype=weight.dtype, device=weight.device)

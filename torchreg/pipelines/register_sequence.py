@@ -56,7 +56,7 @@ def register_sequence(
     Going from the reference outward, the reference as moved for one frame is aligned with the next, its points expected
     to go on somewhat as they went, and a few bones are fitted to that: every frame is reached by bending the reference
     itself, not what earlier frames made of it, so that errors do not pile up. Then labels, weights and the motions of
-    all frames are solved together.
+    all frames are solved together, from the alignments.
 
     Args:
         scans: T scans of one thing, two at least, in one unit and frame; motions between neighbors as in `register`.

@@ -125,10 +125,7 @@ def align_scans(
     if unsure and not _confirmed(problem, found[0], found[1], config):
         found = sorted([*found, *_turned(problem, config, report)], key=_energy)
         found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
-        exchanged, covering = _both_told(
-            report, partial(_exchanged, problem, found[0], config), partial(_covering, problem, found[0], config)
-        )
-        found = sorted([*found, *exchanged, *covering], key=_energy)
+        found = sorted([*found, *_rearranged(problem, found[0], config, report)], key=_energy)
     chosen = found[0].hypothesis
     transforms = _finished(problem, found[0], config, unsure, report)
     weights = spread_weights(
@@ -243,18 +240,11 @@ def _checked(expected: Any, source: RangeScan) -> Tensor:
     return expected.detach()
 
 
-def _turned(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> Sequence[_Candidate]:
+def _turned(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
     """Return the candidates from the likeliest turns of all of the source, two at most."""
-
-    def followed(name: str, motion: Tensor, told: OnStep) -> _Candidate:
-        everywhere = motion.repeat(problem.graph.num_nodes, 1, 1)
-        reporter = Reporter(name, problem.unit.size, told)
-        return _compared(problem, everywhere, config.refine.sigma[0], config, reporter)
-
-    starts = list(zip(("turned", "turned otherwise"), turned_motions(problem, config.choice, 2), strict=False))
-    if len(starts) < 2:
-        return [followed(*start, on_step) for start in starts]
-    return _both_told(on_step, *(partial(followed, *start) for start in starts))
+    turns = [motion.repeat(problem.graph.num_nodes, 1, 1) for motion in turned_motions(problem, config.choice, 2)]
+    starts = list(zip(("turned", "turned otherwise"), turns, strict=False))
+    return _side_by_side(problem, starts, config.refine.sigma[0], config, on_step)
 
 
 def _fused(
@@ -266,34 +256,57 @@ def _fused(
     return _compared(problem, begin, config.refine.fused_sigma, config, reporter)
 
 
-def _exchanged(
+def _rearranged(
     problem: ScanAlignProblem, best: _Candidate, config: ScanAlignConfig, on_step: OnStep
 ) -> list[_Candidate]:
-    """Return the candidate in which two limbs of the best one change places; none if that looks clearly worse."""
-    reporter = Reporter("exchanged", problem.unit.size, on_step)
-    return _pulled(problem, exchanged_limbs(problem, best.transforms), best, config, reporter)
+    """Return the candidates in which two limbs of the best change places, and in which one covers what is left bare.
 
-
-def _covering(
-    problem: ScanAlignProblem, best: _Candidate, config: ScanAlignConfig, on_step: OnStep
-) -> list[_Candidate]:
-    """Return the candidate in which a limb covers what the best one leaves bare; none if that looks clearly worse."""
-    reporter = Reporter("covering", problem.unit.size, on_step)
-    return _pulled(problem, covering_limbs(problem, best.transforms, config.choice), best, config, reporter)
+    Of each kind it is the option that one-to-one matches make the best, and none if that looks clearly worse.
+    """
+    exchanged, covering = both(
+        partial(exchanged_limbs, problem, best.transforms),
+        partial(covering_limbs, problem, best.transforms, config.choice),
+    )
+    options = [("exchanged", option) for option in exchanged] + [("covering", option) for option in covering]
+    some, others = _both_told(
+        on_step, *(partial(_pulled, problem, part, config) for part in (options[::2], options[1::2]))
+    )
+    starts = []
+    for name in ("exchanged", "covering"):
+        kind = [option for option in (*some, *others) if option.hypothesis.name == name]
+        likeliest = min(kind, key=_energy, default=None)
+        if likeliest is not None and _energy(likeliest) <= _energy(best) + _HARDLY_WORSE:
+            starts.append((name, likeliest.transforms))
+    return _side_by_side(problem, starts, config.refine.near_sigma, config, on_step)
 
 
 def _pulled(
-    problem: ScanAlignProblem, options: Sequence[Tensor], best: _Candidate, config: ScanAlignConfig, reporter: Reporter
+    problem: ScanAlignProblem, options: Sequence[tuple[str, Tensor]], config: ScanAlignConfig, on_step: OnStep
 ) -> list[_Candidate]:
-    """Return the candidate from the option that one-to-one matches make the best; none if it looks clearly worse."""
-    if not options:
-        return []
-    energy = partial(_energy_of, problem, config, reporter.name)
-    pulled = [pull_one_to_one(problem, each, config.reassign, reporter) for each in options]
-    least, number = min((energy(each), number) for number, each in enumerate(pulled))
-    if least > _energy(best) + _HARDLY_WORSE:
-        return []
-    return [_compared(problem, pulled[number], config.refine.near_sigma, config, reporter)]
+    """Return named options as one-to-one matches pull them."""
+    found = []
+    for name, option in options:
+        reporter = Reporter(name, problem.unit.size, on_step)
+        transforms = pull_one_to_one(problem, option, config.reassign, reporter)
+        found.append(_Candidate(judge(problem, name, transforms, config.choice), transforms, config.refine.near_sigma))
+    return found
+
+
+def _side_by_side(
+    problem: ScanAlignProblem,
+    starts: Sequence[tuple[str, Tensor]],
+    sigma: float,
+    config: ScanAlignConfig,
+    on_step: OnStep,
+) -> list[_Candidate]:
+    """Return the candidates from two named motions (J, 4, 4) at most, followed at once."""
+
+    def followed(name: str, transforms: Tensor, told: OnStep) -> _Candidate:
+        return _compared(problem, transforms, sigma, config, Reporter(name, problem.unit.size, told))
+
+    if len(starts) < 2:
+        return [followed(*start, on_step) for start in starts]
+    return list(_both_told(on_step, *(partial(followed, *start) for start in starts)))
 
 
 def _compared(
@@ -343,11 +356,6 @@ def _confirmed(problem: ScanAlignProblem, best: _Candidate, next_best: _Candidat
 
 def _energy(candidate: _Candidate) -> float:
     return candidate.hypothesis.energy
-
-
-def _energy_of(problem: ScanAlignProblem, config: ScanAlignConfig, name: str, transforms: Tensor) -> float:
-    """Return the energy of motions (J, 4, 4) of a hypothesis."""
-    return judge(problem, name, transforms, config.choice).energy
 
 
 def _confidence(problem: ScanAlignProblem, transforms: Tensor, config: ScanAlignConfig, points: Tensor) -> Tensor:
