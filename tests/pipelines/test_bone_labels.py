@@ -69,12 +69,8 @@ def test_seams_cost_what_two_bones_tear_apart_up_to_a_cap(bar):
     labels, energy = relabel(data, pull, both, start, seamed)
     centers, seams = data.grid.cell_centers(), 0.0
     for one, other in pairs[labels[pairs[:, 0]] != labels[pairs[:, 1]]].tolist():
-        middle = 0.5 * (centers[one] + centers[other])
-        gaps = [
-            motion[labels[one], :3] @ torch.cat([middle, torch.ones(1).double()])
-            - motion[labels[other], :3] @ torch.cat([middle, torch.ones(1).double()])
-            for motion in both
-        ]
+        middle = torch.cat([0.5 * (centers[one] + centers[other]), torch.ones(1, dtype=torch.float64)])
+        gaps = [(motion[labels[one], :3] - motion[labels[other], :3]) @ middle for motion in both]
         apart = torch.stack(gaps).square().sum(-1).mean().sqrt() / spacing
         seams += 0.3 * min(float(apart), 0.5)
     own = both[:, labels[data.cell], :3, :3] @ data.points[..., None]

@@ -42,10 +42,10 @@ class RegisterConfig:
         joint_weight: beta, of the joints against the mean squared distance, in the first and the last round of labels
             and after it, in even ratios between; (1, 0.05) in the paper. It holds bones together where matches do not;
             the dense alignment does so already, and joints that are no points resist more of it. Zeros leave it out,
-            and with it:
+            and what turns cost.
         turn_weight: what it costs that bones that meet turn against each other, per squared radian: what scans do not
-            tell, such as the twist of a round limb, stays as it was. Turns
-        turn_scale: beyond this many radians count ever less.
+            tell, such as the twist of a round limb, stays as it was.
+        turn_scale: bones that turned against each other by more than this many radians hold each other ever less.
         max_distance: of a match, first and last; never below two sampling distances of the target.
         max_angle: between normals of a match, first and last, radians.
         normal_scale: distance that counts as much as normals 60 degrees apart.
