@@ -46,7 +46,7 @@ def test_labels_then_weights_come_nearer_to_the_truth(toy):
     reduced, truth = fit(toy[1][:1], noise=0.005, on_step=records.append)
     first = error(reduced, truth)
     reduced.fit_labels()
-    assert error(reduced, truth) < 1.1 * first
+    assert error(reduced, truth) < 1.2 * first
     reduced.refine()
     assert error(reduced, truth) < first
     assert error(reduced, truth) < 0.006
@@ -78,13 +78,13 @@ def test_joints_hold_better_when_they_count(toy):
 
 
 def test_joints_count_less_from_round_to_round(toy, monkeypatch):
-    weights, solve = [], reduced_fit.fit_bones
+    weights, solve = [], reduced_fit.fit_bones_and_joints
 
     def noted(problem, *args, **kwargs):
         weights.append(problem.joint_weight)
         return solve(problem, *args, **kwargs)
 
-    monkeypatch.setattr(reduced_fit, "fit_bones", noted)
+    monkeypatch.setattr(reduced_fit, "fit_bones_and_joints", noted)
     reduced, _ = fit(toy[1][:1], config=RegisterConfig(joint_weight=(1.0, 0.05), rtol=0.0, label_steps=3))
     reduced.fit_labels()
     reduced.refine()
@@ -127,22 +127,36 @@ def test_bones_do_not_twist_unseen_but_bend_as_seen(rod, weight, least, most):
     assert float(left[1:].norm()) < 0.07
 
 
-def test_turns_count_less_the_wider_they_are_and_not_without_joints(toy, monkeypatch):
-    spreads, solve = [], reduced_fit.fit_bones
+def test_turns_count_less_the_wider_they_are(toy, monkeypatch):
+    spreads, solve = [], reduced_fit.fit_bones_and_joints
 
     def noted(problem, *args, **kwargs):
-        spreads.append(None if problem.moments is None else problem.moments.spread)
+        spreads.append(problem.moments.spread)
         return solve(problem, *args, **kwargs)
 
-    monkeypatch.setattr(reduced_fit, "fit_bones", noted)
-    for settings in ({"turn_scale": 1e-3}, {"turn_scale": 1e3}, {"turn_weight": 0.0}, {"joint_weight": (0.0, 0.0)}):
+    monkeypatch.setattr(reduced_fit, "fit_bones_and_joints", noted)
+    for settings in ({"turn_scale": 1e-3}, {"turn_scale": 1e3}, {"turn_weight": 0.0}):
         fit(toy[1], config=RegisterConfig(**settings))[0].solve_motions()
-    narrow, wide, none, without = spreads
-    assert without is None
+    narrow, wide, none = spreads
     assert not none.any()
     whole = 0.5 * RegisterConfig().turn_weight / RegisterConfig().joint_weight[0]
     torch.testing.assert_close(wide, (whole * torch.eye(3).double()).expand_as(wide), rtol=1e-4, atol=0.0)
     assert (narrow.diagonal(dim1=-2, dim2=-1) < 0.01 * whole).any()
+
+
+def test_joints_that_do_not_hold_count_less_and_none_without_weight(toy, monkeypatch):
+    counted, solve = [], reduced_fit.fit_bones_and_joints
+
+    def noted(problem, *args, **kwargs):
+        counted.append(problem.pair_weights)
+        return solve(problem, *args, **kwargs)
+
+    monkeypatch.setattr(reduced_fit, "fit_bones_and_joints", noted)
+    for settings in ({"joint_scale": 1e-5}, {"joint_scale": 1e5}, {"joint_weight": (0.0, 0.0)}):
+        fit(toy[1], noise=0.005, config=RegisterConfig(**settings))[0].solve_motions()
+    loose, firm = counted
+    torch.testing.assert_close(firm, torch.ones_like(firm))
+    assert loose.max() < 0.5
 
 
 @pytest.mark.parametrize("settings", [{"reuse": False}, {"refine_steps": 0}, {"blend": "dual_quaternion"}])

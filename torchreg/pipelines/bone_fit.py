@@ -69,7 +69,7 @@ def bone_step(
     transforms = problem.batched(transforms)
     current = problem.linearize(transforms)
     twists = _damped_twists(problem, transforms, current, torch.full_like(current.cost, damping), fixed)
-    return _straightened(turn_about(transforms, twists, problem.centers(transforms)))
+    return straightened(turn_about(transforms, twists, problem.centers(transforms)))
 
 
 @torch.no_grad()
@@ -140,7 +140,7 @@ def fit_bones(
             torch.where(better[..., None, None], trial.hessian, current.hessian),
         )
         done = done | small
-    return BoneFit(_straightened(transforms), 2 * current.cost, level, steps, done)
+    return BoneFit(straightened(transforms), 2 * current.cost, level, steps, done)
 
 
 def _rounding_floor(problem: BoneProblem) -> float:
@@ -169,7 +169,7 @@ def _damped_twists(
     return damped_step(flat, rounding, frozen=frozen).reshape(*transforms.shape[:-2], 6)
 
 
-def _straightened(transforms: Tensor) -> Tensor:
+def straightened(transforms: Tensor) -> Tensor:
     """Return motions with the nearest rotations, by one Newton step: products of many drift by rounding."""
     rotation = transforms[..., :3, :3]
     transforms = transforms.clone()

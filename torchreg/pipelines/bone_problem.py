@@ -203,13 +203,16 @@ class BoneProblem:
         shifting = nn.functional.pad(identity, (0, 3, 0, 3))
         return shifting + nn.functional.pad(turning, (3, 0, 3, 0))
 
-    def linearize(self, transforms: Tensor) -> Linearization:
-        """Return half of E, its gradient and Gauss-Newton Hessian by the 6 B twists at motions (..., B, 4, 4)."""
+    def linearize(self, transforms: Tensor, joints: Tensor | None = None) -> Linearization:
+        """Return half of E, its gradient and Gauss-Newton Hessian by the 6 B twists at motions (..., B, 4, 4).
+
+        With ``joints`` (P, 3), these are the centers of the moments.
+        """
         transforms = self.batched(transforms)
         system = _System(transforms, self.centers(transforms))
         self._add_matches(system)
         if self._springs is not None:
-            self._add_springs(system, self._springs)
+            self._add_springs(system, self._springs if joints is None else self._springs.at(joints))
         return system.linearization()
 
     @cached_property
@@ -328,6 +331,12 @@ class _Springs(NamedTuple):
     root: Tensor
     slots: Tensor
     num_joints: int
+
+    def at(self, joints: Tensor) -> _Springs:
+        """Return the springs with the joints at other centers (P, 3)."""
+        frames = self.frames.clone()
+        frames.unflatten(0, (2, -1))[:, : self.num_joints, 0, :3] = joints
+        return self._replace(frames=frames)
 
 
 def _per_spring(weight: float | Tensor, count: int, like: Tensor) -> Tensor:

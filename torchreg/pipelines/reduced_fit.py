@@ -10,12 +10,13 @@ from torch import Tensor
 
 from torchreg.correspondence.compatible import CompatibleMatcher
 from torchreg.geometry.joint_moments import JointMoments
+from torchreg.geometry.joints import Joints, find_joints
 from torchreg.geometry.range_scan import RangeScan
-from torchreg.losses.grid import JointEnergy
 from torchreg.models.grid_lbs import GridLBS
-from torchreg.pipelines.bone_fit import fit_bones
+from torchreg.pipelines.bone_fit import BoneFit, fit_bones
 from torchreg.pipelines.bone_labels import CellData, LabelCosts, Pull, first_labels, relabel, reuse_labels
 from torchreg.pipelines.bone_problem import BoneProblem, bind
+from torchreg.pipelines.joint_fit import JOINT_REGULARIZATION, JointFit, fit_bones_and_joints
 from torchreg.pipelines.refine_weights import refine_weights
 from torchreg.pipelines.register_config import OnRegisterStep, RegisterConfig
 from torchreg.pipelines.scan_align_config import between
@@ -23,6 +24,8 @@ from torchreg.results.scans import RegisterRecord
 
 # Sampling distances of the target below which the threshold for matches never falls.
 _LEAST_REACH = 2.0
+# A T-step ends when it changes the energy by less than this share.
+_RTOL = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +65,14 @@ class ReducedFit:
     Attributes:
         labels: (C,) bone of each cell, from 0 without gaps.
         model: the bones and weights, its poses the F frames.
+        meetings: where bones of the labels meet.
         pull: where the samples should go.
         history: records so far.
     """
+
+    labels: Tensor
+    model: GridLBS
+    meetings: JointMoments
 
     def __init__(
         self,
@@ -85,8 +93,7 @@ class ReducedFit:
         self._costs = LabelCosts(config.smoothness, per_label, config.truncation, config.seam, config.seam_cap)
         if labels is None:
             labels = first_labels(data, samples.moved, samples.confidence, num_bones, self._costs)
-        self.labels = labels
-        self.model = self._labeled(data.moments(samples.moved, samples.confidence).joined(*self._parts()).motions())
+        self._label(labels, data.moments(samples.moved, samples.confidence).joined(*self._parts(labels)).motions())
         self._counts = (0, 0, 0, 0)
         self._joint_weight = config.joint_weight_at(0)
 
@@ -110,10 +117,23 @@ class ReducedFit:
         return False
 
     def refine(self) -> bool:
-        """Make weights continuous, alternating with motions and correspondences; return whether the fit settled."""
+        """Make weights continuous, alternating with motions and correspondences; return whether the fit settled.
+
+        In some more rounds weights stay, and motions and joints come to terms.
+        """
+        self._joint_weight = self.config.joint_weight_at(1)
+        rounds = self.config.refine_steps + self.config.settle_steps
+        settled = self._refine_weights(rounds)
+        for step in range(self.config.refine_steps, rounds):
+            self.solve_motions()
+            self.update_matches(1.0)
+            self._report("refine", step, rounds)
+        return settled
+
+    def _refine_weights(self, rounds: int) -> bool:
+        """Refine weights, the first of some rounds, and return whether the energy settled."""
         base, steps = self.model.weights.detach(), self.config.refine_steps
         settings = replace(self.config.refine, point_to_point=self.pull.point_to_point)
-        self._joint_weight = self.config.joint_weight_at(1)
         energy = self.solve_motions()
         for step in range(steps):
             labeled = GridLBS(self.data.grid, base, self.model.transforms.detach())
@@ -124,14 +144,14 @@ class ReducedFit:
             self.model = self._weighted(found.weights, self.model.transforms.detach())
             last, energy = energy, self.solve_motions()
             self.update_matches(0.5 + 0.5 * (step + 1) / steps)
-            self._report("refine", step, steps)
+            self._report("refine", step, rounds)
             if energy >= (1 - self.config.rtol) * last:
                 return True
         return steps == 0
 
     def solve_motions(self) -> float:
-        """Fit the bones' motions to the targets of the samples: the T-step, eq. 5; return the mean energy."""
-        pull = self.pull
+        """Fit the bones' motions and joints to the samples' targets: the T-step, eq. 5; return the mean energy."""
+        pull, joints, transforms = self.pull, self._joints(), self.model.transforms.detach()
         problem = BoneProblem(
             self.samples.points,
             bind(self.model.weights_at(self.samples.points).detach()),
@@ -139,11 +159,18 @@ class ReducedFit:
             pull.normals,
             pull.weights,
             pull.point_to_point,
-            moments=self._turning(self._joints()),
+            moments=None if joints is None else self._turning(),
             joint_weight=self._joint_weight,
+            pair_weights=None if joints is None else self._holding(joints),
             blend=self.config.blend,
         )
-        fit = fit_bones(problem, self.model.transforms.detach(), max_steps=self.config.motion_steps, rtol=1e-3)
+        fit: BoneFit | JointFit
+        if joints is None:
+            fit = fit_bones(problem, transforms, max_steps=self.config.motion_steps, rtol=_RTOL)
+        else:
+            fit = fit_bones_and_joints(
+                problem, transforms, joints.centers, max_steps=self.config.motion_steps, rtol=_RTOL
+            )
         self.model.set_transforms_(fit.transforms)
         return float(fit.energy.mean())
 
@@ -180,46 +207,48 @@ class ReducedFit:
             weights, transforms = self.model.weights_at(points), self.model.transforms
             return self.model.move(points, weights), turned_normals(normals, weights, transforms)
 
-    def _parts(self) -> tuple[Tensor, int]:
-        """Return the label of each patch, and the number of labels, while labels do not cut patches."""
+    def _parts(self, labels: Tensor) -> tuple[Tensor, int]:
+        """Return the label of each patch, and the number of labels, where labels (C,) do not cut patches."""
         patches = self.data.patches
         part = torch.zeros(int(patches.max()) + 1, dtype=torch.int64, device=patches.device)
-        return part.scatter(0, patches, self.labels), int(self.labels.max()) + 1
+        return part.scatter(0, patches, labels), int(labels.max()) + 1
 
-    def _labeled(self, transforms: Tensor) -> GridLBS:
-        """Return the model of the labels."""
-        return GridLBS.from_labels(
-            self.data.grid, self.labels, transforms.shape[-3], transforms, blend=self.config.blend
-        )
+    def _label(self, labels: Tensor, transforms: Tensor) -> None:
+        """Take over labels (C,) from 0 without gaps, and their motions."""
+        self.labels, count = labels, transforms.shape[-3]
+        self.model = GridLBS.from_labels(self.data.grid, labels, count, transforms, blend=self.config.blend)
+        # Continuous weights spread far: bones share some of them that no joint holds together.
+        self.meetings = self.model.joint_moments()
 
     def _weighted(self, weights: Tensor, transforms: Tensor) -> GridLBS:
         return GridLBS(self.data.grid, weights, transforms, blend=self.config.blend)
 
     def _use(self, labels: Tensor) -> None:
         """Take over labels (C,), dropping bones without a cell."""
-        kept, self.labels = labels.unique(return_inverse=True)
-        self.model = self._labeled(self.model.transforms.detach()[:, kept])
+        kept, labels = labels.unique(return_inverse=True)
+        self._label(labels, self.model.transforms.detach()[:, kept])
 
     def _reuse(self) -> None:
         """Bring lost labels back; a bone that takes over half of another's region starts from that one's motion."""
         before = self.labels
-        self.labels = reuse_labels(self.data, self.pull, before, self.num_bones, self._costs)
-        used = int(self.labels.max()) + 1
-        origin = torch.stack([before[self.labels == label][0] for label in range(used)])
-        self.model = self._labeled(self.model.transforms.detach()[:, origin])
+        labels = reuse_labels(self.data, self.pull, before, self.num_bones, self._costs)
+        origin = torch.stack([before[labels == label][0] for label in range(int(labels.max()) + 1)])
+        self._label(labels, self.model.transforms.detach()[:, origin])
 
-    def _joints(self) -> JointMoments | None:
-        """Return the joints that hold: points, not the regions that bones share, within which they must bend."""
-        if self._joint_weight == 0:
+    def _joints(self) -> Joints | None:
+        """Return where the bones meet, as their motions tell, if that counts."""
+        if self._joint_weight == 0 or not len(self.meetings.pairs):
             return None
-        moments = self.model.joint_moments()
-        centers = self.model.joints_of(moments).centers.detach()
-        return JointMoments(moments.pairs, moments.mass, centers, torch.zeros_like(moments.spread))
+        return find_joints(self.meetings, self.model.transforms.detach(), regularization=JOINT_REGULARIZATION)
 
-    def _turning(self, joints: JointMoments | None) -> JointMoments | None:
-        """Return the joints with a spread that makes bones pay a little for turning against each other."""
-        if joints is None:
-            return None
+    def _holding(self, joints: Joints) -> Tensor:
+        """Return how much each joint counts (P,): less, the farther motions take it apart (Geman and McClure 1987)."""
+        square = joints.gaps.square().reshape(-1, len(joints.pairs)).mean(0)
+        return (1 + square / self.config.joint_scale**2) ** -2
+
+    def _turning(self) -> JointMoments:
+        """Return the joints as points, with a spread that makes bones pay a little for turning against each other."""
+        joints = self.meetings
         first, second = self.model.transforms.detach()[..., :3, :3][..., joints.pairs.mT, :, :].unbind(-4)
         # |R_i - R_j|^2 is about twice the squared angle between them; a spread s I costs s times as much.
         turns = 0.5 * (first - second).square().sum((-1, -2)).flatten(0, -2).mean(0)
@@ -233,7 +262,7 @@ class ReducedFit:
             squares = self.pull.squares(self.model(points))
             weights, neighbors = self.pull.weights, self.data.neighbors
             joints = self._joints()
-            gap = 0.0 if joints is None else float(JointEnergy()(transforms, joints).mean())
+            gap = 0.0 if joints is None else float(joints.gaps.square().sum(-1).mean())
             record = RegisterRecord(
                 stage,
                 step,

@@ -31,6 +31,7 @@ class RegisterConfig:
         num_patches: of the grid, from which parts are merged.
         label_steps: most rounds of T-step, correspondences and W-step.
         refine_steps: rounds of refining weights, T-step and correspondences.
+        settle_steps: rounds of T-step and correspondences after it.
         motion_steps: most linear systems of a T-step.
         smoothness: mu of the W-step: of neighboring cells with different labels, in squared cells.
         seam: what it costs there that these labels take the side between the cells apart, per cell,
@@ -41,8 +42,10 @@ class RegisterConfig:
         reuse: give labels that lost all their cells to the regions that fit worst.
         joint_weight: beta, of the joints against the mean squared distance, in the first and the last round of labels
             and after it, in even ratios between; (1, 0.05) in the paper. It holds bones together where matches do not;
-            the dense alignment does so already, and joints that are no points resist more of it. Zeros leave it out,
-            and what turns cost.
+            the dense alignment does so already, and joints that are no points, or wrong, resist more of it. Zeros leave
+            it out, and what turns cost.
+        joint_scale: bones whose motions take their joint apart by more than this hold each other ever less: not all
+            that meets is joined.
         turn_weight: what it costs that bones that meet turn against each other, per squared radian: what scans do not
             tell, such as the twist of a round limb, stays as it was.
         turn_scale: bones that turned against each other by more than this many radians hold each other ever less.
@@ -67,6 +70,7 @@ class RegisterConfig:
     num_patches: int = 100
     label_steps: int = 4
     refine_steps: int = 1
+    settle_steps: int = 2
     motion_steps: int = 5
     smoothness: float = 0.01
     seam: float = 0.2
@@ -74,7 +78,8 @@ class RegisterConfig:
     label_cost: float = 0.0003
     truncation: float = 4.0
     reuse: bool = True
-    joint_weight: tuple[float, float] = (0.001, 0.0001)
+    joint_weight: tuple[float, float] = (0.001, 0.001)
+    joint_scale: float = 0.005
     turn_weight: float = 6e-7
     turn_scale: float = 0.1
     max_distance: tuple[float, float] = (0.03, 0.01)
@@ -90,8 +95,9 @@ class RegisterConfig:
     def __post_init__(self) -> None:
         for name in ("num_samples", "num_patches", "label_steps", "motion_steps"):
             check_count(getattr(self, name), name, 1)
-        check_count(self.refine_steps, "refine_steps", 0)
-        for name in ("truncation", "unmatched", "seam_cap", "turn_scale"):
+        for name in ("refine_steps", "settle_steps"):
+            check_count(getattr(self, name), name, 0)
+        for name in ("truncation", "unmatched", "seam_cap", "joint_scale", "turn_scale"):
             check_positive(getattr(self, name), name)
         for name in ("smoothness", "seam", "label_cost", "turn_weight", "normal_scale", "rtol"):
             check_positive(getattr(self, name), name, allow_zero=True)

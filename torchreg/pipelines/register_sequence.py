@@ -31,10 +31,13 @@ from torchreg.pipelines.threads import one_thread
 from torchreg.results.scans import SequenceRegistration
 
 # From frame to frame few large bones carry the reference: what many small ones take over from noise adds up, and so
-# does what slides along the surface.
-_CARRIED_LABEL_COST, _CARRIED_SMOOTHNESS, _CARRIED_POINT_TO_POINT = 0.002, 0.2, 0.1
-# What no frame tells is lost again in each of them: bones hold each other in wide turns too, radians.
-_HELD_TURNS = 0.5
+# does what slides along the surface. They have no room for all joints, so that none of them may be firm.
+_CARRIED_LABEL_COST, _CARRIED_SMOOTHNESS, _CARRIED_POINT_TO_POINT, _CARRIED_JOINTS = 0.002, 0.2, 0.1, 1e-4
+# Together, frames tell more of joints, so that these may be firm; what no frame tells is lost again in each of them, so
+# that bones hold each other in wide turns too, radians; and places along the surface, which drift, count less.
+_HELD_JOINTS, _HELD_TURNS, _HELD_POINT_TO_POINT = 0.01, 0.5, 0.001
+# Wide motions tear more where parts meet, cells.
+_HELD_SEAM_CAP = 1.0
 # Share of its last step by which a point is expected to move on: hidden limbs would run away with the whole.
 _GOES_ON = 0.5
 
@@ -92,23 +95,41 @@ def register_sequence(
     source = scans[reference]
     index = source_samples(source, config, generator)
     unit = ScanUnit.of(source.points[index])
-    few = replace(
-        config,
-        label_cost=max(config.label_cost, _CARRIED_LABEL_COST),
-        smoothness=max(config.smoothness, _CARRIED_SMOOTHNESS),
-        point_to_point=max(config.point_to_point, _CARRIED_POINT_TO_POINT),
-    )
-    reached, confidence = _chain(scans, reference, num_bones, grid_resolution, few, generator, on_step)
+    reached, confidence = _chain(scans, reference, num_bones, grid_resolution, _carrying(config), generator, on_step)
     scan = unit.of_scan(source)
     data = CellData(SparseGrid.from_points(scan.points, grid_resolution), scan.points[index], config.num_patches)
     places = unit.of_points(reached)[:, index]
     trust = confidence[:, index].double().clamp(min=LEAST_CONFIDENCE)
     samples = Samples(scan.points[index], scan.normals[index], places, trust)
-    held = replace(config, turn_scale=max(config.turn_scale, _HELD_TURNS))
-    fit = ReducedFit(data, samples, [unit.of_scan(other) for other in scans], num_bones, held, on_step)
+    fit = ReducedFit(data, samples, [unit.of_scan(other) for other in scans], num_bones, _held(config), on_step)
     settled = fit.fit_labels()
     settled = fit.refine() and settled
     return _result(scans, reference, unit, fit, settled)
+
+
+def _carrying(config: RegisterConfig) -> RegisterConfig:
+    """Return settings for the few bones that carry the reference from frame to frame."""
+    first, last = config.joint_weight
+    return replace(
+        config,
+        label_cost=max(config.label_cost, _CARRIED_LABEL_COST),
+        smoothness=max(config.smoothness, _CARRIED_SMOOTHNESS),
+        point_to_point=max(config.point_to_point, _CARRIED_POINT_TO_POINT),
+        joint_weight=(min(first, _CARRIED_JOINTS), min(last, _CARRIED_JOINTS)),
+        settle_steps=0,
+    )
+
+
+def _held(config: RegisterConfig) -> RegisterConfig:
+    """Return settings for all frames together."""
+    first, last = (max(weight, _HELD_JOINTS) if weight > 0 else weight for weight in config.joint_weight)
+    return replace(
+        config,
+        joint_weight=(first, last),
+        turn_scale=max(config.turn_scale, _HELD_TURNS),
+        point_to_point=min(config.point_to_point, _HELD_POINT_TO_POINT),
+        seam_cap=max(config.seam_cap, _HELD_SEAM_CAP),
+    )
 
 
 def _chain(
