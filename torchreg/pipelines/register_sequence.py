@@ -36,8 +36,8 @@ _CARRIED_LABEL_COST, _CARRIED_SMOOTHNESS, _CARRIED_POINT_TO_POINT, _CARRIED_JOIN
 # Together, frames tell more of joints, so that these may be firm; what no frame tells is lost again in each of them, so
 # that bones hold each other in wide turns too, radians; and places along the surface, which drift, count less.
 _HELD_JOINTS, _HELD_TURNS, _HELD_POINT_TO_POINT = 0.01, 0.5, 0.001
-# Wide motions tear more where parts meet, cells.
-_HELD_SEAM_CAP = 1.0
+# Parts may start from smaller patches, and wide motions tear more where parts meet, cells.
+_HELD_PATCHES, _HELD_SEAM_CAP = 200, 1.0
 # Share of its last step by which a point is expected to move on: hidden limbs would run away with the whole.
 _GOES_ON = 0.5
 
@@ -97,11 +97,12 @@ def register_sequence(
     unit = ScanUnit.of(source.points[index])
     reached, confidence = _chain(scans, reference, num_bones, grid_resolution, _carrying(config), generator, on_step)
     scan = unit.of_scan(source)
-    data = CellData(SparseGrid.from_points(scan.points, grid_resolution), scan.points[index], config.num_patches)
+    held = _held(config)
+    data = CellData(SparseGrid.from_points(scan.points, grid_resolution), scan.points[index], held.num_patches)
     places = unit.of_points(reached)[:, index]
     trust = confidence[:, index].double().clamp(min=LEAST_CONFIDENCE)
     samples = Samples(scan.points[index], scan.normals[index], places, trust)
-    fit = ReducedFit(data, samples, [unit.of_scan(other) for other in scans], num_bones, _held(config), on_step)
+    fit = ReducedFit(data, samples, [unit.of_scan(other) for other in scans], num_bones, held, on_step)
     settled = fit.fit_labels()
     settled = fit.refine() and settled
     return _result(scans, reference, unit, fit, settled)
@@ -125,6 +126,7 @@ def _held(config: RegisterConfig) -> RegisterConfig:
     first, last = (max(weight, _HELD_JOINTS) if weight > 0 else weight for weight in config.joint_weight)
     return replace(
         config,
+        num_patches=max(config.num_patches, _HELD_PATCHES),
         joint_weight=(first, last),
         turn_scale=max(config.turn_scale, _HELD_TURNS),
         point_to_point=min(config.point_to_point, _HELD_POINT_TO_POINT),
