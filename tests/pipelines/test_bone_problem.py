@@ -1,5 +1,7 @@
 """The energy of the T-step: its linearization against automatic differentiation of the losses, and its parts."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -74,6 +76,17 @@ def test_without_residuals_the_hessian_is_exact(bones, share):
 
         expected = torch.func.hessian(cost)(torch.zeros(6 * bones.COUNT, dtype=torch.float64))
         torch.testing.assert_close(some.linearize(at).hessian, expected, atol=1e-10, rtol=1e-8)
+
+
+def test_joints_may_be_elsewhere(bones):
+    problem, _ = bones.noisy_problem()
+    transforms = se3_exp(0.3 * bones.draw(2, bones.COUNT, 6, seed=5))
+    joints = problem.moments.center + 0.1 * bones.draw(len(problem.moments.pairs), 3, seed=6)
+    moved = replace(problem, moments=replace(problem.moments, center=joints))
+    found, expected = problem.linearize(transforms, joints), moved.linearize(transforms)
+    for name in ("cost", "gradient", "hessian"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name))
+    torch.testing.assert_close(problem.linearize(transforms).cost, problem.energy(transforms) / 2)
 
 
 def test_bindings_list_every_pair_once(bones):

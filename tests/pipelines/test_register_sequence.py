@@ -84,21 +84,35 @@ def test_points_are_expected_to_go_on_as_they_went(toy, monkeypatch):
     torch.testing.assert_close(back, first - 0.5 * (second - first))
 
 
-@pytest.mark.parametrize(("given", "carried"), [(0.01, 0.1), (0.5, 0.5)])
-def test_what_is_carried_is_held_along_the_surface(toy, monkeypatch, given, carried):
-    shares = []
+@pytest.mark.parametrize(
+    ("given", "carried"),
+    [
+        ({"point_to_point": 0.01, "joint_weight": (0.001, 0.001)}, (0.1, (1e-4, 1e-4))),
+        ({"point_to_point": 0.5, "joint_weight": (1e-5, 1e-6)}, (0.5, (1e-5, 1e-6))),
+        ({"joint_weight": (0.0, 0.0)}, (0.1, (0.0, 0.0))),
+    ],
+)
+def test_what_is_carried_is_held_along_the_surface_and_not_by_joints(toy, monkeypatch, given, carried):
+    settings = []
 
     def watched(source, target, num_bones, grid_resolution, config, generator, **start):
-        shares.append(config.point_to_point)
+        settings.append((config.point_to_point, config.joint_weight))
         return tr.register(source, target, num_bones, grid_resolution, config, generator, **start)
 
     monkeypatch.setattr(sys.modules[register_sequence.__module__], "register", watched)
-    register_sequence([toy[0], toy[1], toy[2]], 8, 30, replace(QUICK, point_to_point=given))
-    assert shares == [carried]
+    register_sequence([toy[0], toy[1], toy[2]], 8, 30, replace(QUICK, **given))
+    assert settings == [carried]
 
 
-@pytest.mark.parametrize(("given", "held"), [(0.1, 0.5), (2.0, 2.0)])
-def test_all_frames_are_fitted_to_the_dense_alignments_and_hold_wide_turns(toy, monkeypatch, given, held):
+@pytest.mark.parametrize(
+    ("given", "held"),
+    [
+        ({}, {"turn_scale": 0.5, "joint_weight": (0.01, 0.01), "point_to_point": 0.001, "seam_cap": 1.0}),
+        ({"turn_scale": 2.0, "joint_weight": (1.0, 0.05)}, {"turn_scale": 2.0, "joint_weight": (1.0, 0.05)}),
+        ({"joint_weight": (0.0, 0.0), "num_patches": 300}, {"joint_weight": (0.0, 0.0), "num_patches": 300}),
+    ],
+)
+def test_all_frames_are_fitted_to_the_dense_alignments_and_bones_hold_each_other(toy, monkeypatch, given, held):
     module, reached, fits = sys.modules[register_sequence.__module__], [], []
 
     def aligned(*arguments, **options):
@@ -112,9 +126,9 @@ def test_all_frames_are_fitted_to_the_dense_alignments_and_hold_wide_turns(toy, 
 
     monkeypatch.setattr(module, "align_scans", aligned)
     monkeypatch.setattr(module, "ReducedFit", Watched)
-    config = replace(QUICK, turn_scale=given)
+    config = replace(QUICK, **given)
     register_sequence([toy[0], toy[1], toy[2]], 8, 30, config)
-    assert fits[0].config.turn_scale == held
+    assert {name: getattr(fits[0].config, name) for name in held} == held
     index = source_samples(toy[0], config, None)
     unit = ScanUnit.of(toy[0].points[index])
     expected = torch.stack([unit.of_points(points)[index] for points in (toy[0].points, *(r.points for r in reached))])
