@@ -142,6 +142,8 @@ def test_bad_input_is_named(bones):
         fit_bones_and_joints(problem, start(bones), PIVOTS[:1])
     with pytest.raises(InputError, match="transforms must have shape"):
         fit_bones_and_joints(problem, start(bones)[0])
+    with pytest.raises(InputError, match="targets must have shape"):
+        fit_bones_and_joints(bones.noisy_problem(batch=(2, 3))[0], start(bones))
     with pytest.raises(InputError, match="regularization must be positive"):
         fit_bones_and_joints(problem, start(bones), regularization=0.0)
     with pytest.raises(InputError, match="max_steps must be at least 1"):

@@ -83,6 +83,7 @@ def fit_bones_and_joints(
     check_positive(rtol, "rtol", allow_zero=True)
     check_positive(regularization, "regularization")
     moments = _joints_of(problem)
+    check_shape(problem.targets, "targets", ("F", len(problem.points), 3))
     check_shape(transforms, "transforms", ("F", problem.binding.num_bones, 4, 4))
     transforms = problem.batched(transforms)
     centers = moments.center if centers is None else centers
