@@ -55,7 +55,39 @@ def test_neighbors_share_samples():
     assert bool((graph.edges[:, 0] < graph.edges[:, 1]).all())
     gap = (places[:, 0] - places[:, 1]).abs()
     assert {4} <= set(gap.tolist()) <= {4, 8}
-    assert float(graph.edge_weights.mean()) == pytest.approx(1)
+    torch.testing.assert_close(graph.edge_weights, raised(graph))
+
+
+def raised(graph):
+    """Return weights of edges by what they share, those raised that alone hold two sides together, edge by edge."""
+    dense = graph.dense_weights()
+    shared = (dense.mT @ dense)[graph.edges[:, 0], graph.edges[:, 1]]
+    shared = shared / shared.mean()
+    count, weights = len(graph.nodes), shared.clone()
+    for number in range(len(shared)):
+        # It alone holds its ends together if no way around it consists of stronger edges.
+        reach = torch.arange(count)
+        for one, other in graph.edges[shared > shared[number]].tolist():
+            reach[reach == reach[other]] = reach[one].clone()
+        one, other = graph.edges[number]
+        if reach[one] != reach[other]:
+            weights[number] = shared[number].clamp(min=1)
+    return weights
+
+
+def test_islands_are_held_as_firmly_as_the_rest():
+    """Two chains of samples with a long link between them, on whose sides samples share next to nothing."""
+    edges = torch.stack((torch.arange(32), torch.arange(1, 33)), dim=1)
+    lengths = torch.ones(32)
+    lengths[20] = 12.0
+    graph = build_node_graph(GeodesicGraph.from_steps(edges, lengths, 33), 0, 9, 4)
+    side = graph.nodes[graph.edges] > 20
+    across = side[:, 0] != side[:, 1]
+    dense = graph.dense_weights()
+    shared = (dense.mT @ dense)[graph.edges[:, 0], graph.edges[:, 1]]
+    assert 0 < float((shared / shared.mean())[across].max()) < 0.5
+    assert float(graph.edge_weights[across].max()) == 1
+    torch.testing.assert_close(graph.edge_weights, raised(graph))
 
 
 @pytest.mark.parametrize(("count", "nodes"), [(1, 4), (2, 4), (3, 1)])

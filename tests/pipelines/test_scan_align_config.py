@@ -54,6 +54,10 @@ from torchreg.pipelines.scan_align_config import (
         (ScanAlignConfig, {"region_give": 0.0}, "region_give must be positive"),
         (ChoiceConfig, {"leap": -1.0}, "leap must be"),
         (ChoiceConfig, {"leap_cap": 0.0}, "leap_cap must be positive"),
+        (ChoiceConfig, {"overlap": -1.0}, "overlap must be"),
+        (ChoiceConfig, {"overlap_cap": 0.0}, "overlap_cap must be positive"),
+        (ScanAlignConfig, {"overlap_samples": 0}, "overlap_samples must be at least 1"),
+        (ScanAlignConfig, {"overlap_reach": 0.0}, "overlap_reach must be positive"),
     ],
 )
 def test_values_out_of_range_are_named(kind, arguments, message):

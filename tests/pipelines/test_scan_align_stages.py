@@ -28,6 +28,7 @@ from torchreg.pipelines.scan_align_stages import (
     leaps,
     loses_limb,
     mismatch,
+    overlaps,
     pull_one_to_one,
     refine,
     used_samples,
@@ -239,6 +240,61 @@ def test_leaps_cost_their_distance_up_to_a_cap(problem):
         away = replace(problem, expected=places + distance * torch.tensor([0.6, 0.0, -0.8]))
         torch.testing.assert_close(leaps(away, places, config), torch.full_like(places[:, 0], cost))
         assert judge(away, "", rest, config).leap == pytest.approx(cost)
+
+
+@pytest.fixture(scope="module")
+def plates():
+    """Two plates in one scan, 0.1 apart, about half as wide: a problem, and which of its nodes are on the second."""
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(1200, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.5, 0.5, 0.0])
+    points[600:, 0] += 0.6
+    scan = RangeScan(points, normals=torch.tensor([[0.0, 0.0, 1.0]]).double().expand_as(points))
+    problem = describe(scan, scan, CONFIG)
+    return problem, points[problem.nodes, 0] > 0.55
+
+
+def laid(problem, second, height=0.0, turn=0.0):
+    """Return motions that lay the second plate on the first, above it, turned about an edge of its own."""
+    motions, size = problem.graph.rest(), problem.unit.size
+    there = torch.tensor([-0.6 / size, 0.0, height], dtype=torch.float64)
+    middle = problem.graph.centers[second].mean(0)
+    turned = se3_exp(torch.tensor([0.0, 0, 0, turn, 0, 0], dtype=torch.float64))
+    turned[:3, 3] = middle - turned[:3, :3] @ middle + there
+    motions[second] = turned
+    return motions
+
+
+def test_limbs_in_one_place_overlap(plates):
+    problem, second = plates
+    config, total = ChoiceConfig(), len(problem.far)
+    assert torch.equal(problem.far, problem.far.mT)
+    assert not problem.far.diagonal().any()
+    assert overlaps(problem, problem.moved(problem.graph.rest()), config).count_nonzero() == 0
+    found = overlaps(problem, problem.moved(laid(problem, second)), config)
+    # By hand, pair by pair: points alone, as all face one way.
+    places = problem.graph(laid(problem, second))[:total]
+    first = problem.graph.points[:total, 0] < problem.graph.points[:, 0].mean()
+    away = torch.full((total,), torch.inf, dtype=torch.float64)
+    for one in range(total):
+        for other in (first != first[one]).nonzero()[:, 0].tolist():
+            away[one] = min(away[one], float((places[one] - places[other]).norm()))
+    torch.testing.assert_close(found, 1 - (away / config.overlap_cap).clamp(max=1).square())
+    assert float(found.mean()) > 0.2
+    # Not if one lies above the other, or faces the other way.
+    for apart in (laid(problem, second, 1.01 * config.overlap_cap), laid(problem, second, 0.0, torch.pi)):
+        assert overlaps(problem, problem.moved(apart), config).count_nonzero() == 0
+
+
+def test_overlaps_cost_as_much_as_they_weigh_and_lose_a_limb(plates):
+    problem, second = plates
+    both = laid(problem, second)
+    share = float(overlaps(problem, problem.moved(both), ChoiceConfig()).mean())
+    plain, dear = (judge(problem, "", both, ChoiceConfig(overlap=weight)) for weight in (0.0, 3.0))
+    assert dear.overlap == pytest.approx(3 * share)
+    assert dear.energy - plain.energy == pytest.approx(dear.overlap)
+    # Everything lies on the target: that half of it is bare tells nothing, it may be new.
+    assert loses_limb(problem, both, ChoiceConfig())
+    assert not loses_limb(problem, both, ChoiceConfig(lost_share=1.1 * share))
 
 
 def test_better_hypotheses_are_judged_better(problem, reporter):

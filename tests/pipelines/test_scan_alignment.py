@@ -75,7 +75,7 @@ def test_the_result_is_what_its_parts_say(pair, aligned):
     ahead = align_scans(pair.source, pair.target, QUICK, expected=aligned.points).chosen
     assert aligned.chosen.leap == 0
     for one in (aligned.chosen, ahead):
-        terms = (one.forward, one.seen, one.backward, one.unlike, one.bend, one.strain, one.leap)
+        terms = (one.forward, one.seen, one.backward, one.unlike, one.bend, one.strain, one.leap, one.overlap)
         assert one.energy == pytest.approx(sum(terms))
         assert one.strain > 0
 
@@ -128,6 +128,15 @@ def test_the_best_is_believed_if_the_next_best_about_agrees(pair, monkeypatch):
     widths.clear()
     monkeypatch.setattr(scan_alignment, "loses_limb", lambda *_: True)
     assert "fused" in {each.name for each in align_scans(pair.source, pair.target, QUICK).hypotheses}
+
+
+@pytest.mark.parametrize(("pulled", "believed"), [((1, 0), True), ((1, 1), False), ((1, 1, 0), True), ((0, 0), False)])
+def test_two_that_were_pulled_alike_do_not_confirm_each_other(pair, pulled, believed):
+    problem = describe(pair.source, pair.source, QUICK)
+    rest = problem.graph.rest()
+    best = judge(problem, "", rest, QUICK.choice)
+    found = [scan_alignment._Candidate(best, rest, 0.1, bool(each)) for each in pulled]
+    assert scan_alignment._confirmed(problem, found, QUICK) == believed
 
 
 def test_as_many_turns_are_followed_as_lie_better(pair, monkeypatch):

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import minimum_spanning_tree
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_count, check_points
@@ -14,6 +17,8 @@ from torchreg.geometry.neighbors import nearest_few
 
 # Two nodes are neighbors if what they carry in common weighs at least this many samples.
 _LEAST_SHARED = 1e-3
+# Weight by which any part of a graph is held to the rest, at least; that of an edge is one in the mean.
+_LEAST_LINK = 1.0
 # Shares below this count as this: a sample as far from its nearest node as from the next but four has any.
 _LEAST_SHARE = 1e-6
 # The few nodes nearest to a sample are mostly within so many times the distance of any sample from its nearest one.
@@ -29,7 +34,7 @@ class NodeGraph:
         nearest: (S, K) int64 nodes that each sample hangs on, the nearest first.
         weights: (S, K) float64 by how much; rows sum to one.
         edges: (E, 2) int64 neighbors, the smaller index first.
-        edge_weights: (E,) float64, how much they carry in common; one in the mean.
+        edge_weights: (E,) float64, how much they carry in common, one in the mean; more where little else holds.
     """
 
     nodes: Tensor
@@ -107,8 +112,23 @@ def _neighbors(nearest: Tensor, weights: Tensor, count: int) -> tuple[Tensor, Te
     dense = weights.new_zeros(len(weights), count).scatter_add(1, nearest, weights)
     shared = (dense.mT @ dense).triu(1)
     edges = (shared > _LEAST_SHARED).nonzero()
+    if len(edges) == 0:
+        return edges, shared.new_zeros(0)
     weight = shared[edges[:, 0], edges[:, 1]]
-    return edges, weight / weight.mean() if len(edges) else weight
+    weight = weight / weight.mean()
+    return edges, _firmly_linked(edges, weight, count)
+
+
+def _firmly_linked(edges: Tensor, weights: Tensor, count: int) -> Tensor:
+    """Return weights (E,) of edges by which every part of a graph hangs firmly on the rest.
+
+    Those of a maximum spanning tree are raised: across the gaps around islands of a scan samples share next to nothing.
+    """
+    graph = coo_array(((1 / weights).numpy(), tuple(edges.mT.numpy())), shape=(count, count))
+    tree = coo_array(minimum_spanning_tree(graph))
+    number = torch.from_numpy(tree.row.astype(np.int64) * count + tree.col)
+    held = torch.isin(edges[:, 0] * count + edges[:, 1], number)
+    return torch.where(held, weights.clamp(min=_LEAST_LINK), weights)
 
 
 def spread_weights(

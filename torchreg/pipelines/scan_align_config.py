@@ -192,10 +192,13 @@ class ChoiceConfig:
         strain: what it costs that samples leave the wide regions they are in, see `WideRegions.strain`.
         leap: what it costs that samples are far from where they were expected, if that is known, squared,
         leap_cap: up to this distance, length.
+        overlap: what it costs that samples far from each other along the surface come together, facing the same way:
+            two limbs cannot be in one place,
+        overlap_cap: from this distance on, length.
         same: hypotheses agree where their samples are this near each other, length,
         same_share: for at least this share of the samples,
         lost_share: unless more of the samples of both scans are as far as the cap from the other scan: of one alone
-            they may be hidden, of both a limb went elsewhere.
+            they may be hidden, of both a limb went elsewhere; or they overlap by more in the mean.
     """
 
     cap: float = 0.03
@@ -208,14 +211,16 @@ class ChoiceConfig:
     strain: float = 2.5
     leap: float = 3.0
     leap_cap: float = 0.1
+    overlap: float = 1.0
+    overlap_cap: float = 0.02
     same: float = 0.005
     same_share: float = 0.95
     lost_share: float = 0.02
 
     def __post_init__(self) -> None:
-        for name in ("cap", "behind", "leap_cap", "same", "same_share"):
+        for name in ("cap", "behind", "leap_cap", "overlap_cap", "same", "same_share"):
             check_positive(getattr(self, name), name)
-        for name in ("normal_scale", "seen", "unlike", "bend", "slack", "strain", "leap", "lost_share"):
+        for name in ("normal_scale", "seen", "unlike", "bend", "slack", "strain", "leap", "overlap", "lost_share"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
 
@@ -231,6 +236,8 @@ class ScanAlignConfig:
         region_samples: of the source, that wide regions hold.
         region_reach: radius of those along the surface, length.
         region_give: samples off a region's rigid motion by more than this are free, length.
+        overlap_samples: of the source, that must not come together
+        overlap_reach: if they are farther apart than this along the surface, length.
         curvature_radii: of the features, lengths; learned descriptors rest on the default ones.
         occluder_depth: a surface this much nearer to the camera beside an edge hides what is behind, length.
         occluder_reach: spacings of samples within which of such an edge matches hold across the surface alone.
@@ -253,6 +260,8 @@ class ScanAlignConfig:
     region_samples: int = 200
     region_reach: float = 0.5
     region_give: float = 0.05
+    overlap_samples: int = 600
+    overlap_reach: float = 0.1
     curvature_radii: tuple[float, ...] = CURVATURE_RADII
     occluder_depth: float = 0.03
     occluder_reach: float = 2.5
@@ -266,9 +275,16 @@ class ScanAlignConfig:
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
 
     def __post_init__(self) -> None:
-        for name in ("num_samples", "num_target_samples", "num_nodes", "num_nearest", "region_samples"):
+        for name in (
+            "num_samples",
+            "num_target_samples",
+            "num_nodes",
+            "num_nearest",
+            "region_samples",
+            "overlap_samples",
+        ):
             check_count(getattr(self, name), name, 1)
-        for name in ("region_reach", "region_give"):
+        for name in ("region_reach", "region_give", "overlap_reach"):
             check_positive(getattr(self, name), name)
         _check_values(self.curvature_radii, "curvature_radii")
         if self.match.descriptor == "learned" and tuple(self.curvature_radii) != CURVATURE_RADII:
@@ -322,8 +338,8 @@ class Hypothesis:
 
     Args:
         name: what it started from.
-        energy: ``forward + seen + backward + unlike + bend + strain + leap``, by which hypotheses are compared; lower
-            is better.
+        energy: ``forward + seen + backward + unlike + bend + strain + leap + overlap``, by which hypotheses are
+            compared; lower is better.
         forward: mean squared distance of moved samples to the target, capped at one.
         seen: weighted mean distance of moved samples to the target, from 0 at a quarter of the cap to one at the cap; 0
             where its camera would not have seen them, and everywhere if it is not known where that was.
@@ -333,6 +349,8 @@ class Hypothesis:
         strain: weighted share by which wide regions do not move rigidly.
         leap: weighted mean squared distance of samples from where they were expected, capped at one; 0 if that is not
             known.
+        overlap: weighted mean over samples, from 0 to 1 where another, far from it along the surface, lies in the same
+            place and faces the same way.
     """
 
     name: str
@@ -344,6 +362,7 @@ class Hypothesis:
     bend: float
     strain: float
     leap: float = 0.0
+    overlap: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,6 +46,7 @@ class ScanAlignProblem:
         source: samples of the source, evenly spread in any first few of them.
         target: samples of the target.
         regions: of the graph's first samples, about its nodes, each of which mostly moves rigidly.
+        far: (M, M) which of the graph's first samples are far from each other along the surface.
         free: where the camera saw nothing when the target was scanned; None if it is not known where the camera was.
         samples: (S,) source points that are samples of the graph.
         nodes: (J,) source points that are nodes.
@@ -57,6 +58,7 @@ class ScanAlignProblem:
     source: OrientedSamples
     target: OrientedSamples
     regions: WideRegions
+    far: Tensor
     free: FreeSpace | None
     samples: Tensor
     nodes: Tensor
@@ -116,7 +118,14 @@ def describe(
     graph = DeformationGraph(one.points[: len(samples)], one.normals[: len(samples)], nodes)
     ahead = None if expected is None else unit.of_points(expected)[samples]
     regions = _wide_regions(graph, ways, nodes.nodes, config)
-    return ScanAlignProblem(graph, one, other, regions, free, samples, samples[nodes.nodes], unit, ahead)
+    far = _far_apart(ways, config)
+    return ScanAlignProblem(graph, one, other, regions, far, free, samples, samples[nodes.nodes], unit, ahead)
+
+
+def _far_apart(ways: GeodesicGraph, config: ScanAlignConfig) -> Tensor:
+    """Return which of the first samples (M, M) are far from each other along the surface."""
+    few = torch.arange(min(config.overlap_samples, len(ways)))
+    return ways.distances(few, limit=config.overlap_reach)[:, : len(few)].isinf()
 
 
 def _wide_regions(graph: DeformationGraph, ways: GeodesicGraph, nodes: Tensor, config: ScanAlignConfig) -> WideRegions:

@@ -223,7 +223,8 @@ def judge(problem: ScanAlignProblem, name: str, transforms: Tensor, config: Choi
     bend = config.bend * float(problem.graph.bend(transforms, config.slack))
     strain = config.strain * problem.regions.strain(moved.points)
     leap = float(leaps(problem, moved.points, config).mean())
-    costs = (forward, seen, backward, unlike, bend, strain, leap)
+    overlap = config.overlap * float(overlaps(problem, moved, config).mean())
+    costs = (forward, seen, backward, unlike, bend, strain, leap, overlap)
     return Hypothesis(name, sum(costs), *costs)
 
 
@@ -233,6 +234,16 @@ def leaps(problem: ScanAlignProblem, places: Tensor, config: ChoiceConfig) -> Te
         return torch.zeros_like(places[:, 0])
     apart = (places - problem.expected).norm(dim=-1) / config.leap_cap
     return config.leap * apart.clamp(max=1).square()
+
+
+def overlaps(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> Tensor:
+    """Return how far the first moved samples (M,) lie where others do that are far from them along the surface.
+
+    From 0, no nearer than the cap, to 1. Two limbs that end on one of the target's match it well, each on its own.
+    """
+    places = embedded(moved.first(len(problem.far)), replace(config, cap=config.overlap_cap))
+    apart = torch.cdist(places, places).masked_fill(~problem.far, torch.inf).amin(1)
+    return 1 - (apart / config.overlap_cap).clamp(max=1).square()
 
 
 def mismatch(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> tuple[Tensor, Tensor, Tensor]:
@@ -263,8 +274,11 @@ def embedded(samples: OrientedSamples, config: ChoiceConfig) -> Tensor:
 
 
 def loses_limb(problem: ScanAlignProblem, transforms: Tensor, config: ChoiceConfig) -> bool:
-    """Return whether samples of both scans are left over."""
-    here, there = embedded(problem.moved(transforms), config), embedded(problem.target, config)
+    """Return whether samples of both scans are left over, or limbs of the source lie in one place."""
+    moved = problem.moved(transforms)
+    if float(overlaps(problem, moved, config).mean()) > config.lost_share:
+        return True
+    here, there = embedded(moved, config), embedded(problem.target, config)
     left = [
         float((nearest_few(one, other, 1)[1] >= config.cap).double().mean())
         for one, other in ((here, there), (there, here))

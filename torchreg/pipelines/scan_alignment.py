@@ -80,10 +80,10 @@ def align_scans(
     it, and the EM goes on from there as well, and from the best with two limbs exchanged or with one laid where nothing
     covers the target, if one-to-one matches make that about as good. The best covers the target, most of all where its
     camera would have seen it, is covered by it, is like it, bends least, leaves the larger part of each wide region
-    rigid, and is nearest to what is expected; its EM is taken to the end, and beside that run anew, slowly, with
-    matches that may slide, while what is unlike the target all around follows the wide regions it is in: that end is
-    kept unless it is clearly worse or leaves more of the target bare. Where rest and stiff matches agree and leave
-    little of both scans over, the softer ones are left out, and so is the slow EM.
+    rigid, is nearest to what is expected, and takes no two limbs to one place; its EM is taken to the end, and beside
+    that run anew, slowly, with matches that may slide, while what is unlike the target all around follows the wide
+    regions it is in: that end is kept unless it is clearly worse or leaves more of the target bare. Where rest and
+    stiff matches agree and leave little of both scans over, the softer ones are left out, and so is the slow EM.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -122,7 +122,7 @@ def align_scans(
     problem = describe(source, target, config, generator, None if expected is None else _checked(expected, source))
     found = sorted(_candidates(problem, config, report), key=_energy)
     unsure = len(found) >= _LEAST_FUSED
-    if unsure and not _confirmed(problem, found[0], found[1], config):
+    if unsure and not _confirmed(problem, found, config):
         found = sorted([*found, *_turned(problem, config, report)], key=_energy)
         found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
         found = sorted([*found, *_rearranged(problem, found[0], config, report)], key=_energy)
@@ -158,11 +158,13 @@ class _Candidate:
         hypothesis: how they compare.
         transforms: the motions.
         sigma: with which their EM began.
+        pulled: whether one-to-one matches led there.
     """
 
     hypothesis: Hypothesis
     transforms: Tensor
     sigma: float
+    pulled: bool = False
 
 
 def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
@@ -211,14 +213,14 @@ def _by_matches(
     reporter = Reporter("matches", problem.unit.size, on_step)
     fitted = fit_first_matches(problem, matches, config.match.stiffness, config.match, reporter)
     pulled = pull_one_to_one(problem, fitted, config.reassign, reporter)
-    return _compared(problem, pulled, config.refine.sigma[0], config, reporter)
+    return replace(_compared(problem, pulled, config.refine.sigma[0], config, reporter), pulled=True)
 
 
 def _one_to_one(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> _Candidate:
     """Return the candidate pulled from rest by one-to-one matches alone."""
     reporter = Reporter("one to one", problem.unit.size, on_step)
     pulled = pull_one_to_one(problem, problem.graph.rest(), config.assign, reporter)
-    return _compared(problem, pulled, config.refine.sigma[0], config, reporter)
+    return replace(_compared(problem, pulled, config.refine.sigma[0], config, reporter), pulled=True)
 
 
 def _both_told(
@@ -346,8 +348,15 @@ def _slow_is_kept(slow: Hypothesis, quick: Hypothesis) -> bool:
     return slow.energy + _BARE * slow.backward < quick.energy + _BARE * quick.backward + _SLOW_COSTS_MORE
 
 
-def _confirmed(problem: ScanAlignProblem, best: _Candidate, next_best: _Candidate, config: ScanAlignConfig) -> bool:
-    """Return whether the best of several candidates is believed: the next best goes there too, and no limb is lost."""
+def _confirmed(problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig) -> bool:
+    """Return whether the best of several candidates is believed: the next best goes there too, and no limb is lost.
+
+    The next best is one found in another way: what one-to-one matches pull from two starts is often wrong alike.
+    """
+    best = found[0]
+    next_best = next((other for other in found if other.pulled != best.pulled), None)
+    if next_best is None:
+        return False
     like = replace(config.choice, same=_CONFIRMED * config.choice.same)
     if not agree(problem, best.transforms, next_best.transforms, like):
         return False
