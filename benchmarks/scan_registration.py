@@ -121,7 +121,7 @@ def _ablations() -> list[Recipe]:
         Recipe("without joint term", config=replace(plain, joint_weight=(0.0, 0.0))),
         Recipe("joints 0.01 all along", config=replace(plain, joint_weight=(0.01, 0.01))),
         Recipe("joints 1 to 0.05", config=replace(plain, joint_weight=(1.0, 0.05))),
-        Recipe("all that meets held", config=replace(plain, joint_scale=1e3)),
+        Recipe("all that meets held", config=replace(plain, joint_scale=(1e3, 1e3))),
         Recipe("without turns held", config=replace(plain, turn_weight=0.0)),
         Recipe("borders anywhere", config=replace(plain, seam=0.0, smoothness=0.05)),
         Recipe("without label reuse", config=replace(plain, reuse=False)),
@@ -131,6 +131,7 @@ def _ablations() -> list[Recipe]:
         Recipe("learned descriptors", config=replace(plain, align=_learned(plain.align))),
         Recipe("without wide regions", config=replace(plain, align=_no_regions(plain.align))),
         Recipe("without visibility", config=replace(plain, align=_blind(plain.align))),
+        Recipe("limbs may overlap", config=replace(plain, align=_overlapping(plain.align))),
         *(Recipe(f"grid {size}", grid=size) for size in (20, 35, 65, 80)),
         *(Recipe(f"bones {size}", bones=size) for size in (4, 6, 10, 15)),
     ]
@@ -154,6 +155,11 @@ def _no_regions(align: ScanAlignConfig) -> ScanAlignConfig:
 def _blind(align: ScanAlignConfig) -> ScanAlignConfig:
     """Return settings under which hypotheses may take points to where the camera would have seen them."""
     return replace(align, choice=replace(align.choice, seen=0.0))
+
+
+def _overlapping(align: ScanAlignConfig) -> ScanAlignConfig:
+    """Return settings under which hypotheses may take limbs to one place."""
+    return replace(align, choice=replace(align.choice, overlap=0.0))
 
 
 def file_problems(folder: Path) -> Iterator[Problem]:

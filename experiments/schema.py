@@ -148,7 +148,7 @@ class RegistrationTrial:
         method: "reduced" is the library's; "cpd" (pycpd, deformable) and "gicp" (small_gicp, rigid) are others'.
         num_bones: at most.
         grid_resolution: cells along the longest axis.
-        joint_weight: of the joint term; 0 leaves it out.
+        joint_weight: of the joint term in the end, from ten times as much on; 0 leaves it out.
         reuse: whether lost labels are reborn.
         refine_steps: rounds of refining weights.
         num_samples: source points that are matched.
@@ -163,7 +163,7 @@ class RegistrationTrial:
     joint_weight: float = 0.001
     reuse: bool = True
     refine_steps: int = 1
-    num_samples: int = 2500
+    num_samples: int = 4000
     pictures: bool = False
 
 

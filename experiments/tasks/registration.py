@@ -68,7 +68,7 @@ def run(config: RegistrationTrial, bench: Bench) -> TrialOutcome:
 
 def _settings(config: RegistrationTrial) -> tr.RegisterConfig:
     return tr.RegisterConfig(
-        joint_weight=(config.joint_weight, config.joint_weight), reuse=config.reuse,
+        joint_weight=(10 * config.joint_weight, config.joint_weight), reuse=config.reuse,
         refine_steps=config.refine_steps, num_samples=config.num_samples,
     )  # fmt: skip
 

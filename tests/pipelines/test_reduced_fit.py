@@ -22,7 +22,8 @@ def toy():
     return sequence, [sequence.pair(0, 1), sequence.pair(0, 2)]
 
 
-def fit(pairs, num_bones=8, noise=0.0, config=None, on_step=None):
+def fit(pairs, num_bones=8, noise=0.0, config=None, on_step=None, drift=0.0):
+    """Return a fit that starts from the truth, but for noise of each point and drift of each part, and the truth."""
     source = pairs[0].source
     size, middle = source.diagonal, source.points.mean(0)
     motion = torch.eye(4, dtype=torch.float64) / size
@@ -32,6 +33,8 @@ def fit(pairs, num_bones=8, noise=0.0, config=None, on_step=None):
     generator = torch.Generator().manual_seed(0)
     truth = torch.stack([(pair.truth - middle) / size for pair in pairs])
     moved = truth + noise * torch.randn(truth.shape, generator=generator, dtype=torch.float64)
+    parts = int(pairs[0].labels.max()) + 1
+    moved += drift * torch.randn(len(pairs), parts, 3, generator=generator, dtype=torch.float64)[:, pairs[0].labels]
     samples = Samples(points, source.normals, moved, torch.ones_like(moved[..., 0]))
     targets = [pair.target.transformed(motion) for pair in pairs]
     return ReducedFit(data, samples, targets, num_bones, config or RegisterConfig(), on_step), truth
@@ -43,12 +46,12 @@ def error(reduced, truth):
 
 def test_labels_then_weights_come_nearer_to_the_truth(toy):
     records = []
-    reduced, truth = fit(toy[1][:1], noise=0.005, on_step=records.append)
+    reduced, truth = fit(toy[1][:1], noise=0.005, drift=0.005, on_step=records.append)
     first = error(reduced, truth)
     reduced.fit_labels()
+    assert error(reduced, truth) < 0.8 * first
     reduced.refine()
-    assert error(reduced, truth) < first
-    assert error(reduced, truth) < 0.006
+    assert error(reduced, truth) < 0.75 * first
     assert records == reduced.history
     assert [record.stage for record in records] == sorted(record.stage for record in records)
     for record in records:
@@ -58,12 +61,10 @@ def test_labels_then_weights_come_nearer_to_the_truth(toy):
     assert records[-1].distance < records[0].distance
 
 
-LET_GO = "a small bone that tears its joint in the first rounds is let go too early"
-
-
-@pytest.mark.parametrize("weight", [pytest.param(0.001, marks=pytest.mark.xfail(strict=True, reason=LET_GO)), 0.01])
+@pytest.mark.parametrize("weight", [(0.001, 0.001), (0.01, 0.01), RegisterConfig().joint_weight])
 def test_labels_alone_lose_little(toy, weight):
-    reduced, truth = fit(toy[1][:1], noise=0.005, config=RegisterConfig(joint_weight=(weight, weight)))
+    """From the truth but for noise, which parts average out, there is nothing to gain."""
+    reduced, truth = fit(toy[1][:1], noise=0.005, config=RegisterConfig(joint_weight=weight))
     first = error(reduced, truth)
     reduced.fit_labels()
     assert error(reduced, truth) < 1.1 * first
@@ -155,11 +156,20 @@ def test_turns_count_less_the_wider_they_are(toy, problems):
 
 
 def test_joints_that_do_not_hold_count_less_and_none_without_weight(toy, problems):
-    for settings in ({"joint_scale": 1e-5}, {"joint_scale": 1e5}, {"joint_weight": (0.0, 0.0)}):
+    scales = ({"joint_scale": (scale, scale)} for scale in (1e-5, 1e5))
+    for settings in (*scales, {"joint_weight": (0.0, 0.0)}):
         fit(toy[1], noise=0.005, config=RegisterConfig(**settings))[0].solve_motions()
     loose, firm = (problem.pair_weights for problem in problems)
     torch.testing.assert_close(firm, torch.ones_like(firm))
     assert loose.max() < 0.5
+
+
+def test_joints_are_held_first_and_let_go_later(toy, problems):
+    reduced, _ = fit(toy[1], noise=0.005, config=RegisterConfig(joint_scale=(1e5, 1e-5), rtol=0.0))
+    reduced.fit_labels()
+    reduced.refine()
+    torch.testing.assert_close(problems[0].pair_weights, torch.ones_like(problems[0].pair_weights))
+    assert problems[-1].pair_weights.max() < 0.5
 
 
 @pytest.mark.parametrize("settings", [{"reuse": False}, {"refine_steps": 0}, {"blend": "dual_quaternion"}])

@@ -95,16 +95,15 @@ class ReducedFit:
             labels = first_labels(data, samples.moved, samples.confidence, num_bones, self._costs)
         self._label(labels, data.moments(samples.moved, samples.confidence).joined(*self._parts(labels)).motions())
         self._counts = (0, 0, 0, 0)
-        self._joint_weight = config.joint_weight_at(0)
+        self._progress = 0.0
 
     def fit_labels(self) -> bool:
         """Alternate T-step, correspondences and W-step, and return whether the energy settled."""
         energy, steps = float("inf"), self.config.label_steps
         for step in range(steps):
-            progress = step / max(1, steps - 1)
-            self._joint_weight = self.config.joint_weight_at(progress)
+            self._progress = step / max(1, steps - 1)
             self.solve_motions()
-            self.update_matches(0.5 * progress)
+            self.update_matches(0.5 * self._progress)
             labels, found = relabel(self.data, self.pull, self.model.transforms.detach(), self.labels, self._costs)
             self._use(labels)
             settled = found >= (1 - self.config.rtol) * energy
@@ -121,7 +120,7 @@ class ReducedFit:
 
         In some more rounds weights stay, and motions and joints come to terms.
         """
-        self._joint_weight = self.config.joint_weight_at(1)
+        self._progress = 1.0
         rounds = self.config.refine_steps + self.config.settle_steps
         settled = self._refine_weights(rounds)
         for step in range(self.config.refine_steps, rounds):
@@ -207,6 +206,10 @@ class ReducedFit:
             weights, transforms = self.model.weights_at(points), self.model.transforms
             return self.model.move(points, weights), turned_normals(normals, weights, transforms)
 
+    @property
+    def _joint_weight(self) -> float:
+        return self.config.joint_weight_at(self._progress)
+
     def _parts(self, labels: Tensor) -> tuple[Tensor, int]:
         """Return the label of each patch, and the number of labels, where labels (C,) do not cut patches."""
         patches = self.data.patches
@@ -244,7 +247,7 @@ class ReducedFit:
     def _holding(self, joints: Joints) -> Tensor:
         """Return how much each joint counts (P,): less, the farther motions take it apart (Geman and McClure 1987)."""
         square = joints.gaps.square().reshape(-1, len(joints.pairs)).mean(0)
-        return (1 + square / self.config.joint_scale**2) ** -2
+        return (1 + square / between(self.config.joint_scale, self._progress) ** 2) ** -2
 
     def _turning(self) -> JointMoments:
         """Return the joints as points, with a spread that makes bones pay a little for turning against each other."""

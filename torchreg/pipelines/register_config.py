@@ -45,7 +45,7 @@ class RegisterConfig:
             the dense alignment does so already, and joints that are no points, or wrong, resist more of it. Zeros leave
             it out, and what turns cost.
         joint_scale: bones whose motions take their joint apart by more than this hold each other ever less: not all
-            that meets is joined.
+            that meets is joined. First and last like ``joint_weight``: labels are coarse first, and tear joints.
         turn_weight: what it costs that bones that meet turn against each other, per squared radian: what scans do not
             tell, such as the twist of a round limb, stays as it was.
         turn_scale: bones that turned against each other by more than this many radians hold each other ever less.
@@ -66,7 +66,7 @@ class RegisterConfig:
     """
 
     align: ScanAlignConfig = field(default_factory=ScanAlignConfig)
-    num_samples: int = 2500
+    num_samples: int = 4000
     num_patches: int = 100
     label_steps: int = 4
     refine_steps: int = 1
@@ -78,8 +78,8 @@ class RegisterConfig:
     label_cost: float = 0.0003
     truncation: float = 4.0
     reuse: bool = True
-    joint_weight: tuple[float, float] = (0.001, 0.001)
-    joint_scale: float = 0.005
+    joint_weight: tuple[float, float] = (0.01, 0.001)
+    joint_scale: tuple[float, float] = (0.01, 0.005)
     turn_weight: float = 6e-7
     turn_scale: float = 0.1
     max_distance: tuple[float, float] = (0.03, 0.01)
@@ -97,7 +97,7 @@ class RegisterConfig:
             check_count(getattr(self, name), name, 1)
         for name in ("refine_steps", "settle_steps"):
             check_count(getattr(self, name), name, 0)
-        for name in ("truncation", "unmatched", "seam_cap", "joint_scale", "turn_scale"):
+        for name in ("truncation", "unmatched", "seam_cap", "turn_scale"):
             check_positive(getattr(self, name), name)
         for name in ("smoothness", "seam", "label_cost", "turn_weight", "normal_scale", "rtol"):
             check_positive(getattr(self, name), name, allow_zero=True)
@@ -105,7 +105,7 @@ class RegisterConfig:
             check_share(getattr(self, name), name)
         if self.point_to_point == 0:
             raise InputError("point_to_point must be positive: along flat parts nothing else holds samples")
-        for name in ("max_distance", "max_angle"):
+        for name in ("joint_scale", "max_distance", "max_angle"):
             check_ends(getattr(self, name), name)
         check_ends(self.joint_weight, "joint_weight", allow_zero=True)
         if min(self.joint_weight) == 0 < max(self.joint_weight):
