@@ -25,9 +25,9 @@ _LEAST_GAIN = 1e-4
 def fuse_motions(problem: ScanAlignProblem, options: Tensor, config: ChoiceConfig) -> Tensor:
     """Return motions of the nodes, each as in one of several hypotheses.
 
-    The energy is that by which hypotheses are compared, without the strain of wide regions, every sample moved by the
-    node that it hangs on most. Starting from the first hypothesis, the patch and hypothesis that lower it most change
-    hands, until none does.
+    The energy is that by which hypotheses are compared, without the strain of wide regions and without overlaps, every
+    sample moved by the node that it hangs on most: where limbs overlap, the way to where they do not leads through
+    worse. Starting from the first hypothesis, the patch and hypothesis that lower it most change hands, until none does.
 
     Args:
         problem: the scans.
