@@ -27,7 +27,8 @@ def fuse_motions(problem: ScanAlignProblem, options: Tensor, config: ChoiceConfi
 
     The energy is that by which hypotheses are compared, without the strain of wide regions and without overlaps, every
     sample moved by the node that it hangs on most: where limbs overlap, the way to where they do not leads through
-    worse. Starting from the first hypothesis, the patch and hypothesis that lower it most change hands, until none does.
+    worse. Starting from the first hypothesis, the patch and hypothesis that lower it most change hands, until none
+    does.
 
     Args:
         problem: the scans.
