@@ -58,11 +58,16 @@ def test_neighbors_share_samples():
     torch.testing.assert_close(graph.edge_weights, raised(graph))
 
 
-def raised(graph):
-    """Return weights of edges by what they share, those raised that alone hold two sides together, edge by edge."""
+def shares(graph):
+    """Return what the ends of edges carry in common, one in the mean."""
     dense = graph.dense_weights()
     shared = (dense.mT @ dense)[graph.edges[:, 0], graph.edges[:, 1]]
-    shared = shared / shared.mean()
+    return shared / shared.mean()
+
+
+def raised(graph):
+    """Return weights of edges by what they share, those raised that alone hold two sides together, edge by edge."""
+    shared = shares(graph)
     count, weights = len(graph.nodes), shared.clone()
     for number in range(len(shared)):
         # It alone holds its ends together if no way around it consists of stronger edges.
@@ -83,9 +88,7 @@ def test_islands_are_held_as_firmly_as_the_rest():
     graph = build_node_graph(GeodesicGraph.from_steps(edges, lengths, 33), 0, 9, 4)
     side = graph.nodes[graph.edges] > 20
     across = side[:, 0] != side[:, 1]
-    dense = graph.dense_weights()
-    shared = (dense.mT @ dense)[graph.edges[:, 0], graph.edges[:, 1]]
-    assert 0 < float((shared / shared.mean())[across].max()) < 0.5
+    assert 0 < float(shares(graph)[across].max()) < 0.5
     assert float(graph.edge_weights[across].max()) == 1
     torch.testing.assert_close(graph.edge_weights, raised(graph))
 

@@ -52,6 +52,7 @@ def test_labels_then_weights_come_nearer_to_the_truth(toy):
     assert error(reduced, truth) < 0.8 * first
     reduced.refine()
     assert error(reduced, truth) < 0.75 * first
+    assert error(reduced, truth) < 0.006
     assert records == reduced.history
     assert [record.stage for record in records] == sorted(record.stage for record in records)
     for record in records:
