@@ -171,6 +171,12 @@ def test_gaps_are_bridged_by_the_nearest_cells():
         grid.neighbors(math.nan)
 
 
+def test_regions_are_linked_however_far_apart():
+    grid = blocks((0, 0, 0), (1, 0, 0), (1, 1, 0), (7, 0, 0), (7, 1, 0), (9, 0, 0))
+    assert sorted(grid.links().tolist()) == [[1, 3], [2, 4], [3, 5]]
+    assert blocks((0, 0, 0), (1, 1, 1)).links().shape == (0, 2)
+
+
 def test_labels_are_averaged_at_shared_corners():
     grid = blocks((0, 0, 0), (0, 0, 1))
     weights = grid.spread_to_corners(torch.eye(2, dtype=torch.float64))

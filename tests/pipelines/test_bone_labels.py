@@ -44,6 +44,19 @@ def test_regions_that_do_not_touch_share_labels_if_there_are_too_few(bar):
     assert labels.unique().tolist() == [0, 1]
 
 
+def test_what_is_cut_off_follows_what_it_hangs_on_where_nothing_is_told(bar):
+    data, moved, _, _, motions = bar
+    cut = (data.points[:, 0] < 4.4) | (data.points[:, 0] > 5.2)
+    points, there = data.points[cut], moved[:, cut]
+    island = points[:, 0] > 5.2
+    trust = torch.where(island, 1e-6, 1.0).expand(1, -1)
+    seen = CellData(SparseGrid.from_points(points, 40), points, 150)
+    start = (seen.grid.cell_centers()[:, 0] > 4).long() + 1
+    start[seen.grid.cell_centers()[:, 0] > 5.2] = 0
+    labels, _ = relabel(seen, Pull(there, None, trust), motions[None], start, COSTS)
+    assert labels[seen.cell[island]].unique().tolist() == [2]
+
+
 def test_the_w_step_finds_borders_and_its_energy_is_as_defined(bar):
     data, moved, weights, part, motions = bar
     pull = Pull(moved, None, weights)

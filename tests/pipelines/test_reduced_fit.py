@@ -146,6 +146,63 @@ def test_bones_do_not_twist_unseen_but_bend_as_seen(rod, weight, least, most):
     assert float(left[1:].norm()) < 0.07
 
 
+@pytest.mark.parametrize(("weight", "least", "most"), [(0.0, 0.15, 0.4), (1e-3, 0.0, 0.08)])
+def test_what_turns_about_one_axis_in_all_frames_does_not_twist_in_some(rod, weight, least, most):
+    points, normals, _, _, _ = rod
+    end, angles = points[:, 0] > 0, torch.tensor([0.0, 0.4, -0.5, 0.7]).double()
+    bends = so3_exp(torch.stack([0 * angles, 0 * angles, angles], dim=-1))
+    # Twists in proportion to the bends would be a hinge of another axis, along which a round rod tells nothing.
+    wrong = torch.tensor([0.0, 0.3, 0.24, 0.0]).double()
+    twists = so3_exp(torch.stack([wrong, 0 * wrong, 0 * wrong], dim=-1))
+    places = [torch.where(end[:, None], points @ bend.mT, points) for bend in bends]
+    sides = [torch.where(end[:, None], normals @ bend.mT, normals) for bend in bends]
+    targets = [RangeScan(place, normals=side) for place, side in zip(places, sides, strict=True)]
+    moved = torch.stack([torch.where(end[:, None], points @ turn.mT, points) for turn in bends @ twists])
+    data = CellData(SparseGrid.from_points(points, 30), points, 60)
+    samples = Samples(points, normals, moved, torch.ones_like(moved[..., 0]))
+    labels = (data.grid.cell_centers()[:, 0] > 0).long()
+    config = RegisterConfig(joint_weight=(1e-4, 1e-4), turn_weight=0.0, hinge_weight=weight, hinge_scale=10.0)
+    reduced = ReducedFit(data, samples, targets, 2, config, labels=labels)
+    for _ in range(8):
+        reduced.update_matches(0.5)
+        reduced.solve_motions()
+    still, moving = reduced.model.transforms.detach()[..., :3, :3].unbind(1)
+    left = so3_log(bends.mT @ still.mT @ moving)
+    assert least < float(left[:, 0].abs().max()) < most
+    assert float(left[:, 1:].norm(dim=-1).max()) < 0.1
+
+
+def test_hinges_need_three_frames_and_give_way_to_joints_that_are_none(toy, problems):
+    whole = RegisterConfig().hinge_weight / RegisterConfig().joint_weight[0]
+    settings, thrice = {"turn_weight": 0.0, "hinge_scale": 1e3}, [*toy[1], toy[1][0]]
+    fit(toy[1], config=RegisterConfig(**settings))[0].solve_motions()
+    fit(thrice, config=RegisterConfig(**settings))[0].solve_motions()
+    fit(thrice, noise=0.01, config=RegisterConfig(**settings | {"hinge_scale": 1e-4}))[0].solve_motions()
+    none, pins, loose = (torch.linalg.eigvalsh(problem.moments.spread) / whole for problem in problems)
+    assert not none.any()
+    # One direction of each joint is held, all the more the clearer it is.
+    assert pins[:, :2].abs().max() < 1e-9
+    assert 0.8 < pins[:, 2].max() < 1
+    assert loose.abs().max() < 0.01
+
+
+def test_nothing_is_a_hinge_that_does_not_turn(rod, problems):
+    points, normals, _, _, _ = rod
+    data = CellData(SparseGrid.from_points(points, 30), points, 60)
+    still = points.expand(3, -1, -1)
+    labels = (data.grid.cell_centers()[:, 0] > 0).long()
+    config, trust = RegisterConfig(turn_weight=0.0), torch.ones(3, len(points), dtype=torch.float64)
+    targets = [RangeScan(points, normals=normals)] * 3
+    ReducedFit(data, Samples(points, normals, still, trust), targets, 2, config, labels=labels).solve_motions()
+    assert problems[0].moments.spread.abs().max() < 1e-9
+
+
+def test_matches_may_settle_before_labels_change(toy, problems):
+    reduced, _ = fit(toy[1][:1], config=RegisterConfig(match_steps=3, label_steps=1))
+    reduced.fit_labels()
+    assert len(problems) == 3
+
+
 def test_turns_count_less_the_wider_they_are(toy, problems):
     for settings in ({"turn_scale": 1e-3}, {"turn_scale": 1e3}, {"turn_weight": 0.0}):
         fit(toy[1], config=RegisterConfig(**settings))[0].solve_motions()

@@ -110,6 +110,8 @@ def test_what_is_carried_is_held_along_the_surface_and_not_by_joints(toy, monkey
         ({}, {"turn_scale": 0.5, "joint_weight": (0.01, 0.01), "point_to_point": 0.001, "seam_cap": 1.0}),
         ({"turn_scale": 2.0, "joint_weight": (1.0, 0.05)}, {"turn_scale": 2.0, "joint_weight": (1.0, 0.05)}),
         ({"joint_weight": (0.0, 0.0), "num_patches": 300}, {"joint_weight": (0.0, 0.0), "num_patches": 300}),
+        ({}, {"match_steps": 4, "refine_steps": 3, "settle_steps": 4, "rtol": 0.02}),
+        ({"match_steps": 6, "refine_steps": 0, "rtol": 0.0}, {"match_steps": 6, "refine_steps": 0, "rtol": 0.0}),
     ],
 )
 def test_all_frames_are_fitted_to_the_dense_alignments_and_bones_hold_each_other(toy, monkeypatch, given, held):

@@ -20,10 +20,9 @@ from torchreg._checks import (
 )
 from torchreg.errors import InputError
 from torchreg.geometry.geodesics import GeodesicGraph
+from torchreg.geometry.islands import island_links
 from torchreg.geometry.normals import distinct_places, k_nearest
 
-# Links between two parts of a scan that no surface joins.
-_BRIDGE_LINKS = 3
 # A step leads across a valley where both normals lean over it by this much, in the mean: the sine of an angle.
 _VALLEY = 0.2
 # With a larger share of such steps between them, surroundings do not meet.
@@ -153,18 +152,6 @@ def _lengths(places: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 def _bridged(places: np.ndarray, edges: np.ndarray, lengths: np.ndarray, cost: float) -> tuple[np.ndarray, np.ndarray]:
     """Return edges and lengths with each part linked to what has grown from the largest, the nearest part first."""
-    count = len(places)
-    label = _parts(edges, count)
-    joined = label == np.bincount(label).argmax()
-    for _ in range(label.max()):
-        inside, outside = np.flatnonzero(joined), np.flatnonzero(~joined)
-        tree = cKDTree(places[inside])
-        nearest = outside[tree.query(places[outside])[0].argmin()]
-        part = np.flatnonzero(label == label[nearest])
-        distance, other = tree.query(places[part])
-        few = np.argsort(distance, kind="stable")[:_BRIDGE_LINKS]
-        links = np.stack((part[few], inside[other[few]]), axis=1)
-        edges = np.concatenate((edges, np.sort(links, axis=1)))
-        lengths = np.concatenate((lengths, np.maximum(distance[few] * cost, np.finfo(np.float64).tiny)))
-        joined[part] = True
-    return edges, lengths
+    links, apart = island_links(places, _parts(edges, len(places)))
+    across = np.maximum(apart * cost, np.finfo(np.float64).tiny)
+    return np.concatenate((edges, links)), np.concatenate((lengths, across))

@@ -27,6 +27,7 @@ from torchreg._checks import (
     check_shape,
 )
 from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.islands import island_links
 
 MAX_RESOLUTION = 256
 # The eight corners of a unit cell; corner 4 i + 2 j + k lies at (i, j, k).
@@ -252,6 +253,11 @@ class SparseGrid:
     def regions(self, gap: float = 0.0) -> Tensor:
         """Return which connected region (C,) int64 each cell belongs to; see `neighbors` for ``gap``."""
         return _regions(self.neighbors(gap), self.num_cells)
+
+    def links(self) -> Tensor:
+        """Return pairs of cells (L, 2), the lower number first, that link all regions, however far apart they are."""
+        links, _ = island_links(self.cells.cpu().double().numpy(), self.regions().cpu().numpy())
+        return torch.from_numpy(links).to(self.cells.device)
 
     def _beside(self, axis: int) -> Tensor:
         """Return pairs (A, 2) of cells with the one before it along an axis."""

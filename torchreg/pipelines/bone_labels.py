@@ -42,8 +42,8 @@ class CellData:
 
     @cached_property
     def neighbors(self) -> Tensor:
-        """Pairs (A, 2) of cells whose labels should agree."""
-        return self.grid.neighbors()
+        """Pairs (A, 2) of cells whose labels should agree: those that touch, and links to what is cut off."""
+        return torch.cat([self.grid.neighbors(), self.grid.links()])
 
     @cached_property
     def bridged(self) -> Tensor:

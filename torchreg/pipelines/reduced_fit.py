@@ -26,6 +26,8 @@ from torchreg.results.scans import RegisterRecord
 _LEAST_REACH = 2.0
 # A T-step ends when it changes the energy by less than this share.
 _RTOL = 1e-3
+# Between two frames everything turns about one axis, and none is clear where bones turn by less than that, radians.
+_LEAST_FRAMES, _CLEAR_TURN = 3, 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,12 +100,13 @@ class ReducedFit:
         self._progress = 0.0
 
     def fit_labels(self) -> bool:
-        """Alternate T-step, correspondences and W-step, and return whether the energy settled."""
+        """Alternate T-steps, correspondences and W-step, and return whether the energy settled."""
         energy, steps = float("inf"), self.config.label_steps
         for step in range(steps):
             self._progress = step / max(1, steps - 1)
-            self.solve_motions()
-            self.update_matches(0.5 * self._progress)
+            for _ in range(self.config.match_steps):
+                self.solve_motions()
+                self.update_matches(0.5 * self._progress)
             labels, found = relabel(self.data, self.pull, self.model.transforms.detach(), self.labels, self._costs)
             self._use(labels)
             settled = found >= (1 - self.config.rtol) * energy
@@ -254,10 +257,26 @@ class ReducedFit:
         joints = self.meetings
         first, second = self.model.transforms.detach()[..., :3, :3][..., joints.pairs.mT, :, :].unbind(-4)
         # |R_i - R_j|^2 is about twice the squared angle between them; a spread s I costs s times as much.
-        turns = 0.5 * (first - second).square().sum((-1, -2)).flatten(0, -2).mean(0)
+        apart = first - second
+        squares = (apart.mT @ apart).mean(0)
+        turns = 0.5 * squares.diagonal(dim1=-2, dim2=-1).sum(-1)
         weight = 0.5 * self.config.turn_weight / (1 + turns / self.config.turn_scale**2)
-        identity = torch.eye(3, dtype=weight.dtype, device=weight.device)
-        return replace(joints, spread=(weight / self._joint_weight)[:, None, None] * identity)
+        spread = weight[:, None, None] * torch.eye(3, dtype=weight.dtype, device=weight.device)
+        if len(apart) >= _LEAST_FRAMES:
+            spread = spread + self._hinges(squares)
+        return replace(joints, spread=spread / self._joint_weight)
+
+    def _hinges(self, squares: Tensor) -> Tensor:
+        """Return spreads (P, 3, 3) along the axes about which bones mostly turn, of mean squares of R_i - R_j.
+
+        As if each joint were a pin along its axis, which both bones must keep to; less, the more they turn otherwise or
+        the less they tell the axis.
+        """
+        off, axes = torch.linalg.eigh(squares)
+        axis, (least, second, _) = axes[..., 0], off.clamp(min=0).unbind(-1)
+        told = (second - least) / (second + _CLEAR_TURN**2)
+        hold = told / (1 + least / self.config.hinge_scale**2).square()
+        return (self.config.hinge_weight * hold)[:, None, None] * axis.unsqueeze(-1) * axis.unsqueeze(-2)
 
     def _report(self, stage: str, step: int, num_steps: int) -> None:
         with torch.no_grad():

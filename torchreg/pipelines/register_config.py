@@ -29,7 +29,8 @@ class RegisterConfig:
         align: the dense alignment from which parts are found.
         num_samples: source points that are matched, evenly spread.
         num_patches: of the grid, from which parts are merged.
-        label_steps: most rounds of T-step, correspondences and W-step.
+        label_steps: most rounds of T-steps, correspondences and W-step.
+        match_steps: T-steps, each followed by new correspondences, before a W-step.
         refine_steps: rounds of refining weights, T-step and correspondences.
         settle_steps: rounds of T-step and correspondences after it.
         motion_steps: most linear systems of a T-step.
@@ -49,6 +50,9 @@ class RegisterConfig:
         turn_weight: what it costs that bones that meet turn against each other, per squared radian: what scans do not
             tell, such as the twist of a round limb, stays as it was.
         turn_scale: bones that turned against each other by more than this many radians hold each other ever less.
+        hinge_weight: what it costs, where three frames or more tell the axis, that bones that meet turn against each
+            other about another axis than they mostly do, per squared radian: most joints are hinges.
+        hinge_scale: bones that turn about other axes by more than this many radians hold each other ever less.
         max_distance: of a match, first and last; never below two sampling distances of the target.
         max_angle: between normals of a match, first and last, radians.
         normal_scale: distance that counts as much as normals 60 degrees apart.
@@ -69,6 +73,7 @@ class RegisterConfig:
     num_samples: int = 4000
     num_patches: int = 100
     label_steps: int = 4
+    match_steps: int = 1
     refine_steps: int = 1
     settle_steps: int = 2
     motion_steps: int = 5
@@ -82,6 +87,8 @@ class RegisterConfig:
     joint_scale: tuple[float, float] = (0.01, 0.005)
     turn_weight: float = 6e-7
     turn_scale: float = 0.1
+    hinge_weight: float = 1e-5
+    hinge_scale: float = 0.2
     max_distance: tuple[float, float] = (0.03, 0.01)
     max_angle: tuple[float, float] = (1.05, 0.52)
     normal_scale: float = 0.025
@@ -93,13 +100,13 @@ class RegisterConfig:
     blend: str = "linear"
 
     def __post_init__(self) -> None:
-        for name in ("num_samples", "num_patches", "label_steps", "motion_steps"):
+        for name in ("num_samples", "num_patches", "label_steps", "match_steps", "motion_steps"):
             check_count(getattr(self, name), name, 1)
         for name in ("refine_steps", "settle_steps"):
             check_count(getattr(self, name), name, 0)
-        for name in ("truncation", "unmatched", "seam_cap", "turn_scale"):
+        for name in ("truncation", "unmatched", "seam_cap", "turn_scale", "hinge_scale"):
             check_positive(getattr(self, name), name)
-        for name in ("smoothness", "seam", "label_cost", "turn_weight", "normal_scale", "rtol"):
+        for name in ("smoothness", "seam", "label_cost", "turn_weight", "hinge_weight", "normal_scale", "rtol"):
             check_positive(getattr(self, name), name, allow_zero=True)
         for name in ("point_to_point", "min_matched"):
             check_share(getattr(self, name), name)

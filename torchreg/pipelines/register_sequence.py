@@ -38,6 +38,8 @@ _CARRIED_LABEL_COST, _CARRIED_SMOOTHNESS, _CARRIED_POINT_TO_POINT, _CARRIED_JOIN
 _HELD_JOINTS, _HELD_TURNS, _HELD_POINT_TO_POINT = 0.01, 0.5, 0.001
 # Parts may start from smaller patches, and wide motions tear more where parts meet, cells.
 _HELD_PATCHES, _HELD_SEAM_CAP = 200, 1.0
+# What moves along the surface settles slowly, and borders between parts are where settled motions agree.
+_HELD_MATCH_STEPS, _HELD_REFINE_STEPS, _HELD_SETTLE_STEPS, _HELD_RTOL = 4, 3, 4, 0.02
 # Share of its last step by which a point is expected to move on: hidden limbs would run away with the whole.
 _GOES_ON = 0.5
 
@@ -59,7 +61,7 @@ def register_sequence(
     Going from the reference outward, the reference as moved for one frame is aligned with the next, its points expected
     to go on somewhat as they went, and a few bones are fitted to that: every frame is reached by bending the reference
     itself, not what earlier frames made of it, so that errors do not pile up. Then labels, weights and the motions of
-    all frames are solved together, from the alignments.
+    all frames are solved together, from the alignments; bones that meet had better turn about one axis in all frames.
 
     Args:
         scans: T scans of one thing, two at least, in one unit and frame; motions between neighbors as in `register`.
@@ -79,7 +81,7 @@ def register_sequence(
 
     Differentiable: no.
 
-    Cost: that of `register` for every frame, and a quarter of a second each for the joint fit.
+    Cost: that of `register` for every frame, and half a second each for the joint fit.
 
     References: Chang and Zwicker 2009, section 6, which asks for a simultaneous optimization.
     """
@@ -127,6 +129,10 @@ def _held(config: RegisterConfig) -> RegisterConfig:
     return replace(
         config,
         num_patches=max(config.num_patches, _HELD_PATCHES),
+        match_steps=max(config.match_steps, _HELD_MATCH_STEPS),
+        refine_steps=max(config.refine_steps, _HELD_REFINE_STEPS) if config.refine_steps > 0 else 0,
+        settle_steps=max(config.settle_steps, _HELD_SETTLE_STEPS),
+        rtol=min(config.rtol, _HELD_RTOL),
         joint_weight=(first, last),
         turn_scale=max(config.turn_scale, _HELD_TURNS),
         point_to_point=min(config.point_to_point, _HELD_POINT_TO_POINT),
