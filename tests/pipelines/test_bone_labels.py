@@ -50,7 +50,7 @@ def test_what_is_cut_off_follows_what_it_hangs_on_where_nothing_is_told(bar):
     points, there = data.points[cut], moved[:, cut]
     island = points[:, 0] > 5.2
     trust = torch.where(island, 1e-6, 1.0).expand(1, -1)
-    seen = CellData(SparseGrid.from_points(points, 40), points, 150)
+    seen = CellData(SparseGrid.from_points(points, 40), points, 150, linked=True)
     start = (seen.grid.cell_centers()[:, 0] > 4).long() + 1
     start[seen.grid.cell_centers()[:, 0] > 5.2] = 0
     labels, _ = relabel(seen, Pull(there, None, trust), motions[None], start, COSTS)

@@ -29,11 +29,13 @@ class CellData:
         grid: the grid, C cells.
         points: (n, 3) samples before they are moved.
         num_patches: about how many patches the cells make, from which parts are merged.
+        linked: whether labels of what is cut off should agree with those of the cells nearest to it.
     """
 
     grid: SparseGrid
     points: Tensor
     num_patches: int = 100
+    linked: bool = False
 
     @cached_property
     def cell(self) -> Tensor:
@@ -42,8 +44,9 @@ class CellData:
 
     @cached_property
     def neighbors(self) -> Tensor:
-        """Pairs (A, 2) of cells whose labels should agree: those that touch, and links to what is cut off."""
-        return torch.cat([self.grid.neighbors(), self.grid.links()])
+        """Pairs (A, 2) of cells whose labels should agree."""
+        beside = self.grid.neighbors()
+        return torch.cat([beside, self.grid.links()]) if self.linked else beside
 
     @cached_property
     def bridged(self) -> Tensor:

@@ -100,7 +100,8 @@ def register_sequence(
     reached, confidence = _chain(scans, reference, num_bones, grid_resolution, _carrying(config), generator, on_step)
     scan = unit.of_scan(source)
     held = _held(config)
-    data = CellData(SparseGrid.from_points(scan.points, grid_resolution), scan.points[index], held.num_patches)
+    grid = SparseGrid.from_points(scan.points, grid_resolution)
+    data = CellData(grid, scan.points[index], held.num_patches, linked=True)
     places = unit.of_points(reached)[:, index]
     trust = confidence[:, index].double().clamp(min=LEAST_CONFIDENCE)
     samples = Samples(scan.points[index], scan.normals[index], places, trust)
