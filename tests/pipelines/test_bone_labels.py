@@ -44,17 +44,18 @@ def test_regions_that_do_not_touch_share_labels_if_there_are_too_few(bar):
     assert labels.unique().tolist() == [0, 1]
 
 
-def test_what_is_cut_off_follows_what_it_hangs_on_where_nothing_is_told(bar):
+@pytest.mark.parametrize(("linked", "label"), [(False, 0), (True, 2)])
+def test_what_is_cut_off_follows_what_it_hangs_on_where_hardly_anything_is_told(bar, linked, label):
     data, moved, _, _, motions = bar
     cut = (data.points[:, 0] < 4.4) | (data.points[:, 0] > 5.2)
-    points, there = data.points[cut], moved[:, cut]
+    points = data.points[cut]
     island = points[:, 0] > 5.2
+    there = torch.where(island[:, None], transform_points(motions[0], points), moved[0, cut])
     trust = torch.where(island, 1e-6, 1.0).expand(1, -1)
-    seen = CellData(SparseGrid.from_points(points, 40), points, 150, linked=True)
-    start = (seen.grid.cell_centers()[:, 0] > 4).long() + 1
-    start[seen.grid.cell_centers()[:, 0] > 5.2] = 0
-    labels, _ = relabel(seen, Pull(there, None, trust), motions[None], start, COSTS)
-    assert labels[seen.cell[island]].unique().tolist() == [2]
+    seen = CellData(SparseGrid.from_points(points, 40), points, 150, linked=linked)
+    start = torch.zeros(seen.grid.num_cells, dtype=torch.int64)
+    labels, _ = relabel(seen, Pull(there[None], None, trust), motions[None], start, COSTS)
+    assert labels[seen.cell[island]].unique().tolist() == [label]
 
 
 def test_the_w_step_finds_borders_and_its_energy_is_as_defined(bar):

@@ -131,6 +131,7 @@ def test_all_frames_are_fitted_to_the_dense_alignments_and_bones_hold_each_other
     config = replace(QUICK, **given)
     register_sequence([toy[0], toy[1], toy[2]], 8, 30, config)
     assert {name: getattr(fits[0].config, name) for name in held} == held
+    assert fits[0].data.linked
     index = source_samples(toy[0], config, None)
     unit = ScanUnit.of(toy[0].points[index])
     expected = torch.stack([unit.of_points(points)[index] for points in (toy[0].points, *(r.points for r in reached))])
