@@ -81,7 +81,7 @@ def register_sequence(
 
     Differentiable: no.
 
-    Cost: that of `register` for every frame, and half a second each for the joint fit.
+    Cost: that of `register` for every frame, and three quarters of a second each for the joint fit.
 
     References: Chang and Zwicker 2009, section 6, which asks for a simultaneous optimization.
     """
