@@ -14,7 +14,8 @@ import typer
 
 from experiments.compose import known_configs, load_sweep
 from experiments.driver import OnOutcome, Summary, run_sweep
-from experiments.engines.base import EngineConfig, make_engine
+from experiments.engines.base import EngineConfig
+from experiments.engines.by_name import make_engine
 from experiments.errors import ConfigError, ExperimentError
 from experiments.plan import planned_trials
 from experiments.records import TrialRecord, parse_record

@@ -13,8 +13,6 @@ from typing import Protocol
 from experiments.errors import ConfigError
 from experiments.worker import Job, Outcome
 
-ENGINES = ("local", "ray", "slurm")
-
 
 class Engine(Protocol):
     """Runs jobs in other processes."""
@@ -54,28 +52,6 @@ class EngineConfig:
                 raise ConfigError(f"--{name} must be at least 1, got {getattr(self, name)}")
         if self.gpus is not None and self.gpus < 0:
             raise ConfigError(f"--gpus must not be negative, got {self.gpus}")
-
-
-def make_engine(name: str, config: EngineConfig) -> Engine:
-    """Return an engine by name.
-
-    Raises:
-        ConfigError: if there is no such engine.
-        ExperimentError: if the package that it needs is not installed.
-    """
-    if name == "local":
-        from experiments.engines.local import LocalEngine
-
-        return LocalEngine(config)
-    if name == "ray":
-        from experiments.engines.ray_cluster import RayEngine
-
-        return RayEngine(config)
-    if name == "slurm":
-        from experiments.engines.slurm import SlurmEngine
-
-        return SlurmEngine(config)
-    raise ConfigError(f"unknown engine {name!r}; known engines: {', '.join(ENGINES)}")
 
 
 def visible_gpus() -> list[str]:

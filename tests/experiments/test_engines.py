@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from experiments.driver import run_sweep
-from experiments.engines.base import EngineConfig, make_engine, share_code, visible_gpus
+from experiments.engines.base import EngineConfig, share_code, visible_gpus
+from experiments.engines.by_name import make_engine
 from experiments.errors import ConfigError, ExperimentError, StoreError
 from experiments.plan import planned_trials
 from experiments.records import parse_record

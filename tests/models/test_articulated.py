@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from torchreg.errors import InputError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.models.articulated import BASE_DOF_NAMES, ArticulatedShape
+from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.articulation import BASE_DOF_NAMES
 from torchreg.models.primitives import Primitive
 
 # torch builds its forward-mode rules with torch.jit.script, and warns about it.

@@ -53,6 +53,14 @@ def test_the_deformation_is_equation_1():
 
 
 @BLENDS
+def test_a_rescaled_model_moves_space_alike(blend):
+    model, points = random_model(blend), bar(20, 1)
+    origin = torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64)
+    moved = model.rescaled(7.0, origin)(origin + 7 * points)
+    torch.testing.assert_close(moved, origin + 7 * model(points))
+
+
+@BLENDS
 def test_no_motion_moves_nothing_and_one_motion_moves_all_rigidly(blend):
     model, points = random_model(blend), bar(50, 1)
     rest = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)

@@ -2,8 +2,6 @@ import torch
 
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import transform_points
-from torchreg.geometry.sparse_grid import SparseGrid
-from torchreg.models.grid_lbs import GridLBS
 from torchreg.pipelines.scan_unit import ScanUnit
 
 F64 = torch.float64
@@ -43,14 +41,3 @@ def test_motions_mean_the_same_in_both_coordinates():
     unit = ScanUnit.of(points)
     there = unit.points_back(transform_points(transforms, unit.of_points(points)), points)
     torch.testing.assert_close(transform_points(unit.transforms_back(transforms), points), there)
-
-
-def test_models_move_the_same_in_both_coordinates():
-    points = cloud()
-    unit = ScanUnit.of(points)
-    inner = unit.of_points(points)
-    grid = SparseGrid.from_points(inner, 6)
-    weights = torch.rand(grid.num_corners, 2, generator=torch.Generator().manual_seed(2), dtype=F64)
-    model = GridLBS(grid, weights / weights.sum(1, keepdim=True), motions(2))
-    outer = unit.model_back(model, points)
-    torch.testing.assert_close(outer(points), unit.points_back(model(inner), points))

@@ -100,3 +100,21 @@ def fit_rigid(source: Tensor, target: Tensor, weights: Tensor | None = None) -> 
     rotation = u @ flip @ vt
     translation = target_mean - source_mean @ rotation.mT
     return rigid_matrix(rotation, translation.squeeze(-2))
+
+
+def rescale_motions(transforms: Tensor, scale: float, origin: Tensor) -> Tensor:
+    """Return the same motions (..., 4, 4) in the coordinates ``x' = origin + scale x``.
+
+    Args:
+        transforms: (..., 4, 4) rigid motions in the coordinates x.
+        scale: of the new coordinates, positive.
+        origin: (3,) where the old origin is in the new coordinates.
+
+    Returns:
+        (..., 4, 4).
+
+    Differentiable: in ``transforms`` and ``origin``.
+    """
+    rotation = transforms[..., :3, :3]
+    shift = origin - (rotation @ origin.unsqueeze(-1)).squeeze(-1)
+    return rigid_matrix(rotation, scale * transforms[..., :3, 3] + shift)

@@ -18,7 +18,7 @@ from torchreg.geometry.blend import (
 )
 from torchreg.geometry.joint_moments import JointMoments, joint_moments
 from torchreg.geometry.joints import BoneTree, Joints, bone_tree, bridged, find_joints
-from torchreg.geometry.rigid import transform_points
+from torchreg.geometry.rigid import rescale_motions, transform_points
 from torchreg.geometry.sparse_grid import SparseGrid, locate
 
 BLENDS = ("linear", "dual_quaternion")
@@ -171,6 +171,17 @@ class GridLBS(nn.Module):
         grid, moved = self.grid, plain(self.transforms)
         tables = plain(grid.cells), grid.shape, plain(grid.origin), plain(grid.axes), grid.spacing
         return GridLBSRecord(*tables, plain(self.weights), moved, self.blend)
+
+    def rescaled(self, scale: float, origin: Tensor) -> GridLBS:
+        """Return the same model, without gradients, in the coordinates ``x' = origin + scale x``.
+
+        Args:
+            scale: of the new coordinates, positive.
+            origin: (3,) where the old origin is in the new coordinates.
+        """
+        grid, transforms = self.grid, rescale_motions(self.transforms.detach(), scale, origin)
+        grown = SparseGrid(grid.cells, grid.shape, origin + scale * grid.origin, grid.axes, scale * grid.spacing)
+        return GridLBS(grown, self.weights.detach(), transforms, blend=self.blend)
 
     def extra_repr(self) -> str:
         """Return the settings for the module's printed form."""

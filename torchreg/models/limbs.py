@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.articulation import Articulation
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Limb:
         return [part for body in self.bodies for part in body.parts]
 
 
-def find_limbs(shape: ArticulatedShape) -> tuple[list[Limb], list[int]]:
+def find_limbs(shape: Articulation) -> tuple[list[Limb], list[int]]:
     """Return the limbs of a shape, parents before children, and the parts of its trunk, which only the base moves.
 
     A degree of freedom that moves several limbs, as of a gripper, belongs to the first of them.
@@ -78,7 +78,7 @@ def find_limbs(shape: ArticulatedShape) -> tuple[list[Limb], list[int]]:
     return found, trunk
 
 
-def _find_bodies(shape: ArticulatedShape) -> list[Body]:
+def _find_bodies(shape: Articulation) -> list[Body]:
     """Return the bodies of a shape, parents before children: parts below the same joints."""
     joints: Tensor = shape.chain.moves[shape.part_index] > 0
     drives = shape.chain.couplings != 0
@@ -96,7 +96,7 @@ def _find_bodies(shape: ArticulatedShape) -> list[Body]:
     return bodies
 
 
-def _ancestors(shape: ArticulatedShape, part: int) -> list[int]:
+def _ancestors(shape: Articulation, part: int) -> list[int]:
     found = []
     while (part := shape.part_parents[part]) >= 0:
         found.append(part)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor, nn
 
@@ -12,12 +10,10 @@ from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.geometry.sampling import farthest_points
+from torchreg.models.articulation import Articulation
 
 # Candidates per chosen point; more cover the surface more evenly.
 _OVERSAMPLING = 8
-
-if TYPE_CHECKING:
-    from torchreg.models.articulated import ArticulatedShape
 
 
 class LinearBlendSkin(nn.Module):
@@ -47,7 +43,7 @@ class LinearBlendSkin(nn.Module):
 
     def __init__(
         self,
-        shape: ArticulatedShape,
+        shape: Articulation,
         points: Tensor,
         weights: Tensor,
         reference_pose: Tensor,
@@ -108,7 +104,7 @@ class LinearBlendSkin(nn.Module):
         """Return the points for given part transforms.
 
         Args:
-            rows: (..., 4 P, 3) transforms as `stacked_rows` and `ArticulatedShape.transform_jacobian` stack them.
+            rows: (..., 4 P, 3) transforms as `stacked_rows` and `Articulation.transform_jacobian` stack them.
 
         Returns:
             (..., N, 3), metres; in memory all x come first, then all y, then all z.
@@ -123,7 +119,7 @@ class LinearBlendSkin(nn.Module):
 
         Args:
             pose: (..., num_dofs).
-            chart: see `ArticulatedShape.part_twists`.
+            chart: see `Articulation.part_twists`.
 
         Returns:
             points (..., N, 3) and Jacobian (..., N, 3, num_dofs).
@@ -192,7 +188,7 @@ class BendingSkin(LinearBlendSkin):
 
     def __init__(
         self,
-        shape: ArticulatedShape,
+        shape: Articulation,
         points: Tensor,
         reference_pose: Tensor | None = None,
         sharpness: float = 2.0,
@@ -212,7 +208,7 @@ class BendingSkin(LinearBlendSkin):
         self.sharpness = sharpness
 
 
-def bending_weights(shape: ArticulatedShape, points: Tensor, pose: Tensor, sharpness: float) -> Tensor:
+def bending_weights(shape: Articulation, points: Tensor, pose: Tensor, sharpness: float) -> Tensor:
     """Return the weights (N, P) of eq. 3: the dominating part and its strongest neighbor share each point.
 
     Args:
@@ -236,7 +232,7 @@ def bending_weights(shape: ArticulatedShape, points: Tensor, pose: Tensor, sharp
     return weights.scatter_(-1, dominating.unsqueeze(-1), share.unsqueeze(-1))
 
 
-def sample_skin(shape: ArticulatedShape, count: int = 500, *, sharpness: float = 2.0, seed: int = 0) -> LinearBlendSkin:
+def sample_skin(shape: Articulation, count: int = 500, *, sharpness: float = 2.0, seed: int = 0) -> LinearBlendSkin:
     """Return model points that cover the shape's surface evenly, in the rest pose, with normals.
 
     A shape read from a file with a mesh gives points of that mesh under the file's weights; any other gives points of

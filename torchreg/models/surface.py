@@ -10,7 +10,7 @@ from torch import Tensor
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
 from torchreg.geometry.neighbors import nearest_neighbor
-from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.articulation import Articulation
 from torchreg.models.skin import LinearBlendSkin, stacked_rows
 
 # Meshes with this many vertices carry their own sampling.
@@ -34,7 +34,7 @@ class FusedSurface:
         shape: the articulated shape.
     """
 
-    def __init__(self, shape: ArticulatedShape) -> None:
+    def __init__(self, shape: Articulation) -> None:
         self.shape = shape
 
     def distance(self, points: Tensor, pose: Tensor) -> Tensor:
@@ -115,7 +115,7 @@ def _signed(size: Tensor, sign: Tensor) -> Tensor:
     return torch.where(sign < 0, -size, size)
 
 
-def dense_file_skin(shape: ArticulatedShape) -> LinearBlendSkin:
+def dense_file_skin(shape: Articulation) -> LinearBlendSkin:
     """Return a dense skin with normals of the file's mesh: its vertices, or samples if they are too many or too few.
 
     Raises:

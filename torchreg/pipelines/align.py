@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -29,8 +28,7 @@ from torchreg.pipelines.align_search import FINAL_SIGMAS, explore, needs_search
 from torchreg.pipelines.align_stages import CORRESPONDENCES, OnStep, StageResult, fit_surface, register
 from torchreg.pipelines.threads import one_thread
 from torchreg.results.alignment import AlignRecord, AlignResult
-from torchreg.results.base import Status
-from torchreg.results.tracking import FrameResult, TrackState
+from torchreg.results.base import Status, normal_copy
 
 # Shares of the model's size, the diagonal of its rest pose.
 _START_SIGMA, _STOP_SIGMA = 0.08, 0.02
@@ -40,8 +38,6 @@ _MIN_INLIERS, _MIN_INLIER_SHARE = 10, 0.02
 _SEARCHED_STEPS = 4
 # With as many data or more, all threads of torch are of use.
 _MANY = 10_000
-
-_Record = TypeVar("_Record", AlignRecord, AlignResult, FrameResult, TrackState)
 
 
 @dataclass(frozen=True)
@@ -177,15 +173,7 @@ def align(
                 final = StageResult(final.pose[best], final.sigma[best], final.change[best])
             final = _search_where_needed(problem, final, pose, config, record)
         result = _result(problem, final, origin, config, tuple(record.history))
-        return ordinary(_unbatched(result, 0) if data.ndim == 2 else result)
-
-
-def ordinary(record: _Record) -> _Record:
-    """Return a copy whose tensors can take part in autograd, as those made in inference mode cannot."""
-    values = {item.name: getattr(record, item.name) for item in fields(record)}
-    with torch.inference_mode(False), torch.no_grad():
-        copies: dict[str, Any] = {name: value.clone() for name, value in values.items() if isinstance(value, Tensor)}
-    return replace(record, **copies)
+        return normal_copy(_unbatched(result, 0) if data.ndim == 2 else result)
 
 
 class _Recorder:
@@ -196,7 +184,7 @@ class _Recorder:
         self.history: list[AlignRecord] = [] if history is None else history
 
     def __call__(self, step: AlignRecord) -> None:
-        step = ordinary(replace(step, pose=shifted(step.pose, self.origin)))
+        step = normal_copy(replace(step, pose=shifted(step.pose, self.origin)))
         self.history.append(step)
         if self.on_step is not None:
             with torch.inference_mode(False), torch.no_grad():

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_shape
 from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.articulation import Articulation
 from torchreg.models.kinematics import stack_sizes
 from torchreg.models.skin import LinearBlendSkin
 from torchreg.models.surface import FusedSurface, SkinSurface, Surface, dense_file_skin
@@ -217,7 +218,7 @@ def centered_problem(
     )
 
 
-def _surface(shape: ArticulatedShape, skin: LinearBlendSkin) -> Surface:
+def _surface(shape: Articulation, skin: LinearBlendSkin) -> Surface:
     """Return what is fitted: the file's own surface where there is one, else the fused solids."""
     if shape.surface is None:
         return FusedSurface(shape)

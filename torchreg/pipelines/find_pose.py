@@ -18,6 +18,7 @@ from torchreg.geometry.rigid import fit_rigid, rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.sampling import farthest_points
 from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.articulation import Articulation
 from torchreg.models.skin import LinearBlendSkin, sample_skin
 from torchreg.pipelines.align_problem import (
     AlignProblem,
@@ -239,12 +240,12 @@ def _find(problem: AlignProblem, sources: Sequence[PoseSource], config: FindPose
     return take_rows(fitted.reshape(poses.shape), order), costs.gather(1, order)
 
 
-def typical_poses(shape: ArticulatedShape) -> Tensor:
+def typical_poses(shape: Articulation) -> Tensor:
     """Return (K, num_dofs) different poses between the rest pose and the middle of the joint limits."""
     return torch.stack([_towards_middle(shape, share) for share in _BENT_SHARES]).unique(dim=0)
 
 
-def _towards_middle(shape: ArticulatedShape, share: float) -> Tensor:
+def _towards_middle(shape: Articulation, share: float) -> Tensor:
     middle = 0.5 * (shape.lower + shape.upper)
     return shape.rest + share * torch.where(middle.isfinite(), middle - shape.rest, 0.0)
 
@@ -282,7 +283,7 @@ def _at_the_middle(problem: AlignProblem, poses: Tensor) -> Tensor:
     return shifted(poses, middle.unsqueeze(1) - center)
 
 
-def _is_bolted(shape: ArticulatedShape) -> bool:
+def _is_bolted(shape: Articulation) -> bool:
     return bool((shape.lower[:6] == shape.upper[:6]).all())
 
 

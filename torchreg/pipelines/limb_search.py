@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix
 from torchreg.geometry.rotation import so3_exp
-from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.articulation import Articulation
 from torchreg.models.limbs import Body, Limb, find_limbs
 from torchreg.pipelines.align_problem import PRIOR_SHARE, AlignProblem
 from torchreg.solvers.cover import best_covers
@@ -93,7 +93,7 @@ class LimbSearch:
         shape: the articulated shape.
     """
 
-    def __init__(self, shape: ArticulatedShape) -> None:
+    def __init__(self, shape: Articulation) -> None:
         self.shape = shape
         limbs, self.trunk = find_limbs(shape)
         self.limbs = [limb for limb in limbs if limb.dofs]

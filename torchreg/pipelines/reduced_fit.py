@@ -18,7 +18,7 @@ from torchreg.pipelines.bone_labels import CellData, LabelCosts, Pull, first_lab
 from torchreg.pipelines.bone_problem import BoneProblem, bind
 from torchreg.pipelines.joint_fit import JOINT_REGULARIZATION, JointFit, fit_bones_and_joints
 from torchreg.pipelines.refine_weights import refine_weights
-from torchreg.pipelines.register_config import OnRegisterStep, RegisterConfig
+from torchreg.pipelines.register_config import BoneConfig, OnRegisterStep
 from torchreg.pipelines.scan_align_config import between
 from torchreg.results.scans import RegisterRecord
 
@@ -61,7 +61,7 @@ class ReducedFit:
         samples: the samples.
         targets: F scans.
         num_bones: most bones.
-        config: see `RegisterConfig`; the source's diagonal is the unit of all lengths here.
+        config: see `BoneConfig`; the source's diagonal is the unit of all lengths here.
         on_step: called with a `RegisterRecord` after each step.
 
     Attributes:
@@ -82,7 +82,7 @@ class ReducedFit:
         samples: Samples,
         targets: Sequence[RangeScan],
         num_bones: int,
-        config: RegisterConfig,
+        config: BoneConfig,
         on_step: OnRegisterStep | None = None,
         labels: Tensor | None = None,
     ) -> None:

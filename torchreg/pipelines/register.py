@@ -17,7 +17,7 @@ from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.sparse_grid import MAX_RESOLUTION, SparseGrid
 from torchreg.pipelines.bone_labels import CellData, labels_of_parts
 from torchreg.pipelines.reduced_fit import ReducedFit, Samples
-from torchreg.pipelines.register_config import OnRegisterStep, RegisterConfig
+from torchreg.pipelines.register_config import BoneConfig, OnRegisterStep, RegisterConfig
 from torchreg.pipelines.scan_alignment import align_scans
 from torchreg.pipelines.scan_unit import ScanUnit
 from torchreg.pipelines.threads import one_thread
@@ -133,7 +133,7 @@ def _result(
     )
     like = source.points
     fit.model.set_transforms_(fit.model.transforms.detach()[0])
-    model = unit.model_back(fit.model, like)
+    model = fit.model.rescaled(unit.size, unit.middle).to(dtype=like.dtype, device=like.device)
     return ScanRegistration(
         model,
         like.detach(),
@@ -150,7 +150,7 @@ def _result(
     )
 
 
-def fit_status(matched: float, settled: bool, config: RegisterConfig) -> Status:
+def fit_status(matched: float, settled: bool, config: BoneConfig) -> Status:
     """Return how a fit went that matched a share of the points."""
     if matched == 0:
         return Status.NO_DATA

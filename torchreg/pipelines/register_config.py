@@ -22,11 +22,10 @@ def _refinement() -> RefineConfig:
 
 
 @dataclass(frozen=True)
-class RegisterConfig:
-    """How a reduced deformable model is fitted to two scans or more.
+class BoneConfig:
+    """How bones, labels and weights are fitted to where points of a source go in one scan or more.
 
     Args:
-        align: the dense alignment from which parts are found.
         num_samples: source points that are matched, evenly spread.
         num_patches: of the grid, from which parts are merged.
         label_steps: most rounds of T-steps, correspondences and W-step.
@@ -69,7 +68,6 @@ class RegisterConfig:
     References: Chang and Zwicker 2009, section 5, for the paper's values.
     """
 
-    align: ScanAlignConfig = field(default_factory=ScanAlignConfig)
     num_samples: int = 4000
     num_patches: int = 100
     label_steps: int = 4
@@ -124,3 +122,17 @@ class RegisterConfig:
     def joint_weight_at(self, progress: float) -> float:
         """Return beta a share of the way through the rounds of labels."""
         return between(self.joint_weight, progress) if self.joint_weight[0] > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class RegisterConfig(BoneConfig):
+    """How a reduced deformable model is fitted to two scans or more.
+
+    Args:
+        align: the dense alignment from which parts are found; all others as in `BoneConfig`.
+
+    Raises:
+        InputError: if a value is out of range.
+    """
+
+    align: ScanAlignConfig = field(default_factory=ScanAlignConfig)

@@ -193,7 +193,7 @@ def _result(
     moved = fit.model.move(points, weights)
     fused, normals, frames = _fused(scans, unit, moved, weights, fit.model.transforms.detach())
     shares = fit.history[-1].kept / (len(scans) * len(fit.samples.points))
-    model = unit.model_back(fit.model, like)
+    model = fit.model.rescaled(unit.size, unit.middle).to(dtype=like.dtype, device=like.device)
     return SequenceRegistration(
         model,
         like.detach(),

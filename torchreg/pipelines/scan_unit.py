@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from torchreg.geometry.range_scan import RangeScan
-from torchreg.geometry.sparse_grid import SparseGrid
-from torchreg.models.grid_lbs import GridLBS
+from torchreg.geometry.rigid import rescale_motions
 
 # Root mean squared distance from the middle, over the diagonal of the bounding box, of people and animals; unlike the
 # box it does not change with the frame.
@@ -51,15 +50,4 @@ class ScanUnit:
 
     def transforms_back(self, transforms: Tensor) -> Tensor:
         """Return motions (..., 4, 4) in the coordinates of the user."""
-        moved = transforms.clone()
-        shift = self.middle - (transforms[..., :3, :3] @ self.middle.unsqueeze(-1)).squeeze(-1)
-        moved[..., :3, 3] = self.size * transforms[..., :3, 3] + shift
-        return moved
-
-    def model_back(self, model: GridLBS, like: Tensor) -> GridLBS:
-        """Return a model in the coordinates of the user, in the dtype and on the device of ``like``."""
-        grid, transforms = model.grid, self.transforms_back(model.transforms.detach())
-        origin = self.middle + self.size * grid.origin
-        bigger = SparseGrid(grid.cells, grid.shape, origin, grid.axes, self.size * grid.spacing)
-        found = GridLBS(bigger, model.weights.detach(), transforms, blend=model.blend)
-        return found.to(dtype=like.dtype, device=like.device)
+        return rescale_motions(transforms, self.size, self.middle)

@@ -15,7 +15,7 @@ from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.skeleton import Skeleton
-from torchreg.models.articulated import ArticulatedShape
+from torchreg.models.articulation import Articulation
 from torchreg.models.limbs import find_limbs
 from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.align_problem import AlignProblem
@@ -136,7 +136,7 @@ class _Chains:
         steps = (places[:, 1:] - places[:, :-1]).norm(dim=-1)
         return cls(parts, offsets, torch.nn.functional.pad(steps.cumsum(-1), (1, 0)), weights)
 
-    def places(self, shape: ArticulatedShape, poses: Tensor) -> Tensor:
+    def places(self, shape: Articulation, poses: Tensor) -> Tensor:
         """Return the points (B, K, S, 3) in poses (B, num_dofs)."""
         transforms = shape.part_transforms(poses)[:, self.parts]
         return (transforms[..., :3, :3] @ self.offsets.unsqueeze(-1)).squeeze(-1) + transforms[..., :3, 3]

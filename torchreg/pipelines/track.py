@@ -17,7 +17,7 @@ from torchreg.correspondence.em import expectation
 from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.skin import LinearBlendSkin
-from torchreg.pipelines.align import AlignConfig, align, ordinary
+from torchreg.pipelines.align import AlignConfig, align
 from torchreg.pipelines.threads import one_thread
 from torchreg.pipelines.track_config import Frame, FrameFit, TrackConfig, thinned
 from torchreg.pipelines.track_evidence import is_doubtful, is_far, is_lost, usual_after
@@ -25,7 +25,7 @@ from torchreg.pipelines.track_fit import MIN_DATA, STOP_SIGMA, FrameFitter, gene
 from torchreg.pipelines.track_motion import first_motion, merged, motion_after, slowed, timed
 from torchreg.pipelines.track_points import points_after
 from torchreg.pipelines.track_recovery import MIN_GAIN, Recovery, rested, waited
-from torchreg.results.base import Status
+from torchreg.results.base import Status, normal_copy
 from torchreg.results.tracking import FrameResult, TrackResult, TrackState
 
 OnFrame = Callable[[Tensor, FrameResult], None]
@@ -130,8 +130,8 @@ class Tracker:
                 result, state = (
                     self._hold(state, frame, Status.LOST) if fit is None else self._accept(state, frame, fit)
                 )
-            self._state = ordinary(state)
-            return ordinary(result)
+            self._state = normal_copy(state)
+            return normal_copy(result)
 
     def run(
         self, frames: Iterable[Tensor], on_frame: OnFrame | None = None, *, times: Sequence[float] | None = None

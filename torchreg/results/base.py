@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from enum import Enum
 from html import escape
 from typing import Any, TypeVar
 
+import torch
 from torch import Tensor, nn
 
 from torchreg.errors import TorchregError
 
 # The class of a shape: models belong to a layer above this one.
 Shape = TypeVar("Shape", bound=nn.Module)
+Record = TypeVar("Record")
 Writer = Callable[[Any, str | os.PathLike[str]], None]
 
 # Files belong to a layer above this one, which registers its function when it is imported.
@@ -110,3 +112,11 @@ class Status(Enum):
     def usable(self) -> bool:
         """Whether the result rests on data, converged or not."""
         return self in (Status.CONVERGED, Status.MAX_STEPS, Status.WITH_WARNINGS)
+
+
+def normal_copy(record: Record) -> Record:
+    """Return a copy of a dataclass whose tensors can take part in autograd, as those made in inference mode cannot."""
+    values = {item.name: getattr(record, item.name) for item in fields(record)}  # type: ignore[arg-type]
+    with torch.inference_mode(False), torch.no_grad():
+        copies = {name: value.clone() for name, value in values.items() if isinstance(value, Tensor)}
+    return replace(record, **copies)  # type: ignore[type-var]

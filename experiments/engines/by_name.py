@@ -1,0 +1,30 @@
+"""Engines by name; each is imported when it is asked for, as its package may not be installed."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from experiments.engines.base import Engine, EngineConfig
+from experiments.errors import ConfigError
+
+# The module and the class of each.
+_HOMES = {
+    "local": ("experiments.engines.local", "LocalEngine"),
+    "ray": ("experiments.engines.ray_cluster", "RayEngine"),
+    "slurm": ("experiments.engines.slurm", "SlurmEngine"),
+}
+ENGINES = tuple(_HOMES)
+
+
+def make_engine(name: str, config: EngineConfig) -> Engine:
+    """Return an engine by name.
+
+    Raises:
+        ConfigError: if there is no such engine.
+        ExperimentError: if the package that it needs is not installed.
+    """
+    if name not in _HOMES:
+        raise ConfigError(f"unknown engine {name!r}; known engines: {', '.join(ENGINES)}")
+    module, kind = _HOMES[name]
+    engine: Engine = getattr(import_module(module), kind)(config)
+    return engine
