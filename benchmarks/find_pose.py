@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 import torchreg as tr
 from torchreg.datasets.hand import HandCloud, make_hand_cloud, surface_skin
-from torchreg.models.skin import LinearBlendSkin, sample_skin
+from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 NOISE, OUTLIERS, NUM_POINTS, DISTANCE, BEND = 0.0015, 0.1, 500, 0.5, 0.5
 TIPS, MIN_SEEN = [4, 8, 12, 16, 20], 4

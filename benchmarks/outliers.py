@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 import torchreg as tr
 from torchreg.datasets.hand import HandCloud, make_hand_cloud, random_hand_pose, surface_skin
-from torchreg.models.skin import LinearBlendSkin, sample_skin
+from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 NOISE, NUM_POINTS = 0.0015, 500
 JOINT_OFF = math.radians(10)

@@ -28,7 +28,7 @@ from torch import Tensor
 
 import torchreg as tr
 from torchreg.geometry.mesh import sample_surface
-from torchreg.models.skin import LinearBlendSkin, sample_skin
+from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 FILE = "webxr_hand_right.glb"
 ANGLES = (15, 30)

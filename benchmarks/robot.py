@@ -31,7 +31,7 @@ from torch import Tensor
 import torchreg as tr
 from torchreg.geometry.mesh import interpolate
 from torchreg.geometry.visibility import sample_visible
-from torchreg.models.skin import LinearBlendSkin, sample_skin
+from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 ROBOTS = {
     "UR5 arm": "ur_description/urdf/ur5_robot.urdf",

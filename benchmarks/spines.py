@@ -38,8 +38,8 @@ from torchreg.datasets.creatures import OCTOPUS, STARFISH, CreatureForm, Creatur
 from torchreg.geometry.clearance import Inside
 from torchreg.geometry.mesh import concatenate, sample_surface, unit_sphere
 from torchreg.geometry.voxels import VoxelGrid, voxelize
-from torchreg.models.skin import sample_skin
 from torchreg.pipelines.spine_source import SpineLimbs
+from torchreg.shapes.skin import sample_skin
 from torchreg.solvers.assignment import assign
 
 BAR_OWN, BAR_NAMED, BAR_INSIDE, BAR_SECONDS, BAR_HANDS = 0.7, 0.99, 0.995, 60.0, 0.9

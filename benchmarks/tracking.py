@@ -45,8 +45,8 @@ import torchreg as tr
 from torchreg.datasets.hand import HandCloud, surface_skin
 from torchreg.datasets.sequences import hand_sequence, other_hand, rig_sequence
 from torchreg.geometry.rotation import compose_rotation_vectors
-from torchreg.models.surface import FusedSurface
 from torchreg.pipelines.align_objectives import PosePrior, SurfaceObjective
+from torchreg.shapes.surface import FusedSurface
 from torchreg.solvers.levenberg_marquardt import levenberg_marquardt
 
 MOTIONS = ("rotation", "bending_palm", "bending_back", "flip", "fast", "occlusion")

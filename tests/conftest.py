@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from torchreg.datasets.hand import surface_skin
-from torchreg.models.hand import Hand
-from torchreg.models.skin import sample_skin
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.skin import sample_skin
 
 torch.set_num_threads(1)
 

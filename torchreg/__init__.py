@@ -24,12 +24,7 @@ if TYPE_CHECKING:
     from torchreg.io.calibration import load_cameras
     from torchreg.io.points import load_mesh, load_points
     from torchreg.losses.em import EMLoss
-    from torchreg.models.articulated import ArticulatedShape
     from torchreg.models.grid_lbs import GridLBS
-    from torchreg.models.hand import Hand
-    from torchreg.models.pose_head import PoseHead
-    from torchreg.models.pose_prior import PosePrior
-    from torchreg.models.skin import BendingSkin, LinearBlendSkin, sample_skin
     from torchreg.models.spine import Spine
     from torchreg.pipelines.align import AlignConfig, align
     from torchreg.pipelines.calibrate import calibrate
@@ -49,6 +44,11 @@ if TYPE_CHECKING:
     from torchreg.results.scans import PoseSolution, ScanRegistration, SequenceRegistration
     from torchreg.results.spines import SpineSequence
     from torchreg.results.tracking import FrameResult, TrackResult, TrackState
+    from torchreg.shapes.articulated import ArticulatedShape
+    from torchreg.shapes.hand import Hand
+    from torchreg.shapes.pose_head import PoseHead
+    from torchreg.shapes.pose_prior import PosePrior
+    from torchreg.shapes.skin import BendingSkin, LinearBlendSkin, sample_skin
     from torchreg.viz.conversions import to_open3d, to_pyvista, to_trimesh
 
 __version__ = "0.1.0"
@@ -125,8 +125,8 @@ _MODULES = frozenset({"errors", "metrics"})
 _OWNERS = {
     "AlignConfig": "pipelines.align",
     "AlignResult": "results.alignment",
-    "ArticulatedShape": "models.articulated",
-    "BendingSkin": "models.skin",
+    "ArticulatedShape": "shapes.articulated",
+    "BendingSkin": "shapes.skin",
     "Calibration": "results.alignment",
     "Camera": "geometry.camera",
     "CameraRig": "geometry.camera_rig",
@@ -134,13 +134,13 @@ _OWNERS = {
     "FindPoseConfig": "pipelines.find_pose",
     "FrameResult": "results.tracking",
     "GridLBS": "models.grid_lbs",
-    "Hand": "models.hand",
+    "Hand": "shapes.hand",
     "InitialPose": "pipelines.pose_initializer",
-    "LinearBlendSkin": "models.skin",
-    "PoseHead": "models.pose_head",
+    "LinearBlendSkin": "shapes.skin",
+    "PoseHead": "shapes.pose_head",
     "PoseInitializer": "pipelines.pose_initializer",
     "PoseInitializerConfig": "pipelines.pose_initializer",
-    "PosePrior": "models.pose_prior",
+    "PosePrior": "shapes.pose_prior",
     "PoseSolution": "results.scans",
     "PoseStarts": "results.alignment",
     "RangeScan": "geometry.range_scan",
@@ -176,7 +176,7 @@ _OWNERS = {
     "load_points": "io.points",
     "register": "pipelines.register",
     "register_sequence": "pipelines.register_sequence",
-    "sample_skin": "models.skin",
+    "sample_skin": "shapes.skin",
     "skeletonize": "pipelines.skeletonize",
     "solve_pose": "pipelines.solve_pose",
     "stereo_points": "capture.stereo",

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchreg.geometry.mesh import unit_sphere
-from torchreg.models.articulated import ArticulatedShape
+from torchreg.shapes.articulated import ArticulatedShape
 
 
 @pytest.fixture(scope="module")

@@ -3,8 +3,8 @@ import math
 import pytest
 import torch
 
-from torchreg.models.articulated import ArticulatedShape
 from torchreg.pipelines.align import AlignConfig
+from torchreg.shapes.articulated import ArticulatedShape
 
 # A box on a hinge whose limits exclude zero, a box that slides, and a round cap that turns about its own axis.
 URDF = """<?xml version="1.0"?><robot name="arm">

@@ -13,8 +13,8 @@ from torchreg.datasets.hand import hand_motion
 from torchreg.datasets.sequences import range_clouds
 from torchreg.io.gltf_write import save_animated_skin
 from torchreg.io.points import save_points
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
 
 ROBOT = """<robot name="arm">
   <link name="base"><visual><geometry><box size="0.2 0.2 0.1"/></geometry></visual></link>

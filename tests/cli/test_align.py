@@ -10,10 +10,10 @@ import torch
 import torchreg
 import torchreg.pipelines.align as align_module
 from torchreg.io.points import load_points, save_points
-from torchreg.models.hand import Hand
 from torchreg.pipelines.align import AlignConfig
 from torchreg.pipelines.storage import load
 from torchreg.results.base import Status
+from torchreg.shapes.hand import Hand
 
 QUICK = ("--search", "never")
 

@@ -7,11 +7,11 @@ import torch
 
 import torchreg.pipelines.track_recovery as recovery_module
 from torchreg.datasets.hand import hand_motion
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
 from torchreg.pipelines.storage import load
 from torchreg.pipelines.track import Tracker
 from torchreg.results.alignment import PoseStarts
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
 
 
 def test_the_demonstration_runs(run, tmp_path):

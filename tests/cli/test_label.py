@@ -3,7 +3,7 @@
 import torch
 
 from torchreg.datasets.pose_labels import PoseLabels
-from torchreg.models.hand import Hand
+from torchreg.shapes.hand import Hand
 
 
 def test_frames_become_labels(run, folder, tmp_path, error_of):

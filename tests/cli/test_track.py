@@ -15,13 +15,13 @@ from torchreg.datasets.hand import hand_motion
 from torchreg.datasets.sequences import range_clouds
 from torchreg.io.frames import save_frames
 from torchreg.io.points import load_points, save_points
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.skin import LinearBlendSkin, sample_skin
 from torchreg.pipelines.storage import load
 from torchreg.pipelines.track import TrackConfig, Tracker
 from torchreg.results.alignment import PoseStarts
 from torchreg.results.base import Status
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 FRAMES = 6
 FAST = ("--movie", "none", "--no-gltf")

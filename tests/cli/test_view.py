@@ -5,9 +5,9 @@ import torch
 
 from torchreg.cli import view as module
 from torchreg.io.points import save_points
-from torchreg.models.hand import Hand
 from torchreg.pipelines.storage import save_result
 from torchreg.results.alignment import PoseStarts
+from torchreg.shapes.hand import Hand
 
 pytest.importorskip("viser", reason="the viewer needs viser")
 

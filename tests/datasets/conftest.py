@@ -3,9 +3,9 @@ import torch
 
 from torchreg.datasets.hand import surface_skin
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.primitives import Primitive
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive
 
 EYE = torch.eye(4, dtype=torch.float64)
 

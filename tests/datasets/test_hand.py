@@ -11,10 +11,10 @@ from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.visibility import visible_points
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import BendingSkin, LinearBlendSkin
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import BendingSkin, LinearBlendSkin
 
 EYE = torch.eye(4, dtype=torch.float64)
 

@@ -16,8 +16,8 @@ from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.visibility import visible_points
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
 
 EYE = torch.eye(4, dtype=torch.float64)
 SMALL = StereoView(focal=300.0, width=320, height=240)

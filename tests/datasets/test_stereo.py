@@ -6,7 +6,7 @@ from torchreg.datasets.stereo import StereoView, stereo_clouds
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.visibility import visible_points
-from torchreg.models.skin import LinearBlendSkin
+from torchreg.shapes.skin import LinearBlendSkin
 
 EYE = torch.eye(4, dtype=torch.float64)
 SMALL = StereoView(focal=300.0, width=320, height=240)

@@ -12,14 +12,14 @@ from torchreg.geometry.rigid import rigid_matrix, se3_exp
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.sampling import farthest_points
 from torchreg.geometry.sparse_grid import SparseGrid
-from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.grid_lbs import GridLBS
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import sample_skin
 from torchreg.pipelines.bone_problem import BoneProblem, bind
 from torchreg.pipelines.track import Tracker
 from torchreg.pipelines.track_config import Frame, TrackConfig
 from torchreg.pipelines.track_fit import FrameFitter
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import sample_skin
 
 BONES = 3
 

@@ -12,12 +12,12 @@ from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import BendingSkin, sample_skin
 from torchreg.pipelines.align import AlignConfig, align
 from torchreg.results.base import Status
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import BendingSkin, sample_skin
 
 # Without a search an alignment is one descent: fast, and the same whatever else is in the batch.
 DESCENT = AlignConfig(search="never")

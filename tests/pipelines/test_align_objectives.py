@@ -6,11 +6,11 @@ import torch
 from torchreg.correspondence.em import EStep, expectation
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import BendingSkin
-from torchreg.models.surface import FusedSurface
 from torchreg.pipelines.align_objectives import PosePrior, RegistrationObjective, SurfaceObjective
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import BendingSkin
+from torchreg.shapes.surface import FusedSurface
 from torchreg.solvers.levenberg_marquardt import Linearization
 
 DOFS = 8

@@ -10,12 +10,6 @@ import torch
 
 from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.primitives import Primitive
-from torchreg.models.rigs import RigSurface
-from torchreg.models.skin import sample_skin
-from torchreg.models.surface import FusedSurface, SkinSurface
 from torchreg.pipelines.align_problem import (
     INLIER_SHARE,
     PRIOR_SHARE,
@@ -26,6 +20,12 @@ from torchreg.pipelines.align_problem import (
     shifted,
     warn_about_units,
 )
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.rigs import RigSurface
+from torchreg.shapes.skin import sample_skin
+from torchreg.shapes.surface import FusedSurface, SkinSurface
 
 
 def offset(*place):

@@ -7,15 +7,15 @@ import torch
 
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import BendingSkin
-from torchreg.models.surface import FusedSurface
 from torchreg.pipelines import align_search
 from torchreg.pipelines.align_objectives import PosePrior
 from torchreg.pipelines.align_problem import AlignProblem
 from torchreg.pipelines.align_search import _scatter, clustered_data, explore, leaves_clusters, needs_search
 from torchreg.pipelines.pose_search import PoseSearch
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import BendingSkin
+from torchreg.shapes.surface import FusedSurface
 
 
 def make_problem(skin, data, mean):

@@ -10,10 +10,6 @@ from torchreg.correspondence.em import posterior
 from torchreg.correspondence.sigma import SigmaSchedule
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import sample_skin
-from torchreg.models.surface import FusedSurface
 from torchreg.pipelines.align_objectives import PosePrior
 from torchreg.pipelines.align_problem import AlignProblem
 from torchreg.pipelines.align_stages import (
@@ -25,6 +21,10 @@ from torchreg.pipelines.align_stages import (
     settle_surface,
     surface_steps,
 )
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import sample_skin
+from torchreg.shapes.surface import FusedSurface
 
 DOFS = 8
 

@@ -9,15 +9,15 @@ from torchreg.datasets.hand import hand_motion, make_hand_cloud
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import BendingSkin, sample_skin
 from torchreg.pipelines.align import AlignConfig, align
 from torchreg.pipelines.calibrate import CalibrateConfig, calibrate, scale_jacobian
 from torchreg.pipelines.storage import load
 from torchreg.results.alignment import Calibration
 from torchreg.results.base import Status
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import BendingSkin, sample_skin
 
 
 def offset(*place):

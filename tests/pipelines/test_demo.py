@@ -6,10 +6,10 @@ import torch
 import torchreg.pipelines.demo as demo
 from torchreg.datasets.sequences import hand_sequence
 from torchreg.errors import InputError
-from torchreg.models.hand import Hand
-from torchreg.models.skin import sample_skin
 from torchreg.pipelines.storage import load
 from torchreg.pipelines.track import TrackConfig, Tracker
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.skin import sample_skin
 
 
 @pytest.fixture(scope="module")

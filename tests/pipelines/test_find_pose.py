@@ -11,10 +11,6 @@ from torchreg.datasets.hand import make_hand_cloud
 from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rotation import so3_exp, so3_log
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import sample_skin
 from torchreg.pipelines.align_problem import alignment_cost, centered_problem, masked_mean
 from torchreg.pipelines.find_pose import (
     FindPoseConfig,
@@ -26,6 +22,10 @@ from torchreg.pipelines.find_pose import (
 )
 from torchreg.pipelines.storage import load
 from torchreg.results.alignment import PoseStarts
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import sample_skin
 
 QUICK = FindPoseConfig(num_candidates=16, num_placed=5, num_searched=2, search_rounds=1, num_model_points=200)
 # Enough for most tests; the default is tried by the first ones.

@@ -5,12 +5,12 @@ import torch
 
 from torchreg.errors import InputError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import sample_skin
 from torchreg.pipelines.find_pose import FindPoseConfig
 from torchreg.pipelines.label import label_frames
 from torchreg.pipelines.pose_initializer import PoseInitializer, PoseInitializerConfig
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import sample_skin
 
 QUICK = FindPoseConfig(num_candidates=8, num_placed=2, num_searched=1, search_rounds=1)
 

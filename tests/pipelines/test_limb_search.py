@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import sample_skin
 from torchreg.pipelines import limb_search
 from torchreg.pipelines.align_problem import centered_problem
 from torchreg.pipelines.limb_search import Effort, LimbSearch, distinct_first, take_rows
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import sample_skin
 
 THOROUGH = Effort(
     num_data=400, width=0.05, beam=80, configurations=30, polish=(0.04, 0.03, 0.025), score_width=0.02,

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import sample_skin
 from torchreg.pipelines.align_problem import centered_problem
 from torchreg.pipelines.pose_confidence import beside_share, is_misfit, known_ends, limb_ends, pose_confidence
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import sample_skin
 
 TIPS = [4, 8, 12, 16, 20]
 SURE = torch.tensor([1e6])

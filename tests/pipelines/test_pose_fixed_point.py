@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.primitives import Primitive
-from torchreg.models.surface import FusedSurface
 from torchreg.pipelines.align_objectives import PosePrior, SurfaceObjective
 from torchreg.pipelines.pose_fixed_point import FixedPoint, attach_gradients, solve_symmetric
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.surface import FusedSurface
 
 D = torch.float64
 

@@ -10,12 +10,12 @@ from torchreg.datasets.hand import make_hand_cloud
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import LinearBlendSkin, bending_weights, sample_skin
 from torchreg.pipelines.find_pose import FindPoseConfig
 from torchreg.pipelines.pose_initializer import InitialPose, PoseInitializer, PoseInitializerConfig
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import LinearBlendSkin, bending_weights, sample_skin
 
 D = torch.float64
 EXACT = PoseInitializerConfig(sigma_steps=1, em_steps=1, fit_steps=6, newton_steps=3, noise=0.004)

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchreg.models.surface import FusedSurface
 from torchreg.pipelines.align_problem import PRIOR_SHARE, centered_problem, masked_mean, shifted
 from torchreg.pipelines.pose_search import PoseSearch, fit_candidates, mean_distances, repeated, score_candidates
+from torchreg.shapes.surface import FusedSurface
 
 TIPS = [4, 8, 12, 16, 20]
 

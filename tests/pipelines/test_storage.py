@@ -10,10 +10,7 @@ import torch
 from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.sparse_grid import SparseGrid
-from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.grid_lbs import GridLBS
-from torchreg.models.hand import Hand
-from torchreg.models.primitives import Primitive
 from torchreg.models.spine import Spine
 from torchreg.pipelines.align import AlignConfig, align
 from torchreg.pipelines.storage import load, load_pose, save_result
@@ -21,6 +18,9 @@ from torchreg.results.alignment import AlignRecord, AlignResult, Calibration
 from torchreg.results.base import Result, Status
 from torchreg.results.spines import SpineSequence
 from torchreg.results.tracking import DemoResult, TrackResult
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive
 
 
 def record(step, batch=1, dtype=torch.float32):

@@ -8,12 +8,12 @@ import torch
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.rotation import compose_rotation_vectors
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.limbs import find_limbs
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import sample_skin
 from torchreg.pipelines.align_objectives import PosePrior
 from torchreg.pipelines.track_evidence import LimbReach, dense_strays, nearest_distance
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.limbs import find_limbs
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import sample_skin
 
 CELL = 0.01
 

@@ -5,12 +5,12 @@ import torch
 
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.limbs import find_limbs
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import sample_skin
 from torchreg.pipelines.align_problem import centered_problem
 from torchreg.pipelines.track_limbs import fit_limbs, mixed, scattered
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.limbs import find_limbs
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import sample_skin
 
 EYE = torch.eye(3, dtype=torch.float64)
 

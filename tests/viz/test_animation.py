@@ -10,7 +10,7 @@ from PIL import Image
 from torchreg.datasets.hand import hand_motion, surface_skin
 from torchreg.datasets.sequences import range_clouds
 from torchreg.errors import InputError, MissingExtraError
-from torchreg.models.hand import Hand
+from torchreg.shapes.hand import Hand
 from torchreg.viz.animation import animate_alignment, save_animation
 
 

@@ -8,8 +8,8 @@ from torchreg.datasets.hand import surface_skin
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
 from torchreg.geometry.visibility import aim
-from torchreg.models.hand import Hand
-from torchreg.models.skin import LinearBlendSkin
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.viz import figures
 from torchreg.viz.figures import (
     bending_figure,

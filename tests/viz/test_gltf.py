@@ -4,9 +4,9 @@ import torch
 
 from torchreg.datasets.hand import hand_motion, surface_skin
 from torchreg.errors import InputError
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.skin import LinearBlendSkin
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.viz.gltf import save_shape_animation
 
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from torchreg.errors import InputError
-from torchreg.models.skin import LinearBlendSkin
 from torchreg.results.base import Status
 from torchreg.results.tracking import FrameResult
+from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.viz.animation import coarse_skin
 from torchreg.viz.live_track import LiveTrack
 

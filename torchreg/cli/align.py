@@ -28,10 +28,10 @@ from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, lo
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchreg.models.articulated import ArticulatedShape
-    from torchreg.models.skin import LinearBlendSkin
     from torchreg.pipelines.align import AlignConfig
     from torchreg.results.alignment import AlignResult
+    from torchreg.shapes.articulated import ArticulatedShape
+    from torchreg.shapes.skin import LinearBlendSkin
 
 
 @dataclass(frozen=True)
@@ -104,9 +104,9 @@ def align(
 
     with tqdm(total=count, unit="cloud", desc="reading", leave=False, disable=quiet) as bar:
         model = load_shape(shape, parents, package_dir, free_base)
-        from torchreg.models.skin import sample_skin
         from torchreg.pipelines.align import AlignConfig
         from torchreg.pipelines.storage import load_pose
+        from torchreg.shapes.skin import sample_skin
 
         config = AlignConfig(schedule=read_schedule(sigma), outlier=outlier, search=search, nan_policy=nan_policy)
         first = None if start is None else load_pose(start, model)

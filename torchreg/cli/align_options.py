@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchreg.correspondence.sigma import SigmaSchedule
-    from torchreg.models.articulated import ArticulatedShape
     from torchreg.results.alignment import AlignResult
+    from torchreg.shapes.articulated import ArticulatedShape
 
 Sigma = Annotated[
     str | None, typer.Option(metavar="START:STOP:STEPS", help="Widths of the EM, metres, as in 0.02:0.005:5.")

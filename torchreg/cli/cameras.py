@@ -13,7 +13,7 @@ from torchreg.errors import InputError
 if TYPE_CHECKING:
     from torchreg.capture.stereo_frames import StereoFrames
     from torchreg.geometry.camera_rig import CameraRig
-    from torchreg.models.articulated import ArticulatedShape
+    from torchreg.shapes.articulated import ArticulatedShape
 
 Calibration = Annotated[
     Path | None,
@@ -91,7 +91,7 @@ def stereo_source(
 
     from torchreg.capture.stereo import StereoConfig
     from torchreg.capture.stereo_frames import StereoFrames
-    from torchreg.models.hand import Hand
+    from torchreg.shapes.hand import Hand
 
     if len(folders) != 2:
         raise InputError(

@@ -38,8 +38,8 @@ def demo(
 
     from tqdm import tqdm
 
-    from torchreg.models.hand import Hand
     from torchreg.pipelines.demo import DEMO_FPS, run_demo
+    from torchreg.shapes.hand import Hand
     from torchreg.viz.tracking import animate_track, save_track_gltf
 
     with tqdm(total=frames, unit="frame", desc="tracking", leave=False) as bar:

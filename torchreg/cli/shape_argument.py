@@ -12,7 +12,7 @@ import typer
 from torchreg.errors import FormatError, InputError
 
 if TYPE_CHECKING:
-    from torchreg.models.articulated import ArticulatedShape
+    from torchreg.shapes.articulated import ArticulatedShape
 
 _HANDS = {"hand": "right", "hand-left": "left"}
 _HELP = "hand, hand-left, a robot (.urdf) or a rigged character (.glb, .gltf)."
@@ -44,10 +44,10 @@ def load_shape(
         if value is not None and option not in uses.get(ending, set()):
             raise InputError(f"{option} has no meaning for {name}; leave it out")
     if name in _HANDS:
-        from torchreg.models.hand import Hand
+        from torchreg.shapes.hand import Hand
 
         return Hand(_HANDS[name])
-    from torchreg.models.articulated import ArticulatedShape
+    from torchreg.shapes.articulated import ArticulatedShape
 
     if ending == ".urdf":
         return ArticulatedShape.from_urdf(name, package_dirs=package_dirs or (), free_base=free_base is not False)

@@ -32,8 +32,8 @@ from torchreg.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchreg.models.skin import LinearBlendSkin
     from torchreg.results.tracking import FrameResult
+    from torchreg.shapes.skin import LinearBlendSkin
 
 MOVIES = ("gif", "mp4", "none")
 

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
     from torchreg.capture.stereo_frames import StereoFrames
     from torchreg.io.frames import Frames
-    from torchreg.models.skin import LinearBlendSkin
     from torchreg.pipelines.track import TrackConfig, Tracker
     from torchreg.pipelines.track_progress import TrackProgress
     from torchreg.results.tracking import FrameResult, TrackResult, TrackState
+    from torchreg.shapes.skin import LinearBlendSkin
 
     OnFrame = Callable[[Tensor, FrameResult], object]
 

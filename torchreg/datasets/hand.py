@@ -13,9 +13,9 @@ from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
 from torchreg.geometry.visibility import sample_visible
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.skin import BendingSkin, LinearBlendSkin
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.skin import BendingSkin, LinearBlendSkin
 
 _DISTANCE = 0.5
 _POSITION_SPREAD = 0.03

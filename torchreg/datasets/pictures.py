@@ -16,8 +16,8 @@ from torchreg.geometry.camera_rig import CameraRig, StereoPair
 from torchreg.geometry.mesh import TriangleMesh, interpolate
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.visibility import rasterize
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.skin import LinearBlendSkin
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.skin import LinearBlendSkin
 
 # Light skin: its mean color, and what blood and melanin change of it.
 _SKIN, _BLOTCH = (0.78, 0.58, 0.48), (0.10, -0.05, -0.06)

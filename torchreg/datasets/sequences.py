@@ -14,9 +14,9 @@ from torchreg.datasets.stereo import StereoView, stereo_clouds, tube
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.skin import LinearBlendSkin
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.skin import LinearBlendSkin
 
 # Pieces of the bar in "occlusion", and seconds of the periods of `rig_sequence`.
 _BAR_PIECES = 20

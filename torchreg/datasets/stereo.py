@@ -15,9 +15,9 @@ from torchreg.geometry.mesh import TriangleMesh, interpolate
 from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.visibility import Raster, View, rasterize
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.skin import LinearBlendSkin
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.skin import LinearBlendSkin
 
 # Shares of the outliers; the rest is spread over the working volume.
 _ON_FOREARM, _ON_WALL = 0.4, 0.3

@@ -15,9 +15,9 @@ from torchreg.errors import InputError
 from torchreg.geometry.camera_rig import CameraRig, StereoPair
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import transform_points
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.skin import LinearBlendSkin
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.skin import LinearBlendSkin
 
 
 def shape_video(

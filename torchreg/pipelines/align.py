@@ -12,8 +12,6 @@ from torchreg._checks import as_float_tensor, check_choice, check_count, check_p
 from torchreg.correspondence.em import OUTLIER_CONSTANT, expectation
 from torchreg.correspondence.sigma import SigmaSchedule
 from torchreg.errors import InputError
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.skin import BendingSkin, LinearBlendSkin, sample_skin
 from torchreg.pipelines.align_problem import (
     INLIER_SHARE,
     AlignProblem,
@@ -29,6 +27,8 @@ from torchreg.pipelines.align_stages import CORRESPONDENCES, OnStep, StageResult
 from torchreg.pipelines.threads import one_thread
 from torchreg.results.alignment import AlignRecord, AlignResult
 from torchreg.results.base import Status, normal_copy
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.skin import BendingSkin, LinearBlendSkin, sample_skin
 
 # Shares of the model's size, the diagonal of its rest pose.
 _START_SIGMA, _STOP_SIGMA = 0.08, 0.02

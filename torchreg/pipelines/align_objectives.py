@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchreg.correspondence.em import EStep
 from torchreg.geometry.rotation import compose_rotation_vectors
-from torchreg.models.skin import LinearBlendSkin
-from torchreg.models.surface import Surface
+from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.shapes.surface import Surface
 from torchreg.solvers.levenberg_marquardt import Linearization
 
 # The base is held, in the Hessian alone, as if by this share of a datum: more slows starts that few data reach.

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_shape
 from torchreg.errors import InputError, InputTypeError, UnitsWarning
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.articulation import Articulation
-from torchreg.models.kinematics import stack_sizes
-from torchreg.models.skin import LinearBlendSkin
-from torchreg.models.surface import FusedSurface, SkinSurface, Surface, dense_file_skin
 from torchreg.pipelines.align_objectives import PosePrior, RegistrationObjective, SurfaceObjective
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.articulation import Articulation
+from torchreg.shapes.kinematics import stack_sizes
+from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.shapes.surface import FusedSurface, SkinSurface, Surface, dense_file_skin
 from torchreg.solvers.levenberg_marquardt import (
     Linearization,
     LMResult,

@@ -12,13 +12,13 @@ from torch import Tensor, nn
 
 from torchreg._checks import as_float_tensor, check_finite, check_positive, check_shape
 from torchreg.errors import InputError, InputTypeError
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.primitives import fuse
-from torchreg.models.skin import sample_skin
 from torchreg.pipelines.align import AlignConfig, align
 from torchreg.pipelines.align_stages import FINAL_SIGMA_RANGE, SIGMA_PER_NOISE, SURFACE_SIGMAS, surface_noise
 from torchreg.results.alignment import Calibration
 from torchreg.results.base import Status
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.primitives import fuse
+from torchreg.shapes.skin import sample_skin
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
 
 # Residuals near each other share what the model gets wrong: they weigh as if their noise were this much larger.

@@ -10,10 +10,10 @@ from torch import Tensor
 from torchreg._checks import check_shape
 from torchreg.datasets.hand import HandCloud
 from torchreg.datasets.sequences import hand_sequence
-from torchreg.models.hand import Hand
-from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.track import TrackConfig, Tracker
 from torchreg.results.tracking import DemoResult, FrameResult, TrackResult
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.skin import LinearBlendSkin
 
 DEMO_FPS = 20.0
 

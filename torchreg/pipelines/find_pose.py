@@ -17,9 +17,6 @@ from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.rigid import fit_rigid, rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.sampling import farthest_points
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.articulation import Articulation
-from torchreg.models.skin import LinearBlendSkin, sample_skin
 from torchreg.pipelines.align_problem import (
     AlignProblem,
     alignment_cost,
@@ -35,6 +32,9 @@ from torchreg.pipelines.pose_confidence import is_misfit, pose_confidence
 from torchreg.pipelines.pose_search import PoseSearch, mean_distances
 from torchreg.pipelines.threads import one_thread
 from torchreg.results.alignment import PoseStarts
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.articulation import Articulation
+from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 # Typical poses lie at these shares of the way from the rest pose to the middle of the joint limits.
 _BENT_SHARES, _TYPICAL_SHARE = (0.2, 0.8), 0.5

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix
 from torchreg.geometry.rotation import so3_exp
-from torchreg.models.articulation import Articulation
-from torchreg.models.limbs import Body, Limb, find_limbs
 from torchreg.pipelines.align_problem import PRIOR_SHARE, AlignProblem
+from torchreg.shapes.articulation import Articulation
+from torchreg.shapes.limbs import Body, Limb, find_limbs
 from torchreg.solvers.cover import best_covers
 
 # Angle between neighboring samples of a joint, radians, and how far a joint without limits is tried.

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchreg.models.limbs import Limb, find_limbs
-from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.align_problem import INLIER_SHARE, AlignProblem
 from torchreg.pipelines.align_search import clustered_data
 from torchreg.pipelines.align_stages import SIGMA_PER_NOISE, pose_covariance, surface_noise
+from torchreg.shapes.limbs import Limb, find_limbs
+from torchreg.shapes.skin import LinearBlendSkin
 
 # A pose is right if the ends of its limbs lie within this share of the size of where they are, on average.
 _TOLERANCE = 0.04

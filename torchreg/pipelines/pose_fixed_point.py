@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from torchreg.geometry.rotation import compose_rotation_vectors, left_jacobian, so3_exp
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.surface import Surface
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.surface import Surface
 from torchreg.solvers.levenberg_marquardt import held_at_limits
 
 _BASE = 6

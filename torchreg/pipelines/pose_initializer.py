@@ -10,15 +10,15 @@ from torch import Tensor, nn
 from torchreg._checks import check_choice, check_count, check_positive, check_shape
 from torchreg.correspondence.sigma import SigmaSchedule
 from torchreg.errors import InputError
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.skin import LinearBlendSkin, sample_skin
-from torchreg.models.surface import FusedSurface
 from torchreg.pipelines.align_objectives import PosePrior, SurfaceObjective
 from torchreg.pipelines.align_problem import AlignProblem, centered_problem, check_data, masked_mean, shifted
 from torchreg.pipelines.align_search import clustered_data
 from torchreg.pipelines.align_stages import SIGMA_PER_NOISE, fit_surface, register, residual_noise
 from torchreg.pipelines.find_pose import FindPoseConfig, find_pose, typical_poses
 from torchreg.pipelines.pose_fixed_point import FixedPoint, attach_gradients
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.skin import LinearBlendSkin, sample_skin
+from torchreg.shapes.surface import FusedSurface
 
 _START_SIGMA, _STOP_SIGMA = 0.08, 0.02
 # How weakly a start holds the base, so that a cloud without data leaves it there: radians, and shares of the size.

@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 
 from torchreg.geometry.sampling import farthest_points
-from torchreg.models.skin import LinearBlendSkin
-from torchreg.models.surface import FusedSurface
 from torchreg.pipelines.align_problem import PRIOR_SHARE, AlignProblem
 from torchreg.pipelines.align_stages import surface_steps
 from torchreg.pipelines.limb_search import Effort, LimbSearch, distinct_first, take_rows
+from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.shapes.surface import FusedSurface
 
 _COARSE = Effort(
     num_data=150, width=0.05, beam=82, configurations=41, polish=(), score_width=0.05, combinations=2, exchanged=0

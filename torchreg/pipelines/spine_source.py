@@ -15,12 +15,12 @@ from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.skeleton import Skeleton
-from torchreg.models.articulation import Articulation
-from torchreg.models.limbs import find_limbs
-from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.align_problem import AlignProblem
 from torchreg.pipelines.find_pose import typical_poses
 from torchreg.pipelines.skeletonize import SkeletonizeConfig, skeletonize
+from torchreg.shapes.articulation import Articulation
+from torchreg.shapes.limbs import find_limbs
+from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
 
 # Mappings of limbs to chains whose poses are fitted, per typical pose, and steps of the fit.

@@ -22,17 +22,17 @@ from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, open_zip, read_bytes
 from torchreg.io.points import PARSER_ERRORS
 from torchreg.io.tensors import FORMAT, load_tensors, save_tensors
-from torchreg.models.articulated import ArticulatedShape
 from torchreg.models.grid_lbs import GridLBS, GridLBSRecord
-from torchreg.models.primitives import Primitive
-from torchreg.models.rigs import RigSurface, ShapeSpec
-from torchreg.models.shape_record import HandSpec, ShapeRecord, build_shape, record_shape
 from torchreg.models.spine import Spine, SpineFields
 from torchreg.results.alignment import AlignRecord, AlignResult, Calibration, PoseStarts
 from torchreg.results.base import Result, Status, register_writer
 from torchreg.results.scans import PoseSolution, RegisterRecord, ScanRegistration, SequenceRegistration
 from torchreg.results.spines import SpineSequence
 from torchreg.results.tracking import DemoResult, FrameResult, TrackResult, TrackState
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.record import HandSpec, ShapeRecord, build_shape, record_shape
+from torchreg.shapes.rigs import RigSurface, ShapeSpec
 
 # What a file may name: nothing else is ever built from it.
 _RESULTS: dict[str, type[Result]] = {

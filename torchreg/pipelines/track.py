@@ -15,8 +15,6 @@ import torchreg.pipelines.storage  # noqa: F401  (results of a tracker can be sa
 from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg.correspondence.em import expectation
 from torchreg.errors import InputError, InputTypeError, UnitsWarning
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.align import AlignConfig, align
 from torchreg.pipelines.threads import one_thread
 from torchreg.pipelines.track_config import Frame, FrameFit, TrackConfig, thinned
@@ -27,6 +25,8 @@ from torchreg.pipelines.track_points import points_after
 from torchreg.pipelines.track_recovery import MIN_GAIN, Recovery, rested, waited
 from torchreg.results.base import Status, normal_copy
 from torchreg.results.tracking import FrameResult, TrackResult, TrackState
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.skin import LinearBlendSkin
 
 OnFrame = Callable[[Tensor, FrameResult], None]
 

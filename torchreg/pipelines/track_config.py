@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_choice, check_count, check_positive
-from torchreg.models.skin import stacked_rows
 from torchreg.pipelines.align_problem import AlignProblem, shifted
+from torchreg.shapes.skin import stacked_rows
 
 MODEL_POINTS = ("seen", "data", "shape")
 

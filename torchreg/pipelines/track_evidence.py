@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from torchreg.geometry.rigid import invert_rigid, transform_points
-from torchreg.models.limbs import Limb
-from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.align_problem import AlignProblem
 from torchreg.pipelines.track_config import FrameFit
 from torchreg.results.tracking import TrackState
+from torchreg.shapes.limbs import Limb
+from torchreg.shapes.skin import LinearBlendSkin
 
 # A loss: fewer inliers than the first, after a loss than this share of the usual; or half of the usual ratio.
 _MIN_INLIERS, _LOST_COUNT, _LOST_RATIO = 10, 0.12, 0.5

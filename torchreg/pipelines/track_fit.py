@@ -11,9 +11,6 @@ from torch import Tensor
 
 from torchreg.correspondence.sigma import SigmaSchedule
 from torchreg.geometry.rigid import invert_rigid, transform_points
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.limbs import find_limbs
-from torchreg.models.skin import LinearBlendSkin, sample_skin, stacked_rows
 from torchreg.pipelines.align import AlignConfig
 from torchreg.pipelines.align_objectives import PosePrior
 from torchreg.pipelines.align_problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem, shifted
@@ -35,6 +32,9 @@ from torchreg.pipelines.track_evidence import (
 from torchreg.pipelines.track_limbs import fit_limbs, scattered
 from torchreg.pipelines.track_motion import moves_fast, predicted, prior_std, spread
 from torchreg.results.tracking import TrackState
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.limbs import find_limbs
+from torchreg.shapes.skin import LinearBlendSkin, sample_skin, stacked_rows
 
 # Less data are none.
 MIN_DATA = 10

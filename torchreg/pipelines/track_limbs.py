@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchreg.models.limbs import Limb
-from torchreg.models.primitives import fuse
 from torchreg.pipelines.align_problem import PRIOR_SHARE, AlignProblem
 from torchreg.pipelines.align_stages import surface_steps
+from torchreg.shapes.limbs import Limb
+from torchreg.shapes.primitives import fuse
 from torchreg.solvers.cover import best_covers
 
 # Kernel widths of the fits from all starts, one step at each, as shares of the size; more data lead no better.

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from torchreg.errors import InputError
 from torchreg.geometry.rotation import compose_rotation_vectors
-from torchreg.models.articulated import ArticulatedShape
 from torchreg.pipelines.track_config import Frame, FrameFit
 from torchreg.results.tracking import TrackState
+from torchreg.shapes.articulated import ArticulatedShape
 
 # Errors of the prediction before any is known: joints and turns in radians, points as a share of the size.
 NEW_TURN_ERROR, NEW_ERROR = 0.15, 0.032

@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchreg.models.skin import bending_weights
 from torchreg.pipelines.track_config import FrameFit
 from torchreg.pipelines.track_fit import MIN_DATA, FrameFitter, generator
 from torchreg.results.tracking import TrackState
+from torchreg.shapes.skin import bending_weights
 
 # Data this near the surface, as a share of the size, are harvested (5 mm on a hand); they show model points this near.
 _HARVEST_SHARE, _SHOWN_SHARE = 0.022, 0.03

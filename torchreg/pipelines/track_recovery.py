@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from torchreg.geometry.rotation import compose_rotation_vectors
-from torchreg.models.skin import LinearBlendSkin
 from torchreg.pipelines.find_pose import FindPoseConfig, find_pose
 from torchreg.pipelines.pose_search import PoseSearch, fit_candidates, score_candidates
 from torchreg.pipelines.track_config import Frame, FrameFit, FrameView, thinned
@@ -18,6 +17,7 @@ from torchreg.pipelines.track_evidence import is_doubtful, is_lost, is_vague
 from torchreg.pipelines.track_fit import STOP_SIGMA, FrameFitter, generator
 from torchreg.pipelines.track_motion import difference, spread
 from torchreg.results.tracking import TrackState
+from torchreg.shapes.skin import LinearBlendSkin
 
 # Data that another pose must explain beyond those that the prediction led to.
 MIN_GAIN = 4.0

@@ -20,8 +20,8 @@ from torchreg.datasets.hand import surface_skin
 from torchreg.errors import InputError, MissingExtraError
 from torchreg.geometry.visibility import View
 from torchreg.io.atomic import write_atomic
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.skin import LinearBlendSkin
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.viz.figures import draw_alignment, new_figure, watch
 
 if TYPE_CHECKING:

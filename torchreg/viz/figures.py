@@ -19,10 +19,10 @@ from torchreg.geometry.mesh import TriangleMesh, interpolate
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.visibility import View, aim, rasterize, visible_points
 from torchreg.io.atomic import write_atomic
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import BendingSkin, LinearBlendSkin
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import BendingSkin, LinearBlendSkin
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

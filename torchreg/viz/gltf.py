@@ -12,8 +12,8 @@ from torchreg.datasets.hand import surface_skin
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.io.gltf_write import save_animated_skin
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.skin import LinearBlendSkin
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.skin import LinearBlendSkin
 
 
 def save_shape_animation(

@@ -8,7 +8,7 @@ import torch
 from torchreg.errors import ModelError
 from torchreg.geometry.primitives import PRIMITIVE_KINDS
 from torchreg.geometry.rigid import se3_exp
-from torchreg.models.primitives import Primitive, PrimitiveSet
+from torchreg.shapes.primitives import Primitive, PrimitiveSet
 
 SIZES = {
     "ellipsoid": (0.2, 0.3, 0.5),

@@ -17,8 +17,8 @@ from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 from torchreg.io.tensors import load_tensors, save_tensors
 
 if TYPE_CHECKING:
-    from torchreg.models.articulated import ArticulatedShape
-    from torchreg.models.pose_head import PoseHead
+    from torchreg.shapes.articulated import ArticulatedShape
+    from torchreg.shapes.pose_head import PoseHead
 
 _KIND = "PosePrior"
 _BASE = 6

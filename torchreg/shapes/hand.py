@@ -11,8 +11,8 @@ from torch import Tensor
 from torchreg._checks import check_choice, check_positive
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.primitives import Primitive
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.primitives import Primitive
 
 FINGER_NAMES = ("thumb", "index", "middle", "ring", "little")
 # Ellipsoids of inner phalanges reach past their joints by this factor, so that neighbors overlap and fuse smoothly.

@@ -8,10 +8,10 @@ import torch
 
 from torchreg.errors import InputError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import BendingSkin, LinearBlendSkin, bending_weights, sample_skin
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import BendingSkin, LinearBlendSkin, bending_weights, sample_skin
 
 # torch builds its forward-mode rules with torch.jit.script, and warns about it.
 JACFWD = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")

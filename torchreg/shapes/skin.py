@@ -10,7 +10,7 @@ from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.geometry.sampling import farthest_points
-from torchreg.models.articulation import Articulation
+from torchreg.shapes.articulation import Articulation
 
 # Candidates per chosen point; more cover the surface more evenly.
 _OVERSAMPLING = 8

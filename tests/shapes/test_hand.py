@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchreg.errors import InputError
-from torchreg.models.hand import FINGER_NAMES, Hand
+from torchreg.shapes.hand import FINGER_NAMES, Hand
 
 
 @pytest.fixture(scope="module")

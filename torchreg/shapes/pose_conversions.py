@@ -14,7 +14,7 @@ from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.rotation_representations import rotation_vector_from_rotation
 
 if TYPE_CHECKING:
-    from torchreg.models.hand import Hand
+    from torchreg.shapes.hand import Hand
 
 _FINGERS = ("thumb", "index", "middle", "ring", "little")
 _OURS = ("wrist", *(f"{finger}_{number}" for finger in _FINGERS for number in range(1, 5)))

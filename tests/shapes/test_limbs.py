@@ -3,10 +3,10 @@
 import torch
 
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.limbs import find_limbs
-from torchreg.models.primitives import Primitive
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.limbs import find_limbs
+from torchreg.shapes.primitives import Primitive
 
 ROD = Primitive("capsule", (0.1, 0.05), torch.eye(4, dtype=torch.float64))
 

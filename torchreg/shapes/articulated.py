@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from torchreg.errors import InputError
-from torchreg.models.articulation import Articulation
-from torchreg.models.rigs import ShapeSpec, spec_from_arrays, spec_from_gltf, spec_from_urdf
-from torchreg.models.skin import LinearBlendSkin
+from torchreg.shapes.articulation import Articulation
+from torchreg.shapes.rigs import ShapeSpec, spec_from_arrays, spec_from_gltf, spec_from_urdf
+from torchreg.shapes.skin import LinearBlendSkin
 
 
 class ArticulatedShape(Articulation):

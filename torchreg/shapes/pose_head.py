@@ -16,7 +16,7 @@ from torchreg.geometry.rotation_representations import (
 )
 
 if TYPE_CHECKING:
-    from torchreg.models.articulated import ArticulatedShape
+    from torchreg.shapes.articulated import ArticulatedShape
 
 _SIZES = {"6d": 6, "quaternion": 4, "vector": 3}
 # Joints at a limit are taken this share of the range inside, where the sigmoid can be undone.

@@ -10,10 +10,10 @@ from torchreg.errors import InputError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.primitives import Primitive
-from torchreg.models.skin import LinearBlendSkin
-from torchreg.models.surface import FusedSurface, SkinSurface, dense_file_skin
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.shapes.surface import FusedSurface, SkinSurface, dense_file_skin
 
 RADIUS = 0.05
 EYE = torch.eye(4, dtype=torch.float64)

@@ -12,10 +12,10 @@ from torchreg.errors import FormatError, InputError, ModelError
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.gltf import load_rig
 from torchreg.io.urdf import UrdfPrimitive
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.primitives import Primitive, refine_primitives
-from torchreg.models.rigs import solid_mesh, spec_from_arrays
-from torchreg.models.skin import BendingSkin, sample_skin
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.primitives import Primitive, refine_primitives
+from torchreg.shapes.rigs import solid_mesh, spec_from_arrays
+from torchreg.shapes.skin import BendingSkin, sample_skin
 
 HAND = Path(__file__).resolve().parents[3] / "shared" / "data" / "webxr_hand_right.glb"
 needs_hand = pytest.mark.skipif(not HAND.exists(), reason="the measuring data is not beside the repository")

@@ -8,8 +8,8 @@ from torch.autograd import gradcheck
 
 from torchreg.errors import InputError
 from torchreg.geometry.rotation import so3_exp
-from torchreg.models.hand import Hand
-from torchreg.models.pose_head import PoseHead
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.pose_head import PoseHead
 
 D = torch.float64
 KINDS = [(rotation, joints) for rotation in ("6d", "quaternion", "vector") for joints in ("free", "sigmoid")]

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from torchreg.errors import InputError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.models.kinematics import KinematicChain, stack_sizes
+from torchreg.shapes.kinematics import KinematicChain, stack_sizes
 
 ROBOT = """<?xml version="1.0"?>
 <robot name="sample">

@@ -17,9 +17,9 @@ from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.primitives import Planes
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import compose_rotation_vectors, left_jacobian, so3_exp, wrap_rotation_vector
-from torchreg.models.kinematics import KinematicChain, neighbor_matrix, part_parents
-from torchreg.models.primitives import Primitive, PrimitiveSet, fuse
-from torchreg.models.rigs import RigSurface
+from torchreg.shapes.kinematics import KinematicChain, neighbor_matrix, part_parents
+from torchreg.shapes.primitives import Primitive, PrimitiveSet, fuse
+from torchreg.shapes.rigs import RigSurface
 
 _MAX_SURFACE_CELLS = 1_500_000
 BASE_DOF_NAMES = ("base_x", "base_y", "base_z", "base_rx", "base_ry", "base_rz")

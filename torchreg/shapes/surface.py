@@ -10,8 +10,8 @@ from torch import Tensor
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
 from torchreg.geometry.neighbors import nearest_neighbor
-from torchreg.models.articulation import Articulation
-from torchreg.models.skin import LinearBlendSkin, stacked_rows
+from torchreg.shapes.articulation import Articulation
+from torchreg.shapes.skin import LinearBlendSkin, stacked_rows
 
 # Meshes with this many vertices carry their own sampling.
 _MIN_VERTICES, _MAX_VERTICES, _NUM_SAMPLES = 800, 6000, 4000

@@ -9,11 +9,11 @@ from torchreg.errors import InputError, InputTypeError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.primitives import Primitive
-from torchreg.models.rigs import RigSurface
-from torchreg.models.shape_record import build_shape, record_shape
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.record import build_shape, record_shape
+from torchreg.shapes.rigs import RigSurface
 
 
 def offset(*values):

@@ -18,8 +18,8 @@ from torchreg.geometry.primitives import PRIMITIVE_KINDS
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix, transform_points
 from torchreg.io.gltf import load_rig
 from torchreg.io.urdf import UrdfPrimitive, UrdfRecord, load_urdf
-from torchreg.models.kinematics import KinematicChain, neighbor_matrix, part_parents
-from torchreg.models.primitives import Primitive, refine_primitives
+from torchreg.shapes.kinematics import KinematicChain, neighbor_matrix, part_parents
+from torchreg.shapes.primitives import Primitive, refine_primitives
 
 Axes = Mapping[str, Sequence[str | Sequence[float]]]
 Limits = Mapping[str, Sequence[tuple[float, float]]]

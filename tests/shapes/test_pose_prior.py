@@ -10,9 +10,9 @@ from torch import nn
 from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
 from torchreg.io.tensors import save_tensors
-from torchreg.models.hand import Hand
-from torchreg.models.pose_head import PoseHead
-from torchreg.models.pose_prior import PosePrior
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.pose_head import PoseHead
+from torchreg.shapes.pose_prior import PosePrior
 
 D = torch.float64
 

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from torchreg.errors import InputError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.articulation import BASE_DOF_NAMES
-from torchreg.models.primitives import Primitive
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.articulation import BASE_DOF_NAMES
+from torchreg.shapes.primitives import Primitive
 
 # torch builds its forward-mode rules with torch.jit.script, and warns about it.
 JACFWD = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")

@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from torchreg.errors import InputError
 from torchreg.geometry.rotation import so3_exp
-from torchreg.models.hand import Hand
-from torchreg.models.pose_conversions import (
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.pose_conversions import (
     KEYPOINT_ORDERS,
     OPENXR_JOINTS,
     OPENXR_PARTS,

@@ -9,10 +9,10 @@ from torch import Tensor
 
 from torchreg.errors import InputTypeError, ModelError
 from torchreg.geometry.rigid import rigid_matrix
-from torchreg.models.articulated import ArticulatedShape
-from torchreg.models.hand import Hand
-from torchreg.models.primitives import Primitive, PrimitiveSet
-from torchreg.models.rigs import ShapeSpec
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive, PrimitiveSet
+from torchreg.shapes.rigs import ShapeSpec
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torchreg.models.articulation import Articulation
+from torchreg.shapes.articulation import Articulation
 
 
 @dataclass(frozen=True)
