@@ -28,12 +28,12 @@ from torch import Tensor
 
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
-from torchreg.geometry.sparse_grid import SparseGrid
-from torchreg.models.grid_lbs import GridLBS
-from torchreg.pipelines.bone_fit import bone_step
-from torchreg.pipelines.bone_problem import BoneProblem, bind
-from torchreg.pipelines.refine_weights import RefineConfig, refine_weights
-from torchreg.pipelines.solve_pose import PoseSolver
+from torchreg.registration.bones.grid_lbs import GridLBS
+from torchreg.registration.bones.motion_problem import BoneProblem, bind
+from torchreg.registration.bones.motions import bone_step
+from torchreg.registration.bones.sparse_grid import SparseGrid
+from torchreg.registration.bones.weights import RefineConfig, refine_weights
+from torchreg.registration.solve_pose import PoseSolver
 
 
 @dataclass(frozen=True)

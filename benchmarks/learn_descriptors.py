@@ -20,16 +20,16 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchreg.correspondence.discriminants import difference_moments, linear_discriminants
-from torchreg.correspondence.learned_descriptors import BIN_SIZES, CURVATURE_RADII, IMAGE_SIZE, surface_descriptors
-from torchreg.correspondence.oriented_samples import OrientedSamples
 from torchreg.datasets.bodies import Proportions
 from torchreg.datasets.scan_sequences import ScanPair, ScanSequence, jointed_toy, walking_animal, walking_figure
 from torchreg.datasets.toys import random_toy
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.io.tensors import save_tensors
-from torchreg.pipelines.scan_align_config import ScanAlignConfig
-from torchreg.pipelines.scan_align_problem import SCENE, describe
+from torchreg.registration.dense.config import ScanAlignConfig
+from torchreg.registration.dense.discriminants import difference_moments, linear_discriminants
+from torchreg.registration.dense.learned_descriptors import BIN_SIZES, CURVATURE_RADII, IMAGE_SIZE, surface_descriptors
+from torchreg.registration.dense.oriented_samples import OrientedSamples
+from torchreg.registration.dense.problem import SCENE, describe
 
 NUM_SEQUENCES, NUM_DIRECTIONS, RIDGE = 120, 32, 0.03
 # Frames of a sequence; each is in one pair.

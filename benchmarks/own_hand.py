@@ -29,9 +29,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torchreg as tr
+from torchreg.alignment.objectives import PosePrior, SurfaceObjective
 from torchreg.datasets.hand import HandCloud, hand_motion, make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.datasets.sequences import other_hand, range_clouds
-from torchreg.pipelines.align_objectives import PosePrior, SurfaceObjective
 from torchreg.shapes.skin import sample_skin
 from torchreg.shapes.surface import FusedSurface
 from torchreg.solvers.levenberg_marquardt import levenberg_marquardt

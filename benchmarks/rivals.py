@@ -39,11 +39,11 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torchreg as tr
-from torchreg.correspondence.em import OUTLIER_CONSTANT, EStep, expectation
-from torchreg.correspondence.softassign import softassign
+from torchreg.alignment.annealed_em import CORRESPONDENCES
+from torchreg.alignment.softassign import softassign
 from torchreg.datasets.hand import HandCloud, make_hand_cloud, random_hand_pose, surface_skin
-from torchreg.pipelines.align_stages import CORRESPONDENCES
 from torchreg.shapes.skin import BendingSkin, LinearBlendSkin, sample_skin
+from torchreg.solvers.e_step import OUTLIER_CONSTANT, EStep, expectation
 from torchreg.viz.figures import save_picture
 
 NOISE, TIPS, FAILURE = 0.0015, [4, 8, 12, 16, 20], 0.01

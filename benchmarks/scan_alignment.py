@@ -27,8 +27,8 @@ import torchreg as tr
 from torchreg.datasets.bodies import Proportions
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import ScanSequence, jointed_toy, walking_animal, walking_figure
-from torchreg.pipelines.scan_align_config import ScanAlignConfig
-from torchreg.pipelines.scan_alignment import align_scans
+from torchreg.registration.dense.align_scans import align_scans
+from torchreg.registration.dense.config import ScanAlignConfig
 
 NEAR, REGISTERED = 0.025, 0.9
 

@@ -26,9 +26,9 @@ from public_shapes import animals_folder
 from scan_robots import Pair, print_row, scan_pair, score
 from torch import Tensor
 
-from torchreg.geometry.blend import blend_linear
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix, se3_exp, transform_points
 from torchreg.geometry.rotation_representations import rotation_from_quaternion
+from torchreg.registration.blend import blend_linear
 
 ANIMALS = {"dog": "suite/dog.xml", "rodent": "locomotion/walkers/assets/rodent.xml"}
 # Shares of the joints' ranges, of which those beyond the second number of radians count as that.

@@ -39,7 +39,7 @@ from torchreg.datasets.toys import random_toy
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.metrics import adjusted_rand
-from torchreg.pipelines.scan_align_config import ScanAlignConfig
+from torchreg.registration.dense.config import ScanAlignConfig
 
 NEAR, REGISTERED, JOINT, APART = 0.025, 0.9, 0.05, 0.005
 SCALE = 100

@@ -35,9 +35,9 @@ from torchreg.datasets.bodies import person, quadruped
 from torchreg.datasets.creatures import OCTOPUS, STARFISH, creature_sequence
 from torchreg.datasets.figures import Figure
 from torchreg.datasets.gaits import animal_walk, person_walk
-from torchreg.geometry.clearance import Inside
 from torchreg.geometry.isosurface import isosurface
 from torchreg.geometry.voxels import voxelize
+from torchreg.spines.clearance import Inside
 
 RESOLUTION, STEADY_BAR, INSIDE_BAR, AXIS_BAR = 128, 0.70, 0.995, 0.10
 TIME_BAR, SEQUENCE_BAR, SEQUENCE_FRAMES = 5.0, 120.0, 44

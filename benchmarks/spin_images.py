@@ -29,18 +29,18 @@ import torch
 from torch import Tensor
 
 import torchreg as tr
-from torchreg.correspondence.descriptor_matching import DescriptorMatches, match_descriptors
-from torchreg.correspondence.isometry import consistent_matches
-from torchreg.correspondence.learned_descriptors import CURVATURE_RADII, learned_descriptors
-from torchreg.correspondence.oriented_samples import OrientedSamples, scaled_together
-from torchreg.correspondence.spin_images import spin_images
 from torchreg.datasets.bodies import Proportions
 from torchreg.datasets.scan_sequences import ScanSequence, jointed_toy, walking_animal, walking_figure
-from torchreg.geometry.curvature import curvature_features
 from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.sampling import farthest_points
-from torchreg.pipelines.scan_unit import ScanUnit
+from torchreg.registration.dense.curvature import curvature_features
+from torchreg.registration.dense.descriptor_matching import DescriptorMatches, match_descriptors
+from torchreg.registration.dense.isometry import consistent_matches
+from torchreg.registration.dense.learned_descriptors import CURVATURE_RADII, learned_descriptors
+from torchreg.registration.dense.oriented_samples import OrientedSamples, scaled_together
+from torchreg.registration.dense.spin_images import spin_images
+from torchreg.registration.normalization import ScanUnit
 from torchreg.solvers.ransac import ransac_rigid
 
 RIGHT = 0.05

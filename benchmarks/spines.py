@@ -34,13 +34,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torchreg as tr
+from torchreg.alignment.skeleton_source import SpineLimbs
 from torchreg.datasets.creatures import OCTOPUS, STARFISH, CreatureForm, CreatureSequence, creature_sequence
-from torchreg.geometry.clearance import Inside
 from torchreg.geometry.mesh import concatenate, sample_surface, unit_sphere
 from torchreg.geometry.voxels import VoxelGrid, voxelize
-from torchreg.pipelines.spine_source import SpineLimbs
 from torchreg.shapes.skin import sample_skin
 from torchreg.solvers.assignment import assign
+from torchreg.spines.clearance import Inside
 
 BAR_OWN, BAR_NAMED, BAR_INSIDE, BAR_SECONDS, BAR_HANDS = 0.7, 0.99, 0.995, 60.0, 0.9
 TIPS, RIGHT, NUM_POINTS, BEND = [4, 8, 12, 16, 20], 0.01, 500, 0.5

@@ -42,10 +42,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torchreg as tr
+from torchreg.alignment.objectives import PosePrior, SurfaceObjective
 from torchreg.datasets.hand import HandCloud, surface_skin
 from torchreg.datasets.sequences import hand_sequence, other_hand, rig_sequence
 from torchreg.geometry.rotation import compose_rotation_vectors
-from torchreg.pipelines.align_objectives import PosePrior, SurfaceObjective
 from torchreg.shapes.surface import FusedSurface
 from torchreg.solvers.levenberg_marquardt import levenberg_marquardt
 

@@ -24,7 +24,7 @@ from torchreg.datasets.pictures import camera_ring
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.visibility import rasterize
-from torchreg.pipelines.extract_spine import extract_spine
+from torchreg.spines.extract_spine import extract_spine
 
 CENTER, RADII = (0.1, -0.05, 0.2), (0.3, 0.2, 0.15)
 

@@ -3,8 +3,13 @@
 import pytest
 import torch
 
+from torchreg.alignment.results import AlignResult
 from torchreg.datasets.hand import surface_skin
+from torchreg.geometry.kinematic_tree import Joint, KinematicTree
+from torchreg.result import Status
+from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.skin import sample_skin
 
 torch.set_num_threads(1)
@@ -26,3 +31,31 @@ def plain_hand_skin(plain_hand):
 def plain_hand_surface(plain_hand):
     """The hand's whole surface as a skin with faces, from which clouds are drawn."""
     return surface_skin(plain_hand, spacing=0.005)
+
+
+@pytest.fixture(scope="session")
+def arm():
+    """A body with an arm on one hinge, in float64, that takes no gradients; not to be changed."""
+    eye = torch.eye(4, dtype=torch.float64)
+    joints = Joint("base", -1, eye), Joint("arm", 0, eye, "revolute", (0.0, 1.0, 0.0), -2.0, 2.0)
+    center = eye.clone()
+    center[0, 3] = 0.15
+    solids = Primitive("ellipsoid", (0.06, 0.09, 0.05), eye), Primitive("ellipsoid", (0.15, 0.03, 0.04), center)
+    tree = KinematicTree(joints)
+    shape = ArticulatedShape(tree, ["base", "arm"], solids, nu=0.01, dtype=torch.float64)
+    return shape.requires_grad_(False)
+
+
+@pytest.fixture
+def result() -> AlignResult:
+    return AlignResult(
+        pose=torch.zeros(27),
+        registered=torch.zeros(5, 3),
+        keypoints=torch.zeros(21, 3),
+        distances=torch.zeros(4),
+        inliers=torch.ones(4, dtype=torch.bool),
+        posterior=torch.ones(4),
+        sigma=torch.tensor(0.002),
+        cost=torch.tensor(1.5),
+        status=Status.CONVERGED,
+    )

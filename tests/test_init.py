@@ -1,6 +1,5 @@
 """The public surface: light to import, names load from their owners, ``python -m torchreg`` is the command line."""
 
-import ast
 import runpy
 import subprocess
 import sys
@@ -12,7 +11,7 @@ import pytest
 
 import torchreg
 
-SOURCE = Path(torchreg.__file__)
+STUB = Path(torchreg.__file__).with_suffix(".pyi")
 
 
 def run(code, cwd):
@@ -32,26 +31,28 @@ def test_a_used_name_brings_torch(tmp_path):
     assert run(code, tmp_path) == ["True"]
 
 
-def test_the_three_lists_of_names_agree():
-    """Type checkers read the guarded imports, users ``__all__``, the interpreter the table of owners."""
-    guarded = next(node for node in ast.parse(SOURCE.read_text(encoding="utf-8")).body if isinstance(node, ast.If))
-    for_types = {
-        alias.name: node.module.removeprefix("torchreg").removeprefix(".")
-        for node in guarded.body
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
-    assert for_types == {**torchreg._OWNERS, **dict.fromkeys(torchreg._MODULES, "")}
-    assert set(torchreg.__all__) == {*for_types, "__version__"}
+def rendered_stub():
+    """What type checkers read, from the one table of names."""
+    rows = [f"from torchreg import {name} as {name}" for name in torchreg._MODULES]
+    for home, names in sorted(torchreg._NAMES.items()):
+        rows += [f"from torchreg.{home} import {name} as {name}" for name in names.split()]
+    listed = "".join(f"    {name!r},\n" for name in torchreg.__all__).replace("'", '"')
+    note = "# Written from the table in __init__.py by `python tests/test_init.py`."
+    return "\n".join([note, *rows, "", "__version__: str", f"__all__ = [\n{listed}]", ""])
+
+
+def test_type_checkers_read_the_same_table():
+    assert STUB.read_text(encoding="utf-8") == rendered_stub(), "run: python tests/test_init.py"
     assert set(torchreg.__all__) <= set(dir(torchreg))
+    assert len(set(torchreg.__all__)) == len(torchreg.__all__)
 
 
-@pytest.mark.parametrize(("name", "owner"), sorted(torchreg._OWNERS.items()))
-def test_names_load_from_their_owner(name, owner):
+@pytest.mark.parametrize(("name", "home"), sorted(torchreg._HOMES.items()))
+def test_names_load_from_their_home(name, home):
     value = getattr(torchreg, name)
-    assert value is getattr(import_module(f"torchreg.{owner}"), name)
+    assert value is getattr(import_module(f"torchreg.{home}"), name)
     assert value is getattr(torchreg, name)
-    assert value.__module__ == f"torchreg.{owner}"
+    assert value.__module__ == f"torchreg.{home}"
 
 
 @pytest.mark.parametrize("name", sorted(torchreg._MODULES))
@@ -75,3 +76,7 @@ def test_running_the_package_runs_the_command_line(monkeypatch):
     assert calls == ["main"]
     runpy.run_module("torchreg.__main__", run_name="imported")
     assert calls == ["main"]
+
+
+if __name__ == "__main__":
+    STUB.write_text(rendered_stub(), encoding="utf-8")

@@ -35,20 +35,19 @@ SYSTEMS = {"alignment", "tracking", "registration", "spines"}
 BRIDGES = {("tracking", "alignment"), ("alignment/skeleton_source.py", "spines")}
 # Two rooms of one system that know nothing of each other.
 APART = {("registration/dense", "registration/bones"), ("registration/bones", "registration/dense")}
-MOVING = {"pipelines", "models", "correspondence", "losses", "results"}
 
 # Files or packages below torchreg/ that may import the library; libraries not named here are free.
 OWNERS = {
     "pytorch_kinematics": {"shapes/kinematics.py"},
     "kornia": {"geometry/rotation.py", "geometry/rigid.py", "capture"},
-    "scipy": {"solvers", "geometry"},
+    "scipy": {"solvers", "geometry", "registration", "spines", "capture"},
     "skimage": {"capture"},
     "cv2": {"capture"},
     "PIL": {"io", "viz"},
     "OpenEXR": {"io"},
     "trimesh": {"io", "viz"},
     "pygltflib": {"io", "viz"},
-    "safetensors": {"io", "pipelines"},
+    "safetensors": {"io"},
     "matplotlib": {"viz"},
     "viser": {"viz"},
     "plotly": {"viz"},
@@ -56,7 +55,7 @@ OWNERS = {
     "tqdm": {"cli"},
 }
 LAZY = {"matplotlib", "viser", "plotly", "cv2", "PIL", "OpenEXR"}
-LOWEST_THIRD_PARTY = {"errors": set(), "results": {"torch"}, "metrics": {"torch"}, "_checks": {"torch"}}
+LOWEST_THIRD_PARTY = {"errors": set(), "metrics": {"torch"}, "_checks": {"torch"}, "_threads": {"torch"}}
 IMPORT_NAMES = {
     "pytorch-kinematics": "pytorch_kinematics",
     "scikit-image": "skimage",
@@ -108,8 +107,6 @@ def folder_of(path: str) -> str:
 def layer_problems(source: str, path: str) -> list[str]:
     """Return what torchreg/``path`` imports from its own layer's neighbors, from above, or from another system."""
     own = unit_of(path)
-    if own in MOVING:
-        return []
     if own not in RANK:
         return [f"torchreg/{path}: {own} has no place in the layers"]
     problems = []
@@ -119,8 +116,6 @@ def layer_problems(source: str, path: str) -> list[str]:
         where = f"torchreg/{path}:{item.line} imports {item.name}"
         inside = item.name.partition(".")[2]
         target = inside.partition(".")[0]
-        if target in MOVING:
-            continue
         if (folder_of(path), "/".join(inside.split(".")[:2])) in APART:
             problems.append(f"{where}: {folder_of(path)} knows nothing of it")
         if target == own:

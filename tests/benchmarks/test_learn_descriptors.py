@@ -4,7 +4,7 @@ import torch
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.io.tensors import load_tensors
-from torchreg.pipelines.scan_align_config import ScanAlignConfig
+from torchreg.registration.dense.config import ScanAlignConfig
 
 CONFIG = ScanAlignConfig(num_samples=300, num_target_samples=600, num_nodes=20)
 

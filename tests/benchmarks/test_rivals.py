@@ -4,7 +4,8 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.pipelines import align, align_stages
+from torchreg.alignment import align
+from torchreg.alignment import annealed_em as align_stages
 
 METHODS = [
     "EM", "EM c / 10", "EM own sigma", "SoftAssign", "ICP", "EM debiased", "SoftAssign debiased", "EM + surface fit",

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 import torchreg
-import torchreg.pipelines.align as align_module
+import torchreg.alignment.align as align_module
+from torchreg.alignment.align import AlignConfig
 from torchreg.io.points import load_points, save_points
-from torchreg.pipelines.align import AlignConfig
-from torchreg.pipelines.storage import load
-from torchreg.results.base import Status
+from torchreg.result import Status
 from torchreg.shapes.hand import Hand
+from torchreg.storage import load
 
 QUICK = ("--search", "never")
 

@@ -6,12 +6,12 @@ import math
 import pytest
 import torch
 
+from torchreg.alignment.results import AlignResult
+from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.cli.align_options import read_cloud, read_schedule, summary, write_pose
-from torchreg.correspondence.sigma import SigmaSchedule
 from torchreg.errors import FormatError, InputError
 from torchreg.io.points import save_points
-from torchreg.results.alignment import AlignResult
-from torchreg.results.base import Status
+from torchreg.result import Status
 
 
 def test_schedules_are_start_stop_steps():

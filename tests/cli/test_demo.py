@@ -5,13 +5,13 @@ import sys
 
 import torch
 
-import torchreg.pipelines.track_recovery as recovery_module
+import torchreg.tracking.recovery as recovery_module
+from torchreg.alignment.results import PoseStarts
 from torchreg.datasets.hand import hand_motion
-from torchreg.pipelines.storage import load
-from torchreg.pipelines.track import Tracker
-from torchreg.results.alignment import PoseStarts
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
+from torchreg.storage import load
+from torchreg.tracking.tracker import Tracker
 
 
 def test_the_demonstration_runs(run, tmp_path):

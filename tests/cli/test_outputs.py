@@ -6,7 +6,7 @@ import pytest
 
 from torchreg.cli.outputs import check_outputs, numbered, with_ending
 from torchreg.errors import InputError
-from torchreg.pipelines.storage import load
+from torchreg.storage import load
 
 QUICK = ("--search", "never")
 

@@ -5,11 +5,11 @@ import math
 import pytest
 import torch
 
+from torchreg.alignment.results import PoseStarts
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
 from torchreg.io.points import load_points
-from torchreg.pipelines.register import register
-from torchreg.results.alignment import PoseStarts
+from torchreg.registration.register import register
 from torchreg.viz.pose_editor import PoseEditor
 
 

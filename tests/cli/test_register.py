@@ -14,7 +14,7 @@ from torchreg.geometry.visibility import rasterize
 from torchreg.io.calibration import load_depth_camera, save_depth_camera
 from torchreg.io.images import load_image, save_depth
 from torchreg.io.points import load_points, save_points
-from torchreg.pipelines import register as pipeline
+from torchreg.registration import register as pipeline
 
 
 @pytest.fixture(scope="module")

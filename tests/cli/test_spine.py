@@ -9,7 +9,7 @@ from torchreg.io.calibration import save_cameras
 from torchreg.io.images import save_image
 from torchreg.io.points import save_points
 from torchreg.io.swc import load_swc
-from torchreg.pipelines.storage import load
+from torchreg.storage import load
 from torchreg.viz.seen import model_mask
 
 

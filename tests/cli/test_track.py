@@ -8,20 +8,20 @@ import pytest
 import torch
 from PIL import Image
 
-import torchreg.pipelines.track as track_module
-import torchreg.pipelines.track_fit as fit_module
-import torchreg.pipelines.track_recovery as recovery_module
+import torchreg.tracking.frame_fit as fit_module
+import torchreg.tracking.recovery as recovery_module
+import torchreg.tracking.tracker as track_module
+from torchreg.alignment.results import PoseStarts
 from torchreg.datasets.hand import hand_motion
 from torchreg.datasets.sequences import range_clouds
 from torchreg.io.frames import save_frames
 from torchreg.io.points import load_points, save_points
-from torchreg.pipelines.storage import load
-from torchreg.pipelines.track import TrackConfig, Tracker
-from torchreg.results.alignment import PoseStarts
-from torchreg.results.base import Status
+from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
+from torchreg.storage import load
+from torchreg.tracking.tracker import TrackConfig, Tracker
 
 FRAMES = 6
 FAST = ("--movie", "none", "--no-gltf")

@@ -8,7 +8,7 @@ import torch
 
 from torchreg.cli.track_run import Clouds, TrackFiles, summary
 from torchreg.errors import FormatError, InputError
-from torchreg.results.base import Status
+from torchreg.result import Status
 
 
 class Frames(list):

@@ -11,7 +11,7 @@ from torchreg.datasets.videos import shape_video
 from torchreg.geometry.camera_rig import CameraRig
 from torchreg.io.calibration import save_cameras
 from torchreg.io.images import load_image, save_image
-from torchreg.pipelines.storage import load
+from torchreg.storage import load
 
 FRAMES = 2
 FAST = ("--movie", "none", "--no-gltf", "--matcher", "block")

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
+from torchreg.alignment.results import PoseStarts
 from torchreg.cli import view as module
 from torchreg.io.points import save_points
-from torchreg.pipelines.storage import save_result
-from torchreg.results.alignment import PoseStarts
 from torchreg.shapes.hand import Hand
+from torchreg.storage import save_result
 
 pytest.importorskip("viser", reason="the viewer needs viser")
 

@@ -6,18 +6,18 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from torchreg.alignment.results import AlignResult, Calibration, PoseStarts
 from torchreg.datasets.hand import hand_motion
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.geometry.rigid import se3_exp
-from torchreg.geometry.sparse_grid import SparseGrid
-from torchreg.models.grid_lbs import GridLBS
-from torchreg.models.spine import Spine
-from torchreg.results.alignment import AlignResult, Calibration, PoseStarts
-from torchreg.results.base import Status
-from torchreg.results.scans import ScanRegistration, SequenceRegistration
-from torchreg.results.spines import SpineSequence
-from torchreg.results.tracking import DemoResult, TrackResult
+from torchreg.registration.bones.grid_lbs import GridLBS
+from torchreg.registration.bones.sparse_grid import SparseGrid
+from torchreg.registration.results import ScanRegistration, SequenceRegistration
+from torchreg.result import Status
 from torchreg.shapes.hand import Hand
+from torchreg.spines.results import SpineSequence
+from torchreg.spines.spine import Spine
+from torchreg.tracking.results import DemoResult, TrackResult
 
 _DTYPES = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from torchreg.errors import InputError
-from torchreg.geometry.sparse_grid import SparseGrid
 from torchreg.io.points import load_points
-from torchreg.models.grid_lbs import GridLBS
+from torchreg.registration.bones.grid_lbs import GridLBS
+from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.viz.bone_colors import bone_palette, error_colors, save_error_ply, save_weight_ply, weight_colors
 
 

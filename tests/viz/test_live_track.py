@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from torchreg.errors import InputError
-from torchreg.results.base import Status
-from torchreg.results.tracking import FrameResult
+from torchreg.result import Status
 from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.tracking.results import FrameResult
 from torchreg.viz.animation import coarse_skin
 from torchreg.viz.live_track import LiveTrack
 

@@ -5,7 +5,7 @@ import time
 import pytest
 import torch
 
-from torchreg.pipelines.storage import load
+from torchreg.storage import load
 from torchreg.viz.pose_app import PoseApp
 from torchreg.viz.pose_editor import PoseEditor
 

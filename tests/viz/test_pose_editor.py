@@ -7,8 +7,8 @@ import torch
 
 from torchreg.errors import InputError
 from torchreg.io.points import load_points
-from torchreg.pipelines.storage import load
-from torchreg.results.scans import PoseSolution
+from torchreg.registration.results import PoseSolution
+from torchreg.storage import load
 from torchreg.viz.pose_editor import PoseEditor
 
 

@@ -5,7 +5,7 @@ import torch
 
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import unit_sphere
-from torchreg.results.tracking import TrackState
+from torchreg.tracking.results import TrackState
 from torchreg.viz.bone_colors import bone_palette
 from torchreg.viz.result_scenes import result_scene
 from torchreg.viz.scene import Cloud, Meshes, Surface

@@ -12,8 +12,8 @@ import torch
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.geometry.rigid import se3_exp
-from torchreg.geometry.sparse_grid import SparseGrid
-from torchreg.models.grid_lbs import GridLBS
+from torchreg.registration.bones.grid_lbs import GridLBS
+from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.viz.scan_gltf import save_grid_animation
 
 VALIDATOR = os.environ.get("GLTF_VALIDATOR", "")

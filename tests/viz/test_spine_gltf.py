@@ -8,7 +8,7 @@ import torch
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.gltf import load_rig
-from torchreg.models.spine import Spine
+from torchreg.spines.spine import Spine
 from torchreg.viz.spine_gltf import save_spine_animation
 
 GRAPH = torch.tensor([[0, 3], [1, 3], [2, 3]])

@@ -7,9 +7,9 @@ import pytest
 import torch
 from PIL import Image
 
+from torchreg.alignment.results import AlignRecord
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
-from torchreg.results.alignment import AlignRecord
 from torchreg.viz.spines import spine_view
 from torchreg.viz.strips import annealing_strip, convergence_figure, registration_strip, spine_strip
 

@@ -10,10 +10,10 @@ from PIL import Image
 from torchreg.datasets.hand import hand_motion, surface_skin
 from torchreg.datasets.sequences import range_clouds
 from torchreg.errors import InputError
-from torchreg.pipelines.track import TrackConfig, Tracker
-from torchreg.results.base import Status
+from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.tracking.tracker import TrackConfig, Tracker
 from torchreg.viz import tracking
 from torchreg.viz.figures import new_figure, watch
 from torchreg.viz.tracking import FrameOverlays, animate_track, draw_track_frame, frame_label, save_track_gltf

@@ -10,7 +10,7 @@ import pytest
 
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
-from torchreg.pipelines.register import register
+from torchreg.registration.register import register
 
 CHROMIUM = os.environ.get("TORCHREG_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
 # WebGL without a graphics card.

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation, Slerp
 from torchreg.datasets.hand import hand_motion
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.gltf_morph import save_vertex_animation
-from torchreg.models.spine import Spine
 from torchreg.shapes.hand import Hand
+from torchreg.spines.spine import Spine
 from torchreg.viz.animation import coarse_skin
 from torchreg.viz.gltf import save_shape_animation
 from torchreg.viz.pose_editor import PoseEditor

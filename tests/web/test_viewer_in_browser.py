@@ -9,11 +9,11 @@ from PIL import Image
 
 from torchreg.datasets.hand import hand_motion, make_hand_cloud
 from torchreg.geometry.mesh import unit_sphere
-from torchreg.models.spine import Spine
-from torchreg.results.base import Status
-from torchreg.results.spines import SpineSequence
-from torchreg.results.tracking import TrackResult
+from torchreg.result import Status
 from torchreg.shapes.hand import Hand
+from torchreg.spines.results import SpineSequence
+from torchreg.spines.spine import Spine
+from torchreg.tracking.results import TrackResult
 from torchreg.viz.result_scenes import result_scene
 from torchreg.viz.scene import Scene
 from torchreg.viz.viewer import SceneViewer, scene_html

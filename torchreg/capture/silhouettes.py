@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_count, check_finite, check_shape
+from torchreg.capture.mask_distance import signed_mask_distance
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.camera import Camera, lens_jacobian
 from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.marching_cubes import marching_cubes
-from torchreg.geometry.mask_distance import signed_mask_distance
 from torchreg.geometry.mesh import TriangleMesh
 
 # Blocks of 16^3 voxels are looked at first, then their eighths, down to voxels.

@@ -28,8 +28,8 @@ from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, lo
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchreg.pipelines.align import AlignConfig
-    from torchreg.results.alignment import AlignResult
+    from torchreg.alignment.align import AlignConfig
+    from torchreg.alignment.results import AlignResult
     from torchreg.shapes.articulated import ArticulatedShape
     from torchreg.shapes.skin import LinearBlendSkin
 
@@ -104,9 +104,9 @@ def align(
 
     with tqdm(total=count, unit="cloud", desc="reading", leave=False, disable=quiet) as bar:
         model = load_shape(shape, parents, package_dir, free_base)
-        from torchreg.pipelines.align import AlignConfig
-        from torchreg.pipelines.storage import load_pose
+        from torchreg.alignment.align import AlignConfig
         from torchreg.shapes.skin import sample_skin
+        from torchreg.storage import load_pose
 
         config = AlignConfig(schedule=read_schedule(sigma), outlier=outlier, search=search, nan_policy=nan_policy)
         first = None if start is None else load_pose(start, model)
@@ -155,8 +155,8 @@ class _AlignRun:
 
     def align(self, place: Path, files: _Files, on_step: Callable[[Any], None]) -> AlignResult:
         """Return the alignment to one cloud, which is on disk then."""
-        from torchreg.pipelines.align import align
-        from torchreg.pipelines.demo import moved_to_mean
+        from torchreg.alignment.align import align
+        from torchreg.tracking.demo import moved_to_mean
 
         data = read_cloud(place, self.scale, self.config.nan_policy)
         start = moved_to_mean(self.skin, self.shape.rest_pose(), data) if self.start is None else self.start

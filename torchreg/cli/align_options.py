@@ -12,8 +12,8 @@ from torchreg.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchreg.correspondence.sigma import SigmaSchedule
-    from torchreg.results.alignment import AlignResult
+    from torchreg.alignment.results import AlignResult
+    from torchreg.alignment.sigma_schedule import SigmaSchedule
     from torchreg.shapes.articulated import ArticulatedShape
 
 Sigma = Annotated[
@@ -29,7 +29,7 @@ def read_schedule(text: str | None) -> SigmaSchedule | None:
     """Return the schedule that START:STOP:STEPS describes, None for None."""
     if text is None:
         return None
-    from torchreg.correspondence.sigma import SigmaSchedule
+    from torchreg.alignment.sigma_schedule import SigmaSchedule
 
     try:
         start, stop, steps = text.split(":")

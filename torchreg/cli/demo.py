@@ -13,7 +13,7 @@ from torchreg.cli.reporting import interruption, reporting
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchreg.results.tracking import DemoResult
+    from torchreg.tracking.results import DemoResult
 
 
 @reporting
@@ -38,8 +38,8 @@ def demo(
 
     from tqdm import tqdm
 
-    from torchreg.pipelines.demo import DEMO_FPS, run_demo
     from torchreg.shapes.hand import Hand
+    from torchreg.tracking.demo import DEMO_FPS, run_demo
     from torchreg.viz.tracking import animate_track, save_track_gltf
 
     with tqdm(total=frames, unit="frame", desc="tracking", leave=False) as bar:

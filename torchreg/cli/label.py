@@ -49,10 +49,10 @@ def label(
     with tqdm(total=len(frames), unit="frame", desc="reading", leave=False, disable=quiet) as bar:
         for place in frames:
             place.stat()  # a missing file is told before the first is labeled
+        from torchreg.alignment.pose_initializer import PoseInitializer
+        from torchreg.alignment.pseudo_labels import label_frames
         from torchreg.datasets.pose_labels import label_path
-        from torchreg.pipelines.label import label_frames
-        from torchreg.pipelines.pose_initializer import PoseInitializer
-        from torchreg.pipelines.storage import load_pose
+        from torchreg.storage import load_pose
 
         output.mkdir(exist_ok=True)
         paths = [label_path(output, number) for number in range(len(frames))]

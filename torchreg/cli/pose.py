@@ -12,7 +12,7 @@ from torchreg.cli.reporting import reporting
 from torchreg.cli.view import Browser, Port, Up, check_up, wait_for_interrupt
 
 if TYPE_CHECKING:
-    from torchreg.results.scans import PoseSolution, ScanRegistration, SequenceRegistration
+    from torchreg.registration.results import PoseSolution, ScanRegistration, SequenceRegistration
     from torchreg.viz.pose_editor import PoseEditor
 
 
@@ -69,8 +69,8 @@ def pose(
 def _load(result: Path, start: Path | None) -> tuple[ScanRegistration | SequenceRegistration, PoseSolution | None]:
     """Return a registration and, if one is given, a pose to start from."""
     from torchreg.errors import FormatError
-    from torchreg.pipelines.storage import load
-    from torchreg.results.scans import PoseSolution, ScanRegistration, SequenceRegistration
+    from torchreg.registration.results import PoseSolution, ScanRegistration, SequenceRegistration
+    from torchreg.storage import load
 
     place = result if result.suffix else result.with_suffix(".safetensors")
     found = load(place)
@@ -88,7 +88,7 @@ def _pose_once(editor: PoseEditor, handle: list[str], to: list[str], path: Path,
     import torch
 
     from torchreg.errors import InputError
-    from torchreg.pipelines.solve_pose import solve_pose
+    from torchreg.registration.solve_pose import solve_pose
     from torchreg.viz.bone_colors import save_weight_ply
 
     if len(handle) != len(to):

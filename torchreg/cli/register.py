@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from torchreg.geometry.camera import Camera
     from torchreg.geometry.range_scan import RangeScan
-    from torchreg.results.scans import ScanRegistration
+    from torchreg.registration.results import ScanRegistration
 
 # Pictures of what was kept of source and target.
 _KEPT = ("source.png", "target.png")
@@ -76,7 +76,7 @@ def register(
     from tqdm import tqdm
 
     from torchreg.io.scans import load_scan
-    from torchreg.pipelines.register import register as run
+    from torchreg.registration.register import register as run
 
     views = {"--intrinsics": intrinsics, "--depth-range": depth_range, "--smoothing": smoothing, "--seen": seen}
     check_used(depth, "--depth", views)

@@ -15,8 +15,7 @@ from torchreg.cli.reporting import reporting
 if TYPE_CHECKING:
     from torchreg.capture.silhouette_frames import SilhouetteFrames
     from torchreg.geometry.mesh import TriangleMesh
-    from torchreg.models.spine import Spine
-    from torchreg.results.spines import SpineSequence
+    from torchreg.spines.results import SpineSequence
 
 
 @reporting
@@ -104,7 +103,7 @@ def spine(
         meshes = _hulls(source, seen_folder(seen, glb, force), progress, quiet)
     from tqdm import tqdm
 
-    from torchreg.pipelines.extract_spine import SpineConfig, extract_spine
+    from torchreg.spines.extract_spine import SpineConfig, extract_spine
 
     with tqdm(total=len(meshes), unit="frame", desc="skeletons", leave=False, disable=quiet) as bar:
         config = SpineConfig(num_tips=tips, num_samples=samples)
@@ -154,7 +153,7 @@ def _hulls(source: SilhouetteFrames, folder: Path, progress: Path | None, quiet:
 
 
 def _write(
-    found: SpineSequence[Spine], meshes: list[TriangleMesh], glb: Path, swc: Sequence[Path | None], npz: Path | None,
+    found: SpineSequence, meshes: list[TriangleMesh], glb: Path, swc: Sequence[Path | None], npz: Path | None,
     fps: float,
 ) -> None:  # fmt: skip
     from torchreg.io.npz import save_arrays
@@ -171,7 +170,7 @@ def _write(
 
 
 def _draw(
-    found: SpineSequence[Spine], meshes: list[TriangleMesh], movie: Path | None, pictures: Path | None, fps: float
+    found: SpineSequence, meshes: list[TriangleMesh], movie: Path | None, pictures: Path | None, fps: float
 ) -> None:
     from torchreg.viz.spines import save_spine_movie, save_spine_pictures
 
@@ -187,7 +186,7 @@ def _named(warning: str, names: tuple[str, ...]) -> str:
     return f"{names[int(frame)]}: {text}"
 
 
-def _summary(found: SpineSequence[Spine], glb: Path) -> str:
+def _summary(found: SpineSequence, glb: Path) -> str:
     share = sum(own == same for own, same in zip(found.own_topologies, found.topologies, strict=True))
     limbs, frames = len(found.graph), len(found.curves)
     return (

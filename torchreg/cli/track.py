@@ -32,8 +32,8 @@ from torchreg.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchreg.results.tracking import FrameResult
     from torchreg.shapes.skin import LinearBlendSkin
+    from torchreg.tracking.results import FrameResult
 
 MOVIES = ("gif", "mp4", "none")
 
@@ -146,9 +146,9 @@ def track(
         tqdm(total=len(clouds), unit="frame", desc="tracking", leave=False, disable=quiet) as bar,
     ):
         model = model if stereo else load_shape(shape, parents, package_dir, free_base)
-        from torchreg.pipelines.storage import load_pose
-        from torchreg.pipelines.track import TrackConfig, Tracker
-        from torchreg.pipelines.track_progress import load_progress
+        from torchreg.cli.track_checkpoint import load_progress
+        from torchreg.storage import load_pose
+        from torchreg.tracking.tracker import TrackConfig, Tracker
 
         config = TrackConfig(
             model_points=model_points, num_model_points=points, prediction=prediction, recovery=recovery, seed=seed

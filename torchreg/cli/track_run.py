@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchreg.capture.stereo_frames import StereoFrames
+    from torchreg.cli.track_checkpoint import TrackProgress
     from torchreg.io.frames import Frames
-    from torchreg.pipelines.track import TrackConfig, Tracker
-    from torchreg.pipelines.track_progress import TrackProgress
-    from torchreg.results.tracking import FrameResult, TrackResult, TrackState
     from torchreg.shapes.skin import LinearBlendSkin
+    from torchreg.tracking.results import FrameResult, TrackResult, TrackState
+    from torchreg.tracking.tracker import TrackConfig, Tracker
 
     OnFrame = Callable[[Tensor, FrameResult], object]
 
@@ -192,7 +192,7 @@ class TrackRun:
     @property
     def result(self) -> TrackResult:
         """All frames done."""
-        from torchreg.pipelines.track_progress import join_frames
+        from torchreg.cli.track_checkpoint import join_frames
 
         self.parts[:] = [reduce(join_frames, self.parts)]
         return self.parts[0]
@@ -222,7 +222,7 @@ class TrackRun:
 
     def run(self) -> bool:
         """Track what is left, and return whether all is done; what is done is on disk."""
-        from torchreg.pipelines.track_progress import TrackProgress, save_progress
+        from torchreg.cli.track_checkpoint import TrackProgress, save_progress
 
         overlays = self._overlays()
         self.clouds.on_drop = self.report.dropped
@@ -239,7 +239,7 @@ class TrackRun:
 
     def _part(self, numbers: range, overlays: Sequence[OnFrame]) -> None:
         """Track some frames; fewer are done if the keyboard interrupts."""
-        from torchreg.pipelines.track_progress import first_frames
+        from torchreg.cli.track_checkpoint import first_frames
 
         def note(points: Tensor, frame: FrameResult) -> None:
             for overlay in overlays:

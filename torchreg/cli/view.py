@@ -65,7 +65,7 @@ def view(
     up_direction = check_up(up)
     if shape is None and (parents or package_dir or free_base is not None):
         raise InputError("--parents, --package-dir and --free-base are about a --shape, which was not given")
-    from torchreg.pipelines.storage import load
+    from torchreg.storage import load
     from torchreg.viz.result_scenes import result_scene
     from torchreg.viz.viewer import scene_html
     from torchreg.viz.viser_server import import_viser

@@ -21,7 +21,7 @@ from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.visibility import View, visible_points
-from torchreg.results.parts import joined_alike
+from torchreg.solvers.rigid_groups import joined_alike
 
 # The camera stands this many diagonals of the rest pose away.
 _DISTANCE = 1.7

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_count, check_finite, check_positive, check_shape
 from torchreg.errors import InputError
 from torchreg.io.points import save_points
-from torchreg.models.grid_lbs import GridLBS
+from torchreg.registration.bones.grid_lbs import GridLBS
 
 # Turns by this share of the circle never come back near an earlier hue.
 _GOLDEN = 0.61803398875

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_points
+from torchreg.alignment.results import AlignResult
 from torchreg.errors import InputError, InputTypeError, MissingExtraError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.io.points import PointCloud
-from torchreg.results.alignment import AlignResult
-from torchreg.results.scans import ScanRegistration, SequenceRegistration
-from torchreg.results.spines import SpineSequence
+from torchreg.registration.results import ScanRegistration, SequenceRegistration
+from torchreg.spines.results import SpineSequence
 from torchreg.viz.bone_colors import bone_palette, weight_colors
 
 Array = NDArray[Any]

@@ -358,7 +358,7 @@ def readme_picture(path: str | Path) -> Path:
     Returns:
         The path written.
     """
-    from torchreg.pipelines.align import align
+    from torchreg.alignment.align import align
 
     hand = Hand()
     skin = surface_skin(hand)

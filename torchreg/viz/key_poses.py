@@ -7,10 +7,10 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg.errors import InputError
-from torchreg.geometry.joints import BoneTree
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix
 from torchreg.geometry.rotation import so3_exp, so3_log
-from torchreg.models.grid_lbs import GridLBS
+from torchreg.registration.bones.grid_lbs import GridLBS
+from torchreg.registration.bones.joints import BoneTree
 
 
 @torch.no_grad()

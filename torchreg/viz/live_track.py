@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from torchreg.errors import InputError
-from torchreg.results.tracking import FrameResult
 from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.tracking.results import FrameResult
 from torchreg.viz.figures import SKIN_COLOR
 from torchreg.viz.result_scenes import inlier_paint
 from torchreg.viz.scene import Cloud, Layer, Scene, Surface

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from torchreg.errors import TorchregError
-from torchreg.geometry.picking import pick_vertex
 from torchreg.viz.latest_worker import LatestWorker
+from torchreg.viz.picking import pick_vertex
 from torchreg.viz.pose_editor import PoseEditor
 from torchreg.viz.scene import Cloud, Scene, Surface
 from torchreg.viz.viser_nodes import as_floats, draw_patches

@@ -14,9 +14,9 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg.errors import InputError
 from torchreg.io.gltf_morph import save_vertex_animation
-from torchreg.models.grid_lbs import GridLBS
-from torchreg.pipelines.solve_pose import PoseConfig, PoseSolver
-from torchreg.results.scans import PoseSolution, ScanRegistration, SequenceRegistration
+from torchreg.registration.bones.grid_lbs import GridLBS
+from torchreg.registration.results import PoseSolution, ScanRegistration, SequenceRegistration
+from torchreg.registration.solve_pose import PoseConfig, PoseSolver
 from torchreg.viz.bone_colors import weight_colors
 from torchreg.viz.key_poses import between_poses
 from torchreg.viz.scan_gltf import save_grid_animation
@@ -61,7 +61,7 @@ class PoseEditor:
 
     def __init__(
         self,
-        registration: ScanRegistration[GridLBS] | SequenceRegistration[GridLBS],
+        registration: ScanRegistration | SequenceRegistration,
         *,
         frame: int = 0,
         start: Tensor | None = None,

@@ -10,17 +10,17 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_shape
+from torchreg.alignment.results import AlignResult, Calibration, PoseStarts
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import transform_points
-from torchreg.models.grid_lbs import GridLBS
-from torchreg.results.alignment import AlignResult, Calibration, PoseStarts
-from torchreg.results.base import Result
-from torchreg.results.scans import ScanRegistration, SequenceRegistration
-from torchreg.results.spines import SpineSequence
-from torchreg.results.tracking import DemoResult, TrackResult
+from torchreg.registration.bones.grid_lbs import GridLBS
+from torchreg.registration.results import ScanRegistration, SequenceRegistration
+from torchreg.result import Result
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
+from torchreg.spines.results import SpineSequence
+from torchreg.tracking.results import DemoResult, TrackResult
 from torchreg.viz.animation import coarse_skin
 from torchreg.viz.bone_colors import bone_palette, error_colors, weight_colors
 from torchreg.viz.figures import SKIN_COLOR

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_choice, check_count, check_finite, check_points, check_shape
 from torchreg.errors import InputError
-from torchreg.geometry.blend import blend_linear
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.io.gltf_write import save_animated_skin
-from torchreg.models.grid_lbs import GridLBS, check_rigid
+from torchreg.registration.blend import blend_linear
+from torchreg.registration.bones.grid_lbs import GridLBS, check_rigid
 from torchreg.viz.bone_colors import weight_colors
 
 _WEIGHTS = (4, 8)

@@ -17,8 +17,8 @@ from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.visibility import rasterize
 from torchreg.io.images import save_image
-from torchreg.results.tracking import FrameResult
 from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.tracking.results import FrameResult
 
 # From far to near.
 _RAMP = ((0.19, 0.07, 0.23), (0.15, 0.43, 0.84), (0.11, 0.79, 0.62), (0.86, 0.89, 0.21), (0.98, 0.42, 0.13))

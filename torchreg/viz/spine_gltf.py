@@ -9,12 +9,12 @@ from torch import Tensor
 
 from torchreg._checks import check_count
 from torchreg.errors import InputError
-from torchreg.geometry.labeled_tree import path_lengths
 from torchreg.geometry.mesh import TriangleMesh, concatenate
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.io.gltf_write import save_animated_skin
-from torchreg.models.spine import Spine
+from torchreg.spines.labeled_tree import path_lengths
+from torchreg.spines.spine import Spine
 from torchreg.viz.bone_colors import bone_palette
 
 # Radius of the tubes as a share of the length of all limbs, and their sides.

@@ -14,7 +14,7 @@ from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.geometry.visibility import View
-from torchreg.results.spines import SpineSequence
+from torchreg.spines.results import SpineSequence
 from torchreg.viz.animation import save_animation
 from torchreg.viz.bone_colors import bone_palette
 from torchreg.viz.figures import new_figure, render_mesh, save_picture, watch

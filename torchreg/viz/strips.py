@@ -11,14 +11,14 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_count, check_points
+from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.visibility import View
-from torchreg.results.alignment import AlignRecord, AlignResult
-from torchreg.results.scans import ScanRegistration
-from torchreg.results.spines import SpineSequence
+from torchreg.registration.results import ScanRegistration
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.spines.results import SpineSequence
 from torchreg.viz.animation import coarse_skin
 from torchreg.viz.bone_colors import error_colors, weight_colors
 from torchreg.viz.figures import (

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_positive, check_shape
+from torchreg.alignment.problem import INLIER_SHARE
 from torchreg.errors import InputError
 from torchreg.geometry.visibility import View
-from torchreg.pipelines.align_problem import INLIER_SHARE
-from torchreg.results.base import Status
-from torchreg.results.tracking import FrameResult, TrackResult
+from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.tracking.results import FrameResult, TrackResult
 from torchreg.viz.animation import check_animation_path, coarse_skin, common_view, save_animation
 from torchreg.viz.figures import (
     INLIER_COLOR,

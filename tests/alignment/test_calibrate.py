@@ -1,0 +1,363 @@
+"""Calibration: known lengths, radii and poses come back, the prior rules what is not seen, bad input is answered."""
+
+import math
+
+import pytest
+import torch
+
+from torchreg.alignment.align import AlignConfig, align
+from torchreg.alignment.calibrate import CalibrateConfig, calibrate, scale_jacobian
+from torchreg.alignment.results import Calibration
+from torchreg.datasets.hand import hand_motion, make_hand_cloud
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.kinematic_tree import Joint, KinematicTree
+from torchreg.geometry.rigid import rigid_matrix
+from torchreg.result import Status
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import BendingSkin, sample_skin
+from torchreg.storage import load
+
+
+def offset(*place):
+    return rigid_matrix(torch.eye(3, dtype=torch.float64), torch.tensor(place, dtype=torch.float64))
+
+
+def make_arm(dtype=torch.float32, **options):
+    """Four unlike solids with three hinges and a slide, about half a metre."""
+    hinge, limits = "revolute", (-1.5, 1.5)
+    tree = KinematicTree((
+        Joint("trunk", -1, offset(0, 0, 0)),
+        Joint("upper", 0, offset(0.1, 0, 0.1), hinge, (0.0, 1.0, 0.0), *limits),
+        Joint("lower", 1, offset(0, 0, 0.15), hinge, (1.0, 0.0, 0.0), *limits),
+        Joint("pin", 2, offset(0, 0, 0.12), hinge, (0.0, 1.0, 0.0), *limits),
+        Joint("blade", 3, offset(0, 0, 0.02), "prismatic", (0.0, 0.0, 1.0), -0.02, 0.05),
+    ))  # fmt: skip
+    solids = [
+        Primitive("superquadric", (0.1, 0.06, 0.08, 0.6, 0.8), offset(0.02, 0, 0)),
+        Primitive("capsule", (0.06, 0.03), offset(0, 0, 0.07)),
+        Primitive("ellipsoid", (0.03, 0.025, 0.07), offset(0, 0, 0.06)),
+        Primitive("cone", (0.05, 0.03, 0.015), offset(0, 0.005, 0.05)),
+    ]
+    return ArticulatedShape(tree, ["trunk", "upper", "lower", "blade"], solids, nu=0.006, dtype=dtype, **options)
+
+
+def set_scales(shape, lengths, radii):
+    with torch.no_grad():
+        shape.log_length_scales.copy_(torch.as_tensor(lengths))
+        shape.log_radius_scales.copy_(torch.as_tensor(radii))
+    return shape
+
+
+ARM_LENGTHS, ARM_RADII = (0.03, -0.06, 0.05, -0.03), (-0.04, 0.05, 0.02, 0.04)
+
+
+@pytest.fixture(scope="module")
+def arm_truth():
+    return set_scales(make_arm(), ARM_LENGTHS, ARM_RADII).requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def arm_poses():
+    generator = torch.Generator().manual_seed(3)
+    poses = torch.zeros(4, 10)
+    poses[:, :3] = torch.tensor([0.2, 0.1, 1.0]) + 0.05 * torch.randn(4, 3, generator=generator)
+    poses[:, 3:6] = 0.5 * torch.randn(4, 3, generator=generator)
+    poses[:, 6:9] = 0.6 * torch.randn(4, 3, generator=generator)
+    poses[:, 9] = torch.tensor([0.0, 0.02, 0.03, -0.01])
+    return poses
+
+
+@pytest.fixture(scope="module")
+def arm_frames(arm_truth, arm_poses):
+    """Noisy points of the whole true surface, 10 % clutter."""
+    generator = torch.Generator().manual_seed(4)
+    frames = []
+    for pose in arm_poses:
+        points = arm_truth.surface_mesh(pose, spacing=0.012).vertices
+        points = points[torch.randperm(len(points), generator=generator)[:350]]
+        points = points + 0.001 * torch.randn(points.shape, generator=generator)
+        clutter = points.mean(0) + 0.5 * (torch.rand(35, 3, generator=generator) - 0.5)
+        frames.append(torch.cat([points, clutter]))
+    return torch.stack(frames)
+
+
+@pytest.fixture(scope="module")
+def arm_starts(arm_poses):
+    starts = arm_poses.clone()
+    starts[:, 6:9] += 0.15 * (1 - 2.0 * (torch.arange(3) % 2))
+    starts[:, :3] += 0.01
+    return starts
+
+
+ARM_CONFIG = CalibrateConfig(align=AlignConfig(search="never", num_model_points=250), rounds=1)
+
+
+@pytest.fixture(scope="module")
+def arm_found(arm_frames, arm_starts):
+    records = []
+    shape = make_arm()
+    return shape, calibrate(shape, arm_frames, arm_starts, config=ARM_CONFIG, on_step=records.append), records
+
+
+def test_lengths_radii_and_poses_come_back(arm_found, arm_truth, arm_poses):
+    """Within a percent or two from errors of three to six."""
+    _, found, _ = arm_found
+    lengths = (found.log_length_scales - arm_truth.log_length_scales).abs()
+    radii = (found.log_radius_scales - arm_truth.log_radius_scales).abs()
+    assert float(lengths.mean()) < 0.012
+    assert float(radii.mean()) < 0.012
+    places, truth = found.shape.keypoints(found.poses).detach(), arm_truth.keypoints(arm_poses)
+    assert float((places - truth).norm(dim=-1).mean()) < 0.002
+    assert found.status in (Status.CONVERGED, Status.MAX_STEPS)
+    assert found.cost.shape == ()
+    torch.testing.assert_close(found.shape.log_length_scales.detach(), found.log_length_scales)
+    torch.testing.assert_close(found.shape.log_radius_scales.detach(), found.log_radius_scales)
+
+
+def test_what_was_found_comes_back_from_a_file(arm_found, arm_frames, tmp_path):
+    _, found, _ = arm_found
+    found.save(tmp_path / "arm.safetensors")
+    loaded = load(tmp_path / "arm.safetensors")
+    assert isinstance(loaded, Calibration)
+    assert loaded.status is found.status
+    for name in ("poses", "log_length_scales", "log_radius_scales", "cost"):
+        assert torch.equal(getattr(loaded, name), getattr(found, name)), name
+    expected = found.shape.distance(arm_frames, found.poses)
+    assert torch.equal(loaded.shape.distance(arm_frames, loaded.poses), expected)
+
+
+def test_the_given_shape_is_not_changed(arm_found, arm_frames, arm_starts):
+    shape, found, _ = arm_found
+    assert float(shape.log_length_scales.detach().abs().max()) == 0.0
+    assert found.shape is not shape
+    assert found.shape.part_names == shape.part_names
+    assert found.shape.log_length_scales.requires_grad
+    frozen = make_arm().requires_grad_(False)
+    copied = calibrate(frozen, arm_frames[:1], arm_starts[:1], config=ARM_CONFIG).shape
+    assert not any(parameter.requires_grad for parameter in copied.parameters())
+
+
+def test_records_tell_how_the_kernel_narrows(arm_found):
+    _, found, records = arm_found
+    assert [(record.round, record.step, record.num_steps) for record in records] == [(0, 0, 3), (0, 1, 3), (0, 2, 3)]
+    sigmas = [record.sigma for record in records]
+    assert sigmas == sorted(sigmas, reverse=True)
+    torch.testing.assert_close(records[-1].poses, found.poses)
+    torch.testing.assert_close(records[-1].log_length_scales, found.log_length_scales)
+    torch.testing.assert_close(records[-1].log_radius_scales, found.log_radius_scales)
+    assert records[-1].cost == pytest.approx(float(found.cost))
+
+
+def test_a_sequence_of_clouds_is_one_tensor_with_a_mask(arm_frames, arm_starts):
+    """Clouds of unlike sizes; what padding holds does not matter; thinning keeps every second point."""
+    clouds = [frame[: 385 - 40 * number] for number, frame in enumerate(arm_frames)]
+    listed = calibrate(make_arm(), clouds, arm_starts, config=ARM_CONFIG)
+    padded = torch.full_like(arm_frames, math.nan)
+    masks = torch.zeros(arm_frames.shape[:2], dtype=torch.bool)
+    for row, cloud in enumerate(clouds):
+        padded[row, : len(cloud)], masks[row, : len(cloud)] = cloud, True
+    masked = calibrate(make_arm(), padded, arm_starts, masks=masks, config=ARM_CONFIG)
+    torch.testing.assert_close(listed.poses, masked.poses)
+    torch.testing.assert_close(listed.log_length_scales, masked.log_length_scales)
+    thinned = CalibrateConfig(align=ARM_CONFIG.align, rounds=1, max_points=200)
+    few = calibrate(make_arm(), arm_frames, arm_starts, config=thinned)
+    assert float((few.log_length_scales - listed.log_length_scales).abs().max()) < 0.03
+
+
+def test_a_frame_that_shows_something_else_does_not_count(arm_frames, arm_starts, arm_found):
+    generator = torch.Generator().manual_seed(6)
+    clutter = arm_starts[:1, :3] + torch.tensor([0.0, 0.0, 2.0]) + torch.rand(385, 3, generator=generator)
+    frames = torch.cat([arm_frames, clutter.unsqueeze(0)])
+    starts = torch.cat([arm_starts, arm_starts[:1]])
+    found = calibrate(make_arm(), frames, starts, config=ARM_CONFIG)
+    assert found.status is Status.FEW_INLIERS
+    torch.testing.assert_close(found.log_length_scales, arm_found[1].log_length_scales, rtol=0, atol=2e-3)
+    torch.testing.assert_close(found.poses[:4], arm_found[1].poses, rtol=0, atol=5e-3)
+
+
+def test_the_prior_rules_what_is_not_seen(arm_truth, arm_poses, arm_starts):
+    """All parts are 8 % larger, but the blade is never seen: it takes the common scale of the others."""
+    larger = set_scales(make_arm(), [0.08] * 4, [0.08] * 4).requires_grad_(False)
+    frames = []
+    for pose in arm_poses:
+        points = larger.surface_mesh(pose, spacing=0.012).vertices
+        frames.append(points[larger.part_distances(points, pose).argmin(-1) != 3][:400])
+    found = calibrate(make_arm(), frames, arm_starts, config=ARM_CONFIG)
+    assert float(found.log_length_scales[3]) == pytest.approx(0.08, abs=0.03)
+    assert float(found.log_radius_scales[3]) == pytest.approx(0.08, abs=0.03)
+    stiff = CalibrateConfig(align=ARM_CONFIG.align, rounds=1, size_std=1e-4, radius_std=1e-4, part_std=1e-4)
+    held = calibrate(make_arm(), frames, arm_starts, config=stiff)
+    assert float(held.log_length_scales.abs().max()) < 2e-3
+
+
+def test_moving_all_frames_moves_the_poses_only(arm_frames, arm_starts, arm_found):
+    away = torch.tensor([300.0, -200.0, 100.0])
+    starts = arm_starts.clone()
+    starts[:, :3] += away
+    found = calibrate(make_arm(), arm_frames + away, starts, config=ARM_CONFIG)
+    torch.testing.assert_close(found.log_length_scales, arm_found[1].log_length_scales, rtol=0, atol=3e-3)
+    torch.testing.assert_close(found.poses[:, :3] - away, arm_found[1].poses[:, :3], rtol=0, atol=1e-3)
+
+
+def test_a_bolted_machine_in_double_precision():
+    shape = make_arm(torch.float64, free_base=False)
+    truth = set_scales(make_arm(torch.float64, free_base=False), ARM_LENGTHS, ARM_RADII).requires_grad_(False)
+    poses = torch.zeros(2, 10).double()
+    poses[:, 6:9] = torch.tensor([[0.4, -0.5, 0.6], [-0.6, 0.5, 0.2]])
+    frames = [truth.surface_mesh(pose, spacing=0.015).vertices for pose in poses]
+    found = calibrate(shape, frames, 0.8 * poses, config=ARM_CONFIG)
+    assert found.poses.dtype == found.log_length_scales.dtype == torch.float64
+    assert bool((found.poses[:, :6] == 0).all())
+    assert float((found.log_radius_scales - truth.log_radius_scales).abs().mean()) < 0.015
+
+
+def test_a_second_round_starts_from_the_calibrated_shape(arm_frames, arm_starts, arm_truth, monkeypatch):
+    sizes = []
+
+    def counted(shape, count, *, sharpness):
+        sizes.append(shape.log_length_scales.detach().clone())
+        return sample_skin(shape, count, sharpness=sharpness)
+
+    monkeypatch.setattr("torchreg.alignment.calibrate.sample_skin", counted)
+    config = CalibrateConfig(align=ARM_CONFIG.align, rounds=2)
+    found = calibrate(make_arm(), arm_frames, arm_starts, config=config)
+    assert len(sizes) == 2
+    assert float(sizes[0].abs().max()) == 0.0
+    assert float((sizes[1] - arm_truth.log_length_scales).abs().mean()) < 0.015
+    assert float((found.log_length_scales - arm_truth.log_length_scales).abs().mean()) < 0.012
+
+
+@pytest.mark.parametrize("kind", ["arm", "hand"])
+def test_scale_jacobian_matches_differences(kind):
+    """Every kind of solid; every length moves the parts that hang on it."""
+    generator = torch.Generator().manual_seed(7)
+    shape = make_arm(torch.float64) if kind == "arm" else Hand(dtype=torch.float64)
+    scales = 0.1 * torch.randn(2, shape.num_parts, generator=generator).double()
+    set_scales(shape, *scales)
+    poses = 0.4 * torch.randn(2, shape.num_dofs, generator=generator).double()
+    points = shape.keypoints(poses).detach().repeat(1, 3, 1)
+    points = points + 0.03 * torch.randn(points.shape, generator=generator).double()
+    found = scale_jacobian(shape, points, poses)
+    columns = []
+    for axis in 1e-6 * torch.eye(2 * shape.num_parts, dtype=torch.float64):
+        values = []
+        for sign in (1, -1):
+            set_scales(shape, *(scales + sign * axis.view_as(scales)))
+            values.append(shape.distance(points, poses).detach())
+        columns.append((values[0] - values[1]) / 2e-6)
+    assert not found.requires_grad
+    torch.testing.assert_close(found, torch.stack(columns, dim=-1), rtol=0, atol=1e-8)
+
+
+# The hand
+
+
+@pytest.fixture(scope="module")
+def other_hand(plain_hand):
+    """A hand 5 % shorter and 5 % thicker, with another skin; nine frames of it."""
+    generator = torch.Generator().manual_seed(11)
+    truth = Hand(nu=0.0035)
+    set_scales(truth, [math.log(0.95)] * 16, [math.log(1.05)] * 16).requires_grad_(False)
+    mesh = truth.surface_mesh(spacing=0.005)
+    skin = BendingSkin(truth, mesh.vertices, sharpness=3.0, faces=mesh.faces)
+    poses = hand_motion(truth, "bend", 9, fps=4.0, bend=0.45, seed=1)
+    clouds = [make_hand_cloud(truth, pose, camera=torch.zeros(3), skin=skin, generator=generator) for pose in poses]
+    signs = 1 - 2.0 * (torch.rand(9, 21, generator=generator) < 0.5)
+    starts = poses.clone()
+    starts[:, 6:] += math.radians(15) * signs
+    return truth, poses, clouds, starts
+
+
+def tip_errors(hand, poses, truth, true_poses, clouds):
+    """Return the distances of fingertips with at least 8 points from their true places, metres."""
+    off = (hand.keypoints(poses) - truth.keypoints(true_poses)).norm(dim=-1)[:, 4::4].detach()
+    seen = [[int((cloud.part_labels == part).sum()) >= 8 for part in truth.fingertip_parts] for cloud in clouds]
+    return off[torch.tensor(seen)]
+
+
+def test_a_hand_of_other_proportions_seen_from_one_side(plain_hand, other_hand):
+    """Five frames of 500 points, 1.5 mm noise, a third outliers; then new frames are fitted with the shape found."""
+    truth, poses, clouds, starts = other_hand
+    frames = torch.stack([cloud.points for cloud in clouds])
+    found = calibrate(plain_hand, frames[:5], starts[:5])
+    before, after = (
+        (hand.log_length_scales - truth.log_length_scales).abs().mean() for hand in (plain_hand, found.shape)
+    )
+    assert float(before) > 0.049
+    assert float(after) < 0.02
+    # Started near the truth, so that the shape alone makes the difference.
+    errors = []
+    for hand in (plain_hand, found.shape):
+        fitted = align(hand, frames[5:], poses[5:], config=AlignConfig(search="never"))
+        errors.append(tip_errors(hand, fitted.pose, truth, poses[5:], clouds[5:]))
+    assert len(errors[0]) >= 10
+    # The median, because a descent loses a finger now and then whatever the shape.
+    assert float(errors[1].median()) < 0.003
+    assert float(errors[1].median()) < 0.6 * float(errors[0].median())
+
+
+# Bad input
+
+
+def rig():
+    """A box of triangles around one joint, as arrays."""
+    corners = torch.cartesian_prod(*[torch.tensor([-0.1, 0.1])] * 3)
+    faces = torch.tensor([
+        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+    ])  # fmt: skip
+    return ArticulatedShape.from_skinned_mesh(corners, faces, torch.ones(8, 1), torch.zeros(1, 3), [-1])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"frames": []}, InputError, r"frames must hold at least one cloud with points, got shape \(0, 0, 3\)"),
+        ({"frames": torch.zeros(2, 0, 3)}, InputError, "frames must hold at least one cloud with points"),
+        ({"frames": torch.zeros(20, 3)}, InputError, r"frames must have shape \(T, M, 3\), got \(20, 3\)"),
+        ({"frames": [torch.zeros(5, 3), torch.zeros(5)]}, InputError, r"frames\[1\] must have shape \(M, 3\)"),
+        ({"frames": ["a.ply"]}, InputTypeError, r"frames\[0\] must be a tensor or an array of numbers, got str"),
+        ({"masks": torch.ones(2, 20)}, InputError, r"masks must be bool of shape \(2, 20\)"),
+        ({"masks": torch.ones(20, dtype=torch.bool)}, InputError, r"masks must be bool of shape \(2, 20\)"),
+        (
+            {"frames": [torch.zeros(5, 3)], "masks": torch.ones(1, 5, dtype=torch.bool)},
+            InputError,
+            "masks go with frames in one tensor",
+        ),
+        ({"initial_poses": torch.zeros(3, 10)}, InputError, r"initial_poses must have shape \(2, 10\), one pose per"),
+        ({"initial_poses": torch.zeros(9)}, InputError, r"initial_poses must have shape \(\.\.\., 10\)"),
+        ({"initial_poses": torch.full((10,), math.nan)}, InputError, "initial_poses must be finite"),
+        ({"frames": torch.full((1, 3, 3), math.inf)}, InputError, "frames hold 3 points that are not finite; drop"),
+        ({"shape": rig()}, InputError, "shape has the surface of a file, whose mesh cannot follow the scales"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, error, message):
+    arguments = {"shape": make_arm(), "frames": torch.zeros(2, 20, 3)} | arguments
+    with pytest.raises(error, match=message):
+        calibrate(**arguments)
+
+
+def test_non_finite_data_may_be_left_out(arm_frames, arm_starts, arm_found):
+    spoiled = arm_frames.clone()
+    spoiled[:, 1::100, 2] = math.nan
+    config = CalibrateConfig(align=AlignConfig(search="never", num_model_points=250, nan_policy="omit"), rounds=1)
+    found = calibrate(make_arm(), spoiled, arm_starts, config=config)
+    torch.testing.assert_close(found.log_length_scales, arm_found[1].log_length_scales, rtol=0, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"rounds": 0}, InputError, "rounds must be at least 1, got 0"),
+        ({"steps": 2.0}, InputTypeError, "steps must be an integer, got float"),
+        ({"max_points": True}, InputTypeError, "max_points must be an integer, got bool"),
+        ({"size_std": 0.0}, InputError, "size_std must be positive"),
+        ({"part_std": -1.0}, InputError, "part_std must be positive"),
+        ({"radius_std": math.inf}, InputError, "radius_std must be positive and finite"),
+    ],
+)
+def test_bad_options_are_named(options, error, message):
+    with pytest.raises(error, match=message):
+        CalibrateConfig(**options)

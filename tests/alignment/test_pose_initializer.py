@@ -1,0 +1,348 @@
+"""PoseInitializer as a function and as a layer: gradients against finite differences and unrolling, batches, limits."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchreg.alignment.find_pose import FindPoseConfig
+from torchreg.alignment.pose_initializer import InitialPose, PoseInitializer, PoseInitializerConfig
+from torchreg.datasets.hand import make_hand_cloud
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.kinematic_tree import Joint, KinematicTree
+from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.skin import LinearBlendSkin, bending_weights, sample_skin
+
+D = torch.float64
+EXACT = PoseInitializerConfig(sigma_steps=1, em_steps=1, fit_steps=6, newton_steps=3, noise=0.004)
+
+
+def offset(*place):
+    pose = torch.eye(4, dtype=D)
+    pose[:3, 3] = torch.tensor(place, dtype=D)
+    return pose
+
+
+def finger():
+    """A lopsided body with a hinge: seven degrees of freedom."""
+    tree = KinematicTree((
+        Joint("body", -1, offset(0.0, 0.0, 0.0)),
+        Joint("finger", 0, offset(0.03, 0.0, 0.05), "revolute", (0.8, 0.6, 0.0), -0.5, 1.2),
+    ))  # fmt: skip
+    solids = [
+        Primitive("ellipsoid", (0.05, 0.03, 0.06), offset(0, 0.0, 0)),
+        Primitive("ellipsoid", (0.012, 0.015, 0.04), offset(0, 0, 0.04)),
+    ]
+    return ArticulatedShape(tree, ["body", "finger"], solids, nu=0.004, dtype=D)
+
+
+@pytest.fixture(scope="module")
+def shape():
+    return finger().requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def skin(shape):
+    return sample_skin(shape, 60)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """At no rotation, a half turn, and any."""
+    truth = torch.zeros(3, 7, dtype=D)
+    truth[:, :3] = torch.tensor([0.2, -0.1, 0.4], dtype=D)
+    truth[1, 3:6] = torch.tensor([0.0, math.pi, 0.0], dtype=D)
+    truth[2, 3:6] = torch.tensor([1.0, -0.7, 0.4], dtype=D)
+    truth[:, 6] = torch.tensor([0.3, 0.7, 0.1], dtype=D)
+    return truth
+
+
+@pytest.fixture(scope="module")
+def points(shape, truth):
+    cloud = sample_skin(shape, 60, seed=5)(truth)
+    return cloud + 0.002 * torch.randn(cloud.shape, generator=torch.Generator().manual_seed(0), dtype=D)
+
+
+@pytest.fixture(scope="module")
+def start(shape, truth):
+    step = 0.06 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(2), dtype=D)
+    step[:, :3] *= 0.1
+    return shape.retract(truth, step)
+
+
+def loss_of(result):
+    """A smooth function of the rotation, not of its vector, which flips at half turns."""
+    generator = torch.Generator().manual_seed(9)
+    weights = torch.randn(result.keypoints.shape, generator=generator, dtype=D)
+    return (weights * result.keypoints).sum() + (so3_exp(result.pose[:, 3:6]).diagonal(dim1=-2, dim2=-1)).sum()
+
+
+def slope(function, at, direction, size):
+    """Return the directional derivative by central differences of fourth order."""
+    far_down, down, up, far_up = (function(at + shift * size * direction) for shift in (-2, -1, 1, 2))
+    return float((8 * (up - down) - (far_up - far_down)) / (12 * size))
+
+
+def direction_like(value, seed):
+    return torch.randn(value.shape, generator=torch.Generator().manual_seed(seed), dtype=D)
+
+
+def test_poses_are_found_from_starts(shape, skin, points, start, truth):
+    layer = PoseInitializer(shape, model_points=skin)
+    with torch.no_grad():
+        result = layer(points, start=start)
+    assert isinstance(result, InitialPose)
+    assert not result.pose.requires_grad
+    torch.testing.assert_close(shape.keypoints(result.pose), shape.keypoints(truth), atol=2e-3, rtol=0)
+    assert result.registered.shape == (3, 60, 3)
+    assert (result.confidence > 0.7).all()
+    assert (layer(points + 0.5, start=start).confidence < 0.1).all()
+
+
+@pytest.mark.parametrize("which", ["points", "start"])
+def test_gradients_are_those_of_finite_differences(shape, skin, points, start, which):
+    layer = PoseInitializer(shape, EXACT, model_points=skin)
+    given = {"points": points, "start": start}
+    leaf = given[which].clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss_of(layer(**{**given, which: leaf})), leaf)
+    direction = direction_like(leaf, 1) * (1.0 if which == "start" else 0.01)
+
+    def function(value):
+        return loss_of(layer(**{**given, which: value.requires_grad_()})).detach()
+
+    expected = slope(function, given[which], direction, 1e-3)
+    assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5)
+
+
+def test_gradients_in_the_sizes_of_the_shape(points, start):
+    shape = finger()
+    layer = PoseInitializer(shape, EXACT, model_points=sample_skin(shape, 60))
+    scales = torch.nn.ParameterList([shape.log_length_scales, shape.log_radius_scales])
+    gradients = torch.autograd.grad(loss_of(layer(points[2:], start=start[2:])), list(scales))
+    direction = torch.tensor([1.0, -0.7, 0.5, 0.8], dtype=D)
+
+    def function(value):
+        torch.nn.utils.vector_to_parameters(value, scales)
+        return loss_of(layer(points[2:], start=start[2:])).detach()
+
+    expected = slope(function, torch.zeros(4, dtype=D), direction, 1e-3)
+    assert float(torch.cat(gradients) @ direction) == pytest.approx(expected, rel=1e-5)
+
+
+def test_gradients_of_a_shape_whose_file_has_a_mesh(shape, points, start):
+    """The nearest points of a mesh jump; the last fit, to its solids, does not."""
+    mesh = shape.surface_mesh(spacing=0.006)
+    weights = bending_weights(shape, mesh.vertices, shape.rest_pose(), 2.0)
+    joints = shape.part_transforms(shape.rest_pose())[:, :3, 3]
+    rig = ArticulatedShape.from_skinned_mesh(
+        mesh.vertices, mesh.faces, weights, joints, [-1, 0], axes={"joint_0": [], "joint_1": ["x"]}, dtype=D
+    ).requires_grad_(False)
+    layer = PoseInitializer(rig, EXACT)
+    leaf = points[2:].clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(loss_of(layer(leaf, start=start[2:])), leaf)
+    direction = 0.01 * direction_like(leaf, 1)
+    expected = slope(
+        lambda x: loss_of(layer(x.requires_grad_(), start=start[2:])).detach(), points[2:], direction, 1e-4
+    )
+    assert float((gradient * direction).sum()) == pytest.approx(expected, rel=1e-5)
+
+
+def test_gradients_are_those_of_unrolling(shape, skin, points, start):
+    """Descent with a fixed metric, every step of it kept: what the implicit function need not do."""
+    layer = PoseInitializer(shape, EXACT, model_points=skin)
+    leaf = points[2:].clone().requires_grad_()
+    result = layer(leaf, start=start[2:])
+    weights = direction_like(result.pose, 3)
+    (implicit,) = torch.autograd.grad((weights * result.pose).sum(), leaf)
+
+    sigma, noise = 0.01, 0.004
+    prior = torch.tensor([0.0] * 6 + [0.3**-2], dtype=D)
+    size = float((skin.points.amax(0) - skin.points.amin(0)).norm())
+    prior[:3], prior[3:6] = (0.5 * size) ** -2, 1.0
+    pose = result.pose.detach() + torch.tensor([1e-4] * 7, dtype=D)
+
+    def energy(pose, points):
+        beta = (-(shape.distance(points, pose) / sigma).square()).exp()
+        turn = compose_rotation_vectors(pose[:, 3:6], -start[2:, 3:6])
+        away = torch.cat([pose[:, :3] - start[2:, :3], turn, pose[:, 6:] - start[2:, 6:]], dim=-1)
+        return 0.5 * (sigma / noise) ** 2 * (1 - beta).sum() + 0.5 * (prior * away.square()).sum()
+
+    hessian = torch.autograd.functional.hessian(lambda p: energy(p, points[2:]), pose)[0, :, 0]
+    metric = 0.7 * torch.linalg.inv(hessian)
+    moved = pose.requires_grad_()
+    for _ in range(30):
+        (gradient,) = torch.autograd.grad(energy(moved, leaf), moved, create_graph=True)
+        moved = moved - gradient @ metric
+    (unrolled,) = torch.autograd.grad((weights * moved).sum(), leaf)
+    torch.testing.assert_close(implicit, unrolled, rtol=0, atol=1e-6 * float(unrolled.abs().max()))
+
+
+def test_joints_held_at_a_limit_take_no_gradient(shape, skin, truth):
+    beyond = truth.clone()
+    beyond[:, 6] = shape.upper[6] + 0.3
+    points = sample_skin(shape, 60, seed=5)(beyond).requires_grad_()
+    result = PoseInitializer(shape, EXACT, model_points=skin)(points, start=shape.clamp(beyond))
+    torch.testing.assert_close(result.pose[:, 6], shape.upper[6].expand(3), atol=1e-12, rtol=0)
+    (gradient,) = torch.autograd.grad(result.pose[:, 6].sum(), points, retain_graph=True)
+    assert not gradient.any()
+    assert torch.autograd.grad(result.pose[:, :3].sum(), points)[0].any()
+
+
+def test_a_cloud_without_points_stays_at_its_start(shape, skin, points, start):
+    mask = torch.ones(3, 60, dtype=torch.bool)
+    mask[1] = False
+    begin = start.clone().requires_grad_()
+    cloud = points.clone().requires_grad_()
+    result = PoseInitializer(shape, EXACT, model_points=skin)(cloud, mask, begin)
+    torch.testing.assert_close(result.pose[1], start[1], atol=1e-9, rtol=0)
+    assert result.confidence[1] == 0
+    weights = direction_like(start, 4)
+    gradients = torch.autograd.grad((weights * result.pose).sum(), [begin, cloud])
+    torch.testing.assert_close(gradients[0][1], weights[1], rtol=1e-6, atol=1e-6)
+    assert not gradients[1][1].any()
+    assert gradients[0].isfinite().all()
+
+
+def test_points_that_fall_together_have_gradients(shape, skin, points, start):
+    cloud = points.clone()
+    cloud[:, 30:] = cloud[:, :30]
+    cloud[0, 0] = start[0, :3]  # at the center of a solid
+    leaf = cloud.requires_grad_()
+    result = PoseInitializer(shape, EXACT, model_points=skin)(leaf, start=start)
+    (gradient,) = torch.autograd.grad(result.pose.sum(), leaf)
+    assert gradient.isfinite().all()
+    torch.testing.assert_close(gradient[1:, 30:], gradient[1:, :30], rtol=1e-6, atol=1e-9)
+
+
+def test_a_batch_is_its_clouds_one_by_one(shape, skin, points, start):
+    layer = PoseInitializer(shape, EXACT, model_points=skin)
+    leaf = points.clone().requires_grad_()
+    together = layer(leaf, start=start)
+    (gradient,) = torch.autograd.grad(together.pose.sum(), leaf)
+    padded = torch.cat([points, torch.full((3, 5, 3), torch.nan, dtype=D)], dim=1)
+    mask = torch.arange(65).expand(3, -1) < 60
+    torch.testing.assert_close(layer(padded.requires_grad_(), mask, start).pose, together.pose, atol=1e-6, rtol=0)
+    for row in range(3):
+        single = points[row].clone().requires_grad_()
+        alone = layer(single, start=start[row])
+        torch.testing.assert_close(alone.pose, together.pose[row], atol=1e-6, rtol=0)
+        (own,) = torch.autograd.grad(alone.pose.sum(), single)
+        torch.testing.assert_close(own, gradient[row], rtol=1e-5, atol=1e-8)
+
+
+def test_memory_does_not_grow_with_the_iterations(shape, skin, points, start):
+    """The graph that a forward pass leaves holds the same tensors after three steps as after sixty."""
+    sizes = []
+    for steps in (3, 60):
+        config = PoseInitializerConfig(sigma_steps=1, fit_steps=steps, newton_steps=1, noise=0.004)
+        saved = []
+
+        def pack(value, saved=saved):
+            saved.append(value.numel())
+            return value
+
+        with torch.autograd.graph.saved_tensors_hooks(pack, lambda value: value):
+            pose = PoseInitializer(shape, config, model_points=skin)(points.clone().requires_grad_(), start=start).pose
+        assert pose.requires_grad
+        sizes.append(sum(saved))
+    assert sizes[0] == sizes[1]
+
+
+def test_single_precision_and_half_precision_around_it(points, start):
+    shape = finger().float().requires_grad_(False)
+    layer = PoseInitializer(shape, EXACT, model_points=sample_skin(shape, 60))
+    double = finger().requires_grad_(False)
+    exact = PoseInitializer(double, EXACT, model_points=sample_skin(double, 60))
+    leaf, half = points.float().requires_grad_(), points.bfloat16().requires_grad_()
+    result = layer(leaf, start=start)
+    reference_leaf = points.clone().requires_grad_()
+    reference = exact(reference_leaf, start=start)
+    assert (result.keypoints.double() - reference.keypoints).norm(dim=-1).max() < 1e-4
+    gradient = torch.autograd.grad(result.keypoints.sum(), leaf)[0].double()
+    expected = torch.autograd.grad(reference.keypoints.sum(), reference_leaf)[0]
+    assert (gradient - expected).norm() < 1e-2 * expected.norm()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        rounded = layer(half, start=start)
+    assert rounded.pose.dtype == torch.float32
+    assert torch.autograd.grad(rounded.pose.sum(), half)[0].dtype == torch.bfloat16
+
+
+def test_hands_are_found_from_scratch(plain_hand, plain_hand_skin, plain_hand_surface):
+    pose = plain_hand.rest_pose()
+    pose[3:6], pose[6:] = torch.tensor([2.0, 1.0, -0.5]), 0.2 * plain_hand.upper[6:]
+    cloud = make_hand_cloud(
+        plain_hand, pose, num_points=300, noise=0.001, outlier_ratio=0.0, skin=plain_hand_surface,
+        generator=torch.Generator().manual_seed(0),
+    ).points  # fmt: skip
+    quick = FindPoseConfig(num_candidates=16, num_placed=5, num_searched=2, search_rounds=1)
+    layer = PoseInitializer(plain_hand, PoseInitializerConfig(search=quick), model_points=plain_hand_skin)
+    leaf = cloud.clone().requires_grad_()
+    result = layer(leaf)
+    error = (result.keypoints - plain_hand.keypoints(pose)).norm(dim=-1)
+    assert error.mean() < 5e-3
+    assert 0.0 < result.confidence <= 1.0
+    shift = torch.autograd.grad(result.pose[:3].sum(), leaf)[0].sum(0)
+    # Points that all move alike take the hand along.
+    torch.testing.assert_close(shift, torch.ones(3), atol=5e-2, rtol=0)
+
+
+def test_from_scratch_a_cloud_of_a_batch_may_be_empty(shape, skin, points):
+    quick = FindPoseConfig(num_candidates=4, num_placed=2, num_searched=1, search_rounds=1)
+    layer = PoseInitializer(shape, PoseInitializerConfig(search=quick), model_points=skin)
+    mask = torch.ones(3, 60, dtype=torch.bool)
+    mask[1] = False
+    with torch.no_grad():
+        result, alone = layer(points, mask), layer(points[2])
+    assert result.pose.isfinite().all()
+    assert result.confidence[1] == 0
+    torch.testing.assert_close(result.keypoints[2], alone.keypoints, atol=1e-6, rtol=0)
+    torch.testing.assert_close(result.confidence[2], alone.confidence, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    "device",
+    [
+        "cpu",
+        pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")),
+    ],
+)
+def test_a_copy_on_any_device_finds_the_same(shape, skin, points, start, device):
+    """From starts with gradients, and from scratch without."""
+    other = finger().requires_grad_(False).to(device)
+    quick = FindPoseConfig(num_candidates=4, num_placed=2, num_searched=1, search_rounds=1)
+    config = replace(EXACT, search=quick)
+    layer, there = PoseInitializer(shape, config, model_points=skin), PoseInitializer(other, config)
+    there.skin = LinearBlendSkin(other, skin.points.to(device), skin.weights.to(device), other.rest_pose())
+    leaf, leaf_there = points.clone().requires_grad_(), points.to(device).requires_grad_()
+    found, found_there = layer(leaf, start=start), there(leaf_there, start=start.to(device))
+    assert found_there.pose.device.type == device
+    torch.testing.assert_close(found_there.keypoints.cpu(), found.keypoints, atol=1e-6, rtol=0)
+    results = ((found, leaf), (found_there, leaf_there))
+    gradients = [torch.autograd.grad(one.keypoints.sum(), at)[0] for one, at in results]
+    torch.testing.assert_close(gradients[1].cpu(), gradients[0], atol=1e-4, rtol=1e-4)
+    with torch.no_grad():
+        search, search_there = layer(points), there(points.to(device))
+    torch.testing.assert_close(search_there.keypoints.cpu(), search.keypoints, atol=1e-4, rtol=0)
+    torch.testing.assert_close(search_there.confidence.cpu(), search.confidence, atol=1e-3, rtol=0)
+
+
+def test_bad_input_is_told(shape, skin, points, start):
+    layer = PoseInitializer(shape, EXACT, model_points=skin)
+    with pytest.raises(InputError, match="start must have shape"):
+        layer(points, start=start[:2])
+    with pytest.raises(InputError, match="start must be finite"):
+        layer(points, start=start * torch.nan)
+    with pytest.raises(InputError, match="not finite"):
+        layer(points * torch.nan, start=start)
+    with pytest.raises(InputTypeError, match="mask must be"):
+        layer(points, torch.ones(3, 60), start)
+    with pytest.raises(InputError, match="skin of another shape"):
+        PoseInitializer(Hand(), model_points=skin)
+    with pytest.raises(InputError, match="noise must be positive"):
+        PoseInitializerConfig(noise=0.0)
+    with pytest.raises(InputError, match="fit_steps must be at least 1"):
+        PoseInitializerConfig(fit_steps=0)

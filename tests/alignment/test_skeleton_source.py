@@ -1,0 +1,71 @@
+"""Poses from skeletons: a hand's chains laid on limbs that are known exactly, with and without a forearm."""
+
+import pytest
+import torch
+
+from torchreg.alignment.find_pose import find_pose
+from torchreg.alignment.skeleton_source import SpineLimbs
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.skeleton import Skeleton, build_skeleton
+
+TIPS = [4, 8, 12, 16, 20]
+
+
+def bent_pose(hand, seed):
+    generator = torch.Generator().manual_seed(seed)
+    pose = hand.rest_pose()
+    pose[6:] = 0.5 * torch.rand(hand.num_dofs - 6, generator=generator) * hand.upper[6:].clamp_min(0)
+    pose[:3] = torch.tensor([0.1, -0.2, 0.5])
+    pose[3:6] = torch.randn(3, generator=generator)
+    return hand.clamp(pose)
+
+
+def hand_skeleton(hand, pose, *, forearm=True):
+    """The fingers' bones, joined in the middle of the palm, and a limb towards the forearm."""
+    points = hand.keypoints(pose)
+    wrist, fingers = points[0], points[1:].reshape(5, 4, 3).flip(1)
+    middle = 0.5 * (wrist + fingers[1:, -1].mean(0))
+    order = [3, 0, 4, 1, 2]
+    curves = [torch.cat((fingers[k], middle[None])) for k in order]
+    if forearm:
+        curves.insert(2, torch.stack((wrist + (wrist - middle), wrist, middle)))
+    limbs = [(curve, torch.full((len(curve),), 0.01), torch.eye(3).expand(len(curve), 3, 3)) for curve in curves]
+    return build_skeleton(limbs, [(k, 99) for k in range(len(limbs))])
+
+
+@pytest.mark.parametrize("forearm", [True, False])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_pose_is_found_from_the_limbs_alone(plain_hand, plain_hand_skin, plain_hand_surface, seed, forearm):
+    pose = bent_pose(plain_hand, seed)
+    data = plain_hand_surface(pose)[::7]
+    source = SpineLimbs(hand_skeleton(plain_hand, pose, forearm=forearm), data.mean(0))
+    starts = find_pose(plain_hand, data, sources=[source], model_points=plain_hand_skin)
+    error = (plain_hand.keypoints(starts.best) - plain_hand.keypoints(pose))[TIPS].norm(dim=-1)
+    assert float(error.mean()) < 0.003
+
+
+def test_the_skeleton_of_a_surface_will_do(plain_hand, plain_hand_skin, plain_hand_surface):
+    pose = bent_pose(plain_hand, 4)
+    data = plain_hand_surface(pose)[::7]
+    mesh = TriangleMesh(plain_hand_surface(pose), plain_hand_surface.faces)
+    source = SpineLimbs.of_surface(mesh, data, count=1)
+    assert len(source.skeleton.tips) == 6
+    starts = find_pose(plain_hand, data, sources=[source], model_points=plain_hand_skin)
+    error = (plain_hand.keypoints(starts.best) - plain_hand.keypoints(pose))[TIPS].norm(dim=-1)
+    assert float(error.mean()) < 0.003
+    with pytest.raises(InputError, match="data must hold at least 1"):
+        SpineLimbs.of_surface(mesh, data[:0])
+
+
+def test_bad_input_is_named(plain_hand):
+    skeleton = hand_skeleton(plain_hand, plain_hand.rest_pose())
+    single = Skeleton(torch.zeros(1, 3), torch.zeros(0, 2).long(), torch.ones(1))
+    for call, error, message in (
+        (lambda: SpineLimbs("skeleton", torch.zeros(3)), InputTypeError, "skeleton must be a Skeleton"),
+        (lambda: SpineLimbs(single, torch.zeros(3)), InputError, "skeleton must have a limb"),
+        (lambda: SpineLimbs(skeleton, torch.zeros(2)), InputError, "middle must have shape"),
+        (lambda: SpineLimbs(skeleton, torch.zeros(3), 0), InputError, "count must be at least 1"),
+    ):
+        with pytest.raises(error, match=message):
+            call()

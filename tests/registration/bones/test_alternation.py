@@ -1,0 +1,238 @@
+"""The steps of scan registration: errors fall, records tell of them, several frames at once, joints that hold."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchreg.datasets.depth_scanner import DepthScanner
+from torchreg.datasets.scan_sequences import jointed_toy
+from torchreg.geometry.range_scan import RangeScan
+from torchreg.geometry.rotation import so3_exp, so3_log
+from torchreg.registration.bones import alternation as reduced_fit
+from torchreg.registration.bones.alternation import ReducedFit, Samples
+from torchreg.registration.bones.labels import CellData
+from torchreg.registration.bones.sparse_grid import SparseGrid
+from torchreg.registration.config import RegisterConfig
+
+
+@pytest.fixture(scope="module")
+def toy():
+    sequence = jointed_toy(3, seed=2, scanner=DepthScanner(num_points=1000), dtype=torch.float64)
+    return sequence, [sequence.pair(0, 1), sequence.pair(0, 2)]
+
+
+def fit(pairs, num_bones=8, noise=0.0, config=None, on_step=None, drift=0.0):
+    """Return a fit that starts from the truth, but for noise of each point and drift of each part, and the truth."""
+    source = pairs[0].source
+    size, middle = source.diagonal, source.points.mean(0)
+    motion = torch.eye(4, dtype=torch.float64) / size
+    motion[:3, 3], motion[3, 3] = -middle / size, 1.0
+    points = source.transformed(motion).points
+    data = CellData(SparseGrid.from_points(points, 30), points, 60)
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.stack([(pair.truth - middle) / size for pair in pairs])
+    moved = truth + noise * torch.randn(truth.shape, generator=generator, dtype=torch.float64)
+    parts = int(pairs[0].labels.max()) + 1
+    moved += drift * torch.randn(len(pairs), parts, 3, generator=generator, dtype=torch.float64)[:, pairs[0].labels]
+    samples = Samples(points, source.normals, moved, torch.ones_like(moved[..., 0]))
+    targets = [pair.target.transformed(motion) for pair in pairs]
+    return ReducedFit(data, samples, targets, num_bones, config or RegisterConfig(), on_step), truth
+
+
+def error(reduced, truth):
+    return (reduced.moved(reduced.samples.points, reduced.samples.normals)[0] - truth).norm(dim=-1).mean()
+
+
+def test_labels_then_weights_come_nearer_to_the_truth(toy):
+    records = []
+    reduced, truth = fit(toy[1][:1], noise=0.005, drift=0.005, on_step=records.append)
+    first = error(reduced, truth)
+    reduced.fit_labels()
+    assert error(reduced, truth) < 0.8 * first
+    reduced.refine()
+    assert error(reduced, truth) < 0.75 * first
+    assert error(reduced, truth) < 0.006
+    assert records == reduced.history
+    assert [record.stage for record in records] == sorted(record.stage for record in records)
+    for record in records:
+        assert record.kept + record.boundary + record.far + record.turned == len(reduced.samples.points)
+        assert record.num_labels <= 8
+        assert record.smoothness > 0
+    assert records[-1].distance < records[0].distance
+
+
+@pytest.mark.parametrize("weight", [(0.001, 0.001), (0.01, 0.01), RegisterConfig().joint_weight])
+def test_labels_alone_lose_little(toy, weight):
+    """From the truth but for noise, which parts average out, there is nothing to gain."""
+    reduced, truth = fit(toy[1][:1], noise=0.005, config=RegisterConfig(joint_weight=weight))
+    first = error(reduced, truth)
+    reduced.fit_labels()
+    assert error(reduced, truth) < 1.1 * first
+
+
+def test_two_frames_share_labels_and_weights(toy):
+    reduced, truth = fit(toy[1], noise=0.005)
+    reduced.fit_labels()
+    reduced.refine()
+    assert reduced.model.transforms.shape[0] == 2
+    assert error(reduced, truth) < 0.006
+    assert reduced.history[-1].kept > len(reduced.samples.points)
+
+
+def test_joints_hold_better_when_they_count(toy):
+    gaps, few = [], RegisterConfig(smoothness=0.2, label_cost=0.001, label_steps=1)
+    for weight in (1e-9, 1.0):
+        reduced, _ = fit(toy[1][:1], noise=0.01, config=replace(few, joint_weight=(weight, weight)))
+        reduced.fit_labels()
+        gaps.append(reduced.history[-1].joint)
+    assert gaps[1] < 0.5 * gaps[0]
+
+
+@pytest.fixture
+def problems(monkeypatch):
+    """The problems of all T-steps with joints, as they come."""
+    noted, solve = [], reduced_fit.fit_bones_and_joints
+
+    def watched(problem, *args, **kwargs):
+        noted.append(problem)
+        return solve(problem, *args, **kwargs)
+
+    monkeypatch.setattr(reduced_fit, "fit_bones_and_joints", watched)
+    return noted
+
+
+def test_joints_count_less_from_round_to_round(toy, problems):
+    reduced, _ = fit(toy[1][:1], config=RegisterConfig(joint_weight=(1.0, 0.05), rtol=0.0, label_steps=3))
+    reduced.fit_labels()
+    reduced.refine()
+    weights = [problem.joint_weight for problem in problems]
+    assert weights[:2] == pytest.approx([1.0, 0.05**0.5])
+    assert weights == sorted(weights, reverse=True)
+    assert weights[-2:] == pytest.approx([0.05, 0.05])
+
+
+@pytest.fixture(scope="module")
+def rod():
+    """A round rod whose second half bends, and was twisted by a wrong alignment: points, normals, bent, and twisted."""
+    generator = torch.Generator().manual_seed(0)
+    along, around = torch.rand(2, 4000, generator=generator, dtype=torch.float64)
+    along, around = along - 0.5, 2 * torch.pi * around
+    sides = torch.stack([0 * around, around.cos(), around.sin()], dim=-1)
+    points = 0.1 * sides
+    points[:, 0] = along
+    bend, twist = (so3_exp(torch.tensor(axis).double()) for axis in ([0.0, 0.0, 0.4], [0.3, 0.0, 0.0]))
+    end = along > 0
+    bent = torch.where(end[:, None], points @ bend.mT, points)
+    twisted = torch.where(end[:, None], points @ twist.mT @ bend.mT, points)
+    turned = torch.where(end[:, None], sides @ bend.mT, sides)
+    return points, sides, RangeScan(bent, normals=turned), twisted, bend
+
+
+@pytest.mark.parametrize(("weight", "least", "most"), [(0.0, 0.25, 0.35), (1e-4, 0.0, 0.06)])
+def test_bones_do_not_twist_unseen_but_bend_as_seen(rod, weight, least, most):
+    points, normals, target, twisted, bend = rod
+    data = CellData(SparseGrid.from_points(points, 30), points, 60)
+    samples = Samples(points, normals, twisted[None], torch.ones(1, len(points), dtype=torch.float64))
+    labels = (data.grid.cell_centers()[:, 0] > 0).long()
+    config = RegisterConfig(joint_weight=(1e-4, 1e-4), turn_weight=weight, turn_scale=10.0)
+    reduced = ReducedFit(data, samples, (target,), 2, config, labels=labels)
+    for _ in range(8):
+        reduced.update_matches(0.5)
+        reduced.solve_motions()
+    still, moving = reduced.model.transforms.detach()[0, :, :3, :3]
+    left = so3_log(bend.mT @ still.mT @ moving)
+    assert least < float(left[0].abs()) < most
+    assert float(left[1:].norm()) < 0.07
+
+
+@pytest.mark.parametrize(("weight", "least", "most"), [(0.0, 0.15, 0.4), (1e-3, 0.0, 0.08)])
+def test_what_turns_about_one_axis_in_all_frames_does_not_twist_in_some(rod, weight, least, most):
+    points, normals, _, _, _ = rod
+    end, angles = points[:, 0] > 0, torch.tensor([0.0, 0.4, -0.5, 0.7]).double()
+    bends = so3_exp(torch.stack([0 * angles, 0 * angles, angles], dim=-1))
+    # Twists in proportion to the bends would be a hinge of another axis, along which a round rod tells nothing.
+    wrong = torch.tensor([0.0, 0.3, 0.24, 0.0]).double()
+    twists = so3_exp(torch.stack([wrong, 0 * wrong, 0 * wrong], dim=-1))
+    places = [torch.where(end[:, None], points @ bend.mT, points) for bend in bends]
+    sides = [torch.where(end[:, None], normals @ bend.mT, normals) for bend in bends]
+    targets = [RangeScan(place, normals=side) for place, side in zip(places, sides, strict=True)]
+    moved = torch.stack([torch.where(end[:, None], points @ turn.mT, points) for turn in bends @ twists])
+    data = CellData(SparseGrid.from_points(points, 30), points, 60)
+    samples = Samples(points, normals, moved, torch.ones_like(moved[..., 0]))
+    labels = (data.grid.cell_centers()[:, 0] > 0).long()
+    config = RegisterConfig(joint_weight=(1e-4, 1e-4), turn_weight=0.0, hinge_weight=weight, hinge_scale=10.0)
+    reduced = ReducedFit(data, samples, targets, 2, config, labels=labels)
+    for _ in range(8):
+        reduced.update_matches(0.5)
+        reduced.solve_motions()
+    still, moving = reduced.model.transforms.detach()[..., :3, :3].unbind(1)
+    left = so3_log(bends.mT @ still.mT @ moving)
+    assert least < float(left[:, 0].abs().max()) < most
+    assert float(left[:, 1:].norm(dim=-1).max()) < 0.1
+
+
+def test_hinges_need_three_frames_and_give_way_to_joints_that_are_none(toy, problems):
+    whole = RegisterConfig().hinge_weight / RegisterConfig().joint_weight[0]
+    settings, thrice = {"turn_weight": 0.0, "hinge_scale": 1e3}, [*toy[1], toy[1][0]]
+    fit(toy[1], config=RegisterConfig(**settings))[0].solve_motions()
+    fit(thrice, config=RegisterConfig(**settings))[0].solve_motions()
+    fit(thrice, noise=0.01, config=RegisterConfig(**settings | {"hinge_scale": 1e-4}))[0].solve_motions()
+    none, pins, loose = (torch.linalg.eigvalsh(problem.moments.spread) / whole for problem in problems)
+    assert not none.any()
+    # One direction of each joint is held, all the more the clearer it is.
+    assert pins[:, :2].abs().max() < 1e-9
+    assert 0.8 < pins[:, 2].max() < 1
+    assert loose.abs().max() < 0.01
+
+
+def test_nothing_is_a_hinge_that_does_not_turn(rod, problems):
+    points, normals, _, _, _ = rod
+    data = CellData(SparseGrid.from_points(points, 30), points, 60)
+    still = points.expand(3, -1, -1)
+    labels = (data.grid.cell_centers()[:, 0] > 0).long()
+    config, trust = RegisterConfig(turn_weight=0.0), torch.ones(3, len(points), dtype=torch.float64)
+    targets = [RangeScan(points, normals=normals)] * 3
+    ReducedFit(data, Samples(points, normals, still, trust), targets, 2, config, labels=labels).solve_motions()
+    assert problems[0].moments.spread.abs().max() < 1e-9
+
+
+def test_matches_may_settle_before_labels_change(toy, problems):
+    reduced, _ = fit(toy[1][:1], config=RegisterConfig(match_steps=3, label_steps=1))
+    reduced.fit_labels()
+    assert len(problems) == 3
+
+
+def test_turns_count_less_the_wider_they_are(toy, problems):
+    for settings in ({"turn_scale": 1e-3}, {"turn_scale": 1e3}, {"turn_weight": 0.0}):
+        fit(toy[1], config=RegisterConfig(**settings))[0].solve_motions()
+    narrow, wide, none = (problem.moments.spread for problem in problems)
+    assert not none.any()
+    whole = 0.5 * RegisterConfig().turn_weight / RegisterConfig().joint_weight[0]
+    torch.testing.assert_close(wide, (whole * torch.eye(3).double()).expand_as(wide), rtol=1e-4, atol=0.0)
+    assert (narrow.diagonal(dim1=-2, dim2=-1) < 0.01 * whole).any()
+
+
+def test_joints_that_do_not_hold_count_less_and_none_without_weight(toy, problems):
+    scales = ({"joint_scale": (scale, scale)} for scale in (1e-5, 1e5))
+    for settings in (*scales, {"joint_weight": (0.0, 0.0)}):
+        fit(toy[1], noise=0.005, config=RegisterConfig(**settings))[0].solve_motions()
+    loose, firm = (problem.pair_weights for problem in problems)
+    torch.testing.assert_close(firm, torch.ones_like(firm))
+    assert loose.max() < 0.5
+
+
+def test_joints_are_held_first_and_let_go_later(toy, problems):
+    reduced, _ = fit(toy[1], noise=0.005, config=RegisterConfig(joint_scale=(1e5, 1e-5), rtol=0.0))
+    reduced.fit_labels()
+    reduced.refine()
+    torch.testing.assert_close(problems[0].pair_weights, torch.ones_like(problems[0].pair_weights))
+    assert problems[-1].pair_weights.max() < 0.5
+
+
+@pytest.mark.parametrize("settings", [{"reuse": False}, {"refine_steps": 0}, {"blend": "dual_quaternion"}])
+def test_every_step_can_be_left_out(toy, settings):
+    reduced, truth = fit(toy[1][:1], config=RegisterConfig(**settings))
+    reduced.fit_labels()
+    reduced.refine()
+    assert error(reduced, truth) < 0.01

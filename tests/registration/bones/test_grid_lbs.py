@@ -1,0 +1,294 @@
+"""Bones on a grid: the deformation from its definition, batches, gradients, transforms of torch, joints, skeleton."""
+
+import copy
+import math
+
+import pytest
+import torch
+
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.rigid import rigid_matrix, se3_exp, transform_points
+from torchreg.geometry.rotation import so3_exp
+from torchreg.registration.blend import turn_about
+from torchreg.registration.bones.grid_lbs import GridLBS, check_rigid
+from torchreg.registration.bones.sparse_grid import SparseGrid
+
+# torch builds its forward-mode rules with torch.jit.script, and warns about it.
+JACFWD = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
+BLENDS = pytest.mark.parametrize("blend", ["linear", "dual_quaternion"])
+
+
+def bar(count=300, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(count, 3, generator=generator, dtype=torch.float64) * torch.tensor([3.0, 0.5, 0.4])
+
+
+def random_model(blend="linear", num_bones=3, *batch, seed=0, resolution=12):
+    generator = torch.Generator().manual_seed(seed)
+    grid = SparseGrid.from_points(bar(), resolution)
+    weights = torch.rand(grid.num_corners, num_bones, generator=generator, dtype=torch.float64)
+    transforms = se3_exp(0.7 * torch.randn(*batch, num_bones, 6, generator=generator, dtype=torch.float64))
+    return GridLBS(grid, weights, transforms, blend=blend)
+
+
+def elbow(angle=1.0, resolution=24, dtype=torch.float64):
+    """A bar of two halves; the second turns about (1.5, 0.25, 0.2)."""
+    grid = SparseGrid.from_points(bar(4000), resolution, frame="world").to(dtype)
+    labels = (grid.cell_centers()[:, 0] > 1.5).long()
+    turn = so3_exp(torch.tensor([0, 0, angle], dtype=dtype))
+    pivot = torch.tensor([1.5, 0.25, 0.2], dtype=dtype)
+    transforms = torch.stack([torch.eye(4, dtype=dtype), rigid_matrix(turn, pivot - turn @ pivot)])
+    return GridLBS.from_labels(grid, labels, 2, transforms), pivot
+
+
+def test_the_deformation_is_equation_1():
+    model, points = random_model(), bar(20, 1)
+    weights = model.grid.interpolate(model.corner_weights(), points)
+    torch.testing.assert_close(weights.sum(-1), torch.ones(20, dtype=torch.float64))
+    torch.testing.assert_close(model.weights_at(points), weights)
+    torch.testing.assert_close(model.move(points, weights), model(points))
+    for x, row, found in zip(points, weights, model(points), strict=True):
+        expected = sum(w * (t[:3, :3] @ x + t[:3, 3]) for w, t in zip(row, model.transforms, strict=True))
+        torch.testing.assert_close(found, expected)
+
+
+@BLENDS
+def test_a_rescaled_model_moves_space_alike(blend):
+    model, points = random_model(blend), bar(20, 1)
+    origin = torch.tensor([3.0, -1.0, 0.5], dtype=torch.float64)
+    moved = model.rescaled(7.0, origin)(origin + 7 * points)
+    torch.testing.assert_close(moved, origin + 7 * model(points))
+
+
+@BLENDS
+def test_no_motion_moves_nothing_and_one_motion_moves_all_rigidly(blend):
+    model, points = random_model(blend), bar(50, 1)
+    rest = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    torch.testing.assert_close(model(points, rest), points)
+    torch.testing.assert_close(GridLBS(model.grid, model.weights, blend=blend)(points), points)
+    motion = se3_exp(torch.tensor([1.0, 2, 3, 0.4, -0.3, 0.8], dtype=torch.float64))
+    torch.testing.assert_close(model(points, motion.expand(3, 4, 4)), transform_points(motion, points))
+
+
+@BLENDS
+def test_batches_equal_loops(blend):
+    model, points = random_model(blend, 3, 4, 2), bar(10, 1)
+    assert model.twists.shape == (4, 2, 3, 6)
+    found = model(points)
+    assert found.shape == (4, 2, 10, 3)
+    for a in range(4):
+        for b in range(2):
+            torch.testing.assert_close(found[a, b], model(points, model.transforms[a, b]))
+    apart = bar(20, 2).reshape(2, 10, 3)
+    torch.testing.assert_close(model(apart)[3, 1], model(apart[1], model.transforms[3, 1]))
+    vmapped = torch.func.vmap(lambda t: model(points, t))(model.transforms[:, 0])
+    torch.testing.assert_close(vmapped, found[:, 0])
+    per_point = torch.func.vmap(lambda x: model(x[None], model.transforms[0, 0])[0])(points)
+    torch.testing.assert_close(per_point, found[0, 0])
+
+
+@JACFWD
+@BLENDS
+def test_the_jacobian_equals_automatic_differentiation(blend):
+    model, points = random_model(blend, 3, 2), bar(6, 1)
+    moved, jacobian = model.jacobian(points)
+    torch.testing.assert_close(moved, model(points))
+    transforms = model.transforms.detach()
+    centers = transform_points(transforms, model.middles.unsqueeze(-2)).squeeze(-2)
+
+    def posed(twists):
+        return model(points, turn_about(transforms[1], twists, centers[1]))
+
+    zero = torch.zeros(3, 6, dtype=torch.float64)
+    for differentiate in (torch.func.jacfwd, torch.func.jacrev):
+        torch.testing.assert_close(jacobian[1], differentiate(posed)(zero), atol=1e-12, rtol=1e-10)
+
+
+@BLENDS
+def test_gradients(blend):
+    model, points = random_model(blend, resolution=3), bar(3, 1)
+    names = ("weights", "twists")
+
+    def posed(points, transforms, *parameters):
+        values = dict(zip(names, parameters, strict=True))
+        own = torch.func.functional_call(model, values, (points,))
+        return own + torch.func.functional_call(model, values, (points, transforms))
+
+    inputs = (points, model.transforms, *(getattr(model, name) for name in names))
+    assert torch.autograd.gradcheck(posed, tuple(value.detach().clone().requires_grad_() for value in inputs))
+
+
+def test_twists_turn_bones_about_their_middles():
+    model, _ = elbow(0.0)
+    with torch.no_grad():
+        model.twists[1] = torch.tensor([0, 0.1, 0, 0, 0, 0.5])
+    middle = model.middles[1:]
+    torch.testing.assert_close(
+        transform_points(model.transforms[1], middle), middle + torch.tensor([0, 0.1, 0]).double()
+    )
+    fixed = model.transforms.detach()
+    model.set_transforms_(fixed)
+    assert bool((model.twists == 0).all())
+    torch.testing.assert_close(model.transforms, fixed)
+    model.set_transforms_(fixed.expand(5, 2, 4, 4))
+    assert model.twists.shape == (5, 2, 6)
+    assert model.twists.requires_grad
+
+
+def test_an_optimizer_finds_a_pose():
+    model, _ = elbow(0.6, 12)
+    points = bar(60, 3)
+    goal = model(points).detach()
+    model.set_transforms_(torch.eye(4, dtype=torch.float64).repeat(2, 1, 1))
+    model.weights.requires_grad_(False)
+    optimizer = torch.optim.LBFGS([model.twists], max_iter=100, line_search_fn="strong_wolfe")
+
+    def closure():
+        optimizer.zero_grad()
+        loss = (model(points) - goal).square().sum()
+        loss.backward()
+        return loss
+
+    optimizer.step(closure)
+    assert float((model(points) - goal).detach().norm(dim=-1).max()) < 1e-3
+
+
+def test_labels_give_rigid_parts_with_shared_corners():
+    model, _ = elbow()
+    left, right = model.weights_at(torch.tensor([[0.5, 0.2, 0.2], [2.5, 0.2, 0.2]]).double())
+    assert left.tolist() == [1.0, 0.0]
+    assert right.tolist() == [0.0, 1.0]
+    for bad, message in (
+        (torch.full((model.grid.num_cells,), 2), "labels must be 0 to 1"),
+        (torch.zeros(2).long(), "shape"),
+    ):
+        with pytest.raises(InputError, match=message):
+            GridLBS.from_labels(model.grid, bad, 2)
+    with pytest.raises(InputTypeError, match="labels must hold integers"):
+        GridLBS.from_labels(model.grid, torch.zeros(model.grid.num_cells), 2)
+
+
+def test_weights_for_files_keep_the_largest():
+    model, points = random_model(num_bones=6), bar(30, 1)
+    weights = model.vertex_weights(points)
+    four = model.vertex_weights(points, most=4)
+    assert bool(((four > 0).sum(-1) == 4).all())
+    torch.testing.assert_close(four.sum(-1), torch.ones(30, dtype=torch.float64))
+    kept = four > 0
+    assert bool((weights.masked_fill(~kept, 1).amin(-1) >= weights.masked_fill(kept, 0).amax(-1)).all())
+    torch.testing.assert_close(four, weights * kept / (weights * kept).sum(-1, keepdim=True))
+    torch.testing.assert_close(model.vertex_weights(points, most=6), weights)
+    with pytest.raises(InputError, match="most must be at least 1"):
+        model.vertex_weights(points, most=0)
+
+
+@pytest.mark.parametrize("angle", [0.5, 1.5, math.pi])
+def test_the_elbow_is_found(angle):
+    model, pivot = elbow(angle)
+    joints = model.joints()
+    assert joints.pairs.tolist() == [[0, 1]]
+    torch.testing.assert_close(joints.centers[0], pivot, atol=0.03, rtol=0)
+    tree = model.skeleton()
+    assert sorted(tree.parents) in ([-1, 0], [-1, 1])
+    child = tree.parents.index(max(tree.parents))
+    torch.testing.assert_close(tree.origins[child], joints.centers[0])
+    torch.testing.assert_close(tree.origins[1 - child], model.middles[1 - child])
+
+
+def test_a_hidden_elbow_is_found_across_the_gap():
+    points, turn = bar(4000), so3_exp(torch.tensor([0, 0, 1.0], dtype=torch.float64))
+    grid = SparseGrid.from_points(points[(points[:, 0] - 1.5).abs() > 0.4], 24, frame="world")
+    pivot = torch.tensor([1.5, 0.25, 0.2], dtype=torch.float64)
+    transforms = torch.stack([torch.eye(4, dtype=torch.float64), rigid_matrix(turn, pivot - turn @ pivot)])
+    model = GridLBS.from_labels(grid, (grid.cell_centers()[:, 0] > 1.5).long(), 2, transforms)
+    assert len(model.joint_moments().pairs) == 0
+    joints = model.joints()
+    assert joints.pairs.tolist() == [[0, 1]]
+    assert joints.mass.tolist() == [0.0]
+    torch.testing.assert_close(joints.centers[0, :2], pivot[:2], atol=0.03, rtol=0)
+    assert sorted(model.skeleton().parents) in ([-1, 0], [-1, 1])
+
+
+def test_moments_are_those_of_the_normalized_weights():
+    model = random_model()
+    with torch.no_grad():
+        model.weights.mul_(3)
+    mass = model.joint_moments().mass
+    torch.testing.assert_close(mass, random_model().joint_moments().mass)
+    torch.testing.assert_close(model.joint_moments(pairs=torch.tensor([[1, 2]])).mass, mass[2:])
+
+
+@pytest.mark.parametrize("blend", ["linear", "dual_quaternion"])
+def test_compiles_whole_and_exports(blend):
+    model, points = random_model(blend), bar(20, 1)
+    expected = model(points)
+    torch.testing.assert_close(torch.compile(model, fullgraph=True, backend="eager")(points), expected)
+    count = torch.export.Dim("count", min=2, max=100)
+    program = torch.export.export(model, (points,), dynamic_shapes=({0: count},))
+    torch.testing.assert_close(program.module()(bar(30, 2)), model(bar(30, 2)))
+
+
+def test_moves_between_dtypes_and_into_records():
+    model, points = random_model("dual_quaternion", 3, 2), bar(10, 1)
+    single = copy.deepcopy(model).float()
+    assert single(points.float()).dtype == torch.float32
+    torch.testing.assert_close(single(points.float()).double(), model(points), atol=1e-4, rtol=0)
+    assert single.grid.origin.dtype == torch.float32
+    again = GridLBS.from_record(model.record())
+    assert torch.equal(again(points), model(points))
+    assert torch.equal(again.weights, model.weights)
+    fresh = GridLBS(model.grid, torch.ones_like(model.weights), model.transforms, blend="dual_quaternion")
+    fresh.load_state_dict(model.state_dict())
+    assert torch.equal(fresh(points), model(points))
+    assert "3 bones" in repr(model)
+    assert "dual_quaternion" in repr(model)
+
+
+def test_one_bone_and_bones_without_cells():
+    grid = SparseGrid.from_points(bar(), 4)
+    one = GridLBS(grid, torch.ones(grid.num_corners, 1))
+    torch.testing.assert_close(one(bar()), bar())
+    assert one.skeleton().parents == (-1,)
+    idle = GridLBS.from_labels(grid, torch.zeros(grid.num_cells).long(), 3)
+    assert idle.skeleton().parents == (-1, -1, -1)
+    torch.testing.assert_close(idle.middles[1:], grid.corner_points().mean(0).expand(2, 3))
+    assert len(idle.joints().pairs) == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"weights": torch.ones(3, 2)}, "weights must have shape"),
+        ({"weights": -1.0}, "weights must not be negative"),
+        ({"weights": 0.0}, "must have a positive entry"),
+        ({"weights": math.nan}, "weights must be finite"),
+        ({"transforms": torch.eye(4)}, "transforms must have shape"),
+        ({"transforms": 2 * torch.eye(4).repeat(2, 1, 1)}, "rigid motions"),
+        ({"transforms": torch.diag(torch.tensor([1.0, 1, -1, 1])).repeat(2, 1, 1)}, "rigid motions"),
+        ({"transforms": torch.full((2, 4, 4), math.inf)}, "transforms must be finite"),
+        ({"blend": "cubic"}, "blend must be one of"),
+    ],
+)
+def test_bad_input_is_named(change, message):
+    grid = SparseGrid.from_points(bar(), 4)
+    weights = change.pop("weights", 1.0)
+    weights = torch.full((grid.num_corners, 2), weights) if isinstance(weights, float) else weights
+    with pytest.raises(InputError, match=message):
+        GridLBS(grid, weights, **change)
+
+
+def test_rigidity_is_checked_to_single_precision():
+    check_rigid(se3_exp(torch.randn(5, 6)), "motions")
+    check_rigid(torch.zeros(0, 4, 4), "motions")
+    with pytest.raises(InputError, match="motions must hold rigid motions"):
+        check_rigid(torch.ones(4, 4)[None], "motions")
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@BLENDS
+def test_on_a_graphics_card(blend):
+    model, points = random_model(blend), bar(50, 1)
+    there = copy.deepcopy(model).to("cuda")
+    moved = there(points.cuda())
+    assert moved.is_cuda
+    torch.testing.assert_close(moved.cpu(), model(points))

@@ -1,0 +1,220 @@
+"""Sparse grids: cells, corners and neighbors against loops, trilinear values, and what turning and scaling leave."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import RegularGridInterpolator
+from scipy.spatial.transform import Rotation
+
+from torchreg.errors import InputError, InputTypeError
+from torchreg.registration.bones.sparse_grid import SparseGrid, locate
+
+
+def surface(count=800, seed=0, dtype=torch.float64):
+    """A bent, uneven tube: principal axes and their signs are clear."""
+    generator = torch.Generator().manual_seed(seed)
+    along, around = torch.rand(2, count, generator=generator, dtype=torch.float64)
+    angle, radius = 2 * math.pi * around, 0.1 + 0.1 * along
+    points = [2 * along**2, radius * angle.cos() + 0.4 * along**2, 0.6 * radius * angle.sin() + 0.1 * along]
+    return torch.stack(points, dim=-1).to(dtype)
+
+
+def blocks(*cells, spacing=1.0):
+    cells = torch.tensor(sorted(cells))
+    shape = tuple(int(n) + 1 for n in cells.amax(0))
+    return SparseGrid(cells, shape, torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64), spacing)
+
+
+def test_cells_are_those_that_hold_points():
+    points = surface()
+    grid = SparseGrid.from_points(points, 20, frame="world")
+    low, high = points.amin(0), points.amax(0)
+    assert grid.spacing == pytest.approx(float((high - low).max()) / 20)
+    held = {tuple(c) for c in grid.coordinates(points).floor().clamp(min=0).long().clamp(max=19).tolist()}
+    assert {tuple(c) for c in grid.cells.tolist()} == held
+    assert grid.shape[0] == 20
+    assert grid.num_cells == len(grid.cells) == len(grid.cell_centers())
+    assert "cells of" in repr(grid)
+
+
+def test_corners_are_shared():
+    grid = SparseGrid.from_points(surface(), 6)
+    table = {tuple(c): k for k, c in enumerate(grid.corners.tolist())}
+    assert len(table) == grid.num_corners
+    for cell, corners in zip(grid.cells.tolist(), grid.cell_corners.tolist(), strict=True):
+        for number, corner in enumerate(corners):
+            offset = (number >> 2 & 1, number >> 1 & 1, number & 1)
+            assert table[tuple(np.add(cell, offset))] == corner
+    used = grid.cell_corners.unique()
+    assert torch.equal(used, torch.arange(grid.num_corners))
+    expected = grid.origin + grid.spacing * grid.corners.double() @ grid.axes.mT
+    torch.testing.assert_close(grid.corner_points(), expected)
+    middle = grid.corner_points()[grid.cell_corners].mean(1)
+    torch.testing.assert_close(grid.cell_centers(), middle)
+
+
+def test_values_are_trilinear():
+    points = surface(300)
+    grid = SparseGrid.from_points(points, 9, frame="world")
+    size = [n + 1 for n in grid.shape]
+    dense = np.random.default_rng(0).normal(size=[*size, 2])
+    values = torch.from_numpy(dense[tuple(grid.corners.numpy().T)])
+    oracle = RegularGridInterpolator([np.arange(n) for n in size], dense)
+    expected = oracle(grid.coordinates(points).numpy().clip(0, np.array(grid.shape)))
+    np.testing.assert_allclose(grid.interpolate(values, points).numpy(), expected, atol=1e-12)
+    place = grid.locate(points)
+    assert bool((place.coefficients >= 0).all())
+    torch.testing.assert_close(place.coefficients.sum(-1), torch.ones(300, dtype=torch.float64))
+    corners = grid.corner_points()[grid.cell_corners[place.cell]]
+    torch.testing.assert_close((place.coefficients.unsqueeze(-1) * corners).sum(1), points)
+
+
+def test_points_outside_take_the_nearest_cell():
+    grid = blocks((0, 0, 0), (4, 0, 0))
+    points = torch.tensor([[1.4, 0.5, 0.5], [3.6, 0.5, 0.5], [9.0, 7.0, -3.0], [-5.0, 0.2, 0.5]], dtype=torch.float64)
+    place = grid.locate(points)
+    assert place.cell.tolist() == [0, 1, 1, 0]
+    nearest = (place.coefficients.unsqueeze(-1) * grid.corner_points()[grid.cell_corners[place.cell]]).sum(1)
+    box = torch.tensor([[1.0, 0.5, 0.5], [4.0, 0.5, 0.5], [5.0, 1.0, 0.0], [0.0, 0.2, 0.5]], dtype=torch.float64)
+    torch.testing.assert_close(nearest, box)
+    random = torch.rand(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 3
+    some = SparseGrid.from_points(surface(), 15)
+    cells = some.locate(some.origin + random).cell
+    # The distance of places, between middles of cells, is the least there is.
+    at = some.coordinates(some.origin + random).floor()
+    at = torch.minimum(at.clamp(min=0), torch.tensor(some.shape) - 1.0)
+    far = torch.cdist(at, some.cells.double())
+    torch.testing.assert_close(far.gather(1, cells[:, None])[:, 0], far.amin(1))
+
+
+def test_batches_and_gradients():
+    grid = SparseGrid.from_points(surface(), 9)
+    points = surface(24, 1)
+    values = torch.rand(grid.num_corners, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    batch = grid.interpolate(values, points.reshape(2, 3, 4, 3))
+    torch.testing.assert_close(batch.reshape(24, 3), grid.interpolate(values, points))
+    assert torch.autograd.gradcheck(
+        grid.interpolate, (values.clone().requires_grad_(), points[:4].clone().requires_grad_())
+    )
+    place = torch.func.vmap(lambda p: locate(p, grid.shape, grid.cells, grid.nearest))(grid.coordinates(points))
+    assert torch.equal(place.cell, grid.locate(points).cell)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
+def test_turning_and_scaling_change_nothing_else(factor):
+    points = surface()
+    grid = SparseGrid.from_points(points, 25)
+    turn = torch.from_numpy(Rotation.from_rotvec([0.5, -1.0, 2.0]).as_matrix())
+    shift = factor * torch.tensor([3.0, -2.0, 1.0], dtype=torch.float64)
+    moved = factor * points @ turn.mT + shift
+    other = SparseGrid.from_points(moved, 25)
+    assert other.shape == grid.shape
+    assert torch.equal(other.cells, grid.cells)
+    assert other.spacing == pytest.approx(factor * grid.spacing)
+    torch.testing.assert_close(other.corner_points(), factor * grid.corner_points() @ turn.mT + shift)
+    assert torch.equal(other.locate(moved).cell, grid.locate(points).cell)
+    assert torch.equal(other.edges(), grid.edges())
+
+
+def test_order_and_repetition_of_points_change_nothing():
+    points = surface()
+    grid = SparseGrid.from_points(points, 25, frame="world")
+    mixed = torch.cat([points, points[:100]])[torch.randperm(900, generator=torch.Generator().manual_seed(0))]
+    assert torch.equal(SparseGrid.from_points(mixed, 25, frame="world").cells, grid.cells)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_flat_and_straight_scans(dtype):
+    plane = surface(dtype=dtype) * torch.tensor([1.0, 1.0, 0.0], dtype=dtype)
+    grid = SparseGrid.from_points(plane, 10)
+    assert sorted(grid.shape)[0] == 1
+    # Amid the cells, so that rounding takes no point across a side.
+    flat = (grid.coordinates(plane) - 0.5).abs().amin(-1)
+    assert float(flat.max()) < 1e-5
+    line = SparseGrid.from_points(plane * torch.tensor([1.0, 0.0, 0.0], dtype=dtype), 10)
+    assert line.shape == (10, 1, 1)
+    assert line.origin.dtype == dtype
+    two = SparseGrid.from_points(torch.tensor([[0.0, 0, 0], [1.0, 0, 0]], dtype=dtype), 1)
+    assert two.num_cells == 1
+
+
+def test_edges_are_those_of_the_cells():
+    grid = blocks((0, 0, 0), (0, 0, 1), (2, 0, 0))
+    assert len(grid.edges()) == 20 + 12
+    steps = grid.corners[grid.edges()].diff(dim=1)[:, 0]
+    assert bool((steps.sum(-1) == 1).all())
+    assert bool((steps >= 0).all())
+
+
+def test_neighbors_share_a_side():
+    grid = SparseGrid.from_points(surface(), 14)
+    cells = grid.cells.tolist()
+    expected = [
+        [a, b]
+        for a in range(len(cells))
+        for b in range(a + 1, len(cells))
+        if sum(abs(x - y) for x, y in zip(cells[a], cells[b], strict=True)) == 1
+    ]
+    assert grid.neighbors(-1).tolist() == expected
+
+
+def test_gaps_are_bridged_by_the_nearest_cells():
+    grid = blocks((0, 0, 0), (1, 0, 0), (2, 1, 0), (5, 0, 0), (5, 1, 0))
+    assert grid.neighbors(-1).tolist() == [[0, 1], [3, 4]]
+    assert grid.regions(-1).unique().tolist() == [0, 1, 2]
+    assert grid.neighbors().tolist() == [[0, 1], [1, 2], [3, 4]]
+    assert grid.neighbors(2).tolist() == [[0, 1], [1, 2], [2, 4], [3, 4]]
+    assert len(grid.regions(2).unique()) == 1
+    with pytest.raises(InputError, match="gap must be finite"):
+        grid.neighbors(math.nan)
+
+
+def test_regions_are_linked_however_far_apart():
+    grid = blocks((0, 0, 0), (1, 0, 0), (1, 1, 0), (7, 0, 0), (7, 1, 0), (9, 0, 0))
+    assert sorted(grid.links().tolist()) == [[1, 3], [2, 4], [3, 5]]
+    assert blocks((0, 0, 0), (1, 1, 1)).links().shape == (0, 2)
+
+
+def test_labels_are_averaged_at_shared_corners():
+    grid = blocks((0, 0, 0), (0, 0, 1))
+    weights = grid.spread_to_corners(torch.eye(2, dtype=torch.float64))
+    by_height = {2: [0.0, 1.0], 1: [0.5, 0.5], 0: [1.0, 0.0]}
+    for corner, row in zip(grid.corners.tolist(), weights.tolist(), strict=True):
+        assert row == by_height[corner[2]]
+
+
+def test_conversion_keeps_the_grid():
+    grid = SparseGrid.from_points(surface(), 14)
+    single = grid.to(torch.float32)
+    assert single.origin.dtype == single.axes.dtype == torch.float32
+    assert torch.equal(single.cells, grid.cells)
+    torch.testing.assert_close(single.corner_points(), grid.corner_points().float())
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: SparseGrid.from_points(torch.zeros(5, 3)), "different places"),
+        (lambda: SparseGrid.from_points(torch.zeros(0, 3)), "at least 1 point"),
+        (lambda: SparseGrid.from_points(torch.full((5, 3), torch.nan)), "points must be finite"),
+        (lambda: SparseGrid.from_points(surface(), 0), "resolution must be at least 1"),
+        (lambda: SparseGrid.from_points(surface(), 300), "resolution must be at most 256"),
+        (lambda: SparseGrid.from_points(surface(), frame="camera"), "frame must be one of"),
+        (lambda: blocks((0, 0, 0), (0, 0, 0)), "must be different"),
+        (lambda: SparseGrid(torch.zeros(0, 3).long(), (1, 1, 1), torch.zeros(3), torch.eye(3), 1.0), "at least one"),
+        (lambda: SparseGrid(torch.tensor([[0, 0, 2]]), (1, 1, 1), torch.zeros(3), torch.eye(3), 1.0), "lie in the box"),
+        (lambda: SparseGrid(torch.tensor([[0, 0, 0]]), (1, 0, 1), torch.zeros(3), torch.eye(3), 1.0), "three counts"),
+        (lambda: SparseGrid(torch.tensor([[0, 0, 0]]), (1, 1, 1), torch.zeros(3), -torch.eye(3), 1.0), "a rotation"),
+        (lambda: SparseGrid(torch.tensor([[0, 0, 0]]), (1, 1, 1), torch.zeros(3), torch.eye(3), 0.0), "spacing must"),
+    ],
+)
+def test_bad_input_is_named(call, message):
+    with pytest.raises(InputError, match=message):
+        call()
+
+
+def test_cells_must_be_integers():
+    with pytest.raises(InputTypeError, match="cells must hold integers"):
+        SparseGrid(torch.zeros(1, 3), (1, 1, 1), torch.zeros(3), torch.eye(3), 1.0)

@@ -1,0 +1,200 @@
+"""Refined weights: both methods against scipy on rows built by hand, and what refinement may and may not do."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import nnls as scipy_nnls
+
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.rigid import rigid_matrix, se3_exp, transform_points
+from torchreg.geometry.rotation import so3_exp
+from torchreg.registration.bones.grid_lbs import GridLBS
+from torchreg.registration.bones.sparse_grid import SparseGrid
+from torchreg.registration.bones.weights import RefineConfig, refine_weights
+
+METHODS = pytest.mark.parametrize("method", ["active_set", "gradient"])
+
+
+def bar(count=200, dtype=torch.float64):
+    points = torch.rand(count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return (points * torch.tensor([3.0, 0.5, 0.4])).to(dtype)
+
+
+def scene(batch=(), resolution=10, angle=0.8, dtype=torch.float64):
+    """A bar whose second half turns; its true weights pass smoothly from one half to the other."""
+    points = bar(dtype=dtype)
+    grid = SparseGrid.from_points(points, resolution, frame="world")
+    labels = (grid.cell_centers()[:, 0] > 1.5).long()
+    turn = so3_exp(torch.tensor([0, 0, angle], dtype=dtype))
+    pivot = torch.tensor([1.5, 0.25, 0.2], dtype=dtype)
+    transforms = torch.stack([torch.eye(4, dtype=dtype), rigid_matrix(turn, pivot - turn @ pivot)])
+    transforms = se3_exp(0.1 * torch.ones(*batch, 1, 6, dtype=dtype)) @ transforms
+    model = GridLBS.from_labels(grid, labels, 2, transforms)
+    share = ((points[:, :1] - 1.0) / 1.0).clamp(0, 1)
+    parts = transform_points(transforms, points.expand(*batch, 2, -1, 3))
+    targets = (1 - share) * parts[..., 0, :, :] + share * parts[..., 1, :, :]
+    normals = torch.randn(*targets.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(dtype)
+    return model, points, targets, torch.nn.functional.normalize(normals, dim=-1)
+
+
+def reachable(model, steps):
+    """Corners (K, B) within so many edges of a label, by walking."""
+    found = model.corner_weights().detach() > 0
+    for _ in range(steps):
+        grown = found.clone()
+        for c, d in model.grid.edges().tolist():
+            grown[c] |= found[d]
+            grown[d] |= found[c]
+        found = grown
+    return found
+
+
+def least_squares_by_hand(model, points, targets, normals, weights, config):
+    """A and b of the objective over the reachable corners and bones, one entry at a time."""
+    grid, labels = model.grid, model.corner_weights().detach()
+    where = reachable(model, config.reach).nonzero().tolist()
+    column = {tuple(entry): k for k, entry in enumerate(where)}
+    rows, right = [], []
+
+    def add(entries, target):
+        row = np.zeros(len(column))
+        for key, value in entries:
+            if key in column:
+                row[column[key]] += value
+        rows.append(row)
+        right.append(target)
+
+    place = grid.locate(points)
+    scale = config.distance * grid.num_cells / float(weights.sum())
+    for k in range(len(points)):
+        off = (transform_points(model.transforms.detach(), points[k].expand(2, 1, 3))[:, 0] - targets[k]) / grid.spacing
+        corners = grid.cell_corners[place.cell[k]].tolist()
+        directions = [((1 - config.point_to_point) ** 0.5, normals[k])]
+        directions += [(config.point_to_point**0.5, axis) for axis in torch.eye(3, dtype=torch.float64)]
+        for factor, direction in directions:
+            factor = factor * float(scale * weights[k]) ** 0.5
+            entries = [
+                ((c, j), factor * float(place.coefficients[k, s] * (off[j] @ direction)))
+                for s, c in enumerate(corners)
+                for j in range(2)
+            ]
+            add(entries, 0.0)
+    for c, d in grid.edges().tolist():
+        for j in range(2):
+            add([((c, j), config.smoothness**0.5), ((d, j), -(config.smoothness**0.5))], 0.0)
+    for c in range(grid.num_corners):
+        add([((c, j), config.normalization**0.5) for j in range(2)], config.normalization**0.5)
+        for j in range(2):
+            add([((c, j), config.closeness**0.5)], config.closeness**0.5 * float(labels[c, j]))
+    return np.array(rows), np.array(right), where
+
+
+@METHODS
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_the_objective_is_scipys(method, share):
+    model, points, targets, normals = scene()
+    weights = torch.rand(200, generator=torch.Generator().manual_seed(2), dtype=torch.float64).clamp_min(0.4) - 0.4
+    config = RefineConfig(distance=2.0, reach=2, closeness=0.1, point_to_point=share, method=method)
+    a, b, where = least_squares_by_hand(model, points, targets, normals, weights, config)
+    best, residual = scipy_nnls(a, b)
+    found = refine_weights(model, points, targets, normals, weights, config=config)
+    assert found.converged
+    assert found.objective == pytest.approx(residual**2, rel=1e-6 if method == "active_set" else 1e-2)
+    labels = model.corner_weights().detach()
+    start = np.array([float(labels[c, j]) for c, j in where])
+    assert found.start_objective == pytest.approx(float(((a @ start - b) ** 2).sum()))
+    raw = torch.zeros_like(found.weights)
+    raw[tuple(np.array(where).T)] = torch.from_numpy(best)
+    torch.testing.assert_close(found.weights, raw / raw.sum(-1, keepdim=True), atol=5e-3, rtol=0)
+
+
+def test_both_methods_agree_over_several_poses():
+    model, points, targets, normals = scene((2,))
+    found = [
+        refine_weights(model, points, targets, normals, config=RefineConfig(method=method))
+        for method in ("active_set", "gradient")
+    ]
+    assert found[1].objective == pytest.approx(found[0].objective, rel=1e-2)
+    assert found[0].objective < found[0].start_objective
+    torch.testing.assert_close(found[0].weights, found[1].weights, atol=5e-3, rtol=0)
+
+
+@METHODS
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_refinement_fits_better_and_stays_weights(method, dtype):
+    model, points, targets, normals = scene(dtype=dtype)
+    before = model.weights.detach().clone()
+    config = RefineConfig(point_to_point=0.5, distance=20.0, method=method)
+    found = refine_weights(model, points, targets, normals, config=config).weights
+    assert torch.equal(model.weights, before)
+    assert found.dtype == dtype
+    assert bool((found >= 0).all())
+    torch.testing.assert_close(found.sum(-1), torch.ones(len(found), dtype=dtype))
+    refined = GridLBS(model.grid, found, model.transforms)
+    with torch.no_grad():
+        error = [float((one(points) - targets).norm(dim=-1).mean()) for one in (model, refined)]
+    assert error[1] < 0.5 * error[0]
+
+
+def test_reach_limits_bones_to_corners_near_their_labels():
+    model, points, targets, normals = scene()
+    for reach in (0, 1):
+        found = refine_weights(model, points, targets, normals, config=RefineConfig(reach=reach)).weights
+        assert not bool((found[~reachable(model, reach)] > 0).any())
+
+
+def test_dropped_matches_do_not_count():
+    model, points, targets, normals = scene()
+    seen = (points[:, 0] < 1.4).double()
+    expected = refine_weights(model, points, targets, normals, seen)
+    targets[seen == 0] = torch.nan
+    found = refine_weights(model, points, targets, normals, seen)
+    assert torch.equal(found.weights, expected.weights)
+    nothing = refine_weights(model, points, targets, normals, 0 * seen, config=RefineConfig(smoothness=0.0))
+    torch.testing.assert_close(nothing.weights, model.corner_weights().detach(), atol=1e-6, rtol=0)
+
+
+def test_motions_and_units_change_nothing_else():
+    model, points, targets, normals = scene()
+    expected = refine_weights(model, points, targets, normals)
+    motion = se3_exp(torch.tensor([5.0, -2, 1, 1, 0.5, -1], dtype=torch.float64))
+    moved = GridLBS(model.grid, model.weights, motion @ model.transforms)
+    turned = refine_weights(moved, points, transform_points(motion, targets), normals @ motion[:3, :3].mT)
+    assert turned.objective == pytest.approx(expected.objective)
+    torch.testing.assert_close(turned.weights, expected.weights, atol=1e-4, rtol=0)
+    grid = model.grid
+    wide = SparseGrid(grid.cells, grid.shape, 100 * grid.origin, grid.axes, 100 * grid.spacing)
+    transforms = model.transforms.detach().clone()
+    transforms[:, :3, 3] *= 100
+    scaled = refine_weights(GridLBS(wide, model.weights, transforms), 100 * points, 100 * targets, normals)
+    assert scaled.objective == pytest.approx(expected.objective)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"closeness": 0.0}, "closeness must be positive"),
+        ({"distance": -1.0}, "distance must be zero or positive"),
+        ({"reach": -1}, "reach must be at least 0"),
+        ({"point_to_point": 2.0}, "point_to_point must be"),
+        ({"method": "guess"}, "method must be one of"),
+        ({"max_steps": 0}, "max_steps must be at least 1"),
+    ],
+)
+def test_bad_settings_are_named(change, message):
+    with pytest.raises(InputError, match=message):
+        RefineConfig(**change)
+
+
+def test_bad_input_is_named():
+    model, points, targets, normals = scene()
+    with pytest.raises(InputError, match="normals are needed"):
+        refine_weights(model, points, targets)
+    with pytest.raises(InputError, match="targets must have shape"):
+        refine_weights(model, points, targets[1:], normals)
+    with pytest.raises(InputError, match="points must be finite"):
+        refine_weights(model, points * torch.nan, targets, normals)
+    with pytest.raises(InputError, match="match_weights must have shape"):
+        refine_weights(model, points, targets, normals, torch.ones(3))
+    with pytest.raises(InputTypeError, match="points is"):
+        refine_weights(model, points.float(), targets, normals)

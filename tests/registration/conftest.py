@@ -1,0 +1,89 @@
+"""A limb of three bones, and parts of a figure, that the tests of scan registration share."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from torchreg.geometry.rigid import rigid_matrix, se3_exp
+from torchreg.geometry.rotation import so3_exp
+from torchreg.registration.bones.grid_lbs import GridLBS
+from torchreg.registration.bones.motion_problem import BoneProblem, bind
+from torchreg.registration.bones.sparse_grid import SparseGrid
+
+BONES = 3
+
+
+def draw(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def limb(count=400):
+    """A bent limb of three bones, with outward normals of a tube."""
+    along, around = torch.rand(2, count, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    angle = 2 * math.pi * around
+    ring = torch.stack([torch.zeros_like(angle), angle.cos(), 0.7 * angle.sin()], dim=-1)
+    points = 0.15 * ring + torch.stack([3 * along, 0.1 * along, 0 * along], dim=-1)
+    return points, torch.nn.functional.normalize(ring / torch.tensor([1.0, 1.0, 0.49]), dim=-1)
+
+
+def model_of(points, blend="linear", resolution=24):
+    grid = SparseGrid.from_points(points, resolution, frame="world")
+    labels = grid.cell_centers()[:, 0].long().clamp(0, BONES - 1)
+    return GridLBS.from_labels(grid, labels, BONES, blend=blend)
+
+
+def bent(angle=0.6):
+    """Motions of the limb: bent at x = 1 and x = 2."""
+    motions = [torch.eye(4, dtype=torch.float64)]
+    for place in (1.0, 2.0):
+        pivot = torch.tensor([place, 0.05 * place, 0], dtype=torch.float64)
+        turn = so3_exp(torch.tensor([0.2 * angle, 0, angle], dtype=torch.float64))
+        motions.append(motions[-1] @ rigid_matrix(turn, pivot - turn @ pivot))
+    return se3_exp(torch.tensor([0.1, -0.2, 0.1, 0.2, 0.1, 0], dtype=torch.float64)) @ torch.stack(motions)
+
+
+def noisy_problem(blend="linear", share=0.0, batch=(2,)):
+    points, _ = limb(60)
+    model = model_of(points, blend, 8)
+    with torch.no_grad():
+        weights = model.weights_at(points)
+        moments = model.joint_moments()
+    normals = torch.nn.functional.normalize(draw(*batch, 60, 3, seed=1), dim=-1)
+    match_weights = draw(*batch, 60, seed=2).clamp_min(0)
+    targets = points + 0.1 * draw(*batch, 60, 3, seed=3)
+    problem = BoneProblem(
+        points,
+        bind(weights),
+        targets,
+        normals,
+        match_weights,
+        point_to_point=share,
+        moments=moments,
+        joint_weight=0.7,
+        pair_weights=torch.linspace(0.5, 1.5, len(moments.pairs)).double(),
+        anchors=se3_exp(0.3 * draw(BONES, 6, seed=4)),
+        anchor_weights=torch.tensor([0.1, 0.0, 0.3], dtype=torch.float64),
+        blend=blend,
+    )
+    return problem, model
+
+
+@pytest.fixture(scope="session")
+def bones():
+    """A limb of three bones: how to make it, its model, poses and noisy matches."""
+    makers = (draw, limb, model_of, bent, noisy_problem)
+    return SimpleNamespace(COUNT=BONES, **{maker.__name__: maker for maker in makers})
+
+
+@pytest.fixture(scope="session")
+def lower_legs():
+    """Return a function of a problem and its pair of a figure: samples (S,) of the left and of the right lower leg."""
+
+    def find(problem, pair):
+        names, labels = pair.part_names, pair.labels[problem.samples]
+        below = [[names.index(f"{side} {part}") for part in ("shin", "foot")] for side in ("left", "right")]
+        return [torch.isin(labels, torch.tensor(parts)) for parts in below]
+
+    return find

@@ -1,0 +1,80 @@
+import pytest
+
+from torchreg.errors import InputError
+from torchreg.registration.dense.config import (
+    AssignConfig,
+    ChoiceConfig,
+    MatchConfig,
+    RefineConfig,
+    ScanAlignConfig,
+    ScanAlignRecord,
+)
+from torchreg.registration.dense.e_step import ScanEMConfig
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "message"),
+    [
+        (MatchConfig, {"num_points": 0}, "num_points must be at least 1"),
+        (MatchConfig, {"descriptor": "sift"}, "descriptor must be one of"),
+        (
+            ScanAlignConfig,
+            {"curvature_radii": (0.02, 0.05), "match": MatchConfig(descriptor="learned")},
+            "curvature_radii must be .*spin_image",
+        ),
+        (MatchConfig, {"radius": 0.0}, "radius must be positive"),
+        (MatchConfig, {"stiffness": ()}, "stiffness must hold"),
+        (MatchConfig, {"stiffness": (1.0, -1.0)}, "stiffness must be positive"),
+        (AssignConfig, {"reach": (0.1, 0.0)}, "reach must be positive"),
+        (AssignConfig, {"stiffness": (0.1,)}, "stiffness must be two numbers"),
+        (AssignConfig, {"feature_weight": -0.1}, "feature_weight must be"),
+        (RefineConfig, {"final_steps": -1}, "final_steps must be at least 0"),
+        (RefineConfig, {"slow_steps": -1}, "slow_steps must be at least 0"),
+        (RefineConfig, {"slide": (1.0, 0.0)}, "slide must be positive"),
+        (RefineConfig, {"density": -1.0}, "density must be"),
+        (ChoiceConfig, {"cap": 0.0}, "cap must be positive"),
+        (ChoiceConfig, {"bend": -1.0}, "bend must be"),
+        (ChoiceConfig, {"seen": -1.0}, "seen must be"),
+        (ChoiceConfig, {"behind": 0.0}, "behind must be positive"),
+        (ScanAlignConfig, {"num_nodes": 0}, "num_nodes must be at least 1"),
+        (ScanAlignConfig, {"curvature_radii": ()}, "curvature_radii must hold"),
+        (ScanAlignConfig, {"curvature_radii": (-0.1,)}, "curvature_radii must be positive"),
+        (RefineConfig, {"near_sigma": 0.0}, "near_sigma must be positive"),
+        (MatchConfig, {"stiffer": ()}, "stiffer must hold"),
+        (RefineConfig, {"expected": -1.0}, "expected must be"),
+        (RefineConfig, {"expected_scale": 0.0}, "expected_scale must be positive"),
+        (RefineConfig, {"regions": -0.1}, "regions must be"),
+        (RefineConfig, {"unlike": (0.5,)}, "unlike must be two numbers"),
+        (RefineConfig, {"unlike": (0.8, 0.8)}, "unlike must grow, got 0.8 and 0.8"),
+        (RefineConfig, {"surrounding": 0}, "surrounding must be at least 1"),
+        (ChoiceConfig, {"strain": -1.0}, "strain must be"),
+        (ScanAlignConfig, {"region_samples": 0}, "region_samples must be at least 1"),
+        (ScanAlignConfig, {"region_reach": 0.0}, "region_reach must be positive"),
+        (ScanAlignConfig, {"region_give": 0.0}, "region_give must be positive"),
+        (ChoiceConfig, {"leap": -1.0}, "leap must be"),
+        (ChoiceConfig, {"leap_cap": 0.0}, "leap_cap must be positive"),
+        (ChoiceConfig, {"overlap": -1.0}, "overlap must be"),
+        (ChoiceConfig, {"overlap_cap": 0.0}, "overlap_cap must be positive"),
+        (ScanAlignConfig, {"overlap_samples": 0}, "overlap_samples must be at least 1"),
+        (ScanAlignConfig, {"overlap_reach": 0.0}, "overlap_reach must be positive"),
+    ],
+)
+def test_values_out_of_range_are_named(kind, arguments, message):
+    with pytest.raises(InputError, match=message):
+        kind(**arguments)
+
+
+def test_defaults_are_shared_by_nobody():
+    assert ScanAlignConfig().refine == ScanAlignConfig().refine == RefineConfig()
+    assert RefineConfig().compatible == ScanEMConfig()
+
+
+def test_slowly_matches_slide_from_the_beginning():
+    config = RefineConfig(slow_steps=9, slide=(0.5, 0.1), sigma=(0.02, 0.004))
+    slow = config.slower()
+    assert (slow.num_steps, slow.slide, slow.sigma) == (9, (0.1, 0.1), (0.02, 0.004))
+
+
+def test_the_energy_of_a_record_is_that_of_its_terms():
+    record = ScanAlignRecord("again", "refine", 0, 5, 0.1, 2.0, 3.0, 0.5, 0.9)
+    assert record.energy == 3.5

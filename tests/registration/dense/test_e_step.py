@@ -1,0 +1,103 @@
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchreg.errors import InputError
+from torchreg.registration.dense.e_step import ScanEMConfig, match_softly
+from torchreg.registration.dense.oriented_samples import OrientedSamples
+
+F64 = torch.float64
+
+
+def samples(count, seed, spread=0.05):
+    generator = torch.Generator().manual_seed(seed)
+    points, normals, features = (torch.randn(count, 3, generator=generator, dtype=F64) for _ in range(3))
+    normals = torch.nn.functional.normalize(normals + torch.tensor([0.0, 0.0, 2.0]), dim=-1)
+    return OrientedSamples(spread * points, normals, 0.3 * features, torch.arange(count) % 3 == 0)
+
+
+def table(source, target, sigma, config):
+    """Return the likelihoods of all pairs, in a loop over them."""
+    rows = torch.zeros(len(source), len(target), dtype=F64)
+    for i in range(len(source)):
+        for j in range(len(target)):
+            square = float((source.points[i] - target.points[j]).square().sum()) / (2 * sigma**2)
+            turned = config.normal_weight * (1 - float(source.normals[i] @ target.normals[j]))
+            other = 0.5 * config.feature_weight * float((source.features[i] - target.features[j]).square().sum())
+            rows[i, j] = math.exp(-square - turned - other)
+    return rows
+
+
+@pytest.mark.parametrize("both_ways", [True, False])
+@pytest.mark.parametrize("boundary", [True, False])
+def test_posteriors_are_those_of_the_full_table(both_ways, boundary):
+    config, sigma = ScanEMConfig(num_candidates=20), 0.04
+    source, target = samples(12, 0), replace(samples(15, 1), cut_off=torch.arange(15) % 4 == 0)
+    likelihood = table(source, target, sigma, config)
+
+    def outlier(count):
+        return 0.3 * max(1.0, 2 * count * sigma**2) * math.exp(-0.3 * config.feature_weight)
+
+    chosen = likelihood / (likelihood.sum(1, keepdim=True) + outlier(15))
+    if not boundary:
+        chosen = chosen * ~target.boundary
+    weights = chosen.clone()
+    if both_ways:
+        weights += likelihood / (likelihood.sum(0) + outlier(12)) * 12 / 15
+    found = match_softly(source, target, sigma, config, both_ways=both_ways, boundary=boundary)
+    torch.testing.assert_close(found.posterior, chosen.sum(1))
+    torch.testing.assert_close(found.cut_off, chosen @ target.cut_off.double() / chosen.sum(1))
+    torch.testing.assert_close(found.weights, weights.sum(1))
+    torch.testing.assert_close(found.targets, weights @ target.points / weights.sum(1, keepdim=True))
+    normals = torch.nn.functional.normalize(weights @ target.normals, dim=-1)
+    torch.testing.assert_close(found.normals, normals)
+
+
+def test_few_candidates_are_nearly_all():
+    source, target = samples(60, 0, 0.3), samples(80, 1, 0.3)
+    few = match_softly(source, target, 0.03)
+    every = match_softly(source, target, 0.03, ScanEMConfig(num_candidates=80))
+    torch.testing.assert_close(few.weights, every.weights, rtol=0, atol=2e-2)
+
+
+def test_motion_and_order_change_nothing():
+    source, target = samples(30, 0), samples(40, 1)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2), dtype=F64))[0]
+    plain = match_softly(source, target, 0.04)
+    moved = [each.moved(each.points @ turn.mT + 2, each.normals @ turn.mT) for each in (source, target)]
+    turned = match_softly(*moved, 0.04)
+    torch.testing.assert_close(turned.weights, plain.weights)
+    torch.testing.assert_close(turned.targets, plain.targets @ turn.mT + 2)
+    order = torch.randperm(40, generator=torch.Generator().manual_seed(3))
+    shuffled = OrientedSamples(
+        target.points[order], target.normals[order], target.features[order], target.boundary[order]
+    )
+    torch.testing.assert_close(match_softly(source, shuffled, 0.04).weights, plain.weights)
+
+
+def test_far_samples_are_outliers_that_stay():
+    source = samples(5, 0)
+    far = source.moved(source.points + 50, source.normals)
+    found = match_softly(source, far, 0.02)
+    assert float(found.weights.max()) == 0
+    torch.testing.assert_close(found.targets, source.points)
+    assert bool(found.normals.isfinite().all())
+
+
+def test_exact_matches_are_sure():
+    source = samples(20, 0, 1.0)
+    found = match_softly(source, source, 0.01, both_ways=False)
+    assert float(found.posterior.min()) > 0.9
+    assert float(found.posterior.max()) <= 1
+    torch.testing.assert_close(found.targets, source.points, rtol=0, atol=1e-3)
+
+
+def test_bad_input_is_named():
+    with pytest.raises(InputError, match="sigma must be positive"):
+        match_softly(samples(4, 0), samples(4, 1), 0.0)
+    with pytest.raises(InputError, match="outliers must be positive"):
+        ScanEMConfig(outliers=0.0)
+    with pytest.raises(InputError, match="num_candidates must be at least 1"):
+        ScanEMConfig(num_candidates=0)

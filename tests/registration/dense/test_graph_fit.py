@@ -1,0 +1,188 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchreg.errors import InputError
+from torchreg.geometry.geodesics import GeodesicGraph
+from torchreg.geometry.rigid import se3_exp, transform_points
+from torchreg.registration.blend import turn_about
+from torchreg.registration.dense.deformation_graph import DeformationGraph
+from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph, joined
+from torchreg.registration.dense.node_graph import build_node_graph
+
+F64 = torch.float64
+
+
+@pytest.fixture
+def graph():
+    points = torch.rand(80, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
+    normals = torch.nn.functional.normalize(points - 0.5, dim=-1)
+    return DeformationGraph(points, normals, build_node_graph(GeodesicGraph.from_points(points, 8), 0, 6, 3))
+
+
+def problem(graph, seed=1):
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(*size):
+        return torch.randn(*size, generator=generator, dtype=F64)
+
+    normals = torch.nn.functional.normalize(random(40, 3), dim=-1)
+    targets = graph.points[20:60] + 0.1 * random(40, 3)
+    return se3_exp(0.2 * random(6, 6)), GraphMatches(torch.arange(20, 60), targets, random(40).abs(), normals, 0.3)
+
+
+def energy(graph, transforms, matches, stiffness):
+    """Return the energy as the docstring has it, for autograd."""
+    miss = graph(transforms, matches.which) - matches.targets
+    metric = matches.normals.unsqueeze(-1) * matches.normals.unsqueeze(-2) + matches.slide * torch.eye(3, dtype=F64)
+    misses = (matches.weights * (miss.unsqueeze(-2) @ metric @ miss.unsqueeze(-1))[:, 0, 0]).mean()
+    gaps = (graph.edge_weights * graph.edge_gaps(transforms).square().sum((-1, -2))).sum() / graph.num_nodes
+    return misses, gaps, misses + stiffness * gaps
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_steps_are_those_of_a_dense_gauss_newton(graph, each):
+    transforms, matches = problem(graph)
+    slide = torch.linspace(0, 0.6, 40, dtype=F64) if each else torch.full((40,), 0.3, dtype=F64)
+    matches = replace(matches, slide=slide if each else 0.3)
+    middles = transform_points(transforms, graph.centers.unsqueeze(1)).squeeze(1)
+
+    def residuals(twists):
+        moved = turn_about(transforms, twists.view(-1, 6), middles)
+        miss = graph(moved, matches.which) - matches.targets
+        root = (matches.weights / 40).sqrt().unsqueeze(-1)
+        across = root * (miss * matches.normals).sum(-1, keepdim=True)
+        gap = graph.edge_gaps(moved).flatten(1) * (0.7 / 6 * graph.edge_weights).sqrt().unsqueeze(-1)
+        return torch.cat([across.reshape(-1), (root * slide.sqrt().unsqueeze(-1) * miss).reshape(-1), gap.reshape(-1)])
+
+    zero = torch.zeros(36, dtype=F64)
+    jacobian = torch.autograd.functional.jacobian(residuals, zero)
+    twists = torch.linalg.lstsq(jacobian, -residuals(zero)[:, None]).solution.view(6, 6)
+    expected = turn_about(transforms, twists, middles)
+    torch.testing.assert_close(fit_graph(graph, transforms, matches, 0.7).transforms, expected, rtol=1e-6, atol=1e-7)
+
+
+def test_energies_are_those_reported(graph):
+    transforms, matches = problem(graph)
+    fit = fit_graph(graph, transforms, matches, 0.7)
+    misses, gaps, _ = energy(graph, transforms, matches, 0.7)
+    assert fit.misses == pytest.approx(float(misses))
+    assert fit.gaps == pytest.approx(float(gaps))
+
+
+def test_steps_end_where_the_gradient_vanishes(graph):
+    transforms, matches = problem(graph)
+    fitted = fit_graph(graph, transforms, matches, 0.05, num_steps=30).transforms
+    middles = transform_points(fitted, graph.centers.unsqueeze(1)).squeeze(1)
+    twists = torch.zeros(6, 6, dtype=F64, requires_grad=True)
+    total = energy(graph, turn_about(fitted, twists, middles), matches, 0.05)[2]
+    (slope,) = torch.autograd.grad(total, twists)
+    assert float(slope.abs().max()) < 1e-7
+    assert float(total.detach()) < float(energy(graph, transforms, matches, 0.05)[2])
+
+
+def test_rigid_motions_are_found_whatever_the_stiffness(graph):
+    whole = se3_exp(torch.tensor([0.2, -0.1, 0.3, 0.4, 0.2, -0.3], dtype=F64))
+    targets = transform_points(whole, graph.points)
+    matches = GraphMatches(slice(None), targets, torch.ones(80, dtype=F64))
+    fitted = fit_graph(graph, graph.rest(), matches, 100.0, num_steps=15).transforms
+    torch.testing.assert_close(graph(fitted), targets, rtol=0, atol=1e-6)
+
+
+def test_turning_everything_turns_the_answer(graph):
+    transforms, matches = problem(graph)
+    whole = se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.4, 0.8, -0.3], dtype=F64))
+    nodes = build_node_graph(GeodesicGraph.from_points(graph.points, 8), 0, 6, 3)
+    turned = DeformationGraph(transform_points(whole, graph.points), graph.normals @ whole[:3, :3].mT, nodes)
+    moved = GraphMatches(
+        matches.which, transform_points(whole, matches.targets), matches.weights,
+        matches.normals @ whole[:3, :3].mT, matches.slide,
+    )  # fmt: skip
+    start = whole @ transforms @ torch.linalg.inv(whole)
+    expected = transform_points(whole, graph(fit_graph(graph, transforms, matches, 0.3, 3).transforms))
+    torch.testing.assert_close(turned(fit_graph(turned, start, moved, 0.3, 3).transforms), expected, rtol=0, atol=1e-8)
+
+
+def test_samples_without_weight_leave_nodes_with_their_neighbors(graph):
+    targets = graph.points + torch.tensor([0.1, 0.0, 0.0], dtype=F64)
+    weights = torch.zeros(80, dtype=F64)
+    weights[:10] = 1
+    fitted = fit_graph(graph, graph.rest(), GraphMatches(slice(None), targets, weights), 1.0, 5).transforms
+    torch.testing.assert_close(graph(fitted), targets, rtol=0, atol=1e-4)
+    none = fit_graph(graph, graph.rest(), GraphMatches(slice(None), targets, torch.zeros(80, dtype=F64)), 0.0)
+    torch.testing.assert_close(none.transforms, graph.rest())
+
+
+def test_edges_that_give_count_less(graph):
+    transforms, matches = problem(graph)
+    gap = graph.edge_gaps(transforms).square().sum(-1).mean(-1)
+    fit = fit_graph(graph, transforms, matches, 0.7, give=0.05)
+    expected = (graph.edge_weights / (1 + gap / 0.05**2) * 2 * gap).sum() / graph.num_nodes
+    assert fit.gaps == pytest.approx(float(expected))
+    # A weight fixed before the step, as if the graph had it from the start.
+    nodes = build_node_graph(GeodesicGraph.from_points(graph.points, 8), 0, 6, 3)
+    softer = DeformationGraph(
+        graph.points, graph.normals, replace(nodes, edge_weights=nodes.edge_weights / (1 + gap / 0.05**2))
+    )
+    torch.testing.assert_close(fit.transforms, fit_graph(softer, transforms, matches, 0.7).transforms)
+
+
+def test_pieces_that_hardly_anything_holds_are_not_flung_away():
+    generator = torch.Generator().manual_seed(0)
+    piece = torch.rand(60, 3, generator=generator, dtype=F64)
+    # Two samples of the second piece nearly touch, and are pulled apart: a turn without end would do.
+    piece[1] = piece[0] + torch.tensor([0.01, 0, 0], dtype=F64)
+    points = torch.cat((piece, piece + torch.tensor([6.0, 0, 0], dtype=F64)))
+    normals = torch.nn.functional.normalize(points - points.mean(0), dim=-1)
+    graph = DeformationGraph(points, normals, build_node_graph(GeodesicGraph.from_points(points, 5), 0, 12, 3))
+    which = torch.cat((torch.arange(60), torch.tensor([60, 61])))
+    targets = points[which]
+    targets[60:, 1] += torch.tensor([0.1, -0.1], dtype=F64)
+    size = (points.amax(0) - points.amin(0)).norm()
+    for steps in (1, 6):
+        matches = GraphMatches(which, targets, torch.ones(len(which), dtype=F64))
+        moved = graph(fit_graph(graph, graph.rest(), matches, 0.1, steps).transforms)
+        assert float((moved - points).norm(dim=-1).max()) < size
+        torch.testing.assert_close(moved[:60], points[:60], rtol=0, atol=1e-3)
+
+
+def test_what_is_far_away_is_reached_all_the_same(graph):
+    targets = graph.points + torch.tensor([30.0, 0, 0], dtype=F64)
+    moved = graph(fit_graph(graph, graph.rest(), GraphMatches.of_places(targets), 0.1).transforms)
+    torch.testing.assert_close(moved, targets, rtol=0, atol=1e-4)
+
+
+def test_bad_input_is_named(graph):
+    transforms, matches = problem(graph)
+    with pytest.raises(InputError, match="stiffness must be"):
+        fit_graph(graph, transforms, matches, -1.0)
+    with pytest.raises(InputError, match="give must be positive"):
+        fit_graph(graph, transforms, matches, 1.0, give=0.0)
+    with pytest.raises(InputError, match="num_steps must be at least 1"):
+        fit_graph(graph, transforms, matches, 1.0, 0)
+
+
+def test_joined_matches_cost_what_all_cost(graph):
+    generator = torch.Generator().manual_seed(1)
+
+    def random(*shape):
+        return torch.rand(*shape, generator=generator, dtype=F64)
+
+    targets, normals = random(40, 3), torch.nn.functional.normalize(random(30, 3), dim=-1)
+    along = GraphMatches(slice(0, 30), targets[:30], random(30), normals, random(30))
+    points = GraphMatches(torch.arange(5, 15), targets[30:], random(10))
+    rest = graph.rest()
+    costs = [fit_graph(graph, rest, matches, 1.0).misses for matches in (along, points)]
+    both = joined(along, points)
+    assert fit_graph(graph, rest, both, 1.0).misses == pytest.approx(costs[0] + costs[1] * 10 / 30)
+    assert joined(along) is along
+
+
+def test_matches_with_places_pull_the_first_samples_there_alike(graph):
+    motion = se3_exp(torch.tensor([0.1, -0.2, 0.3, 0.4, 0.1, -0.3], dtype=F64))
+    places = transform_points(motion, graph.points[:20])
+    matches = GraphMatches.of_places(places)
+    assert torch.equal(matches.weights, torch.ones(20, dtype=F64))
+    moved = graph(fit_graph(graph, graph.rest(), matches, 1.0, 15).transforms)
+    torch.testing.assert_close(moved[:20], places, rtol=0, atol=1e-6)

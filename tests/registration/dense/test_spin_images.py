@@ -1,0 +1,157 @@
+import math
+
+import pytest
+import torch
+
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.rigid import se3_exp, transform_points
+from torchreg.registration.dense import spin_images as module
+from torchreg.registration.dense.spin_images import image_similarity, spin_images
+
+
+def cloud(count=200, seed=0, dtype=torch.float64):
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(count, 3, generator=generator, dtype=dtype)
+    normals = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator, dtype=dtype), dim=-1)
+    return points, normals
+
+
+def plain_images(points, normals, seen, seen_normals, bin_size, size, angle, interpolate):
+    """Johnson's definition, one number at a time."""
+    images = torch.zeros(len(points), size, size, dtype=points.dtype)
+    for image, (p, n) in enumerate(zip(points, normals, strict=True)):
+        for x, m in zip(seen, seen_normals, strict=True):
+            if math.acos(max(-1.0, min(1.0, float(n @ m)))) >= angle:
+                continue
+            beta = float(n @ (x - p))
+            alpha = math.sqrt(max(0.0, float((x - p) @ (x - p)) - beta**2))
+            row, column = size / 2 - beta / bin_size, alpha / bin_size
+            if not (0 < row < size and column < size):
+                continue
+            if not interpolate:
+                images[image, int(row), int(column)] += 1
+                continue
+            i, j = math.floor(row - 0.5), math.floor(column - 0.5)
+            a, b = row - 0.5 - i, column - 0.5 - j
+            for line, share in ((i, 1 - a), (i + 1, a)):
+                for place, part in ((j, 1 - b), (j + 1, b)):
+                    if 0 <= line < size and place < size:
+                        images[image, line, max(place, 0)] += share * part
+    return images
+
+
+@pytest.mark.parametrize("interpolate", [True, False])
+@pytest.mark.parametrize(("size", "angle"), [(15, math.pi / 2), (5, math.radians(40)), (7, math.pi)])
+def test_images_are_those_of_a_plain_loop(interpolate, size, angle):
+    points, normals = cloud(60)
+    options = {"bin_size": 0.09, "image_size": size, "support_angle": angle, "interpolate": interpolate}
+    images = spin_images(points[:8], normals[:8], points, normals, **options)
+    expected = plain_images(points[:8], normals[:8], points, normals, 0.09, size, angle, interpolate)
+    torch.testing.assert_close(images, expected)
+    assert float(images.sum()) > 10
+
+
+def test_rigid_motions_change_nothing_and_scale_goes_with_the_bin():
+    points, normals = cloud()
+    images = spin_images(points, normals, points, normals, bin_size=0.05)
+    motion = se3_exp(torch.tensor([3.0, -2, 5, 1, 2, -0.5], dtype=torch.float64))
+    moved, turned = transform_points(motion, points), normals @ motion[:3, :3].mT
+    torch.testing.assert_close(spin_images(moved, turned, moved, turned, bin_size=0.05), images)
+    scaled = spin_images(1e3 * points, normals, 1e3 * points, normals, bin_size=50.0)
+    torch.testing.assert_close(scaled, images)
+
+
+def test_the_order_of_points_does_not_matter():
+    points, normals = cloud()
+    images = spin_images(points, normals, points, normals, bin_size=0.05)
+    order = torch.randperm(len(points), generator=torch.Generator().manual_seed(2))
+    torch.testing.assert_close(spin_images(points, normals, points[order], normals[order], bin_size=0.05), images)
+    torch.testing.assert_close(
+        spin_images(points[order], normals[order], points, normals, bin_size=0.05), images[order]
+    )
+
+
+def test_chunks_change_nothing(monkeypatch):
+    points, normals = cloud()
+    images = spin_images(points, normals, points, normals, bin_size=0.05)
+    monkeypatch.setattr(module, "_CHUNK_ENTRIES", 700)
+    torch.testing.assert_close(spin_images(points, normals, points, normals, bin_size=0.05), images)
+
+
+def test_weights_count_points_and_missing_normals_count_all():
+    points, normals = cloud(50)
+    doubled = spin_images(points, normals, points.repeat(2, 1), normals.repeat(2, 1), bin_size=0.1)
+    weighted = spin_images(points, normals, points, normals, bin_size=0.1, weights=torch.full((50,), 2.0))
+    torch.testing.assert_close(weighted, doubled)
+    blind = spin_images(points, normals, points, bin_size=0.1)
+    torch.testing.assert_close(
+        blind, spin_images(points, normals, points, normals, bin_size=0.1, support_angle=math.pi)
+    )
+
+
+def test_single_precision_far_from_zero():
+    points, normals = cloud()
+    images = spin_images(points, normals, points, normals, bin_size=0.1)
+    far = (points + 64).float()
+    single = spin_images(far, normals.float(), far, normals.float(), bin_size=0.1)
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), images, atol=0.01, rtol=0)
+
+
+@pytest.mark.parametrize("similarity", ["correlation", "overlap", "l2", "distance"])
+def test_an_image_is_most_like_itself(similarity):
+    points, normals = cloud(80)
+    images = spin_images(points, normals, points, normals, bin_size=0.05)
+    scores = image_similarity(images, images, similarity)
+    assert torch.equal(scores.argmax(1), torch.arange(80))
+    torch.testing.assert_close(scores, scores.mT)
+
+
+def test_similarities_by_their_definitions():
+    generator = torch.Generator().manual_seed(0)
+    first, second = torch.rand(2, 5, 4, 4, generator=generator, dtype=torch.float64)
+    first = torch.where(first < 0.3, 0.0, first)
+    names = ("correlation", "overlap", "l2", "distance")
+    correlation, alike, apart, plain = (image_similarity(first, second, name) for name in names)
+    for i, a in enumerate(first.flatten(1)):
+        for j, b in enumerate(second.flatten(1)):
+            torch.testing.assert_close(correlation[i, j], torch.corrcoef(torch.stack([a, b]))[0, 1])
+            torch.testing.assert_close(apart[i, j], -(a / a.norm() - b / b.norm()).norm())
+            torch.testing.assert_close(plain[i, j], -(a - b).square().sum().sqrt())
+            both = (a != 0) & (b != 0)
+            r = torch.corrcoef(torch.stack([a[both], b[both]]))[0, 1]
+            expected = r.sign() * torch.atanh(r) ** 2 - 3 / (both.sum() - 3)
+            torch.testing.assert_close(alike[i, j], expected)
+
+
+def test_empty_images_are_like_nothing():
+    full = torch.rand(3, 4, 4, generator=torch.Generator().manual_seed(1))
+    empty = torch.zeros(2, 4, 4)
+    assert float(image_similarity(empty, full).abs().max()) == 0
+    assert bool((image_similarity(empty, full, "overlap") == -math.inf).all())
+    torch.testing.assert_close(image_similarity(empty, full, "l2"), torch.full((2, 3), -math.sqrt(2.0)))
+    constant = torch.ones(1, 4, 4)
+    assert bool(image_similarity(constant, full, "overlap").isfinite().all())
+
+
+def test_bad_arguments_are_named():
+    points, normals = cloud(10)
+    with pytest.raises(InputError, match="normals must have shape"):
+        spin_images(points, normals[:5], points, normals, bin_size=0.1)
+    with pytest.raises(InputError, match="scan_normals must have shape"):
+        spin_images(points, normals, points, normals[:5], bin_size=0.1)
+    with pytest.raises(InputError, match="scan_points must be finite"):
+        spin_images(points, normals, points * math.nan, normals, bin_size=0.1)
+    with pytest.raises(InputTypeError, match=r"scan_points is torch\.float32"):
+        spin_images(points, normals, points.float(), normals, bin_size=0.1)
+    for name in ("bin_size", "support_angle"):
+        with pytest.raises(InputError, match=name):
+            spin_images(points, normals, points, normals, **{"bin_size": 0.1, name: 0.0})
+    with pytest.raises(InputError, match="image_size"):
+        spin_images(points, normals, points, normals, bin_size=0.1, image_size=0)
+    with pytest.raises(InputError, match="weights must have shape"):
+        spin_images(points, normals, points, normals, bin_size=0.1, weights=torch.ones(3))
+    with pytest.raises(InputError, match="similarity must be one of"):
+        image_similarity(points, points, "cosine")
+    with pytest.raises(InputError, match="target must have shape"):
+        image_similarity(points, points[:, :2])

@@ -1,0 +1,43 @@
+import torch
+
+from torchreg.geometry.range_scan import RangeScan
+from torchreg.geometry.rigid import transform_points
+from torchreg.registration.normalization import ScanUnit
+
+F64 = torch.float64
+
+
+def cloud():
+    return 3 * torch.randn(200, 3, generator=torch.Generator().manual_seed(0), dtype=F64) + 5
+
+
+def motions(count):
+    generator = torch.Generator().manual_seed(1)
+    transforms = torch.eye(4, dtype=F64).repeat(count, 1, 1)
+    transforms[:, :3, :3] = torch.linalg.qr(torch.randn(count, 3, 3, generator=generator, dtype=F64))[0]
+    transforms[:, :3, 3] = torch.randn(count, 3, generator=generator, dtype=F64)
+    return transforms
+
+
+def test_size_follows_the_unit_and_not_the_turn():
+    points, motion = cloud(), motions(1)[0]
+    unit = ScanUnit.of(points)
+    turned = ScanUnit.of(7 * transform_points(motion, points))
+    assert abs(turned.size - 7 * unit.size) < 1e-12 * turned.size
+    torch.testing.assert_close(turned.middle, 7 * transform_points(motion, unit.middle[None])[0])
+    assert bool(unit.of_points(points).mean(0).abs().max() < 1e-12)
+
+
+def test_points_and_scans_come_back():
+    points = cloud().float()
+    unit = ScanUnit.of(points)
+    torch.testing.assert_close(unit.points_back(unit.of_points(points), points), points)
+    scan = RangeScan(points, normals=torch.nn.functional.normalize(points, dim=-1))
+    torch.testing.assert_close(unit.of_scan(scan).points, unit.of_points(points))
+
+
+def test_motions_mean_the_same_in_both_coordinates():
+    points, transforms = cloud(), motions(4)
+    unit = ScanUnit.of(points)
+    there = unit.points_back(transform_points(transforms, unit.of_points(points)), points)
+    torch.testing.assert_close(transform_points(unit.transforms_back(transforms), points), there)

@@ -1,0 +1,242 @@
+"""Scan registration end to end: errors, units, turns, repeatability, bad input, results on disk."""
+
+import math
+
+import pytest
+import torch
+import trimesh
+
+import torchreg as tr
+from torchreg.datasets.depth_scanner import DepthScanner
+from torchreg.datasets.scan_sequences import jointed_toy
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.rigid import rigid_matrix, transform_points
+from torchreg.geometry.rotation import so3_exp
+from torchreg.metrics import adjusted_rand
+from torchreg.registration.config import RegisterConfig
+from torchreg.registration.dense.config import ScanAlignConfig
+from torchreg.registration.register import register
+from torchreg.registration.results import ScanRegistration
+from torchreg.result import Status
+
+QUICK = RegisterConfig(align=ScanAlignConfig(num_samples=400, num_target_samples=600), num_samples=800)
+FEW = RegisterConfig(align=ScanAlignConfig(num_samples=150, num_target_samples=200, num_nodes=15))
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return jointed_toy(2, seed=2, scanner=DepthScanner(num_points=1000), step=math.radians(20)).pair(0, 1)
+
+
+@pytest.fixture(scope="module")
+def known(pair):
+    """Registered from the truth with errors of 0.7 % of the diagonal."""
+    noise = torch.randn(pair.truth.shape, generator=torch.Generator().manual_seed(0))
+    start = pair.truth + 0.004 * pair.source.diagonal * noise
+    return register(pair.source, pair.target, 8, 30, start=start), start
+
+
+def test_a_pair_is_registered_without_a_start(pair):
+    records = []
+    found = register(pair.source, pair.target, 8, 30, QUICK, on_step=records.append)
+    assert float((pair.error(found.deformed) < 0.025).float().mean()) > 0.9
+    assert found.status.usable
+    assert records[-len(found.history) :] == list(found.history)
+    assert {record.stage for record in records} == {"initialize", "align", "refine"}
+    assert found.seconds.shape == (4,)
+    assert (found.seconds > 0).all()
+
+
+def test_bones_filter_the_noise_of_the_start(pair, known):
+    found, start = known
+    assert float(pair.error(found.deformed).mean()) < 0.7 * float(pair.error(start).mean())
+    assert float(adjusted_rand(found.parts(), pair.moving_labels())) > 0.8
+    assert found.matched.float().mean() > 0.5
+
+
+def test_what_is_returned_fits_together(pair, known):
+    found, _ = known
+    count, bones = len(pair.source), found.model.num_bones
+    assert found.transforms.shape == (bones, 4, 4)
+    assert found.weights.shape == (count, bones)
+    torch.testing.assert_close(found.weights.sum(-1), torch.ones(count))
+    assert torch.equal(found.labels, found.weights.argmax(-1))
+    size = pair.source.diagonal
+    with torch.no_grad():
+        torch.testing.assert_close(found.model(pair.source.points), found.deformed, atol=1e-5 * size, rtol=0)
+        torch.testing.assert_close(found.model.weights_at(pair.source.points), found.weights, atol=1e-3, rtol=0)
+    nearest = torch.cdist(found.deformed.double(), pair.target.points.double()).amin(-1)
+    torch.testing.assert_close(found.distances.double(), nearest, atol=1e-5 * size, rtol=0)
+
+
+def test_results_are_the_same_on_disk(known, tmp_path):
+    found, _ = known
+    found.save(tmp_path / "pair.safetensors")
+    back = tr.load(tmp_path / "pair.safetensors")
+    assert isinstance(back, ScanRegistration)
+    for name in ("points", "faces", "deformed", "labels", "transforms", "weights", "distances", "matched", "seconds"):
+        assert torch.equal(getattr(back, name), getattr(found, name))
+    assert back.history == found.history
+    assert back.status is found.status
+    assert torch.equal(back.model.weights, found.model.weights)
+
+
+def test_the_same_again(pair, known):
+    found, start = known
+    again = register(pair.source, pair.target, 8, 30, start=start)
+    assert torch.equal(again.deformed, found.deformed)
+    assert torch.equal(again.weights, found.weights)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3])
+def test_units_change_nothing_but_the_unit(pair, known, scale):
+    start = known[1]
+    bigger = torch.diag(torch.tensor([scale, scale, scale, 1.0], dtype=torch.float64))
+    source, target = (scan.to(torch.float64).transformed(bigger) for scan in (pair.source, pair.target))
+    same = register(pair.source.to(torch.float64), pair.target.to(torch.float64), 8, 30, start=start.double())
+    other = register(source, target, 8, 30, start=scale * start.double())
+    torch.testing.assert_close(other.deformed / scale, same.deformed, atol=1e-6 * pair.source.diagonal, rtol=0)
+    assert other.history[-1].kept == pytest.approx(same.history[-1].kept, abs=2)
+
+
+def test_turned_scans_are_registered_as_well(pair, known):
+    found, start = known
+    turn = so3_exp(torch.tensor([0.5, -1.0, 0.7], dtype=torch.float64))
+    motion = rigid_matrix(turn, torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)).float()
+    source, target = pair.source.transformed(motion), pair.target.transformed(motion)
+    places = start @ motion[:3, :3].mT + motion[:3, 3]
+    other = register(source, target, 8, 30, start=places)
+    back = (other.deformed - motion[:3, 3]) @ motion[:3, :3]
+    assert float(pair.error(back).mean()) < 1.1 * float(pair.error(found.deformed).mean())
+
+
+@pytest.mark.parametrize(("bones", "cells"), [(1, 30), (500, 4)])
+def test_one_bone_and_more_bones_than_cells_are_fine(pair, known, bones, cells):
+    found = register(pair.source, pair.target, bones, cells, start=known[1])
+    assert 1 <= found.model.num_bones <= bones
+    assert found.deformed.isfinite().all()
+    if bones == 1:
+        linear = found.transforms[0]
+        moved = pair.source.points @ linear[:3, :3].mT + linear[:3, 3]
+        torch.testing.assert_close(found.deformed, moved, atol=1e-4, rtol=1e-4)
+
+
+def test_disjoint_scans_say_so(pair):
+    far = torch.eye(4)
+    far[0, 3] = 3 * pair.source.diagonal
+    found = register(pair.source, pair.target.transformed(far), 8, 30, start=pair.source.points)
+    assert found.status in (Status.NO_DATA, Status.FEW_INLIERS)
+    assert not found.status.usable
+    assert found.deformed.isfinite().all()
+
+
+def sheet(count, seed=0, flat=True):
+    points = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
+    return points * torch.tensor([1.0, 0.7, 0.0 if flat else 0.5])
+
+
+def test_flat_and_tiny_scans_and_duplicates_are_sound():
+    flat = tr.RangeScan(sheet(300))
+    shifted = tr.RangeScan(sheet(300) + 0.01)
+    doubled = tr.RangeScan(torch.cat([sheet(200)] * 2))
+    tiny = tr.RangeScan(sheet(4, flat=False))
+    for source, target, start in ((flat, shifted, None), (doubled, flat, doubled.points), (tiny, tiny, tiny.points)):
+        found = register(source, target, 4, 10, FEW, start=start)
+        assert found.deformed.isfinite().all()
+        assert found.deformed.shape == source.points.shape
+    same = register(flat, flat, 4, 10, QUICK, start=flat.points)
+    assert float((same.deformed - flat.points).norm(dim=-1).max()) < 0.01
+
+
+def block(size, middle, seed, turned):
+    """Return samples of a box's surface and their normals, before and after a motion (4, 4)."""
+    box = trimesh.creation.box(size).apply_translation(middle)
+    points, faces = trimesh.sample.sample_surface(box, 1000, seed=seed)
+    points, normals = torch.from_numpy(points), torch.from_numpy(box.face_normals[faces])
+    return points, normals, transform_points(turned, points), normals @ turned[:3, :3].mT
+
+
+def test_an_arm_that_lies_along_the_body_is_parted_from_it():
+    shoulder = torch.tensor([0.315, 0.85, 0.0], dtype=torch.float64)
+    turned = rigid_matrix(so3_exp(torch.tensor([0.0, 0.0, 0.8], dtype=torch.float64)), torch.zeros_like(shoulder))
+    turned[:3, 3] = shoulder - turned[:3, :3] @ shoulder
+    still = torch.eye(4, dtype=torch.float64)
+    scans, truth = [], []
+    for seed in (0, 2):
+        # A cell is wider than the gap of 0.005 between the two.
+        body = block((0.5, 1.0, 0.25), (0.0, 0.5, 0.0), seed, still)
+        arm = block((0.12, 0.85, 0.14), (0.315, 0.475, 0.0), seed + 1, turned)
+        points, normals, moved, after = (torch.cat(both) for both in zip(body, arm, strict=True))
+        scans.append((tr.RangeScan(points, normals=normals), tr.RangeScan(moved, normals=after)))
+        truth.append(moved)
+    source, target = scans[0][0], scans[1][1]
+    found = register(source, target, start=truth[0])
+    # Where the two face each other, a cell has points of both and follows one; all others go with their part.
+    gaps = torch.cdist(source.points[:1000], source.points[1000:])
+    alone = torch.cat((gaps.amin(1), gaps.amin(0))) > 2 * found.model.grid.spacing
+    near = (found.deformed - truth[0]).norm(dim=-1) < 0.025 * source.diagonal
+    assert float(near[alone].double().mean()) > 0.99
+    assert adjusted_rand(found.parts(0.01)[alone], torch.arange(2).repeat_interleave(1000)[alone]) > 0.95
+    apart = (found.model.joints().centers.detach() - shoulder).norm(dim=-1)
+    assert float(apart.min()) < 0.05 * source.diagonal
+
+
+def test_normals_of_unknown_sides_are_oriented(pair, known):
+    signs = torch.where(torch.rand(len(pair.source), 1, generator=torch.Generator().manual_seed(1)) < 0.5, -1.0, 1.0)
+    source = tr.RangeScan(pair.source.points, pair.source.faces, signs * pair.source.normals)
+    found = register(source, pair.target, 8, 30, start=known[1])
+    assert float(pair.error(found.deformed).mean()) < 1.5 * float(pair.error(known[0].deformed).mean())
+
+
+def test_bad_arguments_are_refused_by_name(pair):
+    source, target = pair.source, pair.target
+    with pytest.raises(InputTypeError, match=r"source must be a RangeScan"):
+        register(source.points, target)
+    with pytest.raises(InputTypeError, match=r"target must be a RangeScan"):
+        register(source, target.points)
+    with pytest.raises(InputError, match="num_bones"):
+        register(source, target, 0)
+    with pytest.raises(InputError, match="grid_resolution must be at most"):
+        register(source, target, 4, 1000)
+    with pytest.raises(InputError, match="start must have shape"):
+        register(source, target, start=source.points[1:])
+    with pytest.raises(InputError, match="start must be finite"):
+        register(source, target, start=source.points * torch.nan)
+    with pytest.raises(InputError, match="confidence is that of start"):
+        register(source, target, confidence=torch.ones(len(source)))
+    with pytest.raises(InputError, match="confidence must not be negative"):
+        register(source, target, start=source.points, confidence=-torch.ones(len(source)))
+    for points in (torch.zeros(0, 3), torch.zeros(5, 3), torch.full((5, 3), torch.nan)):
+        with pytest.raises(InputError, match="points"):
+            tr.RangeScan(points)
+
+
+def test_bones_start_from_known_parts(pair, known):
+    found = register(pair.source, pair.target, 10, 30, start=known[1], parts=pair.labels)
+    assert float(adjusted_rand(found.parts(0.01), pair.moving_labels(0.01))) > 0.8
+    assert float(pair.error(found.deformed).mean()) < 0.01
+
+
+def test_limbs_of_a_spine_are_parts_to_start_from(pair, known):
+    nodes = torch.stack([pair.source.points[pair.labels == part].mean(0) for part in pair.labels.unique()])
+    middle = nodes.mean(0, keepdim=True)
+    edges = torch.tensor([[0, k] for k in range(1, len(nodes) + 1)])
+    frames = torch.eye(3).repeat(len(nodes) + 1, 1, 1)
+    spine = tr.Skeleton(torch.cat([middle, nodes]), edges, torch.full((len(nodes) + 1,), 1e-3), frames)
+    found = register(pair.source, pair.target, 10, 30, start=known[1], parts=spine.limb_of(pair.source.points))
+    assert float(pair.error(found.deformed).mean()) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("parts", "error", "message"),
+    [
+        (torch.zeros(3, dtype=torch.int64), InputError, "parts must have shape"),
+        (torch.zeros(1), InputTypeError, "parts must be integers"),
+        (None, InputError, "parts must be from 0 to num_bones - 1 = 1, got 0 to 2"),
+    ],
+)
+def test_parts_that_do_not_fit_are_refused(pair, known, parts, error, message):
+    if parts is None:
+        parts = torch.arange(len(pair.source)) % 3
+    with pytest.raises(error, match=message):
+        register(pair.source, pair.target, 2, 30, start=known[1], parts=parts)

@@ -1,0 +1,95 @@
+"""Which bones of a registration are one part."""
+
+import pytest
+import torch
+
+from torchreg.registration.results import ScanRegistration, SequenceRegistration
+from torchreg.result import Status
+
+
+def bones(*shifts, weights):
+    """Four points in a row on two bones or more, shifted along x by so much each."""
+    motions = torch.eye(4).repeat(len(shifts), 1, 1)
+    motions[:, 0, 3] = torch.tensor(shifts)
+    labels = weights.argmax(-1)
+    deformed = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]) + motions[labels, :3, 3]
+    empty = torch.zeros(4)
+    return ScanRegistration(
+        torch.nn.Identity(),
+        deformed,
+        None,
+        deformed,
+        labels,
+        motions,
+        weights,
+        empty,
+        empty > 0,
+        Status.CONVERGED,
+        empty,
+    )
+
+
+def test_bones_that_meet_and_move_alike_are_one_part():
+    blend = torch.tensor([[1, 0, 0], [0.6, 0.4, 0], [0, 0.6, 0.4], [0, 0, 1]])
+    assert bones(0.0, 0.01, 1.0, weights=blend).parts().tolist() == [0, 0, 0, 1]
+    assert bones(0.0, 0.5, 1.0, weights=blend).parts().tolist() == [0, 0, 1, 2]
+    # The second bone joins the first, larger one and moves like it then: too far from the third.
+    assert bones(0.0, 0.5, 1.0, weights=blend).parts(0.2).tolist() == [0, 0, 0, 1]
+    assert bones(0.0, 0.5, 1.0, weights=blend).parts(0.3).tolist() == [0, 0, 0, 0]
+    apart = torch.tensor([[1.0, 0, 0], [1, 0, 0], [0, 0, 1], [0, 0, 1]])
+    assert bones(0.0, 0.0, 0.0, weights=apart).parts().tolist() == [0, 0, 1, 1]
+
+
+def test_parts_of_a_sequence_moved_as_one_in_every_frame():
+    blend = torch.tensor([[1, 0, 0], [0.6, 0.4, 0], [0, 0.6, 0.4], [0, 0, 1]])
+    frames = [bones(0.0, 0.0, 1.0, weights=blend), bones(0.0, 1.0, 1.0, weights=blend)]
+    assert [frame.parts().tolist() for frame in frames] == [[0, 0, 0, 1], [0, 0, 1, 1]]
+
+    def parts(*frames):
+        deformed, transforms = (
+            torch.stack([getattr(each, name) for each in frames]) for name in ("deformed", "transforms")
+        )
+        first = frames[0]
+        nothing = torch.zeros(0, 3)
+        return SequenceRegistration(
+            torch.nn.Identity(), first.points, None, deformed, first.labels, transforms, first.weights,
+            nothing, nothing, nothing[:, 0].long(), 0, Status.CONVERGED,
+        ).parts()  # fmt: skip
+
+    assert parts(*frames).tolist() == parts(*frames[::-1]).tolist() == [0, 0, 1, 2]
+    assert parts(frames[1]).tolist() == parts(frames[1], frames[1]).tolist() == frames[1].parts().tolist()
+
+
+def chain(order, step):
+    """Eight bones in a row of three points each, every one shifted by ``step`` more along y than the one before."""
+    row = torch.arange(8).repeat_interleave(3)
+    blend = (1 - 0.6 * (row.unsqueeze(1) - torch.arange(8)).abs()).clamp(min=0)
+    weights = (blend / blend.sum(1, keepdim=True))[:, order]
+    motions = torch.eye(4).repeat(8, 1, 1)
+    motions[:, 1, 3] = step * torch.as_tensor(order)
+    labels = weights.argmax(1)
+    deformed = torch.stack([torch.arange(24.0), motions[labels, 1, 3], torch.zeros(24)], dim=1)
+    empty = torch.zeros(24)
+    return ScanRegistration(
+        torch.nn.Identity(), deformed, None, deformed, labels, motions, weights, empty, empty > 0,
+        Status.CONVERGED, empty,
+    )  # fmt: skip
+
+
+def test_a_chain_that_moves_ever_more_is_not_one_part():
+    order = list(range(8))
+    found, size = chain(order, 0.1), 23.0
+    assert found.parts(0.0).tolist() == found.labels.tolist()
+    few = found.parts(0.15 / size)
+    # Along the row, no bone of a part is farther than the tolerance from its largest one.
+    assert 3 <= len(few.unique()) <= 4
+    assert bool((few.diff() >= 0).all())
+    assert found.parts(0.8 / size).tolist() == [0] * 24
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_parts_do_not_depend_on_the_order_of_the_bones(seed):
+    order = torch.randperm(8, generator=torch.Generator().manual_seed(seed)).tolist()
+    assert len(chain(order, 0.0).parts(1e-6).unique()) == 1
+    assert len(chain(order, 0.1).parts(0.05 / 23).unique()) == 8
+    assert len(chain(order, 0.1).parts(0.8 / 23).unique()) == 1

@@ -1,0 +1,101 @@
+"""Layers inside compiled and exported networks, and under the transforms of torch.func."""
+
+import pytest
+import torch
+from torch import nn
+from torch.export import Dim, export
+from torch.func import jacfwd, jacrev, vmap
+
+from torchreg.registration.bones.grid_lbs import GridLBS
+from torchreg.registration.bones.sparse_grid import SparseGrid
+
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+
+
+class Distance(nn.Module):
+    """The distance of points from a shape, as a layer."""
+
+    def __init__(self, shape):
+        super().__init__()
+        self.shape = shape
+
+    def forward(self, points, pose):
+        return self.shape.distance(points, pose)
+
+
+@pytest.fixture(scope="module")
+def points():
+    return 0.05 * torch.randn(60, 3, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture(scope="module")
+def poses(plain_hand):
+    noise = torch.randn(3, plain_hand.num_dofs, generator=torch.Generator().manual_seed(1))
+    return plain_hand.clamp(plain_hand.rest_pose() + 0.1 * noise)
+
+
+def grid_model(points, blend):
+    grid = SparseGrid.from_points(points, 8)
+    generator = torch.Generator().manual_seed(2)
+    transforms = torch.eye(4).repeat(3, 1, 1)
+    transforms[:, :3, 3] = torch.randn(3, 3, generator=generator)
+    weights = torch.randn(grid.num_corners, 3, generator=generator).softmax(-1)
+    return GridLBS(grid, weights, transforms, blend=blend).to(torch.float32)
+
+
+def compiled(layer):
+    """Return a layer captured as one graph, without a compiler of C++."""
+    return torch.compile(layer, fullgraph=True, backend="aot_eager")
+
+
+@pytest.mark.parametrize("blend", ["linear", "dual_quaternion"])
+def test_grids_are_compiled_as_one_graph(points, blend):
+    model = grid_model(points, blend)
+    torch.testing.assert_close(compiled(model)(points), model(points))
+
+
+def test_skins_and_distances_are_compiled_as_one_graph(plain_hand, plain_hand_skin, points, poses):
+    torch.testing.assert_close(compiled(plain_hand_skin)(poses), plain_hand_skin(poses))
+    layer = Distance(plain_hand)
+    torch.testing.assert_close(compiled(layer)(points, poses[0]), layer(points, poses[0]))
+
+
+@pytest.mark.parametrize("blend", ["linear", "dual_quaternion"])
+def test_exported_grids_take_any_number_of_points(points, blend):
+    model = grid_model(points, blend)
+    program = export(model, (points,), dynamic_shapes={"points": {0: Dim.AUTO}}).module()
+    for count in (60, 41, 3):
+        torch.testing.assert_close(program(points[:count]), model(points[:count]))
+
+
+def test_exported_skins_take_any_number_of_poses(plain_hand_skin, poses):
+    program = export(plain_hand_skin, (poses,), dynamic_shapes=({0: Dim.AUTO},)).module()
+    for count in (3, 2):
+        torch.testing.assert_close(program(poses[:count]), plain_hand_skin(poses[:count]))
+
+
+def test_exported_distances_take_any_number_of_points(plain_hand, points, poses):
+    layer = Distance(plain_hand)
+    program = export(layer, (points, poses[0]), dynamic_shapes=({0: Dim.AUTO}, None)).module()
+    for count in (60, 41, 3):
+        torch.testing.assert_close(program(points[:count], poses[1]), layer(points[:count], poses[1]))
+
+
+def test_both_modes_give_the_same_derivatives(plain_hand, plain_hand_skin, points, poses):
+    torch.testing.assert_close(jacfwd(plain_hand_skin)(poses[0]), jacrev(plain_hand_skin)(poses[0]))
+    far = points + 0.3  # the exact zero set of max() is left out
+    one, other = (mode(plain_hand.distance, argnums=1)(far, poses[0]) for mode in (jacfwd, jacrev))
+    torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+    model = grid_model(points, "dual_quaternion")
+    inputs = (points[:10], model.transforms.detach())
+    one, other = (mode(model, argnums=1)(*inputs) for mode in (jacfwd, jacrev))
+    torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+def test_mapped_layers_are_batched_layers(plain_hand, plain_hand_skin, points, poses):
+    torch.testing.assert_close(vmap(plain_hand_skin)(poses), plain_hand_skin(poses))
+    mapped = vmap(plain_hand.distance, in_dims=(None, 0))(points, poses)
+    torch.testing.assert_close(mapped, torch.stack([plain_hand.distance(points, pose) for pose in poses]))
+    model = grid_model(points, "linear")
+    many = model.transforms.detach() + torch.arange(3.0)[:, None, None, None] * torch.eye(4)[:, 3:]
+    torch.testing.assert_close(vmap(model, in_dims=(None, 0))(points, many), model(points, many))

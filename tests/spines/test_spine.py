@@ -1,0 +1,175 @@
+"""The spine model: frames met exactly, smooth between them, shared nodes, gradients, and what it refuses."""
+
+import math
+
+import pytest
+import torch
+
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.rotation import so3_exp
+from torchreg.spines.curves import tangents
+from torchreg.spines.spine import Spine
+
+GRAPH = torch.tensor([[0, 4], [1, 4], [2, 5], [3, 5], [4, 5]])  # four tips, two junctions
+
+
+def made_curves(count=4, samples=7, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    nodes = torch.randn(count, 6, 3, generator=generator, dtype=torch.float64)
+    share = torch.linspace(0, 1, samples, dtype=torch.float64)[:, None]
+    start, end = (nodes[:, GRAPH[:, k]].unsqueeze(2) for k in (0, 1))
+    bulge = torch.randn(count, 5, 1, 3, generator=generator, dtype=torch.float64)
+    return start + share * (end - start) + share * (1 - share) * bulge
+
+
+@pytest.fixture
+def spine():
+    curves = made_curves()
+    radii = torch.full(curves.shape[:3], 0.1, dtype=torch.float64) * torch.arange(1, 5)[:, None, None]
+    return Spine(curves, GRAPH, radii, times=torch.tensor([0.0, 1.0, 3.0, 4.0]))
+
+
+def test_the_frames_are_met_exactly(spine):
+    torch.testing.assert_close(spine(spine.times), made_curves(), rtol=0, atol=1e-14)
+    assert spine(2.0).shape == (5, 7, 3)
+    assert (spine.num_tips, spine.num_limbs) == (4, 5)
+    torch.testing.assert_close(spine.radii(spine.times)[:, 0, 0], torch.tensor([0.1, 0.2, 0.3, 0.4]).double())
+    torch.testing.assert_close(spine.tips(3.0), made_curves()[2, :4, 0])
+
+
+def test_motion_at_even_speed_and_under_even_acceleration_is_met_between_the_frames():
+    times = torch.tensor([0.0, 1.0, 3.0, 4.0], dtype=torch.float64)
+    path = (times + 0.5 * times**2)[:, None, None, None]
+    shape = made_curves(1)
+    spine = Spine(shape + path, GRAPH, times=times)
+    for t in (1.5, 2.0, 2.9):
+        torch.testing.assert_close(spine(t), shape[0] + t + 0.5 * t**2)
+
+
+def test_speed_does_not_jump_at_the_frames(spine):
+    eps = 1e-6
+    for t in (1.0, 3.0):
+        before, after = (spine(t) - spine(t - eps)) / eps, (spine(t + eps) - spine(t)) / eps
+        torch.testing.assert_close(before, after, atol=1e-4, rtol=1e-4)
+
+
+def test_limbs_share_their_nodes_also_after_a_step(spine):
+    with torch.no_grad():
+        spine.nodes += 0.1 * torch.randn(spine.nodes.shape, generator=torch.Generator().manual_seed(1))
+    curves = spine(1.7)
+    torch.testing.assert_close(curves[0, -1], curves[1, -1])
+    torch.testing.assert_close(curves[0, -1], curves[4, 0])
+    torch.testing.assert_close(curves[2, -1], curves[4, -1])
+
+
+def test_many_times_at_once_equal_one_after_the_other(spine):
+    times = torch.tensor([[0.2, 1.0], [2.7, 4.0]], dtype=torch.float64)
+    for function in (spine, spine.radii, spine.frames, spine.lengths, spine.bend_angles, spine.tips):
+        torch.testing.assert_close(function(times)[1, 0], function(2.7))
+
+
+def test_frames_of_the_limbs_follow_the_curves_and_turn_with_the_body():
+    curves = made_curves(1) * torch.tensor([1.0, 1.0, 0.0])
+    turn = so3_exp(torch.tensor([0.0, 0.0, math.pi / 3], dtype=torch.float64))
+    first = Spine(curves, GRAPH).rest_frames
+    spine = Spine(torch.cat((curves, curves @ turn.mT)), GRAPH, frames=torch.cat((first, turn @ first)))
+    half = so3_exp(torch.tensor([0.0, 0.0, math.pi / 6], dtype=torch.float64))
+    frames = spine.frames(0.5)
+    torch.testing.assert_close(frames[..., 2], tangents(spine(0.5)))
+    torch.testing.assert_close(frames @ frames.mT, torch.eye(3, dtype=torch.float64).expand_as(frames))
+    torch.testing.assert_close(frames, half @ first[0])
+
+
+def test_lengths_and_bends_are_those_of_the_curves():
+    straight = torch.linspace(0, 1, 5, dtype=torch.float64)[:, None] * torch.tensor([3.0, 4.0, 0.0])
+    bent = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]], dtype=torch.float64)
+    spine = Spine(straight[None, None], torch.tensor([[0, 1]]))
+    assert float(spine.lengths(0.0).detach()) == pytest.approx(5.0)
+    torch.testing.assert_close(spine.bend_angles(0.0), torch.zeros(1, 3, dtype=torch.float64))
+    torch.testing.assert_close(
+        Spine(bent[None, None], torch.tensor([[0, 1]])).bend_angles(0.0), torch.tensor([[math.pi / 2]]).double()
+    )
+
+
+def test_gradients_are_right_in_time_and_nodes(spine):
+    time = torch.tensor(1.3, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(spine, (time,))
+
+    def of_nodes(nodes):
+        return torch.func.functional_call(spine, {"nodes": nodes}, (torch.tensor([0.4, 3.0]).double(),))
+
+    assert torch.autograd.gradcheck(of_nodes, (spine.nodes.detach().requires_grad_(),))
+    spine.frames(1.3).sum().backward()
+    assert bool(spine.nodes.grad.isfinite().all())
+
+
+def test_a_loss_draws_the_curves_to_their_target(spine):
+    target = made_curves(seed=5)
+    optimizer = torch.optim.Adam(spine.parameters(), lr=0.1)
+    for _ in range(150):
+        optimizer.zero_grad()
+        loss = (spine(spine.times) - target).square().mean()
+        loss.backward()
+        optimizer.step()
+    assert float(loss.detach()) < 1e-3
+
+
+def test_a_single_frame_stands_still():
+    spine = Spine(made_curves(1).float(), GRAPH)
+    assert spine(0.0).dtype == torch.float32
+    torch.testing.assert_close(spine(0.0), made_curves(1).float()[0])
+    assert spine.frames(0.0).shape == (5, 7, 3, 3)
+    assert spine.radii(0.0).shape == (5, 7)
+
+
+def test_states_are_saved_and_loaded(spine):
+    other = Spine(made_curves(seed=3), GRAPH, times=spine.times)
+    other.load_state_dict(spine.state_dict())
+    assert torch.equal(other(2.2), spine(2.2))
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"curves": torch.zeros(2, 5, 1, 3)}, InputError, "two points at least"),
+        ({"curves": torch.zeros(5, 7, 3)}, InputError, "curves must have shape"),
+        ({"curves": torch.full((1, 5, 3, 3), torch.nan)}, InputError, "curves must be finite"),
+        ({"graph": GRAPH[:4]}, InputError, "graph must have shape"),
+        ({"graph": GRAPH.double()}, InputTypeError, "graph must hold integers"),
+        ({"graph": GRAPH + 1}, InputError, "graph must hold the nodes 0 to 5"),
+        ({"graph": torch.tensor([[0, 4], [1, 4], [0, 1], [2, 3], [5, 2]])}, InputError, "must be a tree"),
+        ({"graph": 5 - GRAPH}, InputError, "tips first"),
+        ({"graph": GRAPH[[0, 2, 1, 3, 4]]}, InputError, "must meet where graph says"),
+        ({"radii": torch.zeros(4, 5, 6)}, InputError, "radii must have shape"),
+        ({"frames": torch.zeros(4, 5, 7, 3)}, InputError, "frames must have shape"),
+        ({"times": torch.tensor([0.0, 1.0, 1.0, 2.0])}, InputError, "times must increase strictly"),
+    ],
+)
+def test_bad_input_is_named(change, error, message):
+    with pytest.raises(error, match=message):
+        Spine(**{"curves": made_curves(), "graph": GRAPH, **change})
+
+
+def test_times_outside_are_refused(spine):
+    with pytest.raises(InputError, match=r"t must lie within the times 0.0 to 4.0"):
+        spine(4.5)
+
+
+def test_the_record_makes_the_same_spine_again_also_after_a_step(spine):
+    with torch.no_grad():
+        spine.nodes += 0.1
+        spine.node_radii *= 2
+    fields = spine.record()
+    again = Spine(fields.curves, fields.graph, fields.radii, fields.frames, fields.times)
+    for name in ("nodes", "node_radii", "rest_frames", "times", "graph"):
+        assert torch.equal(getattr(again, name), getattr(spine, name))
+
+
+def test_one_moment_is_a_skeleton(spine):
+    skeleton = spine.skeleton(1.5)
+    assert skeleton.tips.tolist() == [0, 1, 2, 3]
+    assert skeleton.junctions.tolist() == [4, 5]
+    curves = spine(1.5).detach()
+    for limb, curve in zip(skeleton.limbs[:4], curves, strict=False):
+        torch.testing.assert_close(skeleton.nodes[limb], curve)
+    torch.testing.assert_close(skeleton.radii[skeleton.limbs[4]], spine.radii(1.5).detach()[4])

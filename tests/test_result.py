@@ -1,0 +1,70 @@
+"""Result records: frozen, complete, and independent of the pipelines that fill them."""
+
+from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
+
+import pytest
+import torch
+
+from torchreg.alignment import results as alignment
+from torchreg.alignment.results import AlignRecord, Calibration, PoseStarts
+from torchreg.registration import results as registration
+from torchreg.result import Result, Status
+from torchreg.spines import results as spines
+from torchreg.tracking import results as tracking
+
+RECORDS = [
+    kind
+    for module in (alignment, registration, spines, tracking)
+    for kind in vars(module).values()
+    if is_dataclass(kind) and kind.__module__ == module.__name__
+]
+
+
+def test_results_do_not_change(result):
+    with pytest.raises(FrozenInstanceError):
+        result.pose = torch.ones(27)
+    record = AlignRecord("em", 0, 5, torch.ones(1), torch.ones(1), torch.zeros(1, 27), torch.zeros(1))
+    with pytest.raises(FrozenInstanceError):
+        record.step = 1
+
+
+@pytest.mark.parametrize("record", RECORDS, ids=lambda record: record.__name__)
+def test_every_field_is_documented(record):
+    documented = "".join(kind.__doc__ for kind in record.__mro__ if kind in RECORDS)
+    assert [field.name for field in fields(record) if f"        {field.name}: " not in documented] == []
+
+
+def test_a_status_has_one_spelling_in_files():
+    assert [Status(status.value) for status in Status] == list(Status)
+    assert {status.value for status in Status} >= {"converged", "max_steps", "few_inliers", "no_data"}
+
+
+def test_only_alignments_with_data_are_usable():
+    assert [status for status in Status if status.usable] == [
+        Status.CONVERGED,
+        Status.MAX_STEPS,
+        Status.WITH_WARNINGS,
+    ]
+
+
+def test_results_print_in_one_line_without_their_numbers(result):
+    text = repr(result)
+    assert text.startswith("AlignResult(pose=float32 (27,), registered=float32 (5, 3)")
+    assert "sigma=0.002, cost=1.5, status=converged, history=none)" in text
+    assert "\n" not in text
+    record = AlignRecord("em", 0, 5, torch.ones(1), torch.ones(1), torch.zeros(1, 27), torch.zeros(1))
+    many = replace(result, status=(Status.CONVERGED, Status.LOST, Status.CONVERGED), history=(record,) * 3)
+    assert "status=2 converged, 1 lost, history=3 x AlignRecord)" in repr(many)
+    shape = torch.nn.Linear(1, 1)
+    calibration = Calibration(shape, torch.zeros(2, 3), torch.zeros(1), torch.zeros(4), torch.tensor(1.0), Status.LOST)
+    assert "shape=Linear" in repr(calibration)
+    assert all(kind.__repr__ is Result.__repr__ for kind in RECORDS if issubclass(kind, Result))
+
+
+def test_notebooks_show_a_table(result):
+    table = replace(result, status=(Status.OTHER_UNITS,))._repr_html_()
+    assert table.startswith("<table><caption>AlignResult</caption>")
+    assert "<td style='text-align:left'>float32 (5, 3)</td>" in table
+    assert table.count("<tr>") == 10
+    odd = PoseStarts(torch.zeros(1, 3), torch.zeros(1), "<b>")
+    assert "&lt;b&gt;" in odd._repr_html_()

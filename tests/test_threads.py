@@ -1,0 +1,132 @@
+"""How many threads torch uses while the work is on many small tensors."""
+
+import threading
+
+import pytest
+import torch
+
+from torchreg._threads import both, one_thread
+
+
+@pytest.fixture(autouse=True)
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def test_there_is_one_thread_inside_and_as_many_as_before_after():
+    with one_thread():
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 2
+
+
+def test_the_number_comes_back_after_an_error():
+    with pytest.raises(RuntimeError, match="inside"), one_thread():
+        raise RuntimeError("inside")
+    assert torch.get_num_threads() == 2
+
+
+def test_threads_that_overlap_get_their_numbers_back():
+    entered, leave, found = threading.Event(), threading.Event(), []
+
+    def other():
+        torch.set_num_threads(2)
+        with one_thread():
+            entered.set()
+            leave.wait(10)
+        found.append(torch.get_num_threads())
+
+    thread = threading.Thread(target=other)
+    with one_thread():
+        thread.start()
+        assert entered.wait(10)
+    assert torch.get_num_threads() == 2
+    leave.set()
+    thread.join(10)
+    assert found == [2]
+    assert torch.get_num_threads() == 2
+
+
+def test_a_decorated_function_may_call_itself():
+    @one_thread()
+    def count(depth):
+        return [torch.get_num_threads(), *(count(depth - 1) if depth else [])]
+
+    assert count(2) == [1, 1, 1]
+    assert torch.get_num_threads() == 2
+
+
+def test_large_work_keeps_all_threads():
+    with one_thread(False):
+        assert torch.get_num_threads() == 2
+    with one_thread(), one_thread(False):
+        assert torch.get_num_threads() == 1
+
+
+def who():
+    return (
+        threading.current_thread(),
+        torch.get_num_threads(),
+        torch.is_grad_enabled(),
+        torch.is_inference_mode_enabled(),
+    )
+
+
+def test_two_calls_are_made_side_by_side():
+    meet = threading.Barrier(2, timeout=10)
+
+    def call():
+        meet.wait()
+        return who()
+
+    with one_thread(), torch.no_grad():
+        (here, *own), (there, *others) = both(call, call)
+    assert here is threading.current_thread()
+    assert there is not here
+    assert own == others == [1, False, False]
+
+
+@pytest.mark.parametrize("mode", [torch.no_grad, torch.enable_grad, torch.inference_mode])
+def test_gradients_are_recorded_beside_as_here(mode):
+    with mode():
+        (_, *own), (_, *others) = both(who, who)
+    assert own == others
+
+
+def test_one_thread_makes_both_calls_where_torch_has_one():
+    torch.set_num_threads(1)
+    with one_thread():
+        one, other = both(who, who)
+    assert one == other
+    assert one[0] is threading.current_thread()
+
+
+@pytest.mark.parametrize(("allowed", "most"), [(2, 2), (3, 3), (4, 4), (5, 4)])
+def test_calls_within_calls_share_what_is_left(allowed, most):
+    torch.set_num_threads(allowed)
+
+    def pair():
+        return both(who, who)
+
+    with one_thread():
+        found = [each[0] for two in both(pair, pair) for each in two]
+        again = [each[0] for each in pair()]
+    assert len(set(found)) == most
+    assert len(set(again)) == 2
+
+
+def test_an_error_of_either_call_is_raised_once_both_have_ended():
+    ended = threading.Event()
+
+    def fails():
+        raise RuntimeError("inside")
+
+    with pytest.raises(RuntimeError, match="inside"):
+        both(fails, ended.set)
+    assert ended.is_set()
+    with pytest.raises(RuntimeError, match="inside"):
+        both(int, fails)
+    with one_thread():
+        assert both(who, who)[1][0] is not threading.current_thread()

@@ -1,0 +1,102 @@
+"""The demonstration: the sequence that anyone can make, errors against an own computation, interruptions."""
+
+import pytest
+import torch
+
+import torchreg.tracking.demo as demo
+from torchreg.datasets.sequences import hand_sequence
+from torchreg.errors import InputError
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.skin import sample_skin
+from torchreg.storage import load
+from torchreg.tracking.tracker import TrackConfig, Tracker
+
+
+@pytest.fixture(scope="module")
+def three():
+    calls = []
+    result = demo.run_demo(3, seed=1, on_frame=lambda *arguments: calls.append(arguments))
+    return result, calls
+
+
+def test_frames_are_those_of_the_sequence_that_anyone_can_make(three):
+    result, calls = three
+    sequence = hand_sequence("bending_palm", 3, seed=1)
+    assert all(torch.equal(own, cloud.points) for own, cloud in zip(result.clouds, sequence, strict=True))
+    assert torch.equal(result.truths, torch.stack([cloud.pose for cloud in sequence]))
+    assert calls == [(1, 3), (2, 3), (3, 3)]
+    assert result.seed == 1
+    assert result.track.times.tolist() == [0.0, 0.05, 0.1]
+    for finger, part in enumerate(Hand().fingertip_parts):
+        seen = [int((cloud.part_labels == part).sum()) >= 8 for cloud in sequence]
+        assert result.tips_seen[:, finger].tolist() == seen
+
+
+def test_the_hand_is_found_and_followed(three):
+    result, _ = three
+    hand, track = Hand(), result.track
+    assert track.poses.shape == (3, 27)
+    assert track.acquired[0] == "found"
+    assert all(status.usable for status in track.statuses)
+    # The keypoints in the usual order: every fourth after the wrist is a tip.
+    for frame in range(3):
+        found, true = hand.keypoints(track.poses[frame]), hand.keypoints(result.truths[frame])
+        errors = [(found[k] - true[k]).norm().item() for k in (4, 8, 12, 16, 20)]
+        assert result.tip_errors[frame].tolist() == pytest.approx(errors, abs=1e-6)
+    assert result.tip_errors[result.tips_seen].mean() < 0.003
+    for cloud, inliers, share in zip(result.clouds, result.inliers, track.inlier_ratios.tolist(), strict=True):
+        assert inliers.sum().item() / len(cloud) == pytest.approx(share)
+        assert 0.6 < share < 0.8
+
+
+def test_what_is_returned_can_be_saved(three, tmp_path):
+    result, _ = three
+    result.save(tmp_path / "poses.safetensors")
+    loaded = load(tmp_path / "poses.safetensors")
+    assert torch.equal(loaded.track.poses, result.track.poses)
+    assert torch.equal(loaded.clouds[2], result.clouds[2])
+
+
+def stop_at(monkeypatch, frame):
+    """Let the keyboard interrupt the tracker while it works on a frame."""
+    step = Tracker.step
+
+    def stopped(self, points, time=None):
+        if self.state.frame == frame:
+            raise KeyboardInterrupt
+        return step(self, points, time)
+
+    monkeypatch.setattr(Tracker, "step", stopped)
+
+
+def test_an_interruption_keeps_the_frames_that_are_done(monkeypatch):
+    stop_at(monkeypatch, 2)
+    result = demo.run_demo(4, config=TrackConfig(recovery="none"))
+    assert len(result.track.poses) == len(result.truths) == len(result.clouds) == len(result.inliers) == 2
+    # Without a search nothing is found.
+    assert not result.track.poses.isfinite().any()
+    assert result.tip_errors.isnan().all()
+
+
+def test_an_interruption_before_the_first_frame_leaves_nothing(monkeypatch):
+    stop_at(monkeypatch, 0)
+    with pytest.raises(KeyboardInterrupt):
+        demo.run_demo(2)
+
+
+def test_a_pose_moves_to_the_mean_of_a_cloud_and_keeps_its_turn():
+    hand = Hand()
+    skin = sample_skin(hand, 50)
+    pose = hand.rest_pose()
+    pose[3:6] = torch.tensor([0.3, -1.0, 2.0])
+    cloud = torch.randn(40, 3, generator=torch.Generator().manual_seed(0)) + 5
+    moved = demo.moved_to_mean(skin, pose, cloud)
+    assert torch.equal(moved[3:], pose[3:])
+    assert torch.allclose(skin(moved).mean(0), cloud.mean(0), atol=1e-5)
+    with pytest.raises(InputError, match="cloud must have shape"):
+        demo.moved_to_mean(skin, pose, cloud[0])
+
+
+def test_there_is_at_least_one_frame():
+    with pytest.raises(InputError, match="num_frames must be a positive integer, got 0"):
+        demo.run_demo(0)

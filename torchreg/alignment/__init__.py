@@ -1,0 +1,1 @@
+"""Articulated alignment: the pose of a shape in 3-D points."""

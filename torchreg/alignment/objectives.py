@@ -1,0 +1,150 @@
+"""The two objectives of an alignment as least-squares problems around a pose: eq. 20 and eqs. 21, 22."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.rotation import compose_rotation_vectors
+from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.shapes.surface import Surface
+from torchreg.solvers.e_step import EStep
+from torchreg.solvers.levenberg_marquardt import Linearization
+
+# The base is held, in the Hessian alone, as if by this share of a datum: more slows starts that few data reach.
+_ANCHOR_DATA = 0.1
+
+
+@dataclass(frozen=True)
+class PosePrior:
+    """A Gaussian on the pose, ``sum_k precision_k (pose_k - mean_k)^2 / 2``; zero precision leaves one free.
+
+    Args:
+        mean: (B, num_dofs).
+        precision: (num_dofs,) or (B, num_dofs), 1 / std^2.
+        holds_base: whether the base's precision is not zero; its rotations then differ by composition.
+    """
+
+    mean: Tensor
+    precision: Tensor
+    holds_base: bool = False
+
+    def add_to(self, problem: Linearization, pose: Tensor) -> Linearization:
+        """Return the problem with the prior added."""
+        offset = self._offset(pose, self.mean)
+        pull = self.precision * offset
+        return Linearization(
+            problem.cost + 0.5 * (pull * offset).sum(-1),
+            problem.gradient + pull,
+            problem.hessian + torch.diag_embed(self.precision),
+        )
+
+    def cost(self, pose: Tensor) -> Tensor:
+        """Return the prior's cost (...) of poses (..., num_dofs); the mean's batch is the first dimension."""
+        mean = self.mean.reshape(self.mean.shape[0], *[1] * (pose.ndim - 2), -1)
+        return 0.5 * (self.precision * self._offset(pose, mean).square()).sum(-1)
+
+    def _offset(self, pose: Tensor, mean: Tensor) -> Tensor:
+        if not self.holds_base:
+            return pose - mean
+        turned = compose_rotation_vectors(pose[..., 3:6], -mean[..., 3:6])
+        return torch.cat([pose[..., :3] - mean[..., :3], turned, pose[..., 6:] - mean[..., 6:]], dim=-1)
+
+
+class RegistrationObjective:
+    """Eq. 20, ``sum_i lambda_i |T(X_i, pose) - G_i|^2 / 2 sigma^2``, over the model points only.
+
+    The skin is linear in the part transforms, so the curvature over all points collapses into one small matrix.
+
+    Args:
+        skin: the model points.
+        observed: lambda and G from the E-step.
+        sigma: (B,) metres.
+        prior: on the joints.
+    """
+
+    def __init__(self, skin: LinearBlendSkin, observed: EStep, sigma: Tensor, prior: PosePrior) -> None:
+        self.skin, self.prior, self.targets = skin, prior, observed.targets
+        weights = torch.threshold(observed.weights, 1e-12, 0.0)
+        self.weights = (weights / (sigma * sigma).unsqueeze(-1)).unsqueeze(-1)
+        self.curvature = skin.basis.mT @ (self.weights * skin.basis)
+
+    def __call__(self, pose: Tensor) -> Linearization:
+        """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs)."""
+        return self.linearize(pose, *self.skin.shape.transform_jacobian(pose, chart="tangent"))
+
+    def linearize(self, pose: Tensor, rows: Tensor, derivative: Tensor) -> Linearization:
+        """Return the same, given the part transforms and their derivatives at the pose (see `transform_jacobian`)."""
+        residual = self.skin.place(rows) - self.targets
+        weighted = self.weights * residual
+        flat = derivative.flatten(-3, -2)
+        # Written with the three coordinates from the left, as in `place`.
+        pull = (weighted.mT @ self.skin.basis).mT.flatten(-2).unsqueeze(-1)
+        gradient = (flat.mT @ pull).squeeze(-1)
+        curved = (self.curvature @ derivative.flatten(-2)).reshape(flat.shape)
+        problem = Linearization(0.5 * (weighted * residual).sum((-2, -1)), gradient, flat.mT @ curved)
+        return self.prior.add_to(problem, pose)
+
+    def cost(self, pose: Tensor) -> Tensor:
+        """Return the cost alone (B,), in a third of the time."""
+        residual = self.skin(pose) - self.targets
+        return 0.5 * (self.weights * residual * residual).sum((-2, -1)) + self.prior.cost(pose)
+
+
+class SurfaceObjective:
+    """Eqs. 21 and 22: squared surface distances of the data, each weighted by ``beta = exp(-d^2 / sigma_s^2)``.
+
+    With beta recomputed at every pose this is the Welsch function ``sigma_s^2 (1 - beta) / 2``, which never increases.
+
+    Args:
+        surface: the surface to fit.
+        data: (B, M, 3), metres.
+        valid: (B, M) one, or zero where padded.
+        sigma: (B,) kernel width sigma_s, metres.
+        noise: (B,) standard deviation of the distances, metres; weighs data against the prior.
+        prior: on the joints.
+        lever: length by which a turn of the base moves the shape, metres.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        data: Tensor,
+        valid: Tensor,
+        sigma: Tensor,
+        noise: Tensor,
+        prior: PosePrior,
+        lever: float = 1.0,
+    ) -> None:
+        self.surface, self.data, self.valid, self.prior = surface, data, valid, prior
+        self.inverse_square = sigma.square().reciprocal().unsqueeze(-1)
+        self.scale = noise.square().reciprocal()
+        # What the data leave free, as sliding along a cylinder, then stays where it is.
+        stiffness = _ANCHOR_DATA * self.inverse_square
+        turns = torch.nn.functional.pad((stiffness * lever**2).expand(-1, 3), (3, prior.mean.shape[-1] - 6))
+        self.anchor = turns + torch.nn.functional.pad(stiffness.expand(-1, 3), (0, prior.mean.shape[-1] - 3))
+
+    def __call__(self, pose: Tensor) -> Linearization:
+        """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs)."""
+        return self.linearize(pose, *self.surface.distance_jacobian(self.data, pose))
+
+    def linearize(self, pose: Tensor, distance: Tensor, jacobian: Tensor) -> Linearization:
+        """Return the same, given the distances and their Jacobian at the pose."""
+        beta = self._beta(distance)
+        weighted = jacobian * (beta * self.valid * self.scale.unsqueeze(-1)).unsqueeze(-1)
+        gradient = (weighted.mT @ distance.unsqueeze(-1)).squeeze(-1)
+        hessian = weighted.mT @ jacobian + torch.diag_embed(self.anchor)
+        return self.prior.add_to(Linearization(self._data_cost(beta), gradient, hessian), pose)
+
+    def cost(self, pose: Tensor) -> Tensor:
+        """Return the cost alone (B,), in half the time."""
+        beta = self._beta(self.surface.distance(self.data, pose))
+        return self._data_cost(beta) + self.prior.cost(pose)
+
+    def _beta(self, distance: Tensor) -> Tensor:
+        return (-distance.square() * self.inverse_square).exp()
+
+    def _data_cost(self, beta: Tensor) -> Tensor:
+        return 0.5 * ((1 - beta) * self.valid).sum(-1) / self.inverse_square.squeeze(-1) * self.scale

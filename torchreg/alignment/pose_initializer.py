@@ -1,0 +1,261 @@
+"""Poses for networks: a module from batches of clouds to poses, fast without gradients, differentiable with them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor, nn
+
+from torchreg._checks import check_choice, check_count, check_positive, check_shape
+from torchreg.alignment.annealed_em import SIGMA_PER_NOISE, fit_surface, register, residual_noise
+from torchreg.alignment.find_pose import FindPoseConfig, find_pose, typical_poses
+from torchreg.alignment.implicit_gradient import FixedPoint, attach_gradients
+from torchreg.alignment.local_search import clustered_data
+from torchreg.alignment.objectives import PosePrior, SurfaceObjective
+from torchreg.alignment.problem import AlignProblem, centered_problem, check_data, masked_mean, shifted
+from torchreg.alignment.sigma_schedule import SigmaSchedule
+from torchreg.errors import InputError
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.skin import LinearBlendSkin, sample_skin
+from torchreg.shapes.surface import FusedSurface
+
+_START_SIGMA, _STOP_SIGMA = 0.08, 0.02
+# How weakly a start holds the base, so that a cloud without data leaves it there: radians, and shares of the size.
+_TURN_STD, _SHIFT_STD = 1.0, 0.5
+# A datum counts as explained about this share of the size from the surface; clusters of this share of the data do not.
+_EXPLAINED, _DOUBTFUL_SHARE = 0.02, 0.1
+_LEVER = 0.25
+# Clouds that are searched, and whose poses are fitted, at a time.
+_CHUNK, _WIDE_CHUNK = {"cpu": 1}, 256
+_ROWS, _WIDE_ROWS = {"cpu": 64}, 4096
+
+
+@dataclass(frozen=True)
+class PoseInitializerConfig:
+    """How `PoseInitializer` works. Lengths default to shares of the shape's size.
+
+    Args:
+        sigma_steps: widths of the annealed EM from a start, from 8 % to 2 % of the size; 0 leaves the EM out.
+        em_steps: EM iterations per width.
+        surface_steps: steps at each width of the surface fit; 0 leaves the widths above the last out.
+        fit_steps: steps, at most, of the last fit, whose stationary point is the pose.
+        newton_steps: exact Newton steps after it where gradients are wanted, which make them exact; num_dofs + 1
+            backward passes each.
+        prior_std: standard deviation of the prior that holds joints near the start, radians; from scratch it draws
+            them to a typical pose.
+        noise: standard deviation of the data about the surface, metres; by default estimated, cloud by cloud, and then
+            held when gradients are taken.
+        num_model_points: points sampled on the shape for the EM.
+        search: of poses from scratch.
+        chunk: clouds that are searched at a time; by default one on a CPU, whose caches hold no more, else 256.
+        nan_policy: "raise", or "omit" to leave out non-finite data.
+    """
+
+    sigma_steps: int = 3
+    em_steps: int = 2
+    surface_steps: int = 2
+    fit_steps: int = 6
+    newton_steps: int = 2
+    prior_std: float = 0.3
+    noise: float | None = None
+    num_model_points: int = 300
+    search: FindPoseConfig = field(default_factory=lambda: FindPoseConfig(num_retries=3))
+    chunk: int | None = None
+    nan_policy: str = "raise"
+
+    def __post_init__(self) -> None:
+        check_choice(self.nan_policy, "nan_policy", ("raise", "omit"))
+        for name in ("sigma_steps", "em_steps", "surface_steps", "newton_steps"):
+            check_count(getattr(self, name), name, int(name == "em_steps"))
+        for name in ("fit_steps", "num_model_points"):
+            check_count(getattr(self, name), name, 1)
+        if self.chunk is not None:
+            check_count(self.chunk, "chunk", 1)
+        check_positive(self.prior_std, "prior_std")
+        if self.noise is not None:
+            check_positive(self.noise, "noise")
+
+
+@dataclass(frozen=True)
+class InitialPose:
+    """What `PoseInitializer` returns; without a batch of clouds the dimension B is absent.
+
+    Args:
+        pose: (B, num_dofs), metres and radians.
+        confidence: (B,) from 0 to 1, without gradients: the share of the data that the pose explains; from scratch
+            times how surely the search found the pose, and the data tell where its limbs end.
+        keypoints: (B, K, 3) of the shape in the pose, metres.
+        registered: (B, N, 3) model points in the pose, metres.
+    """
+
+    pose: Tensor
+    confidence: Tensor
+    keypoints: Tensor
+    registered: Tensor
+
+
+class PoseInitializer(nn.Module):
+    """Finds the poses in which a shape lies on a batch of clouds; also a layer, with exact gradients.
+
+    With starts, as from a network or the frame before, an annealed EM and a surface fit take all clouds to their poses
+    together; without, `find_pose` searches first. Under ``torch.no_grad`` that is all. Otherwise the pose, a stationary
+    point of the last fit, takes its gradients from the implicit function: in the points, the starts, and the shape's
+    parameters that require them, in memory that does not grow with the iterations.
+
+    The last fit is to the shape's solids, also where its file has a mesh: `align` then fits more closely.
+
+    All is computed in the shape's dtype, whatever autocast says; the solve of the backward pass in float64.
+
+    Args:
+        shape: the articulated shape, in metres. Call ``shape.requires_grad_(False)`` unless its sizes are learned.
+        config: see `PoseInitializerConfig`.
+        model_points: a skin of the shape to reuse; sampled on the surface by default.
+
+    Raises:
+        InputError: if ``model_points`` is a skin of another shape.
+
+    References: Dewaele et al. 2006, section 3.
+    """
+
+    def __init__(
+        self,
+        shape: ArticulatedShape,
+        config: PoseInitializerConfig | None = None,
+        *,
+        model_points: LinearBlendSkin | None = None,
+    ) -> None:
+        super().__init__()
+        self.config = config or PoseInitializerConfig()
+        self.shape = shape
+        if model_points is not None and model_points.shape is not shape:
+            raise InputError("model_points is a skin of another shape; build it from the shape whose pose is sought")
+        self.skin = sample_skin(shape, self.config.num_model_points) if model_points is None else model_points
+
+    def forward(self, points: Tensor, mask: Tensor | None = None, start: Tensor | None = None) -> InitialPose:
+        """Return the poses of the shape in clouds.
+
+        Args:
+            points: (B, M, 3) or (M, 3), metres; of any floating dtype.
+            mask: (B, M) or (M,), False where points are padding. A cloud without points stays at its start.
+            start: (B, num_dofs) or (num_dofs,) pose per cloud; searched for if None.
+
+        Returns:
+            an `InitialPose`.
+
+        Raises:
+            InputError: if a shape does not fit, a number is not finite, or no cloud has a point.
+            InputTypeError: if the mask is not of bool.
+
+        Differentiable: in ``points``, ``start`` and the shape's parameters, once; not in which points are outliers to
+            be ignored, nor in the estimated noise.
+
+        Cost: of the forward pass O(B M) per step; from scratch about two seconds per hand on one CPU core.
+        """
+        with torch.autocast(device_type=self.shape.rest.device.type, enabled=False):
+            data, valid = check_data(self.shape, points, mask, self.config.nan_policy)
+            batch, allowed = (data, valid) if data.ndim == 3 else (data.unsqueeze(0), valid.unsqueeze(0))
+            origin = masked_mean(batch, allowed).detach()
+            given = None if start is None else self._given(start, len(batch))
+            if torch.is_grad_enabled():
+                pose, confidence = self._poses(batch, allowed, given, origin)
+            else:
+                # More clouds at a time are no faster, and would not fit into memory.
+                rows = torch.arange(len(batch), device=batch.device).split(_ROWS.get(batch.device.type, _WIDE_ROWS))
+                parts = [
+                    self._poses(batch[r], allowed[r], None if given is None else given[r], origin[r]) for r in rows
+                ]
+                pose, confidence = (torch.cat(part) for part in zip(*parts, strict=True))
+            keypoints, registered = self.shape.keypoints(pose), self.skin(pose)
+        result = InitialPose(pose, confidence, keypoints, registered)
+        return result if data.ndim == 3 else InitialPose(pose[0], confidence[0], keypoints[0], registered[0])
+
+    def _given(self, start: Tensor, count: int) -> Tensor:
+        start = self.shape.check_pose(start, "start")
+        if not bool(start.isfinite().all()):
+            raise InputError("start must be finite")
+        start = start.expand(count, -1) if start.ndim == 1 else start
+        check_shape(start, "start", (count, self.shape.num_dofs))
+        return start
+
+    def _poses(self, data: Tensor, valid: Tensor, given: Tensor | None, origin: Tensor) -> tuple[Tensor, Tensor]:
+        """Return poses (B, num_dofs) and confidences (B,)."""
+        if given is None:
+            found, sure = self._search(data.detach(), valid)
+            begin = shifted(found, -origin)
+            # The prior draws to a typical pose, which does not change with the data.
+            mean = torch.cat([found[:, :6], typical_poses(self.shape).mean(0)[6:].expand(len(found), -1)], dim=-1)
+        else:
+            begin, mean, sure = given, given, torch.ones_like(given[:, 0]).detach()
+        with torch.no_grad():
+            problem = centered_problem(
+                self.skin, data, valid, mean, origin, prior_std=self.config.prior_std, pose_atol=0.0, debias=0.8
+            )
+            if given is None:
+                begin = self._approach(problem, problem.clamp(begin))
+            else:
+                begin = self._descend(problem, problem.clamp(problem.prior.mean))
+            # A file's own mesh, whose nearest points jump, has no smooth fixed point: the solids have.
+            problem = replace(problem, surface=FusedSurface(self.shape))
+            fixed, pose = self._settle(problem, begin, has_base=given is not None)
+            confidence = sure * self._confidence(problem, pose)
+        mean = shifted(mean, -origin)
+        if torch.is_grad_enabled() and (data.requires_grad or mean.requires_grad or fixed.parameters):
+            centered = torch.where(valid.unsqueeze(-1), data - origin.unsqueeze(1), 0.0)
+            pose = fixed.polish(pose, centered, mean, self.config.newton_steps)
+            pose = attach_gradients(fixed, pose, centered, mean)
+        return shifted(pose, origin), confidence
+
+    @torch.no_grad()
+    def _search(self, data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the best poses (B, num_dofs) that a search finds, and how sure they are (B,); without points, not."""
+        pose = typical_poses(self.shape).mean(0).repeat(len(data), 1)
+        sure = torch.zeros_like(pose[:, 0])
+        chunk = self.config.chunk or _CHUNK.get(data.device.type, _WIDE_CHUNK)
+        for rows in valid.any(-1).nonzero()[:, 0].split(chunk):
+            starts = find_pose(
+                self.shape, data[rows], mask=valid[rows], num_starts=1, model_points=self.skin,
+                config=self.config.search,
+            )  # fmt: skip
+            pose[rows], sure[rows] = starts.poses[:, 0], starts.confidence
+        return pose, sure
+
+    def _descend(self, problem: AlignProblem, pose: Tensor) -> Tensor:
+        """Return the poses after annealed EM, and the surface fit down to the noise."""
+        if self.config.sigma_steps:
+            schedule = SigmaSchedule.geometric(
+                _START_SIGMA * problem.size, _STOP_SIGMA * problem.size, self.config.sigma_steps
+            )
+            pose = register(problem, pose, schedule, em_steps=self.config.em_steps, m_steps=1).pose
+        return self._approach(problem, pose)
+
+    def _approach(self, problem: AlignProblem, pose: Tensor) -> Tensor:
+        if not self.config.surface_steps:
+            return pose
+        return fit_surface(problem, pose, steps=self.config.surface_steps).pose
+
+    def _settle(self, problem: AlignProblem, pose: Tensor, *, has_base: bool) -> tuple[FixedPoint, Tensor]:
+        """Return the energy of the last fit and its stationary pose (B, num_dofs)."""
+        noise = residual_noise(problem, pose)
+        if self.config.noise is not None:
+            noise = torch.full_like(noise, self.config.noise)
+        sigma = SIGMA_PER_NOISE * noise
+        precision = problem.prior.precision.clone()
+        if has_base:
+            precision[:3], precision[3:6] = (_SHIFT_STD * problem.size) ** -2, _TURN_STD**-2
+        fixed = FixedPoint(
+            self.shape, problem.surface, problem.valid, sigma, noise, precision, problem.lower, problem.upper
+        )
+        prior = PosePrior(problem.prior.mean, precision, holds_base=has_base)
+        objective = SurfaceObjective(
+            problem.surface, problem.data, problem.valid, sigma, noise, prior, _LEVER * problem.size
+        )
+        return fixed, problem.solve(objective, pose, self.config.fit_steps, objective(pose)).state
+
+    def _confidence(self, problem: AlignProblem, pose: Tensor) -> Tensor:
+        """Return (B,) from 0 to 1: the share of data near the surface, less where those off it lie densely."""
+        distance = problem.surface.distance(problem.data, pose)
+        near = (-(distance / (_EXPLAINED * problem.size)).square()).exp() * problem.valid
+        share = near.sum(-1) / problem.valid.sum(-1).clamp_min(1)
+        clustered, on_surface = clustered_data(problem, pose)
+        return share * (-clustered / on_surface.clamp_min(1) / _DOUBTFUL_SHARE).exp()

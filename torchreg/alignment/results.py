@@ -1,0 +1,113 @@
+"""What aligning and finding articulated shapes returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from torchreg.result import Result, Status, stored_as
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.record import build_shape, record_shape
+
+
+@dataclass(frozen=True)
+class AlignRecord:
+    """One step of an alignment, as given to ``on_step``.
+
+    Args:
+        stage: "em" or "surface".
+        step: number of the step in its stage.
+        num_steps: steps planned in the stage.
+        sigma: (B,) kernel width, metres.
+        cost: (B,) objective of the stage: after tested steps, before a single untested one.
+        pose: (B, num_dofs) after the step.
+        pose_change: (B,) largest change of a joint in the step, radians (or metres for sliding joints).
+    """
+
+    stage: str
+    step: int
+    num_steps: int
+    sigma: Tensor
+    cost: Tensor
+    pose: Tensor
+    pose_change: Tensor
+
+
+@dataclass(frozen=True)
+class AlignResult(Result):
+    """An articulated shape aligned to data. With a batch of problems every tensor has a leading dimension B.
+
+    Args:
+        pose: (num_dofs,), metres and radians.
+        registered: (N, 3) model points moved onto the data, metres.
+        keypoints: (K, 3) keypoints of the shape (a hand's 21, else the origins of the parts), metres.
+        distances: (M,) signed distance of each datum to the fitted surface, metres; NaN where padded.
+        inliers: (M,) True where the distance is below the inlier threshold.
+        posterior: (M,) probability that the datum belongs to the model at the last sigma (eq. 17 summed over i).
+        sigma: last kernel width, metres.
+        cost: objective that ranks alignments of the same data, lower is better.
+        status: how the alignment ended; a tuple with one entry per problem for a batch.
+        history: one `AlignRecord` per step.
+    """
+
+    pose: Tensor
+    registered: Tensor
+    keypoints: Tensor
+    distances: Tensor
+    inliers: Tensor
+    posterior: Tensor
+    sigma: Tensor
+    cost: Tensor
+    status: Status | tuple[Status, ...]
+    history: tuple[AlignRecord, ...] = ()
+
+    @property
+    def statuses(self) -> tuple[Status, ...]:
+        """One status per problem, also where there is a single one."""
+        return (self.status,) if isinstance(self.status, Status) else self.status
+
+
+@dataclass(frozen=True)
+class Calibration(Result):
+    """A shape fitted to clouds of it in T poses.
+
+    Args:
+        shape: a copy of the shape with the fitted scales.
+        poses: (T, num_dofs) of the frames, metres and radians.
+        log_length_scales: (P,) of the fitted shape.
+        log_radius_scales: (P,) of the fitted shape.
+        cost: (), of the joint fit, lower is better.
+        status: how the calibration ended.
+    """
+
+    shape: ArticulatedShape = field(metadata=stored_as(record_shape, build_shape))
+    poses: Tensor
+    log_length_scales: Tensor
+    log_radius_scales: Tensor
+    cost: Tensor
+    status: Status
+
+
+@dataclass(frozen=True)
+class PoseStarts(Result):
+    """Poses in which an articulated shape may lie on data, best first. A batch adds a leading dimension B to all.
+
+    Args:
+        poses: (S, num_dofs), metres and radians; poses that fell together with a better one come last.
+        costs: (S,) data that a pose leaves unexplained, softly counted, and a weak prior; lower is better.
+        confidence: () from 0 to 1: how surely the first pose is the right one; low too where limbs are not shown.
+    """
+
+    poses: Tensor
+    costs: Tensor
+    confidence: Tensor
+
+    @property
+    def best(self) -> Tensor:
+        """The first pose, (num_dofs,)."""
+        return self.poses[..., 0, :]
+
+    def row(self, index: int) -> PoseStarts:
+        """Return the starts of one cloud of a batch."""
+        return PoseStarts(self.poses[index], self.costs[index], self.confidence[index])

@@ -1,0 +1,124 @@
+"""How far a tracker got, in one file: what it found, what its next frame depends on, and what it was told to do."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import tempfile
+import zipfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchreg.errors import FormatError, InputError
+from torchreg.io.atomic import write_atomic
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, open_zip, read_bytes
+from torchreg.io.points import PARSER_ERRORS
+from torchreg.storage import load, save_result
+from torchreg.tracking.results import TrackResult, TrackState
+
+_RESULT, _STATE, _JOB = "result.safetensors", "state.safetensors", "job.json"
+_MEMBERS = (_RESULT, "result.json", _STATE, "state.json", _JOB)
+
+
+@dataclass(frozen=True)
+class TrackProgress:
+    """A run of a tracker up to some frame.
+
+    Args:
+        result: of the T frames done.
+        state: of the tracker after them.
+        job: what it was told to do, as plain data: str, bool, int, float, None, lists and dicts of them.
+    """
+
+    result: TrackResult
+    state: TrackState
+    job: dict[str, Any]
+
+
+def save_progress(path: str | os.PathLike[str], progress: TrackProgress) -> None:
+    """Write a run to one file, whole or not at all; `load_progress` reads it back to the last bit.
+
+    Args:
+        path: a local file; an existing one is replaced.
+        progress: the run.
+
+    Raises:
+        FormatError: if the path is an address.
+        FileNotFoundError: if the folder does not exist.
+    """
+    place = local_path(path)
+    content = io.BytesIO()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        save_result(progress.result, folder / _RESULT)
+        save_result(progress.state, folder / _STATE)
+        (folder / _JOB).write_text(json.dumps(progress.job), encoding="utf-8")
+        with zipfile.ZipFile(content, "w") as archive:
+            for member in _MEMBERS:
+                archive.writestr(member, (folder / member).read_bytes())
+    write_atomic(place, content.getvalue())
+
+
+def load_progress(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> TrackProgress:
+    """Return the run that `save_progress` wrote.
+
+    Args:
+        path: the file.
+        limits: on its size, packed and unpacked.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FormatError: if it is damaged or something else; names the file.
+    """
+    place = local_path(path)
+    content = read_bytes(place, limits)
+    try:
+        with open_zip(content, limits) as archive, tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            for member in _MEMBERS:
+                (folder / member).write_bytes(archive.read(member))
+            result, state = load(folder / _RESULT, limits=limits), load(folder / _STATE, limits=limits)
+            job = json.loads((folder / _JOB).read_text(encoding="utf-8"))
+    except (FormatError, RecursionError, *PARSER_ERRORS) as error:
+        raise FormatError(f"{place}: is no progress of a tracker, or damaged ({error})") from error
+    if not isinstance(result, TrackResult) or not isinstance(state, TrackState) or not isinstance(job, dict):
+        raise FormatError(f"{place}: must hold a TrackResult, a TrackState and what was to be done")
+    if state.frame != len(result.statuses):
+        raise FormatError(f"{place}: has the state after {state.frame} frames beside {len(result.statuses)} results")
+    return TrackProgress(result, state, job)
+
+
+def first_frames(result: TrackResult, count: int) -> TrackResult:
+    """Return the first frames of a tracked sequence.
+
+    Raises:
+        InputError: if there are fewer.
+    """
+    if not 0 <= count <= len(result.statuses):
+        raise InputError(f"count must be from 0 to {len(result.statuses)}, got {count}")
+    return TrackResult(**{item.name: getattr(result, item.name)[:count] for item in fields(result)})
+
+
+def join_frames(first: TrackResult, second: TrackResult) -> TrackResult:
+    """Return two parts of a tracked sequence as one.
+
+    Raises:
+        InputError: if they are of different shapes.
+    """
+    if first.poses.shape[1:] != second.poses.shape[1:] or first.keypoints.shape[1:] != second.keypoints.shape[1:]:
+        raise InputError(
+            f"second must be of the same shape as first, with {first.poses.shape[-1]} degrees of freedom and "
+            f"{first.keypoints.shape[-2]} keypoints, got {second.poses.shape[-1]} and {second.keypoints.shape[-2]}"
+        )
+
+    def joined(one: Any, other: Any) -> Any:
+        return torch.cat([one, other]) if isinstance(one, Tensor) else one + other
+
+    return TrackResult(
+        **{item.name: joined(getattr(first, item.name), getattr(second, item.name)) for item in fields(first)}
+    )

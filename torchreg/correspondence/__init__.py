@@ -1,1 +1,0 @@
-"""Who matches whom, and how much."""

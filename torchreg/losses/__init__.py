@@ -1,1 +1,0 @@
-"""nn.Modules over (prediction, target); never hold a model."""

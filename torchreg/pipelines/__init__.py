@@ -1,1 +1,0 @@
-"""The loops: one file, one task, one public function."""

@@ -1,0 +1,1 @@
+"""Scan registration: bones, weights and motions of an articulated thing without a template."""

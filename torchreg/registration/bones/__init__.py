@@ -1,0 +1,1 @@
+"""Bones on a grid: labels, motions, joints and weights, the alternation of the paper."""

@@ -1,0 +1,1 @@
+"""Where every point of a scan goes: matching, hypotheses and EM on a deformation graph."""

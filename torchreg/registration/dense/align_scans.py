@@ -1,0 +1,376 @@
+"""One scan bent onto another, however far its limbs moved: several hypotheses, each refined, the best kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import as_float_tensor, check_finite, check_shape
+from torchreg._threads import both, one_thread
+from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.range_scan import RangeScan
+from torchreg.registration.blend import blend_linear
+from torchreg.registration.dense.config import (
+    Hypothesis,
+    OnStep,
+    ScanAlignConfig,
+    ScanAlignment,
+    ScanAlignRecord,
+)
+from torchreg.registration.dense.fusion import fuse_motions
+from torchreg.registration.dense.global_rotation import turned_motions
+from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
+from torchreg.registration.dense.limb_covering import covering_limbs
+from torchreg.registration.dense.limb_swap import exchanged_limbs
+from torchreg.registration.dense.node_graph import spread_weights
+from torchreg.registration.dense.problem import NORMAL_SCALE, ScanAlignProblem, describe, first_matches
+from torchreg.registration.dense.stages import (
+    Reporter,
+    agree,
+    fit_first_matches,
+    follow_regions,
+    judge,
+    loses_limb,
+    pull_one_to_one,
+    refine,
+    soft_matches,
+    used_samples,
+)
+
+_One = TypeVar("_One")
+_Other = TypeVar("_Other")
+# Fewer are not fused, nor are limbs of the best rearranged: two that started apart agreed, or there are few matches.
+_LEAST_FUSED = 4
+# Nor where the two best take samples within so many times what makes hypotheses agree.
+_CONFIRMED = 2.0
+# How a graph is taken to where points are expected: that may be wrong in parts, and limbs turn far.
+_EXPECTED_STIFFNESS, _EXPECTED_FITS = 0.02, 4
+# Rearranged limbs that one-to-one matches leave worse than the best by more than this energy are not gone on with.
+_HARDLY_WORSE = 0.1
+# What the slow end may cost more than the quick one: cloth that follows its folds looks better by its features.
+# Between the two it counts so much more that the target is left bare: from far back, what bends strongly can be lost.
+_SLOW_COSTS_MORE, _BARE = 0.05, 15.0
+
+
+@torch.no_grad()
+@one_thread()
+def align_scans(
+    source: RangeScan,
+    target: RangeScan,
+    config: ScanAlignConfig | None = None,
+    *,
+    generator: torch.Generator | None = None,
+    on_step: OnStep | None = None,
+    expected: Tensor | None = None,
+) -> ScanAlignment:
+    """Return the source moved onto the target: a deformation graph of many small nodes, without bones yet.
+
+    Both scans are described by even samples, their curvature at several sizes and spin images. Hypotheses start from
+    rest; from where points are expected, if that is known; from matches of spin images that agree on distances along
+    the surface, fitted stiffly, or softly and then pulled by one-to-one matches; and from one-to-one matches alone.
+    Each goes on by an EM with an outlier class, while edges of the graph give where its parts disagree, matches
+    beside what something nearer hides hold across the surface alone, and samples where the target's camera saw
+    nothing are taken back into its picture. Then, unless the two best about agree and leave little of both scans over,
+    all of the source is turned, if it lies better on the target then, each part moves as in the hypothesis that suits
+    it, and the EM goes on from there as well, and from the best with two limbs exchanged or with one laid where nothing
+    covers the target, if one-to-one matches make that about as good. The best covers the target, most of all where its
+    camera would have seen it, is covered by it, is like it, bends least, leaves the larger part of each wide region
+    rigid, is nearest to what is expected, and takes no two limbs to one place; its EM is taken to the end, and beside
+    that run anew, slowly, with matches that may slide, while what is unlike the target all around follows the wide
+    regions it is in: that end is kept unless it is clearly worse or leaves more of the target bare. Where rest and
+    stiff matches agree and leave little of both scans over, the softer ones are left out, and so is the slow EM.
+
+    Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
+    scans nothing beyond rounding.
+
+    Args:
+        source: the scan to be moved, N points.
+        target: the scan to be reached, M points, in the same frame and unit.
+        config: see `ScanAlignConfig`.
+        generator: source of randomness; None draws the same numbers at every call.
+        on_step: called with a `ScanAlignRecord` for each step, by the calling thread; when a hypothesis that another
+            thread follows is done, for all of its steps.
+        expected: (N, 3) where the source's points are expected, such as by their velocity.
+
+    Returns:
+        a `ScanAlignment`.
+
+    Raises:
+        InputError: if ``expected`` is not finite or its shape does not fit.
+
+    Differentiable: no.
+
+    Cost: 1 to 2.5 s for scans of 8,000 points on one core; three quarters of it where torch may use two threads, which
+    then follow two hypotheses side by side: the result is the same to the bit.
+
+    References: Chang and Zwicker 2009, section 5, on where to start; Sumner, Schmid and Pauly 2007 for the graph;
+    Myronenko and Song 2010 for the EM with outliers.
+    """
+    config = ScanAlignConfig() if config is None else config
+    history: list[ScanAlignRecord] = []
+
+    def report(record: ScanAlignRecord) -> None:
+        history.append(record)
+        if on_step is not None:
+            on_step(record)
+
+    problem = describe(source, target, config, generator, None if expected is None else _checked(expected, source))
+    found = sorted(_candidates(problem, config, report), key=_energy)
+    unsure = len(found) >= _LEAST_FUSED
+    if unsure and not _confirmed(problem, found, config):
+        found = sorted([*found, *_turned(problem, config, report)], key=_energy)
+        found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
+        found = sorted([*found, *_rearranged(problem, found[0], config, report)], key=_energy)
+    chosen = found[0].hypothesis
+    transforms = _finished(problem, found[0], config, unsure, report)
+    weights = spread_weights(
+        problem.unit.of_points(source.points),
+        source.normals.detach().cpu().double(),
+        problem.graph.points,
+        problem.graph.normals,
+        problem.graph.dense_weights,
+        NORMAL_SCALE,
+    )
+    moved = blend_linear(problem.unit.of_points(source.points), weights, transforms)
+    return ScanAlignment(
+        problem.unit.points_back(moved, source.points),
+        _confidence(problem, transforms, config, source.points).to(source.points),
+        problem.samples,
+        problem.nodes,
+        weights.to(source.points),
+        problem.unit.transforms_back(transforms).to(source.points),
+        chosen,
+        tuple(candidate.hypothesis for candidate in found),
+        tuple(history),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidate:
+    """Motions (J, 4, 4) on their way.
+
+    Args:
+        hypothesis: how they compare.
+        transforms: the motions.
+        sigma: with which their EM began.
+        pulled: whether one-to-one matches led there.
+    """
+
+    hypothesis: Hypothesis
+    transforms: Tensor
+    sigma: float
+    pulled: bool = False
+
+
+def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
+    """Return candidates; where two that started apart agree and no limb is lost, others are left out."""
+    near, (matches, stiff) = _both_told(
+        on_step, partial(_near, problem, config), partial(_by_stiff_matches, problem, config)
+    )
+    if stiff is None:
+        return [*near, _one_to_one(problem, config, on_step)]
+    settled = agree(problem, near[0].transforms, stiff.transforms, config.choice)
+    if settled and not loses_limb(problem, stiff.transforms, config.choice):
+        return [*near, stiff]
+    soft, alone = _both_told(
+        on_step, partial(_by_matches, problem, config, matches), partial(_one_to_one, problem, config)
+    )
+    return [*near, stiff, soft, alone]
+
+
+def _near(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
+    """Return the candidates from rest and, if that is known, from where points are expected."""
+    sigma, rest = config.refine.near_sigma, problem.graph.rest()
+    found = [_compared(problem, rest, sigma, config, Reporter("rest", problem.unit.size, on_step))]
+    if problem.expected is not None:
+        there = GraphMatches.of_places(problem.expected)
+        ahead = fit_graph(problem.graph, rest, there, _EXPECTED_STIFFNESS, _EXPECTED_FITS).transforms
+        found.append(_compared(problem, ahead, sigma, config, Reporter("expected", problem.unit.size, on_step)))
+    return found
+
+
+def _by_stiff_matches(
+    problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep
+) -> tuple[GraphMatches, _Candidate | None]:
+    """Return the first matches, and the candidate that they lead to where parts hardly bend, if they are enough."""
+    matches = first_matches(problem, config.match)
+    if len(matches.weights) < config.match.min_matches:
+        return matches, None
+    reporter = Reporter("stiff matches", problem.unit.size, on_step)
+    fitted = fit_first_matches(problem, matches, config.match.stiffer, config.match, reporter)
+    return matches, _compared(problem, fitted, config.refine.near_sigma, config, reporter)
+
+
+def _by_matches(
+    problem: ScanAlignProblem, config: ScanAlignConfig, matches: GraphMatches, on_step: OnStep
+) -> _Candidate:
+    """Return the candidate from the first matches, pulled one to one."""
+    reporter = Reporter("matches", problem.unit.size, on_step)
+    fitted = fit_first_matches(problem, matches, config.match.stiffness, config.match, reporter)
+    pulled = pull_one_to_one(problem, fitted, config.reassign, reporter)
+    return replace(_compared(problem, pulled, config.refine.sigma[0], config, reporter), pulled=True)
+
+
+def _one_to_one(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> _Candidate:
+    """Return the candidate pulled from rest by one-to-one matches alone."""
+    reporter = Reporter("one to one", problem.unit.size, on_step)
+    pulled = pull_one_to_one(problem, problem.graph.rest(), config.assign, reporter)
+    return replace(_compared(problem, pulled, config.refine.sigma[0], config, reporter), pulled=True)
+
+
+def _both_told(
+    on_step: OnStep, one: Callable[[OnStep], _One], other: Callable[[OnStep], _Other]
+) -> tuple[_One, _Other]:
+    """Return what two calls return, made side by side; the thread that called the library tells of their steps."""
+    later: list[ScanAlignRecord] = []
+    found = both(partial(one, on_step), partial(other, later.append))
+    for record in later:
+        on_step(record)
+    return found
+
+
+def _checked(expected: Any, source: RangeScan) -> Tensor:
+    """Return where points (N, 3) are expected; raise unless it fits the source."""
+    expected = as_float_tensor(expected, "expected")
+    check_shape(expected, "expected", tuple(source.points.shape))
+    check_finite(expected, "expected")
+    return expected.detach()
+
+
+def _turned(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
+    """Return the candidates from the likeliest turns of all of the source, two at most."""
+    turns = [motion.repeat(problem.graph.num_nodes, 1, 1) for motion in turned_motions(problem, config.choice, 2)]
+    starts = list(zip(("turned", "turned otherwise"), turns, strict=False))
+    return _side_by_side(problem, starts, config.refine.sigma[0], config, on_step)
+
+
+def _fused(
+    problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig, on_step: OnStep
+) -> _Candidate:
+    """Return the candidate that takes the best of several."""
+    begin = fuse_motions(problem, torch.stack([candidate.transforms for candidate in found]), config.choice)
+    reporter = Reporter("fused", problem.unit.size, on_step)
+    return _compared(problem, begin, config.refine.fused_sigma, config, reporter)
+
+
+def _rearranged(
+    problem: ScanAlignProblem, best: _Candidate, config: ScanAlignConfig, on_step: OnStep
+) -> list[_Candidate]:
+    """Return the candidates in which two limbs of the best change places, and in which one covers what is left bare.
+
+    Of each kind it is the option that one-to-one matches make the best, and none if that looks clearly worse.
+    """
+    exchanged, covering = both(
+        partial(exchanged_limbs, problem, best.transforms),
+        partial(covering_limbs, problem, best.transforms, config.choice),
+    )
+    options = [("exchanged", option) for option in exchanged] + [("covering", option) for option in covering]
+    some, others = _both_told(
+        on_step, *(partial(_pulled, problem, part, config) for part in (options[::2], options[1::2]))
+    )
+    starts = []
+    for name in ("exchanged", "covering"):
+        kind = [option for option in (*some, *others) if option.hypothesis.name == name]
+        likeliest = min(kind, key=_energy, default=None)
+        if likeliest is not None and _energy(likeliest) <= _energy(best) + _HARDLY_WORSE:
+            starts.append((name, likeliest.transforms))
+    return _side_by_side(problem, starts, config.refine.near_sigma, config, on_step)
+
+
+def _pulled(
+    problem: ScanAlignProblem, options: Sequence[tuple[str, Tensor]], config: ScanAlignConfig, on_step: OnStep
+) -> list[_Candidate]:
+    """Return named options as one-to-one matches pull them."""
+    found = []
+    for name, option in options:
+        reporter = Reporter(name, problem.unit.size, on_step)
+        transforms = pull_one_to_one(problem, option, config.reassign, reporter)
+        found.append(_Candidate(judge(problem, name, transforms, config.choice), transforms, config.refine.near_sigma))
+    return found
+
+
+def _side_by_side(
+    problem: ScanAlignProblem,
+    starts: Sequence[tuple[str, Tensor]],
+    sigma: float,
+    config: ScanAlignConfig,
+    on_step: OnStep,
+) -> list[_Candidate]:
+    """Return the candidates from two named motions (J, 4, 4) at most, followed at once."""
+
+    def followed(name: str, transforms: Tensor, told: OnStep) -> _Candidate:
+        return _compared(problem, transforms, sigma, config, Reporter(name, problem.unit.size, told))
+
+    if len(starts) < 2:
+        return [followed(*start, on_step) for start in starts]
+    return list(_both_told(on_step, *(partial(followed, *start) for start in starts)))
+
+
+def _compared(
+    problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: ScanAlignConfig, reporter: Reporter
+) -> _Candidate:
+    """Return the candidate after the first steps of its EM."""
+    steps = slice(config.refine.compared_after)
+    transforms = refine(problem, transforms, config.refine, reporter, sigma, steps)
+    return _Candidate(judge(problem, reporter.name, transforms, config.choice), transforms, sigma)
+
+
+def _finished(
+    problem: ScanAlignProblem, candidate: _Candidate, config: ScanAlignConfig, unsure: bool, on_step: OnStep
+) -> Tensor:
+    """Return the motions (J, 4, 4) after the last steps; if unsure, those of a slower EM unless they are worse."""
+    name, refining = candidate.hypothesis.name, config.refine
+
+    def to_the_end(told: OnStep) -> Tensor:
+        steps, reporter = slice(refining.compared_after, None), Reporter(name, problem.unit.size, told)
+        return refine(problem, candidate.transforms, refining, reporter, candidate.sigma, steps)
+
+    def slowly(told: OnStep) -> Tensor:
+        slow, reporter = refining.slower(), Reporter(name, problem.unit.size, told)
+        follow = None
+        if refining.regions > 0:
+            follow = follow_regions(problem, candidate.transforms, refining, config.choice)
+        return refine(problem, candidate.transforms, slow, reporter, refining.near_sigma, stage="slide", follow=follow)
+
+    if not unsure or refining.slow_steps == 0:
+        return to_the_end(on_step)
+    slow, quick = _both_told(on_step, slowly, to_the_end)
+    return slow if _slow_is_kept(*(judge(problem, name, end, config.choice) for end in (slow, quick))) else quick
+
+
+def _slow_is_kept(slow: Hypothesis, quick: Hypothesis) -> bool:
+    """Return whether the end of the slower EM is kept."""
+    return slow.energy + _BARE * slow.backward < quick.energy + _BARE * quick.backward + _SLOW_COSTS_MORE
+
+
+def _confirmed(problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig) -> bool:
+    """Return whether the best of several candidates is believed: the next best goes there too, and no limb is lost.
+
+    The next best is one found in another way: what one-to-one matches pull from two starts is often wrong alike.
+    """
+    best = found[0]
+    next_best = next((other for other in found if other.pulled != best.pulled), None)
+    if next_best is None:
+        return False
+    like = replace(config.choice, same=_CONFIRMED * config.choice.same)
+    if not agree(problem, best.transforms, next_best.transforms, like):
+        return False
+    return not loses_limb(problem, best.transforms, config.choice)
+
+
+def _energy(candidate: _Candidate) -> float:
+    return candidate.hypothesis.energy
+
+
+def _confidence(problem: ScanAlignProblem, transforms: Tensor, config: ScanAlignConfig, points: Tensor) -> Tensor:
+    """Return the posterior mass (N,) of matches at points, by that of the nearest samples."""
+    sigma = config.refine.sigma[1]
+    moved = used_samples(problem, transforms, sigma, config.refine)
+    own = soft_matches(problem, moved, sigma, config.refine).posterior
+    index, _ = nearest_few(problem.unit.of_points(points), problem.graph.points[: len(own)], min(3, len(own)))
+    return own[index].mean(1)

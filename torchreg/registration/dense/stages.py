@@ -1,0 +1,292 @@
+"""The stages that pull a deformation graph onto a target: by few sure matches, by one-to-one matches, by EM."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.neighbors import nearest_few
+from torchreg.registration.annealing import geometric_at
+from torchreg.registration.dense.config import (
+    AssignConfig,
+    ChoiceConfig,
+    Hypothesis,
+    MatchConfig,
+    OnStep,
+    RefineConfig,
+    ScanAlignRecord,
+)
+from torchreg.registration.dense.e_step import SoftMatches, match_softly
+from torchreg.registration.dense.graph_fit import GraphFit, GraphMatches, fit_graph, joined
+from torchreg.registration.dense.one_to_one import count_of_spacing, match_one_to_one, typical_spacing
+from torchreg.registration.dense.oriented_samples import OrientedSamples
+from torchreg.registration.dense.problem import ScanAlignProblem
+
+# Right matches differ by so much in their features, squared, in the mean; more than samples at random tells no more.
+_USUALLY_UNLIKE, _UNLIKE = 0.4, 2.0
+# Share of the cap by which samples may be off the target and count as on it: about what its samples are apart.
+_ON_TARGET = 0.25
+# With less posterior mass a sample has no match: it may be hidden.
+_HARDLY_MATCHED = 0.05
+
+
+@dataclass(frozen=True)
+class Reporter:
+    """Where records of one hypothesis go.
+
+    Args:
+        name: of the hypothesis.
+        size: by which widths are multiplied.
+        on_step: what takes the records.
+    """
+
+    name: str
+    size: float
+    on_step: OnStep
+
+    def report(
+        self, stage: str, step: int, num_steps: int, width: float, fit: GraphFit, stiffness: float, matched: float
+    ) -> None:
+        """Hand on one record."""
+        self.on_step(
+            ScanAlignRecord(
+                self.name, stage, step, num_steps, width * self.size, fit.misses, fit.gaps, stiffness, matched
+            )
+        )
+
+
+def fit_first_matches(
+    problem: ScanAlignProblem,
+    matches: GraphMatches,
+    stiffnesses: tuple[float, ...],
+    config: MatchConfig,
+    reporter: Reporter,
+) -> Tensor:
+    """Return motions fitted to few sure matches, of which those that do not fit count less and less."""
+    transforms = problem.graph.rest()
+    for step, stiffness in enumerate(stiffnesses):
+        weighted = matches
+        if step > 0:
+            miss = (problem.graph(transforms, matches.which) - matches.targets).square().sum(-1)
+            weighted = replace(matches, weights=matches.weights / (1 + miss / config.scale**2).square())
+        fit = fit_graph(problem.graph, transforms, weighted, stiffness, num_steps=2)
+        transforms = fit.transforms
+        kept = float(weighted.weights.sum()) / len(problem.samples)
+        reporter.report("match", step, len(stiffnesses), config.scale, fit, stiffness, kept)
+    return transforms
+
+
+def pull_one_to_one(problem: ScanAlignProblem, transforms: Tensor, config: AssignConfig, reporter: Reporter) -> Tensor:
+    """Return motions pulled by one-to-one matches of even samples, whose reach shrinks while the graph softens."""
+    target = problem.target.first(config.num_points)
+    count = count_of_spacing(problem.graph.points, typical_spacing(target.points))
+    for step in range(config.num_steps):
+        share = step / max(config.num_steps - 1, 1)
+        reach, stiffness = geometric_at(config.reach, share), geometric_at(config.stiffness, share)
+        found = match_one_to_one(
+            problem.moved(transforms, count),
+            target,
+            reach,
+            normal_weight=config.normal_weight,
+            feature_weight=config.feature_weight,
+        )
+        weights = (found >= 0).to(transforms)
+        matches = GraphMatches(slice(0, count), target.points[found.clamp(min=0)], weights)
+        fit = fit_graph(problem.graph, transforms, matches, stiffness, config.fits_per_step)
+        transforms = fit.transforms
+        reporter.report("assign", step, config.num_steps, reach, fit, stiffness, float(weights.mean()))
+    return transforms
+
+
+def refine(
+    problem: ScanAlignProblem,
+    transforms: Tensor,
+    config: RefineConfig,
+    reporter: Reporter,
+    first_sigma: float | None = None,
+    steps: slice = slice(None),
+    stage: str = "refine",
+    follow: Tensor | None = None,
+) -> Tensor:
+    """Return motions refined by EM: sigma shrinks, the graph softens, matches may slide along the surface ever more.
+
+    Args:
+        problem: the scans.
+        transforms: (J, 4, 4) to start from.
+        config: see `RefineConfig`.
+        reporter: takes a record of each step.
+        first_sigma: instead of that of the configuration.
+        steps: which of them to take.
+        stage: what records call it.
+        follow: (S,) how far samples follow the wide regions they are in instead of what they match along the surface,
+            from 0 to 1; zeros by default.
+    """
+    number = config.num_steps + config.final_steps
+    widths = (config.sigma[0] if first_sigma is None else first_sigma, config.sigma[1])
+    for step in range(number)[steps]:
+        share = step / max(config.num_steps - 1, 1)
+        sigma, stiffness, slide = (geometric_at(ends, share) for ends in (widths, config.stiffness, config.slide))
+        for _ in range(config.fits_per_step):
+            moved = used_samples(problem, transforms, sigma, config)
+            found = soft_matches(problem, moved, sigma, config, share)
+            along = _along_surface(found, slide, sigma < config.boundary_above, follow)
+            others = _out_of_empty_space(problem, moved, sigma, config) + _as_expected(problem, moved, found, config)
+            if follow is not None and step < config.num_steps:
+                others += (problem.regions.matches(moved.points, follow, config.regions),)
+            fit = fit_graph(problem.graph, transforms, joined(along, *others), stiffness, give=config.give)
+            transforms = fit.transforms
+        reporter.report(stage, step, number, sigma, fit, stiffness, float(found.weights.mean()))
+    return transforms
+
+
+def used_samples(problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: RefineConfig) -> OrientedSamples:
+    """Return as many moved samples as the sigma asks for."""
+    return problem.moved(transforms, _num_used(sigma, config))
+
+
+def _num_used(sigma: float, config: RefineConfig) -> int:
+    return max(round(config.density / sigma**2), config.least_samples)
+
+
+def soft_matches(
+    problem: ScanAlignProblem, moved: OrientedSamples, sigma: float, config: RefineConfig, share: float = 1.0
+) -> SoftMatches:
+    """Return the matches of an E-step, a share of the way through, of moved samples."""
+    first, last = config.feature_weight
+    compatible = replace(config.compatible, feature_weight=first + (last - first) * min(share, 1.0))
+    return match_softly(
+        moved,
+        problem.target.first(_num_used(sigma, config)),
+        sigma,
+        compatible,
+        both_ways=sigma > config.both_ways_above,
+        boundary=sigma >= config.boundary_above,
+    )
+
+
+def _along_surface(found: SoftMatches, slide: float, beside_edges: bool, follow: Tensor | None) -> GraphMatches:
+    """Return matches of the first samples, that may slide; the more beside what is hidden, and if they follow."""
+    # A sample beside an edge, whose own place may be hidden behind, must not be pulled to what is still seen.
+    free = slide * (1 - found.cut_off) if beside_edges else torch.full_like(found.weights, slide)
+    free = free if follow is None else free * (1 - follow[: len(free)])
+    return GraphMatches(slice(0, len(found.weights)), found.targets, found.weights, found.normals, free)
+
+
+def _out_of_empty_space(
+    problem: ScanAlignProblem, moved: OrientedSamples, sigma: float, config: RefineConfig
+) -> tuple[GraphMatches, ...]:
+    """Return what takes samples back that are where the target's camera saw nothing, along the picture alone."""
+    idle = config.beyond == 0 or sigma >= config.beyond_below
+    if idle or problem.free is None or not problem.free.trust.any():
+        return ()
+    apart, back, trust = problem.free.beyond(moved.points, config.beyond_margin * problem.free.spacing)
+    weights = config.beyond * trust / (1 + (apart / config.beyond_scale).square()).square()
+    which = weights.nonzero()[:, 0]
+    targets = moved.points[which] + apart[which].unsqueeze(1) * back[which]
+    return (GraphMatches(which, targets, weights[which], back[which], 0.0),)
+
+
+def _as_expected(
+    problem: ScanAlignProblem, moved: OrientedSamples, found: SoftMatches, config: RefineConfig
+) -> tuple[GraphMatches, ...]:
+    """Return what holds samples without a match near where they are expected."""
+    if problem.expected is None or config.expected == 0:
+        return ()
+    count = len(moved.points)
+    expected = problem.expected[:count]
+    apart = (moved.points - expected).square().sum(-1) / config.expected_scale**2
+    weights = config.expected * (1 - found.weights / _HARDLY_MATCHED).clamp(min=0) / (1 + apart).square()
+    return (GraphMatches(slice(0, count), expected, weights),)
+
+
+def follow_regions(problem: ScanAlignProblem, transforms: Tensor, config: RefineConfig, choice: ChoiceConfig) -> Tensor:
+    """Return how far samples (S,) had better follow wide regions than their own matches, from 0 to 1.
+
+    Where a surface is unlike all around, it has folded anew, or matches are wrong: features tell nothing there.
+    """
+    moved = problem.moved(transforms)
+    apart, unlike = differences(problem, moved, choice)
+    unlike = torch.where(apart < 1, unlike, _UNLIKE)
+    around, _ = nearest_few(problem.graph.points, problem.graph.points, min(config.surrounding, len(unlike)))
+    low, high = config.unlike
+    return ((unlike[around].median(dim=1).values - low) / (high - low)).clamp(0, 1)
+
+
+def judge(problem: ScanAlignProblem, name: str, transforms: Tensor, config: ChoiceConfig) -> Hypothesis:
+    """Return how well the moved source and the target cover each other, how alike they are there, bend and strain."""
+    moved = problem.moved(transforms)
+    forward, seen, unlike = (float(cost.mean()) for cost in mismatch(problem, moved, config))
+    apart = nearest_few(embedded(problem.target, config), embedded(moved, config), 1)[1]
+    backward = float((apart / config.cap).clamp(max=1).square().mean())
+    bend = config.bend * float(problem.graph.bend(transforms, config.slack))
+    strain = config.strain * problem.regions.strain(moved.points)
+    leap = float(leaps(problem, moved.points, config).mean())
+    overlap = config.overlap * float(overlaps(problem, moved, config).mean())
+    costs = (forward, seen, backward, unlike, bend, strain, leap, overlap)
+    return Hypothesis(name, sum(costs), *costs)
+
+
+def leaps(problem: ScanAlignProblem, places: Tensor, config: ChoiceConfig) -> Tensor:
+    """Return what it costs samples (S,) to be elsewhere than expected."""
+    if problem.expected is None:
+        return torch.zeros_like(places[:, 0])
+    apart = (places - problem.expected).norm(dim=-1) / config.leap_cap
+    return config.leap * apart.clamp(max=1).square()
+
+
+def overlaps(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> Tensor:
+    """Return how far the first moved samples (M,) lie where others do that are far from them along the surface.
+
+    From 0, no nearer than the cap, to 1. Two limbs that end on one of the target's match it well, each on its own.
+    """
+    places = embedded(moved.first(len(problem.far)), replace(config, cap=config.overlap_cap))
+    apart = torch.cdist(places, places).masked_fill(~problem.far, torch.inf).amin(1)
+    return 1 - (apart / config.overlap_cap).clamp(max=1).square()
+
+
+def mismatch(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what moved samples cost (S,): by distance from the target, by that where seen, by unlike features there.
+
+    What the target's camera would have seen, had it been there, but did not see, is not there. What it could not have
+    seen may be.
+    """
+    apart, unlike = differences(problem, moved, config)
+    seen = torch.zeros_like(apart)
+    if problem.free is not None and config.seen > 0:
+        off = (apart.sqrt() - _ON_TARGET).clamp(min=0) / (1 - _ON_TARGET)
+        seen = config.seen * off * problem.free.in_view(moved.points, moved.normals, config.behind)
+    # Where there is nothing to be like, a sample is as unlike as right matches usually are: leaving must not pay.
+    return apart, seen, config.unlike * torch.lerp(unlike, torch.full_like(unlike, _USUALLY_UNLIKE), apart)
+
+
+def differences(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> tuple[Tensor, Tensor]:
+    """Return how far moved samples (S,) are from the target, squared and capped at one, and how unlike it there."""
+    index, apart = nearest_few(embedded(moved, config), embedded(problem.target, config), 1)
+    unlike = (moved.features - problem.target.features[index[:, 0]]).square().sum(-1)
+    return (apart[:, 0] / config.cap).clamp(max=1).square(), unlike.clamp(max=_UNLIKE)
+
+
+def embedded(samples: OrientedSamples, config: ChoiceConfig) -> Tensor:
+    """Return (S, 6): places and normals, whose distances count for a choice."""
+    return torch.cat((samples.points, config.normal_scale * config.cap * samples.normals), dim=1)
+
+
+def loses_limb(problem: ScanAlignProblem, transforms: Tensor, config: ChoiceConfig) -> bool:
+    """Return whether samples of both scans are left over, or limbs of the source lie in one place."""
+    moved = problem.moved(transforms)
+    if float(overlaps(problem, moved, config).mean()) > config.lost_share:
+        return True
+    here, there = embedded(moved, config), embedded(problem.target, config)
+    left = [
+        float((nearest_few(one, other, 1)[1] >= config.cap).double().mean())
+        for one, other in ((here, there), (there, here))
+    ]
+    return min(left) > config.lost_share
+
+
+def agree(problem: ScanAlignProblem, one: Tensor, other: Tensor, config: ChoiceConfig) -> bool:
+    """Return whether two hypotheses take nearly all samples to nearly the same places."""
+    apart = (problem.graph(one) - problem.graph(other)).norm(dim=-1)
+    return float((apart < config.same).double().mean()) >= config.same_share

@@ -1,0 +1,122 @@
+"""What all results share: they are frozen records of tensors that print in one line and save themselves."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import fields, replace
+from enum import Enum
+from html import escape
+from importlib import import_module
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+Record = TypeVar("Record")
+
+
+def public(name: str) -> Any:
+    """Return what a public name of the library stands for, the one way from here to the rooms above."""
+    return getattr(import_module("torchreg"), name)
+
+
+def stored_as(to_record: Callable[[Any], Any], from_record: Callable[[Any], Any]) -> dict[str, Any]:
+    """Return the metadata of a result's field that is no plain data, such as a module.
+
+    Args:
+        to_record: from its value to a dataclass of tensors and plain data, annotated with that class.
+        from_record: the inverse.
+    """
+    return {"to_record": to_record, "from_record": from_record}
+
+
+def _described(value: Any) -> str:
+    """Return what is said of a field in few words."""
+    if isinstance(value, Tensor):
+        if value.numel() == 1 and not value.is_complex():
+            return f"{value.item():.4g}"
+        return f"{str(value.dtype).removeprefix('torch.')} {tuple(value.shape)}"
+    if isinstance(value, Enum):
+        return str(value.value)
+    if isinstance(value, tuple):
+        words = [str(item.value) if isinstance(item, Enum) else item for item in value if isinstance(item, (Enum, str))]
+        kinds = sorted(set(words))
+        if len(words) < len(value) or len(kinds) > _FEW:
+            return f"{len(value)} x {type(value[0]).__name__}"
+        return ", ".join(f"{words.count(kind)} {kind}" for kind in kinds) or "none"
+    if isinstance(value, (Result, nn.Module)):
+        return type(value).__name__
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+# Different words that are counted one by one.
+_FEW = 6
+
+
+class Result:
+    """What a pipeline returns: a frozen record that can be saved.
+
+    It prints in one line, and in notebooks as a table: tensors by type and shape, not by their numbers.
+    """
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        # A class that has these already is given no others by @dataclass.
+        cls.__repr__ = Result.__repr__  # type: ignore[method-assign]
+
+    def __repr__(self) -> str:
+        parts = ", ".join(f"{name}={text}" for name, text in self._described())
+        return f"{type(self).__name__}({parts})"
+
+    def _repr_html_(self) -> str:
+        """Return a table of the fields, which notebooks show."""
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:left'>{escape(text)}</td></tr>"
+            for name, text in self._described()
+        )
+        return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
+
+    def _described(self) -> list[tuple[str, str]]:
+        return [(item.name, _described(getattr(self, item.name))) for item in fields(self)]  # type: ignore[arg-type]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result to ``path``, which ends in .safetensors, and a JSON file beside it.
+
+        `torchreg.load` reads it back with every field as it was, on the CPU and without gradients.
+
+        Args:
+            path: a local file ending in .safetensors; an existing pair is replaced, each file whole or not at all.
+
+        Raises:
+            InputError: if the ending is another.
+            InputTypeError: if a field holds something that cannot be stored.
+            FileNotFoundError: if the folder does not exist.
+        """
+        # Files belong to a room above this one.
+        import_module(public("load").__module__).save_result(self, path)
+
+
+class Status(Enum):
+    """How a pipeline ended."""
+
+    CONVERGED = "converged"
+    MAX_STEPS = "max_steps"
+    WITH_WARNINGS = "with_warnings"
+    FEW_INLIERS = "few_inliers"
+    NO_DATA = "no_data"
+    LOST = "lost"
+    OTHER_UNITS = "other_units"
+
+    @property
+    def usable(self) -> bool:
+        """Whether the result rests on data, converged or not."""
+        return self in (Status.CONVERGED, Status.MAX_STEPS, Status.WITH_WARNINGS)
+
+
+def normal_copy(record: Record) -> Record:
+    """Return a copy of a dataclass whose tensors can take part in autograd, as those made in inference mode cannot."""
+    values = {item.name: getattr(record, item.name) for item in fields(record)}  # type: ignore[arg-type]
+    with torch.inference_mode(False), torch.no_grad():
+        copies = {name: value.clone() for name, value in values.items() if isinstance(value, Tensor)}
+    return replace(record, **copies)  # type: ignore[type-var]

@@ -1,1 +1,0 @@
-"""What pipelines return: frozen records of tensors."""

@@ -1,0 +1,1 @@
+"""Spines: one branching graph of curves from surfaces that share nothing."""

@@ -1,0 +1,87 @@
+"""What skeletonizing a sequence returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from torchreg.result import Result, Status, stored_as
+from torchreg.spines.spine import Spine
+
+
+@dataclass(frozen=True)
+class SpineRecord:
+    """One frame that was skeletonized, as given to ``on_step``.
+
+    Args:
+        frame: its number; frames may be done in any order.
+        num_frames: in all.
+        num_tips: that it shows by itself.
+        topology: of its own tree, see `Skeleton.topology`.
+        seconds: that it took; zero if it was kept from before.
+    """
+
+    frame: int
+    num_frames: int
+    num_tips: int
+    topology: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class SpineSequence(Result):
+    """One graph of K tips and L limbs that moves through T frames; lengths in the unit of the surfaces.
+
+    Convention: limb l runs from node ``graph[l, 0]`` to ``graph[l, 1]``. Nodes 0 to K - 1 are the tips, and limb k of
+    the first K starts at tip k; the other nodes are the junctions. ``frames`` are ``R_world_node``, third columns along
+    the limb.
+
+    Args:
+        model: the `Spine`, which gives curves at any time between frames.
+        graph: (L, 2) node indices.
+        curves: (T, L, S, 3) points along the limbs at equal intervals of their lengths.
+        radii: (T, L, S) distances to the surface.
+        frames: (T, L, S, 3, 3) rotations that travel with the curves.
+        times: (T,) of the frames.
+        found: (T, K) True where the frame's own skeleton has the tip.
+        own: (T, L) True where the frame's own skeleton has the limb; others were carried over from frames around.
+        reference: frame from which names were passed on.
+        topologies: per frame the canonical form of the tree of curves as delivered, see `Skeleton.topology`.
+        own_topologies: per frame that of its own skeleton, before the graph was imposed.
+        statuses: per frame.
+        status: WITH_WARNINGS if any frame's is, else CONVERGED.
+        warnings: what was not as it should be, with the number of the frame.
+    """
+
+    model: Spine = field(metadata=stored_as(Spine.record, Spine.from_record))
+    graph: Tensor
+    curves: Tensor
+    radii: Tensor
+    frames: Tensor
+    times: Tensor
+    found: Tensor
+    own: Tensor
+    reference: int
+    topologies: tuple[str, ...]
+    own_topologies: tuple[str, ...]
+    statuses: tuple[Status, ...]
+    status: Status
+    warnings: tuple[str, ...]
+
+    @property
+    def num_tips(self) -> int:
+        """Number K of tips."""
+        return self.found.shape[-1]
+
+    @property
+    def tips(self) -> Tensor:
+        """Where the tips are, (T, K, 3)."""
+        return self.curves[:, : self.num_tips, 0]
+
+    @property
+    def junctions(self) -> Tensor:
+        """Where the junctions are, (T, J, 3); none if there are two tips."""
+        flat = self.graph.reshape(-1)
+        first = [int((flat == node).nonzero()[0, 0]) for node in range(self.num_tips, len(self.graph) + 1)]
+        return self.curves[:, :, [0, -1]].flatten(1, 2)[:, first]

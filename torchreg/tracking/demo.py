@@ -1,0 +1,98 @@
+"""The main job on made-up data: a hand moves before a pair of cameras and is found and followed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import check_shape
+from torchreg.datasets.hand import HandCloud
+from torchreg.datasets.sequences import hand_sequence
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.tracking.results import DemoResult, FrameResult, TrackResult
+from torchreg.tracking.tracker import TrackConfig, Tracker
+
+DEMO_FPS = 20.0
+
+
+def run_demo(
+    num_frames: int = 40,
+    seed: int = 0,
+    *,
+    config: TrackConfig | None = None,
+    on_frame: Callable[[int, int], None] | None = None,
+) -> DemoResult:
+    """Return a hand tracked through a made-up sequence, beside the truth.
+
+    A pair of cameras sees the palm of a hand that bends its fingers and sways: up to 600 points on the hand per frame,
+    with 1.5 mm of noise in depth, and 257 outliers on a forearm, a wall and in the air. The tracker is given no pose to
+    start from.
+
+    Args:
+        num_frames: number of frames, 20 per second.
+        seed: of motion and measurements.
+        config: of the tracker.
+        on_frame: is told (frames done, all frames) after each.
+
+    Returns:
+        a `DemoResult`. An interruption by the keyboard after the first frame ends the sequence: the result then holds
+        the frames that were done.
+
+    Raises:
+        InputError: if ``num_frames`` is not a positive integer.
+
+    Differentiable: no.
+
+    Cost: about 0.1 s per frame to make it, 0.03 s to track it, and 2 s to find the hand in the first.
+    """
+    hand = Hand()
+    clouds = hand_sequence("bending_palm", num_frames, DEMO_FPS, shape=hand, seed=seed)
+    inliers: list[Tensor] = []
+
+    def note(points: Tensor, result: FrameResult) -> None:
+        inliers.append(result.inliers)
+        if on_frame is not None:
+            on_frame(len(inliers), len(clouds))
+
+    times = [frame / DEMO_FPS for frame in range(len(clouds))]
+    track = Tracker(hand, config=config).run([cloud.points for cloud in clouds], note, times=times)
+    return _beside_truth(hand, track, clouds[: len(track.poses)], inliers, seed)
+
+
+def moved_to_mean(skin: LinearBlendSkin, pose: Tensor, cloud: Tensor) -> Tensor:
+    """Return the pose moved so that the mean of the posed skin lies at the mean of a cloud; the turn stays.
+
+    Args:
+        skin: of the shape.
+        pose: (num_dofs,).
+        cloud: (M, 3) finite points, metres.
+
+    Returns:
+        (num_dofs,).
+
+    Raises:
+        InputError: if a size is wrong.
+    """
+    check_shape(cloud, "cloud", ("M", 3))
+    with torch.no_grad():
+        offset = cloud.to(pose).mean(0) - skin(skin.shape.check_pose(pose)).mean(0)
+    return torch.cat([pose[:3] + offset, pose[3:]])
+
+
+def _beside_truth(
+    hand: Hand, track: TrackResult, clouds: Sequence[HandCloud], inliers: Sequence[Tensor], seed: int
+) -> DemoResult:
+    tips = [4 * finger + 4 for finger in range(len(hand.fingertip_parts))]
+    true = torch.stack([cloud.keypoints for cloud in clouds])
+    return DemoResult(
+        track=track,
+        truths=torch.stack([cloud.pose for cloud in clouds]),
+        clouds=tuple(cloud.points for cloud in clouds),
+        inliers=tuple(inliers[: len(clouds)]),
+        tip_errors=(track.keypoints - true)[:, tips].norm(dim=-1),
+        tips_seen=torch.stack([cloud.seen_parts[list(hand.fingertip_parts)] for cloud in clouds]),
+        seed=seed,
+    )

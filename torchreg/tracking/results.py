@@ -1,0 +1,154 @@
+"""What tracking a shape through a sequence returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from torchreg.alignment.results import AlignResult
+from torchreg.result import Result, Status
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameResult(AlignResult):
+    """One frame of a tracked sequence.
+
+    Distances of points out of the shape's reach are infinite; ``sigma``, ``cost``, covariance and residual of a frame
+    that was not fitted are NaN, as is everything before the shape was first found.
+
+    Args:
+        covariance: (num_dofs, num_dofs) of the pose in tangent coordinates (base: translation, then a rotation composed
+            from the left), from the normal equations and the prior.
+        acquired: what led to the pose: "tracked", or where that was in doubt "surface", "starts" or "search"; "found"
+            anywhere; "lost" and "held" rest on the frames before alone.
+        frame: number of the frame.
+        time: of the frame, in the caller's unit.
+        inlier_ratio: inliers as a share of the finite data.
+        residual: robust standard deviation of the distances near the surface, metres.
+    """
+
+    covariance: Tensor
+    acquired: str
+    frame: int
+    time: float
+    inlier_ratio: float
+    residual: float
+
+    @property
+    def std(self) -> Tensor:
+        """Standard deviations (num_dofs,) of the pose, metres and radians."""
+        return self.covariance.diagonal().sqrt()
+
+
+@dataclass(frozen=True)
+class TrackResult(Result):
+    """A tracked sequence of T frames.
+
+    Args:
+        poses: (T, num_dofs), metres and radians; NaN before the shape was first found.
+        std: (T, num_dofs) standard deviations, see `FrameResult`; NaN where a frame was not fitted.
+        keypoints: (T, K, 3), metres.
+        inlier_ratios: (T,) inliers as a share of the data.
+        residuals: (T,) robust standard deviation of the distances near the surface, metres.
+        times: (T,) of the frames.
+        seconds: (T,) that each frame took.
+        statuses: how each frame ended.
+        acquired: what led to each pose, see `FrameResult`.
+    """
+
+    poses: Tensor
+    std: Tensor
+    keypoints: Tensor
+    inlier_ratios: Tensor
+    residuals: Tensor
+    times: Tensor
+    seconds: Tensor
+    statuses: tuple[Status, ...]
+    acquired: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TrackState(Result):
+    """All that the next frame of a tracker depends on. Running figures are means over the frames before.
+
+    Args:
+        frame: number of frames seen.
+        time: of the last one.
+        interval: usual time between frames; zero before the second.
+        pose: (num_dofs,) last or held, NaN before the shape was first found.
+        velocity: (num_dofs,) tangent, per unit of time.
+        points: (N, 3) model points for the next frame, metres.
+        weights: (N, P) their binding to the parts.
+        reference_pose: (num_dofs,) the pose they are given in.
+        previous: (K, num_dofs) some earlier poses.
+        strays: (S, 3) data off the surface as dense as those on it, in the frame of the first part, metres.
+        error: running largest error of the prediction at the model points, metres.
+        surprise: (3,) the same of the base's place, metres, its turn and the joints, radians.
+        total: running number of data.
+        inliers: running number of inliers; zero before the first fit.
+        ratio: running share of inliers in the data in reach.
+        residual: running residual, metres.
+        held: running share of the joints at a limit.
+        lost: frames since the last fit.
+        rest: frames before a search is tried again.
+        fails: searches in a row that left doubts.
+        unsure: how often a pose that was found everywhere may still be checked.
+        seed: of all that is drawn.
+    """
+
+    frame: int
+    time: float
+    interval: float
+    pose: Tensor
+    velocity: Tensor
+    points: Tensor
+    weights: Tensor
+    reference_pose: Tensor
+    previous: Tensor
+    strays: Tensor
+    error: float
+    surprise: Tensor
+    total: float
+    inliers: float
+    ratio: float
+    residual: float
+    held: float
+    lost: int
+    rest: int
+    fails: int
+    unsure: int
+    seed: int
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a pose."""
+        return bool(self.pose.isfinite().all())
+
+    @property
+    def tracked(self) -> bool:
+        """Whether a frame was ever fitted."""
+        return self.inliers > 0
+
+
+@dataclass(frozen=True)
+class DemoResult(Result):
+    """A hand tracked through a made-up sequence, beside the truth; T frames were done.
+
+    Args:
+        track: what the tracker found.
+        truths: (T, num_dofs) the poses behind the clouds.
+        clouds: T clouds (M_t, 3), metres.
+        inliers: T masks (M_t,), True where a datum is near the tracked surface.
+        tip_errors: (T, 5) distance of each fingertip, thumb to little finger, from its true place, metres.
+        tips_seen: (T, 5) True where the cameras saw enough of the fingertip to measure it.
+        seed: of motion and measurements.
+    """
+
+    track: TrackResult
+    truths: Tensor
+    clouds: tuple[Tensor, ...]
+    inliers: tuple[Tensor, ...]
+    tip_errors: Tensor
+    tips_seen: Tensor
+    seed: int
