@@ -30,7 +30,7 @@ from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.bones.motion_problem import BoneProblem, bind
-from torchreg.registration.bones.motions import bone_step
+from torchreg.registration.bones.motions import fit_bones
 from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.registration.bones.weights import RefineConfig, refine_weights
 from torchreg.registration.solve_pose import PoseSolver
@@ -99,7 +99,7 @@ def measure(bones: int, dtype: torch.dtype, scale: float, repeats: int) -> list[
         binary = torch.nn.functional.one_hot(weights.argmax(-1), bones).to(points)
         for name, some in (("binary", binary), ("blended", weights)):
             problem = BoneProblem(points[few], bind(some), targets, tube.normals[few], moments=moments)
-            rows.append((f"T-step, {name}", milliseconds(lambda p=problem: bone_step(p, bent), repeats)))
+            rows.append((f"T-step, {name}", milliseconds(lambda p=problem: fit_bones(p, bent, max_steps=1), repeats)))
     rows += refinement_rows(tube, few[: int(1500 * scale)], max(1, repeats // 10))
     return rows + pose_rows(tube, repeats)
 

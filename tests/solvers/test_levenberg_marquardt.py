@@ -241,8 +241,9 @@ def test_a_hessian_without_a_factor_raises_the_damping_until_it_has_one():
         return Linearization(0.5 * state.square().sum(-1), state, indefinite.expand(1, 2, 2))
 
     start = torch.tensor([[1.0, -0.5]], dtype=D)
-    one = damped_step(linearize(start), torch.tensor([1e-3], dtype=D))
-    assert one.tolist() == [[0, 0]]
+    step, sound = damped_step(linearize(start), torch.tensor([1e-3], dtype=D))
+    assert step.tolist() == [[0, 0]]
+    assert sound.tolist() == [False]
     result = levenberg_marquardt(linearize, start, max_steps=60, atol=1e-9)
     assert result.num_steps > 3
     assert float(result.cost) < 1e-6
@@ -287,9 +288,9 @@ def test_the_damped_step_is_marquardts():
     diagonal = torch.diag_embed(hessian.diagonal(dim1=-2, dim2=-1)) * damping[:, None, None]
     expected = -torch.linalg.solve(hessian + diagonal, gradient)
     at = Linearization(torch.zeros(2, dtype=D), gradient, hessian)
-    torch.testing.assert_close(damped_step(at, damping), expected, rtol=1e-8, atol=0)
+    torch.testing.assert_close(damped_step(at, damping)[0], expected, rtol=1e-8, atol=0)
     frozen = torch.tensor([[False, True, False, False, False]] * 2)
-    held = damped_step(at, damping, frozen=frozen)
+    held, _ = damped_step(at, damping, frozen=frozen)
     keep = [0, 2, 3, 4]
     reduced = -torch.linalg.solve((hessian + diagonal)[:, keep][:, :, keep], gradient[:, keep])
     assert held[:, 1].tolist() == [0, 0]

@@ -105,7 +105,7 @@ class AlignProblem:
         """Return the result of one damped step, without a test: what a generalized EM needs."""
         shares = torch.full_like(pose[:, 0], damping)
         held = held_at_limits(around.gradient, pose, self.lower, self.upper)
-        step = damped_step(around, shares, frozen=held)
+        step, _ = damped_step(around, shares, frozen=held)
         return LMResult(self.clamp(self.skin.shape.retract(pose, step)), around.cost, shares, step, 1)
 
     def change(self, step: Tensor) -> Tensor:

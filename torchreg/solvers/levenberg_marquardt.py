@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-_DAMPING_DOWN = 0.2
-_DAMPING_DOUBT = 2.0
-_DAMPING_UP = 6.0
-# A step that brings less than this share of the decrease that its slope promises makes the model doubtful.
-_DOUBTFUL_SHARE = 0.5
-_MIN_DAMPING = 1e-7
-_MAX_DAMPING = 1e7
+from torchreg.solvers.damped_descent import DampingRule, Trial, damped_descent
+
+# Steps that overshoot almost to the same height would else zigzag for long, each of them accepted: a quadratic falls by
+# at least half of slope times step, and less than half of that makes the model doubtful.
+_RULE = DampingRule(trusted=0.5, down=0.2, doubtful=2.0, up=6.0, least=1e-7)
+_FIRST_DAMPING = 1e-3
 # Rounding makes a singular Hessian of D variables indefinite by about D eps; a damping of a few times that covers it.
 _ROUNDING_COVER = 4.0
 
 
-@dataclass(frozen=True)
-class Linearization:
+class Linearization(NamedTuple):
     """A least-squares problem around a state, for every problem of the batch.
 
     Args:
@@ -96,41 +95,36 @@ def levenberg_marquardt(
     """
     low = state.new_full(state.shape[-1:], -torch.inf) if lower is None else lower
     high = state.new_full(state.shape[-1:], torch.inf) if upper is None else upper
-    min_damping = max(_MIN_DAMPING, _ROUNDING_COVER * state.shape[-1] * torch.finfo(state.dtype).eps)
-    state = torch.minimum(torch.maximum(state, low), high)
-    damping = state.new_full(state.shape[:1], 1e-3) if damping is None else damping
-    current = linearize(state) if start is None else start
-    last_step = torch.zeros_like(state)
-    num_steps = 0
-    while num_steps < max_steps:
-        num_steps += 1
-        step, sound = _solve(current, damping, held_at_limits(current.gradient, state, low, high))
-        trial_state = torch.minimum(torch.maximum(retract(state, step), low), high)
-        if cost is not None and num_steps == max_steps:
-            trial = replace(current, cost=cost(trial_state))
-        else:
-            trial = linearize(trial_state)
-        decrease = current.cost - trial.cost
-        better = (decrease >= 0) & sound
-        # A quadratic falls by at least half of slope times step. Steps that overshoot almost to the same height would
-        # else zigzag for long, each of them accepted.
-        trusted = decrease >= (-0.5 * _DOUBTFUL_SHARE) * (current.gradient * step).sum(-1)
-        keep = better.unsqueeze(-1)
-        state = torch.where(keep, trial_state, state)
-        last_step = torch.where(keep, step, last_step)
-        current = Linearization(
-            torch.where(better, trial.cost, current.cost),
-            torch.where(keep, trial.gradient, current.gradient),
-            torch.where(keep.unsqueeze(-1), trial.hessian, current.hessian),
-        )
-        accepted = torch.where(trusted, damping * _DAMPING_DOWN, damping * _DAMPING_DOUBT)
-        damping = torch.where(better, accepted, damping * _DAMPING_UP).clamp_(min_damping, _MAX_DAMPING)
-        if atol > 0 and bool(((step.abs().amax(-1) <= atol) & sound).all()):
-            break
-    return LMResult(state, current.cost, damping, last_step, num_steps)
+    rounding = _ROUNDING_COVER * state.shape[-1] * torch.finfo(state.dtype).eps
+
+    def within(state: Tensor) -> Tensor:
+        return torch.minimum(torch.maximum(state, low), high)
+
+    def solve(state: Tensor, problem: Linearization, damping: Tensor) -> Trial[Tensor]:
+        step, sound = damped_step(problem, damping, frozen=held_at_limits(problem.gradient, state, low, high))
+        promised = -0.5 * (problem.gradient * step).sum(-1)
+        return Trial(within(retract(state, step)), step, promised, sound)
+
+    def small(trial: Trial[Tensor], before: Tensor, after: Tensor) -> Tensor:
+        # Together: the steps of the others are as small as those of the last.
+        return ((trial.step.abs().amax(-1) <= atol) & trial.sound).all().expand(before.shape)
+
+    found = damped_descent(
+        linearize,
+        solve,
+        within(state),
+        state.new_full(state.shape[:1], _FIRST_DAMPING) if damping is None else damping,
+        rule=replace(_RULE, least=max(_RULE.least, rounding)),
+        max_steps=max_steps,
+        settled=small if atol > 0 else None,
+        start=start,
+        final_cost=cost,
+    )
+    last_step = found.last_step.expand(state.shape)
+    return LMResult(found.state, found.system.cost, found.damping, last_step, found.num_steps)
 
 
-def damped_step(problem: Linearization, damping: Tensor, *, frozen: Tensor | None = None) -> Tensor:
+def damped_step(problem: Linearization, damping: Tensor, *, frozen: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Return the step ``-(H + damping diag(H))^-1 g``, zero in frozen variables and where nothing constrains one.
 
     A variable counts as unconstrained when its curvature is below the rounding of the largest one's. A problem whose
@@ -142,15 +136,10 @@ def damped_step(problem: Linearization, damping: Tensor, *, frozen: Tensor | Non
         frozen: (B, D) True for variables to hold.
 
     Returns:
-        (B, D).
+        (B, D), and (B,) whether the system could be factored.
 
     Differentiable: no.
     """
-    return _solve(problem, damping, frozen)[0]
-
-
-def _solve(problem: Linearization, damping: Tensor, frozen: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return the damped step (B, D) and whether its system could be factored (B,)."""
     hessian, gradient = problem.hessian, problem.gradient
     diagonal = hessian.diagonal(dim1=-2, dim2=-1)
     # A variable without curvature keeps its place: unit diagonal, zero gradient. The floor bounds the repair.

@@ -11,7 +11,7 @@ from torchreg.registration.blend import turn_about
 from torchreg.registration.bones.distance_loss import ScanDistance
 from torchreg.registration.bones.grid_losses import JointEnergy
 from torchreg.registration.bones.motion_problem import BoneProblem, bind, bone_bodies
-from torchreg.registration.bones.motions import bone_step, fit_bones
+from torchreg.registration.bones.motions import fit_bones
 
 # torch builds its forward-mode rules with torch.jit.script, and warns about it.
 JACFWD = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
@@ -145,7 +145,7 @@ def test_bad_input_is_named(bones):
     with pytest.raises(InputError, match="transforms must have shape"):
         fit_bones(problem, torch.eye(4).double().repeat(2, 1, 1))
     with pytest.raises(InputError, match="fixed must have shape"):
-        bone_step(problem, torch.eye(4).double()[None], fixed=torch.ones(2).bool())
+        fit_bones(problem, torch.eye(4).double()[None], fixed=torch.ones(2).bool())
     with pytest.raises(InputError, match="max_steps must be at least 1"):
         fit_bones(problem, torch.eye(4).double()[None], max_steps=0)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -11,14 +11,13 @@ from torch import Tensor
 from torchreg._checks import check_count, check_positive, check_shape
 from torchreg.registration.blend import turn_about
 from torchreg.registration.bones.motion_problem import BoneProblem
+from torchreg.solvers.damped_descent import DampingRule, Trial, damped_descent
 from torchreg.solvers.levenberg_marquardt import Linearization, damped_step
 
 # Nothing beside the pull of matches, of which a bone gets one part in B, but enough against rounding where none pulls.
-_DEFAULT_DAMPING = 1e-4
-# By how much of what the model promised a step must lower the energy for the damping to fall.
-_TRUSTED_SHARE = 0.5
-_DAMPING_DOWN, _DAMPING_UP = 0.25, 4.0
-_LARGEST_DAMPING = 1e7
+FIRST_DAMPING = 1e-4
+_RULE = DampingRule(trusted=0.5, down=0.25, doubtful=1.0, up=4.0, least=0.0)
+# A change of the cost by this many units in the last place of what bones carry, squared, is rounding.
 _ROUNDING = 10.0
 
 
@@ -42,37 +41,6 @@ class BoneFit:
 
 
 @torch.no_grad()
-def bone_step(
-    problem: BoneProblem, transforms: Tensor, *, damping: float = _DEFAULT_DAMPING, fixed: Tensor | None = None
-) -> Tensor:
-    """Return the motions after one Gauss-Newton step, ``R <- exp(w) R`` about the bones' middles, untested.
-
-    Args:
-        problem: the problem.
-        transforms: (..., B, 4, 4) to start from.
-        damping: see `fit_bones`.
-        fixed: (B,) bool, bones to hold.
-
-    Returns:
-        (..., B, 4, 4).
-
-    Raises:
-        InputError: if a shape does not fit or ``damping`` is not positive.
-
-    Differentiable: no.
-
-    Cost: 2 ms for 2,000 points and 40 bones with binary weights on one core, 3 ms where weights blend at the borders.
-
-    References: Chang and Zwicker 2009, section 4.1.
-    """
-    check_positive(damping, "damping")
-    transforms = problem.batched(transforms)
-    current = problem.linearize(transforms)
-    twists = _damped_twists(problem, transforms, current, torch.full_like(current.cost, damping), fixed)
-    return straightened(turn_about(transforms, twists, problem.centers(transforms)))
-
-
-@torch.no_grad()
 def fit_bones(
     problem: BoneProblem,
     transforms: Tensor,
@@ -81,7 +49,7 @@ def fit_bones(
     max_steps: int = 5,
     rtol: float = 1e-4,
     atol: float = 0.0,
-    damping: float | Tensor = _DEFAULT_DAMPING,
+    damping: float | Tensor = FIRST_DAMPING,
     retract: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> BoneFit:
     """Return the motions of least energy that damped Gauss-Newton steps find, each problem of a batch by itself.
@@ -112,35 +80,42 @@ def fit_bones(
     check_count(max_steps, "max_steps", 1)
     check_positive(rtol, "rtol", allow_zero=True)
     check_positive(atol, "atol", allow_zero=True)
+    if fixed is not None:
+        check_shape(fixed, "fixed", (problem.binding.num_bones,))
     transforms = problem.batched(transforms)
     current = problem.linearize(transforms)
-    least = 24 * transforms.shape[-3] * torch.finfo(transforms.dtype).eps
     level = torch.as_tensor(damping, dtype=transforms.dtype, device=transforms.device).expand(current.cost.shape)
     floor = _rounding_floor(problem)
-    done = 2 * current.cost <= atol**2
-    steps = 0
-    while steps < max_steps and not bool(done.all()):
-        steps += 1
-        twists = _damped_twists(problem, transforms, current, level, fixed)
+
+    def solve(transforms: Tensor, current: Linearization, level: Tensor) -> Trial[Tensor]:
+        twists, sound = _damped_twists(problem, transforms, current, level, fixed)
         if retract is None:
-            trial_transforms = turn_about(transforms, twists, problem.centers(transforms))
+            moved = turn_about(transforms, twists, problem.centers(transforms))
         else:
-            trial_transforms = retract(transforms, twists)
-        trial = problem.linearize(trial_transforms)
-        decrease = current.cost - trial.cost
-        better = (decrease >= 0) & ~done
-        small = (decrease.abs() <= rtol * current.cost + floor) | (2 * trial.cost <= atol**2)
-        promised = -0.5 * (current.gradient * twists.flatten(-2)).sum(-1)
-        level = torch.where(decrease > _TRUSTED_SHARE * promised, level * _DAMPING_DOWN, level)
-        level = torch.where(decrease >= 0, level, level * _DAMPING_UP).clamp(least, _LARGEST_DAMPING)
-        transforms = torch.where(better[..., None, None, None], trial_transforms, transforms)
-        current = Linearization(
-            torch.where(better, trial.cost, current.cost),
-            torch.where(better[..., None], trial.gradient, current.gradient),
-            torch.where(better[..., None, None], trial.hessian, current.hessian),
-        )
-        done = done | small
-    return BoneFit(straightened(transforms), 2 * current.cost, level, steps, done)
+            moved = retract(transforms, twists)
+        return Trial(moved, twists, -0.5 * (current.gradient * twists.flatten(-2)).sum(-1), sound)
+
+    def settled(trial: Trial[Tensor], before: Tensor, after: Tensor) -> Tensor:
+        return ((before - after).abs() <= rtol * before + floor) | (2 * after <= atol**2)
+
+    found = damped_descent(
+        problem.linearize,
+        solve,
+        transforms,
+        level,
+        rule=replace(_RULE, least=rounding_cover(problem)),
+        max_steps=max_steps,
+        settled=settled,
+        done=2 * current.cost <= atol**2,
+        start=current,
+    )
+    energy = 2 * found.system.cost
+    return BoneFit(straightened(found.state), energy, found.damping, found.num_steps, found.done)
+
+
+def rounding_cover(problem: BoneProblem) -> float:
+    """Return the damping that makes up for rounding in the Hessian of a problem's 6 B twists."""
+    return 24 * problem.binding.num_bones * torch.finfo(problem.points.dtype).eps
 
 
 def _rounding_floor(problem: BoneProblem) -> float:
@@ -149,24 +124,30 @@ def _rounding_floor(problem: BoneProblem) -> float:
     return (_ROUNDING * torch.finfo(size.dtype).eps) ** 2 * float(size)
 
 
+def add_inertia(problem: BoneProblem, transforms: Tensor, hessian: Tensor, level: Tensor) -> Tensor:
+    """Return Hessians (..., 6 B, 6 B) damped by the mean squared shift of what the bones carry, level (...) times."""
+    size = problem.binding.num_bones
+    damped = hessian.clone()
+    blocks = damped.unflatten(-1, (size, 6)).unflatten(-3, (size, 6)).diagonal(dim1=-4, dim2=-2)
+    blocks += (level / size)[..., None, None, None] * problem.inertia(transforms).movedim(-3, -1)
+    return damped
+
+
 def _damped_twists(
     problem: BoneProblem, transforms: Tensor, current: Linearization, level: Tensor, fixed: Tensor | None
-) -> Tensor:
-    """Return the twists (..., B, 6) of a Gauss-Newton step that pays for the shift of what bones carry."""
+) -> tuple[Tensor, Tensor]:
+    """Return the twists (..., B, 6) of a damped Gauss-Newton step, and whether its system could be solved (...)."""
     size = problem.binding.num_bones
-    hessian = current.hessian.clone()
-    blocks = hessian.unflatten(-1, (size, 6)).unflatten(-3, (size, 6)).diagonal(dim1=-4, dim2=-2)
-    blocks += (level / size)[..., None, None, None] * problem.inertia(transforms).movedim(-3, -1)
+    hessian = add_inertia(problem, transforms, current.hessian, level)
     frozen = None
     if fixed is not None:
-        check_shape(fixed, "fixed", (size,))
         frozen = fixed.to(hessian.device).repeat_interleave(6).expand(level.numel(), -1)
     flat = Linearization(
         current.cost.reshape(-1), current.gradient.reshape(-1, 6 * size), hessian.reshape(-1, 6 * size, 6 * size)
     )
     # What is left of the diagonal's damping repairs rounding alone.
-    rounding = torch.full_like(flat.cost, 24 * size * torch.finfo(flat.cost.dtype).eps)
-    return damped_step(flat, rounding, frozen=frozen).reshape(*transforms.shape[:-2], 6)
+    twists, sound = damped_step(flat, torch.full_like(flat.cost, rounding_cover(problem)), frozen=frozen)
+    return twists.reshape(*transforms.shape[:-2], 6), sound.reshape(current.cost.shape)
 
 
 def straightened(transforms: Tensor) -> Tensor:

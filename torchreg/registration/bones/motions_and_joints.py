@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -15,11 +15,13 @@ from torchreg.geometry.rotation import skew
 from torchreg.registration.blend import turn_about
 from torchreg.registration.bones.joint_moments import JointMoments
 from torchreg.registration.bones.motion_problem import BoneProblem
-from torchreg.registration.bones.motions import straightened
+from torchreg.registration.bones.motions import FIRST_DAMPING, add_inertia, rounding_cover, straightened
+from torchreg.solvers.damped_descent import DampingRule, Trial, damped_descent
 
 # Bones meet at the surface that was scanned, joints lie inside: a firmer lambda draws them out, to a limb's radius off.
 JOINT_REGULARIZATION = 1e-3
-_FIRST_DAMPING, _DAMPING_DOWN, _DAMPING_UP, _LARGEST_DAMPING = 1e-4, 0.25, 4.0, 1e7
+# Any decrease shows that the model holds.
+_RULE = DampingRule(trusted=0.0, down=0.25, doubtful=0.25, up=4.0, least=0.0)
 
 
 @dataclass(frozen=True)
@@ -88,24 +90,36 @@ def fit_bones_and_joints(
     transforms = problem.batched(transforms)
     centers = moments.center if centers is None else centers
     check_shape(centers, "centers", (len(moments.pairs), 3))
-    current = _linearized(problem, transforms, centers, regularization)
-    level, steps, done = _FIRST_DAMPING, 0, False
-    least = 24 * transforms.shape[1] * torch.finfo(transforms.dtype).eps
-    while steps < max_steps and not done:
-        steps += 1
-        step = _step(problem, transforms, current, level)
-        if step is None:
-            level *= _DAMPING_UP
-            continue
-        twists, shifts = step
-        trial_transforms = turn_about(transforms, twists, problem.centers(transforms))
-        trial = _linearized(problem, trial_transforms, centers + shifts, regularization)
-        decrease = current.cost - trial.cost
-        done = abs(decrease) <= rtol * current.cost
-        if decrease >= 0:
-            transforms, centers, current = trial_transforms, centers + shifts, trial
-        level = max(level * _DAMPING_DOWN, least) if decrease >= 0 else min(level * _DAMPING_UP, _LARGEST_DAMPING)
-    return JointFit(straightened(transforms), centers, 2 * current.costs, steps, done)
+
+    def linearize(place: _Place) -> _System:
+        return _linearized(problem, place, regularization)
+
+    def solve(place: _Place, system: _System, level: Tensor) -> Trial[_Place]:
+        return _step(problem, place, system, level)
+
+    def settled(trial: Trial[_Place], before: Tensor, after: Tensor) -> Tensor:
+        return (before - after).abs() <= rtol * before
+
+    found = damped_descent(
+        linearize,
+        solve,
+        _Place(transforms, centers),
+        transforms.new_tensor(FIRST_DAMPING),
+        rule=replace(_RULE, least=rounding_cover(problem)),
+        max_steps=max_steps,
+        settled=settled,
+    )
+    energy = 2 * found.system.costs
+    return JointFit(
+        straightened(found.state.transforms), found.state.centers, energy, found.num_steps, bool(found.done)
+    )
+
+
+class _Place(NamedTuple):
+    """The unknowns: motions (F, B, 4, 4) and centers of joints (P, 3)."""
+
+    transforms: Tensor
+    centers: Tensor
 
 
 class _System(NamedTuple):
@@ -113,7 +127,7 @@ class _System(NamedTuple):
 
     Args:
         costs: (F,) at them, half the problem's energy.
-        cost: of all frames, and of the centers.
+        cost: () of all frames, and of the centers.
         gradient: (F, 6 B) by the twists.
         hessian: (F, 6 B, 6 B).
         center_gradient: (P, 3).
@@ -122,7 +136,7 @@ class _System(NamedTuple):
     """
 
     costs: Tensor
-    cost: float
+    cost: Tensor
     gradient: Tensor
     hessian: Tensor
     center_gradient: Tensor
@@ -130,8 +144,8 @@ class _System(NamedTuple):
     mixed: Tensor
 
 
-def _linearized(problem: BoneProblem, transforms: Tensor, centers: Tensor, regularization: float) -> _System:
-    moments = _joints_of(problem)
+def _linearized(problem: BoneProblem, place: _Place, regularization: float) -> _System:
+    moments, (transforms, centers) = _joints_of(problem), place
     motions, joints = problem.linearize(transforms, centers), _joint_gaps(problem, transforms, centers)
     frames, size, count = len(transforms), transforms.shape[1], len(centers)
     mixed = transforms.new_zeros(frames, size, count, 6, 3)
@@ -142,13 +156,13 @@ def _linearized(problem: BoneProblem, transforms: Tensor, centers: Tensor, regul
     away = centers - moments.center
     identity = torch.eye(3, dtype=transforms.dtype, device=transforms.device)
     return _System(
-        motions.cost,
-        float(motions.cost.sum()) + 0.5 * strength * float(away.square().sum()),
-        motions.gradient,
-        motions.hessian,
-        (joints.by_center.mT @ joints.gap.unsqueeze(-1)).squeeze(-1).sum(0) + strength * away,
-        (joints.by_center.mT @ joints.by_center).sum(0) + strength * identity,
-        mixed.permute(0, 1, 3, 2, 4).reshape(frames, 6 * size, 3 * count),
+        costs=motions.cost,
+        cost=motions.cost.sum() + 0.5 * strength * away.square().sum(),
+        gradient=motions.gradient,
+        hessian=motions.hessian,
+        center_gradient=(joints.by_center.mT @ joints.gap.unsqueeze(-1)).squeeze(-1).sum(0) + strength * away,
+        center_hessian=(joints.by_center.mT @ joints.by_center).sum(0) + strength * identity,
+        mixed=mixed.permute(0, 1, 3, 2, 4).reshape(frames, 6 * size, 3 * count),
     )
 
 
@@ -189,23 +203,20 @@ def _joints_of(problem: BoneProblem) -> JointMoments:
     return problem.moments
 
 
-def _step(problem: BoneProblem, transforms: Tensor, system: _System, level: float) -> tuple[Tensor, Tensor] | None:
-    """Return twists (F, B, 6) and shifts of the centers (P, 3), of a Gauss-Newton step damped as in `fit_bones`.
-
-    None where rounding has left a system without a Cholesky factor.
-    """
-    size, count = transforms.shape[1], len(system.center_gradient)
-    hessian = system.hessian.clone()
-    blocks = hessian.unflatten(-1, (size, 6)).unflatten(-3, (size, 6)).diagonal(dim1=-4, dim2=-2)
-    blocks += level / size * problem.inertia(transforms).movedim(-3, -1)
-    factor, info = torch.linalg.cholesky_ex(hessian)
-    if bool(info.any()):
-        return None
+def _step(problem: BoneProblem, place: _Place, system: _System, level: Tensor) -> Trial[_Place]:
+    """Return a Gauss-Newton step of twists (F, B, 6) and centers, damped as in `fit_bones`."""
+    transforms, centers = place
+    size, count = transforms.shape[1], len(centers)
+    factor, info = torch.linalg.cholesky_ex(add_inertia(problem, transforms, system.hessian, level))
+    sound = ~info.any()
+    if not sound:  # rounding has left a system without a Cholesky factor
+        return Trial(place, transforms.new_zeros(len(transforms), size, 6), torch.zeros_like(level), sound)
     solved = torch.cholesky_solve(torch.cat([system.mixed, system.gradient.unsqueeze(-1)], dim=-1), factor)
     by_center, alone = solved[..., :-1], solved[..., -1]
     reduced = torch.block_diag(*system.center_hessian) - (system.mixed.mT @ by_center).sum(0)
     right = system.center_gradient.flatten() - (system.mixed.mT @ alone.unsqueeze(-1)).sum(0).squeeze(-1)
     reduced.diagonal().mul_(1 + level)
     shifts = -torch.linalg.solve(reduced, right)
-    twists = -alone - by_center @ shifts
-    return twists.unflatten(-1, (size, 6)), shifts.unflatten(0, (count, 3))
+    twists = (-alone - by_center @ shifts).unflatten(-1, (size, 6))
+    moved = turn_about(transforms, twists, problem.centers(transforms))
+    return Trial(_Place(moved, centers + shifts.unflatten(0, (count, 3))), twists, torch.zeros_like(level), sound)
