@@ -10,7 +10,6 @@ from torchreg.errors import InputError
 from torchreg.geometry.rotation import so3_exp
 from torchreg.tracking.motion_model import (
     Motion,
-    difference,
     first_motion,
     merged,
     motion_after,
@@ -89,12 +88,6 @@ def test_prior_follows_the_surprises_between_bounds(arm_tracking):
 def test_motion_is_fast_where_predictions_fail(arm_tracking):
     assert not moves_fast(arm_tracking.state(error=0.0125), 0.4)
     assert moves_fast(arm_tracking.state(error=0.0135), 0.4)
-
-
-def test_differences_are_the_steps_that_lead_there(arm, arm_tracking):
-    end = arm.retract(arm_tracking.pose, VELOCITY)
-    torch.testing.assert_close(difference(arm_tracking.pose, end), VELOCITY)
-    assert difference(end, end).abs().max() < 1e-15
 
 
 def fit_after(arm_tracking, state, step):

@@ -15,7 +15,6 @@ from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.result import Status
 from torchreg.storage import load
-from torchreg.tracking.motion_model import difference
 from torchreg.tracking.tracker import TrackConfig, Tracker
 
 TIPS = [4, 8, 12, 16, 20]
@@ -368,7 +367,7 @@ def test_covariance_is_that_of_repeated_measurements(arm, arm_tracking):
         own.state = replace(start, pose=truth, velocity=0 * truth)
         noise = 0.002 * torch.randn(surface.shape, generator=generator, dtype=torch.float64)
         record = own.step(surface + noise)
-        poses.append(difference(truth, record.pose))
+        poses.append(arm.difference(truth, record.pose))
         stds.append(record.std)
     scatter = torch.stack(poses).std(0)
     said = torch.stack(stds).mean(0)

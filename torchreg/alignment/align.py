@@ -9,7 +9,14 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_choice, check_count, check_positive
 from torchreg._threads import one_thread
-from torchreg.alignment.annealed_em import CORRESPONDENCES, OnStep, StageResult, fit_surface, register
+from torchreg.alignment.annealed_em import (
+    CORRESPONDENCES,
+    OnStep,
+    StageResult,
+    fit_surface,
+    outlier_level,
+    register,
+)
 from torchreg.alignment.local_search import FINAL_SIGMAS, explore, needs_search
 from torchreg.alignment.problem import (
     INLIER_SHARE,
@@ -27,7 +34,7 @@ from torchreg.errors import InputError
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import BendingSkin, LinearBlendSkin, sample_skin
-from torchreg.solvers.e_step import OUTLIER_CONSTANT, expectation
+from torchreg.solvers.e_step import expectation
 
 # Shares of the model's size, the diagonal of its rest pose.
 _START_SIGMA, _STOP_SIGMA = 0.08, 0.02
@@ -248,7 +255,8 @@ def _result(
     distances = torch.where(problem.valid, distances, torch.nan)
     inliers = distances.abs() < _inlier_distance(problem, config)
     posed = problem.skin(pose)
-    observed = expectation(posed, problem.data, final.sigma, OUTLIER_CONSTANT, mask=problem.valid)
+    outlier = outlier_level(problem, posed, final.sigma)
+    observed = expectation(posed, problem.data, final.sigma, outlier, mask=problem.valid)
     world = shifted(pose, origin)
     statuses = zip(inliers.sum(-1).tolist(), problem.valid.sum(-1).tolist(), final.change.tolist(), strict=True)
     return AlignResult(

@@ -131,7 +131,7 @@ def _tempered(prior: PosePrior, observed: EStep) -> PosePrior:
 
 def _expect(problem: AlignProblem, posed: Tensor, sigma: Tensor) -> EStep:
     """Return the E-step, without the kernel's own pull while the kernel is wide."""
-    outlier = _outlier(problem, posed, sigma)
+    outlier = outlier_level(problem, posed, sigma)
     match = CORRESPONDENCES[problem.correspondence]
     observed = match(posed, problem.data, sigma, outlier, mask=problem.valid)
     if problem.debias > 0 and float(sigma.max()) > _NARROW_SIGMA * problem.size:
@@ -150,7 +150,8 @@ def _debiased(observed: EStep, posed: Tensor, itself: EStep, share: float) -> ES
     return replace(observed, targets=observed.targets + share * (posed - itself.targets))
 
 
-def _outlier(problem: AlignProblem, posed: Tensor, sigma: Tensor) -> Tensor | float:
+def outlier_level(problem: AlignProblem, posed: Tensor, sigma: Tensor) -> Tensor | float:
+    """Return c of eq. 18 as the problem's settings have it: (B,) with the working volume, or its limit."""
     if problem.outlier == "limit":
         return OUTLIER_CONSTANT
     # V: the bounding box of data and posed model, grown by 3 sigma.

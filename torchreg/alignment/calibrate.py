@@ -204,7 +204,7 @@ class _Prior:
         """Return the prior about a shape of some size and poses."""
         pose_precision = torch.zeros_like(shape.rest)
         if config.align.prior_std is not None:
-            slides = shape.chain.couplings.abs().mT @ (1 - shape.chain.is_revolute) > 0
+            slides = shape.is_sliding[6:]
             pose_precision[6:] = torch.where(slides, size, 1.0).mul(config.align.prior_std).square().reciprocal()
         scales = torch.cat([shape.log_length_scales, shape.log_radius_scales]).detach()
         radial = torch.arange(len(scales)) >= shape.num_parts

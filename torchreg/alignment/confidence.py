@@ -106,10 +106,8 @@ def _limb_points(skin: LinearBlendSkin) -> list[tuple[Limb, Tensor]]:
 def _precision(problem: AlignProblem) -> Tensor:
     """Return how precisely poses are known without data, 1 / std^2, (num_dofs,) or (B, num_dofs); none is zero."""
     shape = problem.skin.shape
-    slides = shape.chain.couplings.abs().mT @ (1 - shape.chain.is_revolute) > 0
     least = torch.full_like(shape.rest, _TURN_STD**-2)
-    least[6:] = torch.where(slides, (_SHIFT_STD * problem.size) ** -2, least[6:])
-    least[:3] = (_SHIFT_STD * problem.size) ** -2
+    least = torch.where(shape.is_sliding, (_SHIFT_STD * problem.size) ** -2, least)
     return torch.maximum(problem.prior.precision, least)
 
 

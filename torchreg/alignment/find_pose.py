@@ -33,7 +33,7 @@ from torchreg.geometry.sampling import farthest_points
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
-from torchreg.solvers.e_step import OUTLIER_CONSTANT
+from torchreg.solvers.e_step import OUTLIER_CONSTANT, expectation
 
 # Typical poses lie at these shares of the way from the rest pose to the middle of the joint limits.
 _BENT_SHARES, _TYPICAL_SHARE = (0.2, 0.8), 0.5
@@ -47,7 +47,6 @@ _MAX_COMPARED, _SAME_ROUGH, _SAME_POSE = 300, 0.045, 0.05
 _FIT_STEPS, _FINAL_SIGMAS, _FINAL_STEPS = 3, (0.022,), 4
 # Few model points share a datum here, so the outlier class is taken smaller.
 _OUTLIERS = 0.3 * OUTLIER_CONSTANT
-_TINY = 1e-9
 # Square root of two, and the positive root of x^4 = x + 4.
 _SPIRAL_STEPS = (math.sqrt(2), 1.533751168755204288118041)
 
@@ -296,11 +295,8 @@ def _register_rigidly(search: PoseSearch, poses: Tensor, data: AlignProblem) -> 
     moved, motion = points, torch.eye(4).to(points).expand(*poses.shape[:2], 4, 4)
     valid, cloud = data.valid.to(points)[:, None, None], data.data.unsqueeze(1)
     for share in () if _is_bolted(skin.shape) else _RIGID_SIGMAS:
-        kernel = _kernel(moved, cloud, share * size) * valid
-        kernel = kernel / (kernel.sum(-2, keepdim=True) + _OUTLIERS)
-        weights = kernel.sum(-1)
-        targets = kernel @ cloud / weights.clamp_min(_TINY).unsqueeze(-1)
-        motion = fit_rigid(points, targets, weights)
+        held = expectation(moved, cloud, moved.new_tensor(share * size), _OUTLIERS, mask=data.valid.unsqueeze(1))
+        motion = fit_rigid(points, held.targets, held.weights)
         moved = transform_points(motion, points)
     kernel = _kernel(moved, cloud, _RIGID_SCORE * size / math.sqrt(2)) * valid
     count = data.valid.sum(-1, keepdim=True).clamp_min(1)

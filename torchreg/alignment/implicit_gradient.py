@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from torchreg.geometry.rotation import compose_rotation_vectors, left_jacobian, so3_exp
+from torchreg.geometry.rotation import left_jacobian, so3_exp
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.pose_algebra import BASE_DOFS, difference, retract
 from torchreg.shapes.surface import Surface
 from torchreg.solvers.levenberg_marquardt import held_at_limits
 
-_BASE = 6
 # Curvatures below this share of the largest, once every variable has its own scale, are rounding.
 _FLAT = {torch.float32: 1e-6, torch.float64: 1e-12}
 
@@ -64,17 +64,16 @@ class FixedPoint:
 
         Differentiable: in all but ``pose``'s rotation at half turns from the start, and the shape's parameters.
         """
-        turn = step[:, 3:_BASE]
-        joints = pose[:, _BASE:] + step[:, _BASE:]
+        turn = step[:, 3:BASE_DOFS]
+        joints = pose[:, BASE_DOFS:] + step[:, BASE_DOFS:]
         # The step of the base is taken by the data, backwards: then no rotation of the pose is special.
         seen = (data - (pose[:, :3] + step[:, :3]).unsqueeze(1)) @ so3_exp(turn)
-        there = torch.cat([torch.zeros_like(turn), pose[:, 3:_BASE], joints], dim=-1)
+        there = torch.cat([torch.zeros_like(turn), pose[:, 3:BASE_DOFS], joints], dim=-1)
         width = self.sigma.unsqueeze(-1)
         distance = self.surface.distance(seen, there)
         lost = -torch.expm1(-(distance / width).square())
         cost = 0.5 * (lost * self.valid).sum(-1) * (self.sigma / self.noise).square()
-        away = compose_rotation_vectors(turn, compose_rotation_vectors(pose[:, 3:_BASE], -start[:, 3:_BASE]))
-        offset = torch.cat([pose[:, :3] + step[:, :3] - start[:, :3], away, joints - start[:, _BASE:]], dim=-1)
+        offset = retract(difference(start, pose), step)
         return cost + 0.5 * (self.precision * offset.square()).sum(-1)
 
     def derivatives(self, pose: Tensor, data: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
@@ -201,5 +200,6 @@ class _Implicit(torch.autograd.Function):
 
 def _to_tangent(upstream: Tensor, pose: Tensor) -> Tensor:
     """Return gradients in pose vectors as gradients in tangent steps: the base's rotation vector moves by J^-1 step."""
-    turn = torch.linalg.solve(left_jacobian(pose[:, 3:_BASE]).mT, upstream[:, 3:_BASE].unsqueeze(-1)).squeeze(-1)
-    return torch.cat([upstream[:, :3], turn, upstream[:, _BASE:]], dim=-1)
+    jacobian = left_jacobian(pose[:, 3:BASE_DOFS])
+    turn = torch.linalg.solve(jacobian.mT, upstream[:, 3:BASE_DOFS].unsqueeze(-1)).squeeze(-1)
+    return torch.cat([upstream[:, :3], turn, upstream[:, BASE_DOFS:]], dim=-1)

@@ -148,9 +148,8 @@ class LimbSearch:
         lower, upper = shape.lower[dofs], shape.upper[dofs]
         lower = torch.where(lower.isfinite(), lower, torch.where(upper.isfinite(), upper - free, -free / 2))
         upper = torch.where(upper.isfinite(), upper, lower + free)
-        slides = shape.chain.couplings.abs().mT @ (1 - shape.chain.is_revolute) > 0
         counts = [
-            _SLIDE_SAMPLES if slides[dof - 6] else max(2, math.ceil(width / _STEP))
+            _SLIDE_SAMPLES if shape.is_sliding[dof] else max(2, math.ceil(width / _STEP))
             for dof, width in zip(dofs, (upper - lower).tolist(), strict=True)
         ]
         if math.prod(counts) > _MAX_SAMPLES:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchreg.alignment.annealed_em import residual_noise
 from torchreg.alignment.pose_search import PoseSearch
 from torchreg.alignment.problem import AlignProblem
-from torchreg.geometry.rotation import compose_rotation_vectors
+from torchreg.shapes.pose_algebra import difference
 
 _FIT_STEPS = 2
 # Scatter of the candidates: joints as a share of their range, base in radians, base as a share of the size.
@@ -50,9 +50,10 @@ def needs_search(problem: AlignProblem, start: Tensor, pose: Tensor) -> Tensor:
 
 def _motion(start: Tensor, pose: Tensor) -> Tensor:
     """Return how far (B,) poses lie apart, radians: of the base, of the joints (root mean square), of one at half."""
-    joints = torch.nn.functional.pad((pose - start)[:, 6:].abs(), (0, 1))
+    step = difference(start, pose)
+    joints = torch.nn.functional.pad(step[:, 6:].abs(), (0, 1))
     moved = torch.maximum(joints.square().mean(-1).sqrt(), 0.5 * joints.amax(-1))
-    return torch.maximum(moved, compose_rotation_vectors(pose[:, 3:6], -start[:, 3:6]).norm(dim=-1))
+    return torch.maximum(moved, step[:, 3:6].norm(dim=-1))
 
 
 def leaves_clusters(problem: AlignProblem, pose: Tensor) -> Tensor:

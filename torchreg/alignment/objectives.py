@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.geometry.rotation import compose_rotation_vectors
+from torchreg.shapes.pose_algebra import difference
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import Surface
 from torchreg.solvers.e_step import EStep
@@ -49,8 +49,7 @@ class PosePrior:
     def _offset(self, pose: Tensor, mean: Tensor) -> Tensor:
         if not self.holds_base:
             return pose - mean
-        turned = compose_rotation_vectors(pose[..., 3:6], -mean[..., 3:6])
-        return torch.cat([pose[..., :3] - mean[..., :3], turned, pose[..., 6:] - mean[..., 6:]], dim=-1)
+        return difference(mean, pose)
 
 
 class RegistrationObjective:

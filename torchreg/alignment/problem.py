@@ -196,8 +196,7 @@ def centered_problem(
         lower, upper = shape.lower - shift, shape.upper - shift
     precision = torch.zeros_like(shape.rest)
     if prior_std is not None:
-        slides = shape.chain.couplings.abs().mT @ (1 - shape.chain.is_revolute) > 0
-        joints = torch.where(slides, prior_std * size, prior_std)
+        joints = torch.where(shape.is_sliding[6:], prior_std * size, prior_std)
         precision[6:] = joints.square().reciprocal()
         # The three axes of a ball joint share the deviation of its one rotation.
         balls = [6 + dof for dof, size in enumerate(stack_sizes(shape.chain.tree)) if size >= _BALL]

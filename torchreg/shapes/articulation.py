@@ -16,19 +16,22 @@ from torchreg.geometry.kinematic_tree import KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.primitives import Planes
 from torchreg.geometry.rigid import rigid_matrix
-from torchreg.geometry.rotation import compose_rotation_vectors, left_jacobian, so3_exp, wrap_rotation_vector
+from torchreg.geometry.rotation import left_jacobian, so3_exp, wrap_rotation_vector
 from torchreg.shapes.kinematics import KinematicChain, neighbor_matrix, part_parents
+from torchreg.shapes.pose_algebra import BASE_DOF_NAMES, BASE_DOFS, difference, retract
 from torchreg.shapes.primitives import Primitive, PrimitiveSet, fuse
 from torchreg.shapes.rigs import RigSurface
 
 _MAX_SURFACE_CELLS = 1_500_000
-BASE_DOF_NAMES = ("base_x", "base_y", "base_z", "base_rx", "base_ry", "base_rz")
 
 
 class Articulation(nn.Module):
     """Parts on a kinematic tree and their fused surface, in any pose: what skins and files build on.
 
     See `ArticulatedShape`, which is made from files as well, for conventions and arguments.
+
+    Attributes:
+        is_sliding: (num_dofs,) bool, degrees of freedom in metres: the base's translation and joints that slide.
     """
 
     adjacency: Tensor
@@ -36,6 +39,7 @@ class Articulation(nn.Module):
     rest: Tensor
     lower: Tensor
     upper: Tensor
+    is_sliding: Tensor
     _owners: Tensor
     _part_moves: Tensor
     _row_moves: Tensor
@@ -80,6 +84,9 @@ class Articulation(nn.Module):
         self.register_buffer("_row_moves", moves.repeat_interleave(4, 0).unsqueeze(-2), persistent=False)
         couplings = torch.block_diag(torch.eye(6, dtype=torch.float64), self.chain.couplings)
         self.register_buffer("_couplings", couplings, persistent=False)
+        slides = self.chain.couplings.abs().mT @ (1 - self.chain.is_revolute) > 0
+        base_slides = torch.arange(BASE_DOFS) < 3
+        self.register_buffer("is_sliding", torch.cat([base_slides, slides]), persistent=False)
         base = torch.zeros(6, dtype=torch.float64) if not free_base else torch.full((6,), math.inf, dtype=torch.float64)
         self.register_buffer("lower", torch.cat([-base, self.chain.lower]), persistent=False)
         self.register_buffer("upper", torch.cat([base, self.chain.upper]), persistent=False)
@@ -145,8 +152,21 @@ class Articulation(nn.Module):
 
         Differentiable: in both.
         """
-        turned = compose_rotation_vectors(step[..., 3:6], pose[..., 3:6])
-        return torch.cat([pose[..., :3] + step[..., :3], turned, pose[..., 6:] + step[..., 6:]], dim=-1)
+        return retract(pose, step)
+
+    def difference(self, start: Tensor, end: Tensor) -> Tensor:
+        """Return the tangent step that `retract` takes from one pose to another.
+
+        Args:
+            start: (..., num_dofs).
+            end: (..., num_dofs), with batch dimensions that broadcast with the start's.
+
+        Returns:
+            (..., num_dofs); the base's rotation by an angle of at most pi.
+
+        Differentiable: in both, where that angle is below pi.
+        """
+        return difference(start, end)
 
     def frame_transforms(self, pose: Tensor) -> Tensor:
         """Return ``T_world_frame`` of every frame of the tree.

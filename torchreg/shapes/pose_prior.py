@@ -15,13 +15,13 @@ from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.geometry.rotation_representations import quaternion_from_rotation_vector, rotation_vector_from_quaternion
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 from torchreg.io.tensors import load_tensors, save_tensors
+from torchreg.shapes.pose_algebra import BASE_DOFS, difference, retract
+from torchreg.shapes.pose_head import PoseHead
 
 if TYPE_CHECKING:
     from torchreg.shapes.articulated import ArticulatedShape
-    from torchreg.shapes.pose_head import PoseHead
 
 _KIND = "PosePrior"
-_BASE = 6
 # Steps to the mean rotation, which from the chordal mean converge quadratically.
 _MEAN_STEPS = 20
 # A joint may be this far beyond a limit, radians, at the price of one standard deviation.
@@ -114,7 +114,7 @@ class PosePrior(nn.Module):
         """
         check_positive(min_deviation, "min_deviation")
         check_positive(explained, "explained")
-        num_joints = shape.num_dofs - _BASE
+        num_joints = shape.num_dofs - BASE_DOFS
         if num_components is not None:
             check_count(num_components, "num_components", 0)
         poses = as_float_tensor(poses, "poses", like=shape.rest).detach().double()
@@ -122,16 +122,16 @@ class PosePrior(nn.Module):
         poses = poses[poses.isfinite().all(-1)]
         if len(poses) < 2:
             raise InputError(f"poses must hold at least two finite poses, got {len(poses)}")
-        mean = torch.cat([poses[:, :3].mean(0), _mean_rotation(poses[:, 3:_BASE]), poses[:, _BASE:].mean(0)])
-        tangent = _tangent(poses, mean)
-        values, vectors = _principal(tangent[:, _BASE:])
+        mean = torch.cat([poses[:, :3].mean(0), _mean_rotation(poses[:, 3:BASE_DOFS]), poses[:, BASE_DOFS:].mean(0)])
+        tangent = difference(mean, poses)
+        values, vectors = _principal(tangent[:, BASE_DOFS:])
         share = values.cumsum(0) / values.sum().clamp_min(1e-300)
         count = int((share < min(explained, 1.0)).sum()) + 1 if num_components is None else num_components
         count = min(count, num_joints)
-        rows = [nn.functional.pad(vectors[:count], (_BASE, 0))]
+        rows = [nn.functional.pad(vectors[:count], (BASE_DOFS, 0))]
         deviations = [values[:count].sqrt()]
         if base:
-            base_values, base_vectors = _principal(tangent[:, :_BASE])
+            base_values, base_vectors = _principal(tangent[:, :BASE_DOFS])
             rows.insert(0, nn.functional.pad(base_vectors, (0, num_joints)))
             deviations.insert(0, base_values.sqrt())
         rest = values[count:]
@@ -162,7 +162,7 @@ class PosePrior(nn.Module):
         Differentiable: in ``coefficients``.
         """
         check_shape(coefficients, "coefficients", (self.num_components,), batch=True)
-        return self._retract((coefficients * self.deviations) @ self.components)
+        return retract(self.mean, (coefficients * self.deviations) @ self.components)
 
     def coefficients(self, pose: Tensor) -> Tensor:
         """Return the coefficients (..., K) of poses (..., num_dofs): what `forward` undoes, but for the residual.
@@ -173,7 +173,7 @@ class PosePrior(nn.Module):
         Differentiable: in ``pose``, where its base is not a half turn from the mean's.
         """
         check_shape(pose, "pose", (len(self.mean),), batch=True)
-        return _tangent(pose, self.mean) @ self.components.mT / self.deviations
+        return difference(self.mean, pose) @ self.components.mT / self.deviations
 
     def log_prob(self, pose: Tensor) -> Tensor:
         """Return the log density of poses in tangent coordinates, less half the squared excess over the joint limits.
@@ -193,16 +193,16 @@ class PosePrior(nn.Module):
         Differentiable: in ``pose``, where its base is not a half turn from the mean's.
         """
         check_shape(pose, "pose", (len(self.mean),), batch=True)
-        tangent = _tangent(pose, self.mean)
+        tangent = difference(self.mean, pose)
         along = tangent @ self.components.mT
-        joints = self.components[_BASE:] if self.has_base else self.components
-        beyond = tangent[..., _BASE:] - (tangent @ joints.mT) @ joints[:, _BASE:]
+        joints = self.components[BASE_DOFS:] if self.has_base else self.components
+        beyond = tangent[..., BASE_DOFS:] - (tangent @ joints.mT) @ joints[:, BASE_DOFS:]
         squared = (along / self.deviations).square().sum(-1) + (beyond / self.residual).square().sum(-1)
         others = beyond.shape[-1] - len(joints)
         volume = self.deviations.log().sum() + others * math.log(self.residual)
         volume = volume + 0.5 * (self.num_components + others) * math.log(2 * math.pi)
-        low, high = self.lower[_BASE:], self.upper[_BASE:]
-        excess = (low - pose[..., _BASE:]).clamp_min(0) + (pose[..., _BASE:] - high).clamp_min(0)
+        low, high = self.lower[BASE_DOFS:], self.upper[BASE_DOFS:]
+        excess = (low - pose[..., BASE_DOFS:]).clamp_min(0) + (pose[..., BASE_DOFS:] - high).clamp_min(0)
         return -0.5 * squared - volume - 0.5 * (excess / _LIMIT_STD).square().sum(-1)
 
     @torch.no_grad()
@@ -219,11 +219,11 @@ class PosePrior(nn.Module):
         check_count(count, "count", 0)
         generator = generator or torch.Generator().manual_seed(0)
         draw = torch.randn(count, self.num_components, generator=generator).to(self.mean)
-        noise = self.residual * torch.randn(count, len(self.mean) - _BASE, generator=generator).to(self.mean)
-        joints = self.components[_BASE:, _BASE:] if self.has_base else self.components[:, _BASE:]
+        noise = self.residual * torch.randn(count, len(self.mean) - BASE_DOFS, generator=generator).to(self.mean)
+        joints = self.components[BASE_DOFS:, BASE_DOFS:] if self.has_base else self.components[:, BASE_DOFS:]
         noise = noise - (noise @ joints.mT) @ joints
         step = (draw * self.deviations) @ self.components
-        pose = self._retract(step + nn.functional.pad(noise, (_BASE, 0)))
+        pose = retract(self.mean, step + nn.functional.pad(noise, (BASE_DOFS, 0)))
         return torch.minimum(torch.maximum(pose, self.lower), self.upper)
 
     @torch.no_grad()
@@ -284,16 +284,6 @@ class PosePrior(nn.Module):
             return cls(**tensors, residual=record["residual"], has_base=record["has_base"])
         except (KeyError, TypeError, InputError) as error:
             raise FormatError(f"{path}: is no complete {_KIND} ({error})") from error
-
-    def _retract(self, step: Tensor) -> Tensor:
-        turned = compose_rotation_vectors(step[..., 3:_BASE], self.mean[3:_BASE].expand_as(step[..., 3:_BASE]))
-        return torch.cat([self.mean[:3] + step[..., :3], turned, self.mean[_BASE:] + step[..., _BASE:]], dim=-1)
-
-
-def _tangent(pose: Tensor, mean: Tensor) -> Tensor:
-    """Return the steps (..., num_dofs) from the mean pose, the base's rotation by composition."""
-    turn = compose_rotation_vectors(pose[..., 3:_BASE], -mean[3:_BASE].expand_as(pose[..., 3:_BASE]))
-    return torch.cat([pose[..., :3] - mean[:3], turn, pose[..., _BASE:] - mean[_BASE:]], dim=-1)
 
 
 def _mean_rotation(vectors: Tensor) -> Tensor:

@@ -156,9 +156,28 @@ def posterior(
     # Scaled before squaring: the square of a small sigma underflows.
     scale = (2**-0.5 / sigma)[..., None, None, None]
     exponent = -((model.unsqueeze(-2) - data.unsqueeze(-3)) * scale).square().sum(-1)
-    level = torch.as_tensor(outlier, dtype=model.dtype, device=model.device).log()[..., None]
-    alpha = (exponent - torch.logaddexp(exponent.logsumexp(-2), level).unsqueeze(-2)).exp()
+    level = torch.as_tensor(outlier, dtype=model.dtype, device=model.device)[..., None, None]
+    alpha = responsibilities(exponent, level, dim=-2)
     return alpha if mask is None else torch.where(mask.unsqueeze(-2), alpha, 0.0)
+
+
+def responsibilities(exponent: Tensor, outlier: Tensor | float, *, dim: int) -> Tensor:
+    """Return ``exp(e_i) / (sum_k exp(e_k) + c)`` over the candidates of each datum, in the log domain.
+
+    Args:
+        exponent: (...) log-likelihoods, up to a constant, of the candidates along ``dim``.
+        outlier: c, positive, one or with the dimensions of ``exponent``, that of ``dim`` being one.
+        dim: along which candidates lie.
+
+    Returns:
+        (...); what is missing to one along ``dim`` is the probability of an outlier.
+
+    Differentiable: in both.
+
+    References: Dewaele et al. 2006, eq. 17.
+    """
+    level = torch.as_tensor(outlier, dtype=exponent.dtype, device=exponent.device).log()
+    return (exponent - torch.logaddexp(exponent.logsumexp(dim, keepdim=True), level)).exp()
 
 
 def working_volume(model: Tensor, data: Tensor, sigma: Tensor, mask: Tensor | None = None) -> Tensor:

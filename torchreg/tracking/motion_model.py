@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from torchreg.errors import InputError
-from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.pose_algebra import difference
 from torchreg.tracking.config import Frame, FrameFit
 from torchreg.tracking.results import TrackState
 
@@ -149,9 +149,3 @@ def slowed(state: TrackState, gap: float) -> Tensor:
 def _deviation(surprise: Tensor, share: Tensor) -> Tensor:
     sure = share > _SURE_SHARE
     return (surprise * sure).norm() / sure.sum().clamp_min(1).sqrt()
-
-
-def difference(start: Tensor, end: Tensor) -> Tensor:
-    """Return the tangent step (num_dofs,) from one pose to another."""
-    turned = compose_rotation_vectors(end[3:6], -start[3:6])
-    return torch.cat([end[:3] - start[:3], turned, end[6:] - start[6:]])

@@ -14,6 +14,7 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg._threads import one_thread
 from torchreg.alignment.align import AlignConfig, align
+from torchreg.alignment.annealed_em import outlier_level
 from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
@@ -294,7 +295,8 @@ class Tracker:
             registered = posed + fit.view.origin
             keypoints = self.shape.placed_keypoints(fit.transforms) + fit.view.origin
             distances[near] = distance
-            posterior[near] = expectation(posed, data[0], sigma).inlier_posterior
+            outlier = outlier_level(problem, posed[None], sigma[None])
+            posterior[near] = expectation(posed[None], data, sigma[None], outlier).inlier_posterior[0]
         inliers = distances.abs() < self._fitter.inlier_distance
         count = int(frame.finite.sum())
         return FrameResult(

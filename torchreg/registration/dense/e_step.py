@@ -11,6 +11,7 @@ from torch import Tensor
 from torchreg._checks import check_count, check_positive
 from torchreg.geometry.neighbors import nearest_few
 from torchreg.registration.dense.oriented_samples import OrientedSamples
+from torchreg.solvers.e_step import responsibilities
 
 # Least outlier density: two samples within an area of one sigma squared.
 _DENSITY = 2.0
@@ -126,8 +127,7 @@ def _choices(chooser: Tensor, offered: Tensor, sigma: float, config: ScanEMConfi
     """Return the most compatible others (N, K) of each sample and their posteriors."""
     index, distance = nearest_few(chooser, offered, min(config.num_candidates, len(offered)))
     index, distance = index.to(chooser.device), distance.to(chooser)
-    likelihood = torch.exp(-0.5 * (distance / sigma).square())
     # In the middle of a surface a sample has about this many others within its reach.
     density = max(1.0, _DENSITY * len(offered) * sigma**2)
     outlier = config.outliers * density * math.exp(-0.5 * _FEATURE_MISS * config.feature_weight)
-    return index, likelihood / (likelihood.sum(1, keepdim=True) + outlier)
+    return index, responsibilities(-0.5 * (distance / sigma).square(), outlier, dim=1)

@@ -1,0 +1,48 @@
+"""Poses as points of a manifold: steps and differences, in which no rotation of the base is special.
+
+A pose is (translation of the base, rotation vector of the base, joints). A step has the same layout; its rotation is
+composed from the left.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.rotation import compose_rotation_vectors
+
+BASE_DOF_NAMES = ("base_x", "base_y", "base_z", "base_rx", "base_ry", "base_rz")
+# Degrees of freedom of the base, which come first in every pose.
+BASE_DOFS = len(BASE_DOF_NAMES)
+
+
+def retract(pose: Tensor, step: Tensor) -> Tensor:
+    """Return the pose moved by a step; the base rotation is updated by composition, ``exp(step) exp(w)``.
+
+    Args:
+        pose: (..., num_dofs).
+        step: (..., num_dofs), metres and radians.
+
+    Returns:
+        (..., num_dofs).
+
+    Differentiable: in both.
+    """
+    turned = compose_rotation_vectors(step[..., 3:6], pose[..., 3:6])
+    return torch.cat([pose[..., :3] + step[..., :3], turned, pose[..., 6:] + step[..., 6:]], dim=-1)
+
+
+def difference(start: Tensor, end: Tensor) -> Tensor:
+    """Return the step that `retract` takes from one pose to another.
+
+    Args:
+        start: (..., num_dofs).
+        end: (..., num_dofs), with batch dimensions that broadcast with the start's.
+
+    Returns:
+        (..., num_dofs); the base's rotation by an angle of at most pi.
+
+    Differentiable: in both, where that angle is below pi.
+    """
+    turned = compose_rotation_vectors(end[..., 3:6], -start[..., 3:6])
+    return torch.cat([end[..., :3] - start[..., :3], turned, end[..., 6:] - start[..., 6:]], dim=-1)
