@@ -13,6 +13,7 @@ from torchreg.geometry.rotation import compose_rotation_vectors, left_jacobian, 
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.surface import Surface
 from torchreg.solvers.levenberg_marquardt import held_at_limits
+from torchreg.solvers.robust import welsch_loss
 
 _BASE = 6
 # Curvatures below this share of the largest, once every variable has its own scale, are rounding.
@@ -71,7 +72,7 @@ class FixedPoint:
         there = torch.cat([torch.zeros_like(turn), pose[:, 3:_BASE], joints], dim=-1)
         width = self.sigma.unsqueeze(-1)
         distance = self.surface.distance(seen, there)
-        lost = -torch.expm1(-(distance / width).square())
+        lost = welsch_loss((distance / width).square())
         cost = 0.5 * (lost * self.valid).sum(-1) * (self.sigma / self.noise).square()
         away = compose_rotation_vectors(turn, compose_rotation_vectors(pose[:, 3:_BASE], -start[:, 3:_BASE]))
         offset = torch.cat([pose[:, :3] + step[:, :3] - start[:, :3], away, joints - start[:, _BASE:]], dim=-1)
