@@ -10,7 +10,8 @@ All functions take squared ratios (...) >= 0, without unit, in float32 or float6
 Differentiable: in z, at zero too, and so in the residual.
 
 References: Triggs et al. 2000, section 4.3; Barron 2019, whose general loss has them as special cases: Welsch with
-shape -infinity and ``c = s / sqrt(2)``, Geman-McClure with shape -2 and ``c = s / 2``.
+shape -infinity and ``c = s / sqrt(2)``, Geman-McClure with shape -2 and ``c = s / 2``, Cauchy with shape 0 and
+``c = s / sqrt(2)``.
 """
 
 from __future__ import annotations
@@ -49,3 +50,19 @@ def geman_mcclure_loss(squared_ratio: Tensor) -> Tensor:
     References: Geman and McClure 1987.
     """
     return squared_ratio / (1 + squared_ratio)
+
+
+def cauchy_weight(squared_ratio: Tensor) -> Tensor:
+    """Return ``1 / (1 + z)``: 1/2 at the scale, 1/10 at three scales; the pull of a residual fades but slowly.
+
+    References: Holland and Welsch 1977.
+    """
+    return (1 + squared_ratio).reciprocal_()
+
+
+def cauchy_loss(squared_ratio: Tensor) -> Tensor:
+    """Return ``log(1 + z)``, without bound.
+
+    References: Holland and Welsch 1977.
+    """
+    return squared_ratio.log1p()

@@ -21,7 +21,7 @@ from torchreg.registration.bones.motions import BoneFit, fit_bones
 from torchreg.registration.bones.motions_and_joints import JOINT_REGULARIZATION, JointFit, fit_bones_and_joints
 from torchreg.registration.bones.weights import refine_weights
 from torchreg.registration.results import RegisterRecord
-from torchreg.solvers.robust import geman_mcclure_weight
+from torchreg.solvers.robust import cauchy_weight, geman_mcclure_weight
 
 # Sampling distances of the target below which the threshold for matches never falls.
 _LEAST_REACH = 2.0
@@ -261,7 +261,7 @@ class ReducedFit:
         apart = first - second
         squares = (apart.mT @ apart).mean(0)
         turns = 0.5 * squares.diagonal(dim1=-2, dim2=-1).sum(-1)
-        weight = 0.5 * self.config.turn_weight / (1 + turns / self.config.turn_scale**2)
+        weight = 0.5 * self.config.turn_weight * cauchy_weight(turns / self.config.turn_scale**2)
         spread = weight[:, None, None] * torch.eye(3, dtype=weight.dtype, device=weight.device)
         if len(apart) >= _LEAST_FRAMES:
             spread = spread + self._hinges(squares)
