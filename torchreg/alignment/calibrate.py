@@ -20,6 +20,7 @@ from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.primitives import fuse
 from torchreg.shapes.skin import sample_skin
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
+from torchreg.solvers.robust import welsch_loss, welsch_weight
 
 # Residuals near each other share what the model gets wrong: they weigh as if their noise were this much larger.
 _SHARED_ERROR = 1.5
@@ -299,7 +300,7 @@ class _JointProblem:
     def unexplained(self, poses: Tensor) -> Tensor:
         """Return the number of data (T,), softly counted, that poses leave off the surface of the shape as it is."""
         distance = self.shape.distance(self.data, poses - self.shift)
-        return ((1 - (-(distance / (SURFACE_SIGMAS[-1] * self.size)).square()).exp()) * self.valid).sum(-1)
+        return (welsch_loss((distance / (SURFACE_SIGMAS[-1] * self.size)).square()) * self.valid).sum(-1)
 
     def linearize(self, state: Tensor, sigma: float, noise: float) -> Linearization:
         """Return the Welsch cost of all distances and its Gauss-Newton approximation; the batch is one state."""
@@ -307,7 +308,7 @@ class _JointProblem:
         self.set_scales(scales)
         distance, by_pose = self.shape.distance_jacobian(self.data, poses, chart="tangent")
         jacobian = torch.cat([by_pose, scale_jacobian(self.shape, self.data, poses)], dim=-1)
-        beta = (-(distance / sigma).square()).exp()
+        beta = welsch_weight((distance / sigma).square())
         cost = 0.5 * (sigma / noise) ** 2 * ((1 - beta) * self.valid).sum()
         weighted = jacobian * (beta * self.valid / noise**2).unsqueeze(-1)
         gradient = (weighted.mT @ distance.unsqueeze(-1)).squeeze(-1)

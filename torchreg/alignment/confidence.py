@@ -10,6 +10,7 @@ from torchreg.alignment.local_search import clustered_data
 from torchreg.alignment.problem import INLIER_SHARE, AlignProblem
 from torchreg.shapes.limbs import Limb, find_limbs
 from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.solvers.robust import welsch_weight
 
 # A pose is right if the ends of its limbs lie within this share of the size of where they are, on average.
 _TOLERANCE = 0.04
@@ -115,7 +116,7 @@ def _covariance(problem: AlignProblem, pose: Tensor, prior: Tensor) -> Tensor:
     """Return (B, num_dofs, num_dofs): how poses spread, given the data near the surface and the prior's precision."""
     distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
     noise = surface_noise(distance, problem.valid, problem.size)
-    near = (-(distance / (SIGMA_PER_NOISE * noise).unsqueeze(-1)).square()).exp() * problem.valid
+    near = welsch_weight((distance / (SIGMA_PER_NOISE * noise).unsqueeze(-1)).square()) * problem.valid
     return pose_covariance(jacobian, near, noise, prior)
 
 
@@ -132,4 +133,4 @@ def _own_data(problem: AlignProblem, pose: Tensor) -> Tensor:
 
 
 def _explained(problem: AlignProblem, distance: Tensor) -> Tensor:
-    return (-(distance / (INLIER_SHARE * problem.size)).square()).exp() * problem.valid
+    return welsch_weight((distance / (INLIER_SHARE * problem.size)).square()) * problem.valid

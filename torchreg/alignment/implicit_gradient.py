@@ -14,6 +14,7 @@ from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import BASE_DOFS, difference, retract
 from torchreg.shapes.surface import Surface
 from torchreg.solvers.levenberg_marquardt import held_at_limits
+from torchreg.solvers.robust import welsch_loss
 
 # Curvatures below this share of the largest, once every variable has its own scale, are rounding.
 _FLAT = {torch.float32: 1e-6, torch.float64: 1e-12}
@@ -71,7 +72,7 @@ class FixedPoint:
         there = torch.cat([torch.zeros_like(turn), pose[:, 3:BASE_DOFS], joints], dim=-1)
         width = self.sigma.unsqueeze(-1)
         distance = self.surface.distance(seen, there)
-        lost = -torch.expm1(-(distance / width).square())
+        lost = welsch_loss((distance / width).square())
         cost = 0.5 * (lost * self.valid).sum(-1) * (self.sigma / self.noise).square()
         offset = retract(difference(start, pose), step)
         return cost + 0.5 * (self.precision * offset.square()).sum(-1)

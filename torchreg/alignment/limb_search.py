@@ -18,6 +18,7 @@ from torchreg.geometry.rotation import so3_exp
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.limbs import Body, Limb, find_limbs
 from torchreg.solvers.cover import best_covers
+from torchreg.solvers.robust import welsch_loss, welsch_weight
 
 # Angle between neighboring samples of a joint, radians, and how far a joint without limits is tried.
 _STEP = math.radians(16)
@@ -289,7 +290,7 @@ class _Search:
                 problem.data.unsqueeze(1), poses, chart="tangent", parts=self.limbs.parts[limb]
             )
             jacobian = jacobian[..., dofs]
-            weighted = jacobian * (free * (-(distance / (width * problem.size)).square()).exp()).unsqueeze(-1)
+            weighted = jacobian * (free * welsch_weight((distance / (width * problem.size)).square())).unsqueeze(-1)
             values = poses[..., dofs]
             gradient = (weighted.mT @ distance.unsqueeze(-1)).squeeze(-1) + precision * (values - mean)
             # A unit of precision holds joints that no datum reaches.
@@ -313,7 +314,7 @@ class _Search:
 
 
 def _softly_lost(problem: AlignProblem, distance: Tensor, width: float) -> Tensor:
-    return (1 - (-(distance / width).square()).exp()) * problem.valid.unsqueeze(1)
+    return welsch_loss((distance / width).square()) * problem.valid.unsqueeze(1)
 
 
 def _diverse(joints: Tensor, cost: Tensor, count: int) -> Tensor:

@@ -12,6 +12,7 @@ from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import Surface
 from torchreg.solvers.e_step import EStep
 from torchreg.solvers.levenberg_marquardt import Linearization
+from torchreg.solvers.robust import welsch_weight
 
 # The base is held, in the Hessian alone, as if by this share of a datum: more slows starts that few data reach.
 _ANCHOR_DATA = 0.1
@@ -143,7 +144,7 @@ class SurfaceObjective:
         return self._data_cost(beta) + self.prior.cost(pose)
 
     def _beta(self, distance: Tensor) -> Tensor:
-        return (-distance.square() * self.inverse_square).exp()
+        return welsch_weight(distance.square() * self.inverse_square)
 
     def _data_cost(self, beta: Tensor) -> Tensor:
         return 0.5 * ((1 - beta) * self.valid).sum(-1) / self.inverse_square.squeeze(-1) * self.scale

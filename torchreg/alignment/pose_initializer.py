@@ -19,6 +19,7 @@ from torchreg.errors import InputError
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 from torchreg.shapes.surface import FusedSurface
+from torchreg.solvers.robust import welsch_weight
 
 _START_SIGMA, _STOP_SIGMA = 0.08, 0.02
 # How weakly a start holds the base, so that a cloud without data leaves it there: radians, and shares of the size.
@@ -255,7 +256,7 @@ class PoseInitializer(nn.Module):
     def _confidence(self, problem: AlignProblem, pose: Tensor) -> Tensor:
         """Return (B,) from 0 to 1: the share of data near the surface, less where those off it lie densely."""
         distance = problem.surface.distance(problem.data, pose)
-        near = (-(distance / (_EXPLAINED * problem.size)).square()).exp() * problem.valid
+        near = welsch_weight((distance / (_EXPLAINED * problem.size)).square()) * problem.valid
         share = near.sum(-1) / problem.valid.sum(-1).clamp_min(1)
         clustered, on_surface = clustered_data(problem, pose)
         return share * (-clustered / on_surface.clamp_min(1) / _DOUBTFUL_SHARE).exp()

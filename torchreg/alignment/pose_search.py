@@ -19,6 +19,7 @@ from torchreg.alignment.problem import PRIOR_SHARE, AlignProblem
 from torchreg.geometry.sampling import farthest_points
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import FusedSurface
+from torchreg.solvers.robust import welsch_loss
 
 _COARSE = Effort(
     num_data=150, width=0.05, beam=82, configurations=41, polish=(), score_width=0.05, combinations=2, exchanged=0
@@ -164,5 +165,5 @@ def fit_candidates(problem: AlignProblem, poses: Tensor, widths: Sequence[float]
 def score_candidates(problem: AlignProblem, poses: Tensor, width: float) -> Tensor:
     """Return the score (B, K) of poses (B, K, num_dofs): outliers, softly counted, and the prior; lower is better."""
     distance = problem.surface.distance(problem.data.unsqueeze(1), poses)
-    lost = 1 - (-(distance / (width * problem.size)).square()).exp()
+    lost = welsch_loss((distance / (width * problem.size)).square())
     return (lost * problem.valid.unsqueeze(1)).sum(-1) + PRIOR_SHARE * problem.prior.cost(poses)

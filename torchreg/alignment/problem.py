@@ -23,6 +23,7 @@ from torchreg.solvers.levenberg_marquardt import (
     held_at_limits,
     levenberg_marquardt,
 )
+from torchreg.solvers.robust import welsch_loss
 
 # Data nearer to the fitted surface than this share of the model's size are inliers.
 INLIER_SHARE = 0.02
@@ -228,7 +229,7 @@ def _surface(shape: Articulation, skin: LinearBlendSkin) -> Surface:
 def alignment_cost(problem: AlignProblem, pose: Tensor, distances: Tensor | None = None) -> Tensor:
     """Return the cost (B,) by which alignments of the same data are ranked: outliers, softly counted, and the prior."""
     distances = problem.surface.distance(problem.data, pose) if distances is None else distances
-    lost = 1 - (-(distances / (INLIER_SHARE * problem.size)).square()).exp()
+    lost = welsch_loss((distances / (INLIER_SHARE * problem.size)).square())
     return (lost * problem.valid).sum(-1) + PRIOR_SHARE * problem.prior.cost(pose)
 
 

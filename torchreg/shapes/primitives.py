@@ -14,6 +14,7 @@ from torchreg.geometry.primitives import PRIMITIVE_KINDS, Planes
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
+from torchreg.solvers.robust import cauchy_loss, cauchy_weight
 
 # Boxes reach their corners and capsules their round ends: the norm of the sizes and half as much again covers both.
 _BALL_FACTOR = 1.5
@@ -308,9 +309,9 @@ class _Refinement:
         cost, gradient, hessian = self._pull(state, rotations)
         for residual, shares, weight in self._residuals(distances):
             scaled = (residual / (_REFINE_SCALE * self.nu)).square()
-            trust = weight / (1 + scaled)
+            trust = weight * cauchy_weight(scaled)
             jacobian = (motions * shares.unsqueeze(-1)).flatten(1)
-            cost = cost + 0.5 * weight * (_REFINE_SCALE * self.nu) ** 2 * scaled.log1p().sum()
+            cost = cost + 0.5 * weight * (_REFINE_SCALE * self.nu) ** 2 * cauchy_loss(scaled).sum()
             gradient = gradient + jacobian.mT @ (trust * residual)
             hessian = hessian + jacobian.mT @ (trust.unsqueeze(-1) * jacobian)
         return Linearization(cost.view(1), gradient.view(1, -1), hessian.unsqueeze(0))

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchreg._checks import check_points, check_positive, check_shape
+from torchreg.solvers.robust import geman_mcclure_loss
 
 # Distances held at a time.
 _CHUNK_ENTRIES = 4_000_000
@@ -28,7 +29,7 @@ class TubeLoss(nn.Module):
 
     Differentiable: in curves and radii; which piece of a curve is nearest is held fixed.
 
-    References: Geman and McClure 1985 for rho.
+    References: Geman and McClure 1987 for rho.
     """
 
     def __init__(self, scale: float) -> None:
@@ -47,8 +48,8 @@ class TubeLoss(nn.Module):
         Raises:
             InputError: if sizes do not fit or there are no points.
         """
-        square = self.distances(curves, radii, points).square()
-        return (self.scale**2 * square / (self.scale**2 + square)).mean()
+        squared_ratio = (self.distances(curves, radii, points) / self.scale).square()
+        return self.scale**2 * geman_mcclure_loss(squared_ratio).mean()
 
     def distances(self, curves: Tensor, radii: Tensor, points: Tensor) -> Tensor:
         """Return the signed distances (N,) of points to the tubes, negative inside."""

@@ -24,6 +24,7 @@ from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.limbs import find_limbs
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin, stacked_rows
+from torchreg.solvers.robust import welsch_weight
 from torchreg.tracking.config import Frame, FrameFit, FrameView, TrackConfig, thinned
 from torchreg.tracking.evidence import (
     LimbReach,
@@ -177,7 +178,7 @@ class FrameFitter:
         precision = prior.precision.clone()
         if not prior.holds_base:
             precision[:6] = precision.new_tensor([self.size] * 3 + [math.pi] * 3).square().reciprocal()
-        weights = (-(fit.distance[0] / (SIGMA_PER_NOISE * fit.noise)).square()).exp()
+        weights = welsch_weight((fit.distance[0] / (SIGMA_PER_NOISE * fit.noise)).square())
         covariance = pose_covariance(fit.jacobian[0], weights, fit.noise, precision)
         return covariance, (1 - covariance.diagonal() * precision).clamp(0, 1)
 
@@ -218,7 +219,7 @@ class FrameFitter:
 
         What pulls at such a limb are single outliers and the rims of its neighbors.
         """
-        near = (-(distance[0] / (SIGMA_PER_NOISE * noise)).square()).exp()
+        near = welsch_weight((distance[0] / (SIGMA_PER_NOISE * noise)).square())
         levers = [jacobian[0][:, limb.dofs].norm(dim=-1) > _LEVER * self.size for limb in self.limbs]
         if not levers:
             return pose

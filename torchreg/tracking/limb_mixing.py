@@ -12,6 +12,7 @@ from torchreg.alignment.problem import PRIOR_SHARE, AlignProblem
 from torchreg.shapes.limbs import Limb
 from torchreg.shapes.primitives import fuse
 from torchreg.solvers.cover import best_covers
+from torchreg.solvers.robust import welsch_loss
 
 # Kernel widths of the fits from all starts, one step at each, as shares of the size; more data lead no better.
 _WIDTHS, _NUM_DATA = (0.06, 0.04, 0.03, 0.02), 300
@@ -92,4 +93,4 @@ def mixed(problem: AlignProblem, poses: Tensor, best: int, limbs: Sequence[Limb]
 
 def _lost(distance: Tensor, width: float) -> Tensor:
     """Return how far data are from being explained, from 0 to 1."""
-    return 1 - (-(distance / width).square()).exp()
+    return welsch_loss((distance / width).square())

@@ -21,6 +21,7 @@ from torchreg.registration.bones.motions import BoneFit, fit_bones
 from torchreg.registration.bones.motions_and_joints import JOINT_REGULARIZATION, JointFit, fit_bones_and_joints
 from torchreg.registration.bones.weights import refine_weights
 from torchreg.registration.results import RegisterRecord
+from torchreg.solvers.robust import cauchy_weight, geman_mcclure_weight
 
 # Sampling distances of the target below which the threshold for matches never falls.
 _LEAST_REACH = 2.0
@@ -250,7 +251,7 @@ class ReducedFit:
     def _holding(self, joints: Joints) -> Tensor:
         """Return how much each joint counts (P,): less, the farther motions take it apart (Geman and McClure 1987)."""
         square = joints.gaps.square().reshape(-1, len(joints.pairs)).mean(0)
-        return (1 + square / geometric_at(self.config.joint_scale, self._progress) ** 2) ** -2
+        return geman_mcclure_weight(square / geometric_at(self.config.joint_scale, self._progress) ** 2)
 
     def _turning(self) -> JointMoments:
         """Return the joints as points, with a spread that makes bones pay a little for turning against each other."""
@@ -260,7 +261,7 @@ class ReducedFit:
         apart = first - second
         squares = (apart.mT @ apart).mean(0)
         turns = 0.5 * squares.diagonal(dim1=-2, dim2=-1).sum(-1)
-        weight = 0.5 * self.config.turn_weight / (1 + turns / self.config.turn_scale**2)
+        weight = 0.5 * self.config.turn_weight * cauchy_weight(turns / self.config.turn_scale**2)
         spread = weight[:, None, None] * torch.eye(3, dtype=weight.dtype, device=weight.device)
         if len(apart) >= _LEAST_FRAMES:
             spread = spread + self._hinges(squares)
@@ -275,7 +276,7 @@ class ReducedFit:
         off, axes = torch.linalg.eigh(squares)
         axis, (least, second, _) = axes[..., 0], off.clamp(min=0).unbind(-1)
         told = (second - least) / (second + _CLEAR_TURN**2)
-        hold = told / (1 + least / self.config.hinge_scale**2).square()
+        hold = told * geman_mcclure_weight(least / self.config.hinge_scale**2)
         return (self.config.hinge_weight * hold)[:, None, None] * axis.unsqueeze(-1) * axis.unsqueeze(-2)
 
     def _report(self, stage: str, step: int, num_steps: int) -> None:

@@ -16,6 +16,7 @@ from torchreg.registration.dense.config import ChoiceConfig
 from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.registration.dense.problem import ScanAlignProblem
 from torchreg.registration.dense.stages import embedded, mismatch
+from torchreg.solvers.robust import welsch_weight
 
 # Degrees by which the source is turned about each of 26 axes: what is between is near enough.
 _ANGLES = (20.0, 40.0, 60.0)
@@ -79,7 +80,7 @@ def _laid(problem: ScanAlignProblem, turns: Tensor) -> Tensor:
         moved = places + shifts.unsqueeze(1)
         index, apart = nearest_few(torch.cat((moved, normals), dim=-1).flatten(0, 1), there, 1)
         # Limbs went elsewhere: what is far off pulls hardly.
-        pull = (-0.5 * (apart / width).square()).exp().view(*moved.shape[:2], 1)
+        pull = welsch_weight(0.5 * (apart / width).square()).view(*moved.shape[:2], 1)
         pull = pull + torch.finfo(torch.float32).tiny
         pulls = pull * (target.points[index[:, 0]].view_as(moved) - moved)
         shifts = shifts + pulls.sum(1) / pull.sum(1)

@@ -12,6 +12,7 @@ from torchreg.geometry.rigid import transform_points
 from torchreg.registration.blend import turn_about
 from torchreg.registration.dense.blend_sums import upper_triangles
 from torchreg.registration.dense.deformation_graph import DeformationGraph
+from torchreg.solvers.robust import cauchy_weight
 
 # Relative damping: nodes that carry no match follow their neighbors; alone they stay. More is added where a step goes
 # too far: a piece of the graph that hardly any match holds could turn about it, and fly off along the tangent.
@@ -145,7 +146,7 @@ def _costs(
             sums.index_add_(0, matches.which, part)
     gap = places[count:].view(-1, 2, 3)
     apart = gap.square().sum((1, 2))
-    weights = graph.edge_weights if give is None else graph.edge_weights / (1 + apart / (2 * give**2))
+    weights = graph.edge_weights if give is None else graph.edge_weights * cauchy_weight(apart / (2 * give**2))
     held = (stiffness / graph.num_nodes * weights).repeat_interleave(2)
     metrics[count:] = upper_triangles(held, None, 1.0)
     pulls[count:] = held.unsqueeze(1) * places[count:]

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.rigid_moments import rigid_moments
 from torchreg.registration.dense.graph_fit import GraphMatches
+from torchreg.solvers.robust import geman_mcclure_loss, geman_mcclure_weight
 
 # Rounds of fitting and of trusting less what does not fit.
 _ROUNDS = 3
@@ -58,7 +59,7 @@ class WideRegions:
             follow: (S,) from 0, for a sample whose own match is to be trusted, to 1.
             weight: see above.
 
-        References: Geman and McClure 1985, for how a miss that is large counts less.
+        References: Geman and McClure 1987, for how a miss that is large counts less.
         """
         count, tiny = min(len(self.points), len(places)), torch.finfo(places.dtype).tiny
         points, follow, shares = self.points[:count], follow[:count], self.shares[:, :count]
@@ -75,7 +76,7 @@ class WideRegions:
     def strain(self, places: Tensor) -> float:
         """Return the mean, over samples and by share, of ``r^2 / (r^2 + give^2)``, r a miss of a region's motion."""
         _, _, misses = self._fitted(places, torch.ones_like(places[:, 0]))
-        return float((self.shares[:, : misses.shape[1]] * misses / (misses + self.give**2)).sum(0).mean())
+        return float((self.shares[:, : misses.shape[1]] * geman_mcclure_loss(misses / self.give**2)).sum(0).mean())
 
     def _fitted(self, places: Tensor, sure: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return motions (J, 4, 4) of the regions, how far samples (J, m) go along, and their squared misses."""
@@ -86,7 +87,7 @@ class WideRegions:
         for _ in range(_ROUNDS):
             motions = replace(alone, sums=(shares * trust) @ alone.sums).motions()
             misses = _squared_misses(motions, points, places)
-            trust = (1 + misses / self.give**2).pow(-2)
+            trust = geman_mcclure_weight(misses / self.give**2)
         return motions, trust, misses
 
 

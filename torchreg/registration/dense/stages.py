@@ -23,6 +23,7 @@ from torchreg.registration.dense.graph_fit import GraphFit, GraphMatches, fit_gr
 from torchreg.registration.dense.one_to_one import count_of_spacing, match_one_to_one, typical_spacing
 from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.registration.dense.problem import ScanAlignProblem
+from torchreg.solvers.robust import geman_mcclure_weight
 
 # Right matches differ by so much in their features, squared, in the mean; more than samples at random tells no more.
 _USUALLY_UNLIKE, _UNLIKE = 0.4, 2.0
@@ -70,7 +71,7 @@ def fit_first_matches(
         weighted = matches
         if step > 0:
             miss = (problem.graph(transforms, matches.which) - matches.targets).square().sum(-1)
-            weighted = replace(matches, weights=matches.weights / (1 + miss / config.scale**2).square())
+            weighted = replace(matches, weights=matches.weights * geman_mcclure_weight(miss / config.scale**2))
         fit = fit_graph(problem.graph, transforms, weighted, stiffness, num_steps=2)
         transforms = fit.transforms
         kept = float(weighted.weights.sum()) / len(problem.samples)
@@ -182,7 +183,7 @@ def _out_of_empty_space(
     if idle or problem.free is None or not problem.free.trust.any():
         return ()
     apart, back, trust = problem.free.beyond(moved.points, config.beyond_margin * problem.free.spacing)
-    weights = config.beyond * trust / (1 + (apart / config.beyond_scale).square()).square()
+    weights = config.beyond * trust * geman_mcclure_weight((apart / config.beyond_scale).square())
     which = weights.nonzero()[:, 0]
     targets = moved.points[which] + apart[which].unsqueeze(1) * back[which]
     return (GraphMatches(which, targets, weights[which], back[which], 0.0),)
@@ -197,7 +198,7 @@ def _as_expected(
     count = len(moved.points)
     expected = problem.expected[:count]
     apart = (moved.points - expected).square().sum(-1) / config.expected_scale**2
-    weights = config.expected * (1 - found.weights / _HARDLY_MATCHED).clamp(min=0) / (1 + apart).square()
+    weights = config.expected * (1 - found.weights / _HARDLY_MATCHED).clamp(min=0) * geman_mcclure_weight(apart)
     return (GraphMatches(slice(0, count), expected, weights),)
 
 
