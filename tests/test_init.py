@@ -26,6 +26,12 @@ def test_import_is_light(tmp_path):
     assert run(code, tmp_path) == []
 
 
+def test_a_hand_loads_no_library_that_it_does_not_use(tmp_path):
+    heavy = "{'scipy', 'matplotlib', 'trimesh', 'kornia', 'pytorch_kinematics', 'pygltflib', 'networkx'}"
+    code = f"import sys, torchreg; torchreg.Hand(); print(*({heavy} & set(sys.modules)))"
+    assert run(code, tmp_path) == []
+
+
 def test_a_used_name_brings_torch(tmp_path):
     code = "import sys, torchreg; torchreg.metrics.chamfer; print('torch' in sys.modules)"
     assert run(code, tmp_path) == ["True"]

@@ -119,23 +119,12 @@ def test_frames_equal_those_of_pytorch_kinematics_on_a_urdf(tmp_path):
         torch.testing.assert_close(ours[:, index], found[link].get_matrix(), atol=1e-6, rtol=0)
 
 
-def their_chain(tree):
-    frames = []
-    for index, joint in enumerate(tree.joints):
-        frame = pk.Frame(str(index), link=pk.Link(str(index)))
-        offset = pk.Transform3d(matrix=joint.offset.unsqueeze(0), dtype=torch.float64)
-        frame.joint = pk.Joint(str(index), offset=offset, joint_type=joint.kind, axis=joint.axis, dtype=torch.float64)
-        if joint.parent >= 0:
-            frames[joint.parent].add_child(frame)
-        frames.append(frame)
-    return pk.Chain(frames[0], dtype=torch.float64)
-
-
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6), st.integers(1, 40))
 def test_frames_equal_those_of_pytorch_kinematics_on_any_tree(seed, count):
     tree = random_tree(seed, count)
-    chain, theirs = KinematicChain(tree), their_chain(tree)
+    chain = KinematicChain(tree)
+    theirs = chain.to_pytorch_kinematics()
     values = torch.randn(3, chain.num_dofs, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     by_name = {f"{index}": joint.name for index, joint in enumerate(tree.joints)}
     names = [by_name[name] for name in theirs.get_joint_parameter_names()]

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from kornia.feature import harris_response
-from kornia.geometry.transform import remap
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_count, check_finite, check_positive, check_shape
@@ -159,7 +157,7 @@ def stereo_points(
         row, column = corners.nonzero().unbind(-1)
         fit = refine_disparity(first, second, dense, torch.stack((column, row), dim=-1))
         kept = fit.good & (fit.std <= config.max_disparity_std)
-        strength = torch.where(kept, harris_response(first[None, None])[0, 0][row, column], -torch.inf)
+        strength = torch.where(kept, _corner_response(first)[row, column], -torch.inf)
         order = strength.argsort(descending=True)[: min(config.num_corners, int(kept.sum()))]
         pixels = torch.stack((column, row), dim=-1)[order].to(first)
         return _placed(pair, pixels, fit.disparity[order], fit.std[order], dense, config, box)
@@ -214,6 +212,8 @@ def rectify(left: Tensor, right: Tensor, pair: StereoPair) -> tuple[Tensor, Tens
 def _sampled(image: Tensor, source: Tensor) -> Tensor:
     planes = image.unsqueeze(-1) if image.ndim == 2 else image
     maps = source.to(image)[None]
+    from kornia.geometry.transform import remap
+
     warped = remap(planes.movedim(-1, 0)[None], maps[..., 0], maps[..., 1], align_corners=True)[0].movedim(0, -1)
     return warped[..., 0] if image.ndim == 2 else warped
 
@@ -254,7 +254,7 @@ def _check_order(left: Tensor, right: Tensor, highest: int) -> None:
 
 def _corners(gray: Tensor) -> Tensor:
     """Return at which pixels (H, W) the Harris response has a local maximum, away from the border."""
-    response = harris_response(gray[None, None])[0, 0]
+    response = _corner_response(gray)
     around = torch.nn.functional.max_pool2d(response[None, None], 3, 1, 1)[0, 0]
     return (response >= around) & (response > _WEAKEST_CORNER * response.max()) & _inner(gray)
 
@@ -268,7 +268,7 @@ def _inner(gray: Tensor) -> Tensor:
 
 def _textured(gray: Tensor, wanted: Tensor, corners: Tensor, least: int) -> Tensor:
     """Return more pixels (H, W), wanted ones of strong Harris response apart from corners, until there are enough."""
-    response = torch.where(wanted & _inner(gray), harris_response(gray[None, None])[0, 0], 0.0)
+    response = torch.where(wanted & _inner(gray), _corner_response(gray), 0.0)
     response = torch.where(response > _WEAKEST_CORNER * response.max(), response, 0.0)
     more = torch.zeros_like(corners)
     for _ in range(_FILL_ROUNDS):
@@ -326,3 +326,10 @@ def _placed(
     spread = rays.unsqueeze(-1) * rays.unsqueeze(-2) * (depth_std**2)[:, None, None]
     covariance = spread + across[:, None, None] * torch.eye(3).to(points)
     return StereoPoints(points, depth_std, covariance, pixels, disparity, std, dense).subset(kept)
+
+
+def _corner_response(image: Tensor) -> Tensor:
+    """Return Harris' response (H, W) of a gray picture (H, W)."""
+    from kornia.feature import harris_response
+
+    return harris_response(image[None, None])[0, 0]

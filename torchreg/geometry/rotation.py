@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 
 import torch
-from kornia.geometry.conversions import rotation_matrix_to_axis_angle
-from kornia.geometry.liegroup import So3
 from torch import Tensor
 
 # Below this squared angle the series to fourth order is exact to float64 rounding.
@@ -62,6 +60,8 @@ def so3_log(rotation: Tensor) -> Tensor:
 
     Differentiable: in ``rotation``, at angles below pi.
     """
+    from kornia.geometry.conversions import rotation_matrix_to_axis_angle
+
     return rotation_matrix_to_axis_angle(rotation)
 
 
@@ -76,6 +76,8 @@ def left_jacobian(rotation_vector: Tensor) -> Tensor:
 
     Differentiable: in ``rotation_vector``, also at zero.
     """
+    from kornia.geometry.liegroup import So3
+
     return So3.left_jacobian(rotation_vector.reshape(-1, 3)).reshape(*rotation_vector.shape, 3)
 
 

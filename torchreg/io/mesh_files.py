@@ -13,8 +13,6 @@ from urllib.parse import unquote
 
 import numpy as np
 import torch
-import trimesh
-from trimesh.exchange.stl import HeaderError
 
 from torchreg.errors import FormatError, MissingExtraError
 from torchreg.geometry.mesh import TriangleMesh, concatenate
@@ -35,7 +33,6 @@ _PARSER_ERRORS = (
     EOFError,
     ImportError,  # trimesh asks for an encoding detector when text is not UTF-8
     struct.error,
-    HeaderError,
 )
 
 
@@ -113,7 +110,10 @@ def _read_mesh(path: Path, limits: FileLimits) -> TriangleMesh:
         raise FormatError(f"{path}: meshes of kind {kind!r} are not read; known: {', '.join(_MESH_SUFFIXES)}")
     content = read_bytes(path, limits)
     unit = 1.0
-    errors: tuple[type[BaseException], ...] = _PARSER_ERRORS
+    import trimesh
+    from trimesh.exchange.stl import HeaderError
+
+    errors: tuple[type[BaseException], ...] = (*_PARSER_ERRORS, HeaderError)
     if kind == ".dae":
         errors = (*errors, importlib.import_module("collada.common").DaeError)
     try:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import pytorch_kinematics as pk
 import torch
 from torch import Tensor, nn
 
 from torchreg._checks import check_shape
 from torchreg.errors import ModelError
-from torchreg.geometry.kinematic_tree import KinematicTree
+from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rotation import skew
+
+if TYPE_CHECKING:
+    import pytorch_kinematics as pk
 
 # pytorch-kinematics walks the tree recursively when it builds a chain.
 _MAX_DEPTH = 300
@@ -20,10 +23,9 @@ _MAX_DEPTH = 300
 class KinematicChain(nn.Module):
     """Maps joint values to frame transforms, for any number of leading batch dimensions.
 
-    Degrees of freedom are the joints that are neither fixed nor mimics, in the tree's order. pytorch-kinematics builds
-    the chain and says what each joint is; the frames are multiplied here, in a third of its time: the transform of a
-    frame in its parent is linear in sine, cosine and value of its joint, and each round of products doubles the number
-    of ancestors that a frame is held in.
+    Degrees of freedom are the joints that are neither fixed nor mimics, in the tree's order. Frames are as those of
+    `to_pytorch_kinematics`, in a third of its time: the transform of a frame in its parent is linear in sine, cosine
+    and value of its joint, and each round of products doubles the number of ancestors that a frame is held in.
 
     Args:
         tree: the kinematic tree.
@@ -54,7 +56,7 @@ class KinematicChain(nn.Module):
     def __init__(self, tree: KinematicTree) -> None:
         super().__init__()
         self.tree = tree
-        chain = _build_chain(tree)
+        _check_depth(tree)
         joints = tree.joints
         moving = [index for index, joint in enumerate(joints) if joint.kind != "fixed"]
         free = [index for index in moving if joints[index].mimic is None]
@@ -63,10 +65,7 @@ class KinematicChain(nn.Module):
         self.has_mimics = len(free) < len(moving)
         couplings, values = _mimic_couplings(tree, moving, free)
         self.has_slides = any(joints[index].kind == "prismatic" for index in moving)
-        # pytorch-kinematics has an order of its own for frames and joints; its frames are called by their index here.
-        at = [chain.frame_to_idx[str(index)] for index in range(len(joints))]
-        joint_at = chain.joint_indices[at][moving]
-        axes = chain.axes[joint_at]
+        axes = torch.stack([_unit_axis(joints[index]) for index in moving]) if moving else torch.zeros(0, 3).double()
         is_revolute = torch.tensor([joints[index].kind == "revolute" for index in moving], dtype=torch.float64)
         buffers = {
             "axes": axes,
@@ -74,21 +73,40 @@ class KinematicChain(nn.Module):
             "moves": _ancestor_matrix(tree)[:, moving],
             "joint_frames": torch.tensor(moving, dtype=torch.long),
             "is_revolute": is_revolute,
-            "lower": chain.low[joint_at][[moving.index(index) for index in free]],
-            "upper": chain.high[joint_at][[moving.index(index) for index in free]],
+            "lower": torch.tensor([joints[index].lower for index in free], dtype=torch.float64),
+            "upper": torch.tensor([joints[index].upper for index in free], dtype=torch.float64),
             "turn_axes": (axes * is_revolute.unsqueeze(-1)).unsqueeze(-1),
             "slide_axes": (axes * (1 - is_revolute.unsqueeze(-1))).unsqueeze(-1),
             "frame_couplings": torch.zeros(len(joints), len(free), dtype=torch.float64),
             "frame_values": torch.zeros(len(joints), dtype=torch.float64),
         }
         buffers["frame_couplings"][moving], buffers["frame_values"][moving] = couplings, values
-        offsets = torch.cat([chain.joint_offsets[index] for index in at])
+        offsets = torch.stack([joint.offset.double() for joint in joints])
         buffers.update(_local_tables(offsets, moving, axes, is_revolute))
         buffers["by_depth"], buffers["tree_order"], self._complete, jumps = _doubling(tree)
         for number, jump in enumerate(jumps):
             buffers[f"jump_{number}"] = jump
         for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
+
+    def to_pytorch_kinematics(self) -> pk.Chain:
+        """Return the tree as a `pytorch_kinematics.Chain` in float64; frames and joints are called by their index."""
+        import pytorch_kinematics as pk
+
+        frames: list[pk.Frame] = []
+        for index, joint in enumerate(self.tree.joints):
+            offset = pk.Transform3d(matrix=joint.offset.double().unsqueeze(0), dtype=torch.float64)
+            # Indices as names: pytorch-kinematics strips and compares names, which here may hold any character.
+            name = str(index)
+            frame = pk.Frame(name, link=pk.Link(name))
+            frame.joint = pk.Joint(
+                name, offset=offset, joint_type=joint.kind, axis=tuple(joint.axis), dtype=torch.float64,
+                limits=(joint.lower, joint.upper),
+            )  # fmt: skip
+            if joint.parent >= 0:
+                frames[joint.parent].add_child(frame)
+            frames.append(frame)
+        return pk.Chain(frames[0], dtype=torch.float64)
 
     def forward(self, joint_values: Tensor, offset_scales: Tensor | None = None) -> Tensor:
         """Return the transform of every frame in the coordinates of the tree's root.
@@ -184,25 +202,17 @@ def neighbor_matrix(parents: Sequence[int]) -> Tensor:
     return neighbors
 
 
-def _build_chain(tree: KinematicTree) -> pk.Chain:
+def _check_depth(tree: KinematicTree) -> None:
     depths: list[int] = []
-    frames: list[pk.Frame] = []
-    for index, joint in enumerate(tree.joints):
+    for joint in tree.joints:
         depths.append(0 if joint.parent < 0 else depths[joint.parent] + 1)
         if depths[-1] > _MAX_DEPTH:
             raise ModelError(f"frame {joint.name!r} lies {depths[-1]} frames deep; at most {_MAX_DEPTH} are supported")
-        offset = pk.Transform3d(matrix=joint.offset.double().unsqueeze(0), dtype=torch.float64)
-        # Indices as names: pytorch-kinematics strips and compares names, which here may hold any character.
-        name = str(index)
-        frame = pk.Frame(name, link=pk.Link(name))
-        frame.joint = pk.Joint(
-            name, offset=offset, joint_type=joint.kind, axis=tuple(joint.axis), dtype=torch.float64,
-            limits=(joint.lower, joint.upper),
-        )  # fmt: skip
-        if joint.parent >= 0:
-            frames[joint.parent].add_child(frame)
-        frames.append(frame)
-    return pk.Chain(frames[0], dtype=torch.float64)
+
+
+def _unit_axis(joint: Joint) -> Tensor:
+    axis = torch.tensor(joint.axis, dtype=torch.float64)
+    return axis / axis.norm()
 
 
 def stack_sizes(tree: KinematicTree) -> list[int]:
