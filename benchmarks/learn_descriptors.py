@@ -4,7 +4,7 @@ Random toys, people and animals of random proportions move at random; wherever t
 should agree, elsewhere within reach they should not. This writes the file that comes with the package (8 minutes); what
 it is worth is printed by `benchmarks/spin_images.py`.
 
-    python benchmarks/learn_descriptors.py torchreg/correspondence/learned_descriptors.safetensors
+    python benchmarks/learn_descriptors.py torchreg/registration/dense/learned_descriptors.safetensors
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
+from discriminants import difference_moments, linear_discriminants
 from torch import Tensor
 from tqdm import tqdm
 
@@ -26,7 +27,6 @@ from torchreg.datasets.toys import random_toy
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.io.tensors import save_tensors
 from torchreg.registration.dense.config import ScanAlignConfig
-from torchreg.registration.dense.discriminants import difference_moments, linear_discriminants
 from torchreg.registration.dense.learned_descriptors import BIN_SIZES, CURVATURE_RADII, IMAGE_SIZE, surface_descriptors
 from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.registration.dense.problem import SCENE, describe
