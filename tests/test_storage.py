@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ import pytest
 import safetensors.torch
 import torch
 
+from torchreg import storage
 from torchreg.alignment.align import AlignConfig, align
 from torchreg.alignment.results import AlignRecord, AlignResult, Calibration
 from torchreg.errors import FormatError, InputError, InputTypeError
@@ -18,7 +19,7 @@ from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.registration.results import ScanRegistration
-from torchreg.result import Result, Status
+from torchreg.result import Result, Status, formerly
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.pose_prior import PosePrior
@@ -407,6 +408,24 @@ def test_what_earlier_releases_saved_is_read(path):
     direct = [item.name for item in fields(loaded) if item.name in stored]
     assert all(same(stored[name], getattr(loaded, name)) for name in direct)
     assert len(direct) >= 3 or path.stem == "DemoResult"
+
+
+def test_a_renamed_field_is_read_under_its_former_name(tmp_path, monkeypatch):
+    @dataclass(frozen=True)
+    class AlignResult(Result):
+        width: torch.Tensor = field(metadata=formerly("sigma"))
+        cost: float = 0.0
+
+    @dataclass(frozen=True)
+    class Former(Result):
+        sigma: torch.Tensor
+        cost: float
+
+    for kind in (Former, AlignResult):
+        monkeypatch.setattr(storage, "public", lambda name, kind=kind: kind)
+        if kind is Former:
+            Former(torch.ones(2), 3.0).save(tmp_path / "r.safetensors")
+    assert same(load(tmp_path / "r.safetensors"), AlignResult(torch.ones(2), 3.0))
 
 
 def test_results_are_read_in_a_process_that_imported_nothing_yet():

@@ -31,6 +31,11 @@ def stored_as(to_record: Callable[[Any], Any], from_record: Callable[[Any], Any]
     return {"to_record": to_record, "from_record": from_record}
 
 
+def formerly(name: str) -> dict[str, Any]:
+    """Return the metadata of a field that files of earlier releases hold under another name."""
+    return {"formerly": name}
+
+
 def _described(value: Any) -> str:
     """Return what is said of a field in few words."""
     if isinstance(value, Tensor):

@@ -317,6 +317,8 @@ def _make(kind: type, values: dict[str, Any], where: str) -> Any:
     if not is_dataclass(kind):
         raise _WrongContentError(f"{where} is of the kind {kind.__name__}, which is no record")
     declared = {item.name: item for item in fields(kind)}
+    names = {item.metadata["formerly"]: name for name, item in declared.items() if "formerly" in item.metadata}
+    values = {names.get(name, name): value for name, value in values.items()}
     missing = [name for name, item in declared.items() if name not in values and item.default is MISSING]
     unknown = [name for name in values if name not in declared]
     if missing or unknown:
