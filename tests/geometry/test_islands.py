@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from torchreg.geometry.islands import island_links
 
 
