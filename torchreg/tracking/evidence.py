@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.problem import AlignProblem
+from torchreg.geometry.neighbors import nearest_neighbor, sampling_distance
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.shapes.limbs import Limb
 from torchreg.shapes.skin import LinearBlendSkin
@@ -104,11 +105,10 @@ def dense_strays(data: Tensor, near: Tensor, size: float) -> Tensor:
         size: of the shape, metres.
     """
     far, on = data[~near], data[near]
-    if not len(on) or not len(far):
+    if len(on) < 2 or not len(far):
         return far[:0]
-    some = on[:: max(1, len(on) // _NUM_SPACINGS)]
-    spacing = torch.cdist(some, on).topk(2, largest=False).values[:, -1].median() if len(on) > 1 else data.new_zeros(())
-    radius = (_CLUSTER_RADIUS * spacing).clamp_max(_MAX_CLUSTER * size)
+    spacing = sampling_distance(on, on[:: max(1, len(on) // _NUM_SPACINGS)])
+    radius = min(_CLUSTER_RADIUS * spacing, _MAX_CLUSTER * size)
     return far[(torch.cdist(far, far) < radius).sum(-1) > _CLUSTER_NEIGHBORS]
 
 
@@ -116,7 +116,7 @@ def nearest_distance(points: Tensor, others: Tensor) -> Tensor:
     """Return the distance (N,) of each point to the nearest of others (K, 3); infinite where there are none."""
     if not len(others):
         return torch.full_like(points[:, 0], torch.inf)
-    return torch.cdist(points, others).amin(-1)
+    return nearest_neighbor(points, others)[1]
 
 
 class LimbReach:

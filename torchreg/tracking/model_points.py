@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.shapes.skin import bending_weights
 from torchreg.tracking.config import FrameFit
 from torchreg.tracking.frame_fit import MIN_DATA, FrameFitter, generator
@@ -36,27 +37,24 @@ def points_after(fitter: FrameFitter, state: TrackState, fit: FrameFit) -> Model
     if fitter.config.model_points == "shape" or len(data) < MIN_DATA:
         return skin.points, skin.weights, skin.reference_pose
     posed = skin.place(fit.rows)
-    near = torch.cdist(posed, data, compute_mode="donot_use_mm_for_euclid_dist")
     if fitter.config.model_points == "data":
-        return _harvested(fitter, state, data, pose, posed, near)
-    shown = near.amin(-1) < _SHOWN_SHARE * size
+        return _harvested(fitter, state, data, pose, posed)
+    shown = nearest_neighbor(posed, data)[1] < _SHOWN_SHARE * size
     if fit.inliers < _HIDDEN * state.inliers:
         # What something hides comes back as it went.
-        shown = shown | _among(skin.points, state.points)
+        shown = shown | (nearest_neighbor(skin.points, state.points)[1] == 0)
     parts = skin.weights.argmax(-1)
     shown = shown | (_count(parts[shown], skin.weights) < _FEW_SHOWN)[parts]
     return skin.points[shown], skin.weights[shown], skin.reference_pose
 
 
-def _harvested(
-    fitter: FrameFitter, state: TrackState, data: Tensor, pose: Tensor, posed: Tensor, near: Tensor
-) -> ModelPoints:
+def _harvested(fitter: FrameFitter, state: TrackState, data: Tensor, pose: Tensor, posed: Tensor) -> ModelPoints:
     """Return data as model points, at most so many per part, and the shape's own where a part shows few."""
     skin, config = fitter.skin, fitter.config
     if fitter.shape.surface is None:
         weights = bending_weights(fitter.shape, data, pose, config.sharpness)
     else:
-        weights = skin.weights[near.argmin(0)]
+        weights = skin.weights[nearest_neighbor(data, posed)[0]]
     parts = weights.argmax(-1)
     order = (parts + torch.rand(len(parts), generator=generator(state)).to(data)).argsort()
     ordered = parts[order]
@@ -70,8 +68,3 @@ def _harvested(
 
 def _count(parts: Tensor, weights: Tensor) -> Tensor:
     return torch.bincount(parts, minlength=weights.shape[-1])
-
-
-def _among(points: Tensor, some: Tensor) -> Tensor:
-    """Return which points (N,) are exactly among some of them (K, 3)."""
-    return (torch.cdist(points, some, compute_mode="donot_use_mm_for_euclid_dist") == 0).any(-1)
