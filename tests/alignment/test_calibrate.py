@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from torchreg.alignment.align import AlignConfig, align
-from torchreg.alignment.calibrate import CalibrateConfig, calibrate, scale_jacobian
+from torchreg.alignment.calibrate import CalibrateConfig, calibrate
 from torchreg.alignment.results import Calibration
+from torchreg.alignment.scale_fit import scale_jacobian
 from torchreg.datasets.hand import hand_motion, make_hand_cloud
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
@@ -314,13 +315,21 @@ def rig():
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
-        ({"frames": []}, InputError, r"frames must hold at least one cloud with points, got shape \(0, 0, 3\)"),
-        ({"frames": torch.zeros(2, 0, 3)}, InputError, "frames must hold at least one cloud with points"),
+        ({"frames": []}, InputError, r"frames must hold at least one point, got shape \(0, 0, 3\)"),
+        ({"frames": torch.zeros(2, 0, 3)}, InputError, "frames must hold at least one point"),
         ({"frames": torch.zeros(20, 3)}, InputError, r"frames must have shape \(T, M, 3\), got \(20, 3\)"),
         ({"frames": [torch.zeros(5, 3), torch.zeros(5)]}, InputError, r"frames\[1\] must have shape \(M, 3\)"),
         ({"frames": ["a.ply"]}, InputTypeError, r"frames\[0\] must be a tensor or an array of numbers, got str"),
-        ({"masks": torch.ones(2, 20)}, InputError, r"masks must be bool of shape \(2, 20\)"),
-        ({"masks": torch.ones(20, dtype=torch.bool)}, InputError, r"masks must be bool of shape \(2, 20\)"),
+        (
+            {"masks": torch.ones(2, 20)},
+            InputTypeError,
+            "masks must be a tensor of bool, False where frames are padding",
+        ),
+        (
+            {"masks": torch.ones(20, dtype=torch.bool)},
+            InputError,
+            r"masks must have shape \(2, 20\) like the frames, got \(20,\)",
+        ),
         (
             {"frames": [torch.zeros(5, 3)], "masks": torch.ones(1, 5, dtype=torch.bool)},
             InputError,

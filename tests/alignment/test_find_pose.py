@@ -7,16 +7,10 @@ import pytest
 import torch
 
 import torchreg.alignment.find_pose as find_pose_module
-from torchreg.alignment.find_pose import (
-    FindPoseConfig,
-    PrincipalAxes,
-    UniformRotations,
-    find_pose,
-    spread_rotations,
-    typical_poses,
-)
+from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.problem import alignment_cost, centered_problem, masked_mean
 from torchreg.alignment.results import PoseStarts
+from torchreg.alignment.rough_poses import PrincipalAxes, UniformRotations, spread_rotations, typical_poses
 from torchreg.datasets.hand import make_hand_cloud
 from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
@@ -417,7 +411,7 @@ def test_misfits_are_searched_for_again(plain_hand, plain_hand_skin, clouds, tru
         costs = torch.stack([alignment_cost(problem, poses[:, number]) for number in range(2)], dim=1)
         return poses, costs
 
-    monkeypatch.setattr(find_pose_module, "_find", fail_twice)
+    monkeypatch.setattr(find_pose_module, "_search", fail_twice)
     config = replace(QUICK, num_retries=5, seed=7)
     starts = find_pose(plain_hand, clouds, model_points=plain_hand_skin, config=config)
     assert searched == [(7, 2), (8, 1), (9, 1)]

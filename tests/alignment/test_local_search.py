@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from torchreg.alignment import local_search as align_search
-from torchreg.alignment.local_search import _scatter, clustered_data, explore, leaves_clusters, needs_search
-from torchreg.alignment.objectives import PosePrior
+from torchreg.alignment.clusters import clustered_data, leaves_clusters
+from torchreg.alignment.local_search import _scatter, explore, needs_search
+from torchreg.alignment.objectives import GaussianPosePrior
 from torchreg.alignment.pose_search import PoseSearch
 from torchreg.alignment.problem import AlignProblem
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
@@ -28,7 +29,7 @@ def make_problem(skin, data, mean):
         size=float((skin.points.amax(0) - skin.points.amin(0)).norm()),
         lower=shape.lower,
         upper=shape.upper,
-        prior=PosePrior(mean, torch.cat([torch.zeros(6), torch.full((shape.num_dofs - 6,), 8.0)])),
+        prior=GaussianPosePrior(mean, torch.cat([torch.zeros(6), torch.full((shape.num_dofs - 6,), 8.0)])),
         pose_atol=1e-3,
     )
 
@@ -195,13 +196,13 @@ def test_a_search_is_the_same_for_the_same_seed_and_leaves_the_global_state_alon
 
 def test_a_search_that_improves_nothing_ends_and_returns_the_descent(problem, exact, monkeypatch):
     rounds = []
-    searched = PoseSearch._searched
+    searched = PoseSearch._best_options
 
     def counted(*arguments):
         rounds.append(1)
         return searched(*arguments)
 
-    monkeypatch.setattr(PoseSearch, "_searched", counted)
+    monkeypatch.setattr(PoseSearch, "_best_options", counted)
     generator = torch.Generator().manual_seed(5)
     found = explore(problem, exact, exact, candidates=3, rounds=4, generator=generator)
     assert len(rounds) <= 2
@@ -228,21 +229,21 @@ def test_only_lost_problems_are_searched_all_around(problem, exact, plain_hand, 
 def test_further_candidates_are_searched_where_the_best_leaves_clusters(problem, exact, plain_hand, monkeypatch):
     """The rows that do not need it stay as they are."""
     sizes = []
-    settle = PoseSearch.settle
+    settle = PoseSearch.refine
 
     def spied(search, candidates, rounds):
         sizes.append(tuple(candidates.shape[:2]))
         return settle(search, candidates, rounds)
 
     start = misled(exact, plain_hand)
-    monkeypatch.setattr(PoseSearch, "settle", spied)
+    monkeypatch.setattr(PoseSearch, "refine", spied)
     monkeypatch.setattr(align_search, "leaves_clusters", lambda problem, pose: torch.arange(len(pose)) == 0)
     search = PoseSearch(problem, torch.Generator().manual_seed(5))
     poses, scores = align_search._search_around(search, start, start, 8, 1, torch.Generator().manual_seed(6))
     assert sizes[0] == (2, 1)
     assert [batch for batch, _ in sizes[1:]] == [1]
     # What comes back with a pose is its score.
-    torch.testing.assert_close(search.settle(poses.unsqueeze(1), 1)[1][:, 0], scores, rtol=0.1, atol=3.0)
+    torch.testing.assert_close(search.refine(poses.unsqueeze(1), 1)[1][:, 0], scores, rtol=0.1, atol=3.0)
 
 
 def test_large_batches_are_searched_in_parts(problem, exact, monkeypatch):
@@ -253,7 +254,7 @@ def test_large_batches_are_searched_in_parts(problem, exact, monkeypatch):
         return descended + 1
 
     monkeypatch.setattr(align_search, "_explore", spied)
-    monkeypatch.setattr(align_search, "_CHUNK_ENTRIES", 1)
+    monkeypatch.setattr(align_search, "_SEARCH", replace(align_search._SEARCH, entries=1))
     generator = torch.Generator().manual_seed(6)
     found = explore(problem, exact, exact, candidates=2, rounds=1, generator=generator)
     assert sizes == [1, 1]
@@ -262,7 +263,7 @@ def test_large_batches_are_searched_in_parts(problem, exact, monkeypatch):
 
 def test_searched_in_parts_a_batch_ends_where_it_ends_as_a_whole(problem, plain_hand, explored, exact, monkeypatch):
     start, around, _ = explored
-    monkeypatch.setattr(align_search, "_CHUNK_ENTRIES", 1)
+    monkeypatch.setattr(align_search, "_SEARCH", replace(align_search._SEARCH, entries=1))
     found = explore(around, start, start, candidates=16, rounds=2, generator=torch.Generator().manual_seed(4))
     off = (plain_hand.keypoints(found) - plain_hand.keypoints(exact)).norm(dim=-1)
     assert float(off.max()) < 0.015

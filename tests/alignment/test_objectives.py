@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchreg.alignment.objectives import PosePrior, RegistrationObjective, SurfaceObjective
+from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.shapes.articulated import ArticulatedShape
@@ -47,11 +47,11 @@ def poses(count=2, seed=1):
 
 def some_prior(count=2):
     precision = torch.tensor([0.0] * 6 + [3.0, 5.0], dtype=torch.float64)
-    return PosePrior(poses(count, 7), precision)
+    return GaussianPosePrior(poses(count, 7), precision)
 
 
 def free_prior(count=2):
-    return PosePrior(torch.zeros(count, DOFS).double(), torch.zeros(DOFS).double())
+    return GaussianPosePrior(torch.zeros(count, DOFS).double(), torch.zeros(DOFS).double())
 
 
 def data_near(skin, pose, count=60, seed=2):
@@ -222,7 +222,7 @@ def test_prior_is_a_gaussian_on_every_problem(own):
     """One precision for all problems, or each its own."""
     prior, pose = some_prior(), poses()
     if own:
-        prior = PosePrior(prior.mean, torch.stack([prior.precision, 2 * prior.precision]))
+        prior = GaussianPosePrior(prior.mean, torch.stack([prior.precision, 2 * prior.precision]))
     nothing = Linearization(torch.ones(2).double(), torch.ones(2, DOFS).double(), torch.ones(2, DOFS, DOFS).double())
     found = prior.add_to(nothing, pose)
     weights = prior.precision.expand(2, DOFS)

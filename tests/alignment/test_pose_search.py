@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchreg.alignment.pose_search import PoseSearch, fit_candidates, mean_distances, repeated, score_candidates
+from torchreg.alignment.pose_search import PoseSearch, fit_candidates, mean_distances, score_candidates
 from torchreg.alignment.problem import PRIOR_SHARE, centered_problem, masked_mean, shifted
 from torchreg.shapes.surface import FusedSurface
 
@@ -98,13 +98,13 @@ def test_a_batch_is_fitted_as_a_loop(problem, pool):
 
 
 def test_problems_are_repeated_in_a_row(problem):
-    wide = repeated(problem, 3)
+    wide = problem.repeated(3)
     torch.testing.assert_close(wide.data, problem.data[[0, 0, 0, 1, 1, 1]])
     torch.testing.assert_close(wide.prior.mean, problem.prior.mean[[0, 0, 0, 1, 1, 1]])
 
 
 def test_attracted_candidates_come_best_first(plain_hand, search, pool, exact):
-    found = search.attract(pool, 1)
+    found = search.fit_coarsely(pool, 1)
     assert found.shape == pool.shape
     # The data that it ranks by are a draw; by all data the order is much the same.
     scores = independent_score(search.problem, found, 0.022)
@@ -115,18 +115,18 @@ def test_attracted_candidates_come_best_first(plain_hand, search, pool, exact):
 
 
 def test_few_of_many_are_kept_and_their_limbs_are_placed(plain_hand, search, pool, exact):
-    narrowed = search.narrow(pool, 3)
+    narrowed = search.prune(pool, 3)
     assert narrowed.shape == (2, 3, 27)
     assert bool(((narrowed >= plain_hand.lower) & (narrowed <= plain_hand.upper)).all())
     before, after = (independent_score(search.problem, poses, 0.022).amin(1) for poses in (pool, narrowed))
     assert bool((after < 0.7 * before).all())
-    assert search.narrow(pool[:, :2], 5).shape == (2, 2, 27)
+    assert search.prune(pool[:, :2], 5).shape == (2, 2, 27)
 
 
 def test_different_candidates_come_before_twins(search, exact, pool):
     """Twins of the best would crowd out every rival."""
     twins = torch.cat([exact.unsqueeze(1).repeat(1, 3, 1), pool[:, -1:]], dim=1)
-    for found in (search.narrow(twins, 2), search.attract(twins, 1)[:, :2]):
+    for found in (search.prune(twins, 2), search.fit_coarsely(twins, 1)[:, :2]):
         apart = (search.problem.skin(found[:, 0]) - search.problem.skin(found[:, 1])).square().sum(-1).mean(-1).sqrt()
         assert bool((apart > 0.01 * search.problem.size).all())
 
@@ -139,14 +139,14 @@ def test_distances_of_candidates_are_those_of_their_points(search, pool):
 
 
 def test_limbs_that_fit_are_kept_as_they_came(plain_hand, search, exact):
-    narrowed = search.narrow(exact.unsqueeze(1), 1)
+    narrowed = search.prune(exact.unsqueeze(1), 1)
     assert float(tip_errors(plain_hand, narrowed[:, 0], exact).max()) < 0.012
 
 
 @pytest.fixture(scope="module")
 def settled(search, pool):
-    narrowed = search.narrow(pool, 3)
-    return narrowed, *search.settle(narrowed, 2)
+    narrowed = search.prune(pool, 3)
+    return narrowed, *search.refine(narrowed, 2)
 
 
 def test_a_thorough_search_finds_the_pose(plain_hand, settled, exact):
@@ -170,23 +170,23 @@ def test_the_best_is_never_worse_than_what_came_in(search, settled, exact):
     narrowed, _, scores = settled
     came = independent_score(search.problem, narrowed, 0.018)
     assert bool((scores[:, 0] <= came.amin(1)).all())
-    more = search.settle(narrowed, 3)[1]
+    more = search.refine(narrowed, 3)[1]
     assert bool((more[:, 0] <= scores[:, 0] + 1.0).all())
     # Even the true pose comes out no worse than a fit makes it.
-    _, best = search.settle(exact.unsqueeze(1), 1)
+    _, best = search.refine(exact.unsqueeze(1), 1)
     assert bool((best[:, 0] <= independent_score(search.problem, exact.unsqueeze(1), 0.018)[:, 0] + 1.0).all())
 
 
 def test_a_search_ends_when_a_round_gains_nothing(problem, exact, monkeypatch):
     rounds = []
-    searched = PoseSearch._searched
+    searched = PoseSearch._best_options
 
-    def counted(search, candidates, number):
+    def counted(search, problem, candidates, stage, number):
         rounds.append(candidates.shape[1])
-        return searched(search, candidates, number)
+        return searched(search, problem, candidates, stage, number)
 
-    monkeypatch.setattr(PoseSearch, "_searched", counted)
-    PoseSearch(problem, generator()).settle(exact.unsqueeze(1).repeat(1, 2, 1), 6)
+    monkeypatch.setattr(PoseSearch, "_best_options", counted)
+    PoseSearch(problem, generator()).refine(exact.unsqueeze(1).repeat(1, 2, 1), 6)
     # The candidates first, then the best alone.
     assert rounds[0] == 2
     assert set(rounds[1:]) == {1}
@@ -197,18 +197,18 @@ def test_rows_of_a_search_are_searches(search, pool):
     index = torch.tensor([1])
     part = search.rows(index)
     torch.testing.assert_close(part.problem.data, search.problem.data[1:])
-    torch.testing.assert_close(part.few.data, search.few.data[1:])
+    torch.testing.assert_close(part.coarse_problem.data, search.coarse_problem.data[1:])
     assert part.limbs is search.limbs
     assert len(search.problem.data) == 2
-    torch.testing.assert_close(part.attract(pool[1:], 1), search.attract(pool, 1)[1:], rtol=0, atol=1e-3)
-    assert part.narrow(pool[1:], 2).shape == (1, 2, 27)
+    torch.testing.assert_close(part.fit_coarsely(pool[1:], 1), search.fit_coarsely(pool, 1)[1:], rtol=0, atol=1e-3)
+    assert part.prune(pool[1:], 2).shape == (1, 2, 27)
 
 
 def test_large_clouds_are_thinned_and_skins_are_coarse(problem, plain_hand, truths):
     large = replace(problem, data=problem.data.repeat(1, 10, 1), valid=problem.valid.repeat(1, 10))
     found = PoseSearch(large, generator())
     assert found.problem.data.shape[1] < 1000
-    assert found.few.data.shape[1] < found.problem.data.shape[1]
+    assert found.coarse_problem.data.shape[1] < found.problem.data.shape[1]
     assert isinstance(found.problem.surface, FusedSurface)
     coarse, fine = found.problem.skin, problem.skin
     assert len(coarse) < len(fine)
@@ -223,7 +223,7 @@ def test_large_clouds_are_thinned_and_skins_are_coarse(problem, plain_hand, trut
 def test_the_generator_decides_and_the_global_state_does_not(problem, pool):
     torch.manual_seed(9)
     state = torch.get_rng_state()
-    found = [PoseSearch(problem, generator(3)).narrow(pool[:, :3], 1) for _ in range(2)]
+    found = [PoseSearch(problem, generator(3)).prune(pool[:, :3], 1) for _ in range(2)]
     torch.testing.assert_close(*found, rtol=0, atol=0)
     assert bool((torch.get_rng_state() == state).all())
 

@@ -13,7 +13,7 @@ from torchreg.alignment.problem import (
     PRIOR_SHARE,
     alignment_cost,
     centered_problem,
-    check_data,
+    check_clouds,
     masked_mean,
     shifted,
     warn_about_units,
@@ -70,22 +70,22 @@ def problem(plain_hand, plain_hand_skin):
 
 
 def test_data_take_the_shapes_precision_and_all_count(plain_hand):
-    data, valid = check_data(plain_hand, np.ones((4, 3)), None, "raise")
+    data, valid = check_clouds(plain_hand, np.ones((4, 3)), None, "raise")
     assert data.dtype == torch.float32
     assert valid.tolist() == [True] * 4
     double = Hand(dtype=torch.float64)
-    assert check_data(double, torch.ones(2, 4, 3), None, "raise")[0].dtype == torch.float64
+    assert check_clouds(double, torch.ones(2, 4, 3), None, "raise")[0].dtype == torch.float64
 
 
 def test_points_left_out_become_zeros_that_do_not_count(plain_hand):
     data = torch.ones(2, 3, 3)
     data[0, 1, 2], data[1, 0] = torch.nan, torch.inf
     mask = torch.tensor([[True, True, False], [False, True, True]])
-    found, valid = check_data(plain_hand, data, mask, "omit")
+    found, valid = check_clouds(plain_hand, data, mask, "omit")
     assert valid.tolist() == [[True, False, False], [False, True, True]]
     torch.testing.assert_close(found, valid.unsqueeze(-1).expand(2, 3, 3).float())
     # What a mask hides may be anything.
-    hidden, _ = check_data(plain_hand, data, mask & torch.isfinite(data).all(-1), "raise")
+    hidden, _ = check_clouds(plain_hand, data, mask & torch.isfinite(data).all(-1), "raise")
     assert bool(torch.isfinite(hidden).all())
     assert bool(torch.isnan(data[0, 1, 2]))
 
@@ -123,12 +123,12 @@ def test_points_left_out_become_zeros_that_do_not_count(plain_hand):
 )
 def test_unfit_data_are_named(plain_hand, data, mask, error, message):
     with pytest.raises(error, match=message):
-        check_data(plain_hand, data, mask, "raise")
+        check_clouds(plain_hand, data, mask, "raise")
 
 
 def test_data_that_are_all_omitted_are_refused(plain_hand):
     with pytest.raises(InputError, match="data hold no point that is finite and not masked"):
-        check_data(plain_hand, torch.full((4, 3), torch.nan), None, "omit")
+        check_clouds(plain_hand, torch.full((4, 3), torch.nan), None, "omit")
 
 
 def test_the_mean_is_of_what_counts():
@@ -296,13 +296,16 @@ def test_other_units_are_warned_of(problem, scale):
     with pytest.warns(
         UnitsWarning, match=r"the data spread over .* times the model's size of .* m: are they in metres"
     ):
-        warn_about_units(other)
+        warn_about_units(other.data, other.valid, other.size, stacklevel=1)
 
 
 def test_metres_and_few_data_are_not_warned_of(problem):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_about_units(problem)
-        warn_about_units(replace(problem, data=10 * problem.data))
         few = problem.draw(5, torch.Generator().manual_seed(0))
-        warn_about_units(replace(few, data=1000 * few.data))
+        for data, valid in (
+            (problem.data, problem.valid),
+            (10 * problem.data, problem.valid),
+            (1000 * few.data, few.valid),
+        ):
+            assert not warn_about_units(data, valid, problem.size, stacklevel=1)
