@@ -10,16 +10,15 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_choice, check_count, check_positive
 from torchreg._threads import one_thread
 from torchreg.alignment.annealed_em import ANNEALING, CORRESPONDENCES, OnStep, StageResult, anneal, outlier_level
+from torchreg.alignment.inputs import check_clouds, check_skin, warn_about_units
 from torchreg.alignment.local_search import explore, needs_search
 from torchreg.alignment.problem import (
     INLIER_SHARE,
     AlignProblem,
     alignment_cost,
     centered_problem,
-    check_clouds,
     masked_mean,
     shifted,
-    warn_about_units,
 )
 from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.sigma_schedule import SigmaSchedule
@@ -35,8 +34,8 @@ from torchreg.solvers.e_step import expectation
 class _Limits:
     """Limits of an alignment."""
 
-    least_inliers: int = 10  # fewer inliers, and the pose means nothing
-    least_share: float = 0.02  # the same, as a share of the data
+    min_inliers: int = 10  # fewer inliers, and the pose means nothing
+    min_share: float = 0.02  # the same, as a share of the data
     many_data: int = 10_000  # in a batch, from which all threads of torch are of use
 
 
@@ -214,9 +213,7 @@ def _model_skin(
 ) -> LinearBlendSkin:
     """Return the model points as a skin: given, built from points in a pose (1, num_dofs), or sampled."""
     if isinstance(model_points, LinearBlendSkin):
-        if model_points.shape is not shape:
-            raise InputError("model_points is a skin of another shape; build it from the shape that is aligned")
-        return model_points
+        return check_skin(shape, model_points)
     if model_points is None:
         return sample_skin(shape, config.num_model_points, sharpness=config.sharpness)
     if len(pose) != 1:
@@ -311,7 +308,7 @@ def _result(batch: _Batch, found: StageResult, config: AlignConfig) -> AlignResu
 def _status(num_inliers: int, num_data: int, change: float, config: AlignConfig) -> Status:
     if num_data == 0:
         return Status.NO_DATA
-    if num_inliers < max(_LIMITS.least_inliers, _LIMITS.least_share * num_data):
+    if num_inliers < max(_LIMITS.min_inliers, _LIMITS.min_share * num_data):
         return Status.FEW_INLIERS
     return Status.CONVERGED if change <= config.pose_atol else Status.MAX_STEPS
 

@@ -32,10 +32,10 @@ class Annealing:
     """Numbers of the annealed EM; widths are shares of the model's size."""
 
     start: float = 0.08  # first sigma: the largest motion of a point that is to be found
-    stop: float = 0.02  # last sigma: from there the surface fit goes on
-    narrow: float = 0.035  # sigma below which a kernel shrinks the model by less than the noise
-    matched: float = 0.3  # inlier posterior above which a datum tells how many model points share it
-    sure: float = 1 - 1e-6  # inlier posterior that counts as no higher, so that the number of sharers stays finite
+    stop: float = 0.02  # last sigma: the surface fit, which needs no correspondences, is better below
+    debias_from: float = 0.035  # sigma below which a kernel shrinks the model by less than the noise
+    matched: float = 0.3  # inlier posterior above which a datum counts for the number of model points that share it
+    max_posterior: float = 1 - 1e-6  # at which inlier posteriors are capped, so that this number stays finite
 
     def schedule(self, size: float, steps: int = 5) -> SigmaSchedule:
         """Return the paper's geometric schedule for a model of some size in metres."""
@@ -122,7 +122,7 @@ def _match(problem: AlignProblem, posed: Tensor, sigma: Tensor) -> EStep:
     outlier = outlier_level(problem, posed, sigma)
     rule = CORRESPONDENCES[problem.correspondence]
     matches = rule(posed, problem.data, sigma, outlier, mask=problem.valid)
-    if problem.debias > 0 and float(sigma.max()) > ANNEALING.narrow * problem.size:
+    if problem.debias > 0 and float(sigma.max()) > ANNEALING.debias_from * problem.size:
         return _debiased(matches, posed, rule(posed, posed, sigma, outlier), problem.debias)
     return matches
 
@@ -144,7 +144,7 @@ def _tempered_prior(problem: AlignProblem, matches: EStep) -> GaussianPosePrior:
     """
     if problem.correspondence != "em":
         return problem.prior
-    posterior = matches.inlier_posterior.clamp_max(ANNEALING.sure)
+    posterior = matches.inlier_posterior.clamp_max(ANNEALING.max_posterior)
     matched = posterior > ANNEALING.matched
     sharers = OUTLIER_CONSTANT * (posterior / (1 - posterior) * matched).sum(-1) / matched.sum(-1).clamp_min(1)
     return replace(problem.prior, precision=problem.prior.precision * sharers.clamp_min(1).unsqueeze(-1))

@@ -13,7 +13,8 @@ from torch.nn.utils.rnn import pad_sequence
 
 from torchreg._checks import as_float_tensor, check_count, check_finite, check_positive, check_shape
 from torchreg.alignment.align import AlignConfig, align
-from torchreg.alignment.problem import check_clouds, model_size
+from torchreg.alignment.inputs import check_clouds
+from torchreg.alignment.problem import model_size
 from torchreg.alignment.results import Calibration
 from torchreg.alignment.scale_fit import ScalePrior, ScaleProblem
 from torchreg.alignment.surface_fit import SURFACE_FIT
@@ -28,7 +29,7 @@ from torchreg.solvers.levenberg_marquardt import levenberg_marquardt
 class _JointFit:
     """Numbers of a joint fit."""
 
-    shared_error: float = 1.5  # factor on the noise: near residuals share what the shape gets wrong, and are no news
+    shared_error: float = 1.5  # factor on the noise: neighboring residuals share the error of the shape's surface
     last_steps: int = 2  # the last width takes this many times the steps of the others
 
 
@@ -174,7 +175,7 @@ def _fit_jointly(
     state, widths = problem.state(poses), SURFACE_FIT.widths
     for step in range(len(widths) + 1):
         is_last = step == len(widths)
-        noise = problem.noise(state) if is_last else SURFACE_FIT.most_noise(problem.size)
+        noise = problem.noise(state) if is_last else SURFACE_FIT.max_noise(problem.size)
         sigma = SURFACE_FIT.width_per_noise * noise if is_last else widths[step] * problem.size
         solved = levenberg_marquardt(
             partial(problem.linearize, sigma=sigma, noise=_JOINT_FIT.shared_error * noise),

@@ -1,4 +1,4 @@
-"""Unexplained clusters: data off the surface as dense as those on it, which outliers are not but a lost limb is."""
+"""Unexplained clusters: data off the surface as dense as those on it, as of a misplaced limb; outliers are thin."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from torchreg.alignment.surface_fit import surface_noise
 
 @dataclass(frozen=True)
 class OffSurface:
-    """How far data lie off the surface that are not explained by it."""
+    """Distance from which the surface does not explain data."""
 
     noises: float = 3.0  # standard deviations of the noise
     share: float = 0.012  # of the model's size, at least: solids and skins are not exact
 
     def distance(self, noise: Tensor, size: float) -> Tensor:
-        """Return the distance, metres, beyond which data are off the surface, from their noise (...) and the size."""
+        """Return the distance (...), metres, for noise (...) and a model's size in metres."""
         return (self.noises * noise).clamp_min(self.share * size)
 
 
 @dataclass(frozen=True)
 class ClusterTest:
-    """Which data off the surface are a cluster, and which clusters are worth a search."""
+    """Thresholds of clusters, and of the number of data in them that is worth a search."""
 
-    neighbors: int = 5  # other data off the surface within the radius
-    radius: float = 4.0  # in distances of nearest neighbors on the surface
+    neighbors: int = 5  # off the surface within the radius, at least
+    radius: float = 4.0  # as a multiple of the median distance of nearest neighbors on the surface
     max_radius: float = 0.1  # as a share of the model's size
-    share: float = 0.015  # of the data on the surface: clusters of more are worth a search
-    least: int = 5  # clusters of no more data are not
-    max_data: int = 2000  # looked at per cloud; more are thinned, since all pairs are
+    share: float = 0.015  # of the data on the surface: more are worth a search
+    min_count: int = 5  # but so many or fewer are not
+    max_data: int = 2000  # per cloud, of which all pairs are compared; more are thinned
 
 
 OFF_SURFACE = OffSurface()
@@ -40,9 +40,9 @@ CLUSTERS = ClusterTest()
 
 
 def leaves_clusters(problem: AlignProblem, pose: Tensor) -> Tensor:
-    """Return which poses (B,) leave unexplained clusters that are worth a search."""
+    """Return a mask (B,) of poses that leave unexplained clusters worth a search."""
     clustered, near = clustered_data(problem, pose)
-    return clustered > (CLUSTERS.share * near).clamp_min(CLUSTERS.least)
+    return clustered > (CLUSTERS.share * near).clamp_min(CLUSTERS.min_count)
 
 
 def clustered_data(problem: AlignProblem, pose: Tensor) -> tuple[Tensor, Tensor]:

@@ -18,21 +18,21 @@ from torchreg.solvers.robust import welsch_weight
 
 @dataclass(frozen=True)
 class Evidence:
-    """How evidence for a pose becomes confidence in it. Each exponential falls to 1 / e at its scale."""
+    """Scales of the evidence for a pose, at which its factor of the confidence is 1 / e, or 1 - 1 / e."""
 
-    tolerance: float = 0.04  # a limb's end is known if it lies this near to its position, as a share of the size
-    lead: float = 4.0  # data by which a pose must lead a different one
-    left_over: float = 0.1  # data left over, as a share of those on the surface
-    limb_data: float = 4.0  # data that only a limb explains, by which its end is known
-    num_data: int = 2000  # more show no more limbs
+    tolerance: float = 0.04  # of the ends of limbs: their mean distance from the true ones, as a share of the size
+    lead: float = 4.0  # over a different pose, in data that it explains more
+    left_over: float = 0.1  # data beside the surface or in clusters, as a share of those on it
+    limb_data: float = 4.0  # data that nothing but one limb explains
+    num_data: int = 2000  # that are looked at: more show no more limbs
 
 
 @dataclass(frozen=True)
 class _Misfit:
-    """Which data lie beside the surface, so near that outliers are rare, and how many of them tell of a wrong pose."""
+    """Thresholds of a misfit: too many data beside the surface, so near that outliers are rare."""
 
-    reach: float = 0.05  # from the surface, as a share of the model's size
-    share: float = 0.025  # of the data
+    reach: float = 0.05  # of data beside the surface, at most, as a share of the model's size
+    share: float = 0.025  # of the data: more are a misfit
 
 
 EVIDENCE = Evidence()
@@ -42,11 +42,11 @@ _MISFIT = _Misfit()
 def pose_confidence(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor:
     """Return the confidence (B,) in poses, from 0 to 1.
 
-    A pose is doubtful if a different one explains nearly as many data, if it leaves data over beside the surface or in
-    dense clusters, or if the data leave open where some of its limbs end.
+    It is low if a different pose explains nearly as many data, if data lie beside the surface or in dense clusters, or
+    if the data do not determine where the limbs end.
 
     Args:
-        problem: the batch; its prior says what is known of joints that no data show.
+        problem: the batch; its prior holds joints that no data show.
         pose: (B, num_dofs), fitted.
         lead: (B,) by how many data more than the best of different poses it explains.
     """
@@ -57,7 +57,7 @@ def pose_confidence(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor
 
 
 def is_misfit(problem: AlignProblem, pose: Tensor) -> Tensor:
-    """Return which poses (B,) leave too many data beside the surface: outliers are spread far more thinly.
+    """Return a mask (B,) of poses that leave too many data beside the surface: outliers are spread more thinly.
 
     The noise is left out, since a wrong pose makes it look larger than it is: noisy data are misfits, too.
     """
@@ -76,8 +76,8 @@ def beside_share(problem: AlignProblem, pose: Tensor, off: OffSurface = OFF_SURF
 def known_ends(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return the probability (B,) that the limbs end where poses (B, num_dofs) have them.
 
-    About its position an end spreads by the covariance of the pose, given the data near the surface and the prior; a
-    limb without data of its own spreads by the prior alone. The mean of the spreads is taken for that of a Rayleigh
+    The position of an end spreads by the covariance of the pose, given the data near the surface and the prior; that of
+    a limb which explains no data alone spreads by the prior. The mean of the spreads is taken for that of a Rayleigh
     distribution's squares, of which a share lies within the tolerance.
     """
     if problem.data.shape[-2] > EVIDENCE.num_data:
@@ -85,7 +85,7 @@ def known_ends(problem: AlignProblem, pose: Tensor) -> Tensor:
     ends = limb_ends(problem.skin)
     _, derivative = problem.skin.shape.transform_jacobian(pose, chart="tangent")
     moves = (problem.skin.basis[ends] @ derivative.flatten(-2)).unflatten(-1, (3, -1))
-    # No precision is zero: of what the prior leaves free, it is known that poses are plausible.
+    # What the prior leaves free is plausible, at least.
     prior = torch.maximum(problem.prior.precision, BROAD_PRIOR.precision(problem.skin.shape, problem.size))
     variances = prior.reciprocal()
     variances[..., :BASE_DOFS] = 0

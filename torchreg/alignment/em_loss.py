@@ -148,7 +148,7 @@ class EMLoss(nn.Module):
             InputError: if a shape does not fit, or there are no points.
             InputTypeError: if the dtypes or devices differ, or the mask is not boolean.
 
-        Differentiable: no; they are what the M-step holds fixed.
+        Differentiable: no; the M-step holds them fixed.
 
         Cost: O(N M) time, bounded memory.
         """
@@ -252,7 +252,7 @@ def _with_one(points: Tensor) -> Tensor:
 
 
 def _parts(model: Tensor, data: Tensor) -> Iterator[slice]:
-    """Return slices of the data for which the kernel of the whole batch is held at a time."""
+    """Return slices of the data for each of which the kernel of all problems fits into memory."""
     return (columns for _, columns in chunks(1, model.shape[0] * model.shape[1], data.shape[1]))
 
 

@@ -11,33 +11,32 @@ from torch import Tensor
 from torchreg._checks import check_choice, check_count, check_positive
 from torchreg._threads import one_thread
 from torchreg.alignment.confidence import is_misfit, pose_confidence
+from torchreg.alignment.inputs import check_clouds, check_skin, warn_about_units
 from torchreg.alignment.limb_search import distinct_first, take_rows
 from torchreg.alignment.pose_search import PoseSearch, mean_distances
 from torchreg.alignment.problem import (
     AlignProblem,
     alignment_cost,
     centered_problem,
-    check_clouds,
     masked_mean,
     shifted,
-    warn_about_units,
 )
 from torchreg.alignment.results import PoseStarts
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource, bent_pose, register_rigidly
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
-from torchreg.errors import InputError, InputTypeError
+from torchreg.errors import InputError
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 
 @dataclass(frozen=True)
 class _Candidates:
-    """How rough and found poses are compared and fitted; lengths are shares of the model's size."""
+    """Numbers of the candidates; lengths are shares of the model's size."""
 
-    typical: float = 0.5  # mean of the prior, from the rest pose to the middle of the joint limits
-    most_compared: int = 300  # rough poses, the best, of which different ones are taken
-    same_rough: float = 0.045  # rough poses whose points differ by less are one
-    same: float = 0.05  # found poses whose points differ by less are one
+    typical: float = 0.5  # mean of the prior, from the rest pose (0) to the middle of the joint limits (1)
+    max_compared: int = 300  # best rough poses, of which different ones are taken
+    same_rough: float = 0.045  # rough poses whose points differ by less are duplicates
+    same: float = 0.05  # found poses whose points differ by less are duplicates
     fit_steps: int = 3  # at each width of the coarse fit
 
 
@@ -46,7 +45,7 @@ _CANDIDATES = _Candidates()
 
 @dataclass(frozen=True)
 class FindPoseConfig:
-    """How poses are found.
+    """Settings of `find_pose`.
 
     Args:
         num_candidates: rough poses, after rigid registration, that are fitted to the surface.
@@ -123,13 +122,13 @@ def find_pose(
     check_count(num_starts, "num_starts", 1)
     if not sources:
         raise InputError("sources must hold at least one source of rough poses, got none")
-    _check_skin(shape, model_points)
     with torch.no_grad():
         clouds, valid = check_clouds(shape, data, mask, config.nan_policy)
         batch, batch_valid = (clouds, valid) if clouds.ndim == 3 else (clouds[None], valid[None])
         origin = masked_mean(batch, batch_valid)
         typical = shifted(bent_pose(shape, _CANDIDATES.typical).expand(len(batch), -1), origin)
-        skin = sample_skin(shape, config.num_model_points) if model_points is None else model_points
+        count = config.num_model_points
+        skin = sample_skin(shape, count) if model_points is None else check_skin(shape, model_points)
         problem = centered_problem(skin, batch, batch_valid, typical, origin, prior_std=config.prior_std, pose_atol=0.0)
         warn_about_units(problem.data, problem.valid, problem.size, stacklevel=2)
         with one_thread():
@@ -137,15 +136,6 @@ def find_pose(
         starts = _ranked(problem, poses, costs, num_starts)
         starts = replace(starts, poses=shifted(starts.poses, origin.unsqueeze(1)))
     return starts if clouds.ndim == 3 else starts.row(0)
-
-
-def _check_skin(shape: ArticulatedShape, skin: LinearBlendSkin | None) -> None:
-    if skin is not None and not isinstance(skin, LinearBlendSkin):
-        raise InputTypeError(
-            f"model_points must be a skin of the shape, as from sample_skin, got {type(skin).__name__}"
-        )
-    if skin is not None and skin.shape is not shape:
-        raise InputError("model_points is a skin of another shape; build it from the shape whose pose is sought")
 
 
 def _search_with_retries(
@@ -185,7 +175,7 @@ def _search(problem: AlignProblem, sources: Sequence[PoseSource], config: FindPo
 
 def _best_distinct(problem: AlignProblem, poses: Tensor, costs: Tensor, count: int) -> Tensor:
     """Return the best ``count`` of poses (B, K, num_dofs) whose points differ; then duplicates of them."""
-    poses = take_rows(poses, costs.argsort(1)[:, : _CANDIDATES.most_compared])
+    poses = take_rows(poses, costs.argsort(1)[:, : _CANDIDATES.max_compared])
     order = distinct_first(mean_distances(problem, poses) < _CANDIDATES.same_rough * problem.size)
     return take_rows(poses, order[:, :count])
 

@@ -94,7 +94,7 @@ class FixedPoint:
         return gradient, 0.5 * (hessian + hessian.mT)
 
     def free(self, pose: Tensor, gradient: Tensor) -> Tensor:
-        """Return which variables (B, num_dofs) no limit holds."""
+        """Return a mask (B, num_dofs) of the variables that are not at a limit which holds them."""
         return ~held_at_limits(gradient, pose, self.lower, self.upper)
 
     def newton_steps(self, pose: Tensor, data: Tensor, start: Tensor, steps: int) -> Tensor:
@@ -151,7 +151,7 @@ def attach_gradients(problem: FixedPoint, pose: Tensor, data: Tensor, start: Ten
 
     Where ``g(pose, p) = 0`` is the stationarity of the energy over the variables that no limit holds, the implicit
     function gives ``d pose / d p = -H^-1 dg / dp``: one solve per cloud, however many iterations found the pose, and as
-    exact as the pose is stationary. Correspondences and widths are held.
+    exact as the pose is stationary. Correspondences and widths are held fixed.
 
     Args:
         problem: the energy that the pose minimizes.

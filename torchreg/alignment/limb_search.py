@@ -24,7 +24,7 @@ from torchreg.solvers.robust import welsch_loss, welsch_weight
 
 @dataclass(frozen=True)
 class Effort:
-    """How thoroughly limbs are placed. Widths are shares of the model's size.
+    """Thoroughness of placing limbs. Widths are shares of the model's size.
 
     Args:
         num_data: data that the joints' samples are tried on.
@@ -49,27 +49,27 @@ class Effort:
 
 @dataclass(frozen=True)
 class _Sampling:
-    """How the joints between a body and its parent are sampled."""
+    """Sampling of the joints between a body and its parent."""
 
     angle: float = math.radians(16)  # between neighboring samples of a hinge
-    free_range: float = 2 * math.pi  # of a joint without limits: a hinge is tried all around
-    ball_range: float = 2.4  # of each axis of a ball joint without limits, radians: beyond, the axes repeat rotations
-    most: int = 64  # samples of all joints between two bodies
-    slides: int = 8  # samples of a joint that slides
+    free_range: float = 2 * math.pi  # of a hinge without limits: all around
+    ball_range: float = 2.4  # of each axis of a ball joint without limits, radians: more would repeat rotations
+    max_count: int = 64  # samples of all joints between two bodies
+    slide_count: int = 8  # samples of a joint that slides
 
 
 @dataclass(frozen=True)
 class _Placement:
     """Numbers of the beam search over a limb's bodies and of the steps that refine its configurations."""
 
-    most_tried: int = 1500  # configurations of a body tried at a time, per problem
+    max_tried: int = 1500  # configurations of a body, per problem
     near_shares: float = 3.0  # data near its root that a limb is tried on, as multiples of its share among all limbs
-    least_loss: float = 0.02  # of a datum: those that the trunk explains count as this much farther from the root
-    same: float = 0.25  # configurations of a limb whose joints all differ by less are one, radians
+    min_loss: float = 0.02  # of a datum, so that those which the trunk explains count as far from the root
+    same: float = 0.25  # configurations of a limb whose joints all differ by less are duplicates, radians
     noise: float = 0.006  # standard deviation of the data for the weight of the prior, as a share of the model's size
-    longest_step: float = 0.3  # of a joint, radians or metres
-    cpu_entries: int = 1_500_000  # of a table held at a time: what the caches hold
-    device_entries: int = 150_000_000  # the same on other devices: what keeps them busy
+    max_step: float = 0.3  # of a joint, radians or metres
+    cpu_entries: int = 1_500_000  # of a table in memory on a CPU: as its caches hold
+    device_entries: int = 150_000_000  # of a table in memory on other devices: enough to keep them busy
 
 
 _SAMPLING = _Sampling()
@@ -118,7 +118,7 @@ class LimbSearch:
                 self.parts[leader] = self.parts[leader] + follower.parts
         bodies = [body for limb in self.limbs for body in limb.bodies]
         self.samples = {body: self._sample(body) for body in bodies}
-        # Mimic joints of a body follow joints elsewhere, so its samples have no transforms of their own.
+        # Mimic joints of a body follow joints elsewhere, so its samples do not determine its transforms.
         self.relative = {} if shape.chain.has_mimics else {body: self._sampled_transforms(body) for body in bodies}
 
     def __call__(self, problem: AlignProblem, poses: Tensor, effort: Effort, generator: torch.Generator) -> Tensor:
@@ -133,11 +133,11 @@ class LimbSearch:
         Returns:
             (B, C, num_dofs).
 
-        Cost: O(B num_data K) per body, K at most some thousand configurations.
+        Cost: O(B num_data K) per body, K at most 1,500 configurations.
         """
         if not self.limbs:
             return poses.unsqueeze(1)
-        per_row = effort.num_data * _PLACEMENT.most_tried
+        per_row = effort.num_data * _PLACEMENT.max_tried
         entries = _PLACEMENT.cpu_entries if poses.device.type == "cpu" else _PLACEMENT.device_entries
         rows = torch.arange(len(poses), device=poses.device).split(max(1, entries // per_row))
         subset = problem.draw(effort.num_data, generator)
@@ -162,11 +162,11 @@ class LimbSearch:
         lower = torch.where(lower.isfinite(), lower, torch.where(upper.isfinite(), upper - free, -free / 2))
         upper = torch.where(upper.isfinite(), upper, lower + free)
         counts = [
-            _SAMPLING.slides if shape.is_sliding[dof] else max(2, math.ceil(width / _SAMPLING.angle))
+            _SAMPLING.slide_count if shape.is_sliding[dof] else max(2, math.ceil(width / _SAMPLING.angle))
             for dof, width in zip(dofs, (upper - lower).tolist(), strict=True)
         ]
-        if math.prod(counts) > _SAMPLING.most:
-            shares = torch.quasirandom.SobolEngine(len(dofs), scramble=True, seed=0).draw(_SAMPLING.most)
+        if math.prod(counts) > _SAMPLING.max_count:
+            shares = torch.quasirandom.SobolEngine(len(dofs), scramble=True, seed=0).draw(_SAMPLING.max_count)
         else:
             grids = torch.meshgrid(*[(torch.arange(count) + 0.5) / count for count in counts], indexing="ij")
             shares = torch.stack(grids, dim=-1).reshape(-1, len(dofs))
@@ -258,7 +258,7 @@ class _Search:
         """Return the data of the subset nearest to a limb's root (B, 3) that the trunk leaves, and losses (B, 1, M)."""
         distance = (self.subset.data - root.unsqueeze(1)).norm(dim=-1)
         count = math.ceil(min(1.0, _PLACEMENT.near_shares / len(self.limbs.limbs)) * distance.shape[1])
-        index = (distance / (losses[:, 0] + _PLACEMENT.least_loss)).topk(count, dim=1, largest=False).indices
+        index = (distance / (losses[:, 0] + _PLACEMENT.min_loss)).topk(count, dim=1, largest=False).indices
         near = replace(self.subset, data=take_rows(self.subset.data, index), valid=self.subset.valid.gather(1, index))
         return near, losses.gather(2, index.unsqueeze(1))
 
@@ -266,7 +266,7 @@ class _Search:
         """Return the beam with one more body, at samples of its joints and as in ``pose``."""
         batch, count = beam.poses.shape[:2]
         dofs, samples = list(body.dofs), self.limbs.samples[body]
-        num_kept = min(len(samples), max(1, _PLACEMENT.most_tried // count - 1))
+        num_kept = min(len(samples), max(1, _PLACEMENT.max_tried // count - 1))
         kept = torch.linspace(0, len(samples) - 1, num_kept).round().long()
         samples = samples[kept]
         values = torch.cat([samples.expand(batch, *samples.shape), pose[:, None, dofs]], dim=1)
@@ -315,7 +315,7 @@ class _Search:
             gradient = (weighted.mT @ distance.unsqueeze(-1)).squeeze(-1) + precision * (values - mean)
             # A unit of precision holds joints that no datum reaches.
             hessian = weighted.mT @ jacobian + torch.diag_embed(precision + 1)
-            step = torch.linalg.solve(hessian, gradient).clamp(-_PLACEMENT.longest_step, _PLACEMENT.longest_step)
+            step = torch.linalg.solve(hessian, gradient).clamp(-_PLACEMENT.max_step, _PLACEMENT.max_step)
             poses = poses.clone()
             poses[..., dofs] = torch.minimum(torch.maximum(values - step, lower), upper)
         return poses

@@ -16,24 +16,24 @@ from torchreg.shapes.pose_algebra import BASE_DOFS, difference
 
 @dataclass(frozen=True)
 class _Trust:
-    """When a descent is trusted. Motions are of the base or the joints, radians."""
+    """Limits of a descent beyond which its minimum may be a wrong one."""
 
-    motion: float = 0.2  # one that went farther from its start is checked
-    lost_motion: float = 0.32  # one that went farther is taken for lost
-    gain: float = 1.0  # more data than this that a thorough search explains beyond it show that it was lost
-    clusters: float = 0.06  # so do clusters that hold more than this share of the data on the surface
+    motion: float = 0.2  # of the base or the joints, radians: beyond, limbs are placed anew from its end
+    far_motion: float = 0.32  # the same: beyond, candidates all around its start are tried, too
+    gain: float = 1.0  # in data explained by placing limbs anew: beyond, the same
+    clusters: float = 0.06  # data in unexplained clusters after that, as a share of those on the surface: the same
 
 
 @dataclass(frozen=True)
 class _Scatter:
-    """How candidates are scattered around a pose: standard deviations, and limbs that are drawn anew."""
+    """Scatter of candidates around a pose: standard deviations, and limbs that are drawn uniformly."""
 
     joints: float = 0.2  # as a share of their range
-    most_joints: float = 0.4  # at most, radians or metres
+    max_joints: float = 0.4  # radians or metres
     turn: float = 0.17  # of the base, radians
     shift: float = 0.035  # of the base, as a share of the model's size
     redrawn_limbs: float = 0.25  # share of the limbs that are drawn uniformly
-    redrawn_reach: float = 1.2  # from the pose, of the joints of such a limb, radians or metres
+    redrawn_reach: float = 1.2  # of the joints of such a limb from the pose, radians or metres
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class _Search:
     fit_steps: int = 2  # at each width of the coarse fit
     placed_share: float = 0.35  # of the candidates, the best, whose limbs are placed
     num_refined: int = 3  # candidates that are refined thoroughly, at most
-    data_per_candidate: int = 500  # of a candidate with its limbs in several positions
-    entries: int = 4_000_000  # of a table held at a time
+    data_per_candidate: int = 500  # on which it is measured, with its limbs in several positions
+    entries: int = 4_000_000  # of a table in memory
 
 
 _TRUST = _Trust()
@@ -53,7 +53,7 @@ _SEARCH = _Search()
 
 
 def needs_search(problem: AlignProblem, start: Tensor, pose: Tensor) -> Tensor:
-    """Return which problems (B,) a single descent cannot be trusted with.
+    """Return a mask (B,) of problems with which a single descent cannot be trusted.
 
     Either it went far from its start, where other minima are as near; or it leaves an unexplained cluster of data.
     """
@@ -82,8 +82,8 @@ def explore(
 ) -> Tensor:
     """Return the best poses found around the starts; the problems of a batch are searched together.
 
-    Limbs are placed anew where the descent ended. Where that shows that it was lost, candidates are scattered around
-    the start and what became of it, and fitted in one batch; the funnel of `PoseSearch` does the rest.
+    Limbs are placed anew from the descended pose. Where that shows that it was in a wrong minimum, candidates are
+    scattered around the start and the best pose so far, and go through `PoseSearch` in one batch.
 
     Args:
         problem: the batch.
@@ -109,14 +109,14 @@ def explore(
 def _explore(
     problem: AlignProblem, start: Tensor, descended: Tensor, candidates: int, rounds: int, generator: torch.Generator
 ) -> Tensor:
-    """Return the best of a thorough search from each descent and, where that shows it lost, of one from all around."""
+    """Return the best poses of a thorough search from each descent and, where needed, of one from all around."""
     search = PoseSearch(problem, generator)
     before = search.fitted_score(descended)
     poses, scores = search.refine(descended.unsqueeze(1), 1)
     best, score = poses[:, 0], scores[:, 0]
     clustered, near = clustered_data(search.problem, best)
     doubtful = (before - score > _TRUST.gain) | (clustered > _TRUST.clusters * near)
-    rows = (doubtful | (_motion(start, best) > _TRUST.lost_motion)).nonzero()[:, 0]
+    rows = (doubtful | (_motion(start, best) > _TRUST.far_motion)).nonzero()[:, 0]
     if len(rows) == 0:
         return best
     found, value = _search_around(search.rows(rows), start[rows], best[rows], candidates, rounds, generator)
@@ -128,7 +128,7 @@ def _explore(
 def _search_around(
     search: PoseSearch, start: Tensor, best: Tensor, candidates: int, rounds: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Return the poses that the funnel finds from candidates around starts and the best so far, and scores (B,)."""
+    """Return the poses found from candidates around the starts and the best poses so far, and scores (B,)."""
     scattered = [_scatter(search, center, max(1, candidates // 2), generator) for center in (start, best)]
     pool = search.fit_coarsely(torch.cat([*scattered, best.unsqueeze(1)], dim=1), _SEARCH.fit_steps)
     placed = search.prune(pool[:, : max(1, round(_SEARCH.placed_share * pool.shape[1]))], _SEARCH.num_refined)
@@ -147,7 +147,7 @@ def _scatter(search: PoseSearch, center: Tensor, count: int, generator: torch.Ge
     """Return (B, count, num_dofs) candidates; the first is the center itself."""
     problem = search.problem
     shape = problem.skin.shape
-    scale = (_SCATTER.joints * (shape.upper - shape.lower)).clamp_max(_SCATTER.most_joints)
+    scale = (_SCATTER.joints * (shape.upper - shape.lower)).clamp_max(_SCATTER.max_joints)
     scale[:3], scale[3:BASE_DOFS] = _SCATTER.shift * problem.size, _SCATTER.turn
     noise = torch.randn(count, shape.num_dofs, generator=generator).to(center) * scale
     noise[0] = 0

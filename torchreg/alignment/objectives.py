@@ -15,7 +15,7 @@ from torchreg.solvers.e_step import EStep
 from torchreg.solvers.levenberg_marquardt import Linearization
 from torchreg.solvers.robust import welsch_weight
 
-# The base is damped, in the Hessian alone, as by this share of a datum: more slows starts that few data reach.
+# The base is damped, in the Hessian alone, as if by this share of a datum: more slows down starts near few data.
 _BASE_DAMPING_DATA = 0.1
 
 

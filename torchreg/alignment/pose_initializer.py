@@ -14,12 +14,12 @@ from torchreg.alignment.clusters import clustered_data
 from torchreg.alignment.confidence import EVIDENCE
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.implicit_gradient import FixedPoint, attach_gradients
+from torchreg.alignment.inputs import check_clouds, check_skin
 from torchreg.alignment.objectives import GaussianPosePrior
 from torchreg.alignment.problem import (
     BROAD_PRIOR,
     AlignProblem,
     centered_problem,
-    check_clouds,
     masked_mean,
     shifted,
     soft_inliers,
@@ -35,12 +35,12 @@ from torchreg.shapes.surface import FusedSurface
 
 @dataclass(frozen=True)
 class _Batching:
-    """Clouds at a time."""
+    """Number of clouds in one batch."""
 
-    cpu_searched: int = 1  # caches hold no more
-    searched: int = 256  # on other devices, which they keep busy
-    cpu_fitted: int = 64  # more are no faster, and would not fit into memory
-    fitted: int = 4096  # the same on other devices
+    cpu_searched: int = 1  # of a search on a CPU, whose caches hold no more
+    searched: int = 256  # of a search on other devices, which these keep busy
+    cpu_fitted: int = 64  # of fits without gradients on a CPU, where more are no faster
+    fitted: int = 4096  # of fits without gradients on other devices, into whose memory these fit
 
 
 _BATCHING = _Batching()
@@ -143,9 +143,8 @@ class PoseInitializer(nn.Module):
         super().__init__()
         self.config = config or PoseInitializerConfig()
         self.shape = shape
-        if model_points is not None and model_points.shape is not shape:
-            raise InputError("model_points is a skin of another shape; build it from the shape whose pose is sought")
-        self.skin = sample_skin(shape, self.config.num_model_points) if model_points is None else model_points
+        count = self.config.num_model_points
+        self.skin = sample_skin(shape, count) if model_points is None else check_skin(shape, model_points)
 
     def forward(self, points: Tensor, mask: Tensor | None = None, start: Tensor | None = None) -> InitialPose:
         """Return the poses of the shape in clouds.
@@ -212,7 +211,7 @@ class PoseInitializer(nn.Module):
                 pose = self._fit_surface(problem, problem.clamp(shifted(found, -origin)))
             else:
                 pose = self._fit_surface(problem, self._anneal(problem, problem.clamp(problem.prior.mean)))
-            # A file's own mesh, whose nearest points jump, has no smooth fixed point: the solids have.
+            # The mesh of a file, whose nearest points jump, has no smooth fixed point: the solids have.
             problem = replace(problem, surface=FusedSurface(self.shape))
             fixed, pose = self._last_fit(problem, pose, holds_base=start is not None)
             confidence = confidence * _explained_share(problem, pose)

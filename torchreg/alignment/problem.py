@@ -1,17 +1,13 @@
-"""A batch of alignments as every stage sees it: checked data in centered coordinates, limits, prior, sizes."""
+"""A batch of alignments as every stage sees it: data in centered coordinates, limits, prior, sizes."""
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_shape
 from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
-from torchreg.errors import InputError, InputTypeError, UnitsWarning
-from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.kinematics import stack_sizes
 from torchreg.shapes.pose_algebra import BASE_DOFS
@@ -37,16 +33,8 @@ _DENSE_SKIN_POINTS = 2500
 
 
 @dataclass(frozen=True)
-class UnitsCheck:
-    """When data and shape must be in different units."""
-
-    ratio: float = 30.0  # of their sizes, from which no pose or crop explains the difference
-    min_data: int = 10  # fewer data have no reliable size
-
-
-@dataclass(frozen=True)
 class BroadPrior:
-    """Standard deviations of a pose of which nothing is known but that it is plausible."""
+    """Standard deviations of a plausible pose of which nothing else is known."""
 
     turn: float = 1.0  # of hinges and of the base's rotation, radians: a third of a half turn
     shift: float = 0.5  # of sliding joints and of the base's position, as a share of the model's size
@@ -57,13 +45,12 @@ class BroadPrior:
         return torch.where(shape.is_sliding, (self.shift * size) ** -2, turns)
 
 
-UNITS = UnitsCheck()
 BROAD_PRIOR = BroadPrior()
 
 
 @dataclass(frozen=True)
 class AlignProblem:
-    """A batch of alignments of one shape: what every stage works on.
+    """A batch of alignments of one shape, the input of every stage.
 
     Args:
         skin: the model points.
@@ -136,8 +123,8 @@ class AlignProblem:
         The default damping, that of an untried problem, suits an EM, whose objective changes with every E-step anyway.
         """
         shares = torch.full_like(pose[:, 0], damping)
-        held = held_at_limits(around.gradient, pose, self.lower, self.upper)
-        step, _ = damped_step(around, shares, frozen=held)
+        frozen = held_at_limits(around.gradient, pose, self.lower, self.upper)
+        step, _ = damped_step(around, shares, frozen=frozen)
         return LMResult(self.clamp(self.skin.shape.retract(pose, step)), around.cost, shares, step, 1)
 
     def change(self, step: Tensor) -> Tensor:
@@ -155,55 +142,6 @@ class AlignProblem:
 
 def _rows(limits: Tensor, index: Tensor) -> Tensor:
     return limits if limits.ndim == 1 else limits[index]
-
-
-def check_clouds(
-    shape: ArticulatedShape,
-    clouds: Tensor,
-    mask: Tensor | None,
-    nan_policy: str,
-    *,
-    name: str = "data",
-    mask_name: str = "mask",
-    omit_option: str = "nan_policy='omit'",
-) -> tuple[Tensor, Tensor]:
-    """Return clouds (..., M, 3) in the shape's dtype and their valid points (..., M): neither masked nor left out.
-
-    Args:
-        shape: whose dtype and device the clouds take.
-        clouds: (M, 3) or (B, M, 3).
-        mask: (M,) or (B, M), False where clouds are padding.
-        nan_policy: "raise", or "omit" to leave out points that are not finite.
-        name: of the argument, for the message.
-        mask_name: of the mask's argument.
-        omit_option: setting that leaves out points that are not finite, for the message.
-
-    Raises:
-        InputError: if the clouds are empty, not finite, or do not fit the mask.
-        InputTypeError: if something has the wrong type.
-    """
-    clouds = as_float_tensor(clouds, name, like=shape.rest)
-    if clouds.ndim not in (2, 3):
-        raise InputError(f"{name} must have shape (M, 3) or (B, M, 3), got {tuple(clouds.shape)}")
-    check_shape(clouds, name, ("M", 3), batch=True)
-    if clouds.shape[-2] == 0 or clouds.shape[0] == 0:
-        raise InputError(f"{name} must hold at least one point, got shape {tuple(clouds.shape)}")
-    valid = torch.ones_like(clouds[..., 0], dtype=torch.bool)
-    if mask is not None:
-        if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
-            raise InputTypeError(f"{mask_name} must be a tensor of bool, False where {name} are padding")
-        if mask.shape != valid.shape:
-            expected, got = tuple(valid.shape), tuple(mask.shape)
-            raise InputError(f"{mask_name} must have shape {expected} like the {name}, got {got}")
-        valid = mask.to(clouds.device)
-    finite = torch.isfinite(clouds).all(-1)
-    bad = int((valid & ~finite).sum())
-    if bad and nan_policy == "raise":
-        raise InputError(f"{name} hold {bad} points that are not finite; drop them or set {omit_option}")
-    valid = valid & finite
-    if not bool(valid.any()):
-        raise InputError(f"{name} hold no point that is finite and not masked")
-    return torch.where(valid.unsqueeze(-1), clouds, 0.0), valid
 
 
 def masked_mean(data: Tensor, valid: Tensor) -> Tensor:
@@ -299,25 +237,3 @@ def alignment_cost(problem: AlignProblem, pose: Tensor, distances: Tensor | None
     distances = problem.surface.distance(problem.data, pose) if distances is None else distances
     outliers = welsch_loss((distances / (INLIER_SHARE * problem.size)).square())
     return (outliers * problem.valid).sum(-1) + PRIOR_SHARE * problem.prior.cost(pose)
-
-
-def warn_about_units(data: Tensor, valid: Tensor, size: float, *, stacklevel: int) -> bool:
-    """Return whether data cannot be in the units of a shape, as with millimeters for metres, after a `UnitsWarning`.
-
-    Args:
-        data: ((B,) M, 3) of which each cloud has its mean at the origin; few of them have no reliable size.
-        valid: ((B,) M) False where padded.
-        size: of the shape, metres.
-        stacklevel: of the warning: 1 for the caller.
-    """
-    radius = torch.where(valid, data.norm(dim=-1), torch.nan).nanmedian(-1).values
-    ratio = 2 * float(radius.nanmedian()) / size
-    if int(valid.sum(-1).max()) < UNITS.min_data or 1 / UNITS.ratio < ratio < UNITS.ratio:
-        return False
-    warnings.warn(
-        f"the data spread over {ratio:.3g} times the model's size of {size:.3g} m: are they in metres? "
-        f"Scale them, by 0.001 if they are in millimeters",
-        UnitsWarning,
-        stacklevel=stacklevel + 1,
-    )
-    return True

@@ -26,9 +26,9 @@ class _RigidEM:
     widths: tuple[float, ...] = (0.14, 0.14, 0.1, 0.1, 0.07, 0.07, 0.07, 0.05, 0.05, 0.05)  # sigma of each EM step
     num_points: int = 60  # model points
     num_data: int = 120  # drawn per cloud
-    outlier: float = 0.3  # of the usual constant: few model points share a datum
-    score_width: float = 0.05  # sigma of the kernel that ranks the poses
-    model_weight: float = 0.5  # in the ranking, of model points without data beside that of data without model points
+    outlier: float = 0.3  # as a share of the usual outlier constant, since few model points share a datum
+    score_width: float = 0.05  # sigma of the kernel in the cost
+    model_weight: float = 0.5  # in the cost, of model points far from the data, beside that of data far from the model
 
 
 _RIGID_EM = _RigidEM()

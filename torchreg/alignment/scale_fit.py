@@ -16,7 +16,7 @@ from torchreg.shapes.primitives import fuse
 from torchreg.solvers.levenberg_marquardt import Linearization
 from torchreg.solvers.robust import welsch_loss, welsch_weight
 
-# No part shrinks or grows beyond this factor, as a logarithm, of what it was.
+# Largest change of the logarithm of a length or a radius.
 _MAX_LOG_SCALE = 0.7
 
 

@@ -92,7 +92,7 @@ class SigmaSchedule:
         """Return the conventional schedule: sigma is re-estimated from the residuals, never below ``stop``.
 
         Each M-step ends with the sigma that maximizes eq. 19 (see `estimate_sigma`), between ``start`` and ``stop``.
-        The paper observes that it falls too quickly and gets trapped; it is here for comparison. Arguments and errors
+        The paper observes that it falls too quickly and gets trapped; it serves for comparison. Arguments and errors
         are those of `geometric`.
         """
         _check_range(start, stop, steps)

@@ -31,7 +31,7 @@ class _ChainFit:
     """Numbers of fitting the chains of a shape to limbs."""
 
     num_mappings: int = 6  # of limbs to chains whose poses are fitted, per typical pose
-    missing: float = 10.0  # cost of a chain without a limb: only where there is none
+    missing: float = 10.0  # cost of a chain without a limb: so high that it is only where limbs are lacking
     steps: int = 15  # of the fit
     joint_std: float = 0.02  # distance of joints from the curves, as a share of the size of the shape
     num_vertices: int = 6000  # of a surface whose skeleton is taken: limbs need no more
@@ -49,7 +49,7 @@ class SpineLimbs:
     its bones from the tip, and the pose is fitted to all targets within the limits.
 
     Args:
-        skeleton: of the cloud, such as one frame of a spine or what `skeletonize` returns.
+        skeleton: of the cloud, such as one frame of a spine or the result of `skeletonize`.
         middle: (3,) mean of the data that are given to `find_pose`, in the coordinates of the skeleton.
         count: poses proposed.
 

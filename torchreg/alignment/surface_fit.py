@@ -21,18 +21,18 @@ _MAD_TO_STD = 1.4826
 class SurfaceFit:
     """Numbers of the surface fit; widths are shares of the model's size."""
 
-    widths: tuple[float, ...] = (0.045, 0.022)  # of the kernel before the last one, which follows from the noise
-    least_width: float = 0.003  # of the last kernel: solids and skins are no closer to the thing
-    most_width: float = 0.02  # of the last kernel: data beyond are outliers
-    width_per_noise: float = 2.5  # a Welsch kernel this wide is almost as efficient as least squares on Gaussian noise
-    last_steps: int = 3  # the last width takes this many times the steps of the others
-    search_steps: int = 4  # at each width after a search, whose time they hardly add to
+    widths: tuple[float, ...] = (0.045, 0.022)  # of the kernel, before the last one, which follows from the noise
+    min_width: float = 0.003  # of the last kernel: the model itself is no more exact
+    max_width: float = 0.02  # of the last kernel: data beyond are outliers
+    width_per_noise: float = 2.5  # at which a Welsch kernel is almost as efficient as least squares on Gaussian noise
+    last_steps: int = 3  # at the last width, as a multiple of those at the others
+    search_steps: int = 4  # at each width after a search, to whose time they hardly add
     refine_damping: float = 1e-5  # of untested steps from a pose that is known to a few degrees
     lever: float = 0.25  # typical distance of the surface from the base's axis of rotation
 
-    def most_noise(self, size: float) -> float:
-        """Return the largest standard deviation, metres, that data on a model of some size are taken to have."""
-        return self.most_width * size / self.width_per_noise
+    def max_noise(self, size: float) -> float:
+        """Return the largest noise of data on a model of some size, as a standard deviation, metres."""
+        return self.max_width * size / self.width_per_noise
 
 
 SURFACE_FIT = SurfaceFit()
@@ -60,7 +60,7 @@ def fit_surface(
 
     References: Dewaele et al. 2006, section 3.4.
     """
-    noise = torch.full_like(pose[:, 0], SURFACE_FIT.most_noise(problem.size))
+    noise = torch.full_like(pose[:, 0], SURFACE_FIT.max_noise(problem.size))
     num_steps = len(widths) + 1
     for number, width in enumerate(widths):
         sigma = torch.full_like(noise, width * problem.size)
@@ -96,7 +96,7 @@ class SurfaceResult:
 
 def refine_surface(problem: AlignProblem, pose: Tensor, *, steps: int, widths: Sequence[float]) -> SurfaceResult:
     """Return the pose that `fit_surface` reaches from nearby, in half the time: its last steps are not tested."""
-    noise = torch.full_like(pose[:, 0], SURFACE_FIT.most_noise(problem.size))
+    noise = torch.full_like(pose[:, 0], SURFACE_FIT.max_noise(problem.size))
     for width in widths:
         pose = surface_steps(problem, pose, torch.full_like(noise, width * problem.size), noise, steps).state
     distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
@@ -154,8 +154,8 @@ def surface_noise(distance: Tensor, valid: Tensor, size: float) -> Tensor:
     distance = distance.abs()
     near = (distance < SURFACE_FIT.widths[-1] * size) & valid
     median = torch.where(near, distance, torch.nan).nanmedian(-1).values
-    least, most = SURFACE_FIT.least_width * size / SURFACE_FIT.width_per_noise, SURFACE_FIT.most_noise(size)
-    return torch.nan_to_num(_MAD_TO_STD * median, nan=most).clamp(least, most)
+    lowest, highest = SURFACE_FIT.min_width * size / SURFACE_FIT.width_per_noise, SURFACE_FIT.max_noise(size)
+    return torch.nan_to_num(_MAD_TO_STD * median, nan=highest).clamp(lowest, highest)
 
 
 def pose_covariance(jacobian: Tensor, weights: Tensor, noise: Tensor, precision: Tensor) -> Tensor:
