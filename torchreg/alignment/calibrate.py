@@ -16,24 +16,13 @@ from torchreg.alignment.align import AlignConfig, align
 from torchreg.alignment.inputs import check_clouds
 from torchreg.alignment.problem import model_size
 from torchreg.alignment.results import Calibration
-from torchreg.alignment.scale_fit import ScalePrior, ScaleProblem
+from torchreg.alignment.scale_fit import JOINT_FIT, ScalePrior, ScaleProblem
 from torchreg.alignment.surface_fit import SURFACE_FIT
 from torchreg.errors import InputError
 from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import sample_skin
 from torchreg.solvers.levenberg_marquardt import levenberg_marquardt
-
-
-@dataclass(frozen=True)
-class _JointFit:
-    """Numbers of a joint fit."""
-
-    shared_error: float = 1.5  # factor on the noise: neighboring residuals share the error of the shape's surface
-    last_steps: int = 2  # the last width takes this many times the steps of the others
-
-
-_JOINT_FIT = _JointFit()
 
 
 @dataclass(frozen=True)
@@ -178,12 +167,12 @@ def _fit_jointly(
         noise = problem.noise(state) if is_last else SURFACE_FIT.max_noise(problem.size)
         sigma = SURFACE_FIT.width_per_noise * noise if is_last else widths[step] * problem.size
         solved = levenberg_marquardt(
-            partial(problem.linearize, sigma=sigma, noise=_JOINT_FIT.shared_error * noise),
+            partial(problem.linearize, sigma=sigma, noise=JOINT_FIT.shared_error * noise),
             state,
             retract=problem.retract,
             lower=problem.lower,
             upper=problem.upper,
-            max_steps=config.steps * (_JOINT_FIT.last_steps if is_last else 1),
+            max_steps=config.steps * (JOINT_FIT.last_steps if is_last else 1),
             atol=config.align.pose_atol * min(1.0, problem.size),
         )
         state = solved.state

@@ -16,8 +16,17 @@ from torchreg.shapes.primitives import fuse
 from torchreg.solvers.levenberg_marquardt import Linearization
 from torchreg.solvers.robust import welsch_loss, welsch_weight
 
-# Largest change of the logarithm of a length or a radius.
-_MAX_LOG_SCALE = 0.7
+
+@dataclass(frozen=True)
+class JointFit:
+    """Numbers of a joint fit."""
+
+    shared_error: float = 1.5  # factor on the noise: neighboring residuals share the error of the shape's surface
+    last_steps: int = 2  # at the last width, as a multiple of those at the others
+    max_log_scale: float = 0.7  # largest change of the logarithm of a length or a radius
+
+
+JOINT_FIT = JointFit()
 
 
 @dataclass(frozen=True)
@@ -108,8 +117,8 @@ class ScaleProblem:
         self.data, self.valid = torch.where(valid.unsqueeze(-1), data - mean.unsqueeze(1), 0.0), valid
         self.shift = pad(mean, (0, shape.num_dofs - 3))
         self.prior = replace(prior, poses=prior.poses - self.shift)
-        self.lower = torch.cat([(shape.lower - self.shift).flatten(), prior.scales - _MAX_LOG_SCALE])
-        self.upper = torch.cat([(shape.upper - self.shift).flatten(), prior.scales + _MAX_LOG_SCALE])
+        self.lower = torch.cat([(shape.lower - self.shift).flatten(), prior.scales - JOINT_FIT.max_log_scale])
+        self.upper = torch.cat([(shape.upper - self.shift).flatten(), prior.scales + JOINT_FIT.max_log_scale])
 
     def state(self, poses: Tensor) -> Tensor:
         """Return the state (1, T num_dofs + 2 P) of poses and of the shape as it is."""
