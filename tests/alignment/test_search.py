@@ -294,6 +294,18 @@ def test_a_search_that_improves_nothing_returns_the_descent(problem, exact, plai
     assert float(tip_errors(plain_hand, found, exact).max()) < 0.008
 
 
+def test_something_dense_beside_the_shape_misleads_no_search(misled, plain_hand, exact):
+    """It remains an unexplained cluster, for which further candidates are refined in vain."""
+    problem, start = misled
+    middle = problem.data.mean(1, keepdim=True) + torch.tensor([0.0, 0.0, 0.12])
+    ball = middle + 0.012 * torch.nn.functional.normalize(torch.randn(2, 60, 3, generator=generator(2)), dim=-1)
+    data = torch.cat([problem.data, ball], dim=1)
+    cluttered = replace(problem, data=data, valid=torch.ones(2, 460, dtype=torch.bool))
+    assert leaves_clusters(cluttered, exact).all()
+    found = explore(cluttered, start, start, candidates=16, rounds=1, generator=generator(4))
+    assert float(tip_errors(plain_hand, found, exact).max()) < 0.015
+
+
 def test_searched_in_parts_a_batch_ends_where_it_ends_as_a_whole(misled, plain_hand, exact, monkeypatch):
     monkeypatch.setattr(local_search, "_SEARCH", replace(local_search._SEARCH, entries=1))
     found = explore(*misled, misled[1], candidates=16, rounds=2, generator=generator(4))
