@@ -307,7 +307,7 @@ def test_something_dense_beside_the_shape_misleads_no_search(misled, plain_hand,
 
 
 def test_searched_in_parts_a_batch_ends_where_it_ends_as_a_whole(misled, plain_hand, exact, monkeypatch):
-    monkeypatch.setattr(local_search, "_SEARCH", replace(local_search._SEARCH, entries=1))
+    monkeypatch.setattr(local_search, "_AROUND", replace(local_search._AROUND, entries=1))
     found = explore(*misled, misled[1], candidates=16, rounds=2, generator=generator(4))
     assert float(tip_errors(plain_hand, found, exact).max()) < 0.015
 

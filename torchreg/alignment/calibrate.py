@@ -16,7 +16,7 @@ from torchreg.alignment.align import AlignConfig, align
 from torchreg.alignment.inputs import check_clouds
 from torchreg.alignment.problem import model_size
 from torchreg.alignment.results import Calibration
-from torchreg.alignment.scale_fit import JOINT_FIT, ScalePrior, ScaleProblem
+from torchreg.alignment.scale_fit import SCALE_FIT, ScalePrior, ScaleProblem
 from torchreg.alignment.surface_fit import SURFACE_FIT
 from torchreg.errors import InputError
 from torchreg.result import Status
@@ -167,12 +167,12 @@ def _fit_jointly(
         noise = problem.noise(state) if is_last else SURFACE_FIT.max_noise(problem.size)
         sigma = SURFACE_FIT.width_per_noise * noise if is_last else widths[step] * problem.size
         solved = levenberg_marquardt(
-            partial(problem.linearize, sigma=sigma, noise=JOINT_FIT.shared_error * noise),
+            partial(problem.linearize, sigma=sigma, noise=SCALE_FIT.shared_error * noise),
             state,
             retract=problem.retract,
             lower=problem.lower,
             upper=problem.upper,
-            max_steps=config.steps * (JOINT_FIT.last_steps if is_last else 1),
+            max_steps=config.steps * (SCALE_FIT.last_steps if is_last else 1),
             atol=config.align.pose_atol * min(1.0, problem.size),
         )
         state = solved.state

@@ -37,7 +37,7 @@ class _Scatter:
 
 
 @dataclass(frozen=True)
-class _Search:
+class _Around:
     """Numbers of the search all around a start."""
 
     fit_steps: int = 2  # at each width of the coarse fit
@@ -49,7 +49,7 @@ class _Search:
 
 _TRUST = _Trust()
 _SCATTER = _Scatter()
-_SEARCH = _Search()
+_AROUND = _Around()
 
 
 def needs_search(problem: AlignProblem, start: Tensor, pose: Tensor) -> Tensor:
@@ -96,8 +96,8 @@ def explore(
     Returns:
         (B, num_dofs).
     """
-    per_problem = candidates * _SEARCH.data_per_candidate * problem.skin.shape.num_parts
-    rows = torch.arange(len(start), device=start.device).split(max(1, _SEARCH.entries // per_problem))
+    per_problem = candidates * _AROUND.data_per_candidate * problem.skin.shape.num_parts
+    rows = torch.arange(len(start), device=start.device).split(max(1, _AROUND.entries // per_problem))
     state, found = generator.get_state(), []
     for row in rows:
         # The draws for a problem do not depend on the others.
@@ -130,8 +130,8 @@ def _search_around(
 ) -> tuple[Tensor, Tensor]:
     """Return the poses found from candidates around the starts and the best poses so far, and scores (B,)."""
     scattered = [_scatter(search, center, max(1, candidates // 2), generator) for center in (start, best)]
-    pool = search.fit_coarsely(torch.cat([*scattered, best.unsqueeze(1)], dim=1), _SEARCH.fit_steps)
-    placed = search.prune(pool[:, : max(1, round(_SEARCH.placed_share * pool.shape[1]))], _SEARCH.num_refined)
+    pool = search.fit_coarsely(torch.cat([*scattered, best.unsqueeze(1)], dim=1), _AROUND.fit_steps)
+    placed = search.prune(pool[:, : max(1, round(_AROUND.placed_share * pool.shape[1]))], _AROUND.num_refined)
     poses, scores = search.refine(placed[:, :1], rounds)
     found, value = poses[:, 0], scores[:, 0]
     rows = leaves_clusters(search.problem, found).nonzero()[:, 0]

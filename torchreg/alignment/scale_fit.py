@@ -18,7 +18,7 @@ from torchreg.solvers.robust import welsch_loss, welsch_weight
 
 
 @dataclass(frozen=True)
-class JointFit:
+class ScaleFit:
     """Numbers of a joint fit."""
 
     shared_error: float = 1.5  # factor on the noise: neighboring residuals share the error of the shape's surface
@@ -26,7 +26,7 @@ class JointFit:
     max_log_scale: float = 0.7  # largest change of the logarithm of a length or a radius
 
 
-JOINT_FIT = JointFit()
+SCALE_FIT = ScaleFit()
 
 
 @dataclass(frozen=True)
@@ -117,8 +117,8 @@ class ScaleProblem:
         self.data, self.valid = torch.where(valid.unsqueeze(-1), data - mean.unsqueeze(1), 0.0), valid
         self.shift = pad(mean, (0, shape.num_dofs - 3))
         self.prior = replace(prior, poses=prior.poses - self.shift)
-        self.lower = torch.cat([(shape.lower - self.shift).flatten(), prior.scales - JOINT_FIT.max_log_scale])
-        self.upper = torch.cat([(shape.upper - self.shift).flatten(), prior.scales + JOINT_FIT.max_log_scale])
+        self.lower = torch.cat([(shape.lower - self.shift).flatten(), prior.scales - SCALE_FIT.max_log_scale])
+        self.upper = torch.cat([(shape.upper - self.shift).flatten(), prior.scales + SCALE_FIT.max_log_scale])
 
     def state(self, poses: Tensor) -> Tensor:
         """Return the state (1, T num_dofs + 2 P) of poses and of the shape as it is."""
