@@ -24,7 +24,7 @@ class OffSurface:
 
 
 @dataclass(frozen=True)
-class ClusterTest:
+class ClusterThresholds:
     """Thresholds of clusters, and of the number of data in them that is worth a search."""
 
     neighbors: int = 5  # off the surface within the radius, at least
@@ -36,7 +36,7 @@ class ClusterTest:
 
 
 OFF_SURFACE = OffSurface()
-CLUSTERS = ClusterTest()
+CLUSTERS = ClusterThresholds()
 
 
 def leaves_clusters(problem: AlignProblem, pose: Tensor) -> Tensor:
