@@ -29,7 +29,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torchreg as tr
-from torchreg.alignment.objectives import PosePrior, SurfaceObjective
+from torchreg.alignment.objectives import GaussianPosePrior, SurfaceObjective
 from torchreg.datasets.hand import HandCloud, hand_motion, make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.datasets.sequences import other_hand, range_clouds
 from torchreg.shapes.skin import sample_skin
@@ -122,7 +122,7 @@ def prior_precision(hand: tr.Hand) -> Tensor:
 def least_squares(hand: tr.Hand, trial: Trial, variant: str) -> Tensor:
     """Return the pose of least squared surface distances of the true inliers, from the true pose."""
     data = trial.cloud.points[trial.cloud.inliers].unsqueeze(0)
-    prior = PosePrior(trial.starts[variant].unsqueeze(0), prior_precision(hand))
+    prior = GaussianPosePrior(trial.starts[variant].unsqueeze(0), prior_precision(hand))
     wide, noise = torch.tensor([1e3 * NOISE]), torch.tensor([NOISE])
     objective = SurfaceObjective(FusedSurface(hand), data, torch.ones_like(data[..., 0]), wide, noise, prior)
     with torch.no_grad():

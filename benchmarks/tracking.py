@@ -42,7 +42,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torchreg as tr
-from torchreg.alignment.objectives import PosePrior, SurfaceObjective
+from torchreg.alignment.objectives import GaussianPosePrior, SurfaceObjective
 from torchreg.datasets.hand import HandCloud, surface_skin
 from torchreg.datasets.sequences import hand_sequence, other_hand, rig_sequence
 from torchreg.geometry.rotation import compose_rotation_vectors
@@ -143,7 +143,7 @@ def least_squares(hand: tr.Hand, clouds: Sequence[HandCloud]) -> Tensor:
         data, pose = cloud.points[cloud.inliers][None], cloud.pose[None]
         wide, noise = torch.tensor([0.1]), torch.tensor([NOISE])
         objective = SurfaceObjective(
-            FusedSurface(hand), data, torch.ones_like(data[..., 0]), wide, noise, PosePrior(pose, precision)
+            FusedSurface(hand), data, torch.ones_like(data[..., 0]), wide, noise, GaussianPosePrior(pose, precision)
         )
         with torch.no_grad():
             found = levenberg_marquardt(

@@ -14,7 +14,7 @@ __version__ = "0.1.0"
 # checkers the same, is written from this table by tests/test_init.py.
 _NAMES = {
     "alignment.align": "AlignConfig align",
-    "alignment.calibrate": "calibrate",
+    "alignment.calibrate": "CalibrateConfig calibrate",
     "alignment.em_loss": "EMLoss",
     "alignment.find_pose": "FindPoseConfig find_pose",
     "alignment.pose_initializer": "InitialPose PoseInitializer PoseInitializerConfig",

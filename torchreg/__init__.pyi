@@ -3,6 +3,7 @@ from torchreg import errors as errors
 from torchreg import metrics as metrics
 from torchreg.alignment.align import AlignConfig as AlignConfig
 from torchreg.alignment.align import align as align
+from torchreg.alignment.calibrate import CalibrateConfig as CalibrateConfig
 from torchreg.alignment.calibrate import calibrate as calibrate
 from torchreg.alignment.em_loss import EMLoss as EMLoss
 from torchreg.alignment.find_pose import FindPoseConfig as FindPoseConfig
@@ -70,6 +71,7 @@ __all__ = [
     "AlignResult",
     "ArticulatedShape",
     "BendingSkin",
+    "CalibrateConfig",
     "Calibration",
     "Camera",
     "CameraRig",

@@ -132,6 +132,12 @@ def test_clouds_of_a_batch_and_padding_change_nothing(plain_hand, problem, truth
     torch.testing.assert_close(together[1:], pose_confidence(alone, truth, SURE), rtol=1e-4, atol=1e-6)
 
 
+def test_more_data_of_the_same_surface_say_the_same(plain_hand_skin, problem, truth):
+    """Limbs are looked for in a draw of many data."""
+    dense = problem_of(plain_hand_skin, noisy(problem.data.repeat(1, 5, 1)), truth)
+    assert float(known_ends(dense, truth)) == pytest.approx(float(known_ends(problem, truth)), abs=0.05)
+
+
 def test_no_data_and_no_prior_give_finite_answers(problem, truth):
     empty = replace(problem, valid=torch.zeros_like(problem.valid))
     loose = replace(empty, prior=replace(empty.prior, precision=torch.zeros_like(empty.prior.precision)))

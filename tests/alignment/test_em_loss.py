@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.func import grad, hessian, jacfwd, jacrev, vmap
 
-from torchreg.alignment import em_loss as em
 from torchreg.alignment.em_loss import EMLoss
 from torchreg.errors import InputError, InputTypeError
+from torchreg.solvers import e_step
 from torchreg.solvers.e_step import OUTLIER_CONSTANT, outlier_constant, posterior
 
 # torch's own forward mode compiles its decompositions with a deprecated call on first use.
@@ -35,7 +35,7 @@ def by_loops(posed, data, sigma, c):
 
 @pytest.fixture
 def small_chunks(monkeypatch):
-    monkeypatch.setattr(em, "_CHUNK_ENTRIES", 20)
+    monkeypatch.setattr(e_step, "_CHUNK_ENTRIES", 20)
 
 
 # --- value ---

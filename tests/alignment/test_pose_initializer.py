@@ -9,11 +9,9 @@ import torch
 from torchreg.alignment.find_pose import FindPoseConfig
 from torchreg.alignment.pose_initializer import InitialPose, PoseInitializer, PoseInitializerConfig
 from torchreg.datasets.hand import make_hand_cloud
-from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.hand import Hand
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.skin import LinearBlendSkin, bending_weights, sample_skin
 
@@ -328,21 +326,3 @@ def test_a_copy_on_any_device_finds_the_same(shape, skin, points, start, device)
         search, search_there = layer(points), there(points.to(device))
     torch.testing.assert_close(search_there.keypoints.cpu(), search.keypoints, atol=1e-4, rtol=0)
     torch.testing.assert_close(search_there.confidence.cpu(), search.confidence, atol=1e-3, rtol=0)
-
-
-def test_bad_input_is_told(shape, skin, points, start):
-    layer = PoseInitializer(shape, EXACT, model_points=skin)
-    with pytest.raises(InputError, match="start must have shape"):
-        layer(points, start=start[:2])
-    with pytest.raises(InputError, match="start must be finite"):
-        layer(points, start=start * torch.nan)
-    with pytest.raises(InputError, match="not finite"):
-        layer(points * torch.nan, start=start)
-    with pytest.raises(InputTypeError, match="mask must be"):
-        layer(points, torch.ones(3, 60), start)
-    with pytest.raises(InputError, match="skin of another shape"):
-        PoseInitializer(Hand(), model_points=skin)
-    with pytest.raises(InputError, match="noise must be positive"):
-        PoseInitializerConfig(noise=0.0)
-    with pytest.raises(InputError, match="fit_steps must be at least 1"):
-        PoseInitializerConfig(fit_steps=0)

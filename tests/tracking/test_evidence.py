@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchreg.alignment.objectives import PosePrior
+from torchreg.alignment.objectives import GaussianPosePrior
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.rotation import compose_rotation_vectors
@@ -79,6 +79,6 @@ def test_turns_compose_where_the_prior_holds_the_base():
     step = torch.tensor([[0.05, 0.0, 0.0]], dtype=torch.float64)
     pose = mean.clone()
     pose[:, 3:6] = compose_rotation_vectors(step, mean[:, 3:6])
-    prior = PosePrior(mean, torch.full((7,), 4.0, dtype=torch.float64), holds_base=True)
+    prior = GaussianPosePrior(mean, torch.full((7,), 4.0, dtype=torch.float64), holds_base=True)
     assert pose[0, 3] < 0
     assert torch.allclose(prior.cost(pose), 2 * step.square().sum(-1))

@@ -9,46 +9,42 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_choice, check_count, check_positive
 from torchreg._threads import one_thread
-from torchreg.alignment.annealed_em import (
-    CORRESPONDENCES,
-    OnStep,
-    StageResult,
-    fit_surface,
-    outlier_level,
-    register,
-)
-from torchreg.alignment.local_search import FINAL_SIGMAS, explore, needs_search
+from torchreg.alignment.annealed_em import ANNEALING, CORRESPONDENCES, OnStep, StageResult, anneal, outlier_level
+from torchreg.alignment.inputs import check_clouds, check_skin, warn_about_units
+from torchreg.alignment.local_search import explore, needs_search
 from torchreg.alignment.problem import (
     INLIER_SHARE,
     AlignProblem,
     alignment_cost,
     centered_problem,
-    check_data,
     masked_mean,
     shifted,
-    warn_about_units,
 )
 from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.sigma_schedule import SigmaSchedule
+from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.errors import InputError
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import BendingSkin, LinearBlendSkin, sample_skin
 from torchreg.solvers.e_step import expectation
 
-# Shares of the model's size, the diagonal of its rest pose.
-_START_SIGMA, _STOP_SIGMA = 0.08, 0.02
-# Fewer inliers than this, or than this share of the data, and the pose means nothing.
-_MIN_INLIERS, _MIN_INLIER_SHARE = 10, 0.02
-# Steps of the surface fit after a search, whose time they hardly add to.
-_SEARCHED_STEPS = 4
-# With as many data or more, all threads of torch are of use.
-_MANY = 10_000
+
+@dataclass(frozen=True)
+class _Limits:
+    """Limits of an alignment."""
+
+    min_inliers: int = 10  # fewer inliers, and the pose means nothing
+    min_share: float = 0.02  # the same, as a share of the data
+    many_data: int = 10_000  # in a batch, from which all threads of torch are of use
+
+
+_LIMITS = _Limits()
 
 
 @dataclass(frozen=True)
 class AlignConfig:
-    """How an alignment runs. Lengths default to shares of the model's size, so one configuration fits all shapes.
+    """Settings of an alignment. Lengths default to shares of the model's size, so one configuration fits all shapes.
 
     Args:
         schedule: sigma over the EM steps; by default geometric from 8 % to 2 % of the model's size in five steps.
@@ -60,11 +56,11 @@ class AlignConfig:
         num_candidates: poses that a search starts from.
         search_rounds: rounds of the search's last stage, which places every limb thoroughly.
         inlier_distance: data nearer to the fitted surface are inliers, metres; 2 % of the model's size by default.
-        correspondence: who matches whom: "em", the posterior; for comparison "softassign", one to one, or "closest",
-            the closest point as in ICP, trimmed at 1.5 sigma.
+        correspondence: rule that matches model points and data: "em", the posterior; for comparison "softassign", one
+            to one, or "closest", the closest point as in ICP, trimmed at 1.5 sigma.
         outlier: "limit" for c = 3 sqrt(pi / 2), "volume" for eq. 18 with the working volume.
-        debias: share of the pull of a wide kernel on the model itself that is taken from the EM's targets; 0 is the
-            paper's EM, which shrinks the model while sigma is wide.
+        debias: share of the shrinkage of the model by a wide kernel alone that is taken out of the EM's targets; 0 is
+            the paper's EM, which shrinks the model while sigma is wide.
         prior_std: standard deviation of a weak prior that holds joints near the initial pose, radians (of the whole
             rotation of a ball joint; sliding joints: as a share of the model's size); None for no prior.
         num_model_points: points sampled on the shape when none are given.
@@ -118,7 +114,7 @@ def align(
     config: AlignConfig | None = None,
     on_step: OnStep | None = None,
 ) -> AlignResult:
-    """Return the pose in which an articulated shape lies on 3-D data, with what was found on the way.
+    """Return the pose in which an articulated shape lies on 3-D data, with inliers, distances and posterior.
 
     Annealed EM registers model points to data points and rejects outliers; then the surface is fitted to the data.
     Where that cannot be trusted, candidates around the start are refined in one batch and recombined limb by limb.
@@ -153,162 +149,171 @@ def align(
     config = config or AlignConfig()
     # A sixth faster than without gradients alone, as most of the time goes to small operations.
     with torch.inference_mode():
-        data, valid = check_data(shape, data, mask, config.nan_policy)
-        pose = shape.rest_pose() if initial_pose is None else shape.check_pose(initial_pose, "initial_pose")
-        if not bool(torch.isfinite(pose).all()):
-            raise InputError("initial_pose must be finite")
-        starts = _num_starts(data, pose)
-        count = len(data) if data.ndim == 3 else max(starts, 1)
-        pose = shape.clamp(pose.expand(count, shape.num_dofs))
-        skin = _model_skin(shape, model_points, pose, config)
-        batch_data = data.expand(count, *data.shape[-2:])
-        batch_valid = valid.expand(count, valid.shape[-1])
-        origin = masked_mean(batch_data, batch_valid)
-        problem = centered_problem(
-            skin, batch_data, batch_valid, pose, origin, prior_std=config.prior_std, pose_atol=config.pose_atol,
-            outlier=config.outlier, debias=config.debias, correspondence=config.correspondence,
-        )  # fmt: skip
-        warn_about_units(problem)
-        pose = shifted(pose, -origin)
-        record = _Recorder(on_step, origin)
-        with one_thread(batch_valid.numel() < _MANY):
-            final = _descend(problem, pose, config, record)
-            if starts:
-                best = alignment_cost(problem, final.pose).argmin().unsqueeze(0)
-                problem, pose, origin, record = problem.rows(best), pose[best], origin[best], record.rows(best)
-                final = StageResult(final.pose[best], final.sigma[best], final.change[best])
-            final = _search_where_needed(problem, final, pose, config, record)
-        result = _result(problem, final, origin, config, tuple(record.history))
-        return normal_copy(_unbatched(result, 0) if data.ndim == 2 else result)
+        clouds, valid = check_clouds(shape, data, mask, config.nan_policy)
+        pose, several = _check_start(shape, initial_pose, clouds)
+        skin = _model_skin(shape, model_points, pose, config)  # the X_i of eq. 3
+        batch = _centered_batch(skin, clouds, valid, pose, config, on_step)
+        warn_about_units(batch.problem.data, batch.problem.valid, batch.problem.size, stacklevel=2)
+        with one_thread(batch.problem.valid.numel() < _LIMITS.many_data):
+            found = _register(batch, config)  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3
+            found = _fit_surface(batch, found, config)  # eqs. 21 and 22: section 3.4
+            batch, found = _best_start(batch, found) if several else (batch, found)
+            found = _search_where_needed(batch, found, config)
+        result = _result(batch, found, config)  # inliers by eq. 2, the posterior by eq. 17
+        return normal_copy(_unbatched(result) if clouds.ndim == 2 else result)
 
 
-class _Recorder:
-    """Keeps the records of all stages and passes them on, with poses in the coordinates of the data."""
+@dataclass(frozen=True)
+class _Batch:
+    """Alignments in centered coordinates.
 
-    def __init__(self, on_step: OnStep | None, origin: Tensor, history: list[AlignRecord] | None = None) -> None:
-        self.on_step, self.origin = on_step, origin
-        self.history: list[AlignRecord] = [] if history is None else history
+    Args:
+        problem: of B clouds.
+        start: (B, num_dofs).
+        origin: (B, 3) of the coordinates.
+        on_step: the caller's.
+        history: records of all stages, to which those of any rows are added.
+    """
 
-    def __call__(self, step: AlignRecord) -> None:
+    problem: AlignProblem
+    start: Tensor
+    origin: Tensor
+    on_step: OnStep | None
+    history: list[AlignRecord]
+
+    def record(self, step: AlignRecord) -> None:
+        """Keep the record of a step and pass it on, with poses in the coordinates of the data."""
         step = normal_copy(replace(step, pose=shifted(step.pose, self.origin)))
         self.history.append(step)
         if self.on_step is not None:
             with torch.inference_mode(False), torch.no_grad():
                 self.on_step(step)
 
-    def rows(self, index: Tensor) -> _Recorder:
-        """Return a recorder for some rows of the batch, which writes into the same history."""
-        return _Recorder(self.on_step, self.origin[index], self.history)
+    def rows(self, index: Tensor) -> _Batch:
+        """Return some rows of the batch."""
+        return replace(self, problem=self.problem.rows(index), start=self.start[index], origin=self.origin[index])
 
 
-def _descend(problem: AlignProblem, pose: Tensor, config: AlignConfig, record: OnStep) -> StageResult:
-    """Return the pose after registration and surface fit, the paper's two stages."""
-    schedule = config.schedule or SigmaSchedule.geometric(_START_SIGMA * problem.size, _STOP_SIGMA * problem.size)
-    final = register(problem, pose, schedule, em_steps=config.em_steps, m_steps=config.m_steps, on_step=record)
+def _check_start(shape: ArticulatedShape, initial_pose: Tensor | None, clouds: Tensor) -> tuple[Tensor, bool]:
+    """Return starts (B, num_dofs) within the limits, and whether they are several starts of a single cloud."""
+    pose = shape.rest_pose() if initial_pose is None else shape.check_pose(initial_pose, "initial_pose")
+    if not bool(torch.isfinite(pose).all()):
+        raise InputError("initial_pose must be finite")
+    if pose.ndim > 2:
+        raise InputError(f"initial_pose must have one or two dimensions, got shape {tuple(pose.shape)}")
+    several = clouds.ndim == 2 and pose.ndim == 2
+    if clouds.ndim == 3 and pose.ndim == 2 and len(pose) not in (1, len(clouds)):
+        raise InputError(f"initial_pose must hold one pose per cloud ({len(clouds)}), got {len(pose)}")
+    count = len(pose) if several else len(clouds) if clouds.ndim == 3 else 1
+    return shape.clamp(pose.expand(count, shape.num_dofs)), several
+
+
+def _model_skin(
+    shape: ArticulatedShape, model_points: Tensor | LinearBlendSkin | None, pose: Tensor, config: AlignConfig
+) -> LinearBlendSkin:
+    """Return the model points as a skin: given, built from points in a pose (1, num_dofs), or sampled."""
+    if isinstance(model_points, LinearBlendSkin):
+        return check_skin(shape, model_points)
+    if model_points is None:
+        return sample_skin(shape, config.num_model_points, sharpness=config.sharpness)
+    if len(pose) != 1:
+        raise InputError("model_points given as a tensor need a single initial_pose; pass a skin for several poses")
+    return BendingSkin(shape, as_float_tensor(model_points, "model_points", like=shape.rest), pose[0], config.sharpness)
+
+
+def _centered_batch(
+    skin: LinearBlendSkin, clouds: Tensor, valid: Tensor, pose: Tensor, config: AlignConfig, on_step: OnStep | None
+) -> _Batch:
+    """Return the alignments of clouds ((B,) M, 3) from starts (B, num_dofs), each about the mean of its data."""
+    data, valid = clouds.expand(len(pose), *clouds.shape[-2:]), valid.expand(len(pose), valid.shape[-1])
+    origin = masked_mean(data, valid)
+    problem = centered_problem(
+        skin, data, valid, pose, origin, prior_std=config.prior_std, pose_atol=config.pose_atol,
+        outlier=config.outlier, debias=config.debias, correspondence=config.correspondence,
+    )  # fmt: skip
+    return _Batch(problem=problem, start=shifted(pose, -origin), origin=origin, on_step=on_step, history=[])
+
+
+def _register(batch: _Batch, config: AlignConfig) -> StageResult:
+    schedule = config.schedule or ANNEALING.schedule(batch.problem.size)
+    return anneal(
+        batch.problem, batch.start, schedule, em_steps=config.em_steps, m_steps=config.m_steps, on_step=batch.record
+    )
+
+
+def _fit_surface(batch: _Batch, found: StageResult, config: AlignConfig) -> StageResult:
+    """Return the poses after a surface fit; sigma stays that of the registration, at which the posterior is told."""
     if config.surface_steps == 0:
-        return final
-    fitted = fit_surface(problem, final.pose, steps=config.surface_steps, on_step=record)
-    return replace(fitted, sigma=final.sigma)
+        return found
+    fitted = fit_surface(batch.problem, found.pose, steps=config.surface_steps, on_step=batch.record)
+    return replace(fitted, sigma=found.sigma)
 
 
-def _search_where_needed(
-    problem: AlignProblem, final: StageResult, start: Tensor, config: AlignConfig, record: _Recorder
-) -> StageResult:
+def _best_start(batch: _Batch, found: StageResult) -> tuple[_Batch, StageResult]:
+    best = alignment_cost(batch.problem, found.pose).argmin().unsqueeze(0)
+    return batch.rows(best), found.rows(best)
+
+
+def _search_where_needed(batch: _Batch, found: StageResult, config: AlignConfig) -> StageResult:
     """Return the result with better poses where a search found any."""
     if config.search == "never":
-        return final
-    wanted = torch.ones_like(final.change, dtype=torch.bool)
+        return found
+    wanted = torch.ones_like(found.change, dtype=torch.bool)
     if config.search == "auto":
-        wanted = needs_search(problem, start, final.pose)
+        wanted = needs_search(batch.problem, batch.start, found.pose)
     rows = wanted.nonzero()[:, 0]
     if len(rows) == 0:
-        return final
-    part = problem.rows(rows)
+        return found
+    part, before = batch.rows(rows), found.rows(rows)
     generator = torch.Generator().manual_seed(config.seed)
-    found = explore(
-        part,
-        start[rows],
-        final.pose[rows],
-        candidates=config.num_candidates,
-        rounds=config.search_rounds,
+    explored = explore(
+        part.problem, part.start, before.pose, candidates=config.num_candidates, rounds=config.search_rounds,
         generator=generator,
-    )
-    steps = max(config.surface_steps, _SEARCHED_STEPS)
-    refined = fit_surface(part, found, steps=steps, sigmas=FINAL_SIGMAS, on_step=record.rows(rows))
-    better = alignment_cost(part, refined.pose) < alignment_cost(part, final.pose[rows])
-    pose, change = final.pose.clone(), final.change.clone()
-    pose[rows] = torch.where(better.unsqueeze(-1), refined.pose, final.pose[rows])
-    change[rows] = torch.where(better, refined.change, final.change[rows])
-    return StageResult(pose, final.sigma, change)
+    )  # fmt: skip
+    steps = max(config.surface_steps, SURFACE_FIT.search_steps)
+    widths = SURFACE_FIT.widths[-1:]
+    refined = fit_surface(part.problem, explored, steps=steps, widths=widths, on_step=part.record)
+    better = alignment_cost(part.problem, refined.pose) < alignment_cost(part.problem, before.pose)
+    pose, change = found.pose.clone(), found.change.clone()
+    pose[rows] = torch.where(better.unsqueeze(-1), refined.pose, before.pose)
+    change[rows] = torch.where(better, refined.change, before.change)
+    return replace(found, pose=pose, change=change)
 
 
-def _inlier_distance(problem: AlignProblem, config: AlignConfig) -> float:
-    return config.inlier_distance or INLIER_SHARE * problem.size
-
-
-def _result(
-    problem: AlignProblem, final: StageResult, origin: Tensor, config: AlignConfig, history: tuple[AlignRecord, ...]
-) -> AlignResult:
-    pose, shape = final.pose, problem.skin.shape
+def _result(batch: _Batch, found: StageResult, config: AlignConfig) -> AlignResult:
+    problem, pose = batch.problem, found.pose
     distances = problem.surface.distance(problem.data, pose)
     cost = alignment_cost(problem, pose, distances)
     distances = torch.where(problem.valid, distances, torch.nan)
-    inliers = distances.abs() < _inlier_distance(problem, config)
+    inliers = distances.abs() < (config.inlier_distance or INLIER_SHARE * problem.size)
     posed = problem.skin(pose)
-    outlier = outlier_level(problem, posed, final.sigma)
-    observed = expectation(posed, problem.data, final.sigma, outlier, mask=problem.valid)
-    world = shifted(pose, origin)
-    statuses = zip(inliers.sum(-1).tolist(), problem.valid.sum(-1).tolist(), final.change.tolist(), strict=True)
+    outlier = outlier_level(problem, posed, found.sigma)
+    matches = expectation(posed, problem.data, found.sigma, outlier, mask=problem.valid)
+    world = shifted(pose, batch.origin)
+    counts = zip(inliers.sum(-1).tolist(), problem.valid.sum(-1).tolist(), found.change.tolist(), strict=True)
     return AlignResult(
         pose=world,
-        registered=posed + origin.unsqueeze(1),
-        keypoints=shape.keypoints(world),
+        registered=posed + batch.origin.unsqueeze(1),
+        keypoints=problem.skin.shape.keypoints(world),
         distances=distances,
         inliers=inliers,
-        posterior=observed.inlier_posterior,
-        sigma=final.sigma,
+        posterior=matches.inlier_posterior,
+        sigma=found.sigma,
         cost=cost,
-        status=tuple(_status(near, count, change, config) for near, count, change in statuses),
-        history=history,
+        status=tuple(_status(num_inliers, num_data, change, config) for num_inliers, num_data, change in counts),
+        history=tuple(batch.history),
     )
 
 
 def _status(num_inliers: int, num_data: int, change: float, config: AlignConfig) -> Status:
     if num_data == 0:
         return Status.NO_DATA
-    if num_inliers < max(_MIN_INLIERS, _MIN_INLIER_SHARE * num_data):
+    if num_inliers < max(_LIMITS.min_inliers, _LIMITS.min_share * num_data):
         return Status.FEW_INLIERS
     return Status.CONVERGED if change <= config.pose_atol else Status.MAX_STEPS
 
 
-def _unbatched(result: AlignResult, row: int) -> AlignResult:
-    status = result.status if isinstance(result.status, Status) else result.status[row]
-    tensors = {
-        item.name: getattr(result, item.name)[row] for item in fields(result) if item.name not in ("status", "history")
-    }
-    return AlignResult(**tensors, status=status, history=result.history)
-
-
-def _num_starts(data: Tensor, pose: Tensor) -> int:
-    """Return how many starts one cloud has (0: not a multi-start problem); check that poses fit the clouds."""
-    if pose.ndim > 2:
-        raise InputError(f"initial_pose must have one or two dimensions, got shape {tuple(pose.shape)}")
-    if data.ndim == 2:
-        return len(pose) if pose.ndim == 2 else 0
-    if pose.ndim == 2 and len(pose) not in (1, len(data)):
-        raise InputError(f"initial_pose must hold one pose per cloud ({len(data)}), got {len(pose)}")
-    return 0
-
-
-def _model_skin(
-    shape: ArticulatedShape, model_points: Tensor | LinearBlendSkin | None, pose: Tensor, config: AlignConfig
-) -> LinearBlendSkin:
-    if isinstance(model_points, LinearBlendSkin):
-        if model_points.shape is not shape:
-            raise InputError("model_points is a skin of another shape; build it from the shape that is aligned")
-        return model_points
-    if model_points is None:
-        return sample_skin(shape, config.num_model_points, sharpness=config.sharpness)
-    if len(pose) != 1:
-        raise InputError("model_points given as a tensor need a single initial_pose; pass a skin for several poses")
-    return BendingSkin(shape, as_float_tensor(model_points, "model_points", like=shape.rest), pose[0], config.sharpness)
+def _unbatched(result: AlignResult) -> AlignResult:
+    """Return the result of the single problem of a batch."""
+    first = {item.name: getattr(result, item.name)[0] for item in fields(result) if item.name != "history"}
+    return replace(result, **first)

@@ -1,18 +1,14 @@
-"""Who matches whom, all or nothing: every datum votes for its closest model point, as in ICP."""
+"""All-or-nothing correspondences, as in ICP: every datum votes for its closest model point."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_positive
-from torchreg.solvers.e_step import OUTLIER_CONSTANT, EStep
+from torchreg.solvers.e_step import OUTLIER_CONSTANT, EStep, chunks
 
-# Distances held at a time: in cache on a CPU.
-_CHUNK_ENTRIES = 2_000_000
 # A datum farther than this many sigmas from every model point is an outlier; on hands this did best of 0.75 to 4.
 TRIM = 1.5
 
@@ -24,12 +20,11 @@ def closest_point(
     outlier: Tensor | float = OUTLIER_CONSTANT,
     *,
     mask: Tensor | None = None,
-    trim: float = TRIM,
 ) -> EStep:
     """Return the matches of an articulated ICP in the form of an E-step: one vote of each datum, or none.
 
     Each datum belongs to its closest model point alone, with probability one, unless that lies farther away than
-    ``trim * sigma``; then it is an outlier. The trimming distance shrinks with the schedule of sigma.
+    1.5 sigma; then it is an outlier. The trimming distance shrinks with the schedule of sigma.
 
     Args:
         model: (..., N, 3) posed model points, metres.
@@ -37,15 +32,10 @@ def closest_point(
         sigma: (...) metres, positive.
         outlier: not used, as the trimming distance takes its place; all E-steps are called alike.
         mask: (..., M) False where a datum is padding, whose coordinates are never looked at.
-        trim: distance from which data are outliers, in units of sigma.
 
     Returns:
         an `EStep`: the number of data of each model point, their mean, 0 or 1 for each datum, and the sum of squared
         distances of all matches.
-
-    Raises:
-        InputError: if ``trim`` is not positive.
-        InputTypeError: if ``trim`` is not a number.
 
     Differentiable: no.
 
@@ -53,13 +43,14 @@ def closest_point(
 
     References: Besl and McKay 1992; Zhang 1994 for the trimming distance.
     """
-    check_positive(trim, "trim")
     batch = torch.broadcast_shapes(model.shape[:-2], data.shape[:-2])
     flat, num_model, num_data = math.prod(batch), model.shape[-2], data.shape[-2]
     if num_model == 0:
-        nobody = model.new_zeros(batch)
         return EStep(
-            model.new_zeros(*batch, 0), model.new_zeros(*batch, 0, 3), data.new_zeros(*batch, num_data), nobody
+            weights=model.new_zeros(*batch, 0),
+            targets=model.new_zeros(*batch, 0, 3),
+            inlier_posterior=data.new_zeros(*batch, num_data),
+            squared_error=model.new_zeros(batch),
         )
     with torch.no_grad():
         sigma = torch.as_tensor(sigma, dtype=model.dtype, device=model.device).expand(batch).reshape(flat, 1)
@@ -67,25 +58,25 @@ def closest_point(
         data = data.expand(*batch, num_data, 3).reshape(flat, num_data, 3)
         # Near the origin float32 tells close points apart.
         center = model.mean(-2, keepdim=True)
-        near, far = model - center, data - center
+        local_model, local_data = model - center, data - center
         if mask is not None:
             valid = mask.expand(*batch, num_data).reshape(flat, num_data)
-            far = torch.where(valid.unsqueeze(-1), far, 0.0)
-        index, distance = _closest(near, far)
-        votes = (distance <= trim * sigma).to(model.dtype)
+            local_data = torch.where(valid.unsqueeze(-1), local_data, 0.0)
+        index, distance = _closest(local_model, local_data)
+        votes = (distance <= TRIM * sigma).to(model.dtype)
         if mask is not None:
             votes = votes * valid
-        weights = torch.zeros_like(near[..., 0]).scatter_add_(-1, index, votes)
-        voted = torch.where(votes.unsqueeze(-1) > 0, far, 0.0)
-        moments = torch.zeros_like(near).scatter_add_(-2, index.unsqueeze(-1).expand_as(voted), voted)
-        held = weights.unsqueeze(-1) > 0
-        targets = torch.where(held, moments / weights.unsqueeze(-1).clamp_min(1) + center, model)
+        weights = torch.zeros_like(local_model[..., 0]).scatter_add_(-1, index, votes)
+        voters = torch.where(votes.unsqueeze(-1) > 0, local_data, 0.0)
+        moments = torch.zeros_like(local_model).scatter_add_(-2, index.unsqueeze(-1).expand_as(voters), voters)
+        means = moments / weights.unsqueeze(-1).clamp_min(1) + center
+        targets = torch.where(weights.unsqueeze(-1) > 0, means, model)
         squares = torch.where(votes > 0, distance, 0.0).square().sum(-1)
     return EStep(
-        weights.reshape(*batch, num_model),
-        targets.reshape(*batch, num_model, 3),
-        votes.reshape(*batch, num_data),
-        squares.reshape(batch),
+        weights=weights.reshape(*batch, num_model),
+        targets=targets.reshape(*batch, num_model, 3),
+        inlier_posterior=votes.reshape(*batch, num_data),
+        squared_error=squares.reshape(batch),
     )
 
 
@@ -93,17 +84,8 @@ def _closest(model: Tensor, data: Tensor) -> tuple[Tensor, Tensor]:
     """Return the index of, and the distance to, the model point closest to every datum, (B, M) each."""
     index = torch.zeros_like(data[..., 0], dtype=torch.long)
     half = 0.5 * model.square().sum(-1, keepdim=True)
-    for rows, columns in _chunks(model.shape[0], model.shape[1], data.shape[1]):
+    for rows, columns in chunks(model.shape[0], model.shape[1], data.shape[1]):
         # |x - y|^2 without |y|^2, which is the same for all x.
         index[rows, columns] = torch.baddbmm(half[rows], model[rows], data[rows, columns].mT, alpha=-1).argmin(-2)
-    found = model.gather(-2, index.unsqueeze(-1).expand_as(data))
-    return index, torch.linalg.vector_norm(data - found, dim=-1)
-
-
-def _chunks(batch: int, num_model: int, num_data: int) -> Iterator[tuple[slice, slice]]:
-    """Yield slices over batch and data that keep the matrix of distances within the chunk size."""
-    rows = max(1, _CHUNK_ENTRIES // max(num_model * num_data, 1))
-    columns = max(1, min(num_data, _CHUNK_ENTRIES // num_model))
-    for row in range(0, batch, rows):
-        for column in range(0, num_data, columns):
-            yield slice(row, row + rows), slice(column, column + columns)
+    nearest = model.gather(-2, index.unsqueeze(-1).expand_as(data))
+    return index, torch.linalg.vector_norm(data - nearest, dim=-1)

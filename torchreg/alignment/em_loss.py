@@ -14,15 +14,13 @@ from torchreg._checks import check_choice, check_positive, check_same_kind, chec
 from torchreg.errors import InputError, InputTypeError
 from torchreg.solvers.e_step import (
     OUTLIER_CONSTANT,
+    chunks,
     expectation,
     gaussian_kernel,
     outlier_constant,
     posterior,
     working_volume,
 )
-
-# Entries of the kernel matrix held at a time.
-_CHUNK_ENTRIES = 2_000_000
 
 
 class EMLoss(nn.Module):
@@ -136,7 +134,7 @@ class EMLoss(nn.Module):
     def virtual_observations(
         self, posed_points: Tensor, data: Tensor, mask: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
-        """Return lambda_i and G_i, the mass and the mean of the data that every posed point holds, eq. 20.
+        """Return lambda_i and G_i, the mass and the mean of the data matched to every posed point, eq. 20.
 
         Args:
             posed_points: (..., N, 3), metres.
@@ -144,13 +142,13 @@ class EMLoss(nn.Module):
             mask: (..., M) bool, False where a datum is padding.
 
         Returns:
-            weights (..., N), and targets (..., N, 3) in metres: the posed point itself where it holds nothing.
+            weights (..., N), and targets (..., N, 3) in metres: the posed point itself where no datum matches it.
 
         Raises:
             InputError: if a shape does not fit, or there are no points.
             InputTypeError: if the dtypes or devices differ, or the mask is not boolean.
 
-        Differentiable: no; they are what the M-step holds fixed.
+        Differentiable: no; the M-step holds them fixed.
 
         Cost: O(N M) time, bounded memory.
         """
@@ -159,8 +157,8 @@ class EMLoss(nn.Module):
         batch = torch.broadcast_shapes(batch, sigma.shape)
         constant = self._constant(posed_points, data, sigma, mask)
         posed_points = posed_points.expand(*batch, *posed_points.shape[-2:])
-        step = expectation(posed_points, data, sigma, constant, mask=mask)
-        return step.weights, step.targets
+        matches = expectation(posed_points, data, sigma, constant, mask=mask)
+        return matches.weights, matches.targets
 
     def _sigma(self, like: Tensor) -> Tensor:
         return torch.as_tensor(self.sigma, dtype=like.dtype, device=like.device)
@@ -205,7 +203,7 @@ class _LogLikelihood(Function):
     @staticmethod
     def forward(model: Tensor, data: Tensor, outlier: Tensor) -> Tensor:
         levels = torch.zeros_like(data[..., 0] + model[:, :1, 0] + outlier.unsqueeze(-1))
-        for part in _chunks(model, data):
+        for part in _parts(model, data):
             levels[:, part] = (_kernel(model, data[:, part]).sum(-2) + outlier.unsqueeze(-1)).log()
         return levels
 
@@ -220,15 +218,15 @@ class _LogLikelihood(Function):
         mixed = grad[:, :1, None] + model[:, :1] + data[:, :1] + outlier[:, None, None]
         model_grad, data_grad = torch.zeros_like(model + mixed), torch.zeros_like(data + mixed)
         sources = _with_one(model)
-        for part in _chunks(model, data):
+        for part in _parts(model, data):
             targets = _with_one(data[:, part])
             kernel = _kernel(model, data[:, part])
-            seen = kernel.mT @ sources
-            share = (2 * grad[:, part] / (seen[..., 3] + outlier.unsqueeze(-1))).unsqueeze(-1)
-            held = kernel @ (share * targets)
+            model_sums = kernel.mT @ sources
+            share = (2 * grad[:, part] / (model_sums[..., 3] + outlier.unsqueeze(-1))).unsqueeze(-1)
+            data_sums = kernel @ (share * targets)
             # With a_ij the shares of the kernel: sum_j a_ij (y_j - x_i), and sum_i a_ij (x_i - y_j).
-            model_grad += held[..., :3] - held[..., 3:] * model
-            data_grad[:, part] = share * (seen[..., :3] - seen[..., 3:] * targets[..., :3])
+            model_grad += data_sums[..., :3] - data_sums[..., 3:] * model
+            data_grad[:, part] = share * (model_sums[..., :3] - model_sums[..., 3:] * targets[..., :3])
         return model_grad, data_grad, None
 
     @staticmethod
@@ -239,13 +237,13 @@ class _LogLikelihood(Function):
         mixed = (model + model_t)[:, :1, 0] + outlier.unsqueeze(-1)
         levels_t = torch.zeros_like((data + data_t)[..., 0] + mixed)
         sources = torch.cat([_with_one(model), model_t, (model * model_t).sum(-1, keepdim=True)], dim=-1)
-        for part in _chunks(model, data):
+        for part in _parts(model, data):
             target, target_t = data[:, part], data_t[:, part]
-            seen = _kernel(model, target).mT @ sources
+            sums = _kernel(model, target).mT @ sources
             # d(-|x - y|^2) = -2 (x - y) . (dx - dy), its four products summed over i.
-            total = seen[..., 3]
-            moved = (seen[..., 4:7] * target + (seen[..., :3] - total.unsqueeze(-1) * target) * target_t).sum(-1)
-            levels_t[:, part] = 2 * (moved - seen[..., 7]) / (total + outlier.unsqueeze(-1))
+            total = sums[..., 3]
+            crossed = (sums[..., 4:7] * target + (sums[..., :3] - total.unsqueeze(-1) * target) * target_t).sum(-1)
+            levels_t[:, part] = 2 * (crossed - sums[..., 7]) / (total + outlier.unsqueeze(-1))
         return levels_t
 
 
@@ -253,10 +251,9 @@ def _with_one(points: Tensor) -> Tensor:
     return torch.cat([points, torch.ones_like(points[..., :1])], dim=-1)
 
 
-def _chunks(model: Tensor, data: Tensor) -> Iterator[slice]:
-    columns = max(1, _CHUNK_ENTRIES // max(model.shape[0] * model.shape[1], 1))
-    for start in range(0, data.shape[1], columns):
-        yield slice(start, start + columns)
+def _parts(model: Tensor, data: Tensor) -> Iterator[slice]:
+    """Return slices of the data for each of which the kernel of all problems fits into memory."""
+    return (columns for _, columns in chunks(1, model.shape[0] * model.shape[1], data.shape[1]))
 
 
 def _kernel(model: Tensor, data: Tensor) -> Tensor:

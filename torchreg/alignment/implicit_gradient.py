@@ -1,4 +1,4 @@
-"""The end of an alignment as a fixed point: its energy, exact Newton steps, and gradients by the implicit function."""
+"""The pose of a surface fit as a fixed point: its energy, exact Newton steps, gradients by the implicit function."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from torchreg.shapes.surface import Surface
 from torchreg.solvers.levenberg_marquardt import held_at_limits
 from torchreg.solvers.robust import welsch_loss
 
-# Curvatures below this share of the largest, once every variable has its own scale, are rounding.
+# Curvatures below this share of the largest, once every variable is scaled to a unit diagonal, are rounding.
 _FLAT = {torch.float32: 1e-6, torch.float64: 1e-12}
 
 
 @dataclass(frozen=True)
 class FixedPoint:
-    """What the surface fit of a batch of clouds minimizes at its last width, about a start.
+    """The energy that the surface fit of a batch of clouds minimizes at its last width, about a start.
 
     ``E(pose) = sum_j s^2 (1 - exp(-d(Y_j, pose)^2 / s^2)) / (2 noise^2) + sum_k p_k (pose - start)_k^2 / 2``, where the
     base's rotation differs from the start's by composition. Its stationary point inside the joint limits is the pose.
@@ -68,12 +68,11 @@ class FixedPoint:
         turn = step[:, 3:BASE_DOFS]
         joints = pose[:, BASE_DOFS:] + step[:, BASE_DOFS:]
         # The step of the base is taken by the data, backwards: then no rotation of the pose is special.
-        seen = (data - (pose[:, :3] + step[:, :3]).unsqueeze(1)) @ so3_exp(turn)
-        there = torch.cat([torch.zeros_like(turn), pose[:, 3:BASE_DOFS], joints], dim=-1)
-        width = self.sigma.unsqueeze(-1)
-        distance = self.surface.distance(seen, there)
-        lost = welsch_loss((distance / width).square())
-        cost = 0.5 * (lost * self.valid).sum(-1) * (self.sigma / self.noise).square()
+        local_data = (data - (pose[:, :3] + step[:, :3]).unsqueeze(1)) @ so3_exp(turn)
+        local_pose = torch.cat([torch.zeros_like(turn), pose[:, 3:BASE_DOFS], joints], dim=-1)
+        distance = self.surface.distance(local_data, local_pose)
+        losses = welsch_loss((distance / self.sigma.unsqueeze(-1)).square())
+        cost = 0.5 * (losses * self.valid).sum(-1) * (self.sigma / self.noise).square()
         offset = retract(difference(start, pose), step)
         return cost + 0.5 * (self.precision * offset.square()).sum(-1)
 
@@ -95,11 +94,11 @@ class FixedPoint:
         return gradient, 0.5 * (hessian + hessian.mT)
 
     def free(self, pose: Tensor, gradient: Tensor) -> Tensor:
-        """Return which variables (B, num_dofs) may move: not pushed against a limit."""
+        """Return a mask (B, num_dofs) of the variables that are not at a limit which holds them."""
         return ~held_at_limits(gradient, pose, self.lower, self.upper)
 
-    def polish(self, pose: Tensor, data: Tensor, start: Tensor, steps: int) -> Tensor:
-        """Return the pose (B, num_dofs) after exact Newton steps, each kept where it lowers the gradient's size.
+    def newton_steps(self, pose: Tensor, data: Tensor, start: Tensor, steps: int) -> Tensor:
+        """Return the pose (B, num_dofs) after exact Newton steps, each kept where it lowers the norm of the gradient.
 
         Differentiable: no.
         """
@@ -111,9 +110,9 @@ class FixedPoint:
             gradient = gradient.detach()
             free = self.free(trial, gradient)
             scale = hessian.diagonal(dim1=-2, dim2=-1).abs().clamp_min(torch.finfo(pose.dtype).tiny).rsqrt()
-            size = (gradient * scale * free).norm(dim=-1)
-            better = (size < best).unsqueeze(-1)
-            kept, best = torch.where(better, trial, kept), torch.minimum(size, best)
+            norm = (gradient * scale * free).norm(dim=-1)
+            better = (norm < best).unsqueeze(-1)
+            kept, best = torch.where(better, trial, kept), torch.minimum(norm, best)
             if number == steps:
                 break
             step = -solve_symmetric(hessian, gradient, free)
@@ -125,7 +124,7 @@ class FixedPoint:
 def solve_symmetric(matrix: Tensor, right: Tensor, free: Tensor) -> Tensor:
     """Return ``x`` with ``matrix x = right`` over the free variables, in float64; zero in the others.
 
-    Directions without curvature get nothing, as a pseudoinverse gives it once every variable has its own scale.
+    Directions without curvature get zero, as from a pseudoinverse once every variable is scaled to a unit diagonal.
 
     Args:
         matrix: (B, D, D), symmetric.
@@ -135,15 +134,15 @@ def solve_symmetric(matrix: Tensor, right: Tensor, free: Tensor) -> Tensor:
     Returns:
         (B, D), in the dtype of ``right``.
     """
-    flat = _FLAT[right.dtype]
-    matrix, wanted = matrix.double(), right.double() * free
+    matrix, free_right = matrix.double(), right.double() * free
     diagonal = matrix.diagonal(dim1=-2, dim2=-1).abs()
     idle = ~free | (diagonal <= torch.finfo(torch.float64).tiny)
     scale = diagonal.masked_fill(idle, 1.0).rsqrt().masked_fill(idle, 0.0)
     values, vectors = torch.linalg.eigh(matrix * scale.unsqueeze(-1) * scale.unsqueeze(-2))
-    steep = values.abs() > flat * values.abs().amax(-1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
-    inverse = torch.where(steep, 1 / values.masked_fill(~steep, 1.0), 0.0)
-    inner = (vectors.mT @ (wanted * scale).unsqueeze(-1)) * inverse.unsqueeze(-1)
+    largest = values.abs().amax(-1, keepdim=True).clamp_min(torch.finfo(torch.float64).tiny)
+    curved = values.abs() > _FLAT[right.dtype] * largest
+    inverse = torch.where(curved, 1 / values.masked_fill(~curved, 1.0), 0.0)
+    inner = (vectors.mT @ (free_right * scale).unsqueeze(-1)) * inverse.unsqueeze(-1)
     return ((vectors @ inner).squeeze(-1) * scale).to(right.dtype)
 
 
@@ -152,10 +151,10 @@ def attach_gradients(problem: FixedPoint, pose: Tensor, data: Tensor, start: Ten
 
     Where ``g(pose, p) = 0`` is the stationarity of the energy over the variables that no limit holds, the implicit
     function gives ``d pose / d p = -H^-1 dg / dp``: one solve per cloud, however many iterations found the pose, and as
-    exact as the pose is stationary. Correspondences and widths are held.
+    exact as the pose is stationary. Correspondences and widths are held fixed.
 
     Args:
-        problem: what the pose minimizes.
+        problem: the energy that the pose minimizes.
         pose: (B, num_dofs), stationary.
         data: (B, M, 3), metres.
         start: (B, num_dofs).
@@ -195,8 +194,8 @@ class _Implicit(torch.autograd.Function):
         adjoint = solve_symmetric(hessian, _to_tangent(upstream, pose), free)
         inputs = [data, start, *problem.parameters]
         grads = torch.autograd.grad(gradient, inputs, -adjoint, allow_unused=True)
-        wanted = ctx.needs_input_grad[2:]
-        return (None, None, *(grad if needed else None for grad, needed in zip(grads, wanted, strict=True)))
+        needs = ctx.needs_input_grad[2:]
+        return (None, None, *(grad if needed else None for grad, needed in zip(grads, needs, strict=True)))
 
 
 def _to_tangent(upstream: Tensor, pose: Tensor) -> Tensor:

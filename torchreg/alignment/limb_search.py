@@ -1,7 +1,7 @@
 """Placing the limbs of a shape on data, given where its trunk lies.
 
 The joints of each limb are tried body by body over their whole range; the configurations that explain most data are
-kept, diverse ones, and moved onto the data; then the limbs are combined so that no two live on the same data.
+kept, diverse ones, and moved onto the data; then the limbs are combined so that no two explain the same data.
 """
 
 from __future__ import annotations
@@ -12,44 +12,27 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg.alignment.problem import PRIOR_SHARE, AlignProblem
+from torchreg.alignment.problem import BALL_AXES, PRIOR_SHARE, AlignProblem
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix
 from torchreg.geometry.rotation import so3_exp
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.limbs import Body, Limb, find_limbs
+from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.solvers.cover import best_covers
 from torchreg.solvers.robust import welsch_loss, welsch_weight
-
-# Angle between neighboring samples of a joint, radians, and how far a joint without limits is tried.
-_STEP = math.radians(16)
-_FREE_RANGE, _BALL_RANGE = 2 * math.pi, 2.4
-_BALL = 3
-# Samples of all joints between two bodies, at most, and of a joint that slides.
-_MAX_SAMPLES, _SLIDE_SAMPLES = 64, 8
-# Configurations of a body tried at a time, at most, per problem.
-_MAX_GROWN = 1500
-# A limb's samples are tried on the data nearest to its root, so many times its share among all limbs.
-_NEAR_SHARES = 3.0
-_TINY = 0.02
-# Two configurations of a limb whose joints all differ by less are one, radians.
-_SAME = 0.25
-# Standard deviation of the data for the weight of the prior, as a share of the model's size; longest step, radians.
-_NOISE, _MAX_STEP = 0.006, 0.3
-# Entries of a table held at a time: what a CPU's caches hold, and what keeps other devices busy.
-_CHUNK_ENTRIES, _WIDE_ENTRIES = 1_500_000, 150_000_000
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How thoroughly limbs are placed. Widths are shares of the model's size.
+    """Thoroughness of placing limbs. Widths are shares of the model's size.
 
     Args:
         num_data: data that the joints' samples are tried on.
         width: of the kernel by which a datum counts as explained by a sample.
         beam: configurations kept from body to body.
         configurations: kept per limb.
-        polish: kernel widths of the steps that move configurations onto the data; none if empty.
-        score_width: of the kernel by which combinations are judged, on all data if there is a polish.
+        refine_widths: of the kernel in the steps that move configurations onto the data; no steps if empty.
+        score_width: of the kernel by which combinations are judged, on all data if configurations are refined.
         combinations: returned.
         exchanged: of them improved by exchanging pairs of limbs.
     """
@@ -58,10 +41,39 @@ class Effort:
     width: float
     beam: int
     configurations: int
-    polish: tuple[float, ...]
+    refine_widths: tuple[float, ...]
     score_width: float
     combinations: int
     exchanged: int
+
+
+@dataclass(frozen=True)
+class _Sampling:
+    """Sampling of the joints between a body and its parent."""
+
+    angle: float = math.radians(16)  # between neighboring samples of a hinge
+    free_range: float = 2 * math.pi  # of a hinge without limits: all around
+    ball_range: float = 2.4  # of each axis of a ball joint without limits, radians: more would repeat rotations
+    max_count: int = 64  # samples of all joints between two bodies
+    slide_count: int = 8  # samples of a joint that slides
+
+
+@dataclass(frozen=True)
+class _Placement:
+    """Numbers of the beam search over a limb's bodies and of the steps that refine its configurations."""
+
+    max_tried: int = 1500  # configurations of a body, per problem
+    near_shares: float = 3.0  # data near its root that a limb is tried on, as multiples of its share among all limbs
+    min_loss: float = 0.02  # of a datum, so that those which the trunk explains count as far from the root
+    same: float = 0.25  # configurations of a limb whose joints all differ by less are duplicates, radians
+    noise: float = 0.006  # standard deviation of the data for the weight of the prior, as a share of the model's size
+    max_step: float = 0.3  # of a joint, radians or metres
+    cpu_entries: int = 1_500_000  # of a table in memory on a CPU: as its caches hold
+    device_entries: int = 150_000_000  # of a table in memory on other devices: enough to keep them busy
+
+
+_SAMPLING = _Sampling()
+_PLACEMENT = _Placement()
 
 
 @dataclass(frozen=True)
@@ -70,16 +82,16 @@ class _Beam:
 
     Args:
         poses: (B, K, num_dofs).
-        lost: (B, K, M), from 0 for a datum that is explained to 1.
+        losses: (B, K, M), from 0 for a datum that is explained to 1.
         frames: (B, K, 4, 4) of the part that the next body hangs on.
     """
 
     poses: Tensor
-    lost: Tensor
+    losses: Tensor
     frames: Tensor
 
     def take(self, index: Tensor) -> _Beam:
-        return _Beam(take_rows(self.poses, index), take_rows(self.lost, index), take_rows(self.frames, index))
+        return _Beam(take_rows(self.poses, index), take_rows(self.losses, index), take_rows(self.frames, index))
 
 
 def take_rows(table: Tensor, index: Tensor) -> Tensor:
@@ -101,12 +113,12 @@ class LimbSearch:
         self.parts = {limb: limb.parts for limb in self.limbs}
         for follower in limbs:
             if not follower.dofs:
-                # All joints of the other jaw of a gripper are mimics: it goes where the first one goes.
+                # A limb whose joints are all mimics, as the second jaw of a gripper, goes with the limb they follow.
                 leader = self._leader(follower)
                 self.parts[leader] = self.parts[leader] + follower.parts
         bodies = [body for limb in self.limbs for body in limb.bodies]
         self.samples = {body: self._sample(body) for body in bodies}
-        # Mimic joints of a body follow joints elsewhere, so its samples have no transforms of their own.
+        # Mimic joints of a body follow joints elsewhere, so its samples do not determine its transforms.
         self.relative = {} if shape.chain.has_mimics else {body: self._sampled_transforms(body) for body in bodies}
 
     def __call__(self, problem: AlignProblem, poses: Tensor, effort: Effort, generator: torch.Generator) -> Tensor:
@@ -114,47 +126,47 @@ class LimbSearch:
 
         Args:
             problem: the batch.
-            poses: (B, num_dofs): where the trunk lies, and one configuration of the limbs to try beside the samples.
+            poses: (B, num_dofs): position of the trunk, and a configuration of the limbs to try beside the samples.
             effort: how thoroughly to search.
             generator: draws the data that samples are tried on.
 
         Returns:
             (B, C, num_dofs).
 
-        Cost: O(B num_data K) per body, K at most some thousand configurations.
+        Cost: O(B num_data K) per body, K at most 1,500 configurations.
         """
         if not self.limbs:
             return poses.unsqueeze(1)
-        per_row = effort.num_data * _MAX_GROWN
-        entries = _CHUNK_ENTRIES if poses.device.type == "cpu" else _WIDE_ENTRIES
+        per_row = effort.num_data * _PLACEMENT.max_tried
+        entries = _PLACEMENT.cpu_entries if poses.device.type == "cpu" else _PLACEMENT.device_entries
         rows = torch.arange(len(poses), device=poses.device).split(max(1, entries // per_row))
-        few = problem.draw(effort.num_data, generator)
-        found = [_Search(self, problem.rows(row), few.rows(row), effort).run(poses[row]) for row in rows]
+        subset = problem.draw(effort.num_data, generator)
+        found = [_Search(self, problem.rows(row), subset.rows(row), effort).run(poses[row]) for row in rows]
         return torch.cat(found)
 
     def _leader(self, follower: Limb) -> Limb:
         """Return the limb whose degrees of freedom move the first body of one that has none."""
         chain, first = self.shape.chain, follower.bodies[0]
         moves = chain.moves[self.shape.part_index]
-        own = moves[first.parts[0]] - moves[first.parent] if first.parent >= 0 else moves[first.parts[0]]
-        driven = own.to(chain.couplings) @ chain.couplings.abs() > 0
-        return max(self.limbs, key=lambda limb: int(driven[[dof - 6 for dof in limb.dofs]].sum()))
+        joints = moves[first.parts[0]] - moves[first.parent] if first.parent >= 0 else moves[first.parts[0]]
+        driven = joints.to(chain.couplings) @ chain.couplings.abs() > 0
+        return max(self.limbs, key=lambda limb: int(driven[[dof - BASE_DOFS for dof in limb.dofs]].sum()))
 
     def _sample(self, body: Body) -> Tensor:
         """Return samples (G, dofs) of the joints between a body and its parent; none if those only follow others."""
         shape, dofs = self.shape, list(body.dofs)
         if not dofs:
             return shape.rest.new_zeros(0, 0)
-        free = _FREE_RANGE if len(dofs) < _BALL else _BALL_RANGE
+        free = _SAMPLING.free_range if len(dofs) < BALL_AXES else _SAMPLING.ball_range
         lower, upper = shape.lower[dofs], shape.upper[dofs]
         lower = torch.where(lower.isfinite(), lower, torch.where(upper.isfinite(), upper - free, -free / 2))
         upper = torch.where(upper.isfinite(), upper, lower + free)
         counts = [
-            _SLIDE_SAMPLES if shape.is_sliding[dof] else max(2, math.ceil(width / _STEP))
+            _SAMPLING.slide_count if shape.is_sliding[dof] else max(2, math.ceil(width / _SAMPLING.angle))
             for dof, width in zip(dofs, (upper - lower).tolist(), strict=True)
         ]
-        if math.prod(counts) > _MAX_SAMPLES:
-            shares = torch.quasirandom.SobolEngine(len(dofs), scramble=True, seed=0).draw(_MAX_SAMPLES)
+        if math.prod(counts) > _SAMPLING.max_count:
+            shares = torch.quasirandom.SobolEngine(len(dofs), scramble=True, seed=0).draw(_SAMPLING.max_count)
         else:
             grids = torch.meshgrid(*[(torch.arange(count) + 0.5) / count for count in counts], indexing="ij")
             shares = torch.stack(grids, dim=-1).reshape(-1, len(dofs))
@@ -180,94 +192,100 @@ class LimbSearch:
 class _Search:
     """One search, over a batch of problems.
 
-    Samples are tried on few data with a wide kernel (``lost`` of a beam); combinations are judged on ``problem``.
+    Samples are tried on a subset of the data with a wide kernel; combinations are judged on ``problem``.
     """
 
-    def __init__(self, limbs: LimbSearch, problem: AlignProblem, few: AlignProblem, effort: Effort) -> None:
-        self.limbs, self.shape, self.effort, self.few = limbs, limbs.shape, effort, few
-        self.problem = problem if effort.polish else self.few
+    def __init__(self, limbs: LimbSearch, problem: AlignProblem, subset: AlignProblem, effort: Effort) -> None:
+        self.limbs, self.shape, self.effort, self.subset = limbs, limbs.shape, effort, subset
+        self.problem = problem if effort.refine_widths else subset
         self.width = effort.width * problem.size
         self.score_width = effort.score_width * problem.size
 
     def run(self, poses: Tensor) -> Tensor:
         """Return the best poses (B, C, num_dofs) with the trunk where ``poses`` have it."""
         transforms = self.shape.part_transforms(poses).unsqueeze(1)[:, :, self.limbs.trunk]
-        unexplained = self._unexplained(self.problem, transforms, self.limbs.trunk, self.score_width)[:, 0]
-        lost = self._unexplained(self.few, transforms, self.limbs.trunk, self.width)
+        score_losses = self._part_losses(self.problem, transforms, self.limbs.trunk, self.score_width)[:, 0]
+        losses = self._part_losses(self.subset, transforms, self.limbs.trunk, self.width)
         found = poses.unsqueeze(1)
         for level in sorted({limb.level for limb in self.limbs.limbs}):
             # Limbs that hang on limbs are placed on the best combination of those.
             pose = found[:, 0]
             members = [limb for limb in self.limbs.limbs if limb.level == level]
-            placed = [self._place(pose, lost, unexplained, limb) for limb in members]
-            here = PRIOR_SHARE * self.problem.prior.cost(pose.unsqueeze(1))
-            index, _ = best_covers(
-                unexplained,
-                [tables for _, tables in placed],
-                [PRIOR_SHARE * self.problem.prior.cost(options) - here for options, _ in placed],
-                count=self.effort.combinations,
-                num_exchanged=self.effort.exchanged,
-            )
+            placed = [self._place(pose, losses, score_losses, limb) for limb in members]
+            index = self._combine(pose, score_losses, placed)
             found = pose.unsqueeze(1).repeat(1, index.shape[1], 1)
             for number, (limb, (options, tables)) in enumerate(zip(members, placed, strict=True)):
                 chosen = index[..., number]
                 found[..., limb.dofs] = take_rows(options, chosen)[..., limb.dofs]
-                unexplained = torch.minimum(unexplained, take_rows(tables, chosen[:, :1])[:, 0])
-                lost = torch.minimum(lost, self._lost(self.few, found[:, :1], limb, self.width))
+                score_losses = torch.minimum(score_losses, take_rows(tables, chosen[:, :1])[:, 0])
+                losses = torch.minimum(losses, self._limb_losses(self.subset, found[:, :1], limb, self.width))
         return found
 
-    def _place(self, pose: Tensor, lost: Tensor, unexplained: Tensor, limb: Limb) -> tuple[Tensor, Tensor]:
-        """Return configurations (B, K, num_dofs) of a limb and what data they leave unexplained (B, K, M)."""
+    def _combine(self, pose: Tensor, score_losses: Tensor, placed: list[tuple[Tensor, Tensor]]) -> Tensor:
+        """Return the best choices (B, C, L) of one configuration per limb."""
+        cost = PRIOR_SHARE * self.problem.prior.cost(pose.unsqueeze(1))
+        index, _ = best_covers(
+            score_losses,
+            [tables for _, tables in placed],
+            [PRIOR_SHARE * self.problem.prior.cost(options) - cost for options, _ in placed],
+            count=self.effort.combinations,
+            num_exchanged=self.effort.exchanged,
+        )
+        return index
+
+    def _place(self, pose: Tensor, losses: Tensor, score_losses: Tensor, limb: Limb) -> tuple[Tensor, Tensor]:
+        """Return configurations (B, K, num_dofs) of a limb and the losses (B, K, M) of the data with each of them."""
         transforms = self.shape.part_transforms(pose)
         frame = self.limbs.parent_frame(limb.bodies[0], pose, transforms)
-        near, lost = self._within_reach(lost, frame[..., :3, 3])
-        beam = _Beam(pose.unsqueeze(1), lost, frame.unsqueeze(1))
+        near, losses = self._near_data(losses, frame[..., :3, 3])
+        beam = _Beam(pose.unsqueeze(1), losses, frame.unsqueeze(1))
         strata = 1
         for body in limb.bodies:
-            beam = self._grown(near, beam, body, pose, transforms)
+            beam = self._extended(near, beam, body, pose, transforms)
             strata = beam.poses.shape[1] if strata == 1 else strata
-            beam = self._thinned(beam, strata, self.effort.beam)
-        if self.effort.polish:
-            poses = self._polished(near, beam.poses, lost, limb)
+            beam = self._pruned(beam, strata, self.effort.beam)
+        if self.effort.refine_widths:
+            poses = self._refined(near, beam.poses, losses, limb)
         else:
-            poses = self._thinned(beam, strata, self.effort.configurations).poses
-        tables = torch.minimum(self._lost(self.problem, poses, limb, self.score_width), unexplained.unsqueeze(1))
+            poses = self._pruned(beam, strata, self.effort.configurations).poses
+        limb_losses = self._limb_losses(self.problem, poses, limb, self.score_width)
+        tables = torch.minimum(limb_losses, score_losses.unsqueeze(1))
         cost = tables.sum(-1) + PRIOR_SHARE * self.problem.prior.cost(poses)
         index = _diverse(poses[..., limb.dofs], cost, self.effort.configurations)
         return take_rows(poses, index), take_rows(tables, index)
 
-    def _within_reach(self, lost: Tensor, root: Tensor) -> tuple[AlignProblem, Tensor]:
-        """Return the few data nearest to a limb's root (B, 3) that the trunk leaves over, and how far (B, 1, M)."""
-        distance = (self.few.data - root.unsqueeze(1)).norm(dim=-1)
-        count = math.ceil(min(1.0, _NEAR_SHARES / len(self.limbs.limbs)) * distance.shape[1])
-        index = (distance / (lost[:, 0] + _TINY)).topk(count, dim=1, largest=False).indices
-        near = replace(self.few, data=take_rows(self.few.data, index), valid=self.few.valid.gather(1, index))
-        return near, lost.gather(2, index.unsqueeze(1))
+    def _near_data(self, losses: Tensor, root: Tensor) -> tuple[AlignProblem, Tensor]:
+        """Return the data of the subset nearest to a limb's root (B, 3) that the trunk leaves, and losses (B, 1, M)."""
+        distance = (self.subset.data - root.unsqueeze(1)).norm(dim=-1)
+        count = math.ceil(min(1.0, _PLACEMENT.near_shares / len(self.limbs.limbs)) * distance.shape[1])
+        index = (distance / (losses[:, 0] + _PLACEMENT.min_loss)).topk(count, dim=1, largest=False).indices
+        near = replace(self.subset, data=take_rows(self.subset.data, index), valid=self.subset.valid.gather(1, index))
+        return near, losses.gather(2, index.unsqueeze(1))
 
-    def _grown(self, near: AlignProblem, beam: _Beam, body: Body, pose: Tensor, transforms: Tensor) -> _Beam:
-        """Return the beam with one more body, at samples of its joints and where it was."""
+    def _extended(self, near: AlignProblem, beam: _Beam, body: Body, pose: Tensor, transforms: Tensor) -> _Beam:
+        """Return the beam with one more body, at samples of its joints and as in ``pose``."""
         batch, count = beam.poses.shape[:2]
-        dofs = list(body.dofs)
-        samples = self.limbs.samples[body]
-        kept = torch.linspace(0, len(samples) - 1, min(len(samples), max(1, _MAX_GROWN // count - 1))).round().long()
+        dofs, samples = list(body.dofs), self.limbs.samples[body]
+        num_kept = min(len(samples), max(1, _PLACEMENT.max_tried // count - 1))
+        kept = torch.linspace(0, len(samples) - 1, num_kept).round().long()
         samples = samples[kept]
         values = torch.cat([samples.expand(batch, *samples.shape), pose[:, None, dofs]], dim=1)
         poses = beam.poses.unsqueeze(2).repeat(1, 1, values.shape[1], 1)
         poses[..., dofs] = values.unsqueeze(1)
         if body in self.limbs.relative:
             sampled = self.limbs.relative[body][kept]
-            own = self.limbs.transforms_on_parent(body, pose, transforms).unsqueeze(1)
-            relative = torch.cat([sampled.expand(batch, *sampled.shape), own], dim=1).unsqueeze(1)
+            given = self.limbs.transforms_on_parent(body, pose, transforms).unsqueeze(1)
+            relative = torch.cat([sampled.expand(batch, *sampled.shape), given], dim=1).unsqueeze(1)
         else:
             relative = self.limbs.transforms_on_parent(body, poses, self.shape.part_transforms(poses))
         placed = (beam.frames[:, :, None, None] @ relative).flatten(1, 2)
-        unexplained = self._unexplained(near, placed, list(body.parts), self.width)
-        lost = torch.minimum(unexplained, beam.lost.repeat_interleave(values.shape[1], dim=1))
-        return _Beam(poses.flatten(1, 2), lost, placed[:, :, 0])
+        losses = self._part_losses(near, placed, list(body.parts), self.width)
+        losses = torch.minimum(losses, beam.losses.repeat_interleave(values.shape[1], dim=1))
+        return _Beam(poses.flatten(1, 2), losses, placed[:, :, 0])
 
-    def _thinned(self, beam: _Beam, strata: int, keep: int) -> _Beam:
+    def _pruned(self, beam: _Beam, strata: int, keep: int) -> _Beam:
         """Return the best configurations; of each sample of the limb's first body equally many, so that all survive."""
-        cost = beam.lost.sum(-1) + PRIOR_SHARE * self.few.prior.cost(beam.poses)
+        cost = beam.losses.sum(-1) + PRIOR_SHARE * self.subset.prior.cost(beam.poses)
         if keep < strata:
             return beam.take(cost.topk(min(keep, cost.shape[1]), largest=False).indices)
         cost = cost.unflatten(1, (strata, -1))
@@ -275,53 +293,55 @@ class _Search:
         first = torch.arange(strata, device=cost.device).unsqueeze(-1) * cost.shape[-1]
         return beam.take((best + first).flatten(1))
 
-    def _polished(self, problem: AlignProblem, poses: Tensor, lost: Tensor, limb: Limb) -> Tensor:
-        """Return configurations after Gauss-Newton steps of the limb's joints, on data that the trunk leaves over."""
+    def _refined(self, problem: AlignProblem, poses: Tensor, losses: Tensor, limb: Limb) -> Tensor:
+        """Return configurations after Gauss-Newton steps of the limb's joints, on data that the trunk leaves."""
         dofs = limb.dofs
         prior = problem.prior
         precision, mean = prior.precision[..., dofs], prior.mean[..., None, dofs]
         precision = precision.reshape(-1, 1, len(dofs))
-        share = self.problem.valid.sum(-1) / self.few.valid.sum(-1).clamp_min(1)
-        noise = _NOISE * problem.size
-        free = (lost * problem.valid.unsqueeze(1)) * (share / noise**2)[:, None, None]
+        # The data of the subset count for all.
+        share = self.problem.valid.sum(-1) / self.subset.valid.sum(-1).clamp_min(1)
+        noise = _PLACEMENT.noise * problem.size
+        weights = (losses * problem.valid.unsqueeze(1)) * (share / noise**2)[:, None, None]
         lower, upper = self.shape.lower[dofs], self.shape.upper[dofs]
-        for width in self.effort.polish:
+        for width in self.effort.refine_widths:
             distance, jacobian = self.shape.distance_jacobian(
                 problem.data.unsqueeze(1), poses, chart="tangent", parts=self.limbs.parts[limb]
             )
             jacobian = jacobian[..., dofs]
-            weighted = jacobian * (free * welsch_weight((distance / (width * problem.size)).square())).unsqueeze(-1)
+            near = welsch_weight((distance / (width * problem.size)).square())
+            weighted = jacobian * (weights * near).unsqueeze(-1)
             values = poses[..., dofs]
             gradient = (weighted.mT @ distance.unsqueeze(-1)).squeeze(-1) + precision * (values - mean)
             # A unit of precision holds joints that no datum reaches.
             hessian = weighted.mT @ jacobian + torch.diag_embed(precision + 1)
-            step = torch.linalg.solve(hessian, gradient).clamp(-_MAX_STEP, _MAX_STEP)
+            step = torch.linalg.solve(hessian, gradient).clamp(-_PLACEMENT.max_step, _PLACEMENT.max_step)
             poses = poses.clone()
             poses[..., dofs] = torch.minimum(torch.maximum(values - step, lower), upper)
         return poses
 
-    def _unexplained(self, problem: AlignProblem, transforms: Tensor, parts: list[int], width: float) -> Tensor:
-        """Return how far data are from being explained, (B, K, M), by parts at transforms (B, K, P, 4, 4)."""
+    def _part_losses(self, problem: AlignProblem, transforms: Tensor, parts: list[int], width: float) -> Tensor:
+        """Return the losses (B, K, M) of data on parts at transforms (B, K, P, 4, 4)."""
         if not parts:
             return problem.valid.to(problem.data).unsqueeze(1)
         distance = self.shape.placed_distances(problem.data.unsqueeze(1), transforms, parts).amin(-2)
-        return _softly_lost(problem, distance, width)
+        return _losses(problem, distance, width)
 
-    def _lost(self, problem: AlignProblem, poses: Tensor, limb: Limb, width: float) -> Tensor:
-        """Return how far data are from being explained, (B, K, M), by a limb in poses (B, K, num_dofs)."""
+    def _limb_losses(self, problem: AlignProblem, poses: Tensor, limb: Limb, width: float) -> Tensor:
+        """Return the losses (B, K, M) of data on a limb in poses (B, K, num_dofs)."""
         distance = self.shape.distance(problem.data.unsqueeze(1), poses, parts=self.limbs.parts[limb])
-        return _softly_lost(problem, distance, width)
+        return _losses(problem, distance, width)
 
 
-def _softly_lost(problem: AlignProblem, distance: Tensor, width: float) -> Tensor:
+def _losses(problem: AlignProblem, distance: Tensor, width: float) -> Tensor:
     return welsch_loss((distance / width).square()) * problem.valid.unsqueeze(1)
 
 
 def _diverse(joints: Tensor, cost: Tensor, count: int) -> Tensor:
-    """Return the indices (B, C) of the best of K configurations (B, K, d) that differ; then of the others."""
+    """Return the indices (B, C) of the best of K configurations (B, K, d), those that differ before the others."""
     order = cost.argsort(1)
     joints = take_rows(joints, order)
-    close = (joints.unsqueeze(2) - joints.unsqueeze(1)).abs().amax(-1) < _SAME
+    close = (joints.unsqueeze(2) - joints.unsqueeze(1)).abs().amax(-1) < _PLACEMENT.same
     return order.gather(1, distinct_first(close)[:, :count])
 
 

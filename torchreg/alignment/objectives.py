@@ -6,21 +6,22 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
-from torchreg.shapes.pose_algebra import difference
+from torchreg.shapes.pose_algebra import BASE_DOFS, difference
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import Surface
 from torchreg.solvers.e_step import EStep
 from torchreg.solvers.levenberg_marquardt import Linearization
 from torchreg.solvers.robust import welsch_weight
 
-# The base is held, in the Hessian alone, as if by this share of a datum: more slows starts that few data reach.
-_ANCHOR_DATA = 0.1
+# The base is damped, in the Hessian alone, as if by this share of a datum: more slows down starts near few data.
+_BASE_DAMPING_DATA = 0.1
 
 
 @dataclass(frozen=True)
-class PosePrior:
-    """A Gaussian on the pose, ``sum_k precision_k (pose_k - mean_k)^2 / 2``; zero precision leaves one free.
+class GaussianPosePrior:
+    """A Gaussian on the pose, ``sum_k precision_k (pose_k - mean_k)^2 / 2``; zero precision leaves a variable free.
 
     Args:
         mean: (B, num_dofs).
@@ -35,10 +36,10 @@ class PosePrior:
     def add_to(self, problem: Linearization, pose: Tensor) -> Linearization:
         """Return the problem with the prior added."""
         offset = self._offset(pose, self.mean)
-        pull = self.precision * offset
+        gradient = self.precision * offset
         return Linearization(
-            problem.cost + 0.5 * (pull * offset).sum(-1),
-            problem.gradient + pull,
+            problem.cost + 0.5 * (gradient * offset).sum(-1),
+            problem.gradient + gradient,
             problem.hessian + torch.diag_embed(self.precision),
         )
 
@@ -48,9 +49,7 @@ class PosePrior:
         return 0.5 * (self.precision * self._offset(pose, mean).square()).sum(-1)
 
     def _offset(self, pose: Tensor, mean: Tensor) -> Tensor:
-        if not self.holds_base:
-            return pose - mean
-        return difference(mean, pose)
+        return difference(mean, pose) if self.holds_base else pose - mean
 
 
 class RegistrationObjective:
@@ -59,15 +58,15 @@ class RegistrationObjective:
     The skin is linear in the part transforms, so the curvature over all points collapses into one small matrix.
 
     Args:
-        skin: the model points.
-        observed: lambda and G from the E-step.
+        skin: the model points X.
+        matches: lambda and G from the E-step.
         sigma: (B,) metres.
         prior: on the joints.
     """
 
-    def __init__(self, skin: LinearBlendSkin, observed: EStep, sigma: Tensor, prior: PosePrior) -> None:
-        self.skin, self.prior, self.targets = skin, prior, observed.targets
-        weights = torch.threshold(observed.weights, 1e-12, 0.0)
+    def __init__(self, skin: LinearBlendSkin, matches: EStep, sigma: Tensor, prior: GaussianPosePrior) -> None:
+        self.skin, self.prior, self.targets = skin, prior, matches.targets
+        weights = torch.threshold(matches.weights, 1e-12, 0.0)
         self.weights = (weights / (sigma * sigma).unsqueeze(-1)).unsqueeze(-1)
         self.curvature = skin.basis.mT @ (self.weights * skin.basis)
 
@@ -81,8 +80,8 @@ class RegistrationObjective:
         weighted = self.weights * residual
         flat = derivative.flatten(-3, -2)
         # Written with the three coordinates from the left, as in `place`.
-        pull = (weighted.mT @ self.skin.basis).mT.flatten(-2).unsqueeze(-1)
-        gradient = (flat.mT @ pull).squeeze(-1)
+        by_transform = (weighted.mT @ self.skin.basis).mT.flatten(-2).unsqueeze(-1)
+        gradient = (flat.mT @ by_transform).squeeze(-1)
         curved = (self.curvature @ derivative.flatten(-2)).reshape(flat.shape)
         problem = Linearization(0.5 * (weighted * residual).sum((-2, -1)), gradient, flat.mT @ curved)
         return self.prior.add_to(problem, pose)
@@ -104,8 +103,8 @@ class SurfaceObjective:
         valid: (B, M) one, or zero where padded.
         sigma: (B,) kernel width sigma_s, metres.
         noise: (B,) standard deviation of the distances, metres; weighs data against the prior.
-        prior: on the joints.
-        lever: length by which a turn of the base moves the shape, metres.
+        prior: on the pose.
+        lever: distance of the shape's points from the base's axis of rotation, metres.
     """
 
     def __init__(
@@ -115,16 +114,17 @@ class SurfaceObjective:
         valid: Tensor,
         sigma: Tensor,
         noise: Tensor,
-        prior: PosePrior,
+        prior: GaussianPosePrior,
         lever: float = 1.0,
     ) -> None:
         self.surface, self.data, self.valid, self.prior = surface, data, valid, prior
         self.inverse_square = sigma.square().reciprocal().unsqueeze(-1)
         self.scale = noise.square().reciprocal()
-        # What the data leave free, as sliding along a cylinder, then stays where it is.
-        stiffness = _ANCHOR_DATA * self.inverse_square
-        turns = torch.nn.functional.pad((stiffness * lever**2).expand(-1, 3), (3, prior.mean.shape[-1] - 6))
-        self.anchor = turns + torch.nn.functional.pad(stiffness.expand(-1, 3), (0, prior.mean.shape[-1] - 3))
+        # Motions of the base that the data leave free, as along a cylinder's axis, are then not taken.
+        stiffness = _BASE_DAMPING_DATA * self.inverse_square
+        num_dofs = prior.mean.shape[-1]
+        turns = pad((stiffness * lever**2).expand(-1, 3), (3, num_dofs - BASE_DOFS))
+        self.base_damping = turns + pad(stiffness.expand(-1, 3), (0, num_dofs - 3))
 
     def __call__(self, pose: Tensor) -> Linearization:
         """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs)."""
@@ -135,7 +135,7 @@ class SurfaceObjective:
         beta = self._beta(distance)
         weighted = jacobian * (beta * self.valid * self.scale.unsqueeze(-1)).unsqueeze(-1)
         gradient = (weighted.mT @ distance.unsqueeze(-1)).squeeze(-1)
-        hessian = weighted.mT @ jacobian + torch.diag_embed(self.anchor)
+        hessian = weighted.mT @ jacobian + torch.diag_embed(self.base_damping)
         return self.prior.add_to(Linearization(self._data_cost(beta), gradient, hessian), pose)
 
     def cost(self, pose: Tensor) -> Tensor:

@@ -8,33 +8,47 @@ import torch
 from torch import Tensor, nn
 
 from torchreg._checks import check_choice, check_count, check_positive, check_shape
-from torchreg.alignment.annealed_em import SIGMA_PER_NOISE, fit_surface, register, residual_noise
-from torchreg.alignment.find_pose import FindPoseConfig, find_pose, typical_poses
+from torchreg.alignment.align import AlignConfig
+from torchreg.alignment.annealed_em import ANNEALING, anneal
+from torchreg.alignment.clusters import clustered_data
+from torchreg.alignment.confidence import EVIDENCE
+from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.implicit_gradient import FixedPoint, attach_gradients
-from torchreg.alignment.local_search import clustered_data
-from torchreg.alignment.objectives import PosePrior, SurfaceObjective
-from torchreg.alignment.problem import AlignProblem, centered_problem, check_data, masked_mean, shifted
-from torchreg.alignment.sigma_schedule import SigmaSchedule
+from torchreg.alignment.inputs import check_clouds, check_skin
+from torchreg.alignment.objectives import GaussianPosePrior
+from torchreg.alignment.problem import (
+    BROAD_PRIOR,
+    AlignProblem,
+    centered_problem,
+    masked_mean,
+    shifted,
+    soft_inliers,
+)
+from torchreg.alignment.rough_poses import typical_poses
+from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface, residual_noise, surface_objective
 from torchreg.errors import InputError
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 from torchreg.shapes.surface import FusedSurface
-from torchreg.solvers.robust import welsch_weight
 
-_START_SIGMA, _STOP_SIGMA = 0.08, 0.02
-# How weakly a start holds the base, so that a cloud without data leaves it there: radians, and shares of the size.
-_TURN_STD, _SHIFT_STD = 1.0, 0.5
-# A datum counts as explained about this share of the size from the surface; clusters of this share of the data do not.
-_EXPLAINED, _DOUBTFUL_SHARE = 0.02, 0.1
-_LEVER = 0.25
-# Clouds that are searched, and whose poses are fitted, at a time.
-_CHUNK, _WIDE_CHUNK = {"cpu": 1}, 256
-_ROWS, _WIDE_ROWS = {"cpu": 64}, 4096
+
+@dataclass(frozen=True)
+class _Batching:
+    """Number of clouds in one batch."""
+
+    cpu_searched: int = 1  # of a search on a CPU, whose caches hold no more
+    searched: int = 256  # of a search on other devices, which these keep busy
+    cpu_fitted: int = 64  # of fits without gradients on a CPU, where more are no faster
+    fitted: int = 4096  # of fits without gradients on other devices, into whose memory these fit
+
+
+_BATCHING = _Batching()
 
 
 @dataclass(frozen=True)
 class PoseInitializerConfig:
-    """How `PoseInitializer` works. Lengths default to shares of the shape's size.
+    """Settings of a `PoseInitializer`. Lengths default to shares of the shape's size.
 
     Args:
         sigma_steps: widths of the annealed EM from a start, from 8 % to 2 % of the size; 0 leaves the EM out.
@@ -80,12 +94,12 @@ class PoseInitializerConfig:
 
 @dataclass(frozen=True)
 class InitialPose:
-    """What `PoseInitializer` returns; without a batch of clouds the dimension B is absent.
+    """Poses found by `PoseInitializer`; without a batch of clouds the dimension B is absent.
 
     Args:
         pose: (B, num_dofs), metres and radians.
         confidence: (B,) from 0 to 1, without gradients: the share of the data that the pose explains; from scratch
-            times how surely the search found the pose, and the data tell where its limbs end.
+            times the confidence of the search, which falls with limbs of which no data tell where they end.
         keypoints: (B, K, 3) of the shape in the pose, metres.
         registered: (B, N, 3) model points in the pose, metres.
     """
@@ -129,9 +143,8 @@ class PoseInitializer(nn.Module):
         super().__init__()
         self.config = config or PoseInitializerConfig()
         self.shape = shape
-        if model_points is not None and model_points.shape is not shape:
-            raise InputError("model_points is a skin of another shape; build it from the shape whose pose is sought")
-        self.skin = sample_skin(shape, self.config.num_model_points) if model_points is None else model_points
+        count = self.config.num_model_points
+        self.skin = sample_skin(shape, count) if model_points is None else check_skin(shape, model_points)
 
     def forward(self, points: Tensor, mask: Tensor | None = None, start: Tensor | None = None) -> InitialPose:
         """Return the poses of the shape in clouds.
@@ -154,24 +167,25 @@ class PoseInitializer(nn.Module):
         Cost: of the forward pass O(B M) per step; from scratch about two seconds per hand on one CPU core.
         """
         with torch.autocast(device_type=self.shape.rest.device.type, enabled=False):
-            data, valid = check_data(self.shape, points, mask, self.config.nan_policy)
-            batch, allowed = (data, valid) if data.ndim == 3 else (data.unsqueeze(0), valid.unsqueeze(0))
-            origin = masked_mean(batch, allowed).detach()
-            given = None if start is None else self._given(start, len(batch))
+            clouds, valid = check_clouds(self.shape, points, mask, self.config.nan_policy, name="points")
+            batch, batch_valid = (clouds, valid) if clouds.ndim == 3 else (clouds.unsqueeze(0), valid.unsqueeze(0))
+            origin = masked_mean(batch, batch_valid).detach()
+            start = None if start is None else self._check_start(start, len(batch))
             if torch.is_grad_enabled():
-                pose, confidence = self._poses(batch, allowed, given, origin)
+                pose, confidence = self._poses(batch, batch_valid, start, origin)
             else:
-                # More clouds at a time are no faster, and would not fit into memory.
-                rows = torch.arange(len(batch), device=batch.device).split(_ROWS.get(batch.device.type, _WIDE_ROWS))
+                size = _BATCHING.cpu_fitted if batch.device.type == "cpu" else _BATCHING.fitted
+                rows = torch.arange(len(batch), device=batch.device).split(size)
                 parts = [
-                    self._poses(batch[r], allowed[r], None if given is None else given[r], origin[r]) for r in rows
+                    self._poses(batch[r], batch_valid[r], None if start is None else start[r], origin[r]) for r in rows
                 ]
                 pose, confidence = (torch.cat(part) for part in zip(*parts, strict=True))
             keypoints, registered = self.shape.keypoints(pose), self.skin(pose)
-        result = InitialPose(pose, confidence, keypoints, registered)
-        return result if data.ndim == 3 else InitialPose(pose[0], confidence[0], keypoints[0], registered[0])
+        if clouds.ndim == 2:
+            pose, confidence, keypoints, registered = pose[0], confidence[0], keypoints[0], registered[0]
+        return InitialPose(pose=pose, confidence=confidence, keypoints=keypoints, registered=registered)
 
-    def _given(self, start: Tensor, count: int) -> Tensor:
+    def _check_start(self, start: Tensor, count: int) -> Tensor:
         start = self.shape.check_pose(start, "start")
         if not bool(start.isfinite().all()):
             raise InputError("start must be finite")
@@ -179,84 +193,88 @@ class PoseInitializer(nn.Module):
         check_shape(start, "start", (count, self.shape.num_dofs))
         return start
 
-    def _poses(self, data: Tensor, valid: Tensor, given: Tensor | None, origin: Tensor) -> tuple[Tensor, Tensor]:
+    def _poses(self, data: Tensor, valid: Tensor, start: Tensor | None, origin: Tensor) -> tuple[Tensor, Tensor]:
         """Return poses (B, num_dofs) and confidences (B,)."""
-        if given is None:
-            found, sure = self._search(data.detach(), valid)
-            begin = shifted(found, -origin)
+        if start is None:
+            found, confidence = self._search(data.detach(), valid)
             # The prior draws to a typical pose, which does not change with the data.
-            mean = torch.cat([found[:, :6], typical_poses(self.shape).mean(0)[6:].expand(len(found), -1)], dim=-1)
+            joints = typical_poses(self.shape).mean(0)[BASE_DOFS:].expand(len(found), -1)
+            mean = torch.cat([found[:, :BASE_DOFS], joints], dim=-1)
         else:
-            begin, mean, sure = given, given, torch.ones_like(given[:, 0]).detach()
+            mean, confidence = start, torch.ones_like(start[:, 0]).detach()
         with torch.no_grad():
             problem = centered_problem(
-                self.skin, data, valid, mean, origin, prior_std=self.config.prior_std, pose_atol=0.0, debias=0.8
-            )
-            if given is None:
-                begin = self._approach(problem, problem.clamp(begin))
+                self.skin, data, valid, mean, origin, prior_std=self.config.prior_std, pose_atol=0.0,
+                debias=AlignConfig.debias,
+            )  # fmt: skip
+            if start is None:
+                pose = self._fit_surface(problem, problem.clamp(shifted(found, -origin)))
             else:
-                begin = self._descend(problem, problem.clamp(problem.prior.mean))
-            # A file's own mesh, whose nearest points jump, has no smooth fixed point: the solids have.
+                pose = self._fit_surface(problem, self._anneal(problem, problem.clamp(problem.prior.mean)))
+            # The mesh of a file, whose nearest points jump, has no smooth fixed point: the solids have.
             problem = replace(problem, surface=FusedSurface(self.shape))
-            fixed, pose = self._settle(problem, begin, has_base=given is not None)
-            confidence = sure * self._confidence(problem, pose)
+            fixed, pose = self._last_fit(problem, pose, holds_base=start is not None)
+            confidence = confidence * _explained_share(problem, pose)
         mean = shifted(mean, -origin)
         if torch.is_grad_enabled() and (data.requires_grad or mean.requires_grad or fixed.parameters):
             centered = torch.where(valid.unsqueeze(-1), data - origin.unsqueeze(1), 0.0)
-            pose = fixed.polish(pose, centered, mean, self.config.newton_steps)
+            pose = fixed.newton_steps(pose, centered, mean, self.config.newton_steps)
             pose = attach_gradients(fixed, pose, centered, mean)
         return shifted(pose, origin), confidence
 
     @torch.no_grad()
     def _search(self, data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the best poses (B, num_dofs) that a search finds, and how sure they are (B,); without points, not."""
+        """Return the best poses (B, num_dofs) that a search finds, and confidences (B,), zero without points."""
         pose = typical_poses(self.shape).mean(0).repeat(len(data), 1)
-        sure = torch.zeros_like(pose[:, 0])
-        chunk = self.config.chunk or _CHUNK.get(data.device.type, _WIDE_CHUNK)
-        for rows in valid.any(-1).nonzero()[:, 0].split(chunk):
+        confidence = torch.zeros_like(pose[:, 0])
+        size = _BATCHING.cpu_searched if data.device.type == "cpu" else _BATCHING.searched
+        for rows in valid.any(-1).nonzero()[:, 0].split(self.config.chunk or size):
             starts = find_pose(
                 self.shape, data[rows], mask=valid[rows], num_starts=1, model_points=self.skin,
                 config=self.config.search,
             )  # fmt: skip
-            pose[rows], sure[rows] = starts.poses[:, 0], starts.confidence
-        return pose, sure
+            pose[rows], confidence[rows] = starts.poses[:, 0], starts.confidence
+        return pose, confidence
 
-    def _descend(self, problem: AlignProblem, pose: Tensor) -> Tensor:
-        """Return the poses after annealed EM, and the surface fit down to the noise."""
-        if self.config.sigma_steps:
-            schedule = SigmaSchedule.geometric(
-                _START_SIGMA * problem.size, _STOP_SIGMA * problem.size, self.config.sigma_steps
-            )
-            pose = register(problem, pose, schedule, em_steps=self.config.em_steps, m_steps=1).pose
-        return self._approach(problem, pose)
+    def _anneal(self, problem: AlignProblem, pose: Tensor) -> Tensor:
+        if not self.config.sigma_steps:
+            return pose
+        schedule = ANNEALING.schedule(problem.size, self.config.sigma_steps)
+        return anneal(problem, pose, schedule, em_steps=self.config.em_steps, m_steps=1).pose
 
-    def _approach(self, problem: AlignProblem, pose: Tensor) -> Tensor:
+    def _fit_surface(self, problem: AlignProblem, pose: Tensor) -> Tensor:
         if not self.config.surface_steps:
             return pose
         return fit_surface(problem, pose, steps=self.config.surface_steps).pose
 
-    def _settle(self, problem: AlignProblem, pose: Tensor, *, has_base: bool) -> tuple[FixedPoint, Tensor]:
+    def _last_fit(self, problem: AlignProblem, pose: Tensor, *, holds_base: bool) -> tuple[FixedPoint, Tensor]:
         """Return the energy of the last fit and its stationary pose (B, num_dofs)."""
         noise = residual_noise(problem, pose)
         if self.config.noise is not None:
             noise = torch.full_like(noise, self.config.noise)
-        sigma = SIGMA_PER_NOISE * noise
+        sigma = SURFACE_FIT.width_per_noise * noise
         precision = problem.prior.precision.clone()
-        if has_base:
-            precision[:3], precision[3:6] = (_SHIFT_STD * problem.size) ** -2, _TURN_STD**-2
+        if holds_base:
+            # So weakly that data rule, but a cloud without data leaves the base at its start.
+            precision[:BASE_DOFS] = BROAD_PRIOR.precision(self.shape, problem.size)[:BASE_DOFS]
         fixed = FixedPoint(
-            self.shape, problem.surface, problem.valid, sigma, noise, precision, problem.lower, problem.upper
+            shape=self.shape,
+            surface=problem.surface,
+            valid=problem.valid,
+            sigma=sigma,
+            noise=noise,
+            precision=precision,
+            lower=problem.lower,
+            upper=problem.upper,
         )
-        prior = PosePrior(problem.prior.mean, precision, holds_base=has_base)
-        objective = SurfaceObjective(
-            problem.surface, problem.data, problem.valid, sigma, noise, prior, _LEVER * problem.size
-        )
+        prior = GaussianPosePrior(problem.prior.mean, precision, holds_base=holds_base)
+        objective = surface_objective(problem, sigma, noise, prior)
         return fixed, problem.solve(objective, pose, self.config.fit_steps, objective(pose)).state
 
-    def _confidence(self, problem: AlignProblem, pose: Tensor) -> Tensor:
-        """Return (B,) from 0 to 1: the share of data near the surface, less where those off it lie densely."""
-        distance = problem.surface.distance(problem.data, pose)
-        near = welsch_weight((distance / (_EXPLAINED * problem.size)).square()) * problem.valid
-        share = near.sum(-1) / problem.valid.sum(-1).clamp_min(1)
-        clustered, on_surface = clustered_data(problem, pose)
-        return share * (-clustered / on_surface.clamp_min(1) / _DOUBTFUL_SHARE).exp()
+
+def _explained_share(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return the share (B,) of data near the surface, from 0 to 1, lowered where those off it lie in clusters."""
+    near = soft_inliers(problem, problem.surface.distance(problem.data, pose))
+    share = near.sum(-1) / problem.valid.sum(-1).clamp_min(1)
+    clustered, on_surface = clustered_data(problem, pose)
+    return share * (-clustered / on_surface.clamp_min(1) / EVIDENCE.left_over).exp()

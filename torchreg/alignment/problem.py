@@ -1,19 +1,16 @@
-"""A batch of alignments as every stage sees it: checked data in centered coordinates, limits, prior, sizes."""
+"""A batch of alignments as every stage sees it: data in centered coordinates, limits, prior, sizes."""
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_shape
-from torchreg.alignment.objectives import PosePrior, RegistrationObjective, SurfaceObjective
-from torchreg.errors import InputError, InputTypeError, UnitsWarning
-from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.kinematics import stack_sizes
+from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import FusedSurface, SkinSurface, Surface, dense_file_skin
 from torchreg.solvers.levenberg_marquardt import (
@@ -23,27 +20,41 @@ from torchreg.solvers.levenberg_marquardt import (
     held_at_limits,
     levenberg_marquardt,
 )
-from torchreg.solvers.robust import welsch_loss
+from torchreg.solvers.robust import welsch_loss, welsch_weight
 
 # Data nearer to the fitted surface than this share of the model's size are inliers.
 INLIER_SHARE = 0.02
-# How much the prior weighs in a score, in outliers per squared standard deviation.
+# Weight of the prior in a score, in outliers per half squared standard deviation.
 PRIOR_SHARE = 0.3
-# Damping of the single steps that an EM takes, whose objective changes with every E-step anyway.
-_EM_DAMPING = 1e-3
-# Data and model that differ more than this in size are in different units, if there are enough data to say so.
-_UNITS_RATIO, _MIN_DATA = 30.0, 10
+# Revolute joints with one center make a ball joint from this number on.
+BALL_AXES = 3
+# So many model points follow the surface as closely as a sampling made for that.
 _DENSE_SKIN_POINTS = 2500
-_BALL = 3
+
+
+@dataclass(frozen=True)
+class BroadPrior:
+    """Standard deviations of a plausible pose of which nothing else is known."""
+
+    turn: float = 1.0  # of hinges and of the base's rotation, radians: a third of a half turn
+    shift: float = 0.5  # of sliding joints and of the base's position, as a share of the model's size
+
+    def precision(self, shape: Articulation, size: float) -> Tensor:
+        """Return 1 / std^2 (num_dofs,) for a shape of some size in metres."""
+        turns = torch.full_like(shape.rest, self.turn**-2)
+        return torch.where(shape.is_sliding, (self.shift * size) ** -2, turns)
+
+
+BROAD_PRIOR = BroadPrior()
 
 
 @dataclass(frozen=True)
 class AlignProblem:
-    """A batch of alignments of one shape: what every stage works on.
+    """A batch of alignments of one shape, the input of every stage.
 
     Args:
         skin: the model points.
-        surface: what the surface fit fits.
+        surface: the surface that the surface fit fits.
         data: (B, M, 3), metres.
         valid: (B, M) False where padded.
         size: diagonal of the model in its rest pose, metres: the unit of all thresholds.
@@ -52,7 +63,7 @@ class AlignProblem:
         prior: on the joints.
         pose_atol: largest change of a pose that counts as none.
         outlier: "limit" or "volume".
-        debias: share of the kernel's own pull that is taken from the targets of the EM.
+        debias: share of the kernel's shrinkage that is taken out of the targets of the EM.
         correspondence: one of `CORRESPONDENCES`.
     """
 
@@ -63,7 +74,7 @@ class AlignProblem:
     size: float
     lower: Tensor
     upper: Tensor
-    prior: PosePrior
+    prior: GaussianPosePrior
     pose_atol: float
     outlier: str = "limit"
     debias: float = 0.0
@@ -80,6 +91,10 @@ class AlignProblem:
             prior=replace(self.prior, mean=self.prior.mean[index]),
         )
 
+    def repeated(self, count: int) -> AlignProblem:
+        """Return the batch with every problem ``count`` times in a row."""
+        return self.rows(torch.arange(len(self.data), device=self.data.device).repeat_interleave(count))
+
     def draw(self, count: int, generator: torch.Generator) -> AlignProblem:
         """Return the problem with at most ``count`` data, drawn from the valid ones, the same alone and in a batch."""
         draw = torch.rand(self.valid.shape[-1], generator=generator).to(self.data)
@@ -95,18 +110,21 @@ class AlignProblem:
         around: Linearization,
         damping: Tensor | None = None,
     ) -> LMResult:
-        """Return what Levenberg-Marquardt within the joint limits makes of a pose around which all is known."""
+        """Return the result of Levenberg-Marquardt within the joint limits from a pose with a known linearization."""
         return levenberg_marquardt(
             objective, pose, retract=self.skin.shape.retract, lower=self.lower, upper=self.upper,
             damping=damping, max_steps=max_steps, atol=self.pose_atol * min(1.0, self.size),
             start=around, cost=objective.cost,
         )  # fmt: skip
 
-    def step(self, around: Linearization, pose: Tensor, damping: float = _EM_DAMPING) -> LMResult:
-        """Return the result of one damped step, without a test: what a generalized EM needs."""
+    def step(self, around: Linearization, pose: Tensor, damping: float = 1e-3) -> LMResult:
+        """Return the result of one damped step without a test: all that a generalized EM needs.
+
+        The default damping, that of an untried problem, suits an EM, whose objective changes with every E-step anyway.
+        """
         shares = torch.full_like(pose[:, 0], damping)
-        held = held_at_limits(around.gradient, pose, self.lower, self.upper)
-        step, _ = damped_step(around, shares, frozen=held)
+        frozen = held_at_limits(around.gradient, pose, self.lower, self.upper)
+        step, _ = damped_step(around, shares, frozen=frozen)
         return LMResult(self.clamp(self.skin.shape.retract(pose, step)), around.cost, shares, step, 1)
 
     def change(self, step: Tensor) -> Tensor:
@@ -117,39 +135,13 @@ class AlignProblem:
         """Return poses (..., B, num_dofs) moved inside the limits."""
         return torch.minimum(torch.maximum(pose, self.lower), self.upper)
 
+    def clamp_candidates(self, poses: Tensor) -> Tensor:
+        """Return candidates (B, K, num_dofs) moved inside the limits."""
+        return self.clamp(poses.transpose(0, 1)).transpose(0, 1)
+
 
 def _rows(limits: Tensor, index: Tensor) -> Tensor:
     return limits if limits.ndim == 1 else limits[index]
-
-
-def check_data(shape: ArticulatedShape, data: Tensor, mask: Tensor | None, nan_policy: str) -> tuple[Tensor, Tensor]:
-    """Return the data in the shape's dtype and which of them count (False for padding and points left out).
-
-    Raises:
-        InputError: if the data are empty, not finite, or do not fit the mask.
-        InputTypeError: if something has the wrong type.
-    """
-    data = as_float_tensor(data, "data", like=shape.rest)
-    if data.ndim not in (2, 3):
-        raise InputError(f"data must have shape (M, 3) or (B, M, 3), got {tuple(data.shape)}")
-    check_shape(data, "data", ("M", 3), batch=True)
-    if data.shape[-2] == 0 or data.shape[0] == 0:
-        raise InputError(f"data must hold at least one point, got shape {tuple(data.shape)}")
-    valid = torch.ones_like(data[..., 0], dtype=torch.bool)
-    if mask is not None:
-        if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
-            raise InputTypeError("mask must be a tensor of bool, False where data are padding")
-        if mask.shape != valid.shape:
-            raise InputError(f"mask must have shape {tuple(valid.shape)} like the data, got {tuple(mask.shape)}")
-        valid = mask.to(data.device)
-    finite = torch.isfinite(data).all(-1)
-    bad = int((valid & ~finite).sum())
-    if bad and nan_policy == "raise":
-        raise InputError(f"data hold {bad} points that are not finite; drop them or set nan_policy='omit'")
-    valid = valid & finite
-    if not bool(valid.any()):
-        raise InputError("data hold no point that is finite and not masked")
-    return torch.where(valid.unsqueeze(-1), data, 0.0), valid
 
 
 def masked_mean(data: Tensor, valid: Tensor) -> Tensor:
@@ -160,6 +152,11 @@ def masked_mean(data: Tensor, valid: Tensor) -> Tensor:
 def shifted(pose: Tensor, offset: Tensor) -> Tensor:
     """Return poses (..., num_dofs) with the base moved by offsets (..., 3)."""
     return torch.cat([pose[..., :3] + offset, pose[..., 3:]], dim=-1)
+
+
+def model_size(skin: LinearBlendSkin) -> float:
+    """Return the diagonal of the bounding box of model points in their reference pose, metres."""
+    return float((skin.points.amax(0) - skin.points.amin(0)).norm())
 
 
 def centered_problem(
@@ -175,7 +172,7 @@ def centered_problem(
     debias: float = 0.0,
     correspondence: str = "em",
 ) -> AlignProblem:
-    """Return a batch of alignments in coordinates with the origin, of each cloud, at zero: there float32 is precise.
+    """Return a batch of alignments in coordinates with the origin of each cloud at zero, where float32 is precise.
 
     Args:
         skin: the model points.
@@ -183,25 +180,17 @@ def centered_problem(
         valid: (B, M) False where padded.
         pose: (B, num_dofs) mean of the prior, in the world.
         origin: (B, 3), as from `masked_mean`.
-        prior_std: see `AlignConfig`, like the others.
+        prior_std: see `AlignConfig`, like the settings below.
         pose_atol: largest change of a pose that counts as none.
         outlier: "limit" or "volume".
-        debias: share of the kernel's own pull that is taken from the targets of the EM.
-        correspondence: who matches whom.
+        debias: share of the kernel's shrinkage that is taken out of the targets of the EM.
+        correspondence: one of `CORRESPONDENCES`.
     """
-    shape = skin.shape
-    size = float((skin.points.amax(0) - skin.points.amin(0)).norm())
+    shape, size = skin.shape, model_size(skin)
     shift = torch.nn.functional.pad(origin, (0, shape.num_dofs - 3))
     lower, upper = shape.lower, shape.upper
     if not bool(torch.isinf(shape.lower[:3]).all()):
         lower, upper = shape.lower - shift, shape.upper - shift
-    precision = torch.zeros_like(shape.rest)
-    if prior_std is not None:
-        joints = torch.where(shape.is_sliding[6:], prior_std * size, prior_std)
-        precision[6:] = joints.square().reciprocal()
-        # The three axes of a ball joint share the deviation of its one rotation.
-        balls = [6 + dof for dof, size in enumerate(stack_sizes(shape.chain.tree)) if size >= _BALL]
-        precision[balls] *= _BALL
     return AlignProblem(
         skin=skin,
         surface=_surface(shape, skin),
@@ -210,7 +199,7 @@ def centered_problem(
         size=size,
         lower=lower,
         upper=upper,
-        prior=PosePrior(pose - shift, precision),
+        prior=GaussianPosePrior(pose - shift, _joint_precision(shape, size, prior_std)),
         pose_atol=pose_atol,
         outlier=outlier,
         debias=debias,
@@ -218,30 +207,33 @@ def centered_problem(
     )
 
 
+def _joint_precision(shape: Articulation, size: float, std: float | None) -> Tensor:
+    """Return the precision (num_dofs,) of a prior that leaves the base free, from the joints' deviation."""
+    precision = torch.zeros_like(shape.rest)
+    if std is not None:
+        joints = torch.where(shape.is_sliding[BASE_DOFS:], std * size, std)
+        precision[BASE_DOFS:] = joints.square().reciprocal()
+        # The three axes of a ball joint share the deviation of its one rotation.
+        balls = [BASE_DOFS + dof for dof, axes in enumerate(stack_sizes(shape.chain.tree)) if axes >= BALL_AXES]
+        precision[balls] *= BALL_AXES
+    return precision
+
+
 def _surface(shape: Articulation, skin: LinearBlendSkin) -> Surface:
-    """Return what is fitted: the file's own surface where there is one, else the fused solids."""
+    """Return the surface to fit: that of the shape's file where there is one, else the fused solids."""
     if shape.surface is None:
         return FusedSurface(shape)
-    dense = skin if len(skin) >= _DENSE_SKIN_POINTS and skin.normals is not None else dense_file_skin(shape)
-    return SkinSurface(dense)
+    dense = skin.normals is not None and len(skin) >= _DENSE_SKIN_POINTS
+    return SkinSurface(skin if dense else dense_file_skin(shape))
+
+
+def soft_inliers(problem: AlignProblem, distances: Tensor) -> Tensor:
+    """Return the degree (..., M), from 0 to 1, to which data at distances (..., M) from a surface are inliers."""
+    return welsch_weight((distances / (INLIER_SHARE * problem.size)).square()) * problem.valid
 
 
 def alignment_cost(problem: AlignProblem, pose: Tensor, distances: Tensor | None = None) -> Tensor:
     """Return the cost (B,) by which alignments of the same data are ranked: outliers, softly counted, and the prior."""
     distances = problem.surface.distance(problem.data, pose) if distances is None else distances
-    lost = welsch_loss((distances / (INLIER_SHARE * problem.size)).square())
-    return (lost * problem.valid).sum(-1) + PRIOR_SHARE * problem.prior.cost(pose)
-
-
-def warn_about_units(problem: AlignProblem, stacklevel: int = 3) -> None:
-    """Warn if the spread of the data does not fit the size of the model, as with millimeters for metres."""
-    radius = problem.data.norm(dim=-1)
-    spread = 2 * torch.where(problem.valid, radius, torch.nan).nanmedian(-1).values
-    ratio = float(spread.nanmedian()) / problem.size
-    if int(problem.valid.sum(-1).max()) >= _MIN_DATA and not 1 / _UNITS_RATIO < ratio < _UNITS_RATIO:
-        warnings.warn(
-            f"the data spread over {ratio:.3g} times the model's size of {problem.size:.3g} m: are they in metres? "
-            f"Scale them, by 0.001 if they are in millimeters",
-            UnitsWarning,
-            stacklevel=stacklevel,
-        )
+    outliers = welsch_loss((distances / (INLIER_SHARE * problem.size)).square())
+    return (outliers * problem.valid).sum(-1) + PRIOR_SHARE * problem.prior.cost(pose)

@@ -1,4 +1,4 @@
-"""Pseudo-labels: the frames of a motion with the poses found in them, frame from frame where that can be trusted."""
+"""Pseudo-labels: the frames of a motion with the poses found in them, tracked from frame to frame where reliable."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_positive
-from torchreg.alignment.pose_initializer import PoseInitializer
-from torchreg.alignment.problem import INLIER_SHARE
+from torchreg.alignment.pose_initializer import InitialPose, PoseInitializer
+from torchreg.alignment.problem import INLIER_SHARE, model_size
 from torchreg.datasets.pose_labels import PoseLabel
 
 
@@ -18,13 +18,13 @@ def label_frames(
 ) -> Iterator[PoseLabel]:
     """Yield a label for each frame of a motion.
 
-    A frame starts from the pose of the frame before. Where that is not to be trusted, or what it leads to is not, the
-    pose is searched for anew, and the surer of the two is kept.
+    A frame starts from the pose of the frame before. Where the confidence in that pose, or in the one it leads to, is
+    too low, the pose is searched for from scratch, and the one of higher confidence is kept.
 
     Args:
         initializer: of the shape.
         frames: clouds (M, 3), metres.
-        trusted: least confidence of a pose that the next frame starts from.
+        trusted: least confidence in a pose that the next frame starts from.
         start: (num_dofs,) of the first frame, if known.
 
     Yields:
@@ -36,17 +36,28 @@ def label_frames(
     Differentiable: no.
     """
     check_positive(trusted, "trusted", allow_zero=True)
-    shape = initializer.shape
-    size = float((initializer.skin.points.amax(0) - initializer.skin.points.amin(0)).norm())
     for frame in frames:
+        points = frame.to(initializer.shape.rest)
         with torch.no_grad():
-            points = frame.to(shape.rest)
-            found = None if start is None else initializer(points, start=start)
-            if found is None or float(found.confidence) < trusted:
-                searched = initializer(points)
-                found = searched if found is None or searched.confidence > found.confidence else found
-            distances = shape.part_distances(points, found.pose)
-            off = shape.distance(points, found.pose).abs() > INLIER_SHARE * size
-            parts = distances.argmin(-1).masked_fill(off, -1)
+            found = _pose_of(initializer, points, start, trusted)
+            parts = _part_labels(initializer, points, found.pose)
         start = found.pose if float(found.confidence) >= trusted else None
-        yield PoseLabel(points, found.pose, found.keypoints, parts, found.confidence)
+        yield PoseLabel(
+            points=points, pose=found.pose, keypoints=found.keypoints, parts=parts, confidence=found.confidence
+        )
+
+
+def _pose_of(initializer: PoseInitializer, points: Tensor, start: Tensor | None, trusted: float) -> InitialPose:
+    """Return the pose from a start, or the better one of it and of a search where its confidence is too low."""
+    found = None if start is None else initializer(points, start=start)
+    if found is not None and float(found.confidence) >= trusted:
+        return found
+    searched = initializer(points)
+    return searched if found is None or searched.confidence > found.confidence else found
+
+
+def _part_labels(initializer: PoseInitializer, points: Tensor, pose: Tensor) -> Tensor:
+    """Return the nearest part (M,) of points on the surface; -1 for those off it."""
+    shape, limit = initializer.shape, INLIER_SHARE * model_size(initializer.skin)
+    outliers = shape.distance(points, pose).abs() > limit
+    return shape.part_distances(points, pose).argmin(-1).masked_fill(outliers, -1)

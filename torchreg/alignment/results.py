@@ -1,4 +1,4 @@
-"""What aligning and finding articulated shapes returns."""
+"""Results of aligning, finding and calibrating articulated shapes."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class AlignResult(Result):
         posterior: (M,) probability that the datum belongs to the model at the last sigma (eq. 17 summed over i).
         sigma: last kernel width, metres.
         cost: objective that ranks alignments of the same data, lower is better.
-        status: how the alignment ended; a tuple with one entry per problem for a batch.
+        status: of the alignment at its end; a tuple with one entry per problem for a batch.
         history: one `AlignRecord` per step.
     """
 
@@ -78,7 +78,7 @@ class Calibration(Result):
         log_length_scales: (P,) of the fitted shape.
         log_radius_scales: (P,) of the fitted shape.
         cost: (), of the joint fit, lower is better.
-        status: how the calibration ended.
+        status: of the calibration at its end.
     """
 
     shape: ArticulatedShape = field(metadata=stored_as(record_shape, build_shape))
@@ -94,9 +94,9 @@ class PoseStarts(Result):
     """Poses in which an articulated shape may lie on data, best first. A batch adds a leading dimension B to all.
 
     Args:
-        poses: (S, num_dofs), metres and radians; poses that fell together with a better one come last.
+        poses: (S, num_dofs), metres and radians; duplicates of a better one come last.
         costs: (S,) data that a pose leaves unexplained, softly counted, and a weak prior; lower is better.
-        confidence: () from 0 to 1: how surely the first pose is the right one; low too where limbs are not shown.
+        confidence: () from 0 to 1, in the first pose; low too where no data show a limb.
     """
 
     poses: Tensor
@@ -110,4 +110,4 @@ class PoseStarts(Result):
 
     def row(self, index: int) -> PoseStarts:
         """Return the starts of one cloud of a batch."""
-        return PoseStarts(self.poses[index], self.costs[index], self.confidence[index])
+        return PoseStarts(poses=self.poses[index], costs=self.costs[index], confidence=self.confidence[index])

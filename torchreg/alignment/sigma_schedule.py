@@ -1,4 +1,4 @@
-"""How the width of the correspondence kernel shrinks over an alignment."""
+"""The width sigma of the correspondence kernel over an alignment: schedules, and the estimate of a conventional EM."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_choice, check_positive
-from torchreg.errors import InputError, InputTypeError
+from torchreg._checks import check_choice, check_count, check_positive
+from torchreg.errors import InputError
 from torchreg.solvers.e_step import EStep
 
 
@@ -38,7 +38,7 @@ class SigmaSchedule:
 
     def __post_init__(self) -> None:
         check_choice(self.kind, "kind", ("fixed", "adaptive"))
-        _check_steps(self.steps)
+        check_count(self.steps, "steps", 1)
         expected = self.steps if self.kind == "fixed" else 2
         if len(self.values) != expected:
             raise InputError(
@@ -92,21 +92,21 @@ class SigmaSchedule:
         """Return the conventional schedule: sigma is re-estimated from the residuals, never below ``stop``.
 
         Each M-step ends with the sigma that maximizes eq. 19 (see `estimate_sigma`), between ``start`` and ``stop``.
-        The paper observes that it falls too quickly and gets trapped; it is here for comparison. Arguments and errors
+        The paper observes that it falls too quickly and gets trapped; it serves for comparison. Arguments and errors
         are those of `geometric`.
         """
         _check_range(start, stop, steps)
         return cls((start, stop), steps, "adaptive")
 
 
-def estimate_sigma(observed: EStep, before: Tensor, after: Tensor) -> Tensor:
+def estimate_sigma(matches: EStep, before: Tensor, after: Tensor) -> Tensor:
     """Return the sigma that the M-step of a conventional EM estimates from the points that it moved.
 
-    ``sigma^2 = sum_ij alpha_ij |Y_j - T(X_i)|^2 / (3 sum_ij alpha_ij)`` with the matches of the E-step and the moved
-    points, as in Coherent Point Drift. Zero where no datum is held.
+    ``sigma^2 = sum_ij alpha_ij |Y_j - T(X_i)|^2 / (3 sum_ij alpha_ij)`` with the posterior of the E-step and the moved
+    points, as in Coherent Point Drift. Zero where all data are outliers.
 
     Args:
-        observed: the E-step at ``before``.
+        matches: the E-step at ``before``.
         before: (..., N, 3) model points that the E-step saw, metres.
         after: (..., N, 3) the same points after the M-step, metres.
 
@@ -117,10 +117,10 @@ def estimate_sigma(observed: EStep, before: Tensor, after: Tensor) -> Tensor:
 
     References: Dewaele et al. 2006, section 3.3; Myronenko and Song 2010.
     """
-    nearer = (before - observed.targets).square().sum(-1) - (after - observed.targets).square().sum(-1)
-    squares = observed.squared_error - (observed.weights * nearer).sum(-1)
-    held = observed.weights.sum(-1).clamp_min(torch.finfo(squares.dtype).tiny)
-    return (squares.clamp_min(0) / (3 * held)).sqrt()
+    decrease = (before - matches.targets).square().sum(-1) - (after - matches.targets).square().sum(-1)
+    squares = matches.squared_error - (matches.weights * decrease).sum(-1)
+    mass = matches.weights.sum(-1).clamp_min(torch.finfo(squares.dtype).tiny)
+    return (squares.clamp_min(0) / (3 * mass)).sqrt()
 
 
 def _check_range(start: float, stop: float, steps: int) -> None:
@@ -128,14 +128,7 @@ def _check_range(start: float, stop: float, steps: int) -> None:
     check_positive(stop, "stop")
     if stop > start:
         raise InputError(f"stop must not exceed start, got start {start} and stop {stop}")
-    _check_steps(steps)
-
-
-def _check_steps(steps: int) -> None:
-    if isinstance(steps, bool) or not isinstance(steps, int):
-        raise InputTypeError(f"steps must be an integer, got {type(steps).__name__}")
-    if steps < 1:
-        raise InputError(f"steps must be at least 1, got {steps}")
+    check_count(steps, "steps", 1)
 
 
 def _between(start: float, stop: float, values: list[float]) -> tuple[float, ...]:

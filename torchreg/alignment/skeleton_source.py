@@ -1,4 +1,4 @@
-"""Rough poses of an articulated shape from the skeleton of what was measured: limbs matched to kinematic chains."""
+"""Rough poses of an articulated shape from the skeleton of its data: limbs matched to kinematic chains."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchreg._checks import as_float_tensor, check_count, check_finite, check_points, check_shape
-from torchreg.alignment.find_pose import typical_poses
-from torchreg.alignment.problem import AlignProblem
+from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem
+from torchreg.alignment.rough_poses import typical_poses
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import fit_rigid, transform_points
@@ -17,29 +18,38 @@ from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.limbs import find_limbs
+from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
 from torchreg.spines.curves import points_along
 from torchreg.spines.skeletonize import SkeletonizeConfig, skeletonize
 from torchreg.spines.tip_matching import TipReference, rank_mappings
 
-# Mappings of limbs to chains whose poses are fitted, per typical pose, and steps of the fit.
-_MAPPINGS, _FIT_STEPS = 6, 15
-_FEW_VERTICES = 6000
-# Joints lie this near to the curves, as a share of the size of the shape; joints bend freely by so much, radians.
-_JOINT_STD, _BEND_STD = 0.02, 1.0
+
+@dataclass(frozen=True)
+class _ChainFit:
+    """Numbers of fitting the chains of a shape to limbs."""
+
+    num_mappings: int = 6  # of limbs to chains whose poses are fitted, per typical pose
+    missing: float = 10.0  # cost of a chain without a limb: so high that it is only where limbs are lacking
+    steps: int = 15  # of the fit
+    joint_std: float = 0.02  # distance of joints from the curves, as a share of the size of the shape
+    num_vertices: int = 6000  # of a surface whose skeleton is taken: limbs need no more
+
+
+_CHAIN_FIT = _ChainFit()
 
 
 @dataclass(frozen=True, eq=False)
 class SpineLimbs:
-    """A `PoseSource`: the chains of a shape laid along the limbs of a skeleton.
+    """A `PoseSource`: the chains of a shape fitted to the limbs of a skeleton.
 
-    The tips of the skeleton are matched to the ends of the chains by rigid fits in typical poses; limbs that are no
-    chain's, as a forearm cut off, are left over. Each joint of a chain then lies on its limb at the length of its bones
-    from the tip, and the pose is fitted to all joints within the limits.
+    The tips of the skeleton are matched to the ends of the chains by rigid fits in typical poses; limbs without a
+    chain, as a forearm cut off, stay unmatched. Each joint of a chain then has its target on its limb, at the length of
+    its bones from the tip, and the pose is fitted to all targets within the limits.
 
     Args:
-        skeleton: of the cloud, such as one frame of a spine or what `skeletonize` returns.
+        skeleton: of the cloud, such as one frame of a spine or the result of `skeletonize`.
         middle: (3,) mean of the data that are given to `find_pose`, in the coordinates of the skeleton.
         count: poses proposed.
 
@@ -63,11 +73,11 @@ class SpineLimbs:
 
     @classmethod
     def of_surface(cls, mesh: TriangleMesh, data: Tensor, count: int = 2) -> SpineLimbs:
-        """Return the source of the skeleton of a surface, which is made of few vertices: limbs need no more.
+        """Return the source of the skeleton of a surface, of which few vertices are taken: limbs need no more.
 
         Args:
             mesh: the surface of the shape.
-            data: (M, 3) what is given to `find_pose`, such as points of that surface.
+            data: (M, 3) the data given to `find_pose`, such as points of that surface.
             count: poses proposed.
 
         Raises:
@@ -75,33 +85,34 @@ class SpineLimbs:
         """
         data = as_float_tensor(data, "data")
         check_points(data, "data", batch=False)
-        return cls(skeletonize(mesh, SkeletonizeConfig(max_vertices=_FEW_VERTICES)), data.mean(0), count)
+        skeleton = skeletonize(mesh, SkeletonizeConfig(max_vertices=_CHAIN_FIT.num_vertices))
+        return cls(skeleton=skeleton, middle=data.mean(0), count=count)
 
     def __call__(self, problem: AlignProblem, generator: torch.Generator) -> Tensor:
         """Return (B, K, num_dofs) poses, see `PoseSource`; every cloud of a batch is taken for the skeleton's."""
         shape = problem.skin.shape
-        chains = _Chains.of(problem.skin)
-        limbs = self._limbs(chains.lengths).to(problem.data)
+        chains = _Chains.from_skin(problem.skin)
+        limbs = self._limb_points(chains.lengths).to(problem.data)
         starts, targets = [], []
         for typical in typical_poses(shape):
-            known = chains.places(shape, typical.unsqueeze(0))[0]
-            maps, _ = rank_mappings([TipReference(known, turn=0.0)], limbs, missing=10.0)
-            for row in maps[:_MAPPINGS]:
-                pose, target = _laid(typical, known, limbs, row)
+            known = chains.positions(shape, typical.unsqueeze(0))[0]
+            maps, _ = rank_mappings([TipReference(known, turn=0.0)], limbs, missing=_CHAIN_FIT.missing)
+            for row in maps[: _CHAIN_FIT.num_mappings]:
+                pose, target = _rigidly_mapped(typical, known, limbs, row)
                 starts.append(pose)
                 targets.append(target)
-        poses, costs = _fitted(problem, chains, torch.stack(starts), torch.stack(targets))
+        poses, costs = _fit_chains(problem, chains, torch.stack(starts), torch.stack(targets))
         best = poses[costs.argsort()[: self.count]]
         return best.expand(len(problem.data), *best.shape)
 
-    def _limbs(self, lengths: Tensor) -> Tensor:
+    def _limb_points(self, lengths: Tensor) -> Tensor:
         """Return points (M, K, S, 3) of each limb at the lengths (K, S) of each chain from the tip, centered."""
         skeleton = self.skeleton
         nodes = skeleton.nodes.detach().cpu().double() - self.middle.detach().cpu().double()
         tips = skeleton.tips.tolist()
         # On beyond the junction, towards the farthest tip: the first joint of a finger may lie in the palm.
-        ways = [max((skeleton.path(tip, other) for other in tips if other != tip), key=len) for tip in tips]
-        return torch.stack([points_along(nodes[way.cpu()], lengths.cpu().double()) for way in ways])
+        paths = [max((skeleton.path(tip, end) for end in tips if end != tip), key=len) for tip in tips]
+        return torch.stack([points_along(nodes[path.cpu()], lengths.cpu().double()) for path in paths])
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,25 +132,31 @@ class _Chains:
     weights: Tensor
 
     @classmethod
-    def of(cls, skin: LinearBlendSkin) -> _Chains:
+    def from_skin(cls, skin: LinearBlendSkin) -> _Chains:
+        """Return the chains of a skin's shape, those of limbs that carry no other limb."""
         shape = skin.shape
         limbs, _ = find_limbs(shape)
         inner = {body.parent for limb in limbs for body in limb.bodies[:1]}
-        ends = [limb for limb in limbs if not inner & set(limb.parts)]
-        rows = [_chain_points(skin, limb.parts) for limb in ends]
+        rows = [_chain_points(skin, limb.parts) for limb in limbs if not inner & set(limb.parts)]
         size = max(len(parts) for parts, _ in rows)
-        parts = torch.tensor([[*some, *[some[-1]] * (size - len(some))] for some, _ in rows])
-        offsets = torch.stack([torch.cat((some, some[-1:].expand(size - len(some), 3))) for _, some in rows])
-        weights = torch.tensor([[1.0] * len(some) + [0.0] * (size - len(some)) for some, _ in rows]).to(offsets)
-        chains = cls(parts, offsets, weights, weights)
-        places = chains.places(shape, shape.rest.unsqueeze(0))[0]
-        steps = (places[:, 1:] - places[:, :-1]).norm(dim=-1)
-        return cls(parts, offsets, torch.nn.functional.pad(steps.cumsum(-1), (1, 0)), weights)
+        parts = torch.tensor([[*row, *[row[-1]] * (size - len(row))] for row, _ in rows])
+        offsets = torch.stack([torch.cat((row, row[-1:].expand(size - len(row), 3))) for _, row in rows])
+        weights = torch.tensor([[1.0] * len(row) + [0.0] * (size - len(row)) for row, _ in rows]).to(offsets)
+        positions = _chain_positions(shape, shape.rest.unsqueeze(0), parts, offsets)[0]
+        steps = (positions[:, 1:] - positions[:, :-1]).norm(dim=-1)
+        return cls(parts=parts, offsets=offsets, lengths=pad(steps.cumsum(-1), (1, 0)), weights=weights)
 
-    def places(self, shape: Articulation, poses: Tensor) -> Tensor:
+    def positions(self, shape: Articulation, poses: Tensor) -> Tensor:
         """Return the points (B, K, S, 3) in poses (B, num_dofs)."""
-        transforms = shape.part_transforms(poses)[:, self.parts]
-        return (transforms[..., :3, :3] @ self.offsets.unsqueeze(-1)).squeeze(-1) + transforms[..., :3, 3]
+        return _chain_positions(shape, poses, self.parts, self.offsets)
+
+
+def _chain_positions(shape: Articulation, poses: Tensor, parts: Tensor, offsets: Tensor) -> Tensor:
+    return _moved(shape.part_transforms(poses)[:, parts], offsets)
+
+
+def _moved(transforms: Tensor, offsets: Tensor) -> Tensor:
+    return (transforms[..., :3, :3] @ offsets.unsqueeze(-1)).squeeze(-1) + transforms[..., :3, 3]
 
 
 def _chain_points(skin: LinearBlendSkin, parts: list[int]) -> tuple[list[int], Tensor]:
@@ -147,46 +164,49 @@ def _chain_points(skin: LinearBlendSkin, parts: list[int]) -> tuple[list[int], T
     transforms = skin.shape.part_transforms(skin.reference_pose)
     last = transforms[parts[-1]]
     local = (skin.points - last[:3, 3]) @ last[:3, :3]
-    own = skin.weights[:, parts[-1]] > 0.5
-    reach = torch.where(own, local.norm(dim=-1), -1.0)
-    end = local[reach.argmax()] if bool(own.any()) else torch.zeros_like(local[0])
+    on_last = skin.weights[:, parts[-1]] > 0.5
+    reach = torch.where(on_last, local.norm(dim=-1), -1.0)
+    end = local[reach.argmax()] if bool(on_last.any()) else torch.zeros_like(local[0])
     return [parts[-1], *reversed(parts)], torch.cat((end[None], end.new_zeros(len(parts), 3)))
 
 
-def _laid(typical: Tensor, known: Tensor, limbs: Tensor, row: Tensor) -> tuple[Tensor, Tensor]:
-    """Return a typical pose laid on the limbs that a mapping (K,) names, and the targets (K, S, 3); NaN for none."""
-    found = row >= 0
+def _rigidly_mapped(typical: Tensor, known: Tensor, limbs: Tensor, row: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a typical pose moved rigidly to the limbs that a mapping (K,) names, and the targets (K, S, 3).
+
+    Targets are NaN where a chain has no limb.
+    """
+    has_limb = row >= 0
     target = limbs[row.clamp_min(0), torch.arange(len(row))].to(known)
-    weights = found.to(known)[:, None].expand(known.shape[:2]).flatten()
+    weights = has_limb.to(known)[:, None].expand(known.shape[:2]).flatten()
     motion = fit_rigid(known.flatten(0, 1), target.flatten(0, 1), weights)
     pose = typical.clone()
     pose[:3] = transform_points(motion, typical[None, :3])[0]
-    pose[3:6] = so3_log(motion[None, :3, :3] @ so3_exp(typical[None, 3:6]))[0]
-    return pose, torch.where(found[:, None, None], target, torch.nan)
+    pose[3:BASE_DOFS] = so3_log(motion[None, :3, :3] @ so3_exp(typical[None, 3:BASE_DOFS]))[0]
+    return pose, torch.where(has_limb[:, None, None], target, torch.nan)
 
 
-def _fitted(problem: AlignProblem, chains: _Chains, poses: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
+def _fit_chains(problem: AlignProblem, chains: _Chains, poses: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
     """Return poses (N, num_dofs) whose chains lie on targets (N, K, S, 3) as far as limits allow, and the costs."""
-    shape = problem.skin.shape
-    weights = torch.where(targets.isnan().any(-1), 0.0, chains.weights) / (_JOINT_STD * problem.size) ** 2
+    shape, mean = problem.skin.shape, poses.clone()
+    variance = (_CHAIN_FIT.joint_std * problem.size) ** 2
+    weights = torch.where(targets.isnan().any(-1), 0.0, chains.weights) / variance
     targets = targets.nan_to_num()
-    middle = poses.clone()
     precision = torch.zeros_like(poses[0])
-    precision[6:] = 1 / _BEND_STD**2
+    precision[BASE_DOFS:] = 1 / BROAD_PRIOR.turn**2
 
     def linearize(state: Tensor) -> Linearization:
         transforms, twists = shape.part_twists(state, chart="tangent")
-        own, twist = transforms[:, chains.parts], twists[:, chains.parts]
-        places = (own[..., :3, :3] @ chains.offsets.unsqueeze(-1)).squeeze(-1) + own[..., :3, 3]
-        moves = twist[..., :3] + torch.linalg.cross(twist[..., 3:], places.unsqueeze(-2).expand_as(twist[..., 3:]))
-        error = places - targets
-        bent = (state - middle) * precision
-        cost = 0.5 * (weights * error.square().sum(-1)).sum((-2, -1)) + 0.5 * (bent * (state - middle)).sum(-1)
-        gradient = torch.einsum("nks,nksdi,nksi->nd", weights, moves, error) + bent
+        twist = twists[:, chains.parts]
+        positions = _moved(transforms[:, chains.parts], chains.offsets)
+        moves = twist[..., :3] + torch.linalg.cross(twist[..., 3:], positions.unsqueeze(-2).expand_as(twist[..., 3:]))
+        residual = positions - targets
+        bend = (state - mean) * precision
+        cost = 0.5 * (weights * residual.square().sum(-1)).sum((-2, -1)) + 0.5 * (bend * (state - mean)).sum(-1)
+        gradient = torch.einsum("nks,nksdi,nksi->nd", weights, moves, residual) + bend
         hessian = torch.einsum("nks,nksdi,nksei->nde", weights, moves, moves) + torch.diag(precision)
         return Linearization(cost, gradient, hessian)
 
     fitted = levenberg_marquardt(
-        linearize, poses, retract=shape.retract, lower=problem.lower, upper=problem.upper, max_steps=_FIT_STEPS
+        linearize, poses, retract=shape.retract, lower=problem.lower, upper=problem.upper, max_steps=_CHAIN_FIT.steps
     )
     return fitted.state, fitted.cost

@@ -229,7 +229,7 @@ def _accumulate(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return lambda (B, N), sum_j alpha_ij Y_j (B, N, 3) and the inlier posterior (B, M) of scaled, raised points."""
     gathered, inlier = model.new_zeros(model.shape[0], 4, model.shape[1]), torch.zeros_like(data[..., 0])
-    for rows, columns in _chunks(model.shape[0], model.shape[1], data.shape[1]):
+    for rows, columns in chunks(model.shape[0], model.shape[1], data.shape[1]):
         part = data[rows, columns]
         kernel = _expanded_kernel(model[rows], part) if expand else _exact_kernel(model[rows], part[..., :3])
         total = kernel.sum(-2)
@@ -243,7 +243,7 @@ def _accumulate(
     return gathered[:, 3], gathered[:, :3].mT, inlier
 
 
-def _chunks(batch: int, num_model: int, num_data: int) -> Iterator[tuple[slice, slice]]:
+def chunks(batch: int, num_model: int, num_data: int) -> Iterator[tuple[slice, slice]]:
     """Yield slices over batch and data that keep the kernel matrix within the chunk size."""
     per_problem = num_model * num_data
     rows = max(1, _CHUNK_ENTRIES // max(per_problem, 1))

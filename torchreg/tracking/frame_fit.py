@@ -10,16 +10,11 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.align import AlignConfig
-from torchreg.alignment.annealed_em import (
-    SIGMA_PER_NOISE,
-    pose_covariance,
-    register,
-    settle_surface,
-    surface_noise,
-)
-from torchreg.alignment.objectives import PosePrior
+from torchreg.alignment.annealed_em import anneal
+from torchreg.alignment.objectives import GaussianPosePrior
 from torchreg.alignment.problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem, shifted
 from torchreg.alignment.sigma_schedule import SigmaSchedule
+from torchreg.alignment.surface_fit import SURFACE_FIT, pose_covariance, refine_surface, surface_noise
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.limbs import find_limbs
@@ -103,7 +98,7 @@ class FrameFitter:
             self._template, skin=skin or self.skin, data=data[None],
             valid=torch.ones_like(data[None, :, 0], dtype=torch.bool),
             lower=self.shape.lower - shift, upper=self.shape.upper - shift,
-            prior=PosePrior(local[None], self._precision(_WIDE_PRIOR)),
+            prior=GaussianPosePrior(local[None], self._precision(_WIDE_PRIOR)),
         )  # fmt: skip
         return FrameView(problem, origin, rows, near)
 
@@ -127,7 +122,7 @@ class FrameFitter:
         view = replace(view, problem=problem)
         if not moves_fast(state, self.size):
             schedule = self._schedule(state, gap)
-            moved = register(problem, problem.prior.mean, schedule, em_steps=self.config.em_steps, m_steps=1).pose
+            moved = anneal(problem, problem.prior.mean, schedule, em_steps=self.config.em_steps, m_steps=1).pose
             return self.fit(view, state, "tracked", moved)
         drawn = generator(state)
         starts = [problem.prior.mean, self._scattered(problem, drawn)]
@@ -137,7 +132,7 @@ class FrameFitter:
             starts.append(view.local(others)[0])
         free = problem.prior.precision.clone()
         free[:6] = 0
-        open_ = replace(problem, prior=PosePrior(problem.prior.mean, free))
+        open_ = replace(problem, prior=GaussianPosePrior(problem.prior.mean, free))
         moved = fit_limbs(open_, torch.cat(starts), self.limbs, drawn)
         return self.fit(view, state, "tracked", moved, sigmas=())
 
@@ -151,7 +146,7 @@ class FrameFitter:
     ) -> FrameFit:
         """Return the fit of the surface from a pose (1, num_dofs), and the evidence for it."""
         problem = view.problem
-        fitted = settle_surface(problem, pose, steps=self.config.surface_steps, sigmas=sigmas)
+        fitted = refine_surface(problem, pose, steps=self.config.surface_steps, widths=sigmas)
         distance, jacobian = fitted.distance, fitted.jacobian
         noise = surface_noise(distance, problem.valid, self.size)
         pose = fitted.pose
@@ -164,7 +159,7 @@ class FrameFitter:
         known = transform_points(transforms[0], state.strays)
         novel = (nearest_distance(strays, known) > _SAME_STRAY * self.size) & self._reach(strays, transforms[0])
         moved = (problem.skin.place(stacked_rows(transforms)) - problem.skin.place(view.rows)).norm(dim=-1)
-        wide = replace(problem, prior=PosePrior(problem.prior.mean, self._precision(_WIDE_PRIOR)))
+        wide = replace(problem, prior=GaussianPosePrior(problem.prior.mean, self._precision(_WIDE_PRIOR)))
         return FrameFit(
             view, pose, distance, jacobian, transforms, noise=noise[0], change=float(fitted.change),
             cost=float(alignment_cost(wide, pose, distance)),
@@ -178,7 +173,7 @@ class FrameFitter:
         precision = prior.precision.clone()
         if not prior.holds_base:
             precision[:6] = precision.new_tensor([self.size] * 3 + [math.pi] * 3).square().reciprocal()
-        weights = welsch_weight((fit.distance[0] / (SIGMA_PER_NOISE * fit.noise)).square())
+        weights = welsch_weight((fit.distance[0] / (SURFACE_FIT.width_per_noise * fit.noise)).square())
         covariance = pose_covariance(fit.jacobian[0], weights, fit.noise, precision)
         return covariance, (1 - covariance.diagonal() * precision).clamp(0, 1)
 
@@ -197,12 +192,12 @@ class FrameFitter:
     def _precision(self, joints: float) -> Tensor:
         return self._template.prior.precision / joints**2
 
-    def _tight_prior(self, prior: PosePrior, state: TrackState, gap: float) -> PosePrior:
+    def _tight_prior(self, prior: GaussianPosePrior, state: TrackState, gap: float) -> GaussianPosePrior:
         """Return the prior about the prediction, the base included: few data may not turn it away."""
         shift, turn, bend = prior_std(state, gap, self.size, self.config.prior_std).tolist()
         precision = self._precision(bend)
         precision[:3], precision[3:6] = shift**-2, turn**-2
-        return PosePrior(prior.mean, precision, holds_base=True)
+        return GaussianPosePrior(prior.mean, precision, holds_base=True)
 
     def _schedule(self, state: TrackState, gap: float) -> SigmaSchedule:
         low, high = _START_RANGE
@@ -219,7 +214,7 @@ class FrameFitter:
 
         What pulls at such a limb are single outliers and the rims of its neighbors.
         """
-        near = welsch_weight((distance[0] / (SIGMA_PER_NOISE * noise)).square())
+        near = welsch_weight((distance[0] / (SURFACE_FIT.width_per_noise * noise)).square())
         levers = [jacobian[0][:, limb.dofs].norm(dim=-1) > _LEVER * self.size for limb in self.limbs]
         if not levers:
             return pose

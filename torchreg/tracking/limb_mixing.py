@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchreg.alignment.annealed_em import surface_steps
 from torchreg.alignment.problem import PRIOR_SHARE, AlignProblem
+from torchreg.alignment.surface_fit import surface_steps
 from torchreg.shapes.limbs import Limb
 from torchreg.shapes.primitives import fuse
 from torchreg.solvers.cover import best_covers

@@ -149,10 +149,10 @@ class Recovery:
             turned = flipped(self.fitter.skin, state.pose)
             known = torch.cat([known, view.local(state.previous), view.local(turned)], dim=1)
         search = PoseSearch(view.problem, generator(state))
-        narrowed = search.narrow(known, _NUM_SEARCHED)
+        narrowed = search.prune(known, _NUM_SEARCHED)
         yield self.fitter.fit(view, state, "starts", narrowed[:, 0])
         if thorough:
-            yield self.fitter.fit(view, state, "search", search.settle(narrowed, 1)[0][:, 0])
+            yield self.fitter.fit(view, state, "search", search.refine(narrowed, 1)[0][:, 0])
 
 
 def flipped(skin: LinearBlendSkin, pose: Tensor) -> Tensor:

@@ -1,10 +1,8 @@
-"""What every stage of an alignment works on: checked data, centered coordinates, limits, prior, cost, units."""
+"""Every stage of an alignment works in centered coordinates, within limits, with a prior and one cost."""
 
 import math
-import warnings
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
@@ -13,12 +11,9 @@ from torchreg.alignment.problem import (
     PRIOR_SHARE,
     alignment_cost,
     centered_problem,
-    check_data,
     masked_mean,
     shifted,
-    warn_about_units,
 )
-from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
@@ -66,78 +61,10 @@ def problem(plain_hand, plain_hand_skin):
     )
 
 
-# Data
-
-
-def test_data_take_the_shapes_precision_and_all_count(plain_hand):
-    data, valid = check_data(plain_hand, np.ones((4, 3)), None, "raise")
-    assert data.dtype == torch.float32
-    assert valid.tolist() == [True] * 4
-    double = Hand(dtype=torch.float64)
-    assert check_data(double, torch.ones(2, 4, 3), None, "raise")[0].dtype == torch.float64
-
-
-def test_points_left_out_become_zeros_that_do_not_count(plain_hand):
-    data = torch.ones(2, 3, 3)
-    data[0, 1, 2], data[1, 0] = torch.nan, torch.inf
-    mask = torch.tensor([[True, True, False], [False, True, True]])
-    found, valid = check_data(plain_hand, data, mask, "omit")
-    assert valid.tolist() == [[True, False, False], [False, True, True]]
-    torch.testing.assert_close(found, valid.unsqueeze(-1).expand(2, 3, 3).float())
-    # What a mask hides may be anything.
-    hidden, _ = check_data(plain_hand, data, mask & torch.isfinite(data).all(-1), "raise")
-    assert bool(torch.isfinite(hidden).all())
-    assert bool(torch.isnan(data[0, 1, 2]))
-
-
-@pytest.mark.parametrize(
-    ("data", "mask", "error", "message"),
-    [
-        (torch.ones(3), None, InputError, r"data must have shape \(M, 3\) or \(B, M, 3\), got \(3,\)"),
-        (torch.ones(1, 1, 4, 3), None, InputError, r"data must have shape \(M, 3\) or \(B, M, 3\), got \(1, 1, 4, 3\)"),
-        (torch.ones(4, 2), None, InputError, r"data must have shape \(\.\.\., M, 3\), got \(4, 2\)"),
-        (torch.ones(0, 3), None, InputError, r"data must hold at least one point, got shape \(0, 3\)"),
-        (torch.ones(0, 5, 3), None, InputError, r"data must hold at least one point, got shape \(0, 5, 3\)"),
-        ("points", None, InputTypeError, "data must be a tensor or an array of numbers, got str"),
-        (torch.ones(4, 3), [True] * 4, InputTypeError, "mask must be a tensor of bool, False where data are padding"),
-        (torch.ones(4, 3), torch.ones(4), InputTypeError, "mask must be a tensor of bool"),
-        (
-            torch.ones(4, 3),
-            torch.ones(3, dtype=torch.bool),
-            InputError,
-            r"mask must have shape \(4,\) like the data, got \(3,\)",
-        ),
-        (
-            torch.full((4, 3), torch.nan),
-            None,
-            InputError,
-            "data hold 4 points that are not finite; drop them or set nan_policy='omit'",
-        ),
-        (
-            torch.ones(4, 3),
-            torch.zeros(4, dtype=torch.bool),
-            InputError,
-            "data hold no point that is finite and not masked",
-        ),
-    ],
-)
-def test_unfit_data_are_named(plain_hand, data, mask, error, message):
-    with pytest.raises(error, match=message):
-        check_data(plain_hand, data, mask, "raise")
-
-
-def test_data_that_are_all_omitted_are_refused(plain_hand):
-    with pytest.raises(InputError, match="data hold no point that is finite and not masked"):
-        check_data(plain_hand, torch.full((4, 3), torch.nan), None, "omit")
-
-
-def test_the_mean_is_of_what_counts():
+def test_the_mean_is_of_valid_data():
     data = torch.tensor([[[1.0, 2, 3], [3, 4, 5], [100, 100, 100]], [[7.0, 7, 7]] * 3])
     valid = torch.tensor([[True, True, False], [False] * 3])
     torch.testing.assert_close(masked_mean(data, valid), torch.tensor([[2.0, 3, 4], [0, 0, 0]]))
-
-
-# Coordinates, limits, prior
 
 
 def test_data_and_prior_are_centered_and_padding_is_zero(problem):
@@ -217,9 +144,6 @@ def test_shapes_with_a_mesh_are_fitted_by_it(plain_hand, problem):
     assert isinstance(precision_of(rigged, 0.3).surface, SkinSurface)
 
 
-# Draws, changes
-
-
 def test_a_draw_takes_data_that_count_and_no_datum_twice(problem):
     drawn = problem.draw(60, torch.Generator().manual_seed(0))
     assert drawn.data.shape == (3, 60, 3)
@@ -262,9 +186,6 @@ def test_poses_are_clamped_between_the_limits(problem, plain_hand):
     torch.testing.assert_close(found[..., :6], wild[..., :6])
 
 
-# Cost
-
-
 def test_the_cost_counts_outliers_and_asks_the_prior(problem, plain_hand):
     pose = problem.prior.mean.clone()
     pose[:, 8] += torch.tensor([0.0, 0.25, 0.5])
@@ -285,24 +206,3 @@ def test_the_cost_counts_outliers_and_asks_the_prior(problem, plain_hand):
 def test_far_data_cost_one_each_and_padding_nothing(problem):
     lost = replace(problem, data=problem.data + 3.0)
     torch.testing.assert_close(alignment_cost(lost, problem.prior.mean), torch.tensor([400.0, 300.0, 50.0]))
-
-
-# Units
-
-
-@pytest.mark.parametrize("scale", [1000.0, 0.001])
-def test_other_units_are_warned_of(problem, scale):
-    other = replace(problem, data=scale * problem.data)
-    with pytest.warns(
-        UnitsWarning, match=r"the data spread over .* times the model's size of .* m: are they in metres"
-    ):
-        warn_about_units(other)
-
-
-def test_metres_and_few_data_are_not_warned_of(problem):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warn_about_units(problem)
-        warn_about_units(replace(problem, data=10 * problem.data))
-        few = problem.draw(5, torch.Generator().manual_seed(0))
-        warn_about_units(replace(few, data=1000 * few.data))

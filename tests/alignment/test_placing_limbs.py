@@ -15,11 +15,18 @@ from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.skin import sample_skin
 
 THOROUGH = Effort(
-    num_data=400, width=0.05, beam=80, configurations=30, polish=(0.04, 0.03, 0.025), score_width=0.02,
+    num_data=400, width=0.05, beam=80, configurations=30, refine_widths=(0.04, 0.03, 0.025), score_width=0.02,
     combinations=6, exchanged=2,
 )  # fmt: skip
 COARSE = Effort(
-    num_data=150, width=0.05, beam=80, configurations=30, polish=(), score_width=0.05, combinations=3, exchanged=0
+    num_data=150,
+    width=0.05,
+    beam=80,
+    configurations=30,
+    refine_widths=(),
+    score_width=0.05,
+    combinations=3,
+    exchanged=0,
 )
 TIPS = [4, 8, 12, 16, 20]
 
@@ -171,7 +178,7 @@ def test_a_batch_is_a_loop(hand_limbs, hands, stretched, placed):
 
 
 def test_a_large_batch_is_searched_in_parts(hand_limbs, hands, stretched, placed, monkeypatch):
-    monkeypatch.setattr(limb_search, "_CHUNK_ENTRIES", 1)
+    monkeypatch.setattr(limb_search, "_PLACEMENT", replace(limb_search._PLACEMENT, cpu_entries=1))
     parts = hand_limbs(hands, stretched, THOROUGH, generator())
     assert parts.shape == placed.shape
     torch.testing.assert_close(parts[:, 0], placed[:, 0], rtol=0, atol=2e-3)

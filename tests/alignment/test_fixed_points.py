@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchreg.alignment.implicit_gradient import FixedPoint, attach_gradients, solve_symmetric
-from torchreg.alignment.objectives import PosePrior, SurfaceObjective
+from torchreg.alignment.objectives import GaussianPosePrior, SurfaceObjective
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.primitives import Primitive
@@ -55,7 +55,7 @@ def fixed_point(shape, **options):
 def test_the_energy_and_its_gradient_are_those_of_the_surface_fit(shape, given):
     data, pose, start = given
     fixed = fixed_point(shape)
-    prior = PosePrior(start, fixed.precision, holds_base=True)
+    prior = GaussianPosePrior(start, fixed.precision, holds_base=True)
     objective = SurfaceObjective(fixed.surface, data, fixed.valid, fixed.sigma, fixed.noise, prior)
     around = objective(pose)
     torch.testing.assert_close(fixed.energy(torch.zeros_like(pose), pose, data, start), around.cost)
@@ -73,15 +73,15 @@ def test_the_energy_and_its_gradient_are_those_of_the_surface_fit(shape, given):
 def test_newton_steps_make_a_pose_stationary_and_never_worse(shape, given):
     data, _, start = given
     fixed = fixed_point(shape, sigma=torch.full((2,), 0.05, dtype=D))
-    prior = PosePrior(start, fixed.precision, holds_base=True)
+    prior = GaussianPosePrior(start, fixed.precision, holds_base=True)
     before = start
-    after = fixed.polish(before, data, start, 6)
+    after = fixed.newton_steps(before, data, start, 6)
     objective = SurfaceObjective(fixed.surface, data, fixed.valid, fixed.sigma, fixed.noise, prior)
     sizes = [
         (objective(pose).gradient * fixed.free(pose, objective(pose).gradient)).norm(dim=-1) for pose in (before, after)
     ]
     assert (sizes[1] <= sizes[0]).all()
-    assert torch.equal(fixed.polish(before, data, start, 0), before)
+    assert torch.equal(fixed.newton_steps(before, data, start, 0), before)
 
 
 def test_attaching_gradients_changes_no_number(shape, given):

@@ -1,0 +1,73 @@
+"""Unexplained clusters: data off the surface as dense as those on it, as of a misplaced limb; outliers are thin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchreg.alignment.problem import AlignProblem
+from torchreg.alignment.surface_fit import surface_noise
+
+
+@dataclass(frozen=True)
+class OffSurface:
+    """Distance from which the surface does not explain data."""
+
+    noises: float = 3.0  # standard deviations of the noise
+    share: float = 0.012  # of the model's size, at least: solids and skins are not exact
+
+    def distance(self, noise: Tensor, size: float) -> Tensor:
+        """Return the distance (...), metres, for noise (...) and a model's size in metres."""
+        return (self.noises * noise).clamp_min(self.share * size)
+
+
+@dataclass(frozen=True)
+class ClusterThresholds:
+    """Thresholds of clusters, and of the number of data in them that is worth a search."""
+
+    neighbors: int = 5  # off the surface within the radius, at least
+    radius: float = 4.0  # as a multiple of the median distance of nearest neighbors on the surface
+    max_radius: float = 0.1  # as a share of the model's size
+    share: float = 0.015  # of the data on the surface: more are worth a search
+    min_count: int = 5  # but so many or fewer are not
+    max_data: int = 2000  # per cloud, of which all pairs are compared; more are thinned
+
+
+OFF_SURFACE = OffSurface()
+CLUSTERS = ClusterThresholds()
+
+
+def leaves_clusters(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return a mask (B,) of poses that leave unexplained clusters worth a search."""
+    clustered, near = clustered_data(problem, pose)
+    return clustered > (CLUSTERS.share * near).clamp_min(CLUSTERS.min_count)
+
+
+def clustered_data(problem: AlignProblem, pose: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the numbers of data (B,) in unexplained clusters, and on the surface."""
+    if problem.data.shape[-2] > CLUSTERS.max_data:
+        problem = _thinned(problem, CLUSTERS.max_data)
+    distance = problem.surface.distance(problem.data, pose).abs()
+    limit = OFF_SURFACE.distance(surface_noise(distance, problem.valid, problem.size), problem.size)
+    far = (distance > limit.unsqueeze(-1)) & problem.valid
+    near = ~far & problem.valid
+    squares = _squared_distances(problem.data)
+    squares.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
+    spacing = torch.where(near, squares.amin(-1), torch.nan).nanmedian(-1).values.sqrt()
+    radius = torch.nan_to_num(CLUSTERS.radius * spacing, nan=0.0).clamp_max(CLUSTERS.max_radius * problem.size)
+    close = (squares < radius.square()[:, None, None]) & far.unsqueeze(-2)
+    clustered = far & (close.sum(-1) >= CLUSTERS.neighbors)
+    return clustered.sum(-1), near.sum(-1)
+
+
+def _squared_distances(data: Tensor) -> Tensor:
+    norms = data.square().sum(-1)
+    return (norms.unsqueeze(-1) + norms.unsqueeze(-2) - 2 * data @ data.mT).clamp_min_(0)
+
+
+def _thinned(problem: AlignProblem, count: int) -> AlignProblem:
+    """Return the problem with every k-th datum, so that about ``count`` remain at most."""
+    stride = -(-problem.data.shape[-2] // count)
+    return replace(problem, data=problem.data[:, ::stride], valid=problem.valid[:, ::stride])

@@ -1,0 +1,112 @@
+"""The checks at the public functions of alignment: clouds and masks, skins, units."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import as_float_tensor, check_shape
+from torchreg.errors import InputError, InputTypeError, UnitsWarning
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.skin import LinearBlendSkin
+
+
+@dataclass(frozen=True)
+class UnitsCheck:
+    """Thresholds of data and shape in different units."""
+
+    ratio: float = 30.0  # of their sizes: no pose and no crop explains more
+    min_data: int = 10  # with a reliable size
+
+
+UNITS = UnitsCheck()
+
+
+def check_clouds(
+    shape: ArticulatedShape,
+    clouds: Tensor,
+    mask: Tensor | None,
+    nan_policy: str,
+    *,
+    name: str = "data",
+    mask_name: str = "mask",
+    omit_option: str = "nan_policy='omit'",
+) -> tuple[Tensor, Tensor]:
+    """Return clouds (..., M, 3) in the shape's dtype and their valid points (..., M): neither masked nor left out.
+
+    Args:
+        shape: whose dtype and device the clouds take.
+        clouds: (M, 3) or (B, M, 3).
+        mask: (M,) or (B, M), False where clouds are padding.
+        nan_policy: "raise", or "omit" to leave out points that are not finite.
+        name: of the argument, for the message.
+        mask_name: of the mask's argument.
+        omit_option: setting that leaves out points that are not finite, for the message.
+
+    Raises:
+        InputError: if the clouds are empty, not finite, or do not fit the mask.
+        InputTypeError: if something has the wrong type.
+    """
+    clouds = as_float_tensor(clouds, name, like=shape.rest)
+    if clouds.ndim not in (2, 3):
+        raise InputError(f"{name} must have shape (M, 3) or (B, M, 3), got {tuple(clouds.shape)}")
+    check_shape(clouds, name, ("M", 3), batch=True)
+    if clouds.shape[-2] == 0 or clouds.shape[0] == 0:
+        raise InputError(f"{name} must hold at least one point, got shape {tuple(clouds.shape)}")
+    valid = torch.ones_like(clouds[..., 0], dtype=torch.bool)
+    if mask is not None:
+        if not isinstance(mask, Tensor) or mask.dtype != torch.bool:
+            raise InputTypeError(f"{mask_name} must be a tensor of bool, False where {name} are padding")
+        if mask.shape != valid.shape:
+            expected, got = tuple(valid.shape), tuple(mask.shape)
+            raise InputError(f"{mask_name} must have shape {expected} like the {name}, got {got}")
+        valid = mask.to(clouds.device)
+    finite = torch.isfinite(clouds).all(-1)
+    bad = int((valid & ~finite).sum())
+    if bad and nan_policy == "raise":
+        raise InputError(f"{name} hold {bad} points that are not finite; drop them or set {omit_option}")
+    valid = valid & finite
+    if not bool(valid.any()):
+        raise InputError(f"{name} hold no point that is finite and not masked")
+    return torch.where(valid.unsqueeze(-1), clouds, 0.0), valid
+
+
+def check_skin(shape: ArticulatedShape, skin: LinearBlendSkin) -> LinearBlendSkin:
+    """Return model points given as a skin.
+
+    Raises:
+        InputError: if the skin is of another shape.
+        InputTypeError: if it is no skin.
+    """
+    if not isinstance(skin, LinearBlendSkin):
+        raise InputTypeError(
+            f"model_points must be a skin of the shape, as from sample_skin, got {type(skin).__name__}"
+        )
+    if skin.shape is not shape:
+        raise InputError("model_points is a skin of another shape; build it from the shape itself")
+    return skin
+
+
+def warn_about_units(data: Tensor, valid: Tensor, size: float, *, stacklevel: int) -> bool:
+    """Return True, after a `UnitsWarning`, if data cannot be in the units of a shape, as with millimeters for metres.
+
+    Args:
+        data: ((B,) M, 3), each cloud with its mean at the origin; less than ten points have no reliable size.
+        valid: ((B,) M) False where padded.
+        size: of the shape, metres.
+        stacklevel: of the warning: 1 for the caller.
+    """
+    radius = torch.where(valid, data.norm(dim=-1), torch.nan).nanmedian(-1).values
+    ratio = 2 * float(radius.nanmedian()) / size
+    if int(valid.sum(-1).max()) < UNITS.min_data or 1 / UNITS.ratio < ratio < UNITS.ratio:
+        return False
+    warnings.warn(
+        f"the data spread over {ratio:.3g} times the model's size of {size:.3g} m: are they in metres? "
+        f"Scale them, by 0.001 if they are in millimeters",
+        UnitsWarning,
+        stacklevel=stacklevel + 1,
+    )
+    return True
