@@ -26,8 +26,15 @@ def arm_tracking(arm):
         return FrameFitter(arm, TrackConfig(**options), skin)
 
     def state(**changes):
-        tracked = {"frame": 1, "inliers": 300.0, "ratio": 1.0, "residual": 0.001, "total": 300.0, "interval": 1.0}
-        motion = {"error": 0.005, "surprise": pose.new_tensor([0.005, 0.04, 0.04])}
+        tracked = {
+            "frame": 1,
+            "num_inliers": 300.0,
+            "ratio_in_reach": 1.0,
+            "residual": 0.001,
+            "num_data": 300.0,
+            "interval": 1.0,
+        }
+        motion = {"prediction_error": 0.005, "innovation": pose.new_tensor([0.005, 0.04, 0.04])}
         return replace(new, **tracked | motion | changes)
 
     def frame(points=cloud, gap=1.0):

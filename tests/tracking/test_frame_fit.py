@@ -102,7 +102,7 @@ def test_fast_joints_may_stop_go_on_or_double(tracking, pace):
     """Where predictions fail by much, a joint that went 0.6 rad a frame is found at each pace."""
     velocity = torch.zeros_like(tracking.pose)
     velocity[HINGE] = 0.6
-    state = tracking.state(pose=bent(tracking.pose, -0.6 * pace), velocity=velocity, error=0.06)
+    state = tracking.state(pose=bent(tracking.pose, -0.6 * pace), velocity=velocity, prediction_error=0.06)
     fitter, frame = tracking.fitter(), tracking.frame()
     fit = fitter.descend(fitter.view_ahead(state, frame), state, frame.gap)
     torch.testing.assert_close(fit.world, tracking.pose, atol=0.02, rtol=0)
@@ -151,8 +151,8 @@ def test_dense_data_where_a_limb_could_be_are_novel_once(arm, tracking):
     learned = fitter.strays_after(state, fit)
     trunk = arm.part_transforms(fit.pose[0])[0]
     torch.testing.assert_close(transform_points(trunk, learned), fit.strays)
-    again = fitter.fit_at(replace(state, strays=learned), frame, tracking.pose, "tracked")
+    again = fitter.fit_at(replace(state, unexplained=learned), frame, tracking.pose, "tracked")
     assert again.novel == 0
     # What doubts leave open is not learned until attempts to explain it ended.
-    assert fitter.strays_after(replace(state, fails=2), fit) is state.strays
-    assert len(fitter.strays_after(replace(state, fails=2), replace(fit, how="found"))) == len(fit.strays)
+    assert fitter.strays_after(replace(state, failed_searches=2), fit) is state.unexplained
+    assert len(fitter.strays_after(replace(state, failed_searches=2), replace(fit, how="found"))) == len(fit.strays)

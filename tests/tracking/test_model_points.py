@@ -20,7 +20,7 @@ def one_side(tracking):
 
 
 def after(tracking, cloud, state=None, **options):
-    fitter, state = tracking.fitter(**options), state or tracking.state(inliers=float(len(cloud)))
+    fitter, state = tracking.fitter(**options), state or tracking.state(num_inliers=float(len(cloud)))
     fit = fitter.fit_at(state, tracking.frame(cloud), tracking.pose, "tracked")
     return fit, points_after(fitter, state, fit)
 
@@ -47,7 +47,7 @@ def test_parts_that_no_data_show_keep_their_points(arm, tracking):
 def test_what_is_hidden_comes_back_as_it_went(tracking):
     side = one_side(tracking)
     points = tracking.skin.points[::2]
-    state = tracking.state(points=points, weights=tracking.skin.weights[::2], inliers=2.0 * len(side))
+    state = tracking.state(points=points, weights=tracking.skin.weights[::2], num_inliers=2.0 * len(side))
     _, (kept, _, _) = after(tracking, side, state)
     _, (shown, _, _) = after(tracking, side)
     expected = {tuple(point) for point in torch.cat([shown, points]).tolist()}

@@ -77,17 +77,17 @@ def test_predictions_spread_with_gaps_and_losses(arm_tracking):
 
 
 def test_prior_follows_the_surprises_between_bounds(arm_tracking):
-    state = arm_tracking.state(surprise=torch.tensor([0.02, 0.1, 0.1], dtype=torch.float64))
-    torch.testing.assert_close(prior_std(state, 1.0, 0.4, None), state.surprise.new_tensor([0.04, 0.2, 0.2]))
-    torch.testing.assert_close(prior_std(state, 2.0, 0.4, None), state.surprise.new_tensor([0.08, 0.4, 0.3]))
+    state = arm_tracking.state(innovation=torch.tensor([0.02, 0.1, 0.1], dtype=torch.float64))
+    torch.testing.assert_close(prior_std(state, 1.0, 0.4, None), state.innovation.new_tensor([0.04, 0.2, 0.2]))
+    torch.testing.assert_close(prior_std(state, 2.0, 0.4, None), state.innovation.new_tensor([0.08, 0.4, 0.3]))
     assert prior_std(state, 1.0, 0.4, 0.5)[2] == 0.5
-    calm = replace(state, surprise=0 * state.surprise)
-    torch.testing.assert_close(prior_std(calm, 1.0, 0.4, None), state.surprise.new_tensor([0.008, 0.08, 0.08]))
+    calm = replace(state, innovation=0 * state.innovation)
+    torch.testing.assert_close(prior_std(calm, 1.0, 0.4, None), state.innovation.new_tensor([0.008, 0.08, 0.08]))
 
 
 def test_motion_is_fast_where_predictions_fail(arm_tracking):
-    assert not moves_fast(arm_tracking.state(error=0.0125), 0.4)
-    assert moves_fast(arm_tracking.state(error=0.0135), 0.4)
+    assert not moves_fast(arm_tracking.state(prediction_error=0.0125), 0.4)
+    assert moves_fast(arm_tracking.state(prediction_error=0.0135), 0.4)
 
 
 def fit_after(arm_tracking, state, step):
@@ -101,7 +101,7 @@ def fit_after(arm_tracking, state, step):
 
 
 def test_velocities_take_over_what_data_confirm(arm_tracking):
-    state = arm_tracking.state(velocity=VELOCITY, interval=0.5, error=0.01)
+    state = arm_tracking.state(velocity=VELOCITY, interval=0.5, prediction_error=0.01)
     step = 0.1 * torch.arange(1.0, 8.0).double()
     frame, fit = fit_after(arm_tracking, state, step)
     known = motion_after(state, frame, fit, torch.ones(7, dtype=torch.float64))
@@ -109,7 +109,7 @@ def test_velocities_take_over_what_data_confirm(arm_tracking):
     expected = torch.stack([part.square().mean().sqrt() for part in (step[:3], step[3:6], step[6:])])
     torch.testing.assert_close(known.surprise, expected)
     assert known.error == 0.03
-    fast = motion_after(replace(state, error=0.05), frame, fit, torch.ones(7, dtype=torch.float64))
+    fast = motion_after(replace(state, prediction_error=0.05), frame, fit, torch.ones(7, dtype=torch.float64))
     torch.testing.assert_close(fast.velocity, VELOCITY + 0.8 / 0.5 * step)
     assert fast.error == pytest.approx(0.045)
 
@@ -121,7 +121,7 @@ def test_velocities_that_data_do_not_confirm_fade(arm_tracking):
     torch.testing.assert_close(unknown.velocity[:6], 0.95 * VELOCITY[:6])
     torch.testing.assert_close(unknown.velocity[6:], 0.7 * VELOCITY[6:])
     # What data do not tell is no surprise.
-    torch.testing.assert_close(unknown.surprise, 0.9 * state.surprise)
+    torch.testing.assert_close(unknown.surprise, 0.9 * state.innovation)
 
 
 def test_motions_begin_at_rest_and_no_surer_than_before(arm_tracking):
@@ -129,12 +129,12 @@ def test_motions_begin_at_rest_and_no_surer_than_before(arm_tracking):
     assert not begun.velocity.any()
     assert begun.error == pytest.approx(0.016)
     torch.testing.assert_close(begun.surprise, arm_tracking.pose.new_tensor([0.016, 0.15, 0.15]))
-    state = arm_tracking.state(error=0.1, surprise=arm_tracking.pose.new_tensor([0.1, 0.0, 0.5]))
+    state = arm_tracking.state(prediction_error=0.1, innovation=arm_tracking.pose.new_tensor([0.1, 0.0, 0.5]))
     both = merged(state, begun)
     assert both.error == pytest.approx(0.09)
     torch.testing.assert_close(both.surprise, arm_tracking.pose.new_tensor([0.09, 0.15, 0.45]))
     assert isinstance(both, Motion)
-    assert replace(state, **both.fields).error == both.error
+    assert replace(state, **both.fields).prediction_error == both.error
 
 
 def test_what_is_not_seen_slows_down(arm_tracking):

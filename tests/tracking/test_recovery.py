@@ -69,7 +69,7 @@ def test_a_flipped_base_is_among_the_starts(plain_hand, plain_hand_skin):
 def test_attempts_that_fail_become_rare(tracking):
     state, attempts = tracking.state(), []
     for number in range(120):
-        if state.rest == 0:
+        if state.cool_down == 0:
             attempts.append(number)
             state = rested(state, False)
         else:
@@ -77,23 +77,23 @@ def test_attempts_that_fail_become_rare(tracking):
     gaps = [later - earlier for earlier, later in pairwise(attempts)]
     assert gaps == [1, 3, 5, 9, 17, 33, 33]
     state = rested(state, True)
-    assert (state.rest, state.fails) == (0, 0)
-    assert waited(state).rest == 0
+    assert (state.cool_down, state.failed_searches) == (0, 0)
+    assert waited(state).cool_down == 0
 
 
 def test_a_limb_that_was_missed_is_placed_anew(tracking):
-    state = tracking.state(pose=bent(tracking.pose, -1.2), fails=1)
+    state = tracking.state(pose=bent(tracking.pose, -1.2), failed_searches=1)
     fit, after, descended = attempt(tracking, state)
     assert (descended.world - tracking.pose)[HINGE].abs() > 0.2
     assert fit.how in ("surface", "starts")
     torch.testing.assert_close(fit.world, tracking.pose, atol=0.01, rtol=0)
     assert fit.explained > descended.explained + 4
     # Nothing that data show goes so far in a frame: the doubt remains.
-    assert (after.rest, after.fails) == (2, 2)
+    assert (after.cool_down, after.failed_searches) == (2, 2)
 
 
 def test_nothing_is_tried_where_it_may_not_or_was_tried_lately(tracking, searches):
-    for level, changes in (("none", {}), ("full", {"rest": 2})):
+    for level, changes in (("none", {}), ("full", {"cool_down": 2})):
         state = tracking.state(pose=bent(tracking.pose, -0.3), **changes)
         fit, after, descended = attempt(tracking, state, level)
         assert fit is descended
@@ -108,7 +108,7 @@ def test_what_is_long_lost_is_sought_everywhere_and_taken_where_it_is_nearest(tr
         fit, after, descended = attempt(tracking, tracking.state(pose=away, lost=lost), level)
         assert descended is None
         assert (fit is not None) == found
-        assert (after.fails == 0) == found
+        assert (after.failed_searches == 0) == found
     assert fit.how == "found"
     torch.testing.assert_close(fit.world, tracking.pose, atol=5e-3, rtol=0)
     assert searches == [(300, 0)]
@@ -116,7 +116,7 @@ def test_what_is_long_lost_is_sought_everywhere_and_taken_where_it_is_nearest(tr
 
 def test_first_frames_take_the_best_of_what_is_found(tracking, searches):
     fitter = tracking.fitter()
-    state, frame = tracking.state(inliers=0.0, ratio=0.0), tracking.frame(torch.cat([tracking.cloud] * 11))
+    state, frame = tracking.state(num_inliers=0.0, ratio_in_reach=0.0), tracking.frame(torch.cat([tracking.cloud] * 11))
     assert Recovery(fitter).everywhere(state, frame) is None
     # The best is half a metre away, where no data are; no more data are searched than tell anything.
     assert searches == [(3000, seed) for seed in range(4)]
@@ -131,7 +131,7 @@ def test_what_lies_beside_its_data_is_sought_again_until_a_pose_explains_them(tr
         return PoseStarts(poses[len(asked) - 1][None], torch.tensor([10.0]), torch.tensor(0.1, dtype=torch.float64))
 
     monkeypatch.setattr(recovery, "find_pose", find)
-    state = tracking.state(inliers=0.0, ratio=0.0, residual=0.0)
+    state = tracking.state(num_inliers=0.0, ratio_in_reach=0.0, residual=0.0)
     monkeypatch.setattr(recovery, "is_vague", lambda state, fit: len(asked) < 2)
     fit = Recovery(tracking.fitter()).everywhere(state, tracking.frame())
     assert [config.seed for config in asked] == [0, 1]
@@ -142,15 +142,15 @@ def test_what_lies_beside_its_data_is_sought_again_until_a_pose_explains_them(tr
 def test_noise_is_no_shape_and_a_hidden_one_is_not_sought(tracking, searches):
     low, high = tracking.cloud.amin(0), tracking.cloud.amax(0)
     noise = low + (high - low) * torch.rand(300, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    state = tracking.state(lost=3, rest=0)
+    state = tracking.state(lost=3, cool_down=0)
     fit, after, _ = attempt(tracking, state, cloud=noise[:40])
     assert fit is None or is_lost(state, fit)
     assert searches == []
-    assert after.fails == 0
+    assert after.failed_searches == 0
     fit, after, _ = attempt(tracking, state, cloud=noise)
     assert fit is None or is_lost(state, fit)
     assert len(searches) == 1
-    assert after == replace(state, fails=1)
+    assert after == replace(state, failed_searches=1)
 
 
 def test_no_attempt_takes_the_trunk_farther_than_it_gets(tracking):

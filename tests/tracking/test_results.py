@@ -1,10 +1,14 @@
 """What tracking returns: how far poses are known, and whether there is one."""
 
+import json
 from dataclasses import fields, replace
+from pathlib import Path
 
 import pytest
+import safetensors.torch
 import torch
 
+from torchreg.storage import load
 from torchreg.tracking.results import FrameResult, TrackState
 
 
@@ -20,7 +24,7 @@ def test_a_state_knows_whether_there_is_a_pose():
     held = state(pose=torch.zeros(7))
     assert held.found
     assert not held.tracked
-    assert replace(held, inliers=12.0).tracked
+    assert replace(held, num_inliers=12.0).tracked
 
 
 def test_deviations_are_roots_of_the_diagonal(result):
@@ -31,3 +35,16 @@ def test_deviations_are_roots_of_the_diagonal(result):
     )
     assert frame.std.tolist() == pytest.approx([2.0, 0.5])
     assert frame.statuses == result.statuses
+
+
+def test_states_of_the_first_release_are_read_under_the_new_names():
+    path = Path(__file__).parents[1] / "saved" / "0.1.0" / "TrackState.safetensors"
+    numbers = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))["metadata"]["fields"]
+    tensors, state = safetensors.torch.load_file(path), load(path)
+    for former, name in {"previous": "keyframes", "strays": "unexplained", "surprise": "innovation"}.items():
+        assert torch.equal(getattr(state, name), tensors[former])
+    renamed = {
+        "error": "prediction_error", "total": "num_data", "inliers": "num_inliers", "ratio": "ratio_in_reach",
+        "held": "limit_share", "rest": "cool_down", "fails": "failed_searches", "unsure": "pending_checks",
+    }  # fmt: skip
+    assert all(getattr(state, name) == numbers[former] for former, name in renamed.items())

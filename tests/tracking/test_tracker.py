@@ -137,9 +137,9 @@ def test_a_restored_state_goes_on_to_the_last_bit(tracker, frames, followed, tmp
 
 def test_states_do_not_grow(followed):
     _, states, _, _ = followed
-    sizes = [state.previous.numel() for state in states]
+    sizes = [state.keyframes.numel() for state in states]
     assert max(sizes) <= 3 * 27
-    assert all(len(state.points) <= 400 and len(state.strays) < 200 for state in states)
+    assert all(len(state.points) <= 400 and len(state.unexplained) < 200 for state in states)
 
 
 def test_the_order_of_points_does_not_matter(tracker, frames, followed):

@@ -45,10 +45,10 @@ def is_far(state: TrackState, fit: FrameFit) -> bool:
 def is_lost(state: TrackState, fit: FrameFit) -> bool:
     """Return whether the data do not support a fit."""
     # What moved far must bring most of its data along; what stayed may be hidden but for a little.
-    few = fit.inliers < max(_MIN_INLIERS, _LOST_COUNT * state.inliers if state.lost else 0)
-    stray = is_far(state, fit) and fit.inliers < _LOST_RATIO * state.inliers
+    few = fit.inliers < max(_MIN_INLIERS, _LOST_COUNT * state.num_inliers if state.lost else 0)
+    stray = is_far(state, fit) and fit.inliers < _LOST_RATIO * state.num_inliers
     vague = state.tracked and is_vague(state, fit)
-    return few or stray or vague or fit.ratio < _LOST_RATIO * state.ratio
+    return few or stray or vague or fit.ratio < _LOST_RATIO * state.ratio_in_reach
 
 
 def is_vague(state: TrackState, fit: FrameFit) -> bool:
@@ -64,14 +64,14 @@ def is_doubtful(state: TrackState, fit: FrameFit) -> bool:
     return (
         fit.novel > max(_DOUBT_NOVEL, _DOUBT_NOVEL_SHARE * fit.inliers)
         or float(fit.noise) > _DOUBT_RESIDUAL * state.residual
-        or fit.held > state.held + _DOUBT_HELD
+        or fit.held > state.limit_share + _DOUBT_HELD
         or is_far(state, fit)
     )
 
 
 def in_doubt(state: TrackState) -> bool:
     """Return whether what a frame shows may not yet be taken for usual."""
-    return state.tracked and (state.lost > 0 or 0 < state.fails < _LEARNED_AFTER)
+    return state.tracked and (state.lost > 0 or 0 < state.failed_searches < _LEARNED_AFTER)
 
 
 def usual_after(state: TrackState, fit: FrameFit, total: int) -> TrackState:
@@ -81,11 +81,13 @@ def usual_after(state: TrackState, fit: FrameFit, total: int) -> TrackState:
         return state
     keep = 0.0 if anew or not state.tracked else _MEMORY
     pairs = (
-        (state.total, total), (state.inliers, fit.inliers), (state.ratio, fit.ratio), (state.residual, fit.noise),
-        (state.held, fit.held),
+        (state.num_data, total), (state.num_inliers, fit.inliers), (state.ratio_in_reach, fit.ratio),
+        (state.residual, fit.noise), (state.limit_share, fit.held),
     )  # fmt: skip
     total_, inliers, ratio, residual, held = (keep * old + (1 - keep) * float(new) for old, new in pairs)
-    return replace(state, total=total_, inliers=inliers, ratio=ratio, residual=residual, held=held)
+    return replace(
+        state, num_data=total_, num_inliers=inliers, ratio_in_reach=ratio, residual=residual, limit_share=held
+    )
 
 
 def share_at_limits(problem: AlignProblem, pose: Tensor) -> float:

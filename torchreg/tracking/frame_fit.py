@@ -161,7 +161,7 @@ class FrameFitter:
             distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
         transforms = self.shape.part_transforms(pose[0])
         strays = dense_strays(problem.data[0], distance[0].abs() < _FAR_NOISES * noise, self.size)
-        known = transform_points(transforms[0], state.strays)
+        known = transform_points(transforms[0], state.unexplained)
         novel = (nearest_distance(strays, known) > _SAME_STRAY * self.size) & self._reach(strays, transforms[0])
         moved = (problem.skin.place(stacked_rows(transforms)) - problem.skin.place(view.rows)).norm(dim=-1)
         wide = replace(problem, prior=PosePrior(problem.prior.mean, self._precision(_WIDE_PRIOR)))
@@ -188,10 +188,10 @@ class FrameFitter:
         Those of a doubtful fit may be what the fit missed, and are expected only after attempts to explain them.
         """
         if in_doubt(state) and fit.how != "found":
-            return state.strays
+            return state.unexplained
         strays = transform_points(invert_rigid(fit.transforms[0]), fit.strays)
         # Where there are some still, those of earlier frames show better how far they reach.
-        lasting = state.strays[nearest_distance(state.strays, strays) < _SAME_STRAY * self.size]
+        lasting = state.unexplained[nearest_distance(state.unexplained, strays) < _SAME_STRAY * self.size]
         return torch.cat([strays, lasting])[:_MAX_STRAYS]
 
     def _precision(self, joints: float) -> Tensor:
@@ -206,7 +206,9 @@ class FrameFitter:
 
     def _schedule(self, state: TrackState, gap: float) -> SigmaSchedule:
         low, high = _START_RANGE
-        start = self.size * min(max(_START_PER_ERROR * spread(state, gap) * state.error / self.size, low), high)
+        start = self.size * min(
+            max(_START_PER_ERROR * spread(state, gap) * state.prediction_error / self.size, low), high
+        )
         stop = STOP_SIGMA * self.size
         return SigmaSchedule.geometric(start, stop, 2 if start < _SIGMA_RATIO * stop else 3)
 

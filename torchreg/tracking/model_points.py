@@ -40,7 +40,7 @@ def points_after(fitter: FrameFitter, state: TrackState, fit: FrameFit) -> Model
     if fitter.config.model_points == "data":
         return _harvested(fitter, state, data, pose, posed, near)
     shown = near.amin(-1) < _SHOWN_SHARE * size
-    if fit.inliers < _HIDDEN * state.inliers:
+    if fit.inliers < _HIDDEN * state.num_inliers:
         # What something hides comes back as it went.
         shown = shown | _among(skin.points, state.points)
     parts = skin.weights.argmax(-1)

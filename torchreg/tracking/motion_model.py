@@ -59,7 +59,7 @@ def timed(state: TrackState, time: float | None) -> tuple[TrackState, float]:
 
 def moves_fast(state: TrackState, size: float) -> bool:
     """Return whether predictions are often off by more than a descent makes good."""
-    return state.error > _FAST * size
+    return state.prediction_error > _FAST * size
 
 
 def spread(state: TrackState, gap: float) -> float:
@@ -83,10 +83,10 @@ def prior_std(state: TrackState, gap: float, size: float, joints: float | None) 
         size: of the shape, metres.
         joints: of the joints, where it is given; radians.
     """
-    shift, turn, bend = (_STD_PER_ERROR * spread(state, gap) * state.surprise).tolist()
+    shift, turn, bend = (_STD_PER_ERROR * spread(state, gap) * state.innovation).tolist()
     low, high = _JOINT_STD
     bend = joints or min(max(bend, low), high)
-    return state.surprise.new_tensor([max(shift, _LEAST_SHIFT * size), max(turn, low), bend])
+    return state.innovation.new_tensor([max(shift, _LEAST_SHIFT * size), max(turn, low), bend])
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ class Motion:
     @property
     def fields(self) -> dict[str, Any]:
         """The fields of a `TrackState`."""
-        return {"velocity": self.velocity, "surprise": self.surprise, "error": self.error}
+        return {"velocity": self.velocity, "innovation": self.surprise, "prediction_error": self.error}
 
 
 def first_motion(pose: Tensor, size: float) -> Motion:
@@ -131,14 +131,14 @@ def motion_after(state: TrackState, frame: Frame, fit: FrameFit, share: Tensor) 
     decay[:6] = _BASE_DECAY
     velocity = share * went + (1 - share) * decay * state.velocity
     errors = [_deviation(surprise[part], share[part]) for part in (slice(3), slice(3, 6), slice(6, None))]
-    surprises = torch.maximum(torch.stack(errors), _ERROR_MEMORY * state.surprise)
-    return Motion(velocity, surprises, max(fit.jump, _ERROR_MEMORY * state.error))
+    surprises = torch.maximum(torch.stack(errors), _ERROR_MEMORY * state.innovation)
+    return Motion(velocity, surprises, max(fit.jump, _ERROR_MEMORY * state.prediction_error))
 
 
 def merged(state: TrackState, motion: Motion) -> Motion:
     """Return a motion that is no surer than the one before."""
-    surprise = torch.maximum(motion.surprise, _ERROR_MEMORY * state.surprise)
-    return replace(motion, surprise=surprise, error=max(motion.error, _ERROR_MEMORY * state.error))
+    surprise = torch.maximum(motion.surprise, _ERROR_MEMORY * state.innovation)
+    return replace(motion, surprise=surprise, error=max(motion.error, _ERROR_MEMORY * state.prediction_error))
 
 
 def slowed(state: TrackState, gap: float) -> Tensor:

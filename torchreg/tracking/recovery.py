@@ -63,10 +63,10 @@ class Recovery:
             fit: what descent in the view led to.
         """
         lost = fit is None or is_lost(state, fit)
-        if self.level == "none" or not (lost or state.rest == 0):
+        if self.level == "none" or not (lost or state.cool_down == 0):
             return fit, waited(state)
         fit = self._best(state, frame, view, fit, lost)
-        tried = state.rest == 0 and (not lost or _may_show(state, frame))
+        tried = state.cool_down == 0 and (not lost or _may_show(state, frame))
         good = fit is not None and not is_lost(state, fit) and not is_doubtful(state, fit)
         return fit, rested(state, good) if good or tried else waited(state)
 
@@ -127,17 +127,17 @@ class Recovery:
     ) -> Iterator[FrameFit | None]:
         """Yield other fits of a frame, each costing more than the one before."""
         lost = fit is None or is_lost(state, fit)
-        dear = self.level == "full" and state.rest == 0 and (not lost or _may_show(state, frame))
+        dear = self.level == "full" and state.cool_down == 0 and (not lost or _may_show(state, frame))
         if view is not None:
             known = torch.cat([view.problem.prior.mean[None], view.local(state.pose[None])], dim=1)
             known = known if fit is None else torch.cat([fit.pose[None], known], dim=1)
             wide = fit_candidates(view.problem, known, _WIDTHS, _STEPS)
             best = score_candidates(view.problem, wide, STOP_SIGMA)[0].argmin()
             yield self.fitter.fit(view, state, "surface", wide[:, best])
-            if lost or state.fails >= _STARTS_FAILS:
-                thorough = dear and (state.lost >= _SEARCH_AFTER if lost else state.fails == _SEARCH_FAILS)
+            if lost or state.failed_searches >= _STARTS_FAILS:
+                thorough = dear and (state.lost >= _SEARCH_AFTER if lost else state.failed_searches == _SEARCH_FAILS)
                 yield from self._searched(state, view, known, lost, thorough)
-        overdue = state.lost >= _FIND_AFTER if lost else state.fails == _FIND_FAILS
+        overdue = state.lost >= _FIND_AFTER if lost else state.failed_searches == _FIND_FAILS
         if dear and overdue:
             yield self.everywhere(state, frame)
 
@@ -147,7 +147,7 @@ class Recovery:
         """Yield fits after placing the limbs anew, from poses known and, after a loss, from earlier and turned ones."""
         if lost:
             turned = flipped(self.fitter.skin, state.pose)
-            known = torch.cat([known, view.local(state.previous), view.local(turned)], dim=1)
+            known = torch.cat([known, view.local(state.keyframes), view.local(turned)], dim=1)
         search = PoseSearch(view.problem, generator(state))
         narrowed = search.narrow(known, _NUM_SEARCHED)
         yield self.fitter.fit(view, state, "starts", narrowed[:, 0])
@@ -169,18 +169,21 @@ def flipped(skin: LinearBlendSkin, pose: Tensor) -> Tensor:
 def rested(state: TrackState, good: bool) -> TrackState:
     """Return the state after an attempt: what helped may be tried at once, what did not, later and later."""
     if good:
-        return replace(state, rest=0, fails=0)
-    return replace(state, rest=_rest_after(state.fails + 1), fails=state.fails + 1)
+        return replace(state, cool_down=0, failed_searches=0)
+    return replace(state, cool_down=_rest_after(state.failed_searches + 1), failed_searches=state.failed_searches + 1)
 
 
 def waited(state: TrackState) -> TrackState:
     """Return the state after a frame without an attempt."""
-    return replace(state, rest=max(0, state.rest - 1))
+    return replace(state, cool_down=max(0, state.cool_down - 1))
 
 
 def _may_show(state: TrackState, frame: Frame) -> bool:
     """Return whether enough data came for the shape to be among them, or it is time to look in any case."""
-    return len(frame.data) > state.total - _HIDDEN_SHARE * state.inliers or _rest_after(state.fails) >= _LONGEST_REST
+    return (
+        len(frame.data) > state.num_data - _HIDDEN_SHARE * state.num_inliers
+        or _rest_after(state.failed_searches) >= _LONGEST_REST
+    )
 
 
 def _rest_after(fails: int) -> int:

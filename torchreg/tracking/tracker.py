@@ -183,9 +183,10 @@ class Tracker:
         points = skin.points
         return TrackState(
             frame=0, time=0.0, interval=0.0, pose=pose, velocity=torch.zeros_like(pose), points=points,
-            weights=skin.weights, reference_pose=skin.reference_pose, previous=pose[None][:0], strays=points[:0],
-            error=0.0, surprise=points.new_zeros(3), total=0.0, inliers=0.0, ratio=0.0, residual=0.0, held=0.0,
-            lost=0, rest=0, fails=0, unsure=0, seed=self.config.seed,
+            weights=skin.weights, reference_pose=skin.reference_pose, keyframes=pose[None][:0],
+            unexplained=points[:0], prediction_error=0.0, innovation=points.new_zeros(3), num_data=0.0, num_inliers=0.0,
+            ratio_in_reach=0.0, residual=0.0, limit_share=0.0, lost=0, cool_down=0, failed_searches=0, pending_checks=0,
+            seed=self.config.seed,
         )  # fmt: skip
 
     def _checked(self, points: Tensor) -> Tensor:
@@ -218,7 +219,7 @@ class Tracker:
             config = AlignConfig(sharpness=self.config.sharpness)
             pose = align(self.shape, data, state.pose, model_points=self._fitter.skin, config=config).pose
             fit = self._fitter.fit_at(state, frame, pose, "tracked")
-        waits = state.rest > 0 or self.config.recovery != "full"
+        waits = state.cool_down > 0 or self.config.recovery != "full"
         if (fit is None or is_lost(state, fit)) and not waits:
             fit = self._recover.everywhere(state, frame)
         fit, state = _kept(state, fit)
@@ -226,15 +227,15 @@ class Tracker:
 
     def _follow(self, state: TrackState, frame: Frame) -> tuple[FrameFit | None, TrackState]:
         """Return the fit of a later frame, if any is worth it, and what the search for it leaves of the state."""
-        checks = state.unsure
+        checks = state.pending_checks
         fit, state = self._continue(state, frame)
         if checks == 0 or (fit is not None and fit.how == "found"):
             return fit, state
         # A pose that was found everywhere must hold against the same search in another frame.
         rival = self._recover.everywhere(state, frame)
         if rival is None or (fit is not None and rival.explained < fit.explained + MIN_GAIN):
-            return fit, replace(state, unsure=0)
-        return rival, replace(state, unsure=checks - 1)
+            return fit, replace(state, pending_checks=0)
+        return rival, replace(state, pending_checks=checks - 1)
 
     def _continue(self, state: TrackState, frame: Frame) -> tuple[FrameFit | None, TrackState]:
         """Return the same, from the frames before and what can be searched around them."""
@@ -254,13 +255,13 @@ class Tracker:
             motion = motion_after(state, frame, fit, share)
         else:
             motion = merged(state, first_motion(pose, self._fitter.size))
-        kept = state.previous if state.frame % _PREVIOUS_EVERY else torch.cat([state.previous, pose[None]])
+        kept = state.keyframes if state.frame % _PREVIOUS_EVERY else torch.cat([state.keyframes, pose[None]])
         points, weights, reference_pose = points_after(self._fitter, state, fit)
         after = replace(
             usual_after(state, fit, len(frame.data)), pose=pose, points=points, weights=weights,
-            reference_pose=reference_pose, previous=kept[-_NUM_PREVIOUS:],
-            strays=self._fitter.strays_after(state, fit), lost=0,
-            fails=min(state.fails, 1) if state.lost else state.fails, **motion.fields,
+            reference_pose=reference_pose, keyframes=kept[-_NUM_PREVIOUS:],
+            unexplained=self._fitter.strays_after(state, fit), lost=0,
+            failed_searches=min(state.failed_searches, 1) if state.lost else state.failed_searches, **motion.fields,
         )  # fmt: skip
         done = fit.change <= fit.view.problem.pose_atol
         status = Status.CONVERGED if done else Status.MAX_STEPS
@@ -312,7 +313,7 @@ def _kept(state: TrackState, fit: FrameFit | None) -> tuple[FrameFit | None, Tra
     """Return the fit if it is no loss, and the state, which is unsure of a fit that was found everywhere."""
     if fit is None or is_lost(state, fit):
         return None, state
-    return fit, replace(state, unsure=_CHECKS) if fit.how == "found" else state
+    return fit, replace(state, pending_checks=_CHECKS) if fit.how == "found" else state
 
 
 def _collected(results: Sequence[FrameResult], seconds: Sequence[float]) -> TrackResult:
