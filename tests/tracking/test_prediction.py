@@ -1,11 +1,13 @@
 """What a tracker expects: times and intervals, poses ahead, how far predictions may be off, velocities after fits."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from torchreg.geometry.rotation import so3_exp
+from torchreg.alignment.objectives import PosePrior
+from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
 from torchreg.tracking.motion_model import (
     advance_clock,
     decayed_velocity,
@@ -121,3 +123,13 @@ def test_what_is_not_seen_slows_down(tracking):
     torch.testing.assert_close(decayed_velocity(state, 1.0), 0.95 * VELOCITY)
     torch.testing.assert_close(decayed_velocity(state, 2.0), 0.95**2 * VELOCITY)
     assert torch.equal(decayed_velocity(state, 3.0), decayed_velocity(state, 90.0))
+
+
+def test_the_prior_of_the_base_counts_rotations_by_composition():
+    mean = torch.tensor([[0.1, 0.2, 0.3, math.pi - 0.01, 0.0, 0.0, 0.5]], dtype=torch.float64)
+    step = torch.tensor([[0.05, 0.0, 0.0]], dtype=torch.float64)
+    pose = mean.clone()
+    pose[:, 3:6] = compose_rotation_vectors(step, mean[:, 3:6])
+    prior = PosePrior(mean, torch.full((7,), 4.0, dtype=torch.float64), holds_base=True)
+    assert pose[0, 3] < 0
+    assert torch.allclose(prior.cost(pose), 2 * step.square().sum(-1))
