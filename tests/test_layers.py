@@ -36,11 +36,14 @@ BRIDGES = {("tracking", "alignment"), ("alignment/skeleton_source.py", "spines")
 # Two rooms of one system that know nothing of each other.
 APART = {("registration/dense", "registration/bones"), ("registration/bones", "registration/dense")}
 
-# Files or packages below torchreg/ that may import the library; libraries not named here are free.
+# Files or packages below torchreg/ that may import the library, or a module of it; what is not named here is free.
 OWNERS = {
     "pytorch_kinematics": {"shapes/kinematics.py"},
     "kornia": {"geometry/rotation.py", "geometry/rigid.py", "capture"},
-    "scipy": {"solvers", "geometry", "registration", "spines", "capture"},
+    "scipy": {"solvers", "geometry", "registration/dense/blend_sums.py"},
+    "scipy.spatial": {"geometry/neighbors.py"},
+    "scipy.ndimage": {"geometry/distance_transform.py"},
+    "scipy.sparse.csgraph": {"geometry/graphs.py", "solvers/graph_cut.py"},
     "skimage": {"capture"},
     "cv2": {"capture"},
     "PIL": {"io", "viz"},
@@ -54,6 +57,8 @@ OWNERS = {
     "typer": {"cli"},
     "tqdm": {"cli"},
 }
+# `from torchreg import x` names the module x, `from torchreg.geometry.mesh import x` something inside mesh.
+MODULES_INSIDE = {"torchreg", "scipy", "scipy.sparse"}
 LAZY = {"matplotlib", "viser", "plotly", "cv2", "PIL", "OpenEXR"}
 LOWEST_THIRD_PARTY = {"errors": set(), "metrics": {"torch"}, "_checks": {"torch"}, "_threads": {"torch"}}
 IMPORT_NAMES = {
@@ -83,8 +88,7 @@ def imports_of(source: str, path: str) -> Iterator[Import]:
         elif isinstance(node, ast.ImportFrom):
             base = package[: len(package) - node.level + 1] if node.level else []
             origin = ".".join([*base, *([node.module] if node.module else [])])
-            # `from torchreg import x` names the module x, `from torchreg.geometry.mesh import x` something inside mesh.
-            names = [alias.name for alias in node.names] if origin in {"torchreg"} else [None]
+            names = [alias.name for alias in node.names] if origin in MODULES_INSIDE else [None]
             yield from (Import(f"{origin}.{name}" if name else origin, node.lineno, lazy) for name in names)
         in_function = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
         for_types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
@@ -141,8 +145,9 @@ def owner_problems(source: str, path: str, declared: set[str]) -> list[str]:
             continue
         if library not in declared:
             problems.append(f"{where}, which pyproject.toml does not declare")
-        if library in OWNERS and not {path, path.split("/")[0]} & OWNERS[library]:
-            problems.append(f"{where}, which belongs to {', '.join(sorted(OWNERS[library]))}")
+        for owned, owners in OWNERS.items():
+            if f"{item.name}.".startswith(f"{owned}.") and not {path, path.split("/")[0]} & owners:
+                problems.append(f"{where} for {owned}, which belongs to {', '.join(sorted(owners))}")
         if library in LAZY and not item.lazy:
             problems.append(f"{where} when it is imported itself; import {library} inside the function that needs it")
         if library not in LOWEST_THIRD_PARTY.get(unit_of(path), {library}):
@@ -238,6 +243,13 @@ def test_the_layer_check_accepts_what_is_right(path, source):
         ("alignment/align.py", "def f():\n    from tqdm import tqdm", 1),
         ("metrics.py", "import numpy", 1),
         ("io/mesh.py", "import plyfile", 1),
+        ("geometry/neighbors.py", "from scipy.spatial import cKDTree", 0),
+        ("geometry/normals.py", "from scipy.spatial import cKDTree", 1),
+        ("geometry/normals.py", "from scipy import spatial", 1),
+        ("geometry/normals.py", "from scipy.sparse import csgraph, csr_array", 1),
+        ("geometry/graphs.py", "from scipy.sparse import csgraph, csr_array", 0),
+        ("solvers/nnls.py", "from scipy.sparse import coo_matrix\nfrom scipy.sparse.linalg import splu", 0),
+        ("spines/loops.py", "from scipy.sparse.csgraph import dijkstra", 2),
     ],
 )
 def test_the_owner_check_tells_right_from_wrong(path, source, count):

@@ -1,4 +1,4 @@
-"""Nearest neighbors against a plain loop over all pairs, by the tree and the table, in batches and degenerate sets."""
+"""Neighbors against plain tables of all pairs, by the tree and the table, in batches and degenerate sets."""
 
 import math
 
@@ -9,7 +9,16 @@ from hypothesis import strategies as st
 
 from torchreg.errors import InputError
 from torchreg.geometry import neighbors
-from torchreg.geometry.neighbors import nearest_few, nearest_neighbor
+from torchreg.geometry.neighbors import (
+    NeighborTree,
+    distinct_places,
+    k_nearest,
+    k_nearest_others,
+    nearest_neighbor,
+    pairs_within,
+    sampling_distance,
+    weld,
+)
 
 
 def clouds(seed, count, size, batch=(), dtype=torch.float64):
@@ -124,15 +133,107 @@ def test_what_does_not_fit_is_refused(points, targets, message):
         nearest_neighbor(points, targets)
 
 
-def test_the_nearest_few_are_those_of_a_sorted_table():
-    generator = torch.Generator().manual_seed(0)
-    points, targets = (torch.randn(count, 5, generator=generator) for count in (30, 40))
-    index, distance = nearest_few(points, targets, 3)
-    expected = torch.cdist(points.double(), targets.double()).topk(3, largest=False)
-    assert torch.equal(index, expected.indices)
-    torch.testing.assert_close(distance, expected.values)
-    assert nearest_few(points, targets[:1], 1)[0].shape == (30, 1)
-    with pytest.raises(InputError, match="count must be between 1 and the number of targets 40, got 41"):
-        nearest_few(points, targets, 41)
-    with pytest.raises(InputError, match="targets must have shape"):
-        nearest_few(points, targets[:, :3], 1)
+def grown_cloud(seed, count, size, copies):
+    """Return points of a lattice or at random, many of them more than once, so that distances tie."""
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.rand(count, size, generator=generator, dtype=torch.float64)
+    points = (3 * points).round() if copies else points
+    return points, generator
+
+
+def table(points, targets):
+    return (points.double()[:, None] - targets.double()).square().sum(-1).sqrt()
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.integers(1, 25), st.integers(1, 6), st.booleans(), st.integers(1, 25))
+def test_the_k_nearest_are_the_least_of_each_row_of_a_table(seed, count, size, copies, k):
+    targets, generator = grown_cloud(seed, count, size, copies)
+    points = torch.rand(7, size, generator=generator)
+    k = min(k, count)
+    tree = NeighborTree(targets)
+    index, distance = tree.k_nearest(points, k)
+    apart = table(points, targets)
+    assert index.shape == (7, k)
+    assert index.dtype == torch.int64
+    assert all(len(set(row)) == k for row in index.tolist())
+    torch.testing.assert_close(distance, apart.sort(dim=1).values[:, :k])
+    torch.testing.assert_close(apart.gather(1, index), distance)
+    for found, nearest in zip(k_nearest(points, targets, 1), tree.nearest(points), strict=True):
+        assert torch.equal(found[:, 0], nearest)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10**6), st.integers(2, 25), st.integers(1, 4), st.booleans(), st.integers(1, 30))
+def test_the_nearest_others_leave_out_the_point_itself_alone(seed, count, size, copies, k):
+    points, _ = grown_cloud(seed, count, size, copies)
+    index, distance = k_nearest_others(points, k)
+    assert index.shape == (count, min(k, count - 1))
+    assert not (index == torch.arange(count)[:, None]).any()
+    assert all(len(set(row)) == len(row) for row in index.tolist())
+    apart = table(points, points)
+    torch.testing.assert_close(apart.gather(1, index), distance)
+    torch.testing.assert_close(distance, apart.fill_diagonal_(torch.inf).sort(dim=1).values[:, :k][:, : count - 1])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10**6), st.integers(0, 25), st.booleans(), st.floats(0, 2))
+def test_pairs_within_a_radius_are_those_of_a_table(seed, count, copies, radius):
+    points, _ = grown_cloud(seed, count, 3, copies)
+    near = (table(points, points) <= radius).triu(1)
+    assert sorted(pairs_within(points, radius).tolist()) == near.nonzero().tolist()
+
+
+def test_the_sampling_distance_is_the_lower_median_of_the_nearest_others():
+    points = torch.tensor([[0.0], [1.0], [3.0], [10.0]])
+    assert sampling_distance(points) == 1.0
+    assert sampling_distance(points, points[1:]) == 2.0
+    assert sampling_distance(torch.cat((points, points))) == 0.0
+    assert sampling_distance(points[:1]) == sampling_distance(points[:0]) == math.inf
+    cloud = torch.rand(501, 3, generator=torch.Generator().manual_seed(0))
+    apart = table(cloud, cloud).fill_diagonal_(torch.inf).amin(1)
+    assert sampling_distance(cloud) == pytest.approx(float(apart.median()))
+    assert sampling_distance(7 * cloud - 3) == pytest.approx(7 * float(apart.median()), rel=1e-4)
+
+
+def test_points_at_one_place_share_a_number():
+    points = torch.tensor([[0.0, 0, 1], [2, 0, 0], [-0.0, 0, 1], [2, 0, 0], [0, 0, 2]])
+    which = weld(points)
+    assert torch.equal(which[:, None] == which, (points[:, None] == points).all(-1))
+    assert sorted(which.unique().tolist()) == [0, 1, 2]
+    places, which = distinct_places(points)
+    torch.testing.assert_close(places[which], points.double())
+
+
+@pytest.mark.parametrize(
+    ("search", "message"),
+    [
+        (lambda: NeighborTree(torch.zeros(0, 3)), "targets must hold at least one point, got none"),
+        (lambda: NeighborTree(torch.zeros(3)), r"targets must have shape \(K, D\), got \(3,\)"),
+        (lambda: NeighborTree(torch.zeros(4, 5)).nearest(torch.zeros(2, 3)), r"points must have shape \(N, 5\)"),
+        (lambda: k_nearest(torch.zeros(2, 5), torch.zeros(4, 3), 1), r"points must have shape \(N, 3\)"),
+        (
+            lambda: k_nearest(torch.zeros(2, 3), torch.zeros(40, 3), 41),
+            "the number of targets 40, got 41",
+        ),
+        (lambda: k_nearest(torch.zeros(2, 3), torch.zeros(40, 3), 0), "the number of targets 40, got 0"),
+        (lambda: k_nearest_others(torch.zeros(1, 3), 2), "points must hold at least 2"),
+        (lambda: k_nearest_others(torch.zeros(4, 3), 0), "count must be at least 1"),
+        (lambda: distinct_places(torch.zeros(5, 3)), "3 places or more, got 5 points at 1"),
+    ],
+)
+def test_searches_that_cannot_be_made_say_why(search, message):
+    with pytest.raises(InputError, match=message):
+        search()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no graphics card")
+def test_answers_stay_on_the_device_of_the_points():
+    points = torch.rand(50, 3, generator=torch.Generator().manual_seed(0))
+    there = points.cuda()
+    for search in (lambda p: k_nearest(p, p, 4), lambda p: k_nearest_others(p, 3), lambda p: [pairs_within(p, 0.3)]):
+        for found, expected in zip(search(there), search(points), strict=True):
+            assert found.device == there.device
+            assert torch.equal(found.cpu(), expected)
+    assert sampling_distance(there) == sampling_distance(points)
+    assert torch.equal(nearest_neighbor(there, there + 0.1)[0].cpu(), nearest_neighbor(points, points + 0.1)[0])

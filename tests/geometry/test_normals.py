@@ -9,15 +9,13 @@ from hypothesis import strategies as st
 
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import unit_sphere
+from torchreg.geometry.neighbors import k_nearest_others
 from torchreg.geometry.normals import (
-    distinct_places,
     estimate_normals,
     face_vertex_normals,
     fit_normals_at,
-    k_nearest,
     neighbors_disagree,
     orient_normals,
-    weld,
 )
 from torchreg.geometry.rotation import so3_exp
 
@@ -38,25 +36,6 @@ def cap(count, seed=0):
 
 def cosines(first, second):
     return (first * second).sum(-1)
-
-
-def test_k_nearest_agrees_with_sorted_distances():
-    points = sphere_points(60)
-    index, distance = k_nearest(points, 7)
-    table = torch.cdist(points, points).fill_diagonal_(torch.inf)
-    wanted, order = table.sort(dim=-1)
-    torch.testing.assert_close(distance, wanted[:, :7])
-    assert torch.equal(index, order[:, :7])
-    assert k_nearest(points[:4], 9)[0].shape == (4, 3)
-
-
-def test_weld_numbers_places():
-    points = torch.tensor([[0.0, 0, 1], [2, 0, 0], [-0.0, 0, 1], [2, 0, 0], [0, 0, 2]])
-    which = weld(points)
-    assert torch.equal(which[:, None] == which, (points[:, None] == points).all(-1))
-    assert sorted(which.unique().tolist()) == [0, 1, 2]
-    places, which = distinct_places(points)
-    torch.testing.assert_close(places[which], points.double())
 
 
 def test_normals_of_a_sphere_look_outward():
@@ -82,7 +61,7 @@ def test_a_plane_through_the_origin_has_one_side():
 
 def test_the_least_spread_of_an_independent_decomposition():
     points = sphere_points(300) * torch.tensor([1.0, 2.0, 0.5], dtype=torch.float64)
-    index, distance = k_nearest(points, 16)
+    index, distance = k_nearest_others(points, 16)
     normals = estimate_normals(points)
     for row in range(0, 300, 37):
         around = points[[row, *index[row].tolist()]].numpy()
@@ -139,7 +118,7 @@ def test_normals_turn_with_the_points(turn, scale, shift, seed):
 def test_random_signs_are_turned_back():
     points = sphere_points(1500)
     signs = torch.where(torch.rand(1500, 1, generator=seeded()) < 0.5, -1.0, 1.0).double()
-    assert 0.4 < neighbors_disagree(points * signs, k_nearest(points, 1)[0]) < 0.6
+    assert 0.4 < neighbors_disagree(points * signs, k_nearest_others(points, 1)[0]) < 0.6
     torch.testing.assert_close(orient_normals(points, points * signs), points)
     torch.testing.assert_close(orient_normals(points, points * signs, viewpoint=torch.zeros(3))[:, 0], -points[:, 0])
 

@@ -4,8 +4,9 @@ import pytest
 import torch
 
 from torchreg.errors import InputError
+from torchreg.geometry.graphs import connected_components
 from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
-from torchreg.geometry.surface_graph import close_holes, coarsened, connected_labels, one_piece, unique_edges
+from torchreg.geometry.surface_graph import close_holes, coarsened, one_piece, unique_edges
 
 
 def ball(subdivisions=2, radius=1.0, at=(0.0, 0.0, 0.0)):
@@ -23,13 +24,6 @@ def test_edges_of_a_tetrahedron():
     assert edges.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
     assert edges[which[1]].tolist() == [[0, 3], [1, 3], [0, 1]]
     assert unique_edges(torch.zeros(0, 3, dtype=torch.int64))[0].shape == (0, 2)
-
-
-def test_labels_follow_chains_of_pairs():
-    labels = connected_labels(torch.tensor([[0, 3], [3, 4], [1, 2]]), 6)
-    assert labels[0] == labels[3] == labels[4]
-    assert labels[1] == labels[2]
-    assert len(labels.unique()) == 3
 
 
 def test_a_clean_surface_stays_as_it_is():
@@ -73,7 +67,7 @@ def test_many_pieces_are_bridged_one_to_the_next():
     mesh = concatenate([ball(1, 0.3, place) for place in places.tolist()])
     bridges = one_piece(mesh, "bridge").bridges
     assert bridges.shape == (59, 2)
-    assert len(connected_labels(torch.cat((bridges // 42, torch.zeros(0, 2, dtype=torch.int64))), 60).unique()) == 1
+    assert len(connected_components(torch.cat((bridges // 42, torch.zeros(0, 2, dtype=torch.int64))), 60).unique()) == 1
     apart = torch.cdist(places, places).fill_diagonal_(torch.inf).amin(1)
     assert (mesh.vertices[bridges].diff(dim=1).norm(dim=-1)).min() < apart.min()
 
@@ -127,6 +121,6 @@ def test_sheets_closer_than_a_cell_stay_apart_and_thin_tubes_stay_tubes():
     outer, inner = ball(5), ball(5, 0.999)
     mesh = concatenate([outer, inner, TriangleMesh(tube + 3, faces)])
     few = coarsened(mesh, 3000)
-    labels = connected_labels(torch.cat((few.faces[:, :2], few.faces[:, 1:])), few.num_vertices)
+    labels = connected_components(torch.cat((few.faces[:, :2], few.faces[:, 1:])), few.num_vertices)
     assert len(labels.unique()) == 3
     assert few.vertices[:, 2].max() == pytest.approx(7.0, abs=0.06)

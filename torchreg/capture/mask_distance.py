@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import torch
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from torchreg._checks import check_shape
 from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.distance_transform import signed_distance
 
 
 def signed_mask_distance(mask: Tensor) -> Tensor:
@@ -34,9 +34,5 @@ def signed_mask_distance(mask: Tensor) -> Tensor:
     check_shape(mask, "mask", ("H", "W"))
     if not mask.numel():
         raise InputError("mask must have pixels, got none")
-    inside = mask.cpu().numpy()
     far = 0.5 * float(mask.shape[0] ** 2 + mask.shape[1] ** 2) ** 0.5
-    if inside.all() or not inside.any():
-        return torch.full(mask.shape, -far if inside.all() else far)
-    distance = torch.from_numpy(distance_transform_edt(inside) + distance_transform_edt(~inside)).float() - 0.5
-    return torch.where(mask.cpu(), -distance, distance)
+    return signed_distance(mask.cpu(), torch.float32).nan_to_num(posinf=far, neginf=-far)

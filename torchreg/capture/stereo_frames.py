@@ -14,6 +14,7 @@ from torchreg._checks import check_positive
 from torchreg.capture.stereo import StereoConfig, StereoPoints, as_gray, rectify, stereo_points
 from torchreg.errors import FormatError, InputError
 from torchreg.geometry.camera_rig import StereoPair
+from torchreg.geometry.neighbors import k_nearest_others
 from torchreg.io.images import list_frames, load_image
 
 # Nearer to the border of what both cameras see, pixels, a thing may go on beyond it.
@@ -143,7 +144,7 @@ def far_end(found: StereoPoints, pair: StereoPair, config: StereoConfig, reach: 
     pixels = torch.stack((column, row), dim=-1)[rim].to(dense)
     entry = pair.left.unproject(pixels, depth[row, column][rim]).median(0).values
     away = found.points - entry
-    company = torch.cdist(found.points, found.points).kthvalue(_COMPANIONS + 1).values < _COMPANY
+    company = k_nearest_others(found.points, _COMPANIONS)[1][:, -1] < _COMPANY
     if not bool(company.any()):
         return everything
     farthest = torch.where(company, away.norm(dim=-1), -1.0).argmax()

@@ -1,56 +1,26 @@
-"""Shortest ways along meshes, voxels and point clouds, from many sources at once."""
+"""Shortest paths along meshes and point clouds, from many sources at once."""
 
 from __future__ import annotations
 
-import itertools
-import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
 from torch import Tensor
 
-from torchreg._checks import (
-    as_float_tensor,
-    as_tensor,
-    check_choice,
-    check_count,
-    check_points,
-    check_positive,
-    check_shape,
-)
-from torchreg.errors import InputError, InputTypeError
+from torchreg._checks import as_float_tensor, check_choice, check_count, check_points
+from torchreg.geometry.graphs import Graph
 from torchreg.geometry.mesh import TriangleMesh
-from torchreg.geometry.normals import k_nearest
+from torchreg.geometry.neighbors import k_nearest_others
 from torchreg.geometry.surface_graph import one_piece
 
 PIECES = ("keep", "largest", "bridge", "error")
 # Starts, ends and lengths of steps.
 _Steps = tuple[np.ndarray, np.ndarray, np.ndarray]
-# Steps between voxels, one of each opposite pair: none passes over a voxel that a shorter one reaches.
-_STEPS = [
-    step
-    for step in itertools.product(range(-2, 3), repeat=3)
-    if step > (0, 0, 0) and math.gcd(*step) == 1 and sum(abs(part) == 2 for part in step) < 3
-]
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class GeodesicGraph:
-    """Places joined by straight steps of known length; made by `from_mesh`, `from_voxels` or `from_points`.
-
-    Args:
-        starts: (V + 1,) int, where in ``ends`` the steps of each place begin.
-        ends: (S,) int, where each step leads.
-        lengths: (S,) float64, in the unit of the coordinates.
-    """
-
-    starts: Tensor
-    ends: Tensor
-    lengths: Tensor
+class GeodesicGraph(Graph):
+    """A graph along a surface, whose nodes are places of it; made by `from_mesh` or `from_points`."""
 
     @classmethod
     def from_mesh(cls, mesh: TriangleMesh, pieces: str = "keep") -> GeodesicGraph:
@@ -86,30 +56,7 @@ class GeodesicGraph:
                 inside = np.zeros(len(vertices), dtype=bool)
                 inside[whole.vertex[whole.vertex >= 0].numpy()] = True
                 pairs = [(a[inside[a]], b[inside[a]], length[inside[a]]) for a, b, length in pairs]
-        return cls._joined(pairs, len(vertices))
-
-    @classmethod
-    def from_voxels(cls, filled: Tensor, spacing: float = 1.0) -> GeodesicGraph:
-        """Return the graph of filled voxels, for ways through the inside of a volume.
-
-        Steps lead to the 98 voxels within two steps along each axis that can be seen, if the voxels next to the middle
-        of the step are filled too; ways are 2 % too long on average.
-
-        Args:
-            filled: (X, Y, Z) bool; places are the filled ones in the order of ``filled.nonzero()``.
-            spacing: edge length of a voxel.
-
-        Raises:
-            InputError: if the shape is wrong, no voxel is filled or the spacing is not positive.
-            InputTypeError: if ``filled`` is not Boolean.
-        """
-        if not isinstance(filled, Tensor) or filled.dtype != torch.bool:
-            raise InputTypeError(f"filled must be a Boolean tensor, got {getattr(filled, 'dtype', type(filled))}")
-        check_shape(filled, "filled", ("X", "Y", "Z"))
-        check_positive(spacing, "spacing")
-        if not bool(filled.any()):
-            raise InputError("filled must hold a filled voxel, got none")
-        return cls._joined(_voxel_steps(filled.cpu().numpy(), spacing), int(filled.sum()))
+        return cls._of_steps(pairs, len(vertices))
 
     @classmethod
     def from_points(cls, points: Tensor, num_neighbors: int = 16) -> GeodesicGraph:
@@ -125,106 +72,14 @@ class GeodesicGraph:
         points = as_float_tensor(points, "points")
         check_count(num_neighbors, "num_neighbors", 1)
         check_points(points, "points", min_count=num_neighbors + 1, batch=False)
-        index, distance = k_nearest(points.detach().cpu().double(), num_neighbors)
-        from_ = np.repeat(np.arange(len(points)), num_neighbors)
-        return cls._joined([(from_, index.numpy().reshape(-1), distance.numpy().reshape(-1))], len(points))
+        index, distance = k_nearest_others(points.detach().cpu(), num_neighbors)
+        edges = torch.stack((torch.arange(len(points)).repeat_interleave(num_neighbors), index.flatten()), dim=1)
+        return cls.from_edges(edges, distance.flatten(), len(points))
 
     @classmethod
-    def from_steps(cls, pairs: Tensor, lengths: Tensor, count: int) -> GeodesicGraph:
-        """Return the graph of ``count`` places with steps between pairs (P, 2) int64, of given lengths (P,)."""
-        return cls._joined([(*pairs.cpu().numpy().T, lengths.cpu().double().numpy())], count)
-
-    def joined(self, pairs: Tensor, lengths: Tensor) -> GeodesicGraph:
-        """Return the graph with more steps, between pairs (P, 2) of places, of given lengths (P,)."""
-        old, old_lengths = self.steps()
-        return self.from_steps(torch.cat((old, pairs)), torch.cat((old_lengths, lengths.double())), len(self))
-
-    def steps(self) -> tuple[Tensor, Tensor]:
-        """Return pairs (P, 2) int64 of places between which a step leads, the smaller first, and the lengths (P,).
-
-        A step that was given twice is returned twice.
-        """
-        from_ = torch.arange(len(self)).repeat_interleave(self.starts.diff().long())
-        once = from_ < self.ends
-        return torch.stack((from_[once], self.ends[once].long()), dim=1), self.lengths[once]
-
-    @classmethod
-    def _joined(cls, pairs: list[_Steps], count: int) -> GeodesicGraph:
-        """Return the graph of steps that lead both ways; the same step may occur twice."""
-        from_, to, length = (np.concatenate(column) for column in zip(*pairs, strict=True))
-        # Zero would be no step.
-        length = np.maximum(length, np.finfo(np.float64).tiny)
-        order = np.argsort(np.concatenate((from_, to)).astype(np.int32), kind="stable")
-        starts = np.concatenate(
-            ([0], np.cumsum(np.bincount(from_, minlength=count) + np.bincount(to, minlength=count)))
-        )
-        ends = np.concatenate((to, from_))[order].astype(np.int32)
-        arrays = (starts.astype(np.int32), ends, np.concatenate((length, length))[order])
-        return cls(*(torch.from_numpy(array) for array in arrays))
-
-    def __len__(self) -> int:
-        return self.starts.shape[0] - 1
-
-    def __repr__(self) -> str:
-        return f"GeodesicGraph({len(self)} places, {len(self.ends) // 2} steps)"
-
-    def distances(self, sources: Any = None, limit: float = math.inf) -> Tensor:
-        """Return how far every place is from each source, (S, V) float64; infinite where no way within limits leads.
-
-        Args:
-            sources: (S,) places; all by default.
-            limit: ways longer than this are not looked for, which saves time.
-
-        Raises:
-            InputError: if a source is no place.
-            InputTypeError: if sources are not integers.
-
-        Cost: O(V log V) per source; 0.06 s for 100,000 vertices of a mesh.
-
-        References: Dijkstra 1959.
-        """
-        sources = None if sources is None else self._check(sources)
-        if sources is not None and len(sources) == 0:
-            return self.lengths.new_zeros(0, len(self))
-        return torch.from_numpy(dijkstra(self._matrix(), indices=sources, limit=limit))
-
-    def nearest(self, sources: Any) -> tuple[Tensor, Tensor]:
-        """Return how far the nearest source is, (V,) float64, and which of them (V,) it is, -1 where no way leads.
-
-        Args:
-            sources: (S,) places, at least one, no two alike.
-
-        Raises:
-            InputError: if a source is no place, or there is none.
-
-        Cost: that of a single source.
-        """
-        sources = self._check(sources)
-        if len(sources) == 0:
-            raise InputError("sources must hold at least one place, got none")
-        distance, _, source = dijkstra(self._matrix(), indices=sources, min_only=True, return_predecessors=True)
-        number = np.full(len(self) + 1, -1)
-        number[sources] = np.arange(len(sources))
-        return torch.from_numpy(distance), torch.from_numpy(number[np.where(source >= 0, source, -1)])
-
-    def labels(self) -> Tensor:
-        """Return (V,) numbers from 0, equal for places between which a way leads."""
-        return torch.from_numpy(connected_components(self._matrix(), directed=False)[1].astype(np.int64))
-
-    def _matrix(self) -> csr_array:
-        arrays = (self.lengths.numpy(), self.ends.numpy(), self.starts.numpy())
-        return csr_array(arrays, shape=(len(self), len(self)))
-
-    def _check(self, sources: Any) -> np.ndarray:
-        sources = as_tensor(sources, "sources", "integers")
-        if sources.numel() == 0:
-            sources = sources.reshape(0).long()
-        if sources.is_floating_point() or sources.is_complex() or sources.dtype == torch.bool:
-            raise InputTypeError(f"sources must hold integers, got dtype {sources.dtype}")
-        check_shape(sources, "sources", ("S",))
-        if len(sources) and not 0 <= int(sources.min()) <= int(sources.max()) < len(self):
-            raise InputError(f"sources must be places from 0 to {len(self) - 1}, got {sources.tolist()[:8]}")
-        return sources.cpu().numpy()
+    def _of_steps(cls, steps: list[_Steps], count: int) -> GeodesicGraph:
+        first, second, lengths = (torch.from_numpy(np.concatenate(column)) for column in zip(*steps, strict=True))
+        return cls.from_edges(torch.stack((first, second), dim=1), lengths, count)
 
 
 def geodesic_distances(mesh: TriangleMesh, sources: Any, pieces: str = "keep") -> Tensor:
@@ -302,20 +157,3 @@ def _crosses(
     apart = off + other_off
     place = along + (other_along - along) * off / np.where(apart > 0, apart, 1.0)
     return (apart > 0) & (place > 0) & (place < length)
-
-
-def _voxel_steps(filled: np.ndarray, spacing: float) -> list[_Steps]:
-    """Return start, end and length of the steps between filled voxels."""
-    number = np.full([size + 4 for size in filled.shape], -1)
-    within = number[2:-2, 2:-2, 2:-2]
-    within[filled] = np.arange(filled.sum())
-    places = np.argwhere(filled) + 2
-    pairs = []
-    for step in np.array(_STEPS):
-        to = number[tuple((places + step).T)]
-        free = to >= 0
-        # The middle of a long step lies between two voxels.
-        for middle in {tuple(np.floor(step / 2).astype(int)), tuple(np.ceil(step / 2).astype(int))}:
-            free &= (number[tuple((places + np.array(middle)).T)] >= 0) | (np.abs(step).max() == 1)
-        pairs.append((np.flatnonzero(free), to[free], np.full(free.sum(), spacing * np.linalg.norm(step))))
-    return pairs

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
-from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_count, check_points, check_shape
+from torchreg._checks import as_float_tensor, check_shape
 from torchreg.errors import InputError
+from torchreg.geometry.graphs import minimum_spanning_forest
 from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.neighbors import distinct_places, k_nearest, k_nearest_others
 
 _LEAST_WEIGHT = 1e-3
 # Points of the coarse copy that tells bulges from hollows, and their neighbors.
@@ -28,27 +26,6 @@ _LOOKING = 0.2
 _FLAT = 5e-3
 # Share of a component's area whose winding decides about the rest.
 _MAJORITY = 0.75
-
-
-def k_nearest(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the nearest other points of each point, nearest first.
-
-    Args:
-        points: (N, 3), at least two, no two at one place.
-        count: how many; N - 1 at most are returned.
-
-    Returns:
-        index (N, K) int64 and distance (N, K) float64, both on the CPU.
-
-    Raises:
-        InputError: if there are fewer than two points or ``count`` is below one.
-    """
-    check_points(points, "points", min_count=2, batch=False)
-    check_count(count, "count", 1)
-    count = min(count, len(points) - 1)
-    places = points.detach().cpu().double().numpy()
-    distance, index = cKDTree(places).query(places, count + 1)
-    return torch.from_numpy(index[:, 1:].astype(np.int64)), torch.from_numpy(distance[:, 1:].copy())
 
 
 def estimate_normals(points: Tensor, *, viewpoint: Tensor | None = None, num_neighbors: int = 16) -> Tensor:
@@ -76,7 +53,7 @@ def estimate_normals(points: Tensor, *, viewpoint: Tensor | None = None, num_nei
     """
     points = as_float_tensor(points, "points")
     places, which = distinct_places(points)
-    index, _ = k_nearest(places, num_neighbors)
+    index, _ = k_nearest_others(places, num_neighbors)
     normals = orient_along_graph(places, fit_normals(places, index), index, check_viewpoint(viewpoint))
     return normals[which].to(points)
 
@@ -112,39 +89,10 @@ def orient_normals(
     places, which = distinct_places(points)
     first = torch.full((len(places),), len(points)).scatter_reduce(0, which, torch.arange(len(points)), "amin")
     guide = normals.detach().cpu().double()[first]
-    index, _ = k_nearest(places, num_neighbors)
+    index, _ = k_nearest_others(places, num_neighbors)
     turned = orient_along_graph(places, guide, index, check_viewpoint(viewpoint))
     turn = (turned[which] * normals.detach().cpu().double()).sum(-1, keepdim=True) < 0
     return torch.where(turn.to(points.device), -normals, normals)
-
-
-def distinct_places(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the different places (M, 3), float64 on the CPU, and which (N,) of them each point is at.
-
-    Raises:
-        InputError: if a number is not finite, or there are fewer than three places.
-    """
-    check_points(points, "points", min_count=3, batch=False)
-    places = points.detach().cpu().double()
-    which = weld(places)
-    count = int(which.max()) + 1
-    if count < 3:
-        raise InputError(f"points must lie at 3 places or more, got {len(points)} points at {count}")
-    if count < len(points):
-        places = places.new_zeros(count, 3).index_copy(0, which, places)
-    return places, which
-
-
-def weld(points: Tensor) -> Tensor:
-    """Return a number (N,) int64 per point from 0 upward, the same for points at exactly one place."""
-    values = points.detach().cpu().double().numpy() + 0.0  # -0 is 0
-    order = np.lexsort(values.T)
-    changes = (np.diff(values[order], axis=0) != 0).any(axis=-1)
-    if changes.all():
-        return torch.arange(len(values))
-    which = np.empty(len(values), dtype=np.int64)
-    which[order] = np.concatenate(([0], np.cumsum(changes)))
-    return torch.from_numpy(which)
 
 
 def fit_normals(points: Tensor, index: Tensor) -> Tensor:
@@ -178,9 +126,8 @@ def check_viewpoint(viewpoint: Any) -> Tensor | None:
 def fit_normals_at(points: Tensor, at: Tensor, num_neighbors: int = 16) -> Tensor:
     """Return unit normals (M, 3) of either sign at a few of the points (N, 3), given by their indices (M,)."""
     places, which = distinct_places(points)
-    few = places[which[at.cpu()]]
-    _, near = cKDTree(places.numpy()).query(few.numpy(), min(num_neighbors + 1, len(places)))
-    return _least_spread(places[torch.from_numpy(near.astype(np.int64))]).to(points)
+    near, _ = k_nearest(places[which[at.cpu()]], places, min(num_neighbors + 1, len(places)))
+    return _least_spread(places[near]).to(points)
 
 
 def face_vertex_normals(points: Tensor, faces: Tensor, viewpoint: Tensor | None = None) -> Tensor:
@@ -197,14 +144,12 @@ def face_vertex_normals(points: Tensor, faces: Tensor, viewpoint: Tensor | None 
     pairs, agree = _adjacent_faces(faces, len(points))
     if viewpoint is None and bool(agree.all()):
         return TriangleMesh(points, faces).vertex_normals()
-    size = (len(faces), len(faces))
-    graph = csr_matrix((np.ones(len(pairs)), tuple(pairs.T.numpy())), shape=size)
-    against = csr_matrix(((~agree.numpy()).astype(np.float64), tuple(pairs.T.numpy())), shape=size)
-    parents, label = _spanning_tree(graph)
-    steps, child = np.ones(len(faces)), np.flatnonzero(parents >= 0)
-    opposed = np.asarray((against + against.T)[child, parents[child]]).reshape(-1)
-    steps[child[opposed > 0]] = -1.0
-    sign = torch.from_numpy(_products_to_root(parents, steps))
+    key, which, shared = (pairs @ pairs.new_tensor([len(faces), 1])).unique(return_inverse=True, return_counts=True)
+    pairs = torch.stack((key // len(faces), key % len(faces)), dim=-1)
+    opposed = _sums((~agree).double(), which, len(pairs)) > 0
+    parents, edge, label = minimum_spanning_forest(pairs, shared, len(faces))
+    steps = torch.where((parents >= 0) & opposed[edge], -1.0, 1.0).double()
+    sign = _products_to_root(parents, steps)
     areas = TriangleMesh(points, faces).face_areas()
     areas = areas / areas.mean().clamp(min=torch.finfo(areas.dtype).tiny)
     side = _sums(areas * sign, label)
@@ -236,14 +181,12 @@ def neighbors_disagree(normals: Tensor, index: Tensor) -> float:
 def orient_along_graph(points: Tensor, normals: Tensor, index: Tensor, viewpoint: Tensor | None) -> Tensor:
     """Return normals with signs by spanning tree and camera; points (N, 3), normals, neighbors (N, K), on the CPU."""
     count, width = index.shape
-    # A cost of zero would be no edge.
-    cost = 1 - (normals[:, None] * normals[index]).sum(-1).abs().clamp(max=1) + 1e-6
-    graph = csr_matrix((cost.reshape(-1), index.reshape(-1), np.arange(count + 1) * width), shape=(count, count))
-    parents, label = _spanning_tree(graph)
-    parent = torch.from_numpy(parents)
-    agree = (normals * normals[parent]).sum(-1)
-    steps = torch.where((parent >= 0) & (agree < 0), -1.0, 1.0).numpy()
-    normals = normals * torch.from_numpy(_products_to_root(parents, steps))[:, None]
+    edges = torch.stack((torch.arange(count).repeat_interleave(width), index.flatten()), dim=-1)
+    cost = 1 - (normals[:, None] * normals[index]).sum(-1).abs().clamp(max=1)
+    parents, _, label = minimum_spanning_forest(edges, cost.flatten(), count)
+    agree = (normals * normals[parents]).sum(-1)
+    steps = torch.where((parents >= 0) & (agree < 0), -1.0, 1.0).to(normals)
+    normals = normals * _products_to_root(parents, steps)[:, None]
     normals = normals * _sides(points, normals, label, viewpoint)[label][:, None]
     if viewpoint is None:
         view = torch.nn.functional.normalize(normals.mean(dim=0), dim=0).expand_as(normals)
@@ -256,28 +199,14 @@ def orient_along_graph(points: Tensor, normals: Tensor, index: Tensor, viewpoint
     return torch.where(away[:, None], -normals, normals)
 
 
-def _spanning_tree(graph: csr_matrix) -> tuple[np.ndarray, Tensor]:
-    """Return each node's parent (N,) in a minimum spanning forest, -1 for roots, and its tree's number (N,) int64."""
-    tree = minimum_spanning_tree(graph).tocoo()
-    count = graph.shape[0]
-    _, label = connected_components(tree, directed=False)
-    roots = np.unique(label, return_index=True)[1]
-    # One more node above all roots: a single walk reaches every tree.
-    rows, columns = np.concatenate((tree.row, np.full(len(roots), count))), np.concatenate((tree.col, roots))
-    whole = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(count + 1, count + 1))
-    parents = breadth_first_order(whole, count, directed=False)[1][:count].astype(np.int64)
-    parents[roots] = -1
-    return parents, torch.from_numpy(label.astype(np.int64))
-
-
-def _products_to_root(parents: np.ndarray, steps: np.ndarray) -> np.ndarray:
+def _products_to_root(parents: Tensor, steps: Tensor) -> Tensor:
     """Return for each node the product of the steps from it up to its root, whose own step is 1."""
-    above = np.where(parents < 0, np.arange(len(parents)), parents)
-    product = steps.copy()
+    above = torch.where(parents < 0, torch.arange(len(parents)), parents)
+    product = steps.clone()
     while True:
         product = product * product[above]
         higher = above[above]
-        if np.array_equal(higher, above):
+        if torch.equal(higher, above):
             return product
         above = higher
 
@@ -302,8 +231,8 @@ def _bulging(points: Tensor, normals: Tensor, label: Tensor) -> Tensor:
     """Return +1 or -1 per label: the sign with which normals spread apart, as they do outside of a body."""
     generator = torch.Generator().manual_seed(0)
     few = torch.randperm(len(points), generator=generator)[:_COARSE_POINTS]
-    _, near = cKDTree(points[few].numpy()).query(points[few].numpy(), min(_COARSE_NEIGHBORS + 1, len(few)))
-    first, second = few.repeat_interleave(near.shape[1]), few[torch.from_numpy(near.reshape(-1).astype(np.int64))]
+    near, _ = k_nearest(points[few], points[few], min(_COARSE_NEIGHBORS + 1, len(few)))
+    first, second = few.repeat_interleave(near.shape[1]), few[near.flatten()]
     kept = (label[first] == label[second]) & (first != second)
     first, second = first[kept], second[kept]
     apart = torch.nn.functional.normalize(points[first] - points[second], dim=-1, eps=torch.finfo(points.dtype).tiny)

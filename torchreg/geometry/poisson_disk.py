@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_count, check_points, check_positive
-from torchreg.geometry.normals import weld
+from torchreg.geometry.neighbors import k_nearest_others, pairs_within, weld
 
 # Radii of successive thinnings grow by this; more neighbors in reach cost more than they save.
 _GROWTH = 3.0
@@ -72,8 +71,8 @@ def poisson_disk_count(points: Tensor, count: int, generator: torch.Generator | 
     return torch.from_numpy(np.sort(index[few])).to(points.device)
 
 
-def _prepare(points: Tensor, generator: torch.Generator | None) -> tuple[Tensor, np.ndarray, np.ndarray]:
-    """Return the points, their different places in random order, float64, and one index into the points for each."""
+def _prepare(points: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor, np.ndarray]:
+    """Return the points, their different places in random order, and one index into the points for each."""
     points = as_float_tensor(points, "points")
     check_points(points, "points", batch=False)
     if generator is None:
@@ -81,15 +80,15 @@ def _prepare(points: Tensor, generator: torch.Generator | None) -> tuple[Tensor,
     order = torch.randperm(len(points), generator=generator, device=generator.device).cpu()
     _, first = np.unique(weld(points)[order].numpy(), return_index=True)
     index = order.numpy()[np.sort(first)]
-    return points, points.detach().cpu().double().numpy()[index], index
+    return points, points.detach().cpu().double()[index], index
 
 
-def _typical_distance(places: np.ndarray) -> float:
-    """Return the median distance of a place to the nearest other one."""
-    return float(np.median(cKDTree(places).query(places, 2)[0][:, 1])) if len(places) > 1 else np.inf
+def _typical_distance(places: Tensor) -> float:
+    """Return the median distance of a place to the nearest other one, the mean of the two middle ones."""
+    return float(np.median(k_nearest_others(places, 1)[1].numpy())) if len(places) > 1 else np.inf
 
 
-def _thin(places: np.ndarray, few: np.ndarray, radius: float, step: float) -> np.ndarray:
+def _thin(places: Tensor, few: np.ndarray, radius: float, step: float) -> np.ndarray:
     """Return those of the indices ``few``, ascending, that stay, thinned by radii growing from their ``step``."""
     steps = int(np.log(max(radius / step, 1.0)) / np.log(_GROWTH))
     for power in range(steps, -1, -1):
@@ -97,9 +96,9 @@ def _thin(places: np.ndarray, few: np.ndarray, radius: float, step: float) -> np
     return few
 
 
-def _undisputed(places: np.ndarray, radius: float) -> np.ndarray:
+def _undisputed(places: Tensor, radius: float) -> np.ndarray:
     """Return a mask of the places that a walk in order keeps; each is out of reach of those kept before."""
-    pairs = cKDTree(places).query_pairs(radius, output_type="ndarray")
+    pairs = pairs_within(places, radius).numpy()
     first, second = np.concatenate((pairs, pairs[:, ::-1])).T
     kept, undecided = np.zeros(len(places), dtype=bool), np.ones(len(places), dtype=bool)
     while undecided.any():
@@ -114,7 +113,7 @@ def _undisputed(places: np.ndarray, radius: float) -> np.ndarray:
     return kept
 
 
-def _search(places: np.ndarray, count: int) -> np.ndarray:
+def _search(places: Tensor, count: int) -> np.ndarray:
     """Return a thinned subset of ``count`` places or more, hardly more if a radius was found that leaves as many."""
     step = _typical_distance(places)
     radius = step * np.sqrt(len(places) / count)
@@ -137,12 +136,12 @@ def _search(places: np.ndarray, count: int) -> np.ndarray:
     return best
 
 
-def _drop_surplus(places: np.ndarray, few: np.ndarray, surplus: int) -> np.ndarray:
+def _drop_surplus(places: Tensor, few: np.ndarray, surplus: int) -> np.ndarray:
     """Return the indices without as many of those with the nearest neighbors, one of a pair at a time."""
     while surplus > 0:
-        distance, near = cKDTree(places[few]).query(places[few], 2)
-        loser = np.maximum(np.arange(len(few)), near[:, 1])
-        order = loser[np.argsort(distance[:, 1], kind="stable")]
+        near, distance = (found[:, 0].numpy() for found in k_nearest_others(places[few], 1))
+        loser = np.maximum(np.arange(len(few)), near)
+        order = loser[np.argsort(distance, kind="stable")]
         out = order[np.sort(np.unique(order, return_index=True)[1])]
         out = out[: min(surplus, 1 + len(few) // 8)]
         few = np.delete(few, out)

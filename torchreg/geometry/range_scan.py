@@ -13,15 +13,13 @@ from torchreg._checks import as_float_tensor, as_tensor, check_finite, check_poi
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.depth_image import unproject
 from torchreg.geometry.mesh import TriangleMesh
-from torchreg.geometry.neighbors import nearest_neighbor
+from torchreg.geometry.neighbors import distinct_places, k_nearest_others, nearest_neighbor, sampling_distance
 from torchreg.geometry.normals import (
     check_viewpoint,
-    distinct_places,
     estimate_normals,
     face_vertex_normals,
     fit_normals,
     fit_normals_at,
-    k_nearest,
     neighbors_disagree,
     orient_along_graph,
     orient_normals,
@@ -234,7 +232,7 @@ class RangeScan:
         points, normals, boundary = self.points[index], self.normals[index], self.boundary[index]
         with torch.no_grad():
             places, place = distinct_places(points)
-            spacing = float(k_nearest(places, 1)[1].median())
+            spacing = sampling_distance(places)
             faces = None
             if self.faces is not None:
                 new = torch.full((len(self),), -1, device=points.device)
@@ -247,7 +245,7 @@ class RangeScan:
                     boundary = boundary.index_fill(0, corners[corners >= 0], True)
             elif mark_cut:
                 guide = torch.zeros_like(places).index_copy(0, place, normals.detach().cpu().double())
-                near = k_nearest(places, _BOUNDARY_NEIGHBORS)[0]
+                near, _ = k_nearest_others(places, _BOUNDARY_NEIGHBORS)
                 boundary = boundary | _boundary_of_points(places, guide, near)[place].to(boundary.device)
         return RangeScan._of(points, faces, normals, boundary, spacing, self.viewpoint)
 
@@ -324,7 +322,7 @@ def _measure(
     """Return normals and boundary on the device of the points, and the spacing."""
     places, which = distinct_places(points)
     count = 1 if faces is not None else _BOUNDARY_NEIGHBORS
-    near, distance = k_nearest(places, count)
+    near, distance = k_nearest_others(places, count)
     corners = None if faces is None else _plain_faces(which[faces.cpu()])
     if normals is not None:
         normals = _given_normals(points, normals.detach(), near, which, eye)

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchreg._checks import check_choice
 from torchreg.errors import InputError
+from torchreg.geometry.graphs import connected_components, minimum_spanning_forest
 from torchreg.geometry.mesh import TriangleMesh
-from torchreg.geometry.normals import weld
+from torchreg.geometry.neighbors import NeighborTree, weld
 
 PIECES = ("largest", "bridge", "error")
 # Fragments with a smaller share of the faces are dust: never bridged to, and no reason for an error.
@@ -53,13 +50,6 @@ def unique_edges(faces: Tensor) -> tuple[Tensor, Tensor]:
     count = int(faces.max()) + 1
     keys, which = (sides.amin(-1) * count + sides.amax(-1)).unique(return_inverse=True)
     return torch.stack((keys // count, keys % count), dim=-1), which
-
-
-def connected_labels(pairs: Tensor, count: int) -> Tensor:
-    """Return (count,) labels from 0, equal for nodes that pairs (P, 2) of nodes join directly or through others."""
-    first, second = pairs.numpy().T
-    graph = coo_array((np.ones(len(first), dtype=np.int8), (first, second)), shape=(count, count))
-    return torch.from_numpy(connected_components(graph, directed=False)[1].astype(np.int64))
 
 
 def one_piece(mesh: TriangleMesh, pieces: str = "largest") -> OnePiece:
@@ -129,7 +119,7 @@ def coarsened(mesh: TriangleMesh, count: int) -> TriangleMesh:
     cell = (cells[:, 0] * number[1] + cells[:, 1]) * number[2] + cells[:, 2]
     edges, _ = unique_edges(faces)
     edges = edges[cell[edges[:, 0]] == cell[edges[:, 1]]]
-    patch = connected_labels(edges, len(vertices))
+    patch = connected_components(edges, len(vertices))
     inner = patch[faces[(patch[faces] == patch[faces[:, :1]]).all(1), 0]]
     most = int(patch.max()) + 1
     euler = torch.bincount(patch) + torch.bincount(inner, minlength=most)
@@ -155,7 +145,7 @@ def _distinct_faces(faces: Tensor) -> Tensor:
 
 def _choose(vertices: Tensor, faces: Tensor, pieces: str) -> tuple[Tensor, int, tuple[str, ...], Tensor]:
     """Return the faces of the pieces to keep, their number, notes and the piece (V,) of each vertex."""
-    labels = connected_labels(torch.cat((faces[:, :2], faces[:, 1:])), len(vertices))
+    labels = connected_components(torch.cat((faces[:, :2], faces[:, 1:])), len(vertices))
     piece = labels[faces[:, 0]]
     number = torch.bincount(piece)
     areas = torch.bincount(piece, TriangleMesh(vertices, faces).face_areas(), minlength=len(number))
@@ -176,28 +166,28 @@ def _bridges(vertices: Tensor, labels: Tensor, count: int) -> Tensor:
     Of many pieces each is compared with those whose boxes are nearest.
     """
     groups = [(labels == label).nonzero()[:, 0] for label in labels.unique().tolist()]
-    trees = [cKDTree(vertices[group].numpy()) for group in groups]
-    lengths, ends = np.zeros((count, count)), {}
-    for first, second in _near_pairs([vertices[group] for group in groups]):
+    trees = [NeighborTree(vertices[group]) for group in groups]
+    pairs = _near_pairs([vertices[group] for group in groups])
+    lengths, ends = [], []
+    for first, second in pairs.tolist():
         small, large = sorted((first, second), key=lambda piece: len(groups[piece]))
-        distance, nearest = trees[large].query(vertices[groups[small]].numpy())
-        start = int(distance.argmin())
-        # Zero would be no edge.
-        lengths[first, second] = distance[start] + np.finfo(np.float64).tiny
-        ends[first, second] = (int(groups[small][start]), int(groups[large][nearest[start]]))
-    chosen = zip(*minimum_spanning_tree(lengths).nonzero(), strict=True)
-    return torch.tensor([ends[int(first), int(second)] for first, second in chosen])
+        nearest, distance = trees[large].nearest(vertices[groups[small]])
+        start = distance.argmin()
+        lengths.append(distance[start])
+        ends.append(torch.stack((groups[small][start], groups[large][nearest[start]])))
+    return torch.stack(ends)[minimum_spanning_forest(pairs, torch.stack(lengths), count).chosen()]
 
 
-def _near_pairs(pieces: list[Tensor]) -> list[tuple[int, int]]:
-    """Return pairs of pieces, the first before the second, that join all of them: all, or those with near boxes."""
+def _near_pairs(pieces: list[Tensor]) -> Tensor:
+    """Return pairs (P, 2) of pieces, the first before the second, that join all: all, or those with near boxes."""
     low = torch.stack([piece.amin(0) for piece in pieces])
     high = torch.stack([piece.amax(0) for piece in pieces])
     gaps = (torch.maximum(low[:, None], low) - torch.minimum(high[:, None], high)).clamp(min=0).norm(dim=-1)
     near = gaps <= gaps.sort(dim=1).values[:, min(_NEAR_PIECES, len(pieces) - 1), None]
-    shortest = minimum_spanning_tree(gaps.numpy() + 1.0).nonzero()
-    near[shortest] = True
-    return [(first, second) for first, second in (near | near.mT).nonzero().tolist() if first < second]
+    pairs = torch.combinations(torch.arange(len(pieces)))
+    kept = (near | near.mT)[pairs[:, 0], pairs[:, 1]]
+    kept[minimum_spanning_forest(pairs, gaps[pairs[:, 0], pairs[:, 1]], len(pieces)).chosen()] = True
+    return pairs[kept]
 
 
 def close_holes(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, int]:
@@ -212,7 +202,7 @@ def close_holes(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, int]:
     corner = (rim[which]).nonzero()
     edges = torch.stack((faces[corner[:, 0], corner[:, 1]], faces[corner[:, 0], (corner[:, 1] + 1) % 3]), dim=-1)
     around, ends = edges.unique(return_inverse=True)
-    label = connected_labels(ends, len(around))
+    label = connected_components(ends, len(around))
     holes = int(label.max()) + 1
     number = torch.bincount(label).unsqueeze(-1)
     middles = vertices.new_zeros(holes, 3).index_add(0, label, vertices[around]) / number

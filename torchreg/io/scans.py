@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from torchreg.errors import FormatError
-from torchreg.geometry.normals import weld
+from torchreg.geometry.neighbors import weld
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 from torchreg.io.points import load_points

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
-from torchreg.geometry.neighbors import nearest_neighbor
+from torchreg.geometry.neighbors import nearest_neighbor, sampling_distance
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.skin import LinearBlendSkin, stacked_rows
 
@@ -57,8 +57,8 @@ class SkinSurface:
 
     def __init__(self, skin: LinearBlendSkin) -> None:
         self.skin = skin
-        self.gap = _GAP_SPACINGS * _spacing(skin.points)
         self.first = _first_copies(skin)
+        self.gap = _GAP_SPACINGS * _spacing(skin.points, self.first)
 
     def distance(self, points: Tensor, pose: Tensor) -> Tensor:
         """Return the signed distances (..., N) of points (..., N, 3) in poses (..., num_dofs), metres."""
@@ -92,12 +92,10 @@ _GAP_SPACINGS = 2.0
 _NUM_SPACINGS = 500
 
 
-def _spacing(points: Tensor) -> float:
+def _spacing(points: Tensor, first: Tensor) -> float:
     """Return the median distance of points from their nearest neighbors elsewhere, zero for a single place."""
-    some = points[:: -(-len(points) // _NUM_SPACINGS)]
-    apart = torch.cdist(some, points, compute_mode="donot_use_mm_for_euclid_dist")
-    nearest = torch.where(apart > 0, apart, torch.inf).amin(-1)
-    return float(torch.where(nearest.isinf(), 0.0, nearest).median())
+    places = points[first.unique()]
+    return 0.0 if len(places) < 2 else sampling_distance(places, points[:: -(-len(points) // _NUM_SPACINGS)])
 
 
 def _first_copies(skin: LinearBlendSkin) -> Tensor:

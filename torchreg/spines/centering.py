@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.neighbors import NeighborTree
 from torchreg.spines.curves import tangents
 
 # Slices per point, each way, that a part of the surface may be in besides that of the nearest point.
@@ -49,8 +49,7 @@ def centered_curves(
     curves = list(curves)
     free = [(False, False)] * len(curves) if free is None else free
     for _ in range(_PASSES):
-        points = torch.cat(list(curves))
-        nearest = torch.from_numpy(cKDTree(points.numpy()).query(samples.numpy())[1])
+        nearest, _ = NeighborTree(torch.cat(curves)).nearest(samples)
         begin = 0
         for number, curve in enumerate(curves):
             own = ((nearest >= begin) & (nearest < begin + len(curve))).nonzero()[:, 0]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.neighbors import NeighborTree
 
 # Of the grid across a ray, along each axis.
 _MAX_SQUARES = 512
@@ -106,17 +106,17 @@ class Clearance:
     def __init__(self, mesh: TriangleMesh) -> None:
         self.mesh = mesh
         vertices = mesh.vertices.detach().cpu().double()
-        self._samples = torch.cat((vertices, vertices[mesh.faces.cpu()].mean(1))).numpy()
-        self._tree = cKDTree(self._samples)
+        self._samples = torch.cat((vertices, vertices[mesh.faces.cpu()].mean(1)))
+        self._tree = NeighborTree(self._samples)
         self._few = self._samples[:: max(1, len(self._samples) // _FEW)]
 
     def __call__(self, points: Tensor) -> Tensor:
         """Return the distance (N,) of points (N, 3) to the surface."""
-        return torch.from_numpy(self._tree.query(points.numpy())[0])
+        return self._tree.nearest(points)[1]
 
     def beyond(self, points: Tensor, depth: float) -> Tensor:
         """Return points (N, 3) moved to and past the nearest place of the surface, by some depth."""
-        nearest = torch.from_numpy(self._samples[self._tree.query(points.numpy())[1]])
+        nearest = self._samples[self._tree.nearest(points)[0]]
         towards = nearest - points
         return nearest + depth * torch.nn.functional.normalize(towards, dim=-1)
 
@@ -130,7 +130,7 @@ class Clearance:
             points: (N, 3) inside the surface.
             reach: largest distance to go.
         """
-        start, samples = points.double(), torch.from_numpy(self._few)
+        start, samples = points.double(), self._few
         place, step = start, torch.full((len(points), 1), _STEP, dtype=torch.float64)
         tiny = torch.finfo(torch.float64).tiny
         distance = torch.cdist(place, samples, compute_mode="donot_use_mm_for_euclid_dist").clamp(min=tiny)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import torch
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_count, check_points, check_positive, check_shape
+from torchreg.geometry.distance_transform import signed_distance
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.voxels import voxelize
 
@@ -32,12 +32,8 @@ class DepthField:
 
     def __init__(self, mesh: TriangleMesh, resolution: int = 96) -> None:
         grid = voxelize(mesh, resolution, touching=False)
-        filled = torch.nn.functional.pad(grid.filled, (_BORDER,) * 6).cpu().numpy()
-        # Half a voxel lies between the middles of a filled and an empty one and the surface.
-        inside, outside = (distance_transform_edt(part) for part in (filled, ~filled))
-        depth = torch.where(torch.from_numpy(filled), torch.from_numpy(inside), -torch.from_numpy(outside))
         self.spacing = grid.spacing
-        self.values = (depth - 0.5 * depth.sign()).double() * grid.spacing
+        self.values = -grid.spacing * signed_distance(torch.nn.functional.pad(grid.filled.cpu(), (_BORDER,) * 6))
         self.origin = grid.origin.detach().cpu().double() - _BORDER * grid.spacing
 
     def __call__(self, points: Tensor) -> Tensor:

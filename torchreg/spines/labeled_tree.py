@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
 from torchreg._checks import check_count
 from torchreg.errors import InputError
+from torchreg.geometry.graphs import Graph, rooted
 from torchreg.geometry.skeleton import Skeleton
 
 # A split names the tips on one side of a limb between junctions: the side without tip 0.
@@ -114,12 +113,8 @@ def fit_together(split: Split, other: Split) -> bool:
 
 def path_lengths(skeleton: Skeleton, starts: Tensor) -> Tensor:
     """Return the lengths (K, N) along the tree from the nodes ``starts`` (K,) to all nodes, float64."""
-    ends = skeleton.edges.cpu().numpy().T
-    places = skeleton.nodes.detach().cpu().double()
-    # Zero would be no step.
-    steps = (places[ends[0]] - places[ends[1]]).norm(dim=-1).clamp_min(torch.finfo(places.dtype).tiny)
-    table = csr_array((steps.numpy(), tuple(ends)), shape=(len(skeleton),) * 2)
-    return torch.from_numpy(dijkstra(table, directed=False, indices=starts.cpu().numpy()))
+    first, second = skeleton.nodes.detach().cpu().double()[skeleton.edges.cpu()].unbind(1)
+    return Graph.from_edges(skeleton.edges, (first - second).norm(dim=-1), len(skeleton)).distances(starts)
 
 
 def skeleton_splits(skeleton: Skeleton, named: Sequence[int]) -> frozenset[Split]:
@@ -134,7 +129,8 @@ def skeleton_splits(skeleton: Skeleton, named: Sequence[int]) -> frozenset[Split
     """
     nodes = _named_nodes(skeleton, named)
     first = next((name for name, node in enumerate(nodes) if node >= 0), 0)
-    parents, order = _rooted(skeleton, max(nodes[first], 0))
+    root = torch.tensor([max(nodes[first], 0)])
+    parents, order = (found.tolist() for found in rooted(skeleton.edges, root, len(skeleton)))
     behind: dict[int, set[int]] = {node: set() for node in order}
     for name, node in enumerate(nodes):
         if node >= 0:
@@ -203,18 +199,3 @@ def _named_nodes(skeleton: Skeleton, named: Sequence[int]) -> list[int]:
     if len(set(given)) < len(given) or any(not -1 <= index < len(tips) for index in named):
         raise InputError(f"named must hold different tips from 0 to {len(tips) - 1}, or -1, got {list(named)}")
     return [tips[index] if index >= 0 else -1 for index in named]
-
-
-def _rooted(skeleton: Skeleton, root: int) -> tuple[dict[int, int], list[int]]:
-    """Return every node's parent, and the nodes with parents before children."""
-    neighbors: list[list[int]] = [[] for _ in range(len(skeleton))]
-    for start, end in skeleton.edges.tolist():
-        neighbors[start].append(end)
-        neighbors[end].append(start)
-    parents, order = {root: -1}, [root]
-    for node in order:
-        for other in neighbors[node]:
-            if other not in parents:
-                parents[other] = node
-                order.append(other)
-    return parents, order

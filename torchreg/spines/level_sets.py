@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_finite, check_positive, check_shape
+from torchreg.geometry.graphs import connected_components
 from torchreg.geometry.mesh import TriangleMesh
-from torchreg.geometry.surface_graph import connected_labels, unique_edges
+from torchreg.geometry.surface_graph import unique_edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +151,7 @@ class _Crossings:
             here = (self.low[edge] < band) & (band < self.high[edge])
             part = self.first_of_edge[edge] + band - self.low[edge] - 1
             pairs.append(np.stack((item[here], part[here]), axis=1))
-        return connected_labels(torch.from_numpy(np.concatenate(pairs)), self.num_items).numpy()
+        return connected_components(torch.from_numpy(np.concatenate(pairs)), self.num_items).numpy()
 
     def segments(self, heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the ends (S, 2, 3) of the segments, and the connected ring (S,) each belongs to."""
@@ -168,7 +169,7 @@ class _Crossings:
             points[cut, filled[cut]] = vertices[start] + share[:, None] * (vertices[end] - vertices[start])
             names[cut, filled[cut]] = first[edge] + level - self.low[edge] - 1
             filled[cut] += 1
-        labels = connected_labels(torch.from_numpy(names), int(count.sum())).numpy()
+        labels = connected_components(torch.from_numpy(names), int(count.sum())).numpy()
         return points, np.unique(labels[names[:, 0]], return_inverse=True)[1]
 
 

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
 from torchreg.geometry.geodesics import GeodesicGraph
+from torchreg.geometry.graphs import Graph
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.surface_graph import one_piece, unique_edges
 from torchreg.spines.level_sets import LevelSets, Surface, level_sets
@@ -90,10 +89,10 @@ def _thinnest_ring(mesh: TriangleMesh, min_length: float, num_levels: int) -> tu
 
 def _longest_loop(sets: LevelSets, root: int) -> list[int]:
     """Return the rings of the longest loop that one ring makes with the tree of shortest ways from a band."""
-    ends = torch.stack((sets.lower, sets.upper), dim=1).numpy()
-    shape = (sets.num_bands, sets.num_bands)
-    graph = coo_array((np.ones(len(ends)), tuple(ends.T)), shape=shape).tocsr()
-    steps, before = dijkstra(graph, directed=False, indices=root, unweighted=True, return_predecessors=True)
+    joined = torch.stack((sets.lower, sets.upper), dim=1)
+    pairs = joined.unique(dim=0)
+    graph = Graph.from_edges(pairs, torch.ones(len(pairs)), sets.num_bands)
+    ends, steps, before = (values.numpy() for values in (joined, *graph.shortest_paths(root)))
     child = np.where(before[ends[:, 0]] == ends[:, 1], ends[:, 0], ends[:, 1])
     in_tree = before[child] == ends.sum(1) - child
     # Of several rings between the same two bands one is in the tree, the longest.

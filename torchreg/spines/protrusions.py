@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import minimum_spanning_tree
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_count, check_positive, check_shape
 from torchreg.errors import InputError
-from torchreg.geometry.geodesics import GeodesicGraph
+from torchreg.geometry.graphs import Graph, minimum_spanning_forest
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +44,7 @@ class Protrusions:
     confidence: Tensor
 
 
-def average_geodesic_distance(graph: GeodesicGraph, areas: Tensor, num_base: int = 40) -> AverageDistance:
+def average_geodesic_distance(graph: Graph, areas: Tensor, num_base: int = 40) -> AverageDistance:
     """Return the average geodesic distance of every place from all others, by base points spread evenly.
 
     Base points are farthest from one another, and count by the area of the places nearest to them, so that neither
@@ -82,7 +80,7 @@ def average_geodesic_distance(graph: GeodesicGraph, areas: Tensor, num_base: int
     return AverageDistance(weights / weights.sum() @ table, float(table.max()), torch.tensor(base))
 
 
-def find_protrusions(graph: GeodesicGraph, values: Tensor, least_height: float) -> Protrusions:
+def find_protrusions(graph: Graph, values: Tensor, least_height: float) -> Protrusions:
     """Return the local maxima of a function that stand out from their surroundings by some height.
 
     A maximum's height is its topological persistence: the least fall on a way to a higher one. Noise of some amplitude
@@ -113,7 +111,7 @@ def find_protrusions(graph: GeodesicGraph, values: Tensor, least_height: float) 
     return Protrusions(torch.from_numpy(peaks[order]), found, share**2 / (1 + share**2))
 
 
-def _basins(graph: GeodesicGraph, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _basins(graph: Graph, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the local maxima and, for every place, the one that the steepest way up ends in."""
     count = len(graph)
     starts, ends = graph.starts.numpy(), graph.ends.numpy()
@@ -130,7 +128,7 @@ def _basins(graph: GeodesicGraph, values: np.ndarray) -> tuple[np.ndarray, np.nd
     return peaks, np.searchsorted(peaks, up)
 
 
-def _persistence(values: np.ndarray, graph: GeodesicGraph, peaks: np.ndarray, basin: np.ndarray) -> np.ndarray:
+def _persistence(values: np.ndarray, graph: Graph, peaks: np.ndarray, basin: np.ndarray) -> np.ndarray:
     """Return the height of each peak over the pass to a higher one."""
     starts, ends = graph.starts.numpy(), graph.ends.numpy()
     from_ = np.repeat(np.arange(len(graph)), np.diff(starts))
@@ -161,8 +159,8 @@ def _highest_passes(
     order = np.lexsort((-level, first * count + second))
     keep = order[np.unique((first * count + second)[order], return_index=True)[1]]
     first, second, level = first[keep], second[keep], level[keep]
-    # The tree of least cost, with costs above zero, which would be no edge.
-    cost = coo_array((level.max() - level + 1.0, (first, second)), shape=(count, count))
-    tree = minimum_spanning_tree(cost.tocsr()).tocoo()
-    order = np.argsort(tree.data, kind="stable")
-    return tree.row[order], tree.col[order], level.max() + 1.0 - tree.data[order]
+    edges = torch.from_numpy(np.stack((first, second), axis=1))
+    tree = minimum_spanning_forest(edges, torch.from_numpy(-level), count).chosen().numpy()
+    first, second, level = first[tree], second[tree], level[tree]
+    order = np.argsort(-level, kind="stable")
+    return first[order], second[order], level[order]

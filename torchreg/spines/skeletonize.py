@@ -175,7 +175,7 @@ class _Body:
         graph = GeodesicGraph.from_mesh(surface)
         if len(whole.bridges):
             ends = surface.vertices[whole.bridges]
-            graph = graph.joined(whole.bridges, (ends[:, 0] - ends[:, 1]).norm(dim=-1))
+            graph = graph.with_edges(whole.bridges, (ends[:, 0] - ends[:, 1]).norm(dim=-1))
         areas = torch.bincount(
             surface.faces.reshape(-1), surface.face_areas().repeat_interleave(3) / 3, minlength=surface.num_vertices
         )

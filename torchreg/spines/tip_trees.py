@@ -9,10 +9,9 @@ from itertools import combinations, product
 
 import numpy as np
 import torch
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
+from torchreg.geometry.graphs import Graph
 from torchreg.spines.level_sets import LevelSets
 
 Tips = frozenset[int]
@@ -87,10 +86,8 @@ def grow_tip_tree(sets: LevelSets, bands: Tensor, root: int, bridges: Tensor | N
     order = np.lexsort((-length, key))
     key, first = np.unique(key[order], return_index=True)
     ring = ring[order][first]
-    shape = (sets.num_bands, sets.num_bands)
-    graph = coo_array((np.ones(len(key)), (key // sets.num_bands, key % sets.num_bands)), shape=shape).tocsr()
-    start = int(bands[root])
-    before = dijkstra(graph, directed=False, indices=start, unweighted=True, return_predecessors=True)[1]
+    edges = torch.from_numpy(np.stack((key // sets.num_bands, key % sets.num_bands), axis=1))
+    _, before = Graph.from_edges(edges, torch.ones(len(edges)), sets.num_bands).shortest_paths(int(bands[root]))
     ways = {}
     for tip, band in enumerate(bands.tolist()):
         way = []

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchreg.geometry.neighbors import nearest_neighbor, sampling_distance
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.shapes.limbs import Limb
 from torchreg.shapes.skin import LinearBlendSkin
@@ -52,13 +53,10 @@ class UnexplainedClusters:
         """
         on_surface = distance.abs() < CLUSTERS.off_surface * residual
         outliers, inliers = data[~on_surface], data[on_surface]
-        if not len(inliers) or not len(outliers):
+        if len(inliers) < 2 or not len(outliers):
             return outliers[:0]
-        spacing = data.new_zeros(())
-        if len(inliers) > 1:
-            sampled = inliers[:: max(1, len(inliers) // CLUSTERS.num_spacings)]
-            spacing = torch.cdist(sampled, inliers).topk(2, largest=False).values[:, -1].median()
-        radius = (CLUSTERS.radius * spacing).clamp_max(CLUSTERS.max_radius * self.size)
+        spacing = sampling_distance(inliers, inliers[:: max(1, len(inliers) // CLUSTERS.num_spacings)])
+        radius = min(CLUSTERS.radius * spacing, CLUSTERS.max_radius * self.size)
         # Every datum is within the radius of itself.
         return outliers[(torch.cdist(outliers, outliers) < radius).sum(-1) > CLUSTERS.min_neighbors]
 
@@ -80,7 +78,7 @@ def nearest_distance(points: Tensor, targets: Tensor) -> Tensor:
     """Return the distances (N,) from points (N, 3) to the nearest of the targets (K, 3); infinite without any."""
     if not len(targets):
         return torch.full_like(points[:, 0], torch.inf)
-    return torch.cdist(points, targets).amin(-1)
+    return nearest_neighbor(points, targets)[1]
 
 
 class LimbReach:

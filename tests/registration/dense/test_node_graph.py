@@ -3,13 +3,14 @@ import torch
 
 from torchreg.errors import InputError
 from torchreg.geometry.geodesics import GeodesicGraph
+from torchreg.geometry.graphs import Graph
 from torchreg.registration.dense.node_graph import build_node_graph, spread_weights
 
 
 def line(count):
     """Return a chain of samples, one apart."""
     edges = torch.stack((torch.arange(count - 1), torch.arange(1, count)), dim=1)
-    return GeodesicGraph.from_steps(edges, torch.ones(count - 1), count)
+    return Graph.from_edges(edges, torch.ones(count - 1), count)
 
 
 def test_nodes_spread_along_the_surface():
@@ -85,7 +86,7 @@ def test_islands_are_held_as_firmly_as_the_rest():
     edges = torch.stack((torch.arange(32), torch.arange(1, 33)), dim=1)
     lengths = torch.ones(32)
     lengths[20] = 12.0
-    graph = build_node_graph(GeodesicGraph.from_steps(edges, lengths, 33), 0, 9, 4)
+    graph = build_node_graph(Graph.from_edges(edges, lengths, 33), 0, 9, 4)
     side = graph.nodes[graph.edges] > 20
     across = side[:, 0] != side[:, 1]
     assert 0 < float(shares(graph)[across].max()) < 0.5

@@ -4,12 +4,12 @@ import pytest
 import torch
 
 from torchreg.errors import InputError
+from torchreg.geometry.neighbors import sampling_distance
 from torchreg.geometry.sampling import farthest_points
 from torchreg.registration.dense.one_to_one import (
     count_of_spacing,
     match_one_to_one,
     squared_distances,
-    typical_spacing,
 )
 from torchreg.registration.dense.oriented_samples import OrientedSamples
 
@@ -74,9 +74,8 @@ def test_squared_distances_are_those_of_a_loop():
 def test_spacing_decides_how_many():
     points = torch.rand(600, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
     points = points[farthest_points(points, 600)]
-    spacing = typical_spacing(points[:200])
+    spacing = sampling_distance(points[:200])
     assert 170 <= count_of_spacing(points, spacing) <= 230
     assert count_of_spacing(points, 1e9) <= 60
     assert count_of_spacing(points, 1e-9) == 600
     assert count_of_spacing(points[:20], spacing) == 20
-    assert typical_spacing(points[:1]) == float("inf")

@@ -5,7 +5,7 @@ import torch
 
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import walking_figure
-from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.neighbors import k_nearest
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import se3_exp
 from torchreg.registration.dense.config import MatchConfig, ScanAlignConfig
@@ -51,7 +51,7 @@ def test_samples_beside_what_hides_the_rest_are_cut_off(pair, problem):
     cut = problem.target.cut_off
     assert 0.02 < float(cut.double().mean()) < 0.3
     # An arm before the body leaves a shadow on it; where the body turns away, nothing is cut off.
-    near = nearest_few(problem.target.points[cut], problem.unit.of_points(target.points[target.boundary]), 1)[1]
+    near = k_nearest(problem.target.points[cut], problem.unit.of_points(target.points[target.boundary]), 1)[1]
     assert float(near.max()) < 0.1
     unknown = RangeScan(target.points, target.faces, target.normals)
     guessed = describe(pair.source, unknown, CONFIG).target.cut_off

@@ -57,14 +57,14 @@ def test_a_smooth_surface_is_joined_as_without_normals():
     plain = sample_graph(points, samples)
     for side in (1.0, -1.0):
         told = sample_graph(points, samples, normals=side * points)
-        assert torch.equal(told.steps()[0], plain.steps()[0])
+        assert torch.equal(told.edges()[0], plain.edges()[0])
 
 
 def test_steps_join_neighbors_alone():
     points, faces = sheet(9)
     samples = torch.arange(81).reshape(9, 9)[::2, ::2].reshape(-1)
     graph = sample_graph(points, samples, faces)
-    edges, lengths = graph.steps()
+    edges, lengths = graph.edges()
     length = (points[samples][edges[:, 0]] - points[samples][edges[:, 1]]).norm(dim=-1)
     torch.testing.assert_close(lengths, length)
     assert float(length.max()) < 3
@@ -79,7 +79,7 @@ def test_all_points_as_samples_give_the_edges_of_the_mesh():
     points, faces = sheet(4)
     graph = sample_graph(points, torch.arange(16), faces)
     sides = torch.cat((faces[:, :2], faces[:, 1:], faces[:, ::2])).sort(dim=1).values.unique(dim=0)
-    assert torch.equal(graph.steps()[0], sides)
+    assert torch.equal(graph.edges()[0], sides)
 
 
 def test_limits_leave_far_samples_out():
@@ -98,7 +98,7 @@ def test_parts_are_bridged_where_they_are_nearest():
     apart = sample_graph(both, torch.arange(32), triangles, bridge=None)
     assert not bool(apart.distances(torch.tensor([0]))[0, 16:].isfinite().any())
     joined = sample_graph(both, torch.arange(32), triangles, bridge=3.0)
-    assert len(joined.steps()[0]) == len(apart.steps()[0]) + 3
+    assert len(joined.edges()[0]) == len(apart.edges()[0]) + 3
     assert float(joined.distances(torch.tensor([0]))[0, 16]) >= 15
     assert bool(joined.distances().isfinite().all())
 
@@ -127,7 +127,7 @@ def test_motion_and_order_change_nothing():
 def test_one_sample_has_no_steps():
     points, faces = sheet(3)
     graph = sample_graph(points, torch.tensor([4]), faces)
-    assert graph.steps()[0].shape == (0, 2)
+    assert graph.edges()[0].shape == (0, 2)
     assert graph.distances().tolist() == [[0.0]]
 
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import dijkstra
 from torch import Tensor
 
 from torchreg._checks import check_count
+from torchreg.geometry.graphs import Graph
 from torchreg.geometry.sampling import farthest_points
 from torchreg.registration.bones.sparse_grid import SparseGrid
 
@@ -37,14 +35,9 @@ def grid_patches(grid: SparseGrid, count: int, gap: float = 0.0) -> Tensor:
     places = grid.cells.cpu().double()
     size = len(places)
     length = (places[pairs[:, 0]] - places[pairs[:, 1]]).norm(dim=-1)
-    rows, columns = pairs.numpy().T
-    graph = coo_matrix((length.numpy(), (rows, columns)), shape=(size, size)).tocsr()
     seeds = farthest_points(places, min(count, size))
     region = grid.regions(gap).cpu()
     # A region that is small and near another may have been passed over.
     first = torch.full((int(region.max()) + 1,), size).scatter_reduce(0, region, torch.arange(size), "amin")
     seeds = torch.cat([seeds, first[~torch.isin(first.new_tensor(range(len(first))), region[seeds])]])
-    nearest = dijkstra(graph, directed=False, indices=seeds.numpy(), min_only=True, return_predecessors=True)[2]
-    number = np.zeros(size, dtype=np.int64)
-    number[seeds.numpy()] = np.arange(len(seeds))
-    return torch.from_numpy(number[nearest]).to(grid.cells.device)
+    return Graph.from_edges(pairs, length, size).nearest(seeds)[1].to(grid.cells.device)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchreg._checks import check_finite, check_points, check_positive, check_shape
+from torchreg.geometry.neighbors import NeighborTree
 
 
 class OrientedTree:
@@ -21,7 +20,7 @@ class OrientedTree:
     Raises:
         InputError: if a shape does not fit, a number is not finite, or ``scale`` is negative.
 
-    References: Johnson 1997, for positions and normals in one tree; Maneewongvatana and Mount 1999, the tree.
+    References: Johnson 1997, for positions and normals in one tree.
     """
 
     def __init__(self, points: Tensor, normals: Tensor, scale: float) -> None:
@@ -30,7 +29,7 @@ class OrientedTree:
         check_finite(normals, "normals")
         check_positive(scale, "scale", allow_zero=True)
         self._scale = scale
-        self._tree = cKDTree(self._features(points, normals))
+        self._tree = NeighborTree(self._features(points, normals))
 
     def nearest(self, points: Tensor, normals: Tensor) -> Tensor:
         """Return the index (N,) int64 of the nearest of the tree's points to each of points (N, 3), on their device.
@@ -43,9 +42,7 @@ class OrientedTree:
         check_points(points, "points", batch=False)
         check_shape(normals, "normals", tuple(points.shape))
         check_finite(normals, "normals")
-        return torch.from_numpy(self._tree.query(self._features(points, normals))[1]).to(points.device)
+        return self._tree.nearest(self._features(points, normals))[0]
 
-    def _features(self, points: Tensor, normals: Tensor) -> np.ndarray:
-        rows = torch.cat([points.detach().double(), self._scale * normals.detach().double()], dim=-1)
-        features: np.ndarray = rows.cpu().numpy()
-        return features
+    def _features(self, points: Tensor, normals: Tensor) -> Tensor:
+        return torch.cat([points.detach().double(), self._scale * normals.detach().double()], dim=-1)

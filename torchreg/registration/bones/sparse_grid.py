@@ -10,10 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchreg._checks import (
@@ -27,7 +23,9 @@ from torchreg._checks import (
     check_shape,
 )
 from torchreg.errors import InputError, InputTypeError
-from torchreg.geometry.islands import island_links
+from torchreg.geometry.distance_transform import nearest_inside
+from torchreg.geometry.graphs import component_links, connected_components
+from torchreg.geometry.neighbors import pairs_within
 
 MAX_RESOLUTION = 256
 # The eight corners of a unit cell; corner 4 i + 2 j + k lies at (i, j, k).
@@ -252,12 +250,11 @@ class SparseGrid:
 
     def regions(self, gap: float = 0.0) -> Tensor:
         """Return which connected region (C,) int64 each cell belongs to; see `neighbors` for ``gap``."""
-        return _regions(self.neighbors(gap), self.num_cells)
+        return connected_components(self.neighbors(gap), self.num_cells)
 
     def links(self) -> Tensor:
         """Return pairs of cells (L, 2), the lower number first, that link all regions, however far apart they are."""
-        links, _ = island_links(self.cells.cpu().double().numpy(), self.regions().cpu().numpy())
-        return torch.from_numpy(links).to(self.cells.device)
+        return component_links(self.cells, self.regions())[0]
 
     def _beside(self, axis: int) -> Tensor:
         """Return pairs (A, 2) of cells with the one before it along an axis."""
@@ -270,13 +267,13 @@ class SparseGrid:
 
     def _bridges(self, pairs: Tensor, gap: float) -> Tensor:
         """Return pairs (A, 2) of cells of two regions, in reach and nearest to each other."""
-        region = _regions(pairs, self.num_cells).cpu().numpy()
+        region = connected_components(pairs, self.num_cells).cpu().numpy()
         if region.max(initial=0) == 0:
             return pairs[:0]
         places = self.cells.cpu().numpy()
         # A gap of no cell is a step of up to sqrt(3) across a corner.
         reach = max(gap + 1, math.sqrt(3)) + 1e-6
-        near = cKDTree(places).query_pairs(reach, output_type="ndarray")
+        near = pairs_within(self.cells, reach).cpu().numpy()
         near = near[region[near[:, 0]] != region[near[:, 1]]]
         both = np.concatenate([near, near[:, ::-1]])
         length = np.linalg.norm(places[both[:, 0]] - places[both[:, 1]], axis=1)
@@ -336,20 +333,10 @@ def _place(numbers: Tensor, shape: Sequence[int]) -> Tensor:
 
 def _nearest_cells(cells: Tensor, shape: tuple[int, int, int]) -> Tensor:
     """Return, for every place of the box, the number of the cell nearest to it."""
-    places = cells.cpu().numpy()
-    number = np.zeros(shape, dtype=np.int64)
-    number[tuple(places.T)] = np.arange(len(places))
-    empty = np.ones(shape, dtype=bool)
-    empty[tuple(places.T)] = False
-    at = distance_transform_edt(empty, return_distances=False, return_indices=True)
-    return torch.from_numpy(number[tuple(at)].reshape(-1)).to(cells.device)
-
-
-def _regions(pairs: Tensor, count: int) -> Tensor:
-    rows, columns = pairs.cpu().numpy().T
-    graph = coo_matrix((np.ones(len(rows), dtype=np.int8), (rows, columns)), shape=(count, count))
-    found = connected_components(graph, directed=False)[1]
-    return torch.from_numpy(found.astype(np.int64)).to(pairs.device)
+    place = _number(cells, shape)
+    number = cells.new_zeros(math.prod(shape)).index_copy(0, place, torch.arange(len(cells), device=cells.device))
+    occupied = torch.zeros_like(number, dtype=torch.bool).index_fill(0, place, True)
+    return number[nearest_inside(occupied.view(shape)).flatten()]
 
 
 def _checked_cells(cells: Any, shape: Any) -> Tensor:

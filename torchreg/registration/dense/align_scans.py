@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg._threads import both, one_thread
-from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.neighbors import k_nearest
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.registration.blend import blend_linear
 from torchreg.registration.dense.config import (
@@ -372,5 +372,5 @@ def _confidence(problem: ScanAlignProblem, transforms: Tensor, config: ScanAlign
     sigma = config.refine.sigma[1]
     moved = used_samples(problem, transforms, sigma, config.refine)
     own = soft_matches(problem, moved, sigma, config.refine).posterior
-    index, _ = nearest_few(problem.unit.of_points(points), problem.graph.points[: len(own)], min(3, len(own)))
+    index, _ = k_nearest(problem.unit.of_points(points), problem.graph.points[: len(own)], min(3, len(own)))
     return own[index].mean(1)

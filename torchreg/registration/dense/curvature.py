@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_count, check_points, check_positive, check_same_kind, check_shape
 from torchreg.errors import InputError
-from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.neighbors import k_nearest
 
 # Neighbors with normals farther apart than this (cosine) are another sheet of the surface.
 _SAME_SHEET = 0.2
@@ -66,7 +66,7 @@ def shape_operators(
         raise InputError("radii must hold at least one radius, got none")
     for radius in radii:
         check_positive(radius, "radii")
-    index = nearest_few(points, scan_points, min(num_neighbors, len(scan_points)))[0].to(points.device)
+    index = k_nearest(points, scan_points, min(num_neighbors, len(scan_points)))[0]
     # What lies in the tangent plane, of offsets and of normals: rows (2, 3) take a vector there.
     plane = _tangent_planes(normals)
     neighbor = scan_normals[index]

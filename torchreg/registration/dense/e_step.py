@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_count, check_positive
-from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.neighbors import k_nearest
 from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.solvers.e_step import responsibilities
 
@@ -125,9 +125,8 @@ def match_softly(
 
 def _choices(chooser: Tensor, offered: Tensor, sigma: float, config: ScanEMConfig) -> tuple[Tensor, Tensor]:
     """Return the most compatible others (N, K) of each sample and their posteriors."""
-    index, distance = nearest_few(chooser, offered, min(config.num_candidates, len(offered)))
-    index, distance = index.to(chooser.device), distance.to(chooser)
+    index, distance = k_nearest(chooser, offered, min(config.num_candidates, len(offered)))
     # In the middle of a surface a sample has about this many others within its reach.
     density = max(1.0, _DENSITY * len(offered) * sigma**2)
     outlier = config.outliers * density * math.exp(-0.5 * _FEATURE_MISS * config.feature_weight)
-    return index, responsibilities(-0.5 * (distance / sigma).square(), outlier, dim=1)
+    return index, responsibilities(-0.5 * (distance.to(chooser) / sigma).square(), outlier, dim=1)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_positive, check_same_kind, check_shape
-from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.neighbors import NeighborTree, k_nearest
 from torchreg.registration.dense.occlusion import Picture
 
 # Neighbors in the picture that a normal is averaged over, and that tell how it changes towards the outline.
@@ -72,9 +72,9 @@ class FreeSpace:
         trust = torch.zeros_like(depth)
         if len(points) <= _MANY:
             return cls(picture, flat, depth, 0.0, trust)
-        index, apart = nearest_few(flat, flat, _MANY)
+        index, apart = k_nearest(flat, flat, _MANY)
         spacing = float(apart[:, 1].median())
-        if _share_cut(flat, depth, normals @ picture.rotation.mT, index.to(flat.device), spacing) > most_cut:
+        if _share_cut(flat, depth, normals @ picture.rotation.mT, index, spacing) > most_cut:
             return cls(picture, flat, depth, spacing, trust)
         facing = -(normals @ picture.rotation[2])[index[:, :_FEW]].mean(1)
         return cls(picture, flat, depth, spacing, ((_FACING[0] - facing) / (_FACING[0] - _FACING[1])).clamp(0, 1))
@@ -94,8 +94,8 @@ class FreeSpace:
         Differentiable: no.
         """
         flat, depth = self.picture.project(points)
-        index, apart = (found[:, 0] for found in nearest_few(flat, self.flat, 1))
-        index, apart = index.to(points.device), apart.to(points)
+        index, apart = NeighborTree(self.flat).nearest(flat)
+        apart = apart.to(points)
         back = (self.flat[index] - flat) / apart.clamp_min(torch.finfo(flat.dtype).tiny).unsqueeze(1)
         # What is twice as far as the picture moves twice as far.
         distance = (apart * depth / self.picture.distance).clamp_min(0)
@@ -125,7 +125,7 @@ class FreeSpace:
         check_same_kind(points, "points", self.flat, "the scan")
         check_positive(behind, "behind")
         flat, depth = self.picture.project(points)
-        index, apart = (found[:, 0].to(points.device) for found in nearest_few(flat, self.flat, 1))
+        index, apart = NeighborTree(self.flat).nearest(flat)
         hidden = (apart < _HIDES * self.spacing) & (depth > self.depth[index] + behind)
         rays = torch.nn.functional.normalize(points - self.picture.viewpoint, dim=-1)
         return ~hidden & (-(normals * rays).sum(-1) >= _SEEN)
@@ -143,7 +143,7 @@ def _share_cut(flat: Tensor, depth: Tensor, normals: Tensor, index: Tensor, spac
     """
     outward = torch.nn.functional.normalize(flat - flat[index].mean(1), dim=-1)
     probe = flat + _PROBE * spacing * outward
-    rim = nearest_few(probe, flat, 1)[1][:, 0].to(flat) > _EMPTY * spacing
+    rim = NeighborTree(flat).nearest(probe)[1].to(flat) > _EMPTY * spacing
     if not rim.any():
         return 1.0
     flat_rim, outward, index = flat[rim], outward[rim], index[rim]

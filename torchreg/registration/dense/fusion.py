@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.neighbors import k_nearest
 from torchreg.geometry.rigid import transform_points
 from torchreg.registration.dense.config import ChoiceConfig
 from torchreg.registration.dense.deformation_graph import DeformationGraph
@@ -95,7 +95,7 @@ class _Energy:
         for option in options:
             moved = problem.moved(option)
             costs.append(torch.stack(mismatch(problem, moved, config)).sum(0) + leaps(problem, moved.points, config))
-            index, apart = nearest_few(there, embedded(moved, config), min(_NUM_COVERS, len(owner)))
+            index, apart = k_nearest(there, embedded(moved, config), min(_NUM_COVERS, len(owner)))
             covers.append((apart / config.cap).clamp(max=1).square())
             by.append(owner[index])
         own = torch.zeros(graph.num_nodes, len(options)).to(options)

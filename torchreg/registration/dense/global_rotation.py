@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.neighbors import NeighborTree
 from torchreg.geometry.rigid import rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.registration.annealing import geometric_at
@@ -73,16 +73,16 @@ def _laid(problem: ScanAlignProblem, turns: Tensor) -> Tensor:
     """Return motions (C, 4, 4) with given rotations that lay the source on the target."""
     source, target = problem.source.first(_NUM_LAID), problem.target
     places, normals = source.points @ turns.mT, _NORMAL_SCALE * source.normals @ turns.mT
-    there = torch.cat((target.points, _NORMAL_SCALE * target.normals), dim=1)
+    tree = NeighborTree(torch.cat((target.points, _NORMAL_SCALE * target.normals), dim=1))
     shifts = target.points.mean(0) - places.mean(1)
     for step in range(_STEPS):
         width = geometric_at(_WIDTHS, step / (_STEPS - 1))
         moved = places + shifts.unsqueeze(1)
-        index, apart = nearest_few(torch.cat((moved, normals), dim=-1).flatten(0, 1), there, 1)
+        index, apart = tree.nearest(torch.cat((moved, normals), dim=-1).flatten(0, 1))
         # Limbs went elsewhere: what is far off pulls hardly.
         pull = welsch_weight(0.5 * (apart / width).square()).view(*moved.shape[:2], 1)
         pull = pull + torch.finfo(torch.float32).tiny
-        pulls = pull * (target.points[index[:, 0]].view_as(moved) - moved)
+        pulls = pull * (target.points[index].view_as(moved) - moved)
         shifts = shifts + pulls.sum(1) / pull.sum(1)
     return rigid_matrix(turns, shifts)
 

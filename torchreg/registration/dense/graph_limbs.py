@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.geometry.geodesics import GeodesicGraph
+from torchreg.geometry.graphs import Graph
 from torchreg.geometry.rigid import transform_points
 from torchreg.registration.dense.deformation_graph import DeformationGraph
 from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
@@ -42,7 +42,7 @@ class Limbs:
     def of(cls, graph: DeformationGraph) -> Limbs:
         """Return the limbs of a graph."""
         one, other = graph.centers[graph.edges].unbind(1)
-        steps = GeodesicGraph.from_steps(graph.edges, (one - other).norm(dim=-1), graph.num_nodes)
+        steps = Graph.from_edges(graph.edges, (one - other).norm(dim=-1), graph.num_nodes)
         ways = finite_ways(steps.distances())
         mean = ways.mean(1)
         tips = (mean >= torch.where(graph.within(2), mean, 0.0).amax(1)).nonzero()[:, 0]

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from torchreg.geometry.geodesics import GeodesicGraph
-from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.graphs import connected_components
+from torchreg.geometry.neighbors import NeighborTree
 from torchreg.registration.dense.config import ChoiceConfig
 from torchreg.registration.dense.graph_limbs import FARTHEST, LONGEST, Limbs, finite_ways, shift_onto
 from torchreg.registration.dense.problem import ScanAlignProblem
@@ -39,7 +40,7 @@ def covering_limbs(problem: ScanAlignProblem, transforms: Tensor, config: Choice
     """
     target = problem.target.first(_NUM_TARGETS)
     moved = problem.moved(transforms)
-    bare = nearest_few(embedded(target, config), embedded(moved, config), 1)[1][:, 0] >= config.cap
+    bare = NeighborTree(embedded(moved, config)).nearest(embedded(target, config))[1] >= config.cap
     if not bare.any():
         return []
     surface = GeodesicGraph.from_points(target.points, min(_NEIGHBORS, len(target) - 1))
@@ -60,9 +61,9 @@ def covering_limbs(problem: ScanAlignProblem, transforms: Tensor, config: Choice
 
 def _bare_tips(surface: GeodesicGraph, bare: Tensor) -> list[int]:
     """Return the sample farthest out in each patch of samples (T,) that nothing covers, of the largest patch first."""
-    pairs, lengths = surface.steps()
+    pairs, _ = surface.edges()
     within = bare[pairs].all(1)
-    patch = GeodesicGraph.from_steps(pairs[within], lengths[within], len(bare)).labels()
+    patch = connected_components(pairs[within], len(bare))
     count = torch.bincount(patch[bare], minlength=len(bare))
     largest = count.argsort(descending=True, stable=True)[:_MOST_PATCHES]
     largest = largest[count[largest] >= max(1, _LEAST_SHARE * len(bare))]

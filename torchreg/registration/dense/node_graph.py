@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import minimum_spanning_tree
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_count, check_points
 from torchreg.errors import InputError
-from torchreg.geometry.geodesics import GeodesicGraph
-from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.graphs import Graph, minimum_spanning_forest
+from torchreg.geometry.neighbors import k_nearest
 
 # Two nodes are neighbors if what they carry in common weighs at least this many samples.
 _LEAST_SHARED = 1e-3
@@ -48,7 +45,7 @@ class NodeGraph:
         return self.weights.new_zeros(len(self.weights), len(self.nodes)).scatter_add(1, self.nearest, self.weights)
 
 
-def build_node_graph(graph: GeodesicGraph, start: int, num_nodes: int, num_nearest: int = 4) -> NodeGraph:
+def build_node_graph(graph: Graph, start: int, num_nodes: int, num_nearest: int = 4) -> NodeGraph:
     """Return nodes chosen by farthest-point sampling along a surface, and the samples hung on them.
 
     A sample at distances ``d_1 <= d_2 <= ...`` from the nodes follows the first K with weights in proportion to
@@ -79,7 +76,7 @@ def build_node_graph(graph: GeodesicGraph, start: int, num_nodes: int, num_neare
     return NodeGraph(nodes, index, weights, edges, edge_weights)
 
 
-def _spread(graph: GeodesicGraph, start: int, count: int) -> tuple[Tensor, float]:
+def _spread(graph: Graph, start: int, count: int) -> tuple[Tensor, float]:
     """Return ``count`` samples (J,), each farthest from those before it, and how far any sample is from all of them."""
     nodes, nearest = [start], graph.distances(torch.tensor([start]))[0]
     while len(nodes) < count:
@@ -89,7 +86,7 @@ def _spread(graph: GeodesicGraph, start: int, count: int) -> tuple[Tensor, float
     return torch.tensor(nodes), float(nearest.max())
 
 
-def _distances(graph: GeodesicGraph, nodes: Tensor, reach: float, num_nearest: int) -> Tensor:
+def _distances(graph: Graph, nodes: Tensor, reach: float, num_nearest: int) -> Tensor:
     """Return distances (S, J) of samples from nodes; infinite for some that are not among the nearest of a sample."""
     near = graph.distances(nodes, limit=_REACHES * reach).mT
     if int(near.isfinite().sum(1).min()) > min(num_nearest, len(nodes) - 1):
@@ -124,11 +121,8 @@ def _firmly_linked(edges: Tensor, weights: Tensor, count: int) -> Tensor:
 
     Those of a maximum spanning tree are raised: across the gaps around islands of a scan samples share next to nothing.
     """
-    graph = coo_array(((1 / weights).numpy(), tuple(edges.mT.numpy())), shape=(count, count))
-    tree = coo_array(minimum_spanning_tree(graph))
-    number = torch.from_numpy(tree.row.astype(np.int64) * count + tree.col)
-    held = torch.isin(edges[:, 0] * count + edges[:, 1], number)
-    return torch.where(held, weights.clamp(min=_LEAST_LINK), weights)
+    held = minimum_spanning_forest(edges, -weights, count).chosen()
+    return weights.index_copy(0, held, weights[held].clamp(min=_LEAST_LINK))
 
 
 def spread_weights(
@@ -152,7 +146,7 @@ def spread_weights(
     check_points(points, "points", batch=False)
     scale = 0.5 * normal_scale
     here, there = (torch.cat(pair, dim=1) for pair in ((points, scale * normals), (samples, scale * sample_normals)))
-    index, distance = nearest_few(here, there, min(3, len(samples)))
+    index, distance = k_nearest(here, there, min(3, len(samples)))
     # A point at a sample follows that one alone.
     share = 1 / (distance + 1e-9 * distance.mean().clamp_min(torch.finfo(distance.dtype).tiny))
     share = (share / share.sum(1, keepdim=True)).to(weights)

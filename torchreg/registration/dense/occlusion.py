@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_positive, check_same_kind, check_shape
-from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.neighbors import k_nearest, sampling_distance
 from torchreg.geometry.visibility import view_rotation
 
 # Neighbors in the picture that are looked at, and how many spacings of the samples there they may be away.
@@ -110,6 +110,5 @@ def occlusion_edges(edges: Tensor, surface: Tensor, viewpoint: Tensor, depth: fl
         return torch.zeros(len(edges), dtype=torch.bool, device=edges.device)
     picture = Picture.of(surface, viewpoint)
     (flat, far), (flat_edges, far_edges) = picture.project(surface), picture.project(edges)
-    spacing = nearest_few(flat, flat, 2)[1][:, 1].median()
-    index, apart = (found.to(edges.device) for found in nearest_few(flat_edges, flat, min(_NEIGHBORS, len(flat))))
-    return ((apart < _BESIDE * float(spacing)) & (far[index] < far_edges.unsqueeze(1) - depth)).any(1)
+    index, apart = k_nearest(flat_edges, flat, min(_NEIGHBORS, len(flat)))
+    return ((apart < _BESIDE * sampling_distance(flat)) & (far[index] < far_edges.unsqueeze(1) - depth)).any(1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from torchreg._checks import check_positive
-from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.neighbors import sampling_distance
 from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.solvers.assignment import assign_within
 
@@ -56,13 +56,6 @@ def squared_distances(one: Tensor, other: Tensor) -> Tensor:
     return (one.square().sum(1)[:, None] + other.square().sum(1) - 2 * product).clamp_min_(0)
 
 
-def typical_spacing(points: Tensor) -> float:
-    """Return the median distance of a point to the nearest other one."""
-    if len(points) < 2:
-        return float("inf")
-    return float(nearest_few(points, points, 2)[1][:, 1].median())
-
-
 def count_of_spacing(points: Tensor, spacing: float, least: int = 50) -> int:
     """Return how many of the first points are about as far apart as ``spacing``.
 
@@ -74,5 +67,5 @@ def count_of_spacing(points: Tensor, spacing: float, least: int = 50) -> int:
     lower, upper = min(least, len(points)), len(points)
     while upper - lower > 10:
         middle = (lower + upper) // 2
-        lower, upper = (middle, upper) if typical_spacing(points[:middle]) > spacing else (lower, middle)
+        lower, upper = (middle, upper) if sampling_distance(points[:middle]) > spacing else (lower, middle)
     return upper

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torchreg._threads import both
 from torchreg.geometry.geodesics import GeodesicGraph
-from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.graphs import Graph
+from torchreg.geometry.neighbors import NeighborTree, sampling_distance
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.sampling import even_order
 from torchreg.registration.dense.config import MatchConfig, ScanAlignConfig
@@ -22,7 +23,6 @@ from torchreg.registration.dense.isometry import consistent_matches
 from torchreg.registration.dense.learned_descriptors import learned_descriptors
 from torchreg.registration.dense.node_graph import build_node_graph
 from torchreg.registration.dense.occlusion import likely_viewpoint, occlusion_edges
-from torchreg.registration.dense.one_to_one import typical_spacing
 from torchreg.registration.dense.oriented_samples import OrientedSamples, scaled_together
 from torchreg.registration.dense.rigid_regions import WideRegions
 from torchreg.registration.dense.sample_graph import sample_graph
@@ -122,13 +122,13 @@ def describe(
     return ScanAlignProblem(graph, one, other, regions, far, free, samples, samples[nodes.nodes], unit, ahead)
 
 
-def _far_apart(ways: GeodesicGraph, config: ScanAlignConfig) -> Tensor:
+def _far_apart(ways: Graph, config: ScanAlignConfig) -> Tensor:
     """Return which of the first samples (M, M) are far from each other along the surface."""
     few = torch.arange(min(config.overlap_samples, len(ways)))
     return ways.distances(few, limit=config.overlap_reach)[:, : len(few)].isinf()
 
 
-def _wide_regions(graph: DeformationGraph, ways: GeodesicGraph, nodes: Tensor, config: ScanAlignConfig) -> WideRegions:
+def _wide_regions(graph: DeformationGraph, ways: Graph, nodes: Tensor, config: ScanAlignConfig) -> WideRegions:
     """Return regions about the nodes, samples of the graph."""
     few = graph.points[: config.region_samples]
     apart = ways.distances(nodes, limit=config.region_reach)[:, : len(few)].to(few)
@@ -148,7 +148,7 @@ def _cut_off(edges: Tensor, points: Tensor, eye: Tensor | None, config: ScanAlig
         edges = edges[occlusion_edges(edges, points, eye, config.occluder_depth)]
     if eye is None or len(edges) == 0:
         return torch.zeros(len(points), dtype=torch.bool)
-    return nearest_few(points, edges, 1)[1][:, 0] < config.occluder_reach * typical_spacing(points)
+    return NeighborTree(edges).nearest(points)[1] < config.occluder_reach * sampling_distance(points)
 
 
 def first_matches(problem: ScanAlignProblem, config: MatchConfig) -> GraphMatches:

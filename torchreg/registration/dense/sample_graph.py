@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchreg._checks import (
@@ -19,9 +16,8 @@ from torchreg._checks import (
     check_shape,
 )
 from torchreg.errors import InputError
-from torchreg.geometry.geodesics import GeodesicGraph
-from torchreg.geometry.islands import island_links
-from torchreg.geometry.normals import distinct_places, k_nearest
+from torchreg.geometry.graphs import Graph, component_links, connected_components
+from torchreg.geometry.neighbors import NeighborTree, distinct_places, k_nearest_others
 
 # A step leads across a valley where both normals lean over it by this much, in the mean: the sine of an angle.
 _VALLEY = 0.2
@@ -38,7 +34,7 @@ def sample_graph(
     normal_scale: float = 0.0,
     num_neighbors: int = 8,
     bridge: float | None = 3.0,
-) -> GeodesicGraph:
+) -> Graph:
     """Return the graph of samples of a surface, joined where their surroundings meet.
 
     The surroundings of a sample are the points that are nearer to it than to any other sample; they meet where an edge
@@ -58,7 +54,7 @@ def sample_graph(
         bridge: lengths of the links between parts are multiplied by this; None leaves the parts apart.
 
     Returns:
-        a `GeodesicGraph`, its steps as long as the straight way.
+        a `Graph`, its steps as long as the straight way.
 
     Raises:
         InputError: if a shape does not fit or there are no samples.
@@ -79,18 +75,21 @@ def sample_graph(
         check_positive(bridge, "bridge")
     facing = None if normals is None else _checked(normals, points)
     places = points.detach().cpu().double().numpy()
-    centers = places[samples.cpu().numpy()]
+    samples = samples.cpu()
+    centers = places[samples.numpy()]
     if len(centers) == 1:
-        return GeodesicGraph.from_steps(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0), 1)
+        return Graph.from_edges(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0), 1)
     steps = _steps_of_points(points, num_neighbors) if faces is None else _steps_of_faces(faces)
-    told_apart = places if facing is None else np.concatenate((places, 0.5 * normal_scale * facing), axis=1)
-    owner = cKDTree(told_apart[samples.cpu().numpy()]).query(told_apart)[1]
+    told_apart = torch.from_numpy(
+        places if facing is None else np.concatenate((places, 0.5 * normal_scale * facing), axis=1)
+    )
+    owner = NeighborTree(told_apart[samples]).nearest(told_apart)[0].numpy()
     valley = np.zeros(len(steps), dtype=bool) if facing is None else _across_valleys(places, facing, steps)
     edges = _around_valleys(owner[steps], len(centers), valley)
     lengths = _lengths(centers, edges)
     if bridge is not None:
         edges, lengths = _bridged(centers, edges, lengths, bridge)
-    return GeodesicGraph.from_steps(torch.from_numpy(edges), torch.from_numpy(lengths), len(centers))
+    return Graph.from_edges(torch.from_numpy(edges), torch.from_numpy(lengths), len(centers))
 
 
 def _steps_of_faces(faces: Tensor) -> np.ndarray:
@@ -100,7 +99,7 @@ def _steps_of_faces(faces: Tensor) -> np.ndarray:
 
 def _steps_of_points(points: Tensor, num_neighbors: int) -> np.ndarray:
     places, place = distinct_places(points)
-    index, _ = k_nearest(places, num_neighbors)
+    index, _ = k_nearest_others(places, num_neighbors)
     # One point of each place, and all others of it through that one.
     one = np.zeros(len(places), dtype=np.int64)
     one[place.numpy()] = np.arange(len(place))
@@ -134,24 +133,17 @@ def _around_valleys(steps: np.ndarray, count: int, valley: np.ndarray) -> np.nda
     key, which = np.unique((low * count + high)[apart], return_inverse=True)
     edges = np.stack((key // count, key % count), axis=1)
     across = np.bincount(which, weights=valley[apart]) > _MOST_VALLEYS * np.bincount(which)
-    part = _parts(edges[~across], count)
+    part = connected_components(torch.from_numpy(edges[~across]), count).numpy()
     return edges[~across | (part[edges[:, 0]] != part[edges[:, 1]])]
 
 
-def _parts(edges: np.ndarray, count: int) -> np.ndarray:
-    """Return numbers (S,) from 0 of the parts that edges leave of so many samples."""
-    graph = coo_array((np.ones(len(edges)), tuple(edges.T)), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
-
-
 def _lengths(places: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Return the lengths of edges, none of them zero, which would be no edge."""
-    length = np.linalg.norm(places[edges[:, 0]] - places[edges[:, 1]], axis=1)
-    return np.maximum(length, np.finfo(np.float64).tiny)
+    length: np.ndarray = np.linalg.norm(places[edges[:, 0]] - places[edges[:, 1]], axis=1)
+    return length
 
 
 def _bridged(places: np.ndarray, edges: np.ndarray, lengths: np.ndarray, cost: float) -> tuple[np.ndarray, np.ndarray]:
     """Return edges and lengths with each part linked to what has grown from the largest, the nearest part first."""
-    links, apart = island_links(places, _parts(edges, len(places)))
-    across = np.maximum(apart * cost, np.finfo(np.float64).tiny)
-    return np.concatenate((edges, links)), np.concatenate((lengths, across))
+    part = connected_components(torch.from_numpy(edges), len(places))
+    links, apart = component_links(torch.from_numpy(places), part)
+    return np.concatenate((edges, links.numpy())), np.concatenate((lengths, cost * apart.numpy()))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg.geometry.neighbors import nearest_few
+from torchreg.geometry.neighbors import NeighborTree, k_nearest, sampling_distance
 from torchreg.registration.annealing import geometric_at
 from torchreg.registration.dense.config import (
     AssignConfig,
@@ -20,7 +20,7 @@ from torchreg.registration.dense.config import (
 )
 from torchreg.registration.dense.e_step import SoftMatches, match_softly
 from torchreg.registration.dense.graph_fit import GraphFit, GraphMatches, fit_graph, joined
-from torchreg.registration.dense.one_to_one import count_of_spacing, match_one_to_one, typical_spacing
+from torchreg.registration.dense.one_to_one import count_of_spacing, match_one_to_one
 from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.registration.dense.problem import ScanAlignProblem
 from torchreg.solvers.robust import geman_mcclure_weight
@@ -82,7 +82,7 @@ def fit_first_matches(
 def pull_one_to_one(problem: ScanAlignProblem, transforms: Tensor, config: AssignConfig, reporter: Reporter) -> Tensor:
     """Return motions pulled by one-to-one matches of even samples, whose reach shrinks while the graph softens."""
     target = problem.target.first(config.num_points)
-    count = count_of_spacing(problem.graph.points, typical_spacing(target.points))
+    count = count_of_spacing(problem.graph.points, sampling_distance(target.points))
     for step in range(config.num_steps):
         share = step / max(config.num_steps - 1, 1)
         reach, stiffness = geometric_at(config.reach, share), geometric_at(config.stiffness, share)
@@ -210,7 +210,7 @@ def follow_regions(problem: ScanAlignProblem, transforms: Tensor, config: Refine
     moved = problem.moved(transforms)
     apart, unlike = differences(problem, moved, choice)
     unlike = torch.where(apart < 1, unlike, _UNLIKE)
-    around, _ = nearest_few(problem.graph.points, problem.graph.points, min(config.surrounding, len(unlike)))
+    around, _ = k_nearest(problem.graph.points, problem.graph.points, min(config.surrounding, len(unlike)))
     low, high = config.unlike
     return ((unlike[around].median(dim=1).values - low) / (high - low)).clamp(0, 1)
 
@@ -219,7 +219,7 @@ def judge(problem: ScanAlignProblem, name: str, transforms: Tensor, config: Choi
     """Return how well the moved source and the target cover each other, how alike they are there, bend and strain."""
     moved = problem.moved(transforms)
     forward, seen, unlike = (float(cost.mean()) for cost in mismatch(problem, moved, config))
-    apart = nearest_few(embedded(problem.target, config), embedded(moved, config), 1)[1]
+    apart = NeighborTree(embedded(moved, config)).nearest(embedded(problem.target, config))[1]
     backward = float((apart / config.cap).clamp(max=1).square().mean())
     bend = config.bend * float(problem.graph.bend(transforms, config.slack))
     strain = config.strain * problem.regions.strain(moved.points)
@@ -264,9 +264,9 @@ def mismatch(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceCo
 
 def differences(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> tuple[Tensor, Tensor]:
     """Return how far moved samples (S,) are from the target, squared and capped at one, and how unlike it there."""
-    index, apart = nearest_few(embedded(moved, config), embedded(problem.target, config), 1)
-    unlike = (moved.features - problem.target.features[index[:, 0]]).square().sum(-1)
-    return (apart[:, 0] / config.cap).clamp(max=1).square(), unlike.clamp(max=_UNLIKE)
+    index, apart = NeighborTree(embedded(problem.target, config)).nearest(embedded(moved, config))
+    unlike = (moved.features - problem.target.features[index]).square().sum(-1)
+    return (apart / config.cap).clamp(max=1).square(), unlike.clamp(max=_UNLIKE)
 
 
 def embedded(samples: OrientedSamples, config: ChoiceConfig) -> Tensor:
@@ -281,7 +281,7 @@ def loses_limb(problem: ScanAlignProblem, transforms: Tensor, config: ChoiceConf
         return True
     here, there = embedded(moved, config), embedded(problem.target, config)
     left = [
-        float((nearest_few(one, other, 1)[1] >= config.cap).double().mean())
+        float((NeighborTree(other).nearest(one)[1] >= config.cap).double().mean())
         for one, other in ((here, there), (there, here))
     ]
     return min(left) > config.lost_share
