@@ -1,4 +1,4 @@
-"""A tracked arm that the tests of tracking share."""
+"""A tracked arm, and a hand tracked through a sequence, that the tests of tracking share."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -6,31 +6,133 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+import torchreg.tracking.recovery as recovery
+from torchreg.alignment.results import PoseStarts
+from torchreg.datasets.hand import hand_motion
+from torchreg.datasets.sequences import range_clouds
 from torchreg.geometry.sampling import farthest_points
 from torchreg.shapes.skin import sample_skin
-from torchreg.tracking.config import Frame, TrackConfig
+from torchreg.tracking.frame import Frame
 from torchreg.tracking.frame_fit import FrameFitter
-from torchreg.tracking.tracker import Tracker
+from torchreg.tracking.tracker import TrackConfig, Tracker
+
+FRAMES = 8
+TIPS = [4, 8, 12, 16, 20]
+HINGE = 6
 
 
 @pytest.fixture(scope="session")
 def arm_tracking(arm):
-    """A pose of the arm, 300 points of its surface there, and how to make a fitter and a state of a tracker of it."""
+    """A pose of the arm, 300 points of its surface, and how to make a fitter, a state and a frame of a tracker."""
     pose = torch.tensor([0.3, -0.2, 0.8, 0.4, 0.2, -0.5, 0.7], dtype=torch.float64)
     vertices = arm.surface_mesh(pose, spacing=0.01).vertices
     cloud = vertices[farthest_points(vertices, 300)]
     skin = sample_skin(arm, 200)
-    new = Tracker(arm, pose, model_points=skin).state
+    initial = Tracker(arm, pose, model_points=skin).state
 
     def fitter(**options):
         return FrameFitter(arm, TrackConfig(**options), skin)
 
     def state(**changes):
-        tracked = {"frame": 1, "inliers": 300.0, "ratio": 1.0, "residual": 0.001, "total": 300.0, "interval": 1.0}
-        motion = {"error": 0.005, "surprise": pose.new_tensor([0.005, 0.04, 0.04])}
-        return replace(new, **tracked | motion | changes)
+        means = {"num_data": 300.0, "num_inliers": 300.0, "ratio_in_reach": 1.0, "residual": 0.001}
+        motion = {"interval": 1.0, "prediction_error": 0.005, "innovation": pose.new_tensor([0.005, 0.04, 0.04])}
+        return replace(initial, **{"frame": 1} | means | motion | changes)
 
-    def frame(points=cloud, gap=1.0):
-        return Frame(points, points.isfinite().all(-1), gap)
+    def frame(points=cloud, elapsed=1.0):
+        return Frame(points, points.isfinite().all(-1), elapsed)
 
-    return SimpleNamespace(pose=pose, cloud=cloud, skin=skin, fitter=fitter, state=state, frame=frame)
+    def bent(angle):
+        moved = pose.clone()
+        moved[HINGE] += angle
+        return moved
+
+    return SimpleNamespace(pose=pose, cloud=cloud, skin=skin, fitter=fitter, state=state, frame=frame, bent=bent)
+
+
+@pytest.fixture
+def tracking(arm_tracking):
+    with torch.no_grad():
+        yield arm_tracking
+
+
+@pytest.fixture(scope="session")
+def truths(plain_hand):
+    return hand_motion(plain_hand, "bending_palm", FRAMES, seed=1)
+
+
+@pytest.fixture(scope="session")
+def clouds(plain_hand, plain_hand_surface, truths):
+    return range_clouds(
+        plain_hand, truths, num_points=400, outlier_ratio=0.2, camera=torch.zeros(3), skin=plain_hand_surface
+    )
+
+
+@pytest.fixture(scope="session")
+def frames(clouds):
+    return [cloud.points for cloud in clouds]
+
+
+@pytest.fixture(scope="session")
+def tracker(plain_hand, plain_hand_skin, truths):
+    """Return a function that makes a tracker of the hand."""
+
+    def make(initial_pose=truths[0], state=None, **config):
+        made = Tracker(plain_hand, initial_pose, config=TrackConfig(**config), model_points=plain_hand_skin)
+        made.state = state or made.state
+        return made
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def tracked(tracker, frames):
+    """A tracker after all frames, its states and results after each, and the result of the run."""
+    made, records, states = tracker(), [], []
+
+    def on_frame(points, record):
+        records.append((points, record))
+        states.append(made.state)
+
+    result = made.run(frames, on_frame)
+    return SimpleNamespace(tracker=made, states=states, records=records, result=result)
+
+
+@pytest.fixture(scope="session")
+def tip_errors(plain_hand):
+    """Return a function from keypoints (T, K, 3) and T clouds to the errors of all seen fingertips, metres."""
+
+    def errors(keypoints, clouds):
+        true = torch.stack([cloud.keypoints for cloud in clouds])
+        seen = torch.stack([cloud.seen_parts[list(plain_hand.fingertip_parts)] for cloud in clouds])
+        return (keypoints - true).norm(dim=-1)[:, TIPS][seen]
+
+    return errors
+
+
+@pytest.fixture(scope="session")
+def noise_frame():
+    """Return a function that draws points all over the room in which the hand moves."""
+
+    def draw(count=500, seed=0):
+        generator = torch.Generator().manual_seed(seed)
+        return torch.rand(count, 3, generator=generator) * 0.5 + torch.tensor([-0.25, -0.25, 0.3])
+
+    return draw
+
+
+@pytest.fixture
+def find(monkeypatch):
+    """Return a function that replaces the search everywhere by given poses and costs; it returns the calls made."""
+
+    def replace_by(poses, costs):
+        calls = []
+
+        def found(shape, data, *, config):
+            calls.append((len(data), config))
+            chosen = poses(len(calls)) if callable(poses) else poses
+            return PoseStarts(chosen, torch.tensor(costs), torch.tensor(0.9, dtype=chosen.dtype))
+
+        monkeypatch.setattr(recovery, "find_pose", found)
+        return calls
+
+    return replace_by

@@ -1,17 +1,13 @@
 """The model points of the next frame: those that the data showed, the data themselves, or all."""
 
+import math
 from dataclasses import replace
 
-import pytest
 import torch
 
-from torchreg.tracking.model_points import points_after
-
-
-@pytest.fixture
-def tracking(arm_tracking):
-    with torch.no_grad():
-        yield arm_tracking
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.tracking.model_points import next_model_points
+from torchreg.tracking.tracker import TrackConfig, Tracker
 
 
 def one_side(tracking):
@@ -20,37 +16,47 @@ def one_side(tracking):
 
 
 def after(tracking, cloud, state=None, **options):
-    fitter, state = tracking.fitter(**options), state or tracking.state(inliers=float(len(cloud)))
+    fitter, state = tracking.fitter(**options), state or tracking.state(num_inliers=float(len(cloud)))
     fit = fitter.fit_at(state, tracking.frame(cloud), tracking.pose, "tracked")
-    return fit, points_after(fitter, state, fit)
+    return fit, next_model_points(fitter, state, fit)
 
 
 def test_seen_points_are_those_near_data(tracking):
     cloud = one_side(tracking)
     fit, (points, weights, reference) = after(tracking, cloud)
-    distances = torch.tensor([float((cloud - point).norm(dim=-1).min()) for point in tracking.skin(fit.world)])
-    shown = distances < 0.03 * fit.view.problem.size
-    assert 20 < shown.sum() < 180
-    assert torch.equal(points, tracking.skin.points[shown])
-    assert torch.equal(weights, tracking.skin.weights[shown])
+    distances = torch.tensor([float((cloud - point).norm(dim=-1).min()) for point in tracking.skin(fit.world_pose)])
+    seen = distances < 0.03 * fit.view.problem.size
+    assert 20 < seen.sum() < 180
+    assert torch.equal(points, tracking.skin.points[seen])
+    assert torch.equal(weights, tracking.skin.weights[seen])
     assert torch.equal(reference, tracking.skin.reference_pose)
+
+
+def test_seen_points_face_the_camera(plain_hand_skin, tracked):
+    """The camera stands at the origin: most of what is kept of well-seen parts faces it."""
+    state = tracked.states[-1]
+    index = torch.cdist(state.points, plain_hand_skin.points).argmin(-1)
+    parts = plain_hand_skin.weights.argmax(-1)
+    on_palm = parts[index] == 0
+    towards = -(plain_hand_skin(state.pose) * plain_hand_skin.posed_normals(state.pose)).sum(-1) > 0
+    assert towards[index][on_palm].float().mean() > 0.8 > 0.6 > towards[parts == 0].float().mean()
 
 
 def test_parts_that_no_data_show_keep_their_points(arm, tracking):
     body = arm.distance(tracking.cloud, tracking.pose, parts=[1]) > 0.03
     _, (_, weights, _) = after(tracking, tracking.cloud[body])
-    parts, own = weights.argmax(-1), tracking.skin.weights.argmax(-1)
-    assert (parts == 1).sum() == (own == 1).sum()
-    assert (parts == 0).sum() < (own == 0).sum()
+    parts, skin_parts = weights.argmax(-1), tracking.skin.weights.argmax(-1)
+    assert (parts == 1).sum() == (skin_parts == 1).sum()
+    assert (parts == 0).sum() < (skin_parts == 0).sum()
 
 
-def test_what_is_hidden_comes_back_as_it_went(tracking):
+def test_occluded_points_are_kept(tracking):
     side = one_side(tracking)
     points = tracking.skin.points[::2]
-    state = tracking.state(points=points, weights=tracking.skin.weights[::2], inliers=2.0 * len(side))
+    state = tracking.state(points=points, weights=tracking.skin.weights[::2], num_inliers=2.0 * len(side))
     _, (kept, _, _) = after(tracking, side, state)
-    _, (shown, _, _) = after(tracking, side)
-    expected = {tuple(point) for point in torch.cat([shown, points]).tolist()}
+    _, (seen, _, _) = after(tracking, side)
+    expected = {tuple(point) for point in torch.cat([seen, points]).tolist()}
     assert {tuple(point) for point in kept.tolist()} == expected
 
 
@@ -60,10 +66,10 @@ def test_all_points_stay_where_asked_or_where_hardly_any_data_lie_on_the_shape(t
         assert torch.equal(points, tracking.skin.points)
 
 
-def test_data_are_harvested_in_balance(tracking):
+def test_data_become_model_points_in_balance(tracking):
     generator = torch.Generator().manual_seed(5)
-    off = tracking.cloud[::10] + 0.05 * torch.randn(30, 3, generator=generator, dtype=torch.float64)
-    cloud = torch.cat([tracking.cloud, off])
+    outliers = tracking.cloud[::10] + 0.05 * torch.randn(30, 3, generator=generator, dtype=torch.float64)
+    cloud = torch.cat([tracking.cloud, outliers])
     fit, (points, weights, reference) = after(tracking, cloud, model_points="data", num_model_points=80)
     local = fit.view.problem.data[0]
     source = torch.cdist(points, local, compute_mode="donot_use_mm_for_euclid_dist")
@@ -77,19 +83,56 @@ def test_data_are_harvested_in_balance(tracking):
     assert torch.equal(again[0], points)
 
 
-def test_harvests_take_the_shapes_own_points_where_a_part_shows_none(arm, tracking):
+def test_parts_without_data_take_the_points_of_the_shape(arm, tracking):
     body = arm.distance(tracking.cloud, tracking.pose, parts=[1]) > 0.03
     fit, (points, weights, _) = after(tracking, tracking.cloud[body], model_points="data")
-    own = tracking.skin.weights.argmax(-1) == 1
+    on_arm = tracking.skin.weights.argmax(-1) == 1
     hinged = weights.argmax(-1) == 1
-    torch.testing.assert_close(points[hinged], tracking.skin(fit.pose[0])[own])
+    torch.testing.assert_close(points[hinged], tracking.skin(fit.pose[0])[on_arm])
     assert len(points[~hinged]) == body.sum()
 
 
-def test_later_frames_draw_others(tracking):
+def test_points_of_a_hand_from_data_lie_on_it_and_are_spread_over_the_parts(
+    plain_hand, plain_hand_skin, tracker, frames
+):
+    made = tracker(model_points="data", num_model_points=120)
+    made.run(frames[:2])
+    state = made.state
+    parts = state.weights.argmax(-1)
+    counts = torch.bincount(parts, minlength=16)
+    sampled = torch.bincount(plain_hand_skin.weights.argmax(-1), minlength=16)
+    world = state.points + (state.pose - state.reference_pose)[:3]
+    from_data = torch.cdist(world, frames[1]).amin(-1) < 1e-5
+    for part in range(16):
+        if from_data[parts == part].any():
+            assert 4 <= counts[part] <= math.ceil(2 * 120 / 4)
+        else:
+            assert counts[part] == sampled[part]
+    assert from_data.float().mean() > 0.5
+    assert (plain_hand.distance(world[from_data], state.pose).abs() < 0.0056).all()
+    torch.testing.assert_close(state.weights.sum(-1), torch.ones(len(state.points)))
+
+
+def test_each_frame_draws_anew(tracking):
     state = tracking.state()
-    first, other = (
-        after(tracking, tracking.cloud, replace(state, frame=frame), model_points="data", num_model_points=30)[1][0]
-        for frame in (1, 2)
+    first, later = (
+        after(tracking, tracking.cloud, replace(state, frame=number), model_points="data", num_model_points=30)[1][0]
+        for number in (1, 2)
     )
-    assert not torch.equal(first[: len(other)], other[: len(first)])
+    count = min(len(first), len(later))
+    assert not torch.equal(first[:count], later[:count])
+
+
+def test_data_on_a_rigged_surface_take_the_weights_of_its_nearest_points(arm):
+    mesh = arm.surface_mesh(arm.rest_pose(), spacing=0.02)
+    weights = torch.nn.functional.one_hot((mesh.vertices[:, 0] > 0.06).long(), 2).double()
+    joints = torch.tensor([[0.0, 0, 0], [0.06, 0, 0]], dtype=torch.float64)
+    rig = ArticulatedShape.from_skinned_mesh(
+        mesh.vertices, mesh.faces, weights, joints, [-1, 0], dtype=torch.float64
+    ).requires_grad_(False)
+    tracker = Tracker(rig, rig.rest_pose(), config=TrackConfig(model_points="data", num_model_points=100))
+    assert tracker.run([mesh.vertices]).statuses[0].usable
+    state = tracker.state
+    assert len(state.points) > 60
+    expected = torch.nn.functional.one_hot((state.points[:, 0] > 0.06).long(), 2).double()
+    assert ((state.weights - expected).abs().amax(-1) < 0.5).double().mean() > 0.9

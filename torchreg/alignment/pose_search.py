@@ -71,7 +71,7 @@ _REFINE = _Stage(
     fit_steps=2,
     score_width=0.018,
 )  # fmt: skip
-_BUDGET = _Budget()
+SEARCH_BUDGET = _Budget()
 
 
 class PoseSearch:
@@ -85,8 +85,8 @@ class PoseSearch:
     def __init__(self, problem: AlignProblem, generator: torch.Generator) -> None:
         shape = problem.skin.shape
         reduced = replace(problem, skin=_coarse_skin(problem.skin), surface=FusedSurface(shape))
-        self.problem = reduced.draw(_BUDGET.num_data, generator)
-        self.coarse_problem = self.problem.draw(_BUDGET.num_coarse_data, generator)
+        self.problem = reduced.draw(SEARCH_BUDGET.num_data, generator)
+        self.coarse_problem = self.problem.draw(SEARCH_BUDGET.num_coarse_data, generator)
         self.limbs = LimbSearch(shape)
         self.seed = int(torch.randint(2**31, (), generator=generator))
 
@@ -107,7 +107,7 @@ class PoseSearch:
         Data of one side only would draw an EM into the shape; the surface they do not. Duplicates of a better
         candidate come last.
         """
-        fitted = fit_candidates(self.coarse_problem, pool, _BUDGET.coarse_widths, steps)
+        fitted = fit_candidates(self.coarse_problem, pool, SEARCH_BUDGET.coarse_widths, steps)
         return self._best_first(fitted, score_candidates(self.coarse_problem, fitted, _PRUNE.score_width))
 
     def prune(self, pool: Tensor, count: int) -> Tensor:
@@ -138,14 +138,15 @@ class PoseSearch:
             better = (gain > 0).unsqueeze(-1)
             poses[active, 0] = torch.where(better, best[:, 0], poses[active, 0])
             scores[active, 0] = torch.minimum(score[:, 0], scores[active, 0])
-            active = active[gain > _BUDGET.min_gain]
+            active = active[gain > SEARCH_BUDGET.min_gain]
             if len(active) == 0:
                 break
         return poses, scores
 
     def _best_first(self, poses: Tensor, scores: Tensor) -> Tensor:
         poses = take_rows(poses, scores.argsort(1))
-        return take_rows(poses, distinct_first(mean_distances(self.problem, poses) < _BUDGET.same * self.problem.size))
+        same = mean_distances(self.problem, poses) < SEARCH_BUDGET.same * self.problem.size
+        return take_rows(poses, distinct_first(same))
 
     def _best_options(
         self, problem: AlignProblem, candidates: Tensor, stage: _Stage, number: int
@@ -167,20 +168,20 @@ class PoseSearch:
 
 def _coarse_skin(skin: LinearBlendSkin) -> LinearBlendSkin:
     """Return a skin of few points that cover the given one's."""
-    index = farthest_points(skin.points, min(_BUDGET.num_model_points, len(skin)))
+    index = farthest_points(skin.points, min(SEARCH_BUDGET.num_model_points, len(skin)))
     return LinearBlendSkin(skin.shape, skin.points[index], skin.weights[index], skin.reference_pose)
 
 
 def mean_distances(problem: AlignProblem, poses: Tensor) -> Tensor:
     """Return the distances (B, K, K) of model points, as root mean squares, between poses (B, K, num_dofs)."""
-    points = problem.skin(poses)[..., :: max(1, len(problem.skin) // _BUDGET.num_compared), :]
+    points = problem.skin(poses)[..., :: max(1, len(problem.skin) // SEARCH_BUDGET.num_compared), :]
     return torch.cdist(points.flatten(2), points.flatten(2)) / math.sqrt(points.shape[-2])
 
 
 def fit_candidates(problem: AlignProblem, poses: Tensor, widths: Sequence[float], steps: int) -> Tensor:
     """Return poses (B, K, num_dofs) after damped steps on the surface, ``steps`` at each width (shares of the size)."""
     wide, pose = problem.repeated(poses.shape[1]), poses.flatten(0, 1)
-    noise = torch.full_like(pose[:, 0], _BUDGET.noise * problem.size)
+    noise = torch.full_like(pose[:, 0], SEARCH_BUDGET.noise * problem.size)
     for width in widths:
         pose = surface_steps(wide, pose, torch.full_like(noise, width * problem.size), noise, steps).state
     return pose.reshape(poses.shape)

@@ -1,4 +1,4 @@
-"""The main job on made-up data: a hand moves before a pair of cameras and is found and followed."""
+"""The demonstration: a hand moves before a pair of cameras, is found and tracked, on synthetic data."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_shape
 from torchreg.datasets.hand import HandCloud
 from torchreg.datasets.sequences import hand_sequence
 from torchreg.shapes.hand import Hand
@@ -25,21 +24,21 @@ def run_demo(
     config: TrackConfig | None = None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> DemoResult:
-    """Return a hand tracked through a made-up sequence, beside the truth.
+    """Return a hand tracked through a synthetic sequence, with the ground truth.
 
     A pair of cameras sees the palm of a hand that bends its fingers and sways: up to 600 points on the hand per frame,
-    with 1.5 mm of noise in depth, and 257 outliers on a forearm, a wall and in the air. The tracker is given no pose to
-    start from.
+    with 1.5 mm of noise in depth, and 257 outliers on a forearm, a wall and in the air. The tracker is given no initial
+    pose.
 
     Args:
         num_frames: number of frames, 20 per second.
-        seed: of motion and measurements.
+        seed: of the motion and the measurements.
         config: of the tracker.
-        on_frame: is told (frames done, all frames) after each.
+        on_frame: called with (frames done, all frames) after each frame.
 
     Returns:
-        a `DemoResult`. An interruption by the keyboard after the first frame ends the sequence: the result then holds
-        the frames that were done.
+        The track with the truth. An interruption by the keyboard after the first frame ends the sequence: the result
+        then holds the frames done.
 
     Raises:
         InputError: if ``num_frames`` is not a positive integer.
@@ -52,47 +51,34 @@ def run_demo(
     clouds = hand_sequence("bending_palm", num_frames, DEMO_FPS, shape=hand, seed=seed)
     inliers: list[Tensor] = []
 
-    def note(points: Tensor, result: FrameResult) -> None:
+    def keep_inliers(points: Tensor, result: FrameResult) -> None:
         inliers.append(result.inliers)
         if on_frame is not None:
             on_frame(len(inliers), len(clouds))
 
     times = [frame / DEMO_FPS for frame in range(len(clouds))]
-    track = Tracker(hand, config=config).run([cloud.points for cloud in clouds], note, times=times)
-    return _beside_truth(hand, track, clouds[: len(track.poses)], inliers, seed)
+    track = Tracker(hand, config=config).run([cloud.points for cloud in clouds], keep_inliers, times=times)
+    return _with_truth(hand, track, clouds[: len(track.poses)], inliers, seed)
 
 
 def moved_to_mean(skin: LinearBlendSkin, pose: Tensor, cloud: Tensor) -> Tensor:
-    """Return the pose moved so that the mean of the posed skin lies at the mean of a cloud; the turn stays.
-
-    Args:
-        skin: of the shape.
-        pose: (num_dofs,).
-        cloud: (M, 3) finite points, metres.
-
-    Returns:
-        (num_dofs,).
-
-    Raises:
-        InputError: if a size is wrong.
-    """
-    check_shape(cloud, "cloud", ("M", 3))
+    """Return a pose (num_dofs,) translated so that the mean of the posed skin is the mean of a cloud (M, 3), metres."""
     with torch.no_grad():
-        offset = cloud.to(pose).mean(0) - skin(skin.shape.check_pose(pose)).mean(0)
+        offset = cloud.to(pose).mean(0) - skin(pose).mean(0)
     return torch.cat([pose[:3] + offset, pose[3:]])
 
 
-def _beside_truth(
+def _with_truth(
     hand: Hand, track: TrackResult, clouds: Sequence[HandCloud], inliers: Sequence[Tensor], seed: int
 ) -> DemoResult:
     tips = [4 * finger + 4 for finger in range(len(hand.fingertip_parts))]
-    true = torch.stack([cloud.keypoints for cloud in clouds])
+    true_keypoints = torch.stack([cloud.keypoints for cloud in clouds])
     return DemoResult(
         track=track,
         truths=torch.stack([cloud.pose for cloud in clouds]),
         clouds=tuple(cloud.points for cloud in clouds),
         inliers=tuple(inliers[: len(clouds)]),
-        tip_errors=(track.keypoints - true)[:, tips].norm(dim=-1),
+        tip_errors=(track.keypoints - true_keypoints)[:, tips].norm(dim=-1),
         tips_seen=torch.stack([cloud.seen_parts[list(hand.fingertip_parts)] for cloud in clouds]),
         seed=seed,
     )

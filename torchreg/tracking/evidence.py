@@ -1,162 +1,103 @@
-"""Whether a frame's fit can be believed: losses, doubts, what is usual, and data that the shape leaves unexplained."""
+"""The evidence for a fit: criteria of a loss and of doubt, relative to running means of the frames before."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, TypeGuard
 
-import torch
 from torch import Tensor
 
+from torchreg.alignment.clusters import CLUSTERS
 from torchreg.alignment.problem import AlignProblem
-from torchreg.geometry.neighbors import nearest_neighbor, sampling_distance
-from torchreg.geometry.rigid import invert_rigid, transform_points
-from torchreg.shapes.limbs import Limb
-from torchreg.shapes.skin import LinearBlendSkin
-from torchreg.tracking.config import FrameFit
+from torchreg.tracking.frame import MIN_DATA, FrameFit
+from torchreg.tracking.motion_model import FILTER
 from torchreg.tracking.results import TrackState
 
-# A loss: fewer inliers than the first, after a loss than this share of the usual; or half of the usual ratio.
-_MIN_INLIERS, _LOST_COUNT, _LOST_RATIO = 10, 0.12, 0.5
-# Residuals this many times the usual ones are a loss, or a doubt, but not below this share of the size.
-_LOST_RESIDUAL, _DOUBT_RESIDUAL, _FINE_RESIDUAL = 1.8, 1.5, 0.006
-# A doubt: more novel strays than this and than this share of the inliers; so many more joints at limits; so far off the
-# prediction, as a share of the size.
-_DOUBT_NOVEL, _DOUBT_NOVEL_SHARE, _DOUBT_HELD, _DOUBT_JUMP = 5, 0.012, 0.3, 0.15
-# Strays that stay after so many attempts to explain them are background.
-_LEARNED_AFTER = 6
-# Kept from frame to frame of running means: they go back half a second.
-_MEMORY = 0.9
-# A joint this near to a limit is at it, radians.
-_AT_LIMIT = 1e-3
-# Strays have this many others within so many distances between neighbors on the surface, and this share of the size.
-_CLUSTER_NEIGHBORS, _CLUSTER_RADIUS, _MAX_CLUSTER = 5, 4.0, 0.1
-# Data whose neighbors tell how dense a surface is.
-_NUM_SPACINGS = 100
-# Poses that show where limbs reach: more fill no more cells.
-_NUM_REACHES = 512
+Criterion = Callable[[FrameFit, TrackState], bool]
 
 
-def is_far(state: TrackState, fit: FrameFit) -> bool:
-    """Return whether a fit is farther from the prediction than shapes go."""
-    return fit.jump > _DOUBT_JUMP * fit.view.problem.size * max(1, state.lost)
+@dataclass(frozen=True)
+class EvidenceLimits:
+    """Limits of the criteria, in running means of the same quantity unless they have another unit."""
+
+    min_regained: float = 0.12  # inliers after a loss
+    min_inliers: float = 0.5  # inliers after a large deviation, and inlier ratio in reach
+    max_residual: float = 1.8  # beyond, the surface was drawn to another object
+    doubtful_residual: float = 1.5  # of a doubtful fit, and of one after a loss, when other objects are as near
+    fine_residual: float = 0.006  # residual, as a share of the size, that noise and model error explain anyhow
+    new_share: float = 0.012  # new unexplained data, as a share of the inliers
+    limit_share: float = 0.3  # share of the joints at a limit beyond its mean
+    deviation: float = 0.15  # from the prediction per interval, as a share of the size
+    at_limit: float = 1e-3  # from a joint to its limit, radians
+    max_searches: int = 6  # that may explain unexplained data before these count as background
 
 
-def is_lost(state: TrackState, fit: FrameFit) -> bool:
-    """Return whether the data do not support a fit."""
-    # What moved far must bring most of its data along; what stayed may be hidden but for a little.
-    few = fit.inliers < max(_MIN_INLIERS, _LOST_COUNT * state.inliers if state.lost else 0)
-    stray = is_far(state, fit) and fit.inliers < _LOST_RATIO * state.inliers
-    vague = state.tracked and is_vague(state, fit)
-    return few or stray or vague or fit.ratio < _LOST_RATIO * state.ratio
+_LIMITS = EvidenceLimits()
 
 
-def is_vague(state: TrackState, fit: FrameFit) -> bool:
-    """Return whether data lie beside the surface, as those of something else do that the surface was drawn to."""
-    loose = _DOUBT_RESIDUAL if state.lost else _LOST_RESIDUAL
-    return float(fit.noise) > max(loose * state.residual, _FINE_RESIDUAL * fit.view.problem.size)
+def deviates_far(fit: FrameFit, state: TrackState) -> bool:
+    """Return whether a fit is farther from the prediction than shapes move."""
+    return fit.deviation > _LIMITS.deviation * fit.view.problem.size * max(1, state.lost)
 
 
-def is_doubtful(state: TrackState, fit: FrameFit) -> bool:
-    """Return whether the evidence for a fit is worse than usual in any way."""
-    if not state.tracked:
-        return False
-    return (
-        fit.novel > max(_DOUBT_NOVEL, _DOUBT_NOVEL_SHARE * fit.inliers)
-        or float(fit.noise) > _DOUBT_RESIDUAL * state.residual
-        or fit.held > state.held + _DOUBT_HELD
-        or is_far(state, fit)
-    )
+def lies_beside_data(fit: FrameFit, state: TrackState) -> bool:
+    """Return whether the data lie beside the surface rather than on it, as those of another object do."""
+    share = _LIMITS.doubtful_residual if state.lost else _LIMITS.max_residual
+    return float(fit.residual) > max(share * state.residual, _LIMITS.fine_residual * fit.view.problem.size)
 
 
-def in_doubt(state: TrackState) -> bool:
-    """Return whether what a frame shows may not yet be taken for usual."""
-    return state.tracked and (state.lost > 0 or 0 < state.fails < _LEARNED_AFTER)
+# A fit is lost if one of these holds.
+_LOSS: tuple[Criterion, ...] = (
+    # Few inliers determine no pose; after a loss, they are found in any cluster of data.
+    lambda fit, state: fit.num_inliers < max(MIN_DATA, _LIMITS.min_regained * state.num_inliers if state.lost else 0),
+    # A shape that moves far takes its data along; one that stays may be occluded but for a little.
+    lambda fit, state: deviates_far(fit, state) and fit.num_inliers < _LIMITS.min_inliers * state.num_inliers,
+    # Where hardly any data in reach lie on the surface, they are those of another object.
+    lambda fit, state: fit.ratio_in_reach < _LIMITS.min_inliers * state.ratio_in_reach,
+    # Before the first fit, there is no residual to compare with.
+    lambda fit, state: state.tracked and lies_beside_data(fit, state),
+)
+# A fit is doubtful if one of these holds.
+_DOUBT: tuple[Criterion, ...] = (
+    # A cluster where a limb could be, and was not in the frame before, may be that limb.
+    lambda fit, state: fit.num_new_unexplained > max(CLUSTERS.neighbors, _LIMITS.new_share * fit.num_inliers),
+    lambda fit, state: float(fit.residual) > _LIMITS.doubtful_residual * state.residual,
+    # Joints that follow wrong data run into their limits.
+    lambda fit, state: fit.limit_share > state.limit_share + _LIMITS.limit_share,
+    deviates_far,
+)
 
 
-def usual_after(state: TrackState, fit: FrameFit, total: int) -> TrackState:
-    """Return the state with running means that a fit to ``total`` data has gone into."""
-    anew = fit.how == "found" and state.lost == 0
-    if in_doubt(state) and not anew:
+def is_supported(fit: FrameFit | None, state: TrackState) -> TypeGuard[FrameFit]:
+    """Return whether there is a fit, and the data support it."""
+    return fit is not None and not any(criterion(fit, state) for criterion in _LOSS)
+
+
+def is_doubtful(fit: FrameFit, state: TrackState) -> bool:
+    """Return whether the evidence for a fit is worse than usual in any way; never before the first fit."""
+    return state.tracked and any(criterion(fit, state) for criterion in _DOUBT)
+
+
+def is_unreliable(state: TrackState) -> bool:
+    """Return whether the next fit may change no running mean: after a loss, and while searches go on."""
+    return state.tracked and (state.lost > 0 or 0 < state.failed_searches < _LIMITS.max_searches)
+
+
+def update_means(state: TrackState, fit: FrameFit, num_data: int) -> TrackState:
+    """Return the state with running means that include a fit to a frame of ``num_data`` data."""
+    restarted = fit.acquired == "found" and state.lost == 0
+    if is_unreliable(state) and not restarted:
         return state
-    keep = 0.0 if anew or not state.tracked else _MEMORY
-    pairs = (
-        (state.total, total), (state.inliers, fit.inliers), (state.ratio, fit.ratio), (state.residual, fit.noise),
-        (state.held, fit.held),
-    )  # fmt: skip
-    total_, inliers, ratio, residual, held = (keep * old + (1 - keep) * float(new) for old, new in pairs)
-    return replace(state, total=total_, inliers=inliers, ratio=ratio, residual=residual, held=held)
+    memory = 0.0 if restarted or not state.tracked else FILTER.memory
+    names = ("num_inliers", "ratio_in_reach", "residual", "limit_share")
+    latest: dict[str, Any] = {"num_data": num_data, **{name: getattr(fit, name) for name in names}}
+    means = {name: memory * getattr(state, name) + (1 - memory) * float(value) for name, value in latest.items()}
+    return replace(state, **means)
 
 
 def share_at_limits(problem: AlignProblem, pose: Tensor) -> float:
-    """Return the share of the joints that lie at a limit."""
+    """Return the share of the joints of a pose (..., num_dofs) that are at a limit; 0 without joints."""
     joints = pose[..., 6:]
-    at = (joints <= problem.lower[6:] + _AT_LIMIT) | (joints >= problem.upper[6:] - _AT_LIMIT)
-    return float(at.float().mean()) if at.numel() else 0.0
-
-
-def dense_strays(data: Tensor, near: Tensor, size: float) -> Tensor:
-    """Return the data (K, 3) off the surface that lie as densely as those on it: outliers are thin in space.
-
-    Args:
-        data: (M, 3).
-        near: (M,) which lie on the surface.
-        size: of the shape, metres.
-    """
-    far, on = data[~near], data[near]
-    if len(on) < 2 or not len(far):
-        return far[:0]
-    spacing = sampling_distance(on, on[:: max(1, len(on) // _NUM_SPACINGS)])
-    radius = min(_CLUSTER_RADIUS * spacing, _MAX_CLUSTER * size)
-    return far[(torch.cdist(far, far) < radius).sum(-1) > _CLUSTER_NEIGHBORS]
-
-
-def nearest_distance(points: Tensor, others: Tensor) -> Tensor:
-    """Return the distance (N,) of each point to the nearest of others (K, 3); infinite where there are none."""
-    if not len(others):
-        return torch.full_like(points[:, 0], torch.inf)
-    return nearest_neighbor(points, others)[1]
-
-
-class LimbReach:
-    """Where the limbs of a shape can be, given where its trunk lies: cells of space, in the trunk's frame.
-
-    What no limb reaches is no limb that was missed: it is something else.
-
-    Args:
-        skin: points of the shape.
-        limbs: the limbs; without any, every place is taken to be in reach.
-        cell: width of a cell, metres.
-    """
-
-    def __init__(self, skin: LinearBlendSkin, limbs: Sequence[Limb], cell: float) -> None:
-        shape = skin.shape
-        self.shape, self.cell = shape, cell
-        self.cells: Tensor | None = None
-        parts = torch.tensor([part for limb in limbs for part in limb.parts], device=shape.rest.device)
-        own = torch.isin(skin.weights.argmax(-1), parts)
-        if not bool(own.any()):
-            return
-        low, high = shape.lower[6:].clamp_min(-math.pi), shape.upper[6:].clamp_max(math.pi)
-        shares = torch.quasirandom.SobolEngine(len(low), scramble=True, seed=0).draw(_NUM_REACHES).to(low)
-        poses = shape.rest.repeat(_NUM_REACHES, 1)
-        poses[:, 6:] = low + (high - low) * shares
-        trunk = invert_rigid(shape.part_transforms(poses)[:, 0])
-        points = transform_points(trunk, skin(poses)[:, own]).flatten(0, 1)
-        # A margin of one cell all around, which the widening by one cell fills.
-        self.low = points.amin(0) - 1.5 * cell
-        index = ((points - self.low) / cell).long()
-        cells = points.new_zeros((index.amax(0) + 2).tolist())
-        cells[index.unbind(-1)] = 1.0
-        self.cells = torch.nn.functional.max_pool3d(cells[None, None], 3, 1, 1)[0, 0] > 0
-
-    def __call__(self, points: Tensor, trunk: Tensor) -> Tensor:
-        """Return which points (N, 3) a limb may reach where the trunk lies at (4, 4), as (N,)."""
-        if self.cells is None:
-            return torch.ones_like(points[:, 0], dtype=torch.bool)
-        local = transform_points(invert_rigid(trunk), points)
-        index = ((local - self.low) / self.cell).floor().long()
-        size = torch.tensor(self.cells.shape, device=index.device)
-        inside = ((index >= 0) & (index < size)).all(-1)
-        return inside & self.cells[torch.minimum(index.clamp_min(0), size - 1).unbind(-1)]
+    at_limit = (joints <= problem.lower[6:] + _LIMITS.at_limit) | (joints >= problem.upper[6:] - _LIMITS.at_limit)
+    return float(at_limit.float().mean()) if at_limit.numel() else 0.0

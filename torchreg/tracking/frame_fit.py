@@ -1,10 +1,10 @@
-"""Fitting a tracked shape to one frame: what is in reach, the descent from the prediction, the evidence for its end."""
+"""Fits a tracked shape to one frame: the data in reach, the descent from the prediction, the evidence at its end."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -14,50 +14,36 @@ from torchreg.alignment.annealed_em import anneal
 from torchreg.alignment.objectives import GaussianPosePrior
 from torchreg.alignment.problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem, shifted
 from torchreg.alignment.sigma_schedule import SigmaSchedule
-from torchreg.alignment.surface_fit import SURFACE_FIT, pose_covariance, refine_surface, surface_noise
-from torchreg.geometry.rigid import invert_rigid, transform_points
+from torchreg.alignment.surface_fit import SURFACE_FIT, SurfaceResult, pose_covariance, refine_surface, surface_noise
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.limbs import find_limbs
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin, stacked_rows
 from torchreg.solvers.robust import welsch_weight
-from torchreg.tracking.config import Frame, FrameFit, FrameView, TrackConfig, thinned
-from torchreg.tracking.evidence import (
-    LimbReach,
-    dense_strays,
-    in_doubt,
-    nearest_distance,
-    share_at_limits,
-)
-from torchreg.tracking.limb_mixing import fit_limbs, scattered
-from torchreg.tracking.motion_model import moves_fast, predicted, prior_std, spread
+from torchreg.tracking.config import TrackConfig
+from torchreg.tracking.evidence import share_at_limits
+from torchreg.tracking.frame import MIN_DATA, WIDTHS, Frame, FrameFit, FrameView, frame_generator, subsample
+from torchreg.tracking.limb_combination import FAST_MOTION, fit_limbs, scatter_joints
+from torchreg.tracking.motion_model import FILTER, moves_fast, predict_pose, prediction_std, uncertainty_growth
 from torchreg.tracking.results import TrackState
+from torchreg.tracking.unexplained import UnexplainedClusters
 
-# Less data are none.
-MIN_DATA = 10
-# Last kernel width of a frame's EM, near the noise, as a share of the size.
-STOP_SIGMA = 0.02
-# Range of the first, this many times the error of the prediction; two that differ by more have one between them.
-_START_RANGE, _START_PER_ERROR, _SIGMA_RATIO = (0.03, 0.08), 2.0, 2.2
-# Width of the surface fit before the last, which follows from the noise.
-_SURFACE_SIGMAS = (0.022,)
-# Joints about the last pose where nothing is sure, radians.
-_WIDE_PRIOR = 0.3
-# Paces at which fast joints go on instead, back to three times as fast; others are scattered by this, so often.
-_PACES, _SCATTER, _NUM_SCATTERED = (-1.0, 0.0, 0.5, 1.5, 2.0, 3.0), 0.3, 2
-# Data that lie this near the bounds of the predicted model count, as a share of its size.
-_REACH = 0.12
-# A limb is shown by this many data at least, this far from its joints, as a share of the size.
-_MIN_SHOWN, _LEVER = 6.0, 0.05
-# Data farther from the surface are off it, standard deviations; strays this near are the same as before, share of size.
-_FAR_NOISES, _SAME_STRAY = 3.0, 0.05
-# Strays that are remembered: more tell no more.
-_MAX_STRAYS = 300
-# Most model points: the rest may be limbs that were missed.
-_MOST = 0.9
+
+@dataclass(frozen=True)
+class FrameSettings:
+    """Numbers of the fit of a frame. Lengths are shares of the model's size."""
+
+    reach: float = 0.12  # from the bounding box of the predicted model to data in reach, per interval
+    sigma_ratio: float = 2.2  # of first and last sigma: with a larger one, a third sigma lies between them
+    min_limb_data: float = 6.0  # soft count of a limb's inliers: with fewer, it stays at its prediction
+    min_lever: float = 0.05  # from its joints to the inliers that count: nearer ones tell no angles
+    deviation_quantile: float = 0.9  # of the model points' deviations: the rest may be limbs that were missed
+
+
+_SETTINGS = FrameSettings()
 
 
 class FrameFitter:
-    """What a tracker knows of its shape, and how it fits a frame.
+    """Fits a shape to frames, from predictions or from given poses.
 
     Args:
         shape: the articulated shape, in metres.
@@ -71,26 +57,30 @@ class FrameFitter:
         count = config.num_model_points * (2 if config.model_points == "seen" else 1)
         self.skin = skin or sample_skin(shape, count, sharpness=config.sharpness)
         self.limbs = find_limbs(shape)[0]
-        nowhere = torch.zeros_like(shape.rest[None, :3])
+        origin = torch.zeros_like(shape.rest[None, :3])
         self._template = centered_problem(
-            self.skin, nowhere[None], torch.ones_like(nowhere[:, :1], dtype=torch.bool), shape.rest[None], nowhere,
+            self.skin, origin[None], torch.ones_like(origin[:, :1], dtype=torch.bool), shape.rest[None], origin,
             prior_std=1.0, pose_atol=AlignConfig().pose_atol, debias=config.debias,
         )  # fmt: skip
         self.size = self._template.size
         self.inlier_distance = config.inlier_distance or INLIER_SHARE * self.size
-        self._reach = LimbReach(self.skin, self.limbs, _SAME_STRAY * self.size)
+        self.clusters = UnexplainedClusters(self.skin, self.limbs, self.size)
+
+    def predict(self, state: TrackState, elapsed: float) -> Tensor:
+        """Return the pose (num_dofs,) expected after some intervals."""
+        return state.pose if self.config.prediction == "none" else predict_pose(self.shape, state, elapsed)
 
     def view(
         self, state: TrackState, frame: Frame, pose: Tensor, skin: LinearBlendSkin | None = None
     ) -> FrameView | None:
-        """Return the frame as seen from a pose (num_dofs,), if any data are in reach; the prior holds joints there."""
+        """Return the frame as seen from a pose (num_dofs,), with a wide prior about it; None without data in reach."""
         origin = pose[:3].clone()
         local = shifted(pose, -origin)
         rows = stacked_rows(self.shape.part_transforms(local))
-        posed, reach = self.skin.place(rows), _REACH * self.size * spread(state, frame.gap)
+        posed, reach = self.skin.place(rows), _SETTINGS.reach * self.size * uncertainty_growth(state, frame.elapsed)
         data = frame.cloud - origin
-        near = ((data > posed.amin(0) - reach) & (data < posed.amax(0) + reach)).all(-1)
-        data = thinned(data[near], self.config.max_points, generator(state))
+        in_reach = ((data > posed.amin(0) - reach) & (data < posed.amax(0) + reach)).all(-1)
+        data = subsample(data[in_reach], self.config.max_points, frame_generator(state))
         if len(data) < MIN_DATA:
             return None
         shift = torch.nn.functional.pad(origin, (0, self.shape.num_dofs - 3))
@@ -98,135 +88,137 @@ class FrameFitter:
             self._template, skin=skin or self.skin, data=data[None],
             valid=torch.ones_like(data[None, :, 0], dtype=torch.bool),
             lower=self.shape.lower - shift, upper=self.shape.upper - shift,
-            prior=GaussianPosePrior(local[None], self._precision(_WIDE_PRIOR)),
+            prior=GaussianPosePrior(local[None], self._joint_precision(FILTER.max_joint_std)),
         )  # fmt: skip
-        return FrameView(problem, origin, rows, near)
+        return FrameView(problem=problem, origin=origin, rows=rows, in_reach=in_reach)
 
-    def view_ahead(self, state: TrackState, frame: Frame) -> FrameView | None:
-        """Return the frame as seen from the prediction, with the model points that were seen last."""
-        seen = LinearBlendSkin(self.shape, state.points, state.weights, state.reference_pose)
-        return self.view(state, frame, self.predicted(state, frame.gap), seen)
+    def look(self, state: TrackState, frame: Frame, pose: Tensor) -> FrameView | None:
+        """Return the frame as seen from the predicted pose (num_dofs,), with the model points that were seen last.
 
-    def predicted(self, state: TrackState, gap: float) -> Tensor:
-        """Return the pose (num_dofs,) expected after some intervals."""
-        return state.pose if self.config.prediction == "none" else predicted(self.shape, state, gap)
+        None without data in reach and before the first fit.
+        """
+        if not state.tracked:
+            return None
+        skin = LinearBlendSkin(self.shape, state.points, state.weights, state.reference_pose)
+        return self.view(state, frame, pose, skin)
 
-    def fit_at(self, state: TrackState, frame: Frame, pose: Tensor, how: str) -> FrameFit | None:
-        """Return the fit from a pose (num_dofs,), if any data are in reach."""
+    def fit_at(self, state: TrackState, frame: Frame, pose: Tensor, acquired: str) -> FrameFit | None:
+        """Return the fit of the surface from a pose (num_dofs,) of the world, None without data in reach."""
         view = self.view(state, frame, pose)
-        return None if view is None else self.fit(view, state, how, view.problem.prior.mean)
+        return None if view is None else self.fit(view, state, acquired, view.problem.prior.mean)
 
-    def descend(self, view: FrameView, state: TrackState, gap: float) -> FrameFit:
-        """Return the fit that descent from the prediction leads to: annealed EM, then the surface."""
-        problem = replace(view.problem, prior=self._tight_prior(view.problem.prior, state, gap))
+    def descend(self, view: FrameView, state: TrackState, elapsed: float) -> FrameFit:
+        """Return the fit by descent from a predicted view: annealed EM, or many starts for fast limbs; then surface."""
+        problem = replace(view.problem, prior=self._prediction_prior(view.problem.prior, state, elapsed))
         view = replace(view, problem=problem)
-        if not moves_fast(state, self.size):
-            schedule = self._schedule(state, gap)
-            moved = anneal(problem, problem.prior.mean, schedule, em_steps=self.config.em_steps, m_steps=1).pose
-            return self.fit(view, state, "tracked", moved)
-        drawn = generator(state)
-        starts = [problem.prior.mean, self._scattered(problem, drawn)]
-        if self.config.prediction == "velocity":
-            # Joints that fast turn back or speed up within a frame, each at another time.
-            others = predicted(self.shape, state, gap, problem.prior.mean.new_tensor(_PACES))
-            starts.append(view.local(others)[0])
-        free = problem.prior.precision.clone()
-        free[:6] = 0
-        open_ = replace(problem, prior=GaussianPosePrior(problem.prior.mean, free))
-        moved = fit_limbs(open_, torch.cat(starts), self.limbs, drawn)
-        return self.fit(view, state, "tracked", moved, sigmas=())
+        if moves_fast(state, self.size):
+            return self.fit(view, state, "tracked", self._fit_fast_limbs(view, state, elapsed), widths=())
+        schedule = self._sigma_schedule(state, elapsed)
+        registered = anneal(problem, problem.prior.mean, schedule, em_steps=self.config.em_steps, m_steps=1)
+        return self.fit(view, state, "tracked", registered.pose)
 
     def fit(
-        self,
-        view: FrameView,
-        state: TrackState,
-        how: str,
-        pose: Tensor,
-        sigmas: Sequence[float] = _SURFACE_SIGMAS,
-    ) -> FrameFit:
-        """Return the fit of the surface from a pose (1, num_dofs), and the evidence for it."""
+        self, view: FrameView, state: TrackState, acquired: str, pose: Tensor,
+        widths: Sequence[float] = (WIDTHS.surface,),
+    ) -> FrameFit:  # fmt: skip
+        """Return the fit of the surface from a pose (1, num_dofs) of the view, with the evidence for it.
+
+        Kernel widths before the last are ``widths``, shares of the model's size.
+        """
         problem = view.problem
-        fitted = refine_surface(problem, pose, steps=self.config.surface_steps, widths=sigmas)
-        distance, jacobian = fitted.distance, fitted.jacobian
-        noise = surface_noise(distance, problem.valid, self.size)
-        pose = fitted.pose
+        fitted = refine_surface(problem, pose, steps=self.config.surface_steps, widths=widths)
+        residual = surface_noise(fitted.distance, problem.valid, self.size)
         if state.tracked:
-            pose = self._modest(problem, fitted.pose, distance, jacobian, noise)
-        if pose is not fitted.pose:
-            distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
-        transforms = self.shape.part_transforms(pose[0])
-        strays = dense_strays(problem.data[0], distance[0].abs() < _FAR_NOISES * noise, self.size)
-        known = transform_points(transforms[0], state.strays)
-        novel = (nearest_distance(strays, known) > _SAME_STRAY * self.size) & self._reach(strays, transforms[0])
-        moved = (problem.skin.place(stacked_rows(transforms)) - problem.skin.place(view.rows)).norm(dim=-1)
-        wide = replace(problem, prior=GaussianPosePrior(problem.prior.mean, self._precision(_WIDE_PRIOR)))
-        return FrameFit(
-            view, pose, distance, jacobian, transforms, noise=noise[0], change=float(fitted.change),
-            cost=float(alignment_cost(wide, pose, distance)),
-            inliers=int((distance.abs() < self.inlier_distance).sum()), strays=strays, novel=int(novel.sum()),
-            held=share_at_limits(problem, pose), jump=float(moved.quantile(_MOST)), how=how,
-        )  # fmt: skip
+            fitted = self._with_unseen_limbs_predicted(problem, fitted, residual)
+        return self._with_evidence(view, state, acquired, fitted, residual[0])
 
     def covariance(self, fit: FrameFit) -> tuple[Tensor, Tensor]:
-        """Return the covariance of a fit, and which share (num_dofs,) of what is known then the data say."""
+        """Return the covariance (num_dofs, num_dofs) of a fit and its observed share (num_dofs,).
+
+        The observed share is that of what is known of a degree of freedom which comes from the data, from 0 to 1.
+        """
         prior = fit.view.problem.prior
         precision = prior.precision.clone()
         if not prior.holds_base:
             precision[:6] = precision.new_tensor([self.size] * 3 + [math.pi] * 3).square().reciprocal()
-        weights = welsch_weight((fit.distance[0] / (SURFACE_FIT.width_per_noise * fit.noise)).square())
-        covariance = pose_covariance(fit.jacobian[0], weights, fit.noise, precision)
+        weights = _inlier_weights(fit.distance[0], fit.residual)
+        covariance = pose_covariance(fit.jacobian[0], weights, fit.residual, precision)
         return covariance, (1 - covariance.diagonal() * precision).clamp(0, 1)
 
-    def strays_after(self, state: TrackState, fit: FrameFit) -> Tensor:
-        """Return the strays to be expected in the next frame, in the trunk's frame.
+    def _with_evidence(
+        self, view: FrameView, state: TrackState, acquired: str, fitted: SurfaceResult, residual: Tensor
+    ) -> FrameFit:
+        """Return a fitted surface, with its residual (), and the evidence for it."""
+        problem, pose, distance = view.problem, fitted.pose, fitted.distance
+        transforms = self.shape.part_transforms(pose[0])
+        unexplained = self.clusters.find(problem.data[0], distance[0], residual)
+        moved = (problem.skin.place(stacked_rows(transforms)) - problem.skin.place(view.rows)).norm(dim=-1)
+        wide_prior = GaussianPosePrior(problem.prior.mean, self._joint_precision(FILTER.max_joint_std))
+        return FrameFit(
+            view=view, pose=pose, distance=distance, jacobian=fitted.jacobian, transforms=transforms,
+            residual=residual, change=float(fitted.change),
+            cost=float(alignment_cost(replace(problem, prior=wide_prior), pose, distance)),
+            num_inliers=int((distance.abs() < self.inlier_distance).sum()),
+            unexplained=unexplained, num_new_unexplained=self.clusters.count_new(state, unexplained, transforms[0]),
+            limit_share=share_at_limits(problem, pose),
+            deviation=float(moved.quantile(_SETTINGS.deviation_quantile)), acquired=acquired,
+        )  # fmt: skip
 
-        Those of a doubtful fit may be what the fit missed, and are expected only after attempts to explain them.
-        """
-        if in_doubt(state) and fit.how != "found":
-            return state.strays
-        strays = transform_points(invert_rigid(fit.transforms[0]), fit.strays)
-        # Where there are some still, those of earlier frames show better how far they reach.
-        lasting = state.strays[nearest_distance(state.strays, strays) < _SAME_STRAY * self.size]
-        return torch.cat([strays, lasting])[:_MAX_STRAYS]
+    def _joint_precision(self, std: float) -> Tensor:
+        """Return the prior's precision (num_dofs,) for a standard deviation of the joints; zero for the base."""
+        return self._template.prior.precision / std**2
 
-    def _precision(self, joints: float) -> Tensor:
-        return self._template.prior.precision / joints**2
-
-    def _tight_prior(self, prior: GaussianPosePrior, state: TrackState, gap: float) -> GaussianPosePrior:
+    def _prediction_prior(self, prior: GaussianPosePrior, state: TrackState, elapsed: float) -> GaussianPosePrior:
         """Return the prior about the prediction, the base included: few data may not turn it away."""
-        shift, turn, bend = prior_std(state, gap, self.size, self.config.prior_std).tolist()
-        precision = self._precision(bend)
+        shift, turn, joints = prediction_std(state, elapsed, self.size, self.config.prior_std).tolist()
+        precision = self._joint_precision(joints)
         precision[:3], precision[3:6] = shift**-2, turn**-2
         return GaussianPosePrior(prior.mean, precision, holds_base=True)
 
-    def _schedule(self, state: TrackState, gap: float) -> SigmaSchedule:
-        low, high = _START_RANGE
-        start = self.size * min(max(_START_PER_ERROR * spread(state, gap) * state.error / self.size, low), high)
-        stop = STOP_SIGMA * self.size
-        return SigmaSchedule.geometric(start, stop, 2 if start < _SIGMA_RATIO * stop else 3)
+    def _sigma_schedule(self, state: TrackState, elapsed: float) -> SigmaSchedule:
+        error = uncertainty_growth(state, elapsed) * state.prediction_error
+        share = FILTER.std_per_error * error / self.size
+        start = self.size * min(max(share, WIDTHS.min_start), WIDTHS.max_start)
+        stop = WIDTHS.stop * self.size
+        return SigmaSchedule.geometric(start, stop, 2 if start < _SETTINGS.sigma_ratio * stop else 3)
 
-    def _scattered(self, problem: AlignProblem, drawn: torch.Generator) -> Tensor:
-        std = _SCATTER * self._template.prior.precision[6:].rsqrt()
-        return problem.clamp(scattered(problem.prior.mean, std, _NUM_SCATTERED, drawn))
+    def _fit_fast_limbs(self, view: FrameView, state: TrackState, elapsed: float) -> Tensor:
+        """Return a pose (1, num_dofs) with each limb from the best of many starts around the prediction."""
+        problem, prior = view.problem, view.problem.prior
+        generator = frame_generator(state)
+        std = FILTER.max_joint_std * self._template.prior.precision[6:].rsqrt()
+        scattered = scatter_joints(prior.mean, std, FAST_MOTION.num_scattered, generator)
+        starts = [prior.mean, problem.clamp(scattered)]
+        if self.config.prediction == "velocity":
+            paced = predict_pose(self.shape, state, elapsed, prior.mean.new_tensor(FAST_MOTION.paces))
+            starts.append(view.to_local(paced)[0])
+        precision = prior.precision.clone()
+        precision[:6] = 0
+        base_free = replace(problem, prior=GaussianPosePrior(prior.mean, precision))
+        return fit_limbs(base_free, torch.cat(starts), self.limbs, generator)
 
-    def _modest(self, problem: AlignProblem, pose: Tensor, distance: Tensor, jacobian: Tensor, noise: Tensor) -> Tensor:
-        """Return a pose (1, num_dofs) with limbs where they are expected that hardly any data show.
+    def _with_unseen_limbs_predicted(
+        self, problem: AlignProblem, fitted: SurfaceResult, residual: Tensor
+    ) -> SurfaceResult:
+        """Return the fit with limbs at their prediction that hardly any data show.
 
-        What pulls at such a limb are single outliers and the rims of its neighbors.
+        What attracts such a limb are single outliers and the edges of its neighbors.
         """
-        near = welsch_weight((distance[0] / (SURFACE_FIT.width_per_noise * noise)).square())
-        levers = [jacobian[0][:, limb.dofs].norm(dim=-1) > _LEVER * self.size for limb in self.limbs]
-        if not levers:
-            return pose
-        shown = (near * torch.stack(levers)).sum(-1).tolist()
-        hidden = [dof for limb, count in zip(self.limbs, shown, strict=True) if count < _MIN_SHOWN for dof in limb.dofs]
-        if not hidden:
-            return pose
-        modest = pose.clone()
-        modest[:, hidden] = problem.prior.mean[:, hidden]
-        return modest
+        if not self.limbs:
+            return fitted
+        levers = [fitted.jacobian[0][:, limb.dofs].norm(dim=-1) for limb in self.limbs]
+        shown = torch.stack(levers) > _SETTINGS.min_lever * self.size
+        counts = (_inlier_weights(fitted.distance[0], residual) * shown).sum(-1).tolist()
+        unseen = [limb for limb, count in zip(self.limbs, counts, strict=True) if count < _SETTINGS.min_limb_data]
+        dofs = [dof for limb in unseen for dof in limb.dofs]
+        if not dofs:
+            return fitted
+        pose = fitted.pose.clone()
+        pose[:, dofs] = problem.prior.mean[:, dofs]
+        distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
+        return replace(fitted, pose=pose, distance=distance, jacobian=jacobian)
 
 
-def generator(state: TrackState) -> torch.Generator:
-    """Return the randomness of a frame, the same whenever it is asked for."""
-    return torch.Generator().manual_seed(state.seed + state.frame)
+def _inlier_weights(distance: Tensor, residual: Tensor) -> Tensor:
+    """Return robust weights (M,) of data at distances (M,), from their standard deviation."""
+    return welsch_weight((distance / (SURFACE_FIT.width_per_noise * residual)).square())

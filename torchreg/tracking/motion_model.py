@@ -1,151 +1,116 @@
-"""What a tracker expects of the next frame: where the shape goes, and how far it may be from there."""
+"""Prediction of the next frame: a constant-velocity filter with a running estimate of how far it is off."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchreg.errors import InputError
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import difference
-from torchreg.tracking.config import Frame, FrameFit
+from torchreg.tracking.frame import Frame, FrameFit
 from torchreg.tracking.results import TrackState
 
-# Errors of the prediction before any is known: joints and turns in radians, points as a share of the size.
-NEW_TURN_ERROR, NEW_ERROR = 0.15, 0.032
-# Share of the largest errors of the prediction kept from frame to frame: a burst is remembered for half a second.
-_ERROR_MEMORY = 0.9
-# The prior's standard deviations are this many times the errors of the prediction, which covers 95 % of them...
-_STD_PER_ERROR = 2.0
-# ...from what smooth motion needs to what one frame allows: joints, radians; the base moves at least this share of it.
-_JOINT_STD, _LEAST_SHIFT = (0.08, 0.3), 0.02
-# Share of a surprise that the velocity takes over: half of it is noise, less of it where prediction fails often.
-_VELOCITY_GAIN, _FAST_GAIN = 0.5, 0.8
-# Left of a velocity that data did not confirm: joints stop on their own, a body goes on.
-_JOINT_DECAY, _BASE_DECAY = 0.7, 0.95
-# Data that say more than this share of what is known of a joint measure its surprise.
-_SURE_SHARE = 0.5
-# Frames ahead that a velocity is trusted, and that uncertainty grows.
-_MAX_AHEAD, _MAX_SPREAD = 3.0, 4.0
-# Where predictions are off by more than this share of the size, motion is fast.
-_FAST = 0.032
+
+@dataclass(frozen=True)
+class VelocityFilter:
+    """Numbers of the prediction. Lengths are shares of the model's size, angles radians."""
+
+    memory: float = 0.9  # share of running means and largest errors kept per frame: they span half a second
+    fast_error: float = 0.032  # prediction error from which on descent may fail; also that of an unknown motion
+    first_turn: float = 0.15  # innovation of base rotation and joints before any is known
+    std_per_error: float = 2.0  # widths of the prior and of the first kernel per error: two cover 95 %
+    min_shift_std: float = 0.02  # of the prior of the base's position: what smooth motion needs
+    min_turn_std: float = 0.08  # the same of the base's rotation and of joints
+    max_joint_std: float = 0.3  # of the prior of a joint: what one interval allows, and all that is known after a loss
+    gain: float = 0.5  # share of an innovation that the velocity takes over: about half of it is noise
+    fast_gain: float = 0.8  # the same of a fast shape: noise is the smaller part
+    joint_decay: float = 0.7  # share of its velocity that a joint keeps over an interval without data: joints stop
+    base_decay: float = 0.95  # the same of the base: a body goes on
+    min_observed: float = 0.5  # observed share from which on a degree of freedom counts in the innovation
+    max_ahead: float = 3.0  # intervals over which a velocity is trusted
+    max_growth: float = 4.0  # intervals over which the prediction gets less certain
 
 
-def timed(state: TrackState, time: float | None) -> tuple[TrackState, float]:
-    """Return the state at the time of the next frame, and how many intervals have passed.
+FILTER = VelocityFilter()
 
-    Raises:
-        InputError: if the time is not finite or not later than that of the frame before.
+
+def advance_clock(state: TrackState, time: float | None) -> tuple[TrackState, float]:
+    """Return the state at the time of the next frame, and the time elapsed since the frame before, in intervals.
+
+    Args:
+        state: after the frame before.
+        time: of the frame, later than the one before; one interval later if None.
     """
-    first = state.frame == 0
-    usual = state.interval or 1.0
-    if time is None:
-        passed = 0.0 if first else usual
-    else:
-        if not math.isfinite(time) or (not first and time <= state.time):
-            raise InputError(f"time must be finite and later than the frame before at {state.time:g}, got {time}")
-        passed = 0.0 if first else time - state.time
-    now = state.time + passed if time is None or not first else time
-    if first:
-        return replace(state, frame=1, time=now), 1.0
-    # The shortest time between frames is the interval; slightly shorter ones do not change the gaps.
+    if state.frame == 0:
+        return replace(state, frame=1, time=state.time if time is None else time), 1.0
+    passed = (state.interval or 1.0) if time is None else time - state.time
+    # The shortest time between frames is the interval; a slightly shorter one hardly changes the others' count.
     interval = passed if state.interval == 0 else min(state.interval, passed)
-    return replace(state, frame=state.frame + 1, time=now, interval=interval), passed / interval
+    return replace(state, frame=state.frame + 1, time=state.time + passed, interval=interval), passed / interval
 
 
 def moves_fast(state: TrackState, size: float) -> bool:
-    """Return whether predictions are often off by more than a descent makes good."""
-    return state.error > _FAST * size
+    """Return whether predictions are often too far off for a descent, for a shape of some size in metres."""
+    return state.prediction_error > FILTER.fast_error * size
 
 
-def spread(state: TrackState, gap: float) -> float:
-    """Return how much wider than usual the prediction may be off."""
-    return min(gap + state.lost, _MAX_SPREAD)
+def uncertainty_growth(state: TrackState, elapsed: float) -> float:
+    """Return the factor by which the prediction is less certain than after one interval."""
+    return min(elapsed + state.lost, FILTER.max_growth)
 
 
-def predicted(shape: ArticulatedShape, state: TrackState, gap: float, pace: Tensor | float = 1.0) -> Tensor:
-    """Return the pose (num_dofs,) expected after some intervals at the last velocity, or (P, num_dofs) at P paces."""
-    ahead = min(gap, _MAX_AHEAD) * (state.interval or 1.0)
+def predict_pose(shape: ArticulatedShape, state: TrackState, elapsed: float, pace: Tensor | float = 1.0) -> Tensor:
+    """Return the pose (num_dofs,) after some intervals at the last velocity, or (P, num_dofs) at P multiples of it."""
+    ahead = min(elapsed, FILTER.max_ahead) * (state.interval or 1.0)
     steps = torch.as_tensor(pace).to(state.pose).unsqueeze(-1) * (ahead * state.velocity)
     return shape.clamp(shape.retract(state.pose.expand_as(steps), steps))
 
 
-def prior_std(state: TrackState, gap: float, size: float, joints: float | None) -> Tensor:
-    """Return standard deviations (3,) about the prediction: of the base's place, metres, its turn, and the joints.
+def prediction_std(state: TrackState, elapsed: float, size: float, joint_std: float | None) -> Tensor:
+    """Return standard deviations (3,) about the prediction: base position, metres, base rotation and joints, radians.
 
-    Args:
-        state: with the surprises of the frames before.
-        gap: intervals since the last frame.
-        size: of the shape, metres.
-        joints: of the joints, where it is given; radians.
+    The size of the shape is in metres; ``joint_std`` replaces the estimate for the joints.
     """
-    shift, turn, bend = (_STD_PER_ERROR * spread(state, gap) * state.surprise).tolist()
-    low, high = _JOINT_STD
-    bend = joints or min(max(bend, low), high)
-    return state.surprise.new_tensor([max(shift, _LEAST_SHIFT * size), max(turn, low), bend])
+    growth = FILTER.std_per_error * uncertainty_growth(state, elapsed)
+    shift, turn, joints = (growth * state.innovation).tolist()
+    joints = joint_std or min(max(joints, FILTER.min_turn_std), FILTER.max_joint_std)
+    deviations = [max(shift, FILTER.min_shift_std * size), max(turn, FILTER.min_turn_std), joints]
+    return state.innovation.new_tensor(deviations)
 
 
-@dataclass(frozen=True)
-class Motion:
-    """How a shape moves, as fields of a `TrackState`.
-
-    Args:
-        velocity: (num_dofs,).
-        surprise: (3,).
-        error: metres.
-    """
-
-    velocity: Tensor
-    surprise: Tensor
-    error: float
-
-    @property
-    def fields(self) -> dict[str, Any]:
-        """The fields of a `TrackState`."""
-        return {"velocity": self.velocity, "surprise": self.surprise, "error": self.error}
+def restart_motion(state: TrackState, size: float) -> TrackState:
+    """Return the state with a shape at rest, of whose motion no more is known than before."""
+    shift, turn = FILTER.fast_error * size, FILTER.first_turn
+    innovation = torch.maximum(state.innovation.new_tensor([shift, turn, turn]), FILTER.memory * state.innovation)
+    error = max(shift, FILTER.memory * state.prediction_error)
+    return replace(state, velocity=torch.zeros_like(state.pose), innovation=innovation, prediction_error=error)
 
 
-def first_motion(pose: Tensor, size: float) -> Motion:
-    """Return the motion after a beginning, of which nothing says where it goes."""
-    surprise = pose.new_tensor([NEW_ERROR * size, NEW_TURN_ERROR, NEW_TURN_ERROR])
-    return Motion(torch.zeros_like(pose), surprise, NEW_ERROR * size)
+def update_motion(state: TrackState, frame: Frame, fit: FrameFit, observed: Tensor) -> TrackState:
+    """Return the state with the motion after a fit near its prediction, with observed shares (num_dofs,) of 0 to 1."""
+    innovation = difference(fit.view.problem.prior.mean[0], fit.pose[0])
+    gain = FILTER.fast_gain if moves_fast(state, fit.view.problem.size) else FILTER.gain
+    corrected = state.velocity + gain / (frame.elapsed * (state.interval or 1.0)) * innovation
+    decay = torch.full_like(observed, FILTER.joint_decay)
+    decay[:6] = FILTER.base_decay
+    groups = (slice(3), slice(3, 6), slice(6, None))
+    latest = torch.stack([_root_mean_square(innovation[group], observed[group]) for group in groups])
+    return replace(
+        state,
+        velocity=observed * corrected + (1 - observed) * decay * state.velocity,
+        innovation=torch.maximum(latest, FILTER.memory * state.innovation),
+        prediction_error=max(fit.deviation, FILTER.memory * state.prediction_error),
+    )
 
 
-def motion_after(state: TrackState, frame: Frame, fit: FrameFit, share: Tensor) -> Motion:
-    """Return the motion after a fit that was predicted.
-
-    Args:
-        state: before it.
-        frame: the frame.
-        fit: what its prediction led to.
-        share: (num_dofs,) of what is known of each degree of freedom that the data say.
-    """
-    surprise = difference(fit.view.problem.prior.mean[0], fit.pose[0])
-    gain = _FAST_GAIN if moves_fast(state, fit.view.problem.size) else _VELOCITY_GAIN
-    went = state.velocity + gain / (frame.gap * (state.interval or 1.0)) * surprise
-    decay = torch.full_like(share, _JOINT_DECAY)
-    decay[:6] = _BASE_DECAY
-    velocity = share * went + (1 - share) * decay * state.velocity
-    errors = [_deviation(surprise[part], share[part]) for part in (slice(3), slice(3, 6), slice(6, None))]
-    surprises = torch.maximum(torch.stack(errors), _ERROR_MEMORY * state.surprise)
-    return Motion(velocity, surprises, max(fit.jump, _ERROR_MEMORY * state.error))
-
-
-def merged(state: TrackState, motion: Motion) -> Motion:
-    """Return a motion that is no surer than the one before."""
-    surprise = torch.maximum(motion.surprise, _ERROR_MEMORY * state.surprise)
-    return replace(motion, surprise=surprise, error=max(motion.error, _ERROR_MEMORY * state.error))
-
-
-def slowed(state: TrackState, gap: float) -> Tensor:
+def decayed_velocity(state: TrackState, elapsed: float) -> Tensor:
     """Return the velocity (num_dofs,) of a shape that was not seen for some intervals."""
-    return state.velocity * _BASE_DECAY ** min(gap, _MAX_AHEAD)
+    return state.velocity * FILTER.base_decay ** min(elapsed, FILTER.max_ahead)
 
 
-def _deviation(surprise: Tensor, share: Tensor) -> Tensor:
-    sure = share > _SURE_SHARE
-    return (surprise * sure).norm() / sure.sum().clamp_min(1).sqrt()
+def _root_mean_square(innovation: Tensor, observed: Tensor) -> Tensor:
+    """Return the root mean square () of the innovation over the degrees of freedom that the data tell."""
+    counts = observed > FILTER.min_observed
+    return (innovation * counts).norm() / counts.sum().clamp_min(1).sqrt()

@@ -1,44 +1,49 @@
-"""What a tracker tries when a fit is in doubt or lost, from what is cheap to what is not, and when it tries again."""
+"""What a tracker tries when a fit is doubtful or lost, from cheap to expensive, and when it tries again."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.pose_search import PoseSearch, fit_candidates, score_candidates
+from torchreg.alignment.surface_fit import SURFACE_FIT
 from torchreg.geometry.rotation import compose_rotation_vectors
+from torchreg.shapes.pose_algebra import difference
 from torchreg.shapes.skin import LinearBlendSkin
-from torchreg.tracking.config import Frame, FrameFit, FrameView, thinned
-from torchreg.tracking.evidence import is_doubtful, is_lost, is_vague
-from torchreg.tracking.frame_fit import STOP_SIGMA, FrameFitter, generator
-from torchreg.tracking.motion_model import difference, spread
+from torchreg.tracking.evidence import is_doubtful, is_supported, lies_beside_data
+from torchreg.tracking.frame import WIDTHS, Frame, FrameFit, FrameView, frame_generator, subsample
+from torchreg.tracking.frame_fit import FrameFitter
+from torchreg.tracking.motion_model import uncertainty_growth
 from torchreg.tracking.results import TrackState
 
-# Data that another pose must explain beyond those that the prediction led to.
-MIN_GAIN = 4.0
-# Attempts in a row that left doubts, before starts, a search around, and a search everywhere are tried.
-_STARTS_FAILS, _SEARCH_FAILS, _FIND_FAILS = 1, 3, 5
-# What did not help is tried again at once so many times, then after longer and longer rests, frames.
-_FREE_FAILS, _LONGEST_REST = 1, 32
-# Frames after a loss before searching around the last pose, and everywhere.
-_SEARCH_AFTER, _FIND_AFTER = 2, 3
-# A frame with this share of the usual inliers less data hides the shape.
-_HIDDEN_SHARE = 0.6
-# Kernel widths of surface fits from poses known, and steps at each; how many of the starts are searched thoroughly.
-_WIDTHS, _STEPS, _NUM_SEARCHED = (0.06, 0.04, 0.03), 2, 2
-# More data tell a search everywhere no more.
-_MAX_FOUND_DATA = 3000
-# Found poses compete by how near they are if they leave at most this share of the data more unexplained than the best.
-_AS_GOOD = 0.03
-# How far a trunk gets from where it is expected in one frame, and the lever at which turns count; shares of the size.
-_LONGEST_LEAP, _TURN_LEVER = 0.4, 0.25
-# Searches everywhere in one frame, beyond the first, with other draws and twice the candidates.
-_MORE_SEARCHES = 3
+
+@dataclass(frozen=True)
+class RecoveryPlan:
+    """Numbers of the recovery. Lengths are shares of the model's size."""
+
+    free_failures: int = 1  # failed searches after which the next, with the limbs placed anew, is due at once
+    search_failed: int = 3  # failed searches after which the limbs are placed thoroughly
+    search_lost: int = 2  # the same in frames since the last fit, after a loss
+    find_failed: int = 5  # failed searches after which the shape is searched everywhere
+    find_lost: int = 3  # the same in frames since the last fit, after a loss
+    min_gain: float = 4.0  # soft inliers by which another pose must exceed the predicted one: less is chance
+    max_doublings: int = 5  # of the cool-down after more failures, to 32 frames
+    occluded: float = 0.6  # of the mean inliers missing from the mean number of data: the shape is probably occluded
+    num_steps: int = 2  # at each width of the surface fits from known poses
+    num_searched: int = 2  # known poses whose limbs are placed thoroughly
+    max_data: int = 3000  # of a search everywhere: more tell no more
+    equivalent: float = 0.03  # share of the data that a pose explains less than the best and still counts as good
+    max_motion: float = 0.4  # of the base from its prediction per interval: on little data much seems to fit
+    max_repetitions: int = 3  # of the first search everywhere, with other draws: nothing is known yet
+    more_candidates: int = 2  # of a repetition, in those of the first search
+
+
+_PLAN = RecoveryPlan()
 
 
 class Recovery:
@@ -54,109 +59,143 @@ class Recovery:
     def __call__(
         self, state: TrackState, frame: Frame, view: FrameView | None, fit: FrameFit | None
     ) -> tuple[FrameFit | None, TrackState]:
-        """Return the best fit of what is tried, and what the attempts leave of the state.
+        """Return the best fit of all attempts, None if the data do not support it, and the state after the attempts.
 
         Args:
             state: before the frame.
             frame: the frame.
-            view: from the prediction, if any data are in reach.
-            fit: what descent in the view led to.
+            view: from the prediction, None without data in reach.
+            fit: by descent in the view.
         """
-        lost = fit is None or is_lost(state, fit)
-        if self.level == "none" or not (lost or state.rest == 0):
-            return fit, waited(state)
-        fit = self._best(state, frame, view, fit, lost)
-        tried = state.rest == 0 and (not lost or _may_show(state, frame))
-        good = fit is not None and not is_lost(state, fit) and not is_doubtful(state, fit)
-        return fit, rested(state, good) if good or tried else waited(state)
+        if state.tracked:
+            fit, state = self._around(state, frame, view, fit)
+        else:
+            fit, state = self._first(state, frame)
+        if is_supported(fit, state):
+            return fit, replace(state, pending_checks=1) if fit.acquired == "found" else state
+        return None, state
+
+    def cross_check(self, state: TrackState, frame: Frame, fit: FrameFit | None) -> tuple[FrameFit | None, TrackState]:
+        """Return the better of a fit and another search everywhere, and the state after the check.
+
+        A search everywhere may find a wrong pose, which the search in another frame seldom repeats. Without pending
+        checks the fit is returned as it is.
+        """
+        if state.pending_checks == 0 or (fit is not None and fit.acquired == "found"):
+            return fit, state
+        rival = self.everywhere(state, frame)
+        if rival is not None and (fit is None or rival.soft_inliers >= fit.soft_inliers + _PLAN.min_gain):
+            fit = rival
+        return fit, replace(state, pending_checks=0)
 
     def everywhere(self, state: TrackState, frame: Frame) -> FrameFit | None:
-        """Return the fit that a search everywhere leads to; among poses as good, the one nearest to the last.
+        """Return the fit of a search everywhere; of equivalent poses after a loss, that of the one nearest to the last.
 
-        A fit whose data lie off the surface is no pose of the shape, and is sought again with more effort.
+        A fit whose data lie beside the surface is no pose of the shape: the first search is repeated with more effort.
         """
-        best = self._found(state, frame, FindPoseConfig(seed=state.seed))
-        for again in range(1, _MORE_SEARCHES + 1):
-            if state.lost or (best is not None and not is_vague(state, best)):
+        best = self._find(state, frame, FindPoseConfig(seed=state.seed))
+        for number in range(1, _PLAN.max_repetitions + 1):
+            if state.lost or (best is not None and not lies_beside_data(best, state)):
                 break
-            config = FindPoseConfig(seed=state.seed + again, num_candidates=128, num_placed=32)
-            other = self._found(state, frame, config)
-            best = max((fit for fit in (best, other) if fit is not None), key=lambda fit: fit.explained, default=None)
+            config = FindPoseConfig(
+                seed=state.seed + number,
+                num_candidates=_PLAN.more_candidates * FindPoseConfig.num_candidates,
+                num_placed=_PLAN.more_candidates * FindPoseConfig.num_placed,
+            )
+            fits = [fit for fit in (best, self._find(state, frame, config)) if fit is not None]
+            best = max(fits, key=lambda fit: fit.soft_inliers, default=None)
         return best
 
-    def _found(self, state: TrackState, frame: Frame, config: FindPoseConfig) -> FrameFit | None:
+    def _find(self, state: TrackState, frame: Frame, config: FindPoseConfig) -> FrameFit | None:
         shape = self.fitter.shape
-        data = thinned(frame.data, _MAX_FOUND_DATA, generator(state))
+        data = subsample(frame.data, _PLAN.max_data, frame_generator(state))
         starts = find_pose(shape, data, config=config)
         poses = starts.poses
         if state.lost:
-            poses = poses[starts.costs <= starts.costs.min() + _AS_GOOD * len(data)]
-            away = (shape.keypoints(poses) - shape.keypoints(state.pose)).norm(dim=-1).mean(-1)
-            poses = poses[away.argsort()]
+            poses = poses[starts.costs <= starts.costs.min() + _PLAN.equivalent * len(data)]
+            distances = (shape.keypoints(poses) - shape.keypoints(state.pose)).norm(dim=-1).mean(-1)
+            poses = poses[distances.argsort()]
         return self.fitter.fit_at(state, frame, poses[0], "found")
 
-    def _best(
-        self, state: TrackState, frame: Frame, view: FrameView | None, fit: FrameFit | None, was_lost: bool
-    ) -> FrameFit | None:
-        best = fit
+    def _first(self, state: TrackState, frame: Frame) -> tuple[FrameFit | None, TrackState]:
+        """Return the fit and the state where the shape was never fitted: only a search everywhere helps."""
+        if state.cool_down > 0 or self.level != "full":
+            return None, after_pause(state)
+        fit = self.everywhere(state, frame)
+        return fit, after_search(state, is_supported(fit, state))
+
+    def _around(
+        self, state: TrackState, frame: Frame, view: FrameView | None, fit: FrameFit | None
+    ) -> tuple[FrameFit | None, TrackState]:
+        """Return the fit and the state after attempts around known poses and, in their turn, everywhere."""
+        lost = not is_supported(fit, state)
+        if self.level == "none" or not (lost or state.cool_down == 0):
+            return fit, after_pause(state)
+        best = self._best(state, frame, view, fit)
+        good = is_supported(best, state) and not is_doubtful(best, state)
+        searched = state.cool_down == 0 and (not lost or _may_show(state, frame))
+        return best, after_search(state, good) if good or searched else after_pause(state)
+
+    def _best(self, state: TrackState, frame: Frame, view: FrameView | None, fit: FrameFit | None) -> FrameFit | None:
+        """Return the first attempt that is neither lost nor doubtful, or else the best of them and the fit."""
+        best, was_lost = fit, not is_supported(fit, state)
         for attempt in self._attempts(state, frame, view, fit):
-            if attempt is None or self._leaps(state, frame, attempt):
+            if attempt is None or self._moves_too_far(state, frame, attempt):
                 continue
-            # What is hidden may be anywhere; only what explains more data is worth a jump.
-            if (
-                best is None
-                or attempt.explained > best.explained + MIN_GAIN
-                or (is_lost(state, best) and not is_lost(state, attempt))
-            ):
+            if best is None or self._is_better(state, attempt, best):
                 best = attempt
             # After a loss, doubts are left to the next frames.
-            if not is_lost(state, best) and (was_lost or not is_doubtful(state, best)):
+            if is_supported(best, state) and (was_lost or not is_doubtful(best, state)):
                 break
         return best
 
-    def _leaps(self, state: TrackState, frame: Frame, fit: FrameFit) -> bool:
-        """Return whether a fit takes the trunk farther than it gets: where little is seen, much seems to fit."""
-        if fit.how == "found":
+    def _is_better(self, state: TrackState, attempt: FrameFit, best: FrameFit) -> bool:
+        """Return whether an attempt explains more data: a limb without data may be anywhere, which is no reason."""
+        if attempt.soft_inliers > best.soft_inliers + _PLAN.min_gain:
+            return True
+        return is_supported(attempt, state) and not is_supported(best, state)
+
+    def _moves_too_far(self, state: TrackState, frame: Frame, fit: FrameFit) -> bool:
+        """Return whether a fit near the prediction moves the base farther than it gets in the time elapsed."""
+        if fit.acquired == "found":
             return False
         base = difference(fit.view.problem.prior.mean[0], fit.pose[0])[:6]
-        gone = base[:3].norm() + _TURN_LEVER * self.fitter.size * base[3:].norm()
-        return bool(gone > _LONGEST_LEAP * self.fitter.size * spread(state, frame.gap))
+        motion = base[:3].norm() + SURFACE_FIT.lever * self.fitter.size * base[3:].norm()
+        return bool(motion > _PLAN.max_motion * self.fitter.size * uncertainty_growth(state, frame.elapsed))
 
     def _attempts(
         self, state: TrackState, frame: Frame, view: FrameView | None, fit: FrameFit | None
     ) -> Iterator[FrameFit | None]:
-        """Yield other fits of a frame, each costing more than the one before."""
-        lost = fit is None or is_lost(state, fit)
-        dear = self.level == "full" and state.rest == 0 and (not lost or _may_show(state, frame))
+        """Yield other fits of a frame, each more expensive than the one before."""
+        lost = not is_supported(fit, state)
+        thorough = self.level == "full" and state.cool_down == 0 and (not lost or _may_show(state, frame))
         if view is not None:
-            known = torch.cat([view.problem.prior.mean[None], view.local(state.pose[None])], dim=1)
+            known = torch.cat([view.problem.prior.mean[None], view.to_local(state.pose[None])], dim=1)
             known = known if fit is None else torch.cat([fit.pose[None], known], dim=1)
-            wide = fit_candidates(view.problem, known, _WIDTHS, _STEPS)
-            best = score_candidates(view.problem, wide, STOP_SIGMA)[0].argmin()
-            yield self.fitter.fit(view, state, "surface", wide[:, best])
-            if lost or state.fails >= _STARTS_FAILS:
-                thorough = dear and (state.lost >= _SEARCH_AFTER if lost else state.fails == _SEARCH_FAILS)
-                yield from self._searched(state, view, known, lost, thorough)
-        overdue = state.lost >= _FIND_AFTER if lost else state.fails == _FIND_FAILS
-        if dear and overdue:
+            fitted = fit_candidates(view.problem, known, WIDTHS.coarse, _PLAN.num_steps)
+            best = score_candidates(view.problem, fitted, WIDTHS.stop)[0].argmin()
+            yield self.fitter.fit(view, state, "surface", fitted[:, best])
+            if lost or state.failed_searches >= _PLAN.free_failures:
+                yield from self._limb_searches(state, view, known, lost, thorough)
+        if thorough and _is_due(state, lost, _PLAN.find_lost, _PLAN.find_failed):
             yield self.everywhere(state, frame)
 
-    def _searched(
+    def _limb_searches(
         self, state: TrackState, view: FrameView, known: Tensor, lost: bool, thorough: bool
     ) -> Iterator[FrameFit]:
-        """Yield fits after placing the limbs anew, from poses known and, after a loss, from earlier and turned ones."""
+        """Yield fits with the limbs placed anew from known poses; after a loss, from keyframes and flipped ones too."""
         if lost:
-            turned = flipped(self.fitter.skin, state.pose)
-            known = torch.cat([known, view.local(state.previous), view.local(turned)], dim=1)
-        search = PoseSearch(view.problem, generator(state))
-        narrowed = search.prune(known, _NUM_SEARCHED)
-        yield self.fitter.fit(view, state, "starts", narrowed[:, 0])
-        if thorough:
-            yield self.fitter.fit(view, state, "search", search.refine(narrowed, 1)[0][:, 0])
+            flips = flipped_poses(self.fitter.skin, state.pose)
+            known = torch.cat([known, view.to_local(state.keyframes), view.to_local(flips)], dim=1)
+        search = PoseSearch(view.problem, frame_generator(state))
+        candidates = search.prune(known, _PLAN.num_searched)
+        yield self.fitter.fit(view, state, "starts", candidates[:, 0])
+        if thorough and _is_due(state, lost, _PLAN.search_lost, _PLAN.search_failed):
+            yield self.fitter.fit(view, state, "search", search.refine(candidates, 1)[0][:, 0])
 
 
-def flipped(skin: LinearBlendSkin, pose: Tensor) -> Tensor:
-    """Return the pose (num_dofs,) turned by half around each principal axis of its points, (3, num_dofs)."""
+def flipped_poses(skin: LinearBlendSkin, pose: Tensor) -> Tensor:
+    """Return a pose (num_dofs,) after half a turn about each principal axis of its points, (3, num_dofs)."""
     points = skin(pose)
     center = points.mean(0)
     axes = torch.linalg.eigh((points - center).mT @ (points - center)).eigenvectors.mT
@@ -166,22 +205,32 @@ def flipped(skin: LinearBlendSkin, pose: Tensor) -> Tensor:
     return torch.cat([moved, rotations, pose[6:].expand(3, -1)], dim=-1)
 
 
-def rested(state: TrackState, good: bool) -> TrackState:
-    """Return the state after an attempt: what helped may be tried at once, what did not, later and later."""
-    if good:
-        return replace(state, rest=0, fails=0)
-    return replace(state, rest=_rest_after(state.fails + 1), fails=state.fails + 1)
+def after_search(state: TrackState, successful: bool) -> TrackState:
+    """Return the state after a search: the next is due at once after a success, ever later after failures."""
+    failed = 0 if successful else state.failed_searches + 1
+    return replace(state, cool_down=_cool_down(failed), failed_searches=failed)
 
 
-def waited(state: TrackState) -> TrackState:
-    """Return the state after a frame without an attempt."""
-    return replace(state, rest=max(0, state.rest - 1))
+def after_pause(state: TrackState) -> TrackState:
+    """Return the state after a frame without a search."""
+    return replace(state, cool_down=max(0, state.cool_down - 1))
+
+
+def _is_due(state: TrackState, lost: bool, num_lost: int, num_failed: int) -> bool:
+    """Return whether it is an attempt's turn: from some lost frames on, or for a doubtful fit after some failures."""
+    return state.lost >= num_lost if lost else state.failed_searches == num_failed
 
 
 def _may_show(state: TrackState, frame: Frame) -> bool:
-    """Return whether enough data came for the shape to be among them, or it is time to look in any case."""
-    return len(frame.data) > state.total - _HIDDEN_SHARE * state.inliers or _rest_after(state.fails) >= _LONGEST_REST
+    """Return whether a frame has enough data for the shape to be among them, or a search is due in any case."""
+    num_hidden = _PLAN.occluded * state.num_inliers
+    return len(frame.data) > state.num_data - num_hidden or _doublings(state.failed_searches) == _PLAN.max_doublings
 
 
-def _rest_after(fails: int) -> int:
-    return 0 if fails <= _FREE_FAILS else min(2 ** min(fails - _FREE_FAILS, 16), _LONGEST_REST)
+def _cool_down(failed: int) -> int:
+    """Return the frames before the next search, after failed ones."""
+    return 2 ** _doublings(failed) if _doublings(failed) else 0
+
+
+def _doublings(failed: int) -> int:
+    return min(max(failed - _PLAN.free_failures, 0), _PLAN.max_doublings)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
 from torchreg.alignment.results import AlignResult
-from torchreg.result import Result, Status
+from torchreg.result import Result, Status, formerly
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,30 +70,31 @@ class TrackResult(Result):
 
 @dataclass(frozen=True)
 class TrackState(Result):
-    """All that the next frame of a tracker depends on. Running figures are means over the frames before.
+    """All that the next frame of a tracker depends on. Means and largest values are running ones over half a second.
 
     Args:
         frame: number of frames seen.
         time: of the last one.
-        interval: usual time between frames; zero before the second.
-        pose: (num_dofs,) last or held, NaN before the shape was first found.
+        interval: shortest time between two frames so far; zero before the second.
+        pose: (num_dofs,) of the last frame, fitted or predicted; NaN before the shape was first found.
         velocity: (num_dofs,) tangent, per unit of time.
         points: (N, 3) model points for the next frame, metres.
-        weights: (N, P) their binding to the parts.
-        reference_pose: (num_dofs,) the pose they are given in.
-        previous: (K, num_dofs) some earlier poses.
-        strays: (S, 3) data off the surface as dense as those on it, in the frame of the first part, metres.
-        error: running largest error of the prediction at the model points, metres.
-        surprise: (3,) the same of the base's place, metres, its turn and the joints, radians.
-        total: running number of data.
-        inliers: running number of inliers; zero before the first fit.
-        ratio: running share of inliers in the data in reach.
-        residual: running residual, metres.
-        held: running share of the joints at a limit.
+        weights: (N, P) their skinning weights.
+        reference_pose: (num_dofs,) the pose that the points are given in.
+        keyframes: (K, num_dofs) poses of the last few of every tenth frame, from which a lost shape is searched.
+        unexplained: (S, 3) clusters of data off the surface, in the frame of the first part, metres.
+        prediction_error: largest distance of most model points from their prediction, metres.
+        innovation: (3,) largest deviations of the pose from its prediction: base position, metres, base rotation and
+            joints, radians.
+        num_data: mean number of data.
+        num_inliers: mean number of inliers; zero before the first fit.
+        ratio_in_reach: mean inlier ratio of the data in reach of the shape.
+        residual: mean residual, see `FrameResult`, metres.
+        limit_share: mean share of the joints at a limit.
         lost: frames since the last fit.
-        rest: frames before a search is tried again.
-        fails: searches in a row that left doubts.
-        unsure: how often a pose that was found everywhere may still be checked.
+        cool_down: frames before the next search.
+        failed_searches: searches in a row after which the fit was still doubtful.
+        pending_checks: how often a pose found by a search everywhere is still to be compared with another search.
         seed: of all that is drawn.
     """
 
@@ -105,19 +106,19 @@ class TrackState(Result):
     points: Tensor
     weights: Tensor
     reference_pose: Tensor
-    previous: Tensor
-    strays: Tensor
-    error: float
-    surprise: Tensor
-    total: float
-    inliers: float
-    ratio: float
+    keyframes: Tensor = field(metadata=formerly("previous"))
+    unexplained: Tensor = field(metadata=formerly("strays"))
+    prediction_error: float = field(metadata=formerly("error"))
+    innovation: Tensor = field(metadata=formerly("surprise"))
+    num_data: float = field(metadata=formerly("total"))
+    num_inliers: float = field(metadata=formerly("inliers"))
+    ratio_in_reach: float = field(metadata=formerly("ratio"))
     residual: float
-    held: float
+    limit_share: float = field(metadata=formerly("held"))
     lost: int
-    rest: int
-    fails: int
-    unsure: int
+    cool_down: int = field(metadata=formerly("rest"))
+    failed_searches: int = field(metadata=formerly("fails"))
+    pending_checks: int = field(metadata=formerly("unsure"))
     seed: int
 
     @property
@@ -128,7 +129,7 @@ class TrackState(Result):
     @property
     def tracked(self) -> bool:
         """Whether a frame was ever fitted."""
-        return self.inliers > 0
+        return self.num_inliers > 0
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,11 @@
-"""Following an articulated shape through a sequence of clouds: predict, align, notice a loss, find it again."""
+"""Follows an articulated shape through a sequence of clouds: predicts, fits, notices a loss and recovers from it."""
 
 from __future__ import annotations
 
 import math
 import time as clock
-import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -14,44 +13,49 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg._threads import one_thread
 from torchreg.alignment.align import AlignConfig, align
-from torchreg.alignment.annealed_em import outlier_level
-from torchreg.errors import InputError, InputTypeError, UnitsWarning
+from torchreg.alignment.inputs import check_skin, warn_about_units
+from torchreg.errors import InputError, InputTypeError
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
-from torchreg.solvers.e_step import expectation
-from torchreg.tracking.config import Frame, FrameFit, TrackConfig, thinned
-from torchreg.tracking.evidence import is_doubtful, is_far, is_lost, usual_after
-from torchreg.tracking.frame_fit import MIN_DATA, STOP_SIGMA, FrameFitter, generator
-from torchreg.tracking.model_points import points_after
-from torchreg.tracking.motion_model import first_motion, merged, motion_after, slowed, timed
-from torchreg.tracking.recovery import MIN_GAIN, Recovery, rested, waited
+from torchreg.tracking.config import TrackConfig
+from torchreg.tracking.evidence import deviates_far, is_doubtful, is_supported, is_unreliable, update_means
+from torchreg.tracking.frame import MIN_DATA, Frame, FrameFit, FrameView, frame_generator, subsample
+from torchreg.tracking.frame_fit import FrameFitter
+from torchreg.tracking.frame_result import fitted_result, predicted_result, track_result
+from torchreg.tracking.model_points import next_model_points
+from torchreg.tracking.motion_model import advance_clock, decayed_velocity, restart_motion, update_motion
+from torchreg.tracking.recovery import Recovery, after_search
 from torchreg.tracking.results import FrameResult, TrackResult, TrackState
 
 OnFrame = Callable[[Tensor, FrameResult], None]
 
-# Data and model that differ more than this in size are in different units.
-_UNITS_RATIO = 30.0
-# Frames in which a pose that was found everywhere is checked against another search.
-_CHECKS = 1
-# After so many intervals without a frame, a limb may be anywhere, and other starts than the prediction are tried too.
-_LONG_GAP = 2.0
-# Earlier poses that a lost shape is looked for in, a second and a half of them.
-_NUM_PREVIOUS, _PREVIOUS_EVERY = 3, 10
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """Numbers of the tracker."""
+
+    long_gap: float = 2.0  # intervals without a frame after which a limb may be anywhere
+    keyframe_interval: int = 10  # frames
+    num_keyframes: int = 3  # from which a lost shape is searched: a second and a half of them
+
+
+_SETTINGS = TrackerSettings()
 
 
 class Tracker:
     """Follows an articulated shape from cloud to cloud.
 
-    Every frame is predicted from those before, registered by annealed EM with the points seen last and fitted to the
-    surface. When the evidence drops below what it was, poses are tried around the last ones, then further off, then
-    everywhere; what could not be found is held, reported as lost, and sought again every few frames.
+    Every frame is predicted from those before, registered by annealed EM with the model points seen last and fitted to
+    the surface. When the evidence is worse than in the frames before, other poses are tried: around the last ones, then
+    farther off, then everywhere. A shape that is not found keeps its predicted pose, is reported as lost, and is
+    searched again every few frames.
 
     Args:
         shape: the articulated shape, in metres.
         initial_pose: (num_dofs,) near the first frame; without one, `find_pose` looks for it.
         config: see `TrackConfig`.
-        model_points: a skin of the shape, whose points stand for its surface; sampled by default (see `sample_skin`).
+        model_points: a skin of the shape, whose points represent its surface; sampled by default (see `sample_skin`).
 
     Raises:
         InputError: if the pose does not fit the shape or is not finite, or the skin is of another shape.
@@ -68,12 +72,12 @@ class Tracker:
         model_points: LinearBlendSkin | None = None,
     ) -> None:
         self.shape, self.config = shape, config or TrackConfig()
-        if model_points is not None and model_points.shape is not shape:
-            raise InputError("model_points is a skin of another shape; build it from the shape that is tracked")
+        if model_points is not None:
+            check_skin(shape, model_points)
         with torch.no_grad():
             self._fitter = FrameFitter(shape, self.config, model_points)
             self._recover = Recovery(self._fitter)
-            self._state = self._begin(self._initial(initial_pose))
+            self._state = self._initial_state(self._checked_pose(initial_pose))
 
     @property
     def state(self) -> TrackState:
@@ -98,15 +102,15 @@ class Tracker:
         self._state = state
 
     def step(self, points: Tensor, time: float | None = None) -> FrameResult:
-        """Return where the shape is in the next frame.
+        """Return the pose of the shape in the next frame, and what is known of it.
 
         Args:
             points: (M, 3), metres; M may be zero.
             time: of the frame, in any unit, seconds say; by default one interval after the frame before. Where frames
-                were dropped, it says how far the shape may have gone.
+                were dropped, it tells how far the shape may have moved.
 
         Returns:
-            a `FrameResult`. Its status tells whether the pose rests on data: NO_DATA, LOST and OTHER_UNITS do not.
+            The frame's result. Its pose rests on data unless its status is NO_DATA, LOST or OTHER_UNITS.
 
         Raises:
             InputError: if the points are not (M, 3), or not finite under ``nan_policy="raise"``, or the time is not
@@ -117,36 +121,39 @@ class Tracker:
 
         Differentiable: no.
         """
-        cloud = self._checked(points)
-        state, gap = timed(self._state, time)
+        cloud = self._checked_points(points)
+        self._check_time(time)
+        state, elapsed = advance_clock(self._state, time)
         # A tenth faster than without gradients alone, as most of the time goes to small operations.
         with torch.inference_mode(), one_thread(), self.shape.held_sizes():
-            frame = Frame(cloud, torch.isfinite(cloud).all(-1), gap)
-            unfit = self._unfit(frame.data)
-            if unfit is not None:
-                result, state = self._hold(state, frame, unfit)
+            frame = Frame(cloud=cloud, finite=torch.isfinite(cloud).all(-1), elapsed=elapsed)
+            rejection = self._rejection(frame.data)
+            if rejection is not None:
+                result, state = self._hold(state, frame, rejection)
             else:
-                fit, state = self._follow(state, frame) if state.tracked else self._first(state, frame)
-                result, state = (
-                    self._hold(state, frame, Status.LOST) if fit is None else self._accept(state, frame, fit)
-                )
+                pose = self._fitter.predict(state, elapsed)
+                view = self._fitter.look(state, frame, pose)
+                fit = self._fit(state, frame, view)
+                if self._is_trusted(state, frame, fit):
+                    state = after_search(state, successful=True)
+                else:
+                    fit, state = self._recover(state, frame, view, fit)
+                fit, state = self._recover.cross_check(state, frame, fit)
+                result, state = self._accept(state, frame, fit)
             self._state = normal_copy(state)
             return normal_copy(result)
 
     def run(
         self, frames: Iterable[Tensor], on_frame: OnFrame | None = None, *, times: Sequence[float] | None = None
     ) -> TrackResult:
-        """Return the poses of all frames given; a tracker that ran some before goes on where it was.
+        """Return the poses of all given frames, which follow those that the tracker has seen before.
 
         An interruption by the keyboard after the first frame ends the sequence: the result then holds the frames done.
 
         Args:
-            frames: T clouds (M_t, 3), metres, such as `load_frames` gives; each is read when its turn comes.
-            on_frame: is told each cloud and what `step` made of it.
+            frames: T clouds (M_t, 3), metres, such as `load_frames` gives; each is read just before its step.
+            on_frame: called with each cloud and the result of its `step`.
             times: (T,) of the frames; see `step`.
-
-        Returns:
-            a `TrackResult`.
 
         Raises:
             InputError: if there is no frame, times are missing, or a frame cannot be used; see `step`.
@@ -168,9 +175,10 @@ class Tracker:
                 raise
         if not results:
             raise InputError("frames must hold at least one cloud, got none")
-        return _collected(results, seconds)
+        return track_result(results, seconds)
 
-    def _initial(self, pose: Tensor | None) -> Tensor:
+    def _checked_pose(self, pose: Tensor | None) -> Tensor:
+        """Return the initial pose (num_dofs,) within the limits, NaN if it is to be found."""
         if pose is None:
             return torch.full_like(self.shape.rest, torch.nan)
         pose = self.shape.check_pose(pose, "initial_pose").detach()
@@ -178,152 +186,86 @@ class Tracker:
         check_finite(pose, "initial_pose")
         return self.shape.clamp(pose)
 
-    def _begin(self, pose: Tensor) -> TrackState:
-        skin = self._fitter.skin
-        points = skin.points
-        return TrackState(
-            frame=0, time=0.0, interval=0.0, pose=pose, velocity=torch.zeros_like(pose), points=points,
-            weights=skin.weights, reference_pose=skin.reference_pose, previous=pose[None][:0], strays=points[:0],
-            error=0.0, surprise=points.new_zeros(3), total=0.0, inliers=0.0, ratio=0.0, residual=0.0, held=0.0,
-            lost=0, rest=0, fails=0, unsure=0, seed=self.config.seed,
-        )  # fmt: skip
-
-    def _checked(self, points: Tensor) -> Tensor:
+    def _checked_points(self, points: Tensor) -> Tensor:
         cloud = as_float_tensor(points, "points", like=self.shape.rest)
         check_shape(cloud, "points", ("M", 3))
         if self.config.nan_policy == "raise":
             check_finite(cloud, "points", "drop them or set nan_policy='omit'")
         return cloud
 
-    def _unfit(self, data: Tensor) -> Status | None:
-        """Return why data cannot be aligned with at all, if so."""
+    def _check_time(self, time: float | None) -> None:
+        if time is None:
+            return
+        latest = self._state.time
+        if not math.isfinite(time) or (self._state.frame > 0 and time <= latest):
+            raise InputError(f"time must be finite and later than the frame before at {latest:g}, got {time}")
+
+    def _initial_state(self, pose: Tensor) -> TrackState:
+        skin = self._fitter.skin
+        return TrackState(
+            frame=0, time=0.0, interval=0.0, pose=pose, velocity=torch.zeros_like(pose), points=skin.points,
+            weights=skin.weights, reference_pose=skin.reference_pose, keyframes=pose[None][:0],
+            unexplained=skin.points[:0], prediction_error=0.0, innovation=skin.points.new_zeros(3), num_data=0.0,
+            num_inliers=0.0, ratio_in_reach=0.0, residual=0.0, limit_share=0.0, lost=0, cool_down=0, failed_searches=0,
+            pending_checks=0, seed=self.config.seed,
+        )  # fmt: skip
+
+    def _rejection(self, data: Tensor) -> Status | None:
+        """Return the status of data (M, 3) that no pose can be fitted to; None for others."""
         if len(data) < MIN_DATA:
             return Status.NO_DATA
-        spread = 2 * float((data - data.mean(0)).norm(dim=-1).median()) / self._fitter.size
-        if 1 / _UNITS_RATIO < spread < _UNITS_RATIO:
+        valid = torch.ones_like(data[:, 0], dtype=torch.bool)
+        if warn_about_units(data - data.mean(0), valid, self._fitter.size, stacklevel=3):
+            return Status.OTHER_UNITS
+        return None
+
+    def _fit(self, state: TrackState, frame: Frame, view: FrameView | None) -> FrameFit | None:
+        """Return the fit by descent from the prediction or, before the first fit, from the initial pose."""
+        if view is not None:
+            return self._fitter.descend(view, state, frame.elapsed)
+        if state.tracked or not state.found:
             return None
-        warnings.warn(
-            f"the data spread over {spread:.3g} times the model's size of {self._fitter.size:.3g} m: are they in "
-            f"metres? Scale them, by 0.001 if they are in millimeters",
-            UnitsWarning,
-            stacklevel=3,
-        )
-        return Status.OTHER_UNITS
+        data = subsample(frame.data, self.config.max_points, frame_generator(state))
+        config = AlignConfig(sharpness=self.config.sharpness)
+        pose = align(self.shape, data, state.pose, model_points=self._fitter.skin, config=config).pose
+        return self._fitter.fit_at(state, frame, pose, "tracked")
 
-    def _first(self, state: TrackState, frame: Frame) -> tuple[FrameFit | None, TrackState]:
-        """Return the fit of the first frame that shows the shape, if any, and what the search leaves of the state."""
-        fit = None
-        if state.found:
-            data = thinned(frame.data, self.config.max_points, generator(state))
-            config = AlignConfig(sharpness=self.config.sharpness)
-            pose = align(self.shape, data, state.pose, model_points=self._fitter.skin, config=config).pose
-            fit = self._fitter.fit_at(state, frame, pose, "tracked")
-        waits = state.rest > 0 or self.config.recovery != "full"
-        if (fit is None or is_lost(state, fit)) and not waits:
-            fit = self._recover.everywhere(state, frame)
-        fit, state = _kept(state, fit)
-        return fit, rested(state, fit is not None) if fit is not None or not waits else waited(state)
+    def _is_trusted(self, state: TrackState, frame: Frame, fit: FrameFit | None) -> bool:
+        """Return whether a fit needs no comparison with others."""
+        continuous = not state.tracked or frame.elapsed < _SETTINGS.long_gap
+        return continuous and is_supported(fit, state) and not is_doubtful(fit, state)
 
-    def _follow(self, state: TrackState, frame: Frame) -> tuple[FrameFit | None, TrackState]:
-        """Return the fit of a later frame, if any is worth it, and what the search for it leaves of the state."""
-        checks = state.unsure
-        fit, state = self._continue(state, frame)
-        if checks == 0 or (fit is not None and fit.how == "found"):
-            return fit, state
-        # A pose that was found everywhere must hold against the same search in another frame.
-        rival = self._recover.everywhere(state, frame)
-        if rival is None or (fit is not None and rival.explained < fit.explained + MIN_GAIN):
-            return fit, replace(state, unsure=0)
-        return rival, replace(state, unsure=checks - 1)
+    def _accept(self, state: TrackState, frame: Frame, fit: FrameFit | None) -> tuple[FrameResult, TrackState]:
+        """Return the result of a frame with the best fit that was found, and the state after it."""
+        if fit is None:
+            return self._hold(state, frame, Status.LOST)
+        covariance, observed = self._fitter.covariance(fit)
+        result = fitted_result(self._fitter, state, frame, fit, covariance)
+        return result, self._state_after(state, frame, fit, observed)
 
-    def _continue(self, state: TrackState, frame: Frame) -> tuple[FrameFit | None, TrackState]:
-        """Return the same, from the frames before and what can be searched around them."""
-        view = self._fitter.view_ahead(state, frame)
-        fit = None if view is None else self._fitter.descend(view, state, frame.gap)
-        sure = frame.gap < _LONG_GAP
-        if fit is not None and sure and not is_lost(state, fit) and not is_doubtful(state, fit):
-            return fit, rested(state, True)
-        fit, state = self._recover(state, frame, view, fit)
-        return _kept(state, fit)
-
-    def _accept(self, state: TrackState, frame: Frame, fit: FrameFit) -> tuple[FrameResult, TrackState]:
-        """Return the record of a frame that was fitted, and the state after it."""
-        pose = fit.world
-        covariance, share = self._fitter.covariance(fit)
-        if state.tracked and state.lost == 0 and fit.how != "found" and not is_far(state, fit):
-            motion = motion_after(state, frame, fit, share)
+    def _state_after(self, state: TrackState, frame: Frame, fit: FrameFit, observed: Tensor) -> TrackState:
+        """Return the state after a fit, of whose degrees of freedom data tell the observed share (num_dofs,)."""
+        found, pose = fit.acquired == "found", fit.world_pose
+        after = update_means(state, fit, len(frame.data))
+        if state.tracked and state.lost == 0 and not found and not deviates_far(fit, state):
+            after = update_motion(after, frame, fit, observed)
         else:
-            motion = merged(state, first_motion(pose, self._fitter.size))
-        kept = state.previous if state.frame % _PREVIOUS_EVERY else torch.cat([state.previous, pose[None]])
-        points, weights, reference_pose = points_after(self._fitter, state, fit)
-        after = replace(
-            usual_after(state, fit, len(frame.data)), pose=pose, points=points, weights=weights,
-            reference_pose=reference_pose, previous=kept[-_NUM_PREVIOUS:],
-            strays=self._fitter.strays_after(state, fit), lost=0,
-            fails=min(state.fails, 1) if state.lost else state.fails, **motion.fields,
+            after = restart_motion(after, self._fitter.size)
+        unexplained = state.unexplained
+        if found or not is_unreliable(state):
+            unexplained = self._fitter.clusters.remember(state, fit.unexplained, fit.transforms[0])
+        keyframes = state.keyframes
+        if state.frame % _SETTINGS.keyframe_interval == 0:
+            keyframes = torch.cat([keyframes, pose[None]])[-_SETTINGS.num_keyframes :]
+        points, weights, reference_pose = next_model_points(self._fitter, state, fit)
+        return replace(
+            after, pose=pose, points=points, weights=weights, reference_pose=reference_pose, keyframes=keyframes,
+            unexplained=unexplained, lost=0,
+            failed_searches=min(state.failed_searches, 1) if state.lost else state.failed_searches,
         )  # fmt: skip
-        done = fit.change <= fit.view.problem.pose_atol
-        status = Status.CONVERGED if done else Status.MAX_STEPS
-        return self._record(state, frame, pose, fit, covariance, status, fit.how), after
 
     def _hold(self, state: TrackState, frame: Frame, status: Status) -> tuple[FrameResult, TrackState]:
-        """Return the record of a frame without a fit, for which the prediction stands in, and the state after it."""
-        pose = self._fitter.predicted(state, frame.gap)
-        after = replace(state, pose=pose, velocity=slowed(state, frame.gap), lost=state.lost + 1)
-        unknown = torch.full((self.shape.num_dofs,) * 2, torch.nan).to(pose)
-        how = "lost" if status is Status.LOST else "held"
-        return self._record(state, frame, pose, None, unknown, status, how), after
-
-    def _record(
-        self, state: TrackState, frame: Frame, pose: Tensor, fit: FrameFit | None, covariance: Tensor, status: Status,
-        how: str,
-    ) -> FrameResult:  # fmt: skip
-        nothing = pose.new_tensor(torch.nan)
-        distances = torch.where(frame.finite, torch.inf, torch.nan).to(pose)
-        posterior = torch.zeros_like(distances)
-        sigma = cost = nothing
-        if fit is None:
-            registered, keypoints = self._fitter.skin(pose), self.shape.keypoints(pose)
-        else:
-            problem, near = fit.view.problem, fit.view.near
-            cost, sigma = nothing.new_tensor(fit.cost), nothing.new_tensor(STOP_SIGMA * problem.size)
-            data, distance = problem.data, fit.distance[0]
-            if int(near.sum()) > len(distance):
-                data = (frame.cloud[near] - fit.view.origin)[None]
-                distance = problem.surface.distance(data, fit.pose)[0]
-            posed = problem.skin.place(fit.rows)
-            registered = posed + fit.view.origin
-            keypoints = self.shape.placed_keypoints(fit.transforms) + fit.view.origin
-            distances[near] = distance
-            outlier = outlier_level(problem, posed[None], sigma[None])
-            posterior[near] = expectation(posed[None], data, sigma[None], outlier).inlier_posterior[0]
-        inliers = distances.abs() < self._fitter.inlier_distance
-        count = int(frame.finite.sum())
-        return FrameResult(
-            pose=pose, registered=registered, keypoints=keypoints, distances=distances,
-            inliers=inliers, posterior=posterior, sigma=sigma, cost=cost, status=status, history=(),
-            covariance=covariance, acquired=how, frame=state.frame - 1, time=state.time,
-            inlier_ratio=int(inliers.sum()) / max(1, count),
-            residual=math.nan if fit is None else float(fit.noise),
-        )  # fmt: skip
-
-
-def _kept(state: TrackState, fit: FrameFit | None) -> tuple[FrameFit | None, TrackState]:
-    """Return the fit if it is no loss, and the state, which is unsure of a fit that was found everywhere."""
-    if fit is None or is_lost(state, fit):
-        return None, state
-    return fit, replace(state, unsure=_CHECKS) if fit.how == "found" else state
-
-
-def _collected(results: Sequence[FrameResult], seconds: Sequence[float]) -> TrackResult:
-    return TrackResult(
-        poses=torch.stack([result.pose for result in results]),
-        std=torch.stack([result.std for result in results]),
-        keypoints=torch.stack([result.keypoints for result in results]),
-        inlier_ratios=torch.tensor([result.inlier_ratio for result in results], dtype=torch.float64),
-        residuals=torch.tensor([result.residual for result in results], dtype=torch.float64),
-        times=torch.tensor([result.time for result in results], dtype=torch.float64),
-        seconds=torch.tensor(list(seconds), dtype=torch.float64),
-        statuses=tuple(result.statuses[0] for result in results),
-        acquired=tuple(result.acquired for result in results),
-    )
+        """Return the result of a frame without a fit, at the predicted pose, and the state after it."""
+        pose = self._fitter.predict(state, frame.elapsed)
+        after = replace(state, pose=pose, velocity=decayed_velocity(state, frame.elapsed), lost=state.lost + 1)
+        return predicted_result(self._fitter, state, frame, pose, status), after

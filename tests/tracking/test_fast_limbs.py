@@ -10,7 +10,7 @@ from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.limbs import find_limbs
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.skin import sample_skin
-from torchreg.tracking.limb_mixing import fit_limbs, mixed, scattered
+from torchreg.tracking.limb_combination import combine_limbs, fit_limbs, scatter_joints
 
 EYE = torch.eye(3, dtype=torch.float64)
 
@@ -21,8 +21,8 @@ def crab():
     joints = [Joint("body", -1, torch.eye(4, dtype=torch.float64))]
     solids = [Primitive("ellipsoid", (0.1, 0.06, 0.05), torch.eye(4, dtype=torch.float64))]
     for name, side in (("left", -1.0), ("right", 1.0)):
-        place = rigid_matrix(EYE, torch.tensor([side * 0.07, 0.05, 0.0], dtype=torch.float64))
-        joints.append(Joint(name, 0, place, "revolute", (0.0, 0.0, 1.0), -1.2, 1.2))
+        position = rigid_matrix(EYE, torch.tensor([side * 0.07, 0.05, 0.0], dtype=torch.float64))
+        joints.append(Joint(name, 0, position, "revolute", (0.0, 0.0, 1.0), -1.2, 1.2))
         along = rigid_matrix(EYE, torch.tensor([0.0, 0.1, 0.0], dtype=torch.float64))
         solids.append(Primitive("ellipsoid", (0.02, 0.1, 0.02), along))
     shape = ArticulatedShape(
@@ -39,8 +39,8 @@ def problem(crab):
     truth[6:] = torch.tensor([0.5, -0.3])
     data = skin(truth)[None]
     valid = torch.ones_like(data[..., 0], dtype=torch.bool)
-    nowhere = torch.zeros(1, 3, dtype=torch.float64)
-    built = centered_problem(skin, data, valid, crab.rest[None], nowhere, prior_std=0.3, pose_atol=1e-4)
+    origin = torch.zeros(1, 3, dtype=torch.float64)
+    built = centered_problem(skin, data, valid, crab.rest[None], origin, prior_std=0.3, pose_atol=1e-4)
     return built, truth
 
 
@@ -53,17 +53,17 @@ def arms(pose, left, right):
 def test_every_limb_is_taken_from_the_pose_that_suits_it(crab, problem):
     built, truth = problem
     poses = torch.stack([arms(truth, 0.5, 0.8), arms(truth, -0.9, -0.3), arms(truth, 0.0, 0.0)])
-    found = mixed(built, poses, 2, find_limbs(crab)[0])
+    found = combine_limbs(built, poses, 2, find_limbs(crab)[0])
     torch.testing.assert_close(found[0], truth)
-    torch.testing.assert_close(mixed(built, poses[[2, 0, 1]], 0, find_limbs(crab)[0]), found)
-    assert torch.equal(mixed(built, poses, 1, []), poses[1:2])
+    torch.testing.assert_close(combine_limbs(built, poses[[2, 0, 1]], 0, find_limbs(crab)[0]), found)
+    assert torch.equal(combine_limbs(built, poses, 1, []), poses[1:2])
 
 
 def test_the_base_is_that_of_the_best(crab, problem):
     built, truth = problem
     off = truth.clone()
     off[:3] += 0.01
-    found = mixed(built, torch.stack([off, truth]), 1, find_limbs(crab)[0])
+    found = combine_limbs(built, torch.stack([off, truth]), 1, find_limbs(crab)[0])
     assert torch.equal(found[0], truth)
 
 
@@ -80,7 +80,7 @@ def test_starts_lead_to_the_pose_though_none_is_near_in_all_limbs(crab, problem)
 
 def test_joints_are_scattered_and_the_base_is_not():
     pose = torch.arange(8.0)[None]
-    poses = scattered(pose, torch.tensor([0.1, 0.4]), 4000, torch.Generator().manual_seed(0))
+    poses = scatter_joints(pose, torch.tensor([0.1, 0.4]), 4000, torch.Generator().manual_seed(0))
     assert torch.equal(poses[:, :6], pose[:, :6].expand(4000, -1))
     torch.testing.assert_close(poses[:, 6:].mean(0), pose[0, 6:], atol=0.02, rtol=0)
     torch.testing.assert_close(poses[:, 6:].std(0), torch.tensor([0.1, 0.4]), atol=0.01, rtol=0)

@@ -1,0 +1,108 @@
+"""A shape is followed from frame to frame, and every frame's result says what it promises."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchreg.geometry.rotation import compose_rotation_vectors
+from torchreg.tracking.motion_model import predict_pose
+
+HINGE = 6
+
+
+def test_a_hand_is_followed(tip_errors, clouds, frames, tracked):
+    errors = tip_errors(tracked.result.keypoints, clouds)
+    assert errors.mean() < 0.0025
+    assert errors.max() < 0.008
+    assert all(status.usable for status in tracked.result.statuses)
+    assert tracked.result.acquired.count("tracked") >= len(frames) - 1
+    assert [record.frame for _, record in tracked.records] == list(range(len(frames)))
+    assert all(points is frame for (points, _), frame in zip(tracked.records, frames, strict=True))
+
+
+def test_results_say_what_they_promise(plain_hand, plain_hand_skin, clouds, tracked):
+    corners = plain_hand_skin.points.aminmax(dim=0)
+    size = (corners.max - corners.min).norm()
+    for cloud, (_, record) in zip(clouds, tracked.records, strict=True):
+        inside = record.distances.isfinite()
+        measured = plain_hand.distance(cloud.points, record.pose)
+        torch.testing.assert_close(record.distances[inside], measured[inside], atol=2e-6, rtol=0)
+        assert (measured[~inside].abs() > 0.02).all()
+        assert torch.equal(record.inliers, record.distances.abs() < 0.02 * size)
+        assert record.inlier_ratio == pytest.approx(float(record.inliers.float().mean()))
+        # What is called an inlier is one, and outliers are few among them.
+        assert (record.inliers == cloud.inliers).float().mean() > 0.9
+        assert record.posterior[cloud.inliers].mean() > 4 * record.posterior[~cloud.inliers].mean()
+        assert 0.0005 < record.residual < 0.003
+        torch.testing.assert_close(record.keypoints, plain_hand.keypoints(record.pose))
+    result = tracked.result
+    assert torch.equal(result.poses, torch.stack([record.pose for _, record in tracked.records]))
+    assert torch.equal(result.std, torch.stack([record.std for _, record in tracked.records]))
+    assert (result.seconds > 0).all()
+    assert result.times.tolist() == [float(k) for k in range(len(clouds))]
+
+
+def test_the_order_of_points_does_not_matter(tracker, frames, tracked):
+    expected = tracked.records[5][1]
+    order = torch.randperm(len(frames[5]), generator=torch.Generator().manual_seed(3))
+    record = tracker(state=tracked.states[4]).step(frames[5][order])
+    torch.testing.assert_close(record.pose, expected.pose, atol=1e-3, rtol=0)
+    assert (record.inliers == expected.inliers[order]).float().mean() > 0.99
+
+
+def test_a_moved_world_moves_the_base_alone(tracker, frames, tracked):
+    """The same data elsewhere, far from the origin, lead to the same joints."""
+    turn, shift = torch.tensor([0.3, -1.2, 0.4]), torch.tensor([3.0, -2.0, 1.0])
+    matrix = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.4, -1.2], [0.4, 0.0, -0.3], [1.2, 0.3, 0.0]]))
+    before, expected = tracked.states[4], tracked.records[5][1].pose
+    pose, velocity = before.pose.clone(), before.velocity.clone()
+    pose[:3], pose[3:6] = matrix @ pose[:3] + shift, compose_rotation_vectors(turn, pose[3:6])
+    velocity[:3], velocity[3:6] = matrix @ velocity[:3], matrix @ velocity[3:6]
+    record = tracker(state=replace(before, pose=pose, velocity=velocity)).step(frames[5] @ matrix.mT + shift)
+    torch.testing.assert_close(record.pose[6:], expected[6:], atol=2e-2, rtol=0)
+    torch.testing.assert_close(record.pose[:3], matrix @ expected[:3] + shift, atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("model_points", ["data", "shape"])
+def test_other_model_points_follow_too(tip_errors, tracker, clouds, frames, model_points):
+    result = tracker(model_points=model_points).run(frames[:4])
+    assert tip_errors(result.keypoints, clouds[:4]).mean() < 0.006
+    assert all(status.usable for status in result.statuses)
+
+
+def test_velocity_predicts_what_goes_on_evenly(plain_hand, truths, tracker, frames, tracked):
+    for state, truth in zip(tracked.states[3:6], truths[4:7], strict=True):
+        true = plain_hand.keypoints(truth)
+        poses = predict_pose(plain_hand, state, 1.0), state.pose
+        near, far = ((plain_hand.keypoints(pose) - true).norm(dim=-1).mean() for pose in poses)
+        assert near < 0.7 * far
+    assert tracker(prediction="none").run(frames[:2]).statuses[1].usable
+
+
+def test_dropped_frames_are_bridged_by_their_time(tip_errors, tracker, clouds, frames):
+    kept = [0, 1, 2, 3, 6, 7]
+    result = tracker().run([frames[k] for k in kept], times=[0.05 * k for k in kept])
+    assert all(status.usable for status in result.statuses)
+    assert tip_errors(result.keypoints, [clouds[k] for k in kept]).mean() < 0.003
+    torch.testing.assert_close(result.times, torch.tensor([0.05 * k for k in kept], dtype=torch.float64))
+
+
+def test_more_points_than_wanted_are_subsampled_but_all_are_measured(tip_errors, tracker, clouds, frames):
+    made = tracker(max_points=150)
+    result = [made.step(frame) for frame in frames[:3]]
+    assert tip_errors(torch.stack([record.keypoints for record in result]), clouds[:3]).mean() < 0.008
+    assert result[2].distances.isfinite().sum() > 300
+    assert (result[2].inliers == clouds[2].inliers).float().mean() > 0.9
+    assert result[2].posterior[clouds[2].inliers].mean() > 0.2
+
+
+@pytest.mark.parametrize("pace", [0.0, 1.0, 2.0])
+def test_fast_joints_may_stop_go_on_or_double(tracking, pace):
+    """Where predictions fail by much, a joint that went 0.6 rad a frame is found at each pace."""
+    velocity = torch.zeros_like(tracking.pose)
+    velocity[HINGE] = 0.6
+    state = tracking.state(pose=tracking.bent(-0.6 * pace), velocity=velocity, prediction_error=0.06)
+    fitter, frame = tracking.fitter(), tracking.frame()
+    fit = fitter.descend(fitter.look(state, frame, fitter.predict(state, 1.0)), state, 1.0)
+    torch.testing.assert_close(fit.world_pose, tracking.pose, atol=0.02, rtol=0)

@@ -1,0 +1,66 @@
+"""How far poses are known: covariances against repeated measurements, with more data and with none."""
+
+from dataclasses import fields, replace
+
+import pytest
+import torch
+
+from torchreg.geometry.rigid import transform_points
+from torchreg.tracking.results import FrameResult
+from torchreg.tracking.tracker import TrackConfig, Tracker
+
+HINGE = 6
+
+
+def test_deviations_are_roots_of_the_diagonal(result):
+    covariance = torch.tensor([[4.0, 1.0], [1.0, 0.25]])
+    values = {field.name: getattr(result, field.name) for field in fields(result)}
+    frame = FrameResult(
+        **values, covariance=covariance, acquired="tracked", frame=3, time=0.1, inlier_ratio=0.9, residual=1e-3
+    )
+    assert frame.std.tolist() == pytest.approx([2.0, 0.5])
+
+
+def test_covariance_is_that_of_repeated_measurements(arm, tracking):
+    """What scatters when only the noise is drawn anew, pose after pose, is what the result says."""
+    truth, surface = tracking.pose, tracking.cloud
+    config = TrackConfig(model_points="shape", recovery="none", surface_steps=3, prior_std=5.0)
+    tracker = Tracker(arm, truth, config=config, model_points=tracking.skin)
+    tracker.step(surface)
+    start, generator, poses, stds = tracker.state, torch.Generator().manual_seed(4), [], []
+    for _ in range(60):
+        tracker.state = replace(start, pose=truth, velocity=0 * truth)
+        noise = 0.002 * torch.randn(surface.shape, generator=generator, dtype=torch.float64)
+        record = tracker.step(surface + noise)
+        poses.append(arm.difference(truth, record.pose))
+        stds.append(record.std)
+    ratio = torch.stack(stds).mean(0) / torch.stack(poses).std(0)
+    assert ratio.min() > 0.75
+    assert ratio.max() < 1.35
+
+
+def test_a_hand_is_known_to_millimeters_and_some_degrees(tracked):
+    for _, record in tracked.records:
+        assert record.covariance.shape == (27, 27)
+        assert (torch.linalg.eigvalsh(record.covariance.double()) > 0).all()
+    # No joint is known better than the data allow.
+    assert (record.std[:3] < 0.003).all()
+    assert (record.std[6:] > 0.003).all()
+    assert (record.std[6:] < 0.31).all()
+
+
+def test_limbs_that_no_data_show_stay_at_their_prediction_and_are_uncertain(arm, tracking):
+    body, hinged = (arm.distance(tracking.cloud, tracking.pose, parts=[part]).abs() for part in (0, 1))
+    # Five outliers beside the arm would attract it.
+    tip = transform_points(arm.part_transforms(tracking.pose)[1], torch.tensor([[0.25, 0.0, 0.045]]).double())
+    outliers = tip + 0.001 * torch.arange(5.0).double().unsqueeze(-1)
+    cloud = torch.cat([tracking.cloud[body + 0.004 < hinged], outliers])
+    fitter, state = tracking.fitter(), tracking.state()
+    fit = fitter.fit_at(state, tracking.frame(cloud), tracking.pose, "tracked")
+    assert fit.world_pose[HINGE] == tracking.pose[HINGE]
+    _, hardly_observed = fitter.covariance(fit)
+    covariance, observed = fitter.covariance(fitter.fit_at(state, tracking.frame(), tracking.pose, "tracked"))
+    assert 1 - hardly_observed[HINGE] > 4 * (1 - observed[HINGE])
+    assert (torch.linalg.eigvalsh(covariance) > 0).all()
+    # 150 data with a lever of some 0.15 m tell the hinge to half a degree.
+    assert covariance[HINGE, HINGE].sqrt() < 0.01

@@ -1,0 +1,140 @@
+"""A frame as it comes, as seen from a pose, and with a pose fitted to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg.alignment.annealed_em import ANNEALING
+from torchreg.alignment.inputs import UNITS
+from torchreg.alignment.problem import AlignProblem, shifted
+from torchreg.alignment.surface_fit import SURFACE_FIT
+from torchreg.shapes.skin import stacked_rows
+from torchreg.tracking.results import TrackState
+
+# Fewer data, or fewer inliers, determine no pose.
+MIN_DATA = UNITS.min_data
+
+
+@dataclass(frozen=True)
+class KernelWidths:
+    """Kernel widths of the fits of a frame, as shares of the model's size."""
+
+    min_start: float = 0.03  # first sigma of the EM where predictions are good: about their error
+    max_start: float = ANNEALING.start  # where they are poor: wider, neighboring limbs would share their data
+    stop: float = ANNEALING.stop  # last sigma of the EM and of the scores of candidates: near the noise of the data
+    coarse: tuple[float, ...] = (0.06, 0.04, 0.03)  # surface fits from poses that may be far off, in this order
+    surface: float = SURFACE_FIT.widths[-1]  # surface fit before the last one, which follows from the residuals
+
+
+WIDTHS = KernelWidths()
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What is known of a frame before it is aligned.
+
+    Args:
+        cloud: (M, 3), metres.
+        finite: (M,) True where a point is finite.
+        elapsed: time since the frame before, in intervals.
+    """
+
+    cloud: Tensor
+    finite: Tensor
+    elapsed: float
+
+    @property
+    def data(self) -> Tensor:
+        """The finite points (F, 3)."""
+        return self.cloud[self.finite]
+
+
+@dataclass(frozen=True)
+class FrameView:
+    """A frame seen from a pose: the alignment of the data in reach, in coordinates around the pose's base.
+
+    Args:
+        problem: one alignment; its prior's mean is the pose.
+        origin: (3,) of its coordinates.
+        rows: (4 P, 3) part transforms of the prior's mean, see `LinearBlendSkin.place`.
+        in_reach: (M,) True where a point of the cloud is in reach of the shape; the problem may hold a subset of these.
+    """
+
+    problem: AlignProblem
+    origin: Tensor
+    rows: Tensor
+    in_reach: Tensor
+
+    def to_local(self, poses: Tensor) -> Tensor:
+        """Return poses (S, num_dofs) of the world in these coordinates and within the limits, (1, S, num_dofs)."""
+        return self.problem.clamp(shifted(poses, -self.origin)).unsqueeze(0)
+
+
+@dataclass(frozen=True)
+class FrameFit:
+    """A pose fitted to a frame, in the coordinates of its view, and the evidence for it.
+
+    Args:
+        view: of the frame.
+        pose: (1, num_dofs).
+        distance: (1, M) signed distances of the data to the surface.
+        jacobian: (1, M, num_dofs) of the distances.
+        transforms: (P, 4, 4) of the parts.
+        residual: () robust standard deviation of the distances near the surface, metres.
+        change: largest change of the pose in the last step.
+        cost: soft count of outliers and the prior, by which fits to a frame are ranked.
+        num_inliers: number of data near the surface.
+        unexplained: (K, 3) clusters of data off the surface, as dense as the data on it.
+        num_new_unexplained: number of them that a limb can reach and that are no cluster of the frame before.
+        limit_share: share of the joints at a limit.
+        deviation: distance of most model points from the prediction, metres.
+        acquired: what led to the pose, see `FrameResult`.
+    """
+
+    view: FrameView
+    pose: Tensor
+    distance: Tensor
+    jacobian: Tensor
+    transforms: Tensor
+    residual: Tensor
+    change: float
+    cost: float
+    num_inliers: int
+    unexplained: Tensor
+    num_new_unexplained: int
+    limit_share: float
+    deviation: float
+    acquired: str
+
+    @property
+    def ratio_in_reach(self) -> float:
+        """Inliers as a share of the data in reach."""
+        return self.num_inliers / max(1, self.distance.shape[-1])
+
+    @property
+    def soft_inliers(self) -> float:
+        """Soft count of the inliers among all data in reach, less the prior's cost: higher is better."""
+        return (1 - self.cost / max(1, self.distance.shape[-1])) * int(self.view.in_reach.sum())
+
+    @property
+    def rows(self) -> Tensor:
+        """The transforms as (4 P, 3), see `LinearBlendSkin.place`."""
+        return stacked_rows(self.transforms)
+
+    @property
+    def world_pose(self) -> Tensor:
+        """The pose (num_dofs,) in the coordinates of the cloud."""
+        return shifted(self.pose[0], self.view.origin)
+
+
+def frame_generator(state: TrackState) -> torch.Generator:
+    """Return the generator of a frame's random draws, which starts anew at every call."""
+    return torch.Generator().manual_seed(state.seed + state.frame)
+
+
+def subsample(data: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Return at most ``count`` of the data (M, 3), drawn at random."""
+    return data if len(data) <= count else data[torch.randperm(len(data), generator=generator)[:count].to(data.device)]

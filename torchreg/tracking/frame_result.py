@@ -1,0 +1,84 @@
+"""What is reported of a frame, fitted or not, and of a sequence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchreg.alignment.annealed_em import outlier_level
+from torchreg.result import Status
+from torchreg.solvers.e_step import expectation
+from torchreg.tracking.frame import WIDTHS, Frame, FrameFit
+from torchreg.tracking.frame_fit import FrameFitter
+from torchreg.tracking.results import FrameResult, TrackResult, TrackState
+
+
+def fitted_result(
+    fitter: FrameFitter, state: TrackState, frame: Frame, fit: FrameFit, covariance: Tensor
+) -> FrameResult:
+    """Return the result of a frame with a fit and its covariance (num_dofs, num_dofs)."""
+    problem, in_reach, origin = fit.view.problem, fit.view.in_reach, fit.view.origin
+    data, distance = problem.data, fit.distance[0]
+    if int(in_reach.sum()) > len(distance):
+        data = (frame.cloud[in_reach] - origin)[None]
+        distance = problem.surface.distance(data, fit.pose)[0]
+    posed = problem.skin.place(fit.rows)
+    sigma = posed.new_tensor(WIDTHS.stop * problem.size)
+    outlier = outlier_level(problem, posed[None], sigma[None])
+    distances = _distances_out_of_reach(frame)
+    distances[in_reach] = distance
+    posterior = torch.zeros_like(distances)
+    posterior[in_reach] = expectation(posed[None], data, sigma[None], outlier).inlier_posterior[0]
+    return _frame_result(
+        fitter, state, frame, pose=fit.world_pose, registered=posed + origin,
+        keypoints=fitter.shape.placed_keypoints(fit.transforms) + origin, distances=distances, posterior=posterior,
+        sigma=sigma, cost=posed.new_tensor(fit.cost), covariance=covariance, acquired=fit.acquired,
+        status=Status.CONVERGED if fit.change <= problem.pose_atol else Status.MAX_STEPS,
+        residual=float(fit.residual),
+    )  # fmt: skip
+
+
+def predicted_result(fitter: FrameFitter, state: TrackState, frame: Frame, pose: Tensor, status: Status) -> FrameResult:
+    """Return the result of a frame without a fit, with the predicted pose (num_dofs,) in its place."""
+    unknown = pose.new_tensor(torch.nan)
+    distances = _distances_out_of_reach(frame)
+    return _frame_result(
+        fitter, state, frame, pose=pose, registered=fitter.skin(pose), keypoints=fitter.shape.keypoints(pose),
+        distances=distances, posterior=torch.zeros_like(distances), sigma=unknown, cost=unknown,
+        covariance=unknown.expand(len(pose), len(pose)).clone(), status=status,
+        acquired="lost" if status is Status.LOST else "held", residual=math.nan,
+    )  # fmt: skip
+
+
+def _distances_out_of_reach(frame: Frame) -> Tensor:
+    """Return distances (M,) of points of which none is near the shape: infinite, NaN where a point is not finite."""
+    return torch.where(frame.finite, torch.inf, torch.nan).to(frame.cloud)
+
+
+def _frame_result(
+    fitter: FrameFitter, state: TrackState, frame: Frame, distances: Tensor, **values: Any
+) -> FrameResult:
+    inliers = distances.abs() < fitter.inlier_distance
+    return FrameResult(
+        distances=distances, inliers=inliers, inlier_ratio=int(inliers.sum()) / max(1, int(frame.finite.sum())),
+        history=(), frame=state.frame - 1, time=state.time, **values,
+    )  # fmt: skip
+
+
+def track_result(results: Sequence[FrameResult], seconds: Sequence[float]) -> TrackResult:
+    """Return the results of T frames as one, with the seconds (T,) that each took."""
+    return TrackResult(
+        poses=torch.stack([result.pose for result in results]),
+        std=torch.stack([result.std for result in results]),
+        keypoints=torch.stack([result.keypoints for result in results]),
+        inlier_ratios=torch.tensor([result.inlier_ratio for result in results], dtype=torch.float64),
+        residuals=torch.tensor([result.residual for result in results], dtype=torch.float64),
+        times=torch.tensor([result.time for result in results], dtype=torch.float64),
+        seconds=torch.tensor(list(seconds), dtype=torch.float64),
+        statuses=tuple(result.statuses[0] for result in results),
+        acquired=tuple(result.acquired for result in results),
+    )
