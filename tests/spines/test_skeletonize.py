@@ -1,3 +1,5 @@
+"""Skeletons of single surfaces: tips, topology and axes against the truth, on sound and unsound meshes."""
+
 import math
 
 import pytest
@@ -186,7 +188,7 @@ def test_a_ball_is_a_single_limb_of_no_confidence():
     assert skeleton.nodes.norm(dim=1).max() < 1
 
 
-def test_large_surfaces_are_thinned(star, star_skeleton):
+def test_large_surfaces_are_coarsened(star, star_skeleton):
     skeleton = skeletonize(star.meshes[0], SkeletonizeConfig(max_vertices=1000))
     assert skeleton.topology == STAR
     assert torch.cdist(skeleton.nodes, star_skeleton.nodes).amin(1).max() < 0.04
@@ -215,6 +217,9 @@ def test_bad_input_is_refused():
         skeletonize(torch.zeros(3, 3))
     with pytest.raises(InputError, match="three different corners"):
         skeletonize(TriangleMesh(torch.zeros(3, 3), torch.zeros(0, 3, dtype=torch.int64)))
+    ball = unit_sphere(2, dtype=torch.float64)
+    with pytest.raises(InputError, match="mesh must have a finite area"):
+        skeletonize(TriangleMesh(1e200 * ball.vertices, ball.faces))
     with pytest.raises(InputError, match="min_protrusion must be positive"):
         SkeletonizeConfig(min_protrusion=0.0)
     with pytest.raises(InputError, match="pieces must be one of"):

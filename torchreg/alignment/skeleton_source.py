@@ -85,7 +85,7 @@ class SpineLimbs:
         starts, targets = [], []
         for typical in typical_poses(shape):
             known = chains.places(shape, typical.unsqueeze(0))[0]
-            maps, _ = rank_mappings([TipReference(known, turn=0.0)], limbs, missing=10.0)
+            maps, _ = rank_mappings([TipReference(known)], limbs, missing_cost=10.0)
             for row in maps[:_MAPPINGS]:
                 pose, target = _laid(typical, known, limbs, row)
                 starts.append(pose)
