@@ -41,9 +41,9 @@ def test_batches_equal_loops_and_rigid_motion_changes_nothing_but_directions():
     turn = so3_exp(torch.tensor([0.3, -1.0, 0.5], dtype=torch.float64))
     moved = 2.5 * curves @ turn.mT + 7
     for function, factor in ((curve_lengths, 2.5), (bend_angles, 1.0)):
-        whole = function(curves)
-        torch.testing.assert_close(whole[1, 2], function(curves[1, 2]))
-        torch.testing.assert_close(function(moved), factor * whole)
+        batched = function(curves)
+        torch.testing.assert_close(batched[1, 2], function(curves[1, 2]))
+        torch.testing.assert_close(function(moved), factor * batched)
     torch.testing.assert_close(tangents(moved), tangents(curves) @ turn.mT)
 
 

@@ -167,12 +167,12 @@ def test_free_ends_go_along():
 
 def test_every_curve_takes_the_surface_around_it():
     mesh = bent_tube()
-    both = TriangleMesh(
+    pair = TriangleMesh(
         torch.cat((mesh.vertices, mesh.vertices + torch.tensor([0.0, 0, 0.7]))),
         torch.cat((mesh.faces, mesh.faces + mesh.num_vertices)),
     )
     shift = torch.tensor([0.0, 0.0, 0.7], dtype=torch.float64)
-    first, second = centered_curves([arc(0.97), arc(1.03) + shift], both, 0.05, 2 * HELD)
+    first, second = centered_curves([arc(0.97), arc(1.03) + shift], pair, 0.05, 2 * HELD)
     assert off_axis(first)[5:-5].max() < 0.02
     assert off_axis(second - shift)[5:-5].max() < 0.02
 

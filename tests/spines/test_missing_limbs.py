@@ -12,7 +12,7 @@ from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.skeleton import build_skeleton
 from torchreg.spines.labeled_tree import LimbGraph
 from torchreg.spines.limb_transfer import transfer_missing_limbs, transported_frames
-from torchreg.spines.local_icp import KnownNodes, LocalFits, SurfacePoints, transfer_nodes
+from torchreg.spines.local_icp import LocalFits, SurfacePoints, transfer_nodes
 from torchreg.spines.observed_limbs import median_lengths, observe_limbs, reject_odd_lengths, smooth_rough_limbs
 
 STAR = LimbGraph(5, frozenset())
@@ -70,6 +70,8 @@ def test_a_junction_needs_three_limbs(creature):
     limbs = observe_limbs(skeleton, [0, -1, -1, 1, -1], STAR, SAMPLES)
     assert limbs.node_observed.tolist() == [True, False, False, True, False, False]
     assert not bool(limbs.observed.any())
+    nothing = observe_limbs(skeleton, [-1] * 5, STAR, SAMPLES)
+    assert not bool(nothing.observed.any() | nothing.node_observed.any())
 
 
 def test_limbs_of_odd_length_are_rejected_with_their_tips(creature):
@@ -139,21 +141,21 @@ COUNT = 21
 def tube(bend, *, turn=0.0, radius=0.12, length=2.0, samples=60, start=0.0):
     """Axis (COUNT, 3), surface points and normals of a tube that is bent into an arc."""
 
-    def at(along):
+    def center_line(along):
         angle = bend * along / length
         if bend:
-            place = torch.stack((angle.sin(), 1 - angle.cos(), 0 * angle), -1) * length / bend
+            center = torch.stack((angle.sin(), 1 - angle.cos(), 0 * angle), -1) * length / bend
         else:
-            place = torch.stack((along, 0 * along, 0 * along), -1)
-        return place, torch.stack((-angle.sin(), angle.cos(), 0 * angle), -1)
+            center = torch.stack((along, 0 * along, 0 * along), -1)
+        return center, torch.stack((-angle.sin(), angle.cos(), 0 * angle), -1)
 
-    axis, _ = at(torch.linspace(0, length, COUNT, dtype=torch.float64))
+    axis, _ = center_line(torch.linspace(0, length, COUNT, dtype=torch.float64))
     along = torch.linspace(0, length, samples, dtype=torch.float64) + start
-    place, across = at(along.repeat_interleave(16))
+    center, across = center_line(along.repeat_interleave(16))
     around = (2 * math.pi * torch.arange(16, dtype=torch.float64) / 16 + turn).repeat(samples)[:, None]
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     normals = around.cos() * across + around.sin() * up
-    return axis, place + radius * normals, normals
+    return axis, center + radius * normals, normals
 
 
 def transferred(axis, source, target, widths, num_rounds=4, known=None, radius=0.12):
@@ -165,7 +167,7 @@ def transferred(axis, source, target, widths, num_rounds=4, known=None, radius=0
         path_lengths=(along[:, None] - along).abs(),
         source=SurfacePoints(*source),
         target=SurfacePoints(*target),
-        known=known or KnownNodes(torch.zeros(COUNT, dtype=torch.bool), axis),
+        known=torch.full_like(axis, torch.nan) if known is None else known,
         fits=LocalFits(widths=tuple(width / float(along[-1]) for width in widths), num_rounds=num_rounds),
     )
 
@@ -182,8 +184,8 @@ def test_nodes_move_rigidly_with_the_surface():
 def test_nodes_follow_a_tube_that_bends_and_is_meshed_anew():
     axis, *source = tube(0.3)
     goal, *target = tube(0.8, turn=0.1, samples=71, start=0.01)
-    known = KnownNodes(torch.zeros(COUNT, dtype=torch.bool), goal)
-    known.mask[[0, -1]] = True
+    known = torch.full_like(goal, torch.nan)
+    known[[0, -1]] = goal[[0, -1]]
     moved = transferred(axis, source, target, [1.0, 0.5, 0.25], num_rounds=8, known=known)
     assert float((moved - goal).norm(dim=-1).max()) < 0.04
     assert float((axis - goal).norm(dim=-1).max()) > 0.4
@@ -195,9 +197,9 @@ def test_scale_and_common_motion_change_nothing():
     plain = transferred(axis, (source, normals), (target, target_normals), [0.5])
     turn = so3_exp(torch.tensor([1.0, -0.4, 2.0], dtype=torch.float64))
 
-    def place(points):
+    def scaled(points):
         return 30 * points @ turn.mT + 7
 
-    surfaces = (place(source), normals @ turn.mT), (place(target), target_normals @ turn.mT)
-    moved = transferred(place(axis), *surfaces, [15.0], radius=30 * 0.12)
-    torch.testing.assert_close(moved, place(plain), rtol=0, atol=1e-6)
+    surfaces = (scaled(source), normals @ turn.mT), (scaled(target), target_normals @ turn.mT)
+    moved = transferred(scaled(axis), *surfaces, [15.0], radius=30 * 0.12)
+    torch.testing.assert_close(moved, scaled(plain), rtol=0, atol=1e-6)

@@ -123,12 +123,12 @@ def test_holes_are_closed_and_told(star):
 
 def test_fragments_by_policy(star):
     mesh, ball = star.meshes[0], unit_sphere(2)
-    both = concatenate([TriangleMesh(0.05 * ball.vertices + 2, ball.faces), mesh])
-    skeleton = skeletonize(both)
+    pair = concatenate([TriangleMesh(0.05 * ball.vertices + 2, ball.faces), mesh])
+    skeleton = skeletonize(pair)
     assert skeleton.topology == STAR
     assert skeleton.notes[0].startswith("1 fragment(s) left out")
     with pytest.raises(InputError, match="mesh must be one piece, got 2"):
-        skeletonize(both, SkeletonizeConfig(pieces="error"))
+        skeletonize(pair, SkeletonizeConfig(pieces="error"))
 
 
 def test_a_limb_in_two_pieces_is_bridged():
@@ -145,8 +145,8 @@ def test_a_limb_in_two_pieces_is_bridged():
 def test_loops_of_bridged_surfaces_are_bypassed():
     turn = torch.linspace(0, 2 * math.pi, 100).double()
     ring = torch.stack((turn.cos(), turn.sin(), 0 * turn), dim=1)
-    both = concatenate([tube(ring + torch.tensor([x, 0.0, 0.0]), 0.2, 0.1) for x in (0.0, 2.8)])
-    skeleton = skeletonize(both, SkeletonizeConfig(pieces="bridge"))
+    pair = concatenate([tube(ring + torch.tensor([x, 0.0, 0.0]), 0.2, 0.1) for x in (0.0, 2.8)])
+    skeleton = skeletonize(pair, SkeletonizeConfig(pieces="bridge"))
     assert skeleton.notes[0] == "2 pieces joined by 1 bridges"
     assert float(skeleton.nodes[:, 0].max() - skeleton.nodes[:, 0].min()) > 4
 

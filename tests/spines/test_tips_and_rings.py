@@ -15,26 +15,26 @@ from torchreg.spines.protrusions import average_geodesic_distance, find_protrusi
 
 
 def brute_heights(graph, values):
-    """Return the height of every maximum by flooding one place at a time."""
+    """Return the height of every maximum by flooding node by node."""
     starts, ends = graph.starts.tolist(), graph.ends.tolist()
-    order = sorted(range(len(values)), key=lambda place: (-values[place], -place))
-    rank = {place: number for number, place in enumerate(order)}
+    order = sorted(range(len(values)), key=lambda node: (-values[node], -node))
+    rank = {node: number for number, node in enumerate(order)}
     owner, heights = {}, {}
-    for place in order:
+    for node in order:
         tops = set()
-        for other in ends[starts[place] : starts[place + 1]]:
-            while other in owner and owner[other] != other:
-                other = owner[other]
-            tops |= {other} & owner.keys()
-        owner[place] = place
+        for neighbor in ends[starts[node] : starts[node + 1]]:
+            while neighbor in owner and owner[neighbor] != neighbor:
+                neighbor = owner[neighbor]
+            tops |= {neighbor} & owner.keys()
+        owner[node] = node
         for number, top in enumerate(sorted(tops, key=rank.get)):
             if number == 0:
-                owner[place] = top
+                owner[node] = top
             else:
-                heights[top] = values[top] - values[place]
-                owner[top] = owner[place]
+                heights[top] = values[top] - values[node]
+                owner[top] = owner[node]
     heights[order[0]] = values[order[0]] - min(values)
-    return {place: height for place, height in heights.items() if height > 0}
+    return {node: height for node, height in heights.items() if height > 0}
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -72,13 +72,13 @@ def test_confidence_is_a_half_at_the_threshold():
 
 def test_average_distance_on_a_long_body_is_that_of_an_interval():
     # Averaged over [0, 1] the distance from x is x^2 - x + 1/2; vertices are three times as dense on the left.
-    places = torch.cat((torch.linspace(0, 0.5, 301)[:-1], torch.linspace(0.5, 1, 101))).double()
-    points = torch.stack((places, 0 * places, 0 * places), dim=1)
+    positions = torch.cat((torch.linspace(0, 0.5, 301)[:-1], torch.linspace(0.5, 1, 101))).double()
+    points = torch.stack((positions, 0 * positions, 0 * positions), dim=1)
     graph = GeodesicGraph.from_points(points, 2)
-    gaps = torch.cat((places[1:] - places[:-1], torch.zeros(1)))
+    gaps = torch.cat((positions[1:] - positions[:-1], torch.zeros(1)))
     areas = 0.5 * (gaps + gaps.roll(1))
     average, largest = average_geodesic_distance(graph, areas, 40)
-    assert torch.allclose(average, places**2 - places + 0.5, atol=5e-3)
+    assert torch.allclose(average, positions**2 - positions + 0.5, atol=5e-3)
     assert largest == pytest.approx(1.0)
 
 
@@ -100,12 +100,12 @@ def test_rings_do_not_depend_on_how_dense_the_vertices_are():
     turn = torch.cat((torch.linspace(0, math.pi, 60)[:-1], torch.linspace(math.pi, 2 * math.pi, 20)[:-1])).double()
     count, rows = len(turn), 12
     ring = torch.stack((turn.cos(), turn.sin()), dim=1)
-    places = torch.cat((ring.repeat(rows, 1), torch.arange(rows).double().repeat_interleave(count)[:, None]), dim=1)
-    here, row = torch.arange(count).repeat(rows - 1), torch.arange(rows - 1).repeat_interleave(count) * count
-    after = (here + 1) % count
-    faces = torch.stack((row + here, row + after, row + count + here), dim=1)
-    faces = torch.cat((faces, torch.stack((row + after, row + count + after, row + count + here), dim=1)))
-    sets = level_sets(MeshEdges(TriangleMesh(places, faces)), places[:, 2], 0.7)
+    positions = torch.cat((ring.repeat(rows, 1), torch.arange(rows).double().repeat_interleave(count)[:, None]), dim=1)
+    column, row = torch.arange(count).repeat(rows - 1), torch.arange(rows - 1).repeat_interleave(count) * count
+    after = (column + 1) % count
+    faces = torch.stack((row + column, row + after, row + count + column), dim=1)
+    faces = torch.cat((faces, torch.stack((row + after, row + count + after, row + count + column), dim=1)))
+    sets = level_sets(MeshEdges(TriangleMesh(positions, faces)), positions[:, 2], 0.7)
     assert len(sets) == 15
     assert sets.centers[:, :2].abs().max() < 0.005
     assert ring.mean(0).norm() > 0.2
@@ -117,20 +117,22 @@ def test_rings_join_bands_in_a_tree_on_a_sphere_and_in_a_loop_on_a_torus():
         assert len(sets) - sets.num_bands + 1 == loops
         steps = torch.floor(mesh.vertices[:, 0] / 0.21).long()
         for band, level in ((sets.lower, sets.levels - 1), (sets.upper, sets.levels)):
-            for one, step in zip(band.tolist(), level.tolist(), strict=True):
-                assert set(steps[sets.vertex_bands == one].tolist()) <= {step}
+            for number, step in zip(band.tolist(), level.tolist(), strict=True):
+                assert set(steps[sets.vertex_bands == number].tolist()) <= {step}
 
 
 def torus(rows=48, columns=24, radius=0.35):
     u = (torch.arange(rows) * 2 * math.pi / rows).double()[:, None]
     v = (torch.arange(columns) * 2 * math.pi / columns).double()[None]
-    out = 1 + radius * v.cos()
-    places = torch.stack((out * u.cos(), out * u.sin(), radius * v.sin().expand(rows, -1)), dim=-1).reshape(-1, 3)
+    distance = 1 + radius * v.cos()
+    positions = torch.stack(
+        (distance * u.cos(), distance * u.sin(), radius * v.sin().expand(rows, -1)), dim=-1
+    ).reshape(-1, 3)
     a = torch.arange(rows)[:, None] * columns + torch.arange(columns)
     b, c = a.roll(-1, 0), a.roll(-1, 1)
     d = b.roll(-1, 1)
     faces = torch.cat((torch.stack((a, b, c), -1).reshape(-1, 3), torch.stack((b, d, c), -1).reshape(-1, 3)))
-    return TriangleMesh(places, faces)
+    return TriangleMesh(positions, faces)
 
 
 def test_triangles_that_span_many_levels_have_a_ring_on_each():

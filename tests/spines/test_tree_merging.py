@@ -25,7 +25,7 @@ TRUNK, ARM = 1.2, 0.4
 
 
 def segment_distance(points, start, end):
-    start, end = (torch.tensor(place, dtype=points.dtype) for place in (start, end))
+    start, end = (torch.tensor(end, dtype=points.dtype) for end in (start, end))
     line = end - start
     share = (((points - start) @ line) / (line @ line)).clamp(0, 1)
     return (points - start - share[:, None] * line).norm(dim=1)
@@ -208,8 +208,8 @@ def test_rings_in_the_balls_at_the_ends_are_left_out():
     end = JunctionBall(torch.tensor([0.9, 0.0, 0.0]).double(), 0.15)
     best = best_rings(frozenset({1}), trees, start, end, 1.0)
     assert best.centers[:, 0].tolist() == pytest.approx([0.3, 0.4, 0.5, 0.6, 0.7])
-    whole = JunctionBall(torch.tensor([0.5, 0.0, 0.0]).double(), 2.0)
-    assert len(best_rings(frozenset({1}), trees, whole, None, 1.0)) == 0
+    large = JunctionBall(torch.tensor([0.5, 0.0, 0.0]).double(), 2.0)
+    assert len(best_rings(frozenset({1}), trees, large, None, 1.0)) == 0
 
 
 def test_a_limb_that_comes_back_to_its_junction_is_not_cut_short():
@@ -240,11 +240,11 @@ def test_first_axes_follow_the_major_axes_of_the_rings_without_jumps():
     major = torch.stack((0 * angle, angle.cos(), angle.sin()), dim=1)
     minor = torch.stack((0 * angle, -angle.sin(), angle.cos()), dim=1)
     axes = 2 * major[:, :, None] * major[:, None, :] + minor[:, :, None] * minor[:, None, :]
-    places = line(count).double()
-    points, frames = limb_curve(places[0] - 0.01, rings(places, axes), places[-1] + 0.01, 1 / (count - 1))
+    centers = line(count).double()
+    points, frames = limb_curve(centers[0] - 0.01, rings(centers, axes), centers[-1] + 0.01, 1 / (count - 1))
     first = frames[:, :, 0]
     assert (first[1:] * first[:-1]).sum(1).min() > 0.97
-    nearest = torch.cdist(points, places).argmin(1)
+    nearest = torch.cdist(points, centers).argmin(1)
     inner = slice(8, -8)
     assert (first * major[nearest]).sum(1).abs()[inner].min() > 0.98
 

@@ -110,8 +110,8 @@ def extract_spine(
     like, topologies = meshes[0].vertices.detach(), tuple(curve_topology(graph, rows) for rows in curves)
     curves, radii, frames = curves.to(like), radii.to(like), frames.to(like)
     model = Spine(curves, graph.edges, radii=radii, frames=frames, times=times)  # eq. 1
-    found, own = labels >= 0, torch.stack([frame.observed for frame in observed])
-    notes = [_notes(*rows) for rows in zip(skeletons, found, own, strict=True)]
+    found, observed_limbs = labels >= 0, torch.stack([frame.observed for frame in observed])
+    notes = [_notes(*rows) for rows in zip(skeletons, found, observed_limbs, strict=True)]
     return SpineSequence(
         model=model,
         graph=model.graph,
@@ -120,7 +120,7 @@ def extract_spine(
         frames=frames,
         times=model.times.clone(),
         found=found,
-        own=own,
+        own=observed_limbs,
         reference=reference,
         topologies=topologies,
         own_topologies=tuple(skeleton.topology for skeleton in skeletons),
@@ -176,19 +176,19 @@ def _observed_limbs(
     return trusted if any(bool(frame.observed.all()) for frame in trusted) else frames
 
 
-def _notes(skeleton: Skeleton, found: Tensor, own: Tensor) -> list[str]:
-    """Return the irregularities of a frame, given which tips (K,) were found and which limbs (L,) are its own."""
+def _notes(skeleton: Skeleton, found: Tensor, observed: Tensor) -> list[str]:
+    """Return the irregularities of a frame, given which tips (K,) were found and which limbs (L,) observed."""
     rows = list(skeleton.notes)
     superfluous = len(skeleton.tips) - int(found.sum())
     if superfluous > 0:
         rows.append(f"{superfluous} superfluous tip(s) left out")
     if not bool(found.all()):
-        rows.append(f"tips {_numbers(~found)} not found")
-    if not bool(own.all()):
-        rows.append(f"limbs {_numbers(~own)} carried over from other frames")
+        rows.append(f"tips {_true_numbers(~found)} not found")
+    if not bool(observed.all()):
+        rows.append(f"limbs {_true_numbers(~observed)} carried over from other frames")
     return rows
 
 
-def _numbers(flags: Tensor) -> str:
+def _true_numbers(flags: Tensor) -> str:
     """Return the numbers of flags (n,) that are True, as a list in words."""
     return ", ".join(str(number) for number in flags.nonzero()[:, 0].tolist())

@@ -74,14 +74,14 @@ def skeletonize_frames(
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         for frame, mesh in enumerate(meshes):
-            kept = _load(folder, frame, _fingerprint(mesh, config))
+            kept = _load_skeleton(folder, frame, _fingerprint(mesh, config))
             if kept is not None:
                 done(frame, kept, 0.0)
     missing = [frame for frame in range(len(meshes)) if frame not in skeletons]
     for frame, (arrays, notes, seconds) in _computed(meshes, config, missing, workers):
         skeleton = Skeleton(**{name: torch.from_numpy(array) for name, array in arrays.items()}, notes=notes)
         if folder is not None:
-            _save(folder, frame, _fingerprint(meshes[frame], config), skeleton)
+            _save_skeleton(folder, frame, _fingerprint(meshes[frame], config), skeleton)
         done(frame, skeleton, seconds)
     return [skeletons[frame] for frame in range(len(meshes))]
 
@@ -140,12 +140,12 @@ def _file(folder: Path, frame: int) -> Path:
     return folder / f"frame_{frame:05d}.safetensors"
 
 
-def _save(folder: Path, frame: int, fingerprint: str, skeleton: Skeleton) -> None:
+def _save_skeleton(folder: Path, frame: int, fingerprint: str, skeleton: Skeleton) -> None:
     tensors: dict[str, Tensor] = {name: getattr(skeleton, name) for name in _FIELDS}
     save_tensors(_file(folder, frame), tensors, {"surface": fingerprint, "notes": list(skeleton.notes)})
 
 
-def _load(folder: Path, frame: int, fingerprint: str) -> Skeleton | None:
+def _load_skeleton(folder: Path, frame: int, fingerprint: str) -> Skeleton | None:
     """Return the skeleton that was kept of a surface; None if there is none or its file is damaged."""
     try:
         tensors, metadata = load_tensors(_file(folder, frame))

@@ -15,12 +15,12 @@ from torchreg.geometry.skeleton import Skeleton
 from torchreg.spines.curves import align_frames, curve_frames, tangents
 from torchreg.spines.depth_field import DepthField, move_inside
 from torchreg.spines.labeled_tree import LimbGraph, gather_nodes, number_nodes, path_lengths
-from torchreg.spines.local_icp import LOCAL_FITS, KnownNodes, SurfacePoints, transfer_nodes
+from torchreg.spines.local_icp import LOCAL_FITS, SurfacePoints, transfer_nodes
 from torchreg.spines.observed_limbs import FrameLimbs
 
 
 @dataclass(frozen=True, eq=False)
-class _Scene:
+class _Sequence:
     """A sequence whose limbs are completed.
 
     Args:
@@ -50,55 +50,52 @@ def transfer_missing_limbs(
         meshes: the surfaces of the frames.
     """
     missing = [number for number, frame in enumerate(frames) if not bool(frame.observed.all())]
-    scene = _Scene(frames, graph, meshes, {number: DepthField(meshes[number]) for number in missing})
-    forward = _propagate(scene, range(len(frames)))
-    backward = _propagate(scene, range(len(frames) - 1, -1, -1))
+    sequence = _Sequence(frames, graph, meshes, {number: DepthField(meshes[number]) for number in missing})
+    forward = _propagate(sequence, range(len(frames)))
+    backward = _propagate(sequence, range(len(frames) - 1, -1, -1))
     return [
-        _interpolated(scene, number, forward, backward) if number in scene.fields else frame
+        _interpolated_limbs(sequence, number, forward, backward) if number in sequence.fields else frame
         for number, frame in enumerate(frames)
     ]
 
 
-def _propagate(scene: _Scene, order: Sequence[int]) -> dict[int, FrameLimbs]:
+def _propagate(sequence: _Sequence, order: Sequence[int]) -> dict[int, FrameLimbs]:
     """Return the frames that lack limbs with those of the frame before them in an order of time."""
     transferred: dict[int, FrameLimbs] = {}
     for before, number in pairwise(order):
-        complete = before not in scene.fields
-        if number in scene.fields and (complete or before in transferred):
-            source = scene.frames[before] if complete else transferred[before]
-            transferred[number] = _transfer(scene, source, before, number)
+        complete = before not in sequence.fields
+        if number in sequence.fields and (complete or before in transferred):
+            source = sequence.frames[before] if complete else transferred[before]
+            transferred[number] = _transfer(sequence, source, before, number)
     return transferred
 
 
-def _transfer(scene: _Scene, source: FrameLimbs, before: int, number: int) -> FrameLimbs:
+def _transfer(sequence: _Sequence, source: FrameLimbs, before: int, number: int) -> FrameLimbs:
     """Return a frame with the limbs that it lacks transferred from another, moved with the surface around them."""
-    frame = scene.frames[number]
-    limb_nodes = number_nodes(scene.graph.edges, source.curves.shape[1])
+    frame = sequence.frames[number]
+    limb_nodes = number_nodes(sequence.graph.edges, source.curves.shape[1])
     nodes, radii = gather_nodes(source.curves[None], limb_nodes)[0], gather_nodes(source.radii[None], limb_nodes)[0]
     steps = torch.stack((limb_nodes[:, :-1], limb_nodes[:, 1:]), -1).reshape(-1, 2)
     moved = transfer_nodes(
         nodes=nodes,
         radii=radii,
         path_lengths=path_lengths(Skeleton(nodes, steps, radii), torch.arange(len(nodes))),
-        source=_surface_points(scene.meshes[before], LOCAL_FITS.num_points),
-        target=_surface_points(scene.meshes[number]),
-        known=_known_nodes(frame, scene.graph, limb_nodes),
+        source=_surface_points(sequence.meshes[before], LOCAL_FITS.num_points),
+        target=_surface_points(sequence.meshes[number]),
+        known=_known_nodes(frame, sequence.graph, limb_nodes),
     )
     curves = torch.where(frame.observed[:, None, None], frame.curves, moved[limb_nodes])
     radii = torch.where(frame.observed[:, None], frame.radii, source.radii)
-    return _joined(replace(frame, curves=curves, radii=radii), scene, number)
+    return _joined_limbs(replace(frame, curves=curves, radii=radii), sequence, number)
 
 
-def _known_nodes(frame: FrameLimbs, graph: LimbGraph, limb_nodes: Tensor) -> KnownNodes:
-    """Return the nodes, samples included, that a frame shows; ``limb_nodes`` (L, S) are the nodes of the samples."""
-    positions = gather_nodes(frame.curves[None], limb_nodes)[0]
-    mask = torch.zeros(len(positions), dtype=torch.bool)
-    mask[limb_nodes[frame.observed].reshape(-1)] = True
+def _known_nodes(frame: FrameLimbs, graph: LimbGraph, limb_nodes: Tensor) -> Tensor:
+    """Return the positions (N, 3) of the samples (L, S) of the limbs that a frame shows, NaN for those of others."""
+    positions = frame.curves.new_full((int(limb_nodes.max()) + 1, 3), torch.nan)
     positions[limb_nodes[frame.observed]] = frame.curves[frame.observed]
-    reliable = _reliable_nodes(frame, graph)
-    mask[: len(reliable)] |= reliable
-    positions[: len(reliable)][reliable] = frame.nodes[reliable]
-    return KnownNodes(mask, positions)
+    reliable = _reliable_nodes(frame, graph).nonzero()[:, 0]
+    positions[reliable] = frame.nodes[reliable]
+    return positions
 
 
 def _reliable_nodes(frame: FrameLimbs, graph: LimbGraph) -> Tensor:
@@ -120,25 +117,25 @@ def _surface_points(mesh: TriangleMesh, count: int | None = None) -> SurfacePoin
     return SurfacePoints(mesh.vertices[used], mesh.vertex_normals()[used] * (-1 if volume < 0 else 1))
 
 
-def _interpolated(
-    scene: _Scene, number: int, forward: dict[int, FrameLimbs], backward: dict[int, FrameLimbs]
+def _interpolated_limbs(
+    sequence: _Sequence, number: int, forward: dict[int, FrameLimbs], backward: dict[int, FrameLimbs]
 ) -> FrameLimbs:
     """Return a frame whose limbs are interpolated in time between those transferred forward and backward."""
     before, after = forward.get(number), backward.get(number)
     if before is None or after is None:
-        return before or after or scene.frames[number]
-    complete = [k for k in range(len(scene.frames)) if k not in scene.fields]
+        return before or after or sequence.frames[number]
+    complete = [k for k in range(len(sequence.frames)) if k not in sequence.fields]
     previous, following = max(k for k in complete if k < number), min(k for k in complete if k > number)
     share = (number - previous) / (following - previous)
     curves = before.curves + share * (after.curves - before.curves)
     radii = before.radii + share * (after.radii - before.radii)
-    return _joined(replace(before, curves=curves, radii=radii), scene, number)
+    return _joined_limbs(replace(before, curves=curves, radii=radii), sequence, number)
 
 
-def _joined(limbs: FrameLimbs, scene: _Scene, number: int) -> FrameLimbs:
+def _joined_limbs(limbs: FrameLimbs, sequence: _Sequence, number: int) -> FrameLimbs:
     """Return transferred limbs of a frame that meet in their nodes again, and lie inside."""
-    frame, field, ends = scene.frames[number], scene.fields[number], scene.graph.edges
-    reliable = _reliable_nodes(frame, scene.graph)
+    frame, field, ends = sequence.frames[number], sequence.fields[number], sequence.graph.edges
+    reliable = _reliable_nodes(frame, sequence.graph)
     total, count = torch.zeros_like(limbs.nodes), torch.zeros(len(limbs.nodes), dtype=limbs.nodes.dtype)
     for side in (0, -1):
         total.index_add_(0, ends[:, side], limbs.curves[:, side])

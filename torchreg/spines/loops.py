@@ -85,7 +85,7 @@ def open_loops(mesh: TriangleMesh, min_length: float, num_levels: int) -> Opened
         ring = _thinnest_ring(opened.mesh, min_length, num_levels)
         if ring is None:
             break
-        opened = _cut(opened, *ring)
+        opened = _cut_ring(opened, *ring)
     return opened
 
 
@@ -93,7 +93,7 @@ def _euler_number(mesh: TriangleMesh) -> int:
     return mesh.num_vertices - len(unique_edges(mesh.faces)[0]) + mesh.num_faces
 
 
-def _cut(opened: OpenedLoops, faces: Tensor, length: float) -> OpenedLoops:
+def _cut_ring(opened: OpenedLoops, faces: Tensor, length: float) -> OpenedLoops:
     """Return the surface without the triangles ``faces`` of a ring of some length, and the two holes closed."""
     keep = torch.ones(opened.mesh.num_faces, dtype=torch.bool)
     keep[faces] = False

@@ -106,10 +106,10 @@ def _persistence(values: np.ndarray, graph: Graph, peaks: np.ndarray, basin: np.
             parent[peak] = peak = parent[parent[peak]]
         return int(peak)
 
-    for left, right, level in zip(
+    for below, above, level in zip(
         *_highest_passes(first[between], second[between], passes[between], len(peaks)), strict=True
     ):
-        low, high = sorted((highest(left), highest(right)), key=lambda peak: (values[peaks[peak]], peaks[peak]))
+        low, high = sorted((highest(below), highest(above)), key=lambda peak: (values[peaks[peak]], peaks[peak]))
         heights[low] = values[peaks[low]] - level
         parent[low] = high
     return heights

@@ -105,7 +105,7 @@ def skeletonize(mesh: TriangleMesh, config: SkeletonizeConfig | None = None) -> 
     interior = Interior(body.mesh)
     balls = [interior.junction_ball(junction, trees) for junction in junctions]
     limbs = _best_limbs(trees, junctions, balls, interior, tips)  # eq. 4 and 5
-    limbs = _centered(limbs, body.mesh, interior, tips)
+    limbs = _centered_limbs(limbs, body.mesh, interior, tips)
     return _assembled(limbs, interior, tips, mesh.vertices)
 
 
@@ -183,7 +183,7 @@ def _find_tips(body: _Body, config: SkeletonizeConfig) -> _SurfaceTips:
     vertices, confidence = protrusions.tips[keep], protrusions.confidence[keep]
     if len(vertices) == 1:
         notes += ("no limb stands out: a single one between two places far apart",)
-        vertices, confidence = _far_apart(graph, vertices), torch.zeros(2, dtype=torch.float64)
+        vertices, confidence = _farthest_pair(graph, vertices), torch.zeros(2, dtype=torch.float64)
     distances = graph.distances(vertices)
     return _SurfaceTips(
         positions=mesh.vertices[vertices],
@@ -195,7 +195,7 @@ def _find_tips(body: _Body, config: SkeletonizeConfig) -> _SurfaceTips:
     )
 
 
-def _far_apart(graph: GeodesicGraph, start: Tensor) -> Tensor:
+def _farthest_pair(graph: GeodesicGraph, start: Tensor) -> Tensor:
     """Return two vertices (2,) that are each other's farthest, or nearly."""
     far = graph.distances(start)[0].argmax()
     return torch.stack((far, graph.distances(far[None])[0].argmax()))
@@ -260,7 +260,7 @@ def _limb_ends(junctions: Sequence[tuple[Tips, ...]], num_tips: int) -> dict[Tip
     return {limb: (near.get(limb), far.get(limb)) for limb in {**far, **near}}
 
 
-def _centered(limbs: Sequence[_Limb], mesh: TriangleMesh, interior: Interior, tips: _SurfaceTips) -> list[_Limb]:
+def _centered_limbs(limbs: Sequence[_Limb], mesh: TriangleMesh, interior: Interior, tips: _SurfaceTips) -> list[_Limb]:
     """Return the limbs moved to the axis of the surface around them, and inside."""
     num_tips = len(tips.vertices)
     free = [(limb.ends[0] < num_tips, limb.ends[1] < num_tips) for limb in limbs]
