@@ -65,8 +65,9 @@ def find_protrusions(graph: Graph, values: Tensor, least_height: float) -> Protr
 
     References: Edelsbrunner, Letscher and Zomorodian 2002.
     """
-    peaks, basin = _basins(graph, values.numpy())
-    heights = _persistence(values.numpy(), graph, peaks, basin)
+    edges = graph.edges()[0].numpy()
+    peaks, basin = _basins(edges, values.numpy())
+    heights = _persistence(values.numpy(), edges, peaks, basin)
     order = np.argsort(-heights, kind="stable")
     order = order[: max(1, int((heights > least_height).sum()))]
     salient = torch.from_numpy(heights[order])
@@ -74,10 +75,9 @@ def find_protrusions(graph: Graph, values: Tensor, least_height: float) -> Protr
     return Protrusions(torch.from_numpy(peaks[order]), salient, ratio**2 / (1 + ratio**2))
 
 
-def _basins(graph: Graph, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _basins(edges: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the local maxima (P,) and, for every node (V,), the number of the one that its steepest ascent ends in."""
-    count = len(graph)
-    first, second = graph.edges()[0].numpy().T
+    count, (first, second) = len(values), edges.T
     # Equal values are ordered by their nodes' numbers, so that a plateau has one maximum.
     rank = np.empty(count, dtype=np.int64)
     rank[np.lexsort((np.arange(count), values))] = np.arange(count)
@@ -91,9 +91,8 @@ def _basins(graph: Graph, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return peaks, np.searchsorted(peaks, ascent)
 
 
-def _persistence(values: np.ndarray, graph: Graph, peaks: np.ndarray, basin: np.ndarray) -> np.ndarray:
+def _persistence(values: np.ndarray, edges: np.ndarray, peaks: np.ndarray, basin: np.ndarray) -> np.ndarray:
     """Return the persistence (P,) of each peak."""
-    edges = graph.edges()[0].numpy()
     first, second = np.sort(basin[edges], axis=1).T
     between = first < second
     passes = values[edges].min(1)
@@ -106,9 +105,8 @@ def _persistence(values: np.ndarray, graph: Graph, peaks: np.ndarray, basin: np.
             parent[peak] = peak = parent[parent[peak]]
         return int(peak)
 
-    for below, above, level in zip(
-        *_highest_passes(first[between], second[between], passes[between], len(peaks)), strict=True
-    ):
+    tree = _highest_passes(first[between], second[between], passes[between], len(peaks))
+    for below, above, level in zip(*tree, strict=True):
         low, high = sorted((highest(below), highest(above)), key=lambda peak: (values[peaks[peak]], peaks[peak]))
         heights[low] = values[peaks[low]] - level
         parent[low] = high

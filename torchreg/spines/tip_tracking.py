@@ -17,13 +17,13 @@ from torchreg.spines.tip_matching import TipReference, rank_mappings
 
 
 @dataclass(frozen=True)
-class Tracking:
+class TipTracking:
     """How a frame is compared with the nearest tracked frame and with the nearest reference."""
 
     rotation_weight: float = 0.3  # of the rotation since the nearest frame; since the reference any will do
     reference_weight: float = 0.3  # of the reference, which may be far in time, against the nearest frame
     min_run: int = 9  # frames of a run that has a reference of its own
-    persistence: float = 0.5  # share of their last displacement by which limbs are predicted to go on
+    velocity_share: float = 0.5  # of the last displacement, by which limbs are predicted to move on
     num_points: int = 8  # of a limb that are compared
     extent: float = 0.85  # share of the limb that they cover, from the tip
     root_softening: float = 0.15  # added to distances from the root, in limb lengths, where errors count as angles
@@ -40,7 +40,7 @@ class Tracking:
         return weights / weights.mean()
 
 
-_TRACKING = Tracking()
+_TRACKING = TipTracking()
 
 
 def track_tips(skeletons: Sequence[Skeleton], num_tips: int | None = None) -> tuple[Tensor, int]:
@@ -143,7 +143,7 @@ class _TipTracker:
         before = 2 * near - frame
         if before not in self.points:
             return self.points[near]
-        return self.points[near] + _TRACKING.persistence * (self.points[near] - self.points[before])
+        return self.points[near] + _TRACKING.velocity_share * (self.points[near] - self.points[before])
 
     def _update(self, frame: int, near: int, curves: Tensor) -> None:
         """Keep the points and path lengths of a frame; those of tips that were not found come from the nearest one."""
