@@ -7,14 +7,14 @@ import torch
 
 from torchreg.geometry.rotation import so3_exp
 from torchreg.spines.curves import (
+    align_frames,
     bend_angles,
     curve_frames,
     curve_lengths,
-    follow,
+    moving_average,
     points_along,
-    smooth_curve,
+    rotation_between,
     tangents,
-    turn_between,
 )
 
 
@@ -41,9 +41,9 @@ def test_batches_equal_loops_and_rigid_motion_changes_nothing_but_directions():
     turn = so3_exp(torch.tensor([0.3, -1.0, 0.5], dtype=torch.float64))
     moved = 2.5 * curves @ turn.mT + 7
     for function, factor in ((curve_lengths, 2.5), (bend_angles, 1.0)):
-        whole = function(curves)
-        torch.testing.assert_close(whole[1, 2], function(curves[1, 2]))
-        torch.testing.assert_close(function(moved), factor * whole)
+        batched = function(curves)
+        torch.testing.assert_close(batched[1, 2], function(curves[1, 2]))
+        torch.testing.assert_close(function(moved), factor * batched)
     torch.testing.assert_close(tangents(moved), tangents(curves) @ turn.mT)
 
 
@@ -58,27 +58,27 @@ def test_frames_are_rotations_along_the_curve_without_twist():
     torch.testing.assert_close(local, local[:1].expand(60, 3))
 
 
-def test_the_smallest_turn_takes_one_vector_to_the_other():
+def test_the_smallest_rotation_takes_one_vector_to_the_other():
     start, end = (torch.nn.functional.normalize(random(50, 3, seed=seed), dim=-1) for seed in (1, 2))
-    turn = turn_between(start, end)
+    turn = rotation_between(start, end)
     torch.testing.assert_close((turn @ start.unsqueeze(-1)).squeeze(-1), end)
     cosine = 0.5 * (turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
     torch.testing.assert_close(cosine, (start * end).sum(-1))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_opposite_vectors_are_turned_by_half(axis):
+def test_opposite_vectors_are_half_a_turn_apart(axis):
     start = torch.eye(3, dtype=torch.float64)[axis]
-    turn = turn_between(start, -start)
+    turn = rotation_between(start, -start)
     torch.testing.assert_close(turn @ start, -start)
     torch.testing.assert_close(torch.linalg.det(turn), torch.tensor(1.0, dtype=torch.float64))
-    torch.testing.assert_close(turn_between(start, start), torch.eye(3, dtype=torch.float64))
+    torch.testing.assert_close(rotation_between(start, start), torch.eye(3, dtype=torch.float64))
 
 
-def test_frames_that_follow_keep_what_lies_across_the_turn():
+def test_aligned_frames_keep_what_lies_on_the_axis_of_rotation():
     frames = so3_exp(random(5, 3))
     direction = torch.nn.functional.normalize(random(5, 3, seed=3), dim=-1)
-    moved = follow(frames, direction)
+    moved = align_frames(frames, direction)
     torch.testing.assert_close(moved[..., 2], direction)
     axis = torch.linalg.cross(frames[..., 2], direction)
     torch.testing.assert_close(
@@ -111,10 +111,10 @@ def test_points_along_a_curve_lie_at_their_lengths():
 
 def test_smoothing_keeps_ends_and_straight_lines_and_takes_the_zigzag_out():
     line = torch.linspace(0, 1, 40, dtype=torch.float64)[:, None] * torch.tensor([1.0, 2.0, -1.0])
-    smooth = smooth_curve(line, 0.3)
+    smooth = moving_average(line, 0.3, 65)
     assert torch.equal(smooth[[0, -1]], line[[0, -1]])
     torch.testing.assert_close(smooth, torch.linspace(0, 1, 65, dtype=torch.float64)[:, None] * line[-1])
     zigzag = line + 0.1 * torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=torch.float64).repeat(20, 1)
     assert float(curve_lengths(zigzag)) > 2 * float(curve_lengths(line))
-    assert float(curve_lengths(smooth_curve(zigzag, 0.3))) < 1.15 * float(curve_lengths(line))
-    torch.testing.assert_close(smooth_curve(circle(), 0.05), circle(), rtol=0, atol=0.02)
+    assert float(curve_lengths(moving_average(zigzag, 0.3, 65))) < 1.15 * float(curve_lengths(line))
+    torch.testing.assert_close(moving_average(circle(), 0.05, 65), circle(), rtol=0, atol=0.02)

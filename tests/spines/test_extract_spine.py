@@ -1,4 +1,4 @@
-"""Spines of sequences that share nothing against the truth: names, topology, curves; and data that are not sound."""
+"""Spines of sequences that share nothing against the truth, on unsound data, in several processes and in two calls."""
 
 import pytest
 import torch
@@ -9,6 +9,8 @@ from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
 from torchreg.geometry.rotation import so3_exp
 from torchreg.result import Status
 from torchreg.spines.extract_spine import SpineConfig, extract_spine
+from torchreg.spines.results import SpineSequence
+from torchreg.spines.skeletonize import SkeletonizeConfig
 from torchreg.storage import load
 
 STAR = "(()()()()())"
@@ -43,7 +45,7 @@ def test_one_graph_with_named_tips_also_where_arms_touch(extracted, touching):
     assert extracted.own_topologies.count(STAR) >= 0.5 * FRAMES
 
 
-def test_the_status_tells_what_was_carried_over(extracted, touching):
+def test_the_status_tells_which_limbs_were_transferred(extracted, touching):
     for frame in range(FRAMES):
         clean = bool(extracted.own[frame].all()) and bool(extracted.found[frame].all())
         if not clean:
@@ -56,8 +58,8 @@ def test_the_status_tells_what_was_carried_over(extracted, touching):
 def test_the_model_plays_between_frames_and_is_saved(extracted, tmp_path):
     torch.testing.assert_close(extracted.model(extracted.times), extracted.curves)
     between = extracted.model(0.15)
-    gap = (extracted.curves[1] - extracted.curves[2]).norm(dim=-1)
-    assert bool(((between - extracted.curves[1]).norm(dim=-1) < gap + 1e-3).all())
+    motion = (extracted.curves[1] - extracted.curves[2]).norm(dim=-1)
+    assert bool(((between - extracted.curves[1]).norm(dim=-1) < motion + 1e-3).all())
     torch.testing.assert_close(extracted.model.frames(0.1), extracted.frames[1], atol=1e-4, rtol=0)
     extracted.save(tmp_path / "a.safetensors")
     again = load(tmp_path / "a.safetensors")
@@ -73,9 +75,9 @@ def test_motion_scale_and_order_of_vertices_change_nothing_but_coordinates():
         return 250 * points @ turn.mT + torch.tensor([10.0, -500.0, 3.0], dtype=torch.float64)
 
     plain = extract_spine(sequence.meshes)
-    other = extract_spine([TriangleMesh(moved(mesh.vertices), mesh.faces) for mesh in sequence.meshes])
-    torch.testing.assert_close(other.curves, moved(plain.curves), rtol=0, atol=250 * 2e-2)
-    assert other.topologies == plain.topologies
+    again = extract_spine([TriangleMesh(moved(mesh.vertices), mesh.faces) for mesh in sequence.meshes])
+    torch.testing.assert_close(again.curves, moved(plain.curves), rtol=0, atol=250 * 2e-2)
+    assert again.topologies == plain.topologies
 
 
 def test_a_single_frame_is_a_spine_that_stands_still():
@@ -144,3 +146,92 @@ def test_more_tips_than_any_frame_shows_are_refused():
         extract_spine(sequence.meshes, config=SpineConfig(num_tips=7))
     with pytest.raises(InputError, match="times must have shape"):
         extract_spine(sequence.meshes, times=torch.tensor([0.0, 1.0]))
+
+
+@pytest.fixture(scope="module")
+def meshes():
+    return creature_sequence(STARFISH, 4, resolution=32).meshes
+
+
+@pytest.fixture(scope="module")
+def alone(meshes):
+    return extract_spine(meshes, workers=1)
+
+
+def test_several_processes_give_what_one_gives(meshes, alone):
+    records = []
+    shared = extract_spine(meshes, workers=2, on_step=records.append)
+    assert torch.equal(shared.curves, alone.curves)
+    assert torch.equal(shared.radii, alone.radii)
+    assert sorted(record.frame for record in records) == [0, 1, 2, 3]
+    assert {(record.num_frames, record.num_tips, record.topology) for record in records} == {(4, 5, STAR)}
+    assert all(record.seconds > 0 for record in records)
+
+
+def test_skeletons_that_were_kept_are_not_computed_again(meshes, alone, tmp_path):
+    folder = tmp_path / "kept"
+
+    def stop(record):
+        if record.frame == 1:
+            raise KeyboardInterrupt
+
+    def computed(meshes, **options):
+        records = []
+        spine = extract_spine(meshes, workers=1, on_step=records.append, progress=folder, **options)
+        return spine, [record.seconds > 0 for record in sorted(records, key=lambda record: record.frame)]
+
+    with pytest.raises(KeyboardInterrupt):
+        extract_spine(meshes, workers=1, on_step=stop, progress=folder)
+    assert len(list(folder.glob("*.safetensors"))) == 2
+    assert computed(meshes)[1] == [False, False, True, True]
+    spine, again = computed(meshes)
+    assert not any(again)
+    assert torch.equal(spine.curves, alone.curves)
+    damaged = folder / "frame_00002.safetensors"
+    damaged.write_bytes(damaged.read_bytes()[:-7])
+    spine, again = computed(meshes)
+    assert again == [False, False, True, False]
+    assert torch.equal(spine.curves, alone.curves)
+    finer = SpineConfig(skeletons=SkeletonizeConfig(num_levels=80))
+    assert computed(meshes[:2], config=finer)[1] == [True, True]
+    assert computed(meshes[1:2])[1] == [True]
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_error_names_its_frame(meshes, workers):
+    flat = TriangleMesh(torch.zeros(3, 3), torch.tensor([[0, 1, 2]]))
+    with pytest.raises(InputError, match=r"meshes\[3\]: "):
+        extract_spine([*meshes[:3], flat], workers=workers)
+
+
+def sequence(graph, curves, num_tips):
+    num_frames, num_limbs = curves.shape[:2]
+    return SpineSequence(
+        model=torch.nn.Identity(), graph=graph, curves=curves, radii=torch.ones(curves.shape[:3]),
+        frames=torch.eye(3).expand(*curves.shape[:3], 3, 3), times=torch.arange(float(num_frames)),
+        found=torch.ones(num_frames, num_tips, dtype=torch.bool),
+        own=torch.ones(num_frames, num_limbs, dtype=torch.bool), reference=0, topologies=("",) * num_frames,
+        own_topologies=("",) * num_frames, statuses=(Status.CONVERGED,) * num_frames, status=Status.CONVERGED,
+        warnings=(),
+    )  # fmt: skip
+
+
+def test_tips_are_where_limbs_start_and_junctions_where_they_meet():
+    # An H: four tips, two junctions, the bar last.
+    positions = torch.tensor([[0.0, 1], [0, -1], [2, 1], [2, -1], [0, 0], [2, 0]])
+    graph = torch.tensor([[0, 4], [1, 4], [2, 5], [3, 5], [4, 5]])
+    ends = torch.nn.functional.pad(positions, (0, 1))[graph]
+    steps = torch.linspace(0, 1, 4)[:, None]
+    curve = torch.lerp(ends[:, :1], ends[:, 1:], steps)
+    curves = torch.stack((curve, curve + torch.tensor([0.0, 0, 5])))
+    found = sequence(graph, curves, num_tips=4)
+    assert found.num_tips == 4
+    torch.testing.assert_close(found.tips[..., :2], positions[:4].expand(2, 4, 2))
+    torch.testing.assert_close(found.junctions[..., :2], positions[4:].expand(2, 2, 2))
+    assert found.junctions[..., 2].unique().tolist() == [0, 5]
+
+
+def test_a_single_limb_has_no_junction():
+    curves = torch.rand(3, 2, 4, 3, generator=torch.Generator().manual_seed(0))[:, :1]
+    found = sequence(torch.tensor([[0, 1]]), curves, num_tips=2)
+    assert found.junctions.shape == (3, 0, 3)

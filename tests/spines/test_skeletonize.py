@@ -1,3 +1,5 @@
+"""Skeletons of single surfaces: tips, topology and axes against the truth, on sound and unsound meshes."""
+
 import math
 
 import pytest
@@ -121,12 +123,12 @@ def test_holes_are_closed_and_told(star):
 
 def test_fragments_by_policy(star):
     mesh, ball = star.meshes[0], unit_sphere(2)
-    both = concatenate([TriangleMesh(0.05 * ball.vertices + 2, ball.faces), mesh])
-    skeleton = skeletonize(both)
+    pair = concatenate([TriangleMesh(0.05 * ball.vertices + 2, ball.faces), mesh])
+    skeleton = skeletonize(pair)
     assert skeleton.topology == STAR
     assert skeleton.notes[0].startswith("1 fragment(s) left out")
     with pytest.raises(InputError, match="mesh must be one piece, got 2"):
-        skeletonize(both, SkeletonizeConfig(pieces="error"))
+        skeletonize(pair, SkeletonizeConfig(pieces="error"))
 
 
 def test_a_limb_in_two_pieces_is_bridged():
@@ -143,8 +145,8 @@ def test_a_limb_in_two_pieces_is_bridged():
 def test_loops_of_bridged_surfaces_are_bypassed():
     turn = torch.linspace(0, 2 * math.pi, 100).double()
     ring = torch.stack((turn.cos(), turn.sin(), 0 * turn), dim=1)
-    both = concatenate([tube(ring + torch.tensor([x, 0.0, 0.0]), 0.2, 0.1) for x in (0.0, 2.8)])
-    skeleton = skeletonize(both, SkeletonizeConfig(pieces="bridge"))
+    pair = concatenate([tube(ring + torch.tensor([x, 0.0, 0.0]), 0.2, 0.1) for x in (0.0, 2.8)])
+    skeleton = skeletonize(pair, SkeletonizeConfig(pieces="bridge"))
     assert skeleton.notes[0] == "2 pieces joined by 1 bridges"
     assert float(skeleton.nodes[:, 0].max() - skeleton.nodes[:, 0].min()) > 4
 
@@ -186,7 +188,7 @@ def test_a_ball_is_a_single_limb_of_no_confidence():
     assert skeleton.nodes.norm(dim=1).max() < 1
 
 
-def test_large_surfaces_are_thinned(star, star_skeleton):
+def test_large_surfaces_are_coarsened(star, star_skeleton):
     skeleton = skeletonize(star.meshes[0], SkeletonizeConfig(max_vertices=1000))
     assert skeleton.topology == STAR
     assert torch.cdist(skeleton.nodes, star_skeleton.nodes).amin(1).max() < 0.04
@@ -215,6 +217,9 @@ def test_bad_input_is_refused():
         skeletonize(torch.zeros(3, 3))
     with pytest.raises(InputError, match="three different corners"):
         skeletonize(TriangleMesh(torch.zeros(3, 3), torch.zeros(0, 3, dtype=torch.int64)))
+    ball = unit_sphere(2, dtype=torch.float64)
+    with pytest.raises(InputError, match="mesh must have a finite area"):
+        skeletonize(TriangleMesh(1e200 * ball.vertices, ball.faces))
     with pytest.raises(InputError, match="min_protrusion must be positive"):
         SkeletonizeConfig(min_protrusion=0.0)
     with pytest.raises(InputError, match="pieces must be one of"):

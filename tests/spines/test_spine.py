@@ -80,7 +80,7 @@ def test_frames_of_the_limbs_follow_the_curves_and_turn_with_the_body():
     torch.testing.assert_close(frames, half @ first[0])
 
 
-def test_lengths_and_bends_are_those_of_the_curves():
+def test_lengths_and_bend_angles_are_those_of_the_curves():
     straight = torch.linspace(0, 1, 5, dtype=torch.float64)[:, None] * torch.tensor([3.0, 4.0, 0.0])
     bent = torch.tensor([[0.0, 0, 0], [1, 0, 0], [1, 1, 0]], dtype=torch.float64)
     spine = Spine(straight[None, None], torch.tensor([[0, 1]]))
@@ -103,7 +103,7 @@ def test_gradients_are_right_in_time_and_nodes(spine):
     assert bool(spine.nodes.grad.isfinite().all())
 
 
-def test_a_loss_draws_the_curves_to_their_target(spine):
+def test_a_loss_moves_the_curves_to_their_target(spine):
     target = made_curves(seed=5)
     optimizer = torch.optim.Adam(spine.parameters(), lr=0.1)
     for _ in range(150):
@@ -123,9 +123,9 @@ def test_a_single_frame_stands_still():
 
 
 def test_states_are_saved_and_loaded(spine):
-    other = Spine(made_curves(seed=3), GRAPH, times=spine.times)
-    other.load_state_dict(spine.state_dict())
-    assert torch.equal(other(2.2), spine(2.2))
+    loaded = Spine(made_curves(seed=3), GRAPH, times=spine.times)
+    loaded.load_state_dict(spine.state_dict())
+    assert torch.equal(loaded(2.2), spine(2.2))
 
 
 @pytest.mark.parametrize(
@@ -159,8 +159,7 @@ def test_the_record_makes_the_same_spine_again_also_after_a_step(spine):
     with torch.no_grad():
         spine.nodes += 0.1
         spine.node_radii *= 2
-    fields = spine.record()
-    again = Spine(fields.curves, fields.graph, fields.radii, fields.frames, fields.times)
+    again = Spine.from_record(spine.record())
     for name in ("nodes", "node_radii", "rest_frames", "times", "graph"):
         assert torch.equal(getattr(again, name), getattr(spine, name))
 

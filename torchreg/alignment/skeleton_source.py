@@ -96,7 +96,7 @@ class SpineLimbs:
         starts, targets = [], []
         for typical in typical_poses(shape):
             known = chains.positions(shape, typical.unsqueeze(0))[0]
-            maps, _ = rank_mappings([TipReference(known, turn=0.0)], limbs, missing=_CHAIN_FIT.missing)
+            maps, _ = rank_mappings([TipReference(known)], limbs, missing_cost=_CHAIN_FIT.missing)
             for row in maps[: _CHAIN_FIT.num_mappings]:
                 pose, target = _rigidly_mapped(typical, known, limbs, row)
                 starts.append(pose)

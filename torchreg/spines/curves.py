@@ -1,4 +1,4 @@
-"""Curves as rows of points: lengths, bends, directions, and frames that follow them without twist."""
+"""Polylines: lengths, bending angles, tangents, smoothing, and frames that follow them without twist."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from torch import Tensor
 
 from torchreg.geometry.rotation import skew
 
-# Below this share of the largest step a step has no direction; cosines this near to -1 turn by half.
-_NO_STEP, _OPPOSITE = 1e-6, 1e-6
+# Relative size below which a step has no direction, and 1 + cosine below which two directions are opposite.
+_DEGENERATE = 1e-6
 
 
 def curve_lengths(curves: Tensor) -> Tensor:
@@ -19,10 +19,16 @@ def curve_lengths(curves: Tensor) -> Tensor:
     return _safe_norm(curves[..., 1:, :] - curves[..., :-1, :]).sum(-1)
 
 
-def points_along(curve: Tensor, lengths: Tensor) -> Tensor:
-    """Return the points (..., 3) of a curve (n, 3) at lengths (...,) along it; its last point beyond the end.
+def arc_lengths(curve: Tensor) -> Tensor:
+    """Return the arc length (n,) from the first point of a curve (n, 3) to each of its points."""
+    steps = (curve[1:] - curve[:-1]).norm(dim=-1)
+    return torch.cat((steps.new_zeros(1), steps.cumsum(0)))
 
-    Differentiable: in the curve, with the places along it held fixed.
+
+def points_along(curve: Tensor, lengths: Tensor) -> Tensor:
+    """Return the points (..., 3) of a curve (n, 3) at arc lengths (...,); its last point beyond the end.
+
+    Differentiable: in the curve, with the positions along it held fixed.
     """
     along = torch.cat((curve.new_zeros(1), _safe_norm(curve[1:] - curve[:-1]).cumsum(0))).detach()
     lengths = lengths.clamp(0, float(along[-1]))
@@ -33,24 +39,35 @@ def points_along(curve: Tensor, lengths: Tensor) -> Tensor:
     return curve[before] + share.unsqueeze(-1) * (curve[after] - curve[before])
 
 
-def smooth_curve(curve: Tensor, share: float, count: int = 65) -> Tensor:
-    """Return a curve (n, 3) as ``count`` points at equal intervals, averaged over a share of its length; its ends stay.
+def moving_average(curve: Tensor, window: float, count: int) -> Tensor:
+    """Return a curve (n, 3) as ``count`` points at equal intervals, averaged over a window; its ends stay.
 
-    Differentiable: in the curve, with the places along it held fixed.
+    Differentiable: in the curve, with the positions along it held fixed.
+
+    Args:
+        curve: (n, 3).
+        window: a share of the curve's length.
+        count: number of points returned.
     """
-    whole = float(curve_lengths(curve.detach()))
-    even = points_along(curve, torch.linspace(0, whole, count, dtype=curve.dtype, device=curve.device))
-    half = min(round(0.5 * share * (count - 1)), count - 1)
-    # Turned about its ends: a straight curve stays what it is.
-    before, after = (
-        2 * even[:1] - even[1 : half + 1].flip(0),
-        2 * even[-1:] - even[count - 1 - half : count - 1].flip(0),
-    )
+    length = float(curve_lengths(curve.detach()))
+    even = points_along(curve, torch.linspace(0, length, count, dtype=curve.dtype, device=curve.device))
+    half = min(round(0.5 * window * (count - 1)), count - 1)
+    # Continued by point reflection at its ends: a straight curve stays what it is.
+    before = 2 * even[:1] - even[1 : half + 1].flip(0)
+    after = 2 * even[-1:] - even[count - 1 - half : count - 1].flip(0)
     return torch.cat((before, even, after)).unfold(0, 2 * half + 1, 1).mean(-1)
 
 
+def binomial_smoothing(values: Tensor, passes: int) -> Tensor:
+    """Return rows (n, 3) averaged with their two neighbors, weights 1-2-1, so many times; the end rows stay."""
+    for _ in range(passes):
+        inner = 0.25 * (values[:-2] + 2 * values[1:-1] + values[2:])
+        values = torch.cat((values[:1], inner, values[-1:]))
+    return values
+
+
 def bend_angles(curves: Tensor) -> Tensor:
-    """Return how far curves (..., S, 3) turn at their inner points, (..., S - 2) radians from 0 to pi.
+    """Return the turning angles (..., S - 2) of curves (..., S, 3) at their inner points, radians from 0 to pi.
 
     Differentiable: in the curves; straight, turned back or without length, the gradient is zero.
     """
@@ -64,27 +81,26 @@ def bend_angles(curves: Tensor) -> Tensor:
 
 
 def tangents(curves: Tensor) -> Tensor:
-    """Return unit directions (..., S, 3) of curves (..., S, 3): central differences, one-sided at the ends.
+    """Return the unit tangents (..., S, 3) of curves (..., S, 3): central differences, one-sided at the ends.
 
-    Where points fall together the direction is that of the points around; along +x for a curve without length.
+    Where points coincide the tangent is the direction of the chord from end to end; +x for a curve without length.
 
     Differentiable: in the curves.
     """
     steps = curves[..., 1:, :] - curves[..., :-1, :]
     padded = torch.cat((steps[..., :1, :], steps, steps[..., -1:, :]), dim=-2)
-    across = padded[..., 1:, :] + padded[..., :-1, :]
-    length = _safe_norm(across)
+    central = padded[..., 1:, :] + padded[..., :-1, :]
+    length = _safe_norm(central)
     chord = curves[..., -1:, :] - curves[..., :1, :]
-    floor = _NO_STEP * length.detach().amax(-1, keepdim=True)
-    weak = (length <= floor).unsqueeze(-1)
-    whole = _safe_norm(chord).unsqueeze(-1)
-    axis = torch.zeros_like(chord)
-    axis[..., 0] = 1.0
-    stand_in = torch.where(whole > 0, chord / torch.where(whole > 0, whole, 1.0), axis)
-    return torch.where(weak, stand_in, across / torch.where(weak, 1.0, length.unsqueeze(-1)))
+    degenerate = (length <= _DEGENERATE * length.detach().amax(-1, keepdim=True)).unsqueeze(-1)
+    extent = _safe_norm(chord).unsqueeze(-1)
+    x_axis = torch.zeros_like(chord)
+    x_axis[..., 0] = 1.0
+    fallback = torch.where(extent > 0, chord / torch.where(extent > 0, extent, 1.0), x_axis)
+    return torch.where(degenerate, fallback, central / torch.where(degenerate, 1.0, length.unsqueeze(-1)))
 
 
-def turn_between(start: Tensor, end: Tensor) -> Tensor:
+def rotation_between(start: Tensor, end: Tensor) -> Tensor:
     """Return the rotations (..., 3, 3) of smallest angle that take unit vectors ``start`` (..., 3) to ``end`` (..., 3).
 
     Opposite vectors are turned about an axis perpendicular to them that is otherwise arbitrary.
@@ -93,28 +109,28 @@ def turn_between(start: Tensor, end: Tensor) -> Tensor:
     """
     start, end = torch.broadcast_tensors(start, end)
     cosine = (start * end).sum(-1, keepdim=True).unsqueeze(-1)
-    opposite = cosine < _OPPOSITE - 1
+    opposite = cosine < _DEGENERATE - 1
     cross = skew(torch.linalg.cross(start, end, dim=-1))
     identity = torch.eye(3, dtype=start.dtype, device=start.device)
-    turn = identity + cross + cross @ cross / torch.where(opposite, 1.0, 1 + cosine)
+    rotation = identity + cross + cross @ cross / torch.where(opposite, 1.0, 1 + cosine)
     smallest = torch.nn.functional.one_hot(start.detach().abs().argmin(-1), 3).to(start)
     axis = torch.linalg.cross(start, smallest, dim=-1)
     axis = axis / axis.norm(dim=-1, keepdim=True)
-    return torch.where(opposite, 2 * axis.unsqueeze(-1) * axis.unsqueeze(-2) - identity, turn)
+    return torch.where(opposite, 2 * axis.unsqueeze(-1) * axis.unsqueeze(-2) - identity, rotation)
 
 
-def follow(frames: Tensor, directions: Tensor) -> Tensor:
-    """Return frames (..., 3, 3) turned by the smallest angle so that their third columns are ``directions`` (..., 3).
+def align_frames(frames: Tensor, directions: Tensor) -> Tensor:
+    """Return frames (..., 3, 3) turned by the smallest angle that makes ``directions`` (..., 3) their third columns.
 
     Differentiable: in both.
     """
-    return turn_between(frames[..., 2], directions) @ frames
+    return rotation_between(frames[..., 2], directions) @ frames
 
 
 def curve_frames(curves: Tensor) -> Tensor:
-    """Return frames ``R_world_curve`` (..., S, 3, 3) along curves (..., S, 3) that turn with them but do not twist.
+    """Return rotation-minimizing frames ``R_world_curve`` (..., S, 3, 3) along curves (..., S, 3).
 
-    The third column is the direction of the curve. The first frame is the smallest turn of the axes.
+    The third column is the tangent. The first frame is the smallest rotation of the world's axes.
 
     Differentiable: in the curves.
 
@@ -122,13 +138,13 @@ def curve_frames(curves: Tensor) -> Tensor:
     """
     directions = tangents(curves)
     eye = torch.eye(3, dtype=curves.dtype, device=curves.device).expand(*curves.shape[:-2], 3, 3)
-    frames = [follow(eye, directions[..., 0, :])]
+    frames = [align_frames(eye, directions[..., 0, :])]
     for index in range(1, curves.shape[-2]):
-        frames.append(follow(frames[-1], directions[..., index, :]))
+        frames.append(align_frames(frames[-1], directions[..., index, :]))
     return torch.stack(frames, dim=-3)
 
 
 def _safe_norm(vectors: Tensor) -> Tensor:
-    """Return lengths (...,) whose gradient at zero is zero."""
+    """Return the lengths (...,) of vectors (..., 3), with gradient zero at zero."""
     square = vectors.square().sum(-1)
     return torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0)

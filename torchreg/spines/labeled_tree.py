@@ -1,96 +1,96 @@
-"""Trees with named tips: the splits that describe them, the graph of their limbs, and where its junctions lie."""
+"""Trees with labeled tips: the splits that describe them, the graph of their limbs, and its junctions on a skeleton."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_count
-from torchreg.errors import InputError
 from torchreg.geometry.graphs import Graph, rooted
 from torchreg.geometry.skeleton import Skeleton
 
-# A split names the tips on one side of a limb between junctions: the side without tip 0.
-Split = frozenset[int]
+# The labels of the tips on one side of a limb; a split is the side without tip 0, and stands for the limb.
+Tips = frozenset[int]
 
 
 @dataclass(frozen=True)
 class LimbGraph:
-    """A tree of limbs with named tips, without places: the G of a spine.
+    """A tree of limbs with labeled tips, without positions: the G of a spine.
 
     Args:
         num_tips: K, at least 2; the tips are the nodes 0 to K - 1, the junctions follow.
-        splits: one per limb between two junctions: the tips on its side away from tip 0. They must fit into one tree.
-
-    Raises:
-        InputError: if a split is not of that kind or contradicts another.
+        splits: one per limb between two junctions; of any two, one contains the other or they share no tip.
 
     References: Buneman 1971.
     """
 
     num_tips: int
-    splits: frozenset[Split]
-
-    def __post_init__(self) -> None:
-        check_count(self.num_tips, "num_tips", 2)
-        inner = range(1, self.num_tips)
-        for split in self.splits:
-            if not 2 <= len(split) <= self.num_tips - 2 or not all(tip in inner for tip in split):
-                most = self.num_tips - 2
-                raise InputError(f"splits must hold 2 to {most} of the tips 1 to {most + 1}, got {sorted(split)}")
-        for split in self.splits:
-            for other in self.splits:
-                if not fit_together(split, other):
-                    raise InputError(f"splits must fit into one tree, but {sorted(split)} and {sorted(other)} do not")
+    splits: frozenset[Tips]
 
     @cached_property
-    def branches(self) -> tuple[tuple[frozenset[int], ...], ...]:
+    def branches(self) -> tuple[tuple[Tips, ...], ...]:
         """Per junction the tips behind each of its limbs; the limb towards tip 0 comes first."""
-        every = frozenset(range(self.num_tips))
         if self.num_tips == 2:
             return ()
-        result = []
-        for below in [every - {0}, *self.ordered_splits]:
-            inside = [split for split in self.ordered_splits if split < below]
-            children = [split for split in inside if not any(split < other for other in inside)]
-            loose = below.difference(*children)
-            parts = sorted([*children, *(frozenset({tip}) for tip in loose)], key=min)
-            result.append((every - below, *parts))
-        return tuple(result)
+        rows = [(first, *sorted(rest, key=min)) for first, *rest in junctions_from_splits(self.splits, self.num_tips)]
+        every = frozenset(range(self.num_tips))
+        return tuple(sorted(rows, key=lambda row: _split_order(every - row[0])))
 
     @cached_property
     def edges(self) -> Tensor:
         """Node indices (L, 2) of the limbs: K that start at the tips, in order, then those between junctions."""
         if self.num_tips == 2:
             return torch.tensor([[0, 1]])
-        owner = {}
-        for number, (_, *parts) in enumerate(self.branches):
-            for part in parts:
-                owner[part] = self.num_tips + number
+        inner_end = {part: self.num_tips + k for k, (_, *parts) in enumerate(self.branches) for part in parts}
         rows = [(0, self.num_tips)]
-        rows += [(tip, owner[frozenset({tip})]) for tip in range(1, self.num_tips)]
-        rows += [(owner[split], self.num_tips + 1 + number) for number, split in enumerate(self.ordered_splits)]
+        rows += [(tip, inner_end[frozenset({tip})]) for tip in range(1, self.num_tips)]
+        rows += [(inner_end[split], self.num_tips + 1 + k) for k, split in enumerate(self.ordered_splits)]
         return torch.tensor(rows)
 
     @cached_property
     def topology(self) -> str:
-        """Canonical form without names, as in `Skeleton.topology`."""
+        """Canonical form without labels, as in `Skeleton.topology`."""
         count = len(self.edges) + 1
-        return Skeleton(torch.eye(3)[torch.zeros(count).long()], self.edges, torch.zeros(count)).topology
+        return Skeleton(torch.zeros(count, 3), self.edges, torch.zeros(count)).topology
 
     @property
-    def ordered_splits(self) -> list[Split]:
-        """The splits, one per limb between junctions, in the order of `edges`: large ones first, then by their tips."""
-        return sorted(self.splits, key=lambda split: (-len(split), sorted(split)))
+    def ordered_splits(self) -> list[Tips]:
+        """The splits in the order of `edges`: large ones first, then by their tips."""
+        return sorted(self.splits, key=_split_order)
+
+
+def _split_order(split: Tips) -> tuple[int, list[int]]:
+    return -len(split), sorted(split)
+
+
+def junctions_from_splits(splits: Collection[Tips], num_tips: int) -> list[tuple[Tips, ...]]:
+    """Return the junctions of the tree of compatible splits, each as the sets of tips that its limbs lead to.
+
+    The set that holds tip 0 comes first in each junction; the junction next to tip 0 is the first one.
+
+    Args:
+        splits: compatible, each the side without tip 0.
+        num_tips: K, three or more.
+    """
+    every = frozenset(range(num_tips))
+    behind = sorted({every - {0}, *splits}, key=len, reverse=True)
+    limbs = {tips: [every - tips] for tips in behind}
+    for child in (*behind[1:], *(frozenset({tip}) for tip in range(1, num_tips))):
+        limbs[min((tips for tips in behind if child < tips), key=len)].append(child)
+    return [tuple(limbs[tips]) for tips in behind]
+
+
+def without_tip_zero(tips: Tips, every: Tips) -> Tips:
+    """Return the side of a limb without tip 0, given the tips on one side and all tips."""
+    return tips if 0 not in tips else every - tips
 
 
 def number_nodes(graph: Tensor, num_samples: int) -> Tensor:
-    """Return which node each sample of each limb is, (L, num_samples), for limbs (L, 2) that share their end nodes.
+    """Return the node of each sample of each limb (L, num_samples), for limbs (L, 2) that share their end nodes.
 
     The nodes of the graph keep their numbers; the samples inside the limbs follow.
     """
@@ -99,16 +99,11 @@ def number_nodes(graph: Tensor, num_samples: int) -> Tensor:
 
 
 def gather_nodes(values: Tensor, limb_nodes: Tensor) -> Tensor:
-    """Return values (T, L, S, ...) along limbs per node (T, N, ...), each from the first limb that has it."""
+    """Return values per node (T, N, ...) of values along limbs (T, L, S, ...), each from the first limb that has it."""
     flat = limb_nodes.reshape(-1)
-    place = torch.arange(len(flat), device=flat.device)
-    first = torch.full_like(place[: int(flat.max()) + 1], len(flat)).scatter_reduce(0, flat, place, "amin")
+    sample = torch.arange(len(flat), device=flat.device)
+    first = torch.full_like(sample[: int(flat.max()) + 1], len(flat)).scatter_reduce(0, flat, sample, "amin")
     return values.flatten(1, 2)[:, first]
-
-
-def fit_together(split: Split, other: Split) -> bool:
-    """Return whether two splits can be limbs of one tree: one holds the other, or they share no tip."""
-    return split <= other or other <= split or not split & other
 
 
 def path_lengths(skeleton: Skeleton, starts: Tensor) -> Tensor:
@@ -117,85 +112,67 @@ def path_lengths(skeleton: Skeleton, starts: Tensor) -> Tensor:
     return Graph.from_edges(skeleton.edges, (first - second).norm(dim=-1), len(skeleton)).distances(starts)
 
 
-def skeleton_splits(skeleton: Skeleton, named: Sequence[int]) -> frozenset[Split]:
-    """Return the splits of the tree that joins named tips; limbs to other tips are left out.
+def tip_nodes(skeleton: Skeleton, labels: Sequence[int]) -> list[int]:
+    """Return the node of each label's tip, -1 for labels without a tip.
 
     Args:
         skeleton: the tree.
-        named: K indices into `Skeleton.tips`, one per name, or -1 for names without a tip.
-
-    Raises:
-        InputError: if an index occurs twice or is out of range.
+        labels: K indices into `Skeleton.tips`, one per label, or -1 for a tip that the skeleton lacks.
     """
-    nodes = _named_nodes(skeleton, named)
-    first = next((name for name, node in enumerate(nodes) if node >= 0), 0)
-    root = torch.tensor([max(nodes[first], 0)])
-    parents, order = (found.tolist() for found in rooted(skeleton.edges, root, len(skeleton)))
-    behind: dict[int, set[int]] = {node: set() for node in order}
-    for name, node in enumerate(nodes):
-        if node >= 0:
-            behind[node].add(name)
-    present = {name for name, node in enumerate(nodes) if node >= 0}
-    found = set()
+    tips = skeleton.tips.tolist()
+    return [tips[index] if index >= 0 else -1 for index in labels]
+
+
+def skeleton_splits(skeleton: Skeleton, labels: Sequence[int]) -> frozenset[Tips]:
+    """Return the splits of the tree that joins the labeled tips; limbs to other tips are left out.
+
+    Args:
+        skeleton: the tree.
+        labels: see `tip_nodes`.
+    """
+    nodes = {node: label for label, node in enumerate(tip_nodes(skeleton, labels)) if node >= 0}
+    present = frozenset(nodes.values())
+    root = torch.tensor([next(iter(nodes), 0)])
+    parents, order = (rows.tolist() for rows in rooted(skeleton.edges, root, len(skeleton)))
+    behind: dict[int, set[int]] = {node: {nodes[node]} if node in nodes else set() for node in order}
+    splits = set()
     for node in reversed(order[1:]):
-        side = frozenset(behind[node])
-        side = side if 0 not in side else frozenset(present - side)
-        if 2 <= len(side) <= len(present) - 2:
-            found.add(side)
+        split = without_tip_zero(frozenset(behind[node]), present)
+        if 2 <= len(split) <= len(present) - 2:
+            splits.add(split)
         behind[parents[node]] |= behind[node]
-    return frozenset(found)
+    return frozenset(splits)
 
 
-def consensus(rows: Sequence[frozenset[Split]]) -> frozenset[Split]:
-    """Return the most frequent set of splits; where several are, the one whose splits are most frequent.
-
-    Raises:
-        InputError: if there is none.
-    """
-    if not rows:
-        raise InputError("rows must hold at least one set of splits, got none")
+def most_frequent_splits(rows: Sequence[frozenset[Tips]]) -> frozenset[Tips]:
+    """Return the most frequent set of splits; of several, the one whose splits are most frequent."""
     count, single = Counter(rows), Counter(split for row in rows for split in row)
     return max(count, key=lambda row: (count[row], sum(single[split] for split in row), sorted(sorted(s) for s in row)))
 
 
-def place_junctions(skeleton: Skeleton, named: Sequence[int], graph: LimbGraph) -> list[int]:
+def place_junctions(skeleton: Skeleton, labels: Sequence[int], graph: LimbGraph) -> list[int]:
     """Return the node of the skeleton on which each junction of a graph lies.
 
-    A junction lies where the mean lengths to the tips behind each of its limbs have the least sum: on a tree that is
-    where no limb holds more than half of all. The answer exists for any tree, also for one with other junctions. Of
+    A junction lies where the mean path lengths to the tips behind each of its limbs have the least sum: on a tree that
+    is where no limb holds more than half of all. The answer exists for any tree, also for one with other junctions. Of
     several equally good nodes it is the middle one.
 
     Args:
         skeleton: the tree.
-        named: K indices into `Skeleton.tips`, or -1 for a tip that was not found; at least one must be.
+        labels: see `tip_nodes`; at least one tip must be there.
         graph: with K tips.
-
-    Raises:
-        InputError: if the sizes do not fit.
     """
-    if len(named) != graph.num_tips:
-        raise InputError(f"named must have one entry per tip of graph ({graph.num_tips}), got {len(named)}")
-    nodes = _named_nodes(skeleton, named)
-    found = [name for name, node in enumerate(nodes) if node >= 0]
-    if not found:
-        raise InputError("named must give one tip at least, got none")
-    lengths = path_lengths(skeleton, torch.tensor([nodes[name] for name in found]))
-    places = []
+    nodes = tip_nodes(skeleton, labels)
+    present = [label for label, node in enumerate(nodes) if node >= 0]
+    lengths = path_lengths(skeleton, torch.tensor([nodes[label] for label in present]))
+    positions = []
     for parts in graph.branches:
         sums = lengths.new_zeros(len(skeleton))
         for part in parts:
-            rows = [row for row, name in enumerate(found) if name in part]
+            rows = [row for row, label in enumerate(present) if label in part]
             if rows:
                 sums = sums + lengths[rows].mean(0)
         best = (sums <= sums.min() + 1e-6 * lengths.max()).nonzero()[:, 0]
         middle = path_lengths(skeleton, best)[:, best].amax(-1).argmin()
-        places.append(int(best[middle]))
-    return places
-
-
-def _named_nodes(skeleton: Skeleton, named: Sequence[int]) -> list[int]:
-    tips = skeleton.tips.tolist()
-    given = [index for index in named if index >= 0]
-    if len(set(given)) < len(given) or any(not -1 <= index < len(tips) for index in named):
-        raise InputError(f"named must hold different tips from 0 to {len(tips) - 1}, or -1, got {list(named)}")
-    return [tips[index] if index >= 0 else -1 for index in named]
+        positions.append(int(best[middle]))
+    return positions

@@ -12,10 +12,19 @@ from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.graphs import Graph
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.surface_graph import one_piece, unique_edges
-from torchreg.spines.level_sets import LevelSets, Surface, level_sets
+from torchreg.spines.level_sets import LevelSets, MeshEdges, level_sets
+from torchreg.spines.protrusions import Protrusions
 
-# More handles than that are left as they are: the surface is a sponge rather than a body.
-_MAX_CUTS = 16
+
+@dataclass(frozen=True)
+class LoopCutting:
+    """Which loops are cut, and which ends of the cuts are tips."""
+
+    max_cuts: int = 16  # a surface with more handles is a sponge rather than a body
+    min_tip_ratio: float = 0.5  # heights of the two ends of a cut at which the lower one is a tip, too
+
+
+_CUTTING = LoopCutting()
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +33,7 @@ class OpenedLoops:
 
     Args:
         mesh: the surface, closed again at the cuts.
-        stumps: (C, 2, 3) middle of the two ends of each cut.
+        stumps: (C, 2, 3) centers of the two ends of each cut.
         radii: (C,) half the length of the rim of each cut.
     """
 
@@ -32,45 +41,68 @@ class OpenedLoops:
     stumps: Tensor
     radii: Tensor
 
+    @classmethod
+    def from_uncut(cls, mesh: TriangleMesh) -> OpenedLoops:
+        """Return a surface as it is, without cuts."""
+        return cls(mesh, torch.zeros(0, 2, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
 
-def open_loops(mesh: TriangleMesh, min_length: float, num_levels: int = 100) -> OpenedLoops:
-    """Return a closed surface with every loop that is long cut through at its thinnest ring, and the ends closed.
+    def keep_tips(self, protrusions: Protrusions) -> list[int]:
+        """Return the numbers of the protrusions that are tips: not the lower end of a cut whose other end is a tip.
+
+        Args:
+            protrusions: of `mesh`.
+        """
+        positions, keep = self.mesh.vertices[protrusions.tips], list(range(len(protrusions.tips)))
+        for ends, radius in zip(self.stumps, self.radii, strict=True):
+            near = torch.cdist(ends, positions) <= radius
+            highest = (near * protrusions.heights).amax(1)
+            low = protrusions.heights < _CUTTING.min_tip_ratio * highest.max()
+            low &= near[int(highest.argmin())]
+            keep = [tip for tip in keep if not low[tip]]
+        return keep
+
+
+def open_loops(mesh: TriangleMesh, min_length: float, num_levels: int) -> OpenedLoops:
+    """Return a closed surface with every long loop cut through at its thinnest ring, and the ends closed.
 
     A hand on the hip makes a loop of arm and trunk, which as a tree is cut best where the hand touches: a contact is
-    thinner than what leads to it. Loops are those that the level sets of the distance from a far place make. A ring cut
+    thinner than what leads to it. Loops are those of the level sets of the distance from a far vertex. A ring cut
     into two limbs has two tips.
 
     Args:
         mesh: closed, in one piece, float64 on the CPU.
-        min_length: of a loop, as a share of the largest distance from the far place; shorter loops stay.
+        min_length: of a loop, as a share of the largest distance from the far vertex; shorter loops stay.
         num_levels: level sets in that distance.
 
     Cost: one source and one set of level sets, and again for each cut; nothing for a surface without handles.
 
     References: Wood, Hoppe, Desbrun and Schroeder 2004, loops from level sets and cuts at short ones.
     """
-    stumps, radii = [], []
-    for _ in range(_MAX_CUTS):
-        if _euler_number(mesh) >= 2:
+    opened = OpenedLoops.from_uncut(mesh)
+    for _ in range(_CUTTING.max_cuts):
+        if _euler_number(opened.mesh) >= 2:
             break
-        found = _thinnest_ring(mesh, min_length, num_levels)
-        if found is None:
+        ring = _thinnest_ring(opened.mesh, min_length, num_levels)
+        if ring is None:
             break
-        faces, length = found
-        keep = torch.ones(mesh.num_faces, dtype=torch.bool)
-        keep[faces] = False
-        whole = one_piece(TriangleMesh(mesh.vertices, mesh.faces[keep]))
-        ends = whole.mesh.vertices[whole.vertex < 0]
-        mesh = whole.mesh
-        if len(ends) == 2:
-            stumps.append(ends)
-            radii.append(length / 2)
-    pairs = torch.stack(stumps) if stumps else torch.zeros(0, 2, 3, dtype=torch.float64)
-    return OpenedLoops(mesh, pairs, torch.tensor(radii, dtype=torch.float64))
+        opened = _cut_ring(opened, *ring)
+    return opened
 
 
 def _euler_number(mesh: TriangleMesh) -> int:
     return mesh.num_vertices - len(unique_edges(mesh.faces)[0]) + mesh.num_faces
+
+
+def _cut_ring(opened: OpenedLoops, faces: Tensor, length: float) -> OpenedLoops:
+    """Return the surface without the triangles ``faces`` of a ring of some length, and the two holes closed."""
+    keep = torch.ones(opened.mesh.num_faces, dtype=torch.bool)
+    keep[faces] = False
+    closed = one_piece(TriangleMesh(opened.mesh.vertices, opened.mesh.faces[keep]))
+    ends = closed.mesh.vertices[closed.vertex < 0]
+    if len(ends) != 2:
+        return OpenedLoops(closed.mesh, opened.stumps, opened.radii)
+    radii = torch.cat((opened.radii, opened.radii.new_tensor([length / 2])))
+    return OpenedLoops(closed.mesh, torch.cat((opened.stumps, ends[None])), radii)
 
 
 def _thinnest_ring(mesh: TriangleMesh, min_length: float, num_levels: int) -> tuple[Tensor, float] | None:
@@ -78,8 +110,7 @@ def _thinnest_ring(mesh: TriangleMesh, min_length: float, num_levels: int) -> tu
     graph = GeodesicGraph.from_mesh(mesh)
     far = int(graph.distances([0])[0].argmax())
     distance = graph.distances([far])[0]
-    spacing = float(distance.max()) / num_levels
-    sets = level_sets(Surface(mesh), distance, spacing)
+    sets = level_sets(MeshEdges(mesh), distance, float(distance.max()) / num_levels)
     loop = _longest_loop(sets, int(sets.vertex_bands[far]))
     if len(loop) < min_length * num_levels:
         return None
@@ -88,14 +119,14 @@ def _thinnest_ring(mesh: TriangleMesh, min_length: float, num_levels: int) -> tu
 
 
 def _longest_loop(sets: LevelSets, root: int) -> list[int]:
-    """Return the rings of the longest loop that one ring makes with the tree of shortest ways from a band."""
+    """Return the rings of the longest loop that a single ring closes with the tree of shortest paths from a band."""
     joined = torch.stack((sets.lower, sets.upper), dim=1)
     pairs = joined.unique(dim=0)
     graph = Graph.from_edges(pairs, torch.ones(len(pairs)), sets.num_bands)
-    ends, steps, before = (values.numpy() for values in (joined, *graph.shortest_paths(root)))
-    child = np.where(before[ends[:, 0]] == ends[:, 1], ends[:, 0], ends[:, 1])
-    in_tree = before[child] == ends.sum(1) - child
-    # Of several rings between the same two bands one is in the tree, the longest.
+    ends, steps, parent = (values.numpy() for values in (joined, *graph.shortest_paths(root)))
+    child = np.where(parent[ends[:, 0]] == ends[:, 1], ends[:, 0], ends[:, 1])
+    in_tree = parent[child] == ends.sum(1) - child
+    # Of several rings between the same two bands only the longest is in the tree.
     order = np.lexsort((-sets.lengths.numpy(), child, ~in_tree))
     ring_above = np.full(sets.num_bands, -1)
     ring_above[child[order][::-1]] = np.where(in_tree[order], order, -1)[::-1]
@@ -106,6 +137,6 @@ def _longest_loop(sets: LevelSets, root: int) -> list[int]:
             if steps[first] < steps[second]:
                 first, second = second, first
             loop.append(int(ring_above[first]))
-            first = before[first]
+            first = parent[first]
         longest = max(longest, loop, key=len)
     return longest

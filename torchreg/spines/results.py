@@ -1,4 +1,4 @@
-"""What skeletonizing a sequence returns."""
+"""The results of `extract_spine`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ class SpineRecord:
 
     Args:
         frame: its number; frames may be done in any order.
-        num_frames: in all.
-        num_tips: that it shows by itself.
-        topology: of its own tree, see `Skeleton.topology`.
-        seconds: that it took; zero if it was kept from before.
+        num_frames: of the sequence.
+        num_tips: of its own skeleton.
+        topology: of its own skeleton, see `Skeleton.topology`.
+        seconds: that it took; zero if it was kept from an earlier call.
     """
 
     frame: int
@@ -45,13 +45,13 @@ class SpineSequence(Result):
         frames: (T, L, S, 3, 3) rotations that travel with the curves.
         times: (T,) of the frames.
         found: (T, K) True where the frame's own skeleton has the tip.
-        own: (T, L) True where the frame's own skeleton has the limb; others were carried over from frames around.
-        reference: frame from which names were passed on.
-        topologies: per frame the canonical form of the tree of curves as delivered, see `Skeleton.topology`.
-        own_topologies: per frame that of its own skeleton, before the graph was imposed.
+        own: (T, L) True where the frame's own skeleton has the limb; others were transferred from the frames around.
+        reference: frame from which tips were tracked.
+        topologies: per frame the canonical form of the tree of its curves, see `Skeleton.topology`.
+        own_topologies: per frame that of its own skeleton.
         statuses: per frame.
         status: WITH_WARNINGS if any frame's is, else CONVERGED.
-        warnings: what was not as it should be, with the number of the frame.
+        warnings: irregularities, with the number of the frame.
     """
 
     model: Spine = field(metadata=stored_as(Spine.record, Spine.from_record))
@@ -76,12 +76,12 @@ class SpineSequence(Result):
 
     @property
     def tips(self) -> Tensor:
-        """Where the tips are, (T, K, 3)."""
+        """Positions (T, K, 3) of the tips."""
         return self.curves[:, : self.num_tips, 0]
 
     @property
     def junctions(self) -> Tensor:
-        """Where the junctions are, (T, J, 3); none if there are two tips."""
+        """Positions (T, J, 3) of the junctions; none if there are two tips."""
         flat = self.graph.reshape(-1)
         first = [int((flat == node).nonzero()[0, 0]) for node in range(self.num_tips, len(self.graph) + 1)]
         return self.curves[:, :, [0, -1]].flatten(1, 2)[:, first]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -10,17 +11,15 @@ from torch import Tensor, nn
 
 from torchreg._checks import as_float_tensor, as_tensor, check_finite, check_shape
 from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.graphs import connected_components
 from torchreg.geometry.skeleton import Skeleton, nearest_rotation
-from torchreg.spines.curves import bend_angles, curve_frames, curve_lengths, follow, tangents
+from torchreg.spines.curves import align_frames, bend_angles, curve_frames, curve_lengths, tangents
 from torchreg.spines.labeled_tree import gather_nodes, number_nodes
-
-# Limbs that share a node must agree on its place up to this share of the size.
-_MEETING_SLACK = 1e-4
 
 
 @dataclass(frozen=True)
 class SpineFields:
-    """What makes a `Spine`; see there."""
+    """The tensors that make a `Spine`; see there."""
 
     curves: Tensor
     graph: Tensor
@@ -32,9 +31,9 @@ class SpineFields:
 class Spine(nn.Module):
     """The function F of ``Spine_t = F(G, t)``: curves of a graph G at any time between the frames.
 
-    Nodes are interpolated by cubics through those of the frames, with velocities from the frames before and after, so
-    that curves move smoothly and pass through what was measured. Limbs that meet share their node, also after a step
-    of an optimizer. Radii are linear in time; frames turn evenly and follow the curves.
+    Nodes are interpolated by cubic Hermite polynomials through those of the frames, with velocities from the frames
+    before and after, so that curves move smoothly and pass through the measured ones. Limbs that meet share their node,
+    also after a step of an optimizer. Radii are linear in time; frames rotate evenly and follow the curves.
 
     Convention: limb ``l`` runs from node ``graph[l, 0]`` to node ``graph[l, 1]``. Nodes 0 to K - 1 are the tips, the
     others the junctions. ``frames`` are ``R_world_node``, their third columns point along the limb.
@@ -76,26 +75,17 @@ class Spine(nn.Module):
         if min(curves.shape[:2]) < 1 or curves.shape[2] < 2:
             raise InputError(f"curves must hold a frame, a limb and two points at least, got {tuple(curves.shape)}")
         check_finite(curves, "curves")
-        count, limbs, samples = curves.shape[:3]
-        graph = _check_graph(graph, limbs).to(curves.device)
-        radii = (
-            curves.new_zeros(count, limbs, samples) if radii is None else as_float_tensor(radii, "radii", like=curves)
-        )
-        check_shape(radii, "radii", (count, limbs, samples))
-        check_finite(radii, "radii")
-        frames = curve_frames(curves) if frames is None else as_float_tensor(frames, "frames", like=curves)
-        check_shape(frames, "frames", (count, limbs, samples, 3, 3))
-        check_finite(frames, "frames")
+        size = curves.shape[:3]
+        radii = _check_like(curves.new_zeros(size) if radii is None else radii, "radii", size, curves)
+        frames = _check_like(curve_frames(curves) if frames is None else frames, "frames", (*size, 3, 3), curves)
+        graph = _check_graph(graph, size[1]).to(curves.device)
         self.register_buffer("graph", graph)
-        self.register_buffer("limb_nodes", number_nodes(graph, samples))
+        self.register_buffer("limb_nodes", number_nodes(graph, size[2]))
         self.register_buffer("times", _check_times(times, curves))
-        self.register_buffer("rest_frames", frames.detach().clone())
+        self.register_buffer("rest_frames", frames.clone())
         self.nodes = nn.Parameter(gather_nodes(curves, self.limb_nodes))
-        self.node_radii = nn.Parameter(gather_nodes(radii.detach(), self.limb_nodes))
-        off = float((self.nodes.detach()[:, self.limb_nodes] - curves).abs().max())
-        size = float((curves.amax((0, 1, 2)) - curves.amin((0, 1, 2))).max())
-        if off > _MEETING_SLACK * size:
-            raise InputError(f"curves must meet where graph says so, got limbs {off:.3g} off their common node")
+        self.node_radii = nn.Parameter(gather_nodes(radii, self.limb_nodes))
+        _check_meeting(self.nodes.detach()[:, self.limb_nodes], curves)
 
     @classmethod
     def from_record(cls, record: SpineFields) -> Spine:
@@ -104,13 +94,13 @@ class Spine(nn.Module):
         Raises:
             InputError: if it describes none.
         """
-        return cls(record.curves, record.graph, record.radii, record.frames, record.times)
+        return cls(record.curves, record.graph, radii=record.radii, frames=record.frames, times=record.times)
 
     def record(self) -> SpineFields:
         """Return the fields that make this spine again, also after it was refined."""
         curves = self.nodes.detach()[:, self.limb_nodes]
         radii = self.node_radii.detach()[:, self.limb_nodes]
-        return SpineFields(curves, self.graph, radii, self.rest_frames, self.times)
+        return SpineFields(curves=curves, graph=self.graph, radii=radii, frames=self.rest_frames, times=self.times)
 
     @property
     def num_tips(self) -> int:
@@ -126,7 +116,7 @@ class Spine(nn.Module):
         """Return the curves (..., L, S, 3) at times ``t`` (...,), in the unit of the surface.
 
         Args:
-            t: within `times`; frames are met exactly.
+            t: within `times`; at these the curves are those of the frames.
 
         Raises:
             InputError: if a time lies outside.
@@ -141,19 +131,21 @@ class Spine(nn.Module):
 
     def nodes_at(self, t: float | Tensor) -> Tensor:
         """Return all nodes (..., N, 3) at times ``t`` (...,); see `forward`."""
-        index, share, step = self._between(t)
+        index, share, step = self._interval(t)
         if len(self.times) == 1:
             return self.nodes[index]
-        speed = self._velocities()
+        velocity = self._velocities()
         start, end = self.nodes[index], self.nodes[index + 1]
         s, h = share[..., None, None], step[..., None, None]
-        rise = s * s * (3 - 2 * s)
-        leave, arrive = s * (1 - s) ** 2, s * s * (s - 1)
-        return (1 - rise) * start + rise * end + h * (leave * speed[index] + arrive * speed[index + 1])
+        # The basis of cubic Hermite interpolation.
+        end_weight = s * s * (3 - 2 * s)
+        start_slope, end_slope = s * (1 - s) ** 2, s * s * (s - 1)
+        slopes = start_slope * velocity[index] + end_slope * velocity[index + 1]
+        return (1 - end_weight) * start + end_weight * end + h * slopes
 
     def radii(self, t: float | Tensor) -> Tensor:
         """Return the radii (..., L, S) along the limbs at times ``t`` (...,), in the unit of the surface."""
-        index, share, _ = self._between(t)
+        index, share, _ = self._interval(t)
         after = (index + 1).clamp_max(len(self.times) - 1)
         values = self.node_radii[index] + share[..., None] * (self.node_radii[after] - self.node_radii[index])
         return values[..., self.limb_nodes]
@@ -163,11 +155,11 @@ class Spine(nn.Module):
 
         Differentiable: in ``t`` and in `nodes`, through the curves that they follow.
         """
-        index, share, _ = self._between(t)
+        index, share, _ = self._interval(t)
         after = (index + 1).clamp_max(len(self.times) - 1)
         share = share.detach()[..., None, None, None, None]
         mixed = self.rest_frames[index] + share * (self.rest_frames[after] - self.rest_frames[index])
-        return follow(nearest_rotation(mixed), tangents(self(t)))
+        return align_frames(nearest_rotation(mixed), tangents(self(t)))
 
     def skeleton(self, t: float) -> Skeleton:
         """Return the curves at one time as a tree of nodes with radii and frames."""
@@ -175,14 +167,14 @@ class Spine(nn.Module):
             nodes = self.nodes_at(t)
             steps = torch.stack((self.limb_nodes[:, :-1], self.limb_nodes[:, 1:]), dim=-1).reshape(-1, 2)
             radii = gather_nodes(self.radii(t)[None], self.limb_nodes)[0]
-            return Skeleton(nodes, steps, radii, gather_nodes(self.frames(t)[None], self.limb_nodes)[0])
+            return Skeleton(nodes, steps, radii, frames=gather_nodes(self.frames(t)[None], self.limb_nodes)[0])
 
     def lengths(self, t: float | Tensor) -> Tensor:
         """Return the lengths (..., L) of the limbs at times ``t`` (...,)."""
         return curve_lengths(self(t))
 
     def bend_angles(self, t: float | Tensor) -> Tensor:
-        """Return how far the limbs turn at their inner points at times ``t`` (...,), (..., L, S - 2) radians."""
+        """Return the turning angles (..., L, S - 2) at the limbs' inner points at times ``t`` (...,), radians."""
         return bend_angles(self(t))
 
     def _velocities(self) -> Tensor:
@@ -193,11 +185,14 @@ class Spine(nn.Module):
         inner = (after * slopes[:-1] + before * slopes[1:]) / (before + after)
         return torch.cat((slopes[:1], inner, slopes[-1:]))
 
-    def _between(self, t: float | Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the frame before each time, the share of the way to the next, and how long that way is."""
+    def _interval(self, t: float | Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return per time the frame before it, its position between this and the next from 0 to 1, and their distance.
+
+        The distance is in the unit of the times.
+        """
         # Python's numbers would lose digits on the way through torch's default dtype.
-        given = self.times.new_tensor(t) if isinstance(t, (int, float)) else t
-        time = as_float_tensor(given, "t", like=self.times)
+        t = self.times.new_tensor(t) if isinstance(t, (int, float)) else t
+        time = as_float_tensor(t, "t", like=self.times)
         check_finite(time, "t")
         first, last = self.times[0], self.times[-1]
         if bool(((time < first) | (time > last)).any()):
@@ -211,6 +206,22 @@ class Spine(nn.Module):
         return index, (time - self.times[index]) / torch.where(step > 0, step, 1.0), step
 
 
+def _check_like(value: Tensor, name: str, size: Sequence[int], curves: Tensor) -> Tensor:
+    """Return a finite tensor of a size, in the dtype and on the device of the curves."""
+    value = as_float_tensor(value, name, like=curves).detach()
+    check_shape(value, name, size)
+    check_finite(value, name)
+    return value
+
+
+def _check_meeting(shared: Tensor, curves: Tensor) -> None:
+    """Raise InputError unless the curves through shared nodes are the given ones, up to rounding."""
+    distance = float((shared - curves).abs().max())
+    size = float((curves.amax((0, 1, 2)) - curves.amin((0, 1, 2))).max())
+    if distance > 1e-4 * size:
+        raise InputError(f"curves must meet where graph says so, got limbs {distance:.3g} off their common node")
+
+
 def _check_graph(graph: Tensor, limbs: int) -> Tensor:
     graph = as_tensor(graph, "graph", "integers")
     if graph.is_floating_point() or graph.is_complex() or graph.dtype == torch.bool:
@@ -220,14 +231,10 @@ def _check_graph(graph: Tensor, limbs: int) -> Tensor:
     count = limbs + 1
     if not 0 <= int(graph.min()) <= int(graph.max()) < count:
         raise InputError(f"graph must hold the nodes 0 to {limbs} of a tree with {limbs} limbs, got {graph.tolist()}")
-    group = list(range(count))
-    for start, end in graph.tolist():
-        old, new = group[start], group[end]
-        group = [new if name == old else name for name in group]
-    if len(set(group)) > 1:
+    if int(connected_components(graph, count).max()) > 0:
         raise InputError(f"graph must be a tree, but its limbs do not join all nodes: {graph.tolist()}")
     degrees = torch.bincount(graph.reshape(-1), minlength=count).tolist()
-    if any(one > 1 and other == 1 for one, other in pairwise(degrees)):
+    if any(degree > 1 and following == 1 for degree, following in pairwise(degrees)):
         raise InputError(f"graph must number its tips first, got the degrees {degrees} of nodes 0 to {limbs}")
     return graph
 

@@ -1,4 +1,4 @@
-"""Which tip of each frame is which: K by the most frequent count, then frame after frame from the middle of a run."""
+"""The identity of tips over time: K of them, tracked from frame to frame from the middle of the longest clean run."""
 
 from __future__ import annotations
 
@@ -13,39 +13,60 @@ from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.spines.curves import curve_lengths, points_along
 from torchreg.spines.labeled_tree import path_lengths
-from torchreg.spines.tip_matching import TipReference, match_tips
-
-# Shares of the frame next in time and of the reference, which may be far.
-_NEAR_SHARE, _REFERENCE_SHARE = 1.0, 0.3
-# Next in time a creature has hardly turned; against the reference any turn will do.
-_NEAR_TURN, _REFERENCE_TURN = 0.3, 0.0
-# Runs of at least so many frames have a reference of their own.
-_LONG_RUN = 9
-# Limbs go on at this share of their speed.
-_PERSISTENCE = 0.5
-# Points by which limbs are compared: from the tip to this share of the way to the junction.
-_POINTS, _REACH = 8, 0.85
-# A limb turns about its root, and the same turn moves its points in proportion to their distance from there: errors
-# count as angles, softened near the root.
-_LEVER = 1 - torch.linspace(0, _REACH, _POINTS, dtype=torch.float64) + 0.15
-_ANGLES = _LEVER**-2 / (_LEVER**-2).mean()
+from torchreg.spines.tip_matching import TipReference, rank_mappings
 
 
-@dataclass(frozen=True, eq=False)
-class TipNames:
-    """Tips with their identity over T frames.
+@dataclass(frozen=True)
+class TipTracking:
+    """How a frame is compared with the nearest tracked frame and with the nearest reference."""
+
+    rotation_weight: float = 0.3  # of the rotation since the nearest frame; since the reference any will do
+    reference_weight: float = 0.3  # of the reference, which may be far in time, against the nearest frame
+    min_run: int = 9  # frames of a run that has a reference of its own
+    velocity_share: float = 0.5  # of the last displacement, by which limbs are predicted to move on
+    num_points: int = 8  # of a limb that are compared
+    extent: float = 0.85  # share of the limb that they cover, from the tip
+    root_softening: float = 0.15  # added to distances from the root, in limb lengths, where errors count as angles
+
+    @property
+    def shares(self) -> Tensor:
+        """Distances (S,) of the compared points from the tip, in limb lengths."""
+        return torch.linspace(0, self.extent, self.num_points, dtype=torch.float64)
+
+    @property
+    def point_weights(self) -> Tensor:
+        """Weights (S,) that make errors of the compared points angles; their mean is one."""
+        weights = (1 - self.shares + self.root_softening) ** -2
+        return weights / weights.mean()
+
+
+_TRACKING = TipTracking()
+
+
+def track_tips(skeletons: Sequence[Skeleton], num_tips: int | None = None) -> tuple[Tensor, int]:
+    """Return the labels (T, K) of the tips in all frames, see `tip_nodes`, and the frame from which they were tracked.
+
+    The reference is the middle of the longest run of frames that have K tips, the most frequent topology of these and,
+    if there are such frames, no loops, in which limbs touch each other. From there tips are tracked in both directions
+    of time: each frame is compared with the one before and with the nearest reference; see `rank_mappings`.
 
     Args:
-        index: (T, K) which of a frame's tips each is, -1 where it was not found.
-        reference: the frame from which names were passed on.
-        references: all frames with which others were compared.
-        costs: (T,) of the mapping, see `match_tips`; zero for the reference.
-    """
+        skeletons: one per frame.
+        num_tips: K; the most frequent number by default.
 
-    index: Tensor
-    reference: int
-    references: tuple[int, ...]
-    costs: Tensor
+    References: Brostow, Essa, Steedly and Kwatra 2004, section 4.2.
+    """
+    if num_tips is None:
+        num_tips = most_frequent_count([len(skeleton.tips) for skeleton in skeletons])
+    runs = _runs(_clean_frames(skeletons, num_tips))
+    longest = max(runs, key=lambda run: (run[1] - run[0], -run[0]))
+    reference = (longest[0] + longest[1] - 1) // 2
+    references = sorted({reference, *((a + b - 1) // 2 for a, b in runs if b - a >= _TRACKING.min_run)})
+    tracker = _TipTracker(skeletons, num_tips, references, reference)
+    for frames in (range(reference + 1, len(skeletons)), range(reference - 1, -1, -1)):
+        for frame in frames:
+            tracker.track(frame)
+    return tracker.labels, reference
 
 
 def most_frequent_count(counts: Sequence[int]) -> int:
@@ -54,125 +75,89 @@ def most_frequent_count(counts: Sequence[int]) -> int:
     return max(frequency, key=lambda count: (frequency[count], count))
 
 
-def name_tips(skeletons: Sequence[Skeleton], num_tips: int | None = None) -> TipNames:
-    """Return the identity of the tips in all frames.
-
-    The reference is the middle of the longest run of frames that have K tips, the most frequent topology of these and,
-    if there are such frames, no loops, in which limbs hold each other. From there names are passed on in both
-    directions of time: each frame is compared with the one before and with the nearest reference; see `match_tips`.
-
-    Args:
-        skeletons: one per frame.
-        num_tips: K; the most frequent number by default.
-
-    References: Brostow, Essa, Steedly and Kwatra 2004, section 4.2.
-    """
-    counts = [len(skeleton.tips) for skeleton in skeletons]
-    count = most_frequent_count(counts) if num_tips is None else num_tips
-    runs = _runs(_usual(skeletons, count))
-    longest = max(runs, key=lambda run: (run[1] - run[0], -run[0]))
-    reference = (longest[0] + longest[1] - 1) // 2
-    references = sorted({reference, *((a + b - 1) // 2 for a, b in runs if b - a >= _LONG_RUN)})
-    named = _Named(skeletons, count, references)
-    named.start(reference)
-    for frames in (range(reference + 1, len(skeletons)), range(reference - 1, -1, -1)):
-        for frame in frames:
-            named.name(frame)
-    return TipNames(named.index, reference, tuple(references), named.costs)
-
-
-def _usual(skeletons: Sequence[Skeleton], count: int) -> list[bool]:
-    """Return which frames may serve as references: those with most of what is wanted."""
-    right = [skeleton.topology for skeleton in skeletons if len(skeleton.tips) == count]
-    if not right:  # a K that no frame has: the frame that comes nearest
-        counts = [len(skeleton.tips) for skeleton in skeletons]
-        nearest = min(range(len(counts)), key=lambda frame: (abs(counts[frame] - count), frame))
-        return [frame == nearest for frame in range(len(counts))]
-    frequent = Counter(right).most_common(1)[0][0]
-    usual = [skeleton.topology == frequent for skeleton in skeletons]
-    whole = [flag and not has_loops(skeleton) for flag, skeleton in zip(usual, skeletons, strict=True)]
-    return whole if any(whole) else usual
-
-
 def has_loops(skeleton: Skeleton) -> bool:
-    """Return whether limbs of the surface touched and were parted."""
+    """Return whether limbs of the surface touched and were separated."""
     return any("loop" in note for note in skeleton.notes)
 
 
-class _Named:
-    """Names given so far. A limb that was not found has the place that it had before, moved with the others."""
+def _clean_frames(skeletons: Sequence[Skeleton], num_tips: int) -> list[bool]:
+    """Return which frames may be references: those with K tips, their most frequent topology and no loops, if any."""
+    topologies = [skeleton.topology for skeleton in skeletons if len(skeleton.tips) == num_tips]
+    if not topologies:  # a K that no frame has: the frame nearest to it
+        counts = [len(skeleton.tips) for skeleton in skeletons]
+        nearest = min(range(len(counts)), key=lambda frame: (abs(counts[frame] - num_tips), frame))
+        return [frame == nearest for frame in range(len(counts))]
+    frequent = Counter(topologies).most_common(1)[0][0]
+    typical = [skeleton.topology == frequent for skeleton in skeletons]
+    clean = [flag and not has_loops(skeleton) for flag, skeleton in zip(typical, skeletons, strict=True)]
+    return clean if any(clean) else typical
 
-    def __init__(self, skeletons: Sequence[Skeleton], count: int, references: Sequence[int]) -> None:
-        self.count, self.references = count, references
-        self.index = torch.full((len(skeletons), count), -1)
-        self.costs = torch.zeros(len(skeletons), dtype=torch.float64)
-        self.topologies = [skeleton.topology for skeleton in skeletons]
-        self.topology = ""
+
+class _TipTracker:
+    """The tips identified so far; one that was not found stays where it was, moved rigidly with the others."""
+
+    def __init__(self, skeletons: Sequence[Skeleton], num_tips: int, references: Sequence[int], start: int) -> None:
+        self.references = references
+        self.labels = torch.full((len(skeletons), num_tips), -1)
+        self.typical = [skeleton.topology == skeletons[start].topology for skeleton in skeletons]
         self.limbs = [_tip_limbs(skeleton) for skeleton in skeletons]
         self.lengths = [path_lengths(skeleton, skeleton.tips)[:, skeleton.tips.cpu()] for skeleton in skeletons]
-        self.places: dict[int, Tensor] = {}
-        self.ways: dict[int, Tensor] = {}
-        self.reach = torch.zeros(count)
+        # A reference with too few tips shows some of them twice, until a frame has them all.
+        numbers = torch.arange(num_tips)
+        self.labels[start] = torch.where(numbers < len(self.limbs[start]), numbers, -1)
+        row = self.labels[start].clamp_min(0)
+        self.limb_lengths = torch.stack([curve_lengths(self.limbs[start][k]) for k in row.tolist()])
+        # Per tracked frame: points (K, S, 3) of the tracked limbs, path lengths (K, K) from tip to tip.
+        self.points = {start: self._cut_limbs(start)[row, numbers]}
+        self.paths = {start: self.lengths[start][row][:, row]}
 
-    def start(self, frame: int) -> None:
-        self.topology = self.topologies[frame]
-        given = torch.arange(min(self.count, len(self.limbs[frame])))
-        self.index[frame, : len(given)] = given
-        # Where the reference has too few tips, the others stand in for those until a frame shows them.
-        row = self.index[frame].clamp_min(0)
-        self.reach = torch.stack([curve_lengths(self.limbs[frame][k]) for k in row.tolist()])
-        self.places[frame] = self.cut(frame)[row, torch.arange(self.count)]
-        self.ways[frame] = self.lengths[frame][row][:, row]
-
-    def name(self, frame: int) -> None:
-        near = min(self.places, key=lambda other: abs(other - frame))
-        done = [other for other in self.references if other in self.places]
-        far = min(done, key=lambda other: abs(other - frame), default=near)
-        known = [TipReference(self._expected(frame, near), self.ways[near], _NEAR_SHARE, _NEAR_TURN)]
+    def track(self, frame: int) -> None:
+        """Identify the tips of a frame."""
+        near = min(self.points, key=lambda tracked: abs(tracked - frame))
+        tracked_references = [reference for reference in self.references if reference in self.points]
+        far = min(tracked_references, key=lambda reference: abs(reference - frame), default=near)
+        predicted = self._predicted(frame, near)
+        known = [TipReference(predicted, self.paths[near], rotation_weight=_TRACKING.rotation_weight)]
         if far != near:
-            known.append(TipReference(self.places[far], self.ways[far], _REFERENCE_SHARE, _REFERENCE_TURN))
-        curves = self.cut(frame)
-        weights = _ANGLES if self._is_usual(frame) else None
-        match = match_tips(known, curves, self.lengths[frame], weights=weights)
-        self.index[frame], self.costs[frame] = match.index, match.cost
-        self._remember(frame, near, curves)
+            known.append(TipReference(self.points[far], self.paths[far], weight=_TRACKING.reference_weight))
+        curves = self._cut_limbs(frame)
+        weights = _TRACKING.point_weights if self.typical[frame] else None
+        maps, _ = rank_mappings(known, curves, self.lengths[frame], weights=weights)
+        self.labels[frame] = maps[0]
+        self._update(frame, near, curves)
 
-    def _is_usual(self, frame: int) -> bool:
-        """Return whether a frame has the junctions of the reference; else the roots of limbs tell nothing."""
-        return self.topologies[frame] == self.topology
-
-    def cut(self, frame: int) -> Tensor:
-        """Return the limbs of a frame's tips, each as long as each of the known ones, (M, K, S, 3).
+    def _cut_limbs(self, frame: int) -> Tensor:
+        """Return the limbs of a frame's tips, each as long as each of the tracked ones, (M, K, S, 3).
 
         They are measured from the root, as a limb that touches another may end late or early; from the tip where the
-        roots are others.
+        frame has other junctions than the reference, whose roots tell nothing.
         """
-        share = torch.linspace(0, _REACH, _POINTS, dtype=torch.float64)
-        wanted = self.reach.unsqueeze(-1) * share
-        if not self._is_usual(frame):
-            return torch.stack([points_along(limb, wanted) for limb in self.limbs[frame]])
-        rest = self.reach.unsqueeze(-1) * (1 - share)
-        return torch.stack([points_along(limb.flip(0), rest) for limb in self.limbs[frame]])
+        if not self.typical[frame]:
+            lengths = self.limb_lengths.unsqueeze(-1) * _TRACKING.shares
+            return torch.stack([points_along(limb, lengths) for limb in self.limbs[frame]])
+        lengths = self.limb_lengths.unsqueeze(-1) * (1 - _TRACKING.shares)
+        return torch.stack([points_along(limb.flip(0), lengths) for limb in self.limbs[frame]])
 
-    def _expected(self, frame: int, near: int) -> Tensor:
-        """Return where the limbs should be if they go on as they did."""
+    def _predicted(self, frame: int, near: int) -> Tensor:
+        """Return the points (K, S, 3) of the limbs in a frame if their motion around the nearest one goes on."""
         before = 2 * near - frame
-        if before not in self.places:
-            return self.places[near]
-        return self.places[near] + _PERSISTENCE * (self.places[near] - self.places[before])
+        if before not in self.points:
+            return self.points[near]
+        return self.points[near] + _TRACKING.velocity_share * (self.points[near] - self.points[before])
 
-    def _remember(self, frame: int, near: int, curves: Tensor) -> None:
-        row = self.index[frame]
+    def _update(self, frame: int, near: int, curves: Tensor) -> None:
+        """Keep the points and path lengths of a frame; those of tips that were not found come from the nearest one."""
+        row = self.labels[frame]
         found, index = row >= 0, row.clamp_min(0)
-        places, ways = self.places[near], self.ways[near]
+        points, paths = self.points[near], self.paths[near]
         if bool(found.any()):
-            there = torch.where(found[:, None, None], curves[index, torch.arange(self.count)], 0.0)
-            weights = found.to(places).unsqueeze(-1).expand(places.shape[:2]).flatten()
-            motion = fit_rigid(places.flatten(0, 1), there.flatten(0, 1), weights)
-            moved = transform_points(motion, places.flatten(0, 1)).reshape(places.shape)
-            places = torch.where(found[:, None, None], there, moved)
-            ways = torch.where(found[:, None] & found, self.lengths[frame][index][:, index], ways)
-        self.places[frame], self.ways[frame] = places, ways
+            observed = torch.where(found[:, None, None], curves[index, torch.arange(len(row))], 0.0)
+            weights = found.to(points).unsqueeze(-1).expand(points.shape[:2]).flatten()
+            motion = fit_rigid(points.flatten(0, 1), observed.flatten(0, 1), weights)
+            moved = transform_points(motion, points.flatten(0, 1)).reshape(points.shape)
+            points = torch.where(found[:, None, None], observed, moved)
+            paths = torch.where(found[:, None] & found, self.lengths[frame][index][:, index], paths)
+        self.points[frame], self.paths[frame] = points, paths
 
 
 def _tip_limbs(skeleton: Skeleton) -> list[Tensor]:
@@ -184,12 +169,6 @@ def _tip_limbs(skeleton: Skeleton) -> list[Tensor]:
 
 
 def _runs(flags: Sequence[bool]) -> list[tuple[int, int]]:
-    """Return first frames and ends of the runs of True."""
-    runs, first = [], None
-    for frame, flag in enumerate([*flags, False]):
-        if flag and first is None:
-            first = frame
-        if not flag and first is not None:
-            runs.append((first, frame))
-            first = None
-    return runs
+    """Return the first frames and the ends of the runs of True."""
+    starts = [frame for frame, flag in enumerate(flags) if flag and not (frame and flags[frame - 1])]
+    return [(start, next((k for k in range(start, len(flags)) if not flags[k]), len(flags))) for start in starts]

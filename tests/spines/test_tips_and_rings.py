@@ -1,0 +1,218 @@
+"""Tips, rings and handles of a surface: salient maxima of distance, its level sets, and loops cut at their thinnest."""
+
+import math
+
+import pytest
+import torch
+
+from torchreg.geometry.geodesics import GeodesicGraph
+from torchreg.geometry.isosurface import isosurface
+from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
+from torchreg.geometry.surface_graph import unique_edges
+from torchreg.spines.level_sets import MeshEdges, level_sets
+from torchreg.spines.loops import open_loops
+from torchreg.spines.protrusions import average_geodesic_distance, find_protrusions
+
+
+def brute_heights(graph, values):
+    """Return the height of every maximum by flooding node by node."""
+    starts, ends = graph.starts.tolist(), graph.ends.tolist()
+    order = sorted(range(len(values)), key=lambda node: (-values[node], -node))
+    rank = {node: number for number, node in enumerate(order)}
+    owner, heights = {}, {}
+    for node in order:
+        tops = set()
+        for neighbor in ends[starts[node] : starts[node + 1]]:
+            while neighbor in owner and owner[neighbor] != neighbor:
+                neighbor = owner[neighbor]
+            tops |= {neighbor} & owner.keys()
+        owner[node] = node
+        for number, top in enumerate(sorted(tops, key=rank.get)):
+            if number == 0:
+                owner[node] = top
+            else:
+                heights[top] = values[top] - values[node]
+                owner[top] = owner[node]
+    heights[order[0]] = values[order[0]] - min(values)
+    return {node: height for node, height in heights.items() if height > 0}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_heights_are_those_of_a_flood(seed):
+    graph = GeodesicGraph.from_mesh(unit_sphere(2, dtype=torch.float64))
+    values = torch.randn(162, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    if seed == 2:
+        values = (2 * values).round()
+    found = find_protrusions(graph, values, 1e-9)
+    expected = brute_heights(graph, values.tolist())
+    assert found.heights.tolist() == pytest.approx(sorted(expected.values(), reverse=True))
+    if seed < 2:
+        assert dict(zip(found.tips.tolist(), found.heights.tolist(), strict=True)) == pytest.approx(expected)
+
+
+def test_low_maxima_are_noise_and_the_highest_is_always_found():
+    mesh = unit_sphere(3, dtype=torch.float64)
+    graph = GeodesicGraph.from_mesh(mesh)
+    noise = 0.1 * torch.rand(mesh.num_vertices, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    found = find_protrusions(graph, mesh.vertices[:, 2].abs() + noise, 0.2)
+    assert len(found.tips) == 2
+    assert mesh.vertices[found.tips, 2].abs().min() > 0.85
+    assert bool(((found.confidence > 0.9) & (found.confidence < 1)).all())
+    assert len(find_protrusions(graph, torch.zeros(mesh.num_vertices).double(), 0.2).tips) == 1
+
+
+def test_confidence_is_a_half_at_the_threshold():
+    graph = GeodesicGraph.from_points(torch.arange(9.0)[:, None] * torch.tensor([1.0, 0, 0]), 2)
+    values = torch.tensor([0.0, 1, 2, 3, 1.5, 3, 4, 5, 6], dtype=torch.float64)
+    assert find_protrusions(graph, values, 2.0).tips.tolist() == [8]
+    assert find_protrusions(graph, values, 0.5).heights.tolist() == [6.0, 1.5]
+    found = find_protrusions(graph, values, 5.999)
+    assert float(found.confidence[0]) == pytest.approx(0.5, abs=1e-3)
+
+
+def test_average_distance_on_a_long_body_is_that_of_an_interval():
+    # Averaged over [0, 1] the distance from x is x^2 - x + 1/2; vertices are three times as dense on the left.
+    positions = torch.cat((torch.linspace(0, 0.5, 301)[:-1], torch.linspace(0.5, 1, 101))).double()
+    points = torch.stack((positions, 0 * positions, 0 * positions), dim=1)
+    graph = GeodesicGraph.from_points(points, 2)
+    gaps = torch.cat((positions[1:] - positions[:-1], torch.zeros(1)))
+    areas = 0.5 * (gaps + gaps.roll(1))
+    average, largest = average_geodesic_distance(graph, areas, 40)
+    assert torch.allclose(average, positions**2 - positions + 0.5, atol=5e-3)
+    assert largest == pytest.approx(1.0)
+
+
+def test_rings_of_a_sphere_are_circles():
+    mesh = unit_sphere(5, dtype=torch.float64)
+    sets = level_sets(MeshEdges(mesh), mesh.vertices[:, 2], 0.1)
+    height = 0.1 * sets.levels.double()
+    inner = height.abs() < 0.95
+    assert sets.levels[inner].sort().values.tolist() == list(range(-9, 10))
+    radius = (1 - height**2).sqrt()
+    assert (sets.centers[inner] - torch.stack((0 * height, 0 * height, height), 1)[inner]).abs().max() < 1e-3
+    assert torch.allclose(sets.lengths[inner], (2 * math.pi * radius)[inner], rtol=3e-3)
+    expected = torch.diag_embed(torch.stack((radius**2 / 2, radius**2 / 2, 0 * radius), 1))
+    assert torch.allclose(sets.covariances[inner], expected[inner], atol=3e-3)
+
+
+def test_rings_do_not_depend_on_how_dense_the_vertices_are():
+    # A tube with many vertices on one side: the mean of the vertices is off by a third of the radius.
+    turn = torch.cat((torch.linspace(0, math.pi, 60)[:-1], torch.linspace(math.pi, 2 * math.pi, 20)[:-1])).double()
+    count, rows = len(turn), 12
+    ring = torch.stack((turn.cos(), turn.sin()), dim=1)
+    positions = torch.cat((ring.repeat(rows, 1), torch.arange(rows).double().repeat_interleave(count)[:, None]), dim=1)
+    column, row = torch.arange(count).repeat(rows - 1), torch.arange(rows - 1).repeat_interleave(count) * count
+    after = (column + 1) % count
+    faces = torch.stack((row + column, row + after, row + count + column), dim=1)
+    faces = torch.cat((faces, torch.stack((row + after, row + count + after, row + count + column), dim=1)))
+    sets = level_sets(MeshEdges(TriangleMesh(positions, faces)), positions[:, 2], 0.7)
+    assert len(sets) == 15
+    assert sets.centers[:, :2].abs().max() < 0.005
+    assert ring.mean(0).norm() > 0.2
+
+
+def test_rings_join_bands_in_a_tree_on_a_sphere_and_in_a_loop_on_a_torus():
+    for mesh, loops in ((unit_sphere(3, dtype=torch.float64), 0), (torus(), 1)):
+        sets = level_sets(MeshEdges(mesh), mesh.vertices[:, 0], 0.21)
+        assert len(sets) - sets.num_bands + 1 == loops
+        steps = torch.floor(mesh.vertices[:, 0] / 0.21).long()
+        for band, level in ((sets.lower, sets.levels - 1), (sets.upper, sets.levels)):
+            for number, step in zip(band.tolist(), level.tolist(), strict=True):
+                assert set(steps[sets.vertex_bands == number].tolist()) <= {step}
+
+
+def torus(rows=48, columns=24, radius=0.35):
+    u = (torch.arange(rows) * 2 * math.pi / rows).double()[:, None]
+    v = (torch.arange(columns) * 2 * math.pi / columns).double()[None]
+    distance = 1 + radius * v.cos()
+    positions = torch.stack(
+        (distance * u.cos(), distance * u.sin(), radius * v.sin().expand(rows, -1)), dim=-1
+    ).reshape(-1, 3)
+    a = torch.arange(rows)[:, None] * columns + torch.arange(columns)
+    b, c = a.roll(-1, 0), a.roll(-1, 1)
+    d = b.roll(-1, 1)
+    faces = torch.cat((torch.stack((a, b, c), -1).reshape(-1, 3), torch.stack((b, d, c), -1).reshape(-1, 3)))
+    return TriangleMesh(positions, faces)
+
+
+def test_triangles_that_span_many_levels_have_a_ring_on_each():
+    mesh = unit_sphere(0, dtype=torch.float64)
+    sets = level_sets(MeshEdges(mesh), mesh.vertices[:, 2], 0.01)
+    # The uppermost ring is a point: the pole itself.
+    assert len(sets) == 200
+    assert sets.num_bands == 201
+    assert torch.equal(sets.levels.sort().values, torch.arange(-99, 101))
+    assert sets.centers[:, :2].abs().max() < 1e-6
+    assert torch.allclose(sets.centers[:, 2], 0.01 * sets.levels.double())
+
+
+def test_faces_of_a_ring_are_those_that_it_passes_through():
+    mesh = unit_sphere(3, dtype=torch.float64)
+    sets = level_sets(MeshEdges(mesh), mesh.vertices[:, 2], 0.3)
+    ring = int((sets.levels == 1).nonzero())
+    corners = mesh.vertices[mesh.faces[sets.faces[sets.face_rings == ring]], 2]
+    assert bool(((corners.amin(1) < 0.3) & (corners.amax(1) >= 0.3)).all())
+
+
+def test_pieces_and_fins_are_fine():
+    ball = unit_sphere(2, dtype=torch.float64)
+    mesh = concatenate([ball, TriangleMesh(ball.vertices + 3, ball.faces)])
+    faces = torch.cat((mesh.faces, mesh.faces[:1, [0, 1, 0]] * 0 + torch.tensor([[0, 1, 200]])))
+    sets = level_sets(MeshEdges(TriangleMesh(mesh.vertices, faces)), mesh.vertices[:, 2], 0.5)
+    assert len(sets) > 6
+
+
+def test_a_constant_function_has_no_rings():
+    mesh = unit_sphere(0, dtype=torch.float64)
+    assert len(level_sets(MeshEdges(mesh), torch.zeros(12, dtype=torch.float64), 1.0)) == 0
+
+
+def tori(centers, thin=0.12, thick=0.3):
+    """Return rings of radius 1 in the plane z = 0, thinnest at their largest x, that may overlap."""
+
+    def field(points):
+        parts = []
+        for x in centers:
+            flat = points[:, :2] - torch.tensor([x, 0.0], dtype=points.dtype)
+            radius = flat.norm(dim=1)
+            share = 0.5 + 0.5 * flat[:, 0] / radius.clamp(min=1e-9)
+            around = torch.stack((radius - 1, points[:, 2]), dim=1).norm(dim=1)
+            parts.append(around - (thick + (thin - thick) * share**4))
+        return torch.stack(parts).amin(0)
+
+    low, high = min(centers) - 1.5, max(centers) + 1.5
+    lower, upper = torch.tensor([low, -1.5, -0.5]).double(), torch.tensor([high, 1.5, 0.5]).double()
+    return isosurface(field, lower, upper, 0.1)
+
+
+def euler_number(mesh):
+    return mesh.num_vertices - len(unique_edges(mesh.faces)[0]) + mesh.num_faces
+
+
+def test_a_ring_is_cut_where_it_is_thinnest():
+    mesh = tori([0.0])
+    assert euler_number(mesh) == 0
+    opened = open_loops(mesh, 0.1, 100)
+    assert euler_number(opened.mesh) == 2
+    assert opened.stumps.shape == (1, 2, 3)
+    middle = opened.stumps.mean(1)[0]
+    assert math.atan2(float(middle[1]), float(middle[0])) == pytest.approx(0, abs=0.35)
+    assert middle.norm() == pytest.approx(1.0, abs=0.1)
+    assert float(opened.radii) == pytest.approx(math.pi * 0.12, rel=0.3)
+
+
+def test_every_long_loop_is_cut():
+    mesh = tori([0.0, 2.0])
+    assert euler_number(mesh) == -2
+    opened = open_loops(mesh, 0.1, 100)
+    assert euler_number(opened.mesh) == 2
+    assert len(opened.stumps) == 2
+
+
+def test_short_loops_and_surfaces_without_any_stay_as_they_are():
+    mesh = tori([0.0])
+    assert open_loops(mesh, 3.0, 100).mesh is mesh
+    ball = unit_sphere(2, dtype=torch.float64)
+    opened = open_loops(TriangleMesh(ball.vertices, ball.faces), 0.1, 100)
+    assert opened.mesh.faces is ball.faces
+    assert opened.stumps.shape == (0, 2, 3)
