@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchreg.errors import InputError
-from torchreg.geometry.camera import Camera, check_rigid, lens_jacobian
+from torchreg.geometry.camera import Camera, check_rigid_motion, lens_jacobian
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import invert_rigid, se3_exp, transform_points
 from torchreg.geometry.visibility import rasterize
@@ -178,7 +178,7 @@ def test_what_is_no_camera_is_refused(change, message):
         Camera(**values)
 
 
-def test_check_rigid_allows_rounding():
-    check_rigid(se3_exp(torch.ones(6)), "motion")
+def test_rigid_motions_may_be_rounded():
+    check_rigid_motion(se3_exp(torch.ones(6)), "motion")
     with pytest.raises(InputError, match="motion must be a rotation"):
-        check_rigid(torch.eye(4) * 1.01, "motion")
+        check_rigid_motion(torch.eye(4) * 1.01, "motion")

@@ -6,6 +6,7 @@ import torch
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.depth_image import unproject
 from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.range_scan import RangeScan
 
 PINHOLE = (100.0, 90.0, 20.0, 15.0)
 
@@ -109,4 +110,4 @@ def test_units_do_not_matter():
 )
 def test_what_is_no_depth_image(depth, intrinsics, error, message):
     with pytest.raises(error, match=message):
-        unproject(depth, intrinsics, 3.0)
+        RangeScan.from_depth(depth, intrinsics)

@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from torchreg.errors import InputError
 from torchreg.geometry.marching_cubes import marching_cubes
 from torchreg.geometry.mesh import TriangleMesh
 
@@ -81,19 +80,3 @@ def test_origin_and_spacing_move_the_vertices():
 def test_no_change_of_sign_gives_no_faces():
     assert isinstance(marching_cubes(torch.ones(3, 3, 3), torch.zeros(3), 1.0), TriangleMesh)
     assert marching_cubes(torch.ones(3, 3, 3), torch.zeros(3), 1.0).num_faces == 0
-
-
-@pytest.mark.parametrize(
-    ("values", "origin", "spacing", "message"),
-    [
-        (torch.ones(3, 3), torch.zeros(3), 1.0, r"values must have shape"),
-        (torch.ones(3, 3, 1), torch.zeros(3), 1.0, "at least two samples"),
-        (torch.full((3, 3, 3), torch.nan), torch.zeros(3), 1.0, "values must be finite"),
-        (torch.ones(3, 3, 3), torch.zeros(2), 1.0, "origin must have shape"),
-        (torch.ones(3, 3, 3), torch.full((3,), torch.inf), 1.0, "origin must be finite"),
-        (torch.ones(3, 3, 3), torch.zeros(3), 0.0, "spacing must be positive"),
-    ],
-)
-def test_bad_input_is_named(values, origin, spacing, message):
-    with pytest.raises(InputError, match=message):
-        marching_cubes(values, origin, spacing)

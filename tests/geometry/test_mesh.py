@@ -128,10 +128,6 @@ def test_wrong_choices_are_refused():
         bumpy().vertex_normals("size")
     with pytest.raises(InputError, match="at least 1 point"):
         TriangleMesh(torch.zeros(0, 3), []).bounds()
-    with pytest.raises(InputError, match="meshes must hold at least one"):
-        concatenate([])
-    with pytest.raises(InputTypeError, match=r"meshes\[1\] is torch\.float64"):
-        concatenate([unit_sphere(0), unit_sphere(0, dtype=torch.float64)])
     for subdivisions in (-1, 9, 1.5, True):
         with pytest.raises(InputError, match="subdivisions must be an integer from 0 to 8"):
             unit_sphere(subdivisions)
@@ -200,9 +196,6 @@ def test_sampling_needs_a_surface():
     for faces in ([], [[0, 1, 2]]):
         with pytest.raises(InputError, match="mesh must have a surface to sample"):
             sample_surface(TriangleMesh(torch.zeros(3, 3), faces), 5)
-    for count in (-1, 2.0, True):
-        with pytest.raises(InputError, match="count must be a non-negative integer"):
-            sample_surface(unit_sphere(0), count)
 
 
 def test_interpolation_reproduces_linear_fields():
@@ -213,7 +206,3 @@ def test_interpolation_reproduces_linear_fields():
     expected = torch.einsum("vi,ijk->vjk", points, slope)
     torch.testing.assert_close(interpolate(field, mesh.faces, face, weights), expected)
     torch.testing.assert_close(interpolate(mesh.vertices[:, 0], mesh.faces, face, weights), points[:, 0])
-    with pytest.raises(InputError, match=r"barycentric must have shape \(30, 3\)"):
-        interpolate(field, mesh.faces, face, weights[:5])
-    with pytest.raises(InputTypeError, match=r"barycentric is torch\.float32"):
-        interpolate(field, mesh.faces, face, weights.float())

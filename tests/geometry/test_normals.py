@@ -7,7 +7,6 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.geometry.neighbors import k_nearest_others
 from torchreg.geometry.normals import (
@@ -172,31 +171,3 @@ def test_a_mostly_inward_winding_wins_without_a_viewpoint():
     faces = mesh.faces.flip(-1).clone()
     faces[:5] = mesh.faces[:5]
     torch.testing.assert_close(face_vertex_normals(mesh.vertices, faces), -mesh.vertex_normals())
-
-
-@pytest.mark.parametrize(
-    ("points", "message"),
-    [
-        (torch.zeros(5, 2), r"points must have shape \(N, 3\)"),
-        (torch.zeros(2, 3), "points must hold at least 3"),
-        (torch.zeros(5, 3), "3 places or more, got 5 points at 1"),
-        (torch.full((5, 3), torch.nan), "points must be finite"),
-    ],
-)
-def test_points_that_hold_no_surface(points, message):
-    with pytest.raises(InputError, match=message):
-        estimate_normals(points)
-
-
-def test_other_arguments_are_checked():
-    points = cap(20)
-    with pytest.raises(InputError, match=r"viewpoint must be finite.*pass None"):
-        estimate_normals(points, viewpoint=torch.tensor([0, 0, torch.inf]))
-    with pytest.raises(InputError, match="viewpoint must have shape"):
-        estimate_normals(points, viewpoint=torch.zeros(2))
-    with pytest.raises(InputError, match="normals must have shape"):
-        orient_normals(points, points[:5])
-    with pytest.raises(InputError, match="count must be at least 1"):
-        estimate_normals(points, num_neighbors=0)
-    with pytest.raises(InputTypeError, match="real numbers"):
-        estimate_normals(points.bool())

@@ -1,13 +1,11 @@
 """Evenly spread subsets: compared with the same rule walked point by point, and by distances and coverage."""
 
 import numpy as np
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.poisson_disk import poisson_disk, poisson_disk_count
 
 
@@ -94,17 +92,3 @@ def test_the_generator_decides():
     other = poisson_disk(points, 0.3, torch.Generator().manual_seed(5))
     assert not torch.equal(poisson_disk(points, 0.3), other)
     assert torch.equal(other, poisson_disk(points, 0.3, torch.Generator().manual_seed(5)))
-
-
-def test_arguments_are_checked():
-    points = cloud(10)
-    with pytest.raises(InputError, match="radius must be positive"):
-        poisson_disk(points, 0.0)
-    with pytest.raises(InputError, match="points must hold at least 1"):
-        poisson_disk(points[:0], 1.0)
-    with pytest.raises(InputError, match="count must be at least 1, got 0"):
-        poisson_disk_count(points, 0)
-    with pytest.raises(InputTypeError, match="count must be an integer"):
-        poisson_disk_count(points, 2.5)
-    with pytest.raises(InputError, match="points must be finite"):
-        poisson_disk_count(points / 0, 2)

@@ -10,13 +10,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from torch.func import jacfwd, jacrev, vmap
 
-from torchreg.geometry.primitives import (
-    PRIMITIVE_KINDS,
-    capsule_distance,
-    cone_distance,
-    ellipsoid_distance,
-    superquadric_distance,
-)
+from torchreg.geometry.primitives import PRIMITIVE_KINDS
 
 # torch's own forward mode compiles its decompositions with a deprecated call on first use.
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
@@ -99,7 +93,7 @@ def test_the_ellipsoid_distance_is_euclidean_to_first_order(radii):
         points = torch.cat([surface + offset * normal, surface - offset * normal])
         exact = np.array([exact_ellipsoid(p, radii) for p in points.numpy()])
         np.testing.assert_allclose(np.abs(exact), offset, rtol=1e-6)
-        errors.append(np.abs(ellipsoid_distance(points, row(radii)).numpy() - exact).max())
+        errors.append(np.abs(PRIMITIVE_KINDS["ellipsoid"].distance(points, row(radii)).numpy() - exact).max())
     # Halving the distance divides a second-order error by four.
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.25)
     assert errors[1] / errors[2] == pytest.approx(4, rel=0.15)
@@ -108,7 +102,9 @@ def test_the_ellipsoid_distance_is_euclidean_to_first_order(radii):
 
 def test_a_sphere_is_exact_everywhere():
     points = random_points(100, (1.0,), spread=3)
-    torch.testing.assert_close(ellipsoid_distance(points, row((1.0, 1.0, 1.0))), points.norm(dim=-1) - 1)
+    torch.testing.assert_close(
+        PRIMITIVE_KINDS["ellipsoid"].distance(points, row((1.0, 1.0, 1.0))), points.norm(dim=-1) - 1
+    )
 
 
 @settings(max_examples=50, deadline=None)
@@ -128,14 +124,16 @@ def test_the_zero_set_is_the_ellipsoid_with_unit_gradient(a, b, c, polar, azimut
 def test_the_capsule_distance_is_exact(sizes):
     points = random_points(400, sizes, spread=2.5)
     expected = profile_distance(points.numpy(), capsule_outline(*sizes))
-    np.testing.assert_allclose(capsule_distance(points, row(sizes)), expected, atol=1e-6 * max(sizes))
+    np.testing.assert_allclose(
+        PRIMITIVE_KINDS["capsule"].distance(points, row(sizes)), expected, atol=1e-6 * max(sizes)
+    )
 
 
 @pytest.mark.parametrize("sizes", SIZES["cone"])
 def test_the_cone_distance_is_exact(sizes):
     points = random_points(2000, sizes, spread=2.5)
     expected = profile_distance(points.numpy(), cone_outline(*sizes))
-    np.testing.assert_allclose(cone_distance(points, row(sizes)), expected, atol=1e-15)
+    np.testing.assert_allclose(PRIMITIVE_KINDS["cone"].distance(points, row(sizes)), expected, atol=1e-15)
 
 
 @pytest.mark.parametrize(("kind", "sizes"), [("cone", SIZES["cone"][0]), ("capsule", SIZES["capsule"][0])])
@@ -166,7 +164,7 @@ def test_the_rim_of_a_cone_is_finite():
         distance, gradient = PRIMITIVE_KINDS["cone"].gradient(rims, row(sizes))
         assert distance.abs().max() < 1e-16
         assert torch.isfinite(gradient).all()
-        (auto,) = torch.autograd.grad(cone_distance(rims, row(sizes)).sum(), rims)
+        (auto,) = torch.autograd.grad(PRIMITIVE_KINDS["cone"].distance(rims, row(sizes)).sum(), rims)
         assert torch.isfinite(auto).all()
 
 
@@ -191,7 +189,7 @@ def test_superquadrics_pass_through_their_parametrization_and_are_radial(sizes):
         dim=-1,
     )
     for factor in (1.0, 0.3, 2.5):
-        distance = superquadric_distance(factor * surface, row(sizes))
+        distance = PRIMITIVE_KINDS["superquadric"].distance(factor * surface, row(sizes))
         torch.testing.assert_close(distance, (factor - 1) * surface.norm(dim=-1), atol=1e-9, rtol=1e-9)
 
 
@@ -199,7 +197,9 @@ def test_a_superquadric_of_exponents_one_is_an_ellipsoid_to_the_sign():
     points = random_points(200, (0.05,))
     radii = (0.02, 0.03, 0.05)
     expected = (points / row(radii)).norm(dim=-1) - 1
-    assert torch.equal(superquadric_distance(points, row((*radii, 1.0, 1.0))).sign(), expected.sign())
+    assert torch.equal(
+        PRIMITIVE_KINDS["superquadric"].distance(points, row((*radii, 1.0, 1.0))).sign(), expected.sign()
+    )
 
 
 @pytest.mark.parametrize("sizes", SIZES["superquadric"])
@@ -211,7 +211,7 @@ def test_superquadrics_are_finite_on_axes_and_planes(sizes, dtype):
     assert torch.isfinite(distance).all()
     assert torch.isfinite(gradient).all()
     learned = row(sizes, dtype).requires_grad_()
-    grads = torch.autograd.grad(superquadric_distance(points, learned).sum(), (points, learned))
+    grads = torch.autograd.grad(PRIMITIVE_KINDS["superquadric"].distance(points, learned).sum(), (points, learned))
     assert all(torch.isfinite(grad).all() for grad in grads)
 
 
@@ -284,7 +284,7 @@ def test_rows_of_sizes_broadcast_over_points(kind):
 def test_lengths_scale(kind, sizes):
     record = PRIMITIVE_KINDS[kind]
     points = random_points(50, sizes)
-    scaled = torch.where(torch.tensor(record.scalable), row(sizes) * 1000, row(sizes))
+    scaled = torch.where(torch.tensor([size.is_length for size in record.sizes]), row(sizes) * 1000, row(sizes))
     torch.testing.assert_close(
         record.distance(points * 1000, scaled), 1000 * record.distance(points, row(sizes)), rtol=1e-9, atol=1e-12
     )
@@ -293,5 +293,5 @@ def test_lengths_scale(kind, sizes):
 def test_kinds_describe_their_sizes():
     for name, kind in PRIMITIVE_KINDS.items():
         assert kind.name == name
-        assert len(kind.sizes) == len(kind.long_sizes) == len(kind.scalable) == len(SIZES[name][0])
-        assert any(kind.long_sizes)
+        assert len(kind.sizes) == len(SIZES[name][0])
+        assert any(size.is_long for size in kind.sizes)

@@ -8,7 +8,6 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
 
-from torchreg.errors import InputError
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.rotation_representations import (
     quaternion_from_rotation,
@@ -123,14 +122,3 @@ def test_batches_of_any_shape_and_float32():
     torch.testing.assert_close(batch[1, 2], rotation_vector_from_6d(columns[1, 2]))
     torch.testing.assert_close(rotation_vector_from_6d(columns.float()).double(), batch, atol=1e-5, rtol=0)
     assert quaternion_from_rotation(rotation_from_6d(columns)).shape == (2, 3, 4)
-
-
-@pytest.mark.parametrize(
-    ("function", "size"),
-    [(rotation_from_6d, (5,)), (rotation_from_quaternion, (3,)), (rotation_vector_from_quaternion, (3,)),
-     (quaternion_from_rotation, (3, 4)), (rotation_to_6d, (2, 2)), (rotation_vector_to_6d, (4,)),
-     (quaternion_from_rotation_vector, (4,)), (rotation_vector_from_rotation, (3,)), (rotation_vector_from_6d, (4,))],
-)  # fmt: skip
-def test_wrong_sizes_are_told(function, size):
-    with pytest.raises(InputError, match="must have shape"):
-        function(torch.ones(size))

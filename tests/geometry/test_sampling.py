@@ -1,11 +1,9 @@
 """Farthest-point sampling: cover, order, and duplicates."""
 
-import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchreg.errors import InputError
 from torchreg.geometry.sampling import even_order, farthest_points
 
 
@@ -47,19 +45,6 @@ def test_float32_and_a_shift_choose_alike():
     expected = farthest_points(points, 10)
     assert torch.equal(farthest_points(points.float(), 10), expected)
     assert torch.equal(farthest_points(points + 5, 10), expected)
-
-
-def test_bad_input_is_refused():
-    with pytest.raises(InputError, match="count must be between 1 and the number of points 5, got 6"):
-        farthest_points(cloud(5), 6)
-    with pytest.raises(InputError, match="count must be between 1"):
-        farthest_points(cloud(5), 0)
-    with pytest.raises(InputError, match="start must be the index of one of 5 points, got -1"):
-        farthest_points(cloud(5), 2, start=-1)
-    with pytest.raises(InputError, match="points must be finite"):
-        farthest_points(cloud(5) * torch.nan, 2)
-    with pytest.raises(InputError, match="points must have shape"):
-        farthest_points(cloud(5)[:, :2], 2)
 
 
 def test_the_even_order_chooses_the_farthest_each_time():

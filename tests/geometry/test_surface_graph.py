@@ -57,8 +57,6 @@ def test_pieces_by_policy():
     assert apart.tolist() == pytest.approx([float(table[:, :42].min()), float(table[:, 204:].min())])
     with pytest.raises(InputError, match="mesh must be one piece, got 3"):
         one_piece(mesh, "error")
-    with pytest.raises(InputError, match="pieces must be one of"):
-        one_piece(mesh, "all")
 
 
 def test_many_pieces_are_bridged_one_to_the_next():

@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.voxels import VoxelGrid, voxelize
@@ -117,22 +116,3 @@ def test_voxels_at_the_border_are_closed():
     mesh = VoxelGrid(torch.ones(2, 2, 2, dtype=torch.bool), torch.zeros(3), 1.0).mesh(0)
     assert mesh.num_vertices - mesh.num_faces // 2 == 2
     assert float(mesh.vertices.min()) < 0
-
-
-@pytest.mark.parametrize(
-    ("call", "error", "message"),
-    [
-        (lambda: voxelize("mesh"), InputTypeError, "mesh must be a TriangleMesh"),
-        (lambda: voxelize(SPHERE, 1), InputError, "resolution must be at least 2"),
-        (lambda: voxelize(SPHERE, 2000), InputError, "choose a smaller one"),
-        (lambda: voxelize(TriangleMesh(torch.zeros(3, 3), torch.zeros(0, 3).long())), InputError, "must have faces"),
-        (lambda: voxelize(TriangleMesh(torch.zeros(3, 3), torch.tensor([[0, 1, 2]]))), InputError, "longest side"),
-        (lambda: VoxelGrid(torch.zeros(2, 2, 2), torch.zeros(3), 1.0), InputTypeError, "filled must be a Boolean"),
-        (lambda: VoxelGrid(torch.zeros(2, 2).bool(), torch.zeros(3), 1.0), InputError, "filled must have shape"),
-        (lambda: VoxelGrid(torch.zeros(2, 2, 2).bool(), torch.zeros(3), -1.0), InputError, "spacing must be"),
-        (lambda: voxelize(SPHERE, 8).mesh(-1), InputError, "smoothing must be at least 0"),
-    ],
-)
-def test_bad_input_is_named(call, error, message):
-    with pytest.raises(error, match=message):
-        call()

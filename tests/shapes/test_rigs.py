@@ -13,7 +13,8 @@ from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.gltf import load_rig
 from torchreg.io.urdf import UrdfPrimitive
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.primitives import Primitive, refine_primitives
+from torchreg.shapes.primitive_refinement import refine_primitives
+from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.rigs import solid_mesh, spec_from_arrays
 from torchreg.shapes.skin import BendingSkin, sample_skin
 

@@ -19,7 +19,8 @@ from torchreg.geometry.rigid import invert_rigid, rigid_matrix, transform_points
 from torchreg.io.gltf import load_rig
 from torchreg.io.urdf import UrdfPrimitive, UrdfRecord, load_urdf
 from torchreg.shapes.kinematics import KinematicChain, neighbor_matrix, part_parents
-from torchreg.shapes.primitives import Primitive, refine_primitives
+from torchreg.shapes.primitive_refinement import refine_primitives
+from torchreg.shapes.primitives import Primitive
 
 Axes = Mapping[str, Sequence[str | Sequence[float]]]
 Limits = Mapping[str, Sequence[tuple[float, float]]]
@@ -307,7 +308,7 @@ def _default_nu(primitives: Sequence[Primitive], share: float = _NU_PER_THICKNES
 
 def _lengths(primitive: Primitive) -> list[float]:
     kind = PRIMITIVE_KINDS[primitive.kind]
-    return [size for size, scalable in zip(primitive.sizes, kind.scalable, strict=True) if scalable]
+    return [value for value, size in zip(primitive.sizes, kind.sizes, strict=True) if size.is_length]
 
 
 def spec_from_urdf(
