@@ -103,7 +103,7 @@ class RangeScan:
     diagonal: float
     viewpoint: Tensor | None
     # Uniform subsamples by their count: every stage of a registration asks for the same ones.
-    _subsamples: dict[int, Tensor]
+    _even: dict[int, Tensor]
 
     def __init__(self, points: Any, faces: Any = None, normals: Any = None, *, viewpoint: Any = None) -> None:
         points = as_float_tensor(points, "points")
@@ -132,7 +132,7 @@ class RangeScan:
     def _set(self, *, points: Tensor, **values: Any) -> None:
         box = points.detach().double()
         diagonal = float((box.amax(dim=0) - box.amin(dim=0)).norm())
-        for name, value in {"points": points, "diagonal": diagonal, "_subsamples": {}, **values}.items():
+        for name, value in {"points": points, "diagonal": diagonal, "_even": {}, **values}.items():
             object.__setattr__(self, name, value)
 
     def _with(self, **values: Any) -> RangeScan:
@@ -218,9 +218,9 @@ class RangeScan:
         check_count(number, "count", 1)
         if generator is not None:
             return poisson_disk_count(self.points, number, generator)
-        if number not in self._subsamples:
-            self._subsamples[number] = poisson_disk_count(self.points, number)
-        return self._subsamples[number].clone()
+        if number not in self._even:
+            self._even[number] = poisson_disk_count(self.points, number)
+        return self._even[number].clone()
 
     def subset(self, which: Any, *, mark_cut: bool = False) -> RangeScan:
         """Return the scan of a subset of the points: their normals and boundary as they are, and the faces among them.
