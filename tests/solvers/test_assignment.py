@@ -5,7 +5,6 @@ from itertools import permutations
 import pytest
 import torch
 
-from torchreg.errors import InputError
 from torchreg.solvers.assignment import assign, assign_within
 
 
@@ -38,15 +37,6 @@ def test_permuting_rows_and_columns_permutes_the_answer():
     assert torch.equal(there, found[rows])
 
 
-def test_bad_input_is_named():
-    with pytest.raises(InputError, match="costs must be finite"):
-        assign(torch.tensor([[torch.inf]]))
-    with pytest.raises(InputError, match="costs must have shape"):
-        assign(torch.zeros(3))
-    with pytest.raises(InputError, match="alone must be finite"):
-        assign(torch.zeros(1, 1), torch.nan)
-
-
 def test_no_assignment_within_a_limit_is_cheaper():
     costs = random(5, 4, seed=3)
     found = assign_within(costs, 0.3)
@@ -57,8 +47,6 @@ def test_no_assignment_within_a_limit_is_cheaper():
     assert bool((costs[found >= 0, found[found >= 0]] < 0.3).all())
 
 
-def test_limits_are_checked():
+def test_nothing_within_the_limit_or_no_rows_leave_no_pairs():
     assert assign_within(random(3, 2), 1e-9).tolist() == [-1, -1, -1]
     assert assign_within(torch.zeros(0, 2), 1.0).tolist() == []
-    with pytest.raises(InputError, match="limit must be positive"):
-        assign_within(random(3, 2), 0.0)

@@ -9,6 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from torchreg.geometry.budget import Budget
 from torchreg.solvers import e_step as em
 from torchreg.solvers.e_step import OUTLIER_CONSTANT, expectation, outlier_constant, posterior, working_volume
 
@@ -76,7 +77,7 @@ def test_chunks_do_not_change_the_answer(monkeypatch, entries):
     mask = torch.rand(3, 9, generator=torch.Generator().manual_seed(2)) > 0.3
     sigma, c = torch.tensor([0.1, 0.2, 0.4], dtype=D), torch.tensor([1.0, 2.0, 3.0], dtype=D)
     whole = expectation(model, data, sigma, c, mask=mask)
-    monkeypatch.setattr(em, "_CHUNK_ENTRIES", entries)
+    monkeypatch.setattr(em, "BUDGET", Budget(table_entries=entries))
     assert_same(expectation(model, data, sigma, c, mask=mask), whole)
 
 

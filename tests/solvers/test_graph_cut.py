@@ -1,6 +1,7 @@
-"""Graph cuts: cuts and labelings against trying them all and linear programs, ties, roundings, refusals."""
+"""Graph cuts: cuts and labelings against trying them all and linear programs, ties, roundings."""
 
 import math
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -11,12 +12,29 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 import torchreg.solvers.graph_cut as module
-from torchreg.errors import InputError, InputTypeError, SolverError
+from torchreg.errors import SolverError
 from torchreg.solvers.graph_cut import alpha_expansion, min_cut
 
 SEEDS = st.integers(0, 10_000)
 EDGES = torch.tensor([[0, 1], [1, 2]])
 HALF = torch.full((2,), 0.5)
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A cut's side, its value summed from the capacities as given, and the bound on its rounding."""
+
+    sink_side: torch.Tensor
+    value: float
+    error: float
+
+
+def cut(source, sink, edges, capacities, reverse=None):
+    reverse = torch.zeros_like(capacities) if reverse is None else reverse
+    source, sink, forward, backward = (values.double().numpy() for values in (source, sink, capacities, reverse))
+    side, error = min_cut(source - sink, edges.numpy(), forward, backward)
+    side = torch.from_numpy(side)
+    return Cut(side, cut_cost(side.tolist(), source, sink, edges, capacities, backward), error)
 
 
 def random_graph(seed, num_nodes, num_edges):
@@ -37,12 +55,12 @@ def cut_cost(side, source, sink, edges, capacities, reverse):
     return total
 
 
-def energy_of(labels, unary, edges, weights, metric, label_costs, places=None, place_weights=None):
+def energy_of(labels, unary, edges, weights, metric, label_costs, places=None, position_weights=None):
     """Return the energy of a labeling, from the definition."""
     total = sum(float(unary[i, label]) for i, label in enumerate(labels))
     total += sum(w * metric[labels[i]][labels[j]] for (i, j), w in zip(edges.tolist(), weights.tolist(), strict=True))
     if places is not None:
-        for (i, j), table, t in zip(edges.tolist(), places.tolist(), place_weights.tolist(), strict=True):
+        for (i, j), table, t in zip(edges.tolist(), places.tolist(), position_weights.tolist(), strict=True):
             total += t * min(math.dist(table[labels[i]], table[labels[j]]), 1.0)
     return total + sum(float(label_costs[label]) for label in set(labels))
 
@@ -60,7 +78,7 @@ def labeling_problem(seed, num_nodes=6, num_labels=3, num_edges=9):
 def seam_problem(edges, num_labels, generator):
     """Return places whose distances are partly below and partly above one, and weights."""
     places = 1.2 * torch.rand(len(edges), num_labels, 2, generator=generator, dtype=torch.float64)
-    return {"places": places, "place_weights": torch.rand(len(edges), generator=generator, dtype=torch.float64)}
+    return {"positions": places, "position_weights": torch.rand(len(edges), generator=generator, dtype=torch.float64)}
 
 
 @given(SEEDS, st.integers(1, 7), st.sampled_from([1.0, 1e-6, 1e9]))
@@ -69,7 +87,7 @@ def test_a_cut_costs_the_least_of_all_cuts(seed, num_nodes, scale):
     edges, generator = random_graph(seed, num_nodes, 12)
     source, sink = torch.rand(2, num_nodes, generator=generator, dtype=torch.float64) * scale
     capacities, reverse = torch.rand(2, len(edges), generator=generator, dtype=torch.float64) * scale
-    result = min_cut(source, sink, edges, capacities, reverse)
+    result = cut(source, sink, edges, capacities, reverse)
     costs = [
         cut_cost(side, source, sink, edges, capacities, reverse) for side in product([False, True], repeat=num_nodes)
     ]
@@ -86,7 +104,7 @@ def test_integers_are_exact_and_a_tie_puts_the_fewest_nodes_at_the_sink(seed):
     edges, generator = random_graph(seed, 6, 10)
     source, sink = torch.randint(0, 4, (2, 6), generator=generator)
     capacities, reverse = torch.randint(0, 3, (2, len(edges)), generator=generator)
-    result = min_cut(source, sink, edges, capacities, reverse)
+    result = cut(source, sink, edges, capacities, reverse)
     sides = list(product([False, True], repeat=6))
     costs = [cut_cost(side, source, sink, edges, capacities, reverse) for side in sides]
     best = [sum(side) for side, cost in zip(sides, costs, strict=True) if cost == min(costs)]
@@ -112,14 +130,14 @@ def test_a_cut_equals_the_linear_program(seed):
         np.zeros(len(edges)),
         bounds=[(0, 1)] * 40 + [(0, None)] * 160,
     )
-    assert min_cut(source, sink, edges, capacities).value == pytest.approx(program.fun + float(sink.sum()), rel=1e-6)
+    assert cut(source, sink, edges, capacities).value == pytest.approx(program.fun + float(sink.sum()), rel=1e-6)
 
 
 def test_capacities_beyond_32_bits_do_not_lose_the_flow():
     # Neither side is plain before the flow, and scipy's maximum flow takes such capacities for none at all.
     big = 2.0**33
     edges, capacities = torch.tensor([[0, 1]]), torch.tensor([2 * big])
-    result = min_cut(torch.tensor([big, 0.0]), torch.tensor([0.0, 0.75 * big]), edges, capacities, capacities)
+    result = cut(torch.tensor([big, 0.0]), torch.tensor([0.0, 0.75 * big]), edges, capacities, capacities)
     assert result.value == 0.75 * big
     assert result.sink_side.tolist() == [False, False]
     assert result.error == 0
@@ -130,18 +148,18 @@ def test_huge_terminals_beside_tiny_edges_keep_the_resolution_of_the_edges():
     source, sink = torch.rand(2, 8, generator=generator, dtype=torch.float64)
     source[0], sink[1] = 1e15, 1e15
     capacities = torch.rand(len(edges), generator=generator, dtype=torch.float64)
-    assert min_cut(source, sink, edges, capacities, capacities).error < 1e-6
+    assert cut(source, sink, edges, capacities, capacities).error < 1e-6
 
 
 def test_repeated_edges_add_up():
     edges, source, sink = torch.tensor([[0, 1]] * 3), torch.tensor([3.0, 0.0]), torch.tensor([0.0, 2.5])
-    assert min_cut(source, sink, edges, torch.full((3,), 0.7)).value == pytest.approx(2.1)
+    assert cut(source, sink, edges, torch.full((3,), 0.7)).value == pytest.approx(2.1)
 
 
 def test_empty_graphs_and_nodes_without_edges_are_cut():
     none = torch.zeros(0, 2, dtype=torch.long)
-    assert min_cut(torch.zeros(0), torch.zeros(0), none, torch.zeros(0)).value == 0
-    result = min_cut(torch.tensor([1.0, 2.0, 0.0]), torch.tensor([2.0, 1.0, 0.0]), none, torch.zeros(0))
+    assert cut(torch.zeros(0), torch.zeros(0), none, torch.zeros(0)).value == 0
+    result = cut(torch.tensor([1.0, 2.0, 0.0]), torch.tensor([2.0, 1.0, 0.0]), none, torch.zeros(0))
     assert result.sink_side.tolist() == [True, False, False]
     assert result.value == 2
 
@@ -155,35 +173,31 @@ def test_a_flow_that_differs_from_the_cut_is_an_error(monkeypatch):
     maximum_flow = module.maximum_flow
     monkeypatch.setattr(module, "maximum_flow", silent)
     with pytest.raises(SolverError, match="maximum flow is 0 but the cut carries"):
-        min_cut(torch.tensor([1.0, 0.0]), torch.tensor([0.0, 0.9]), EDGES[:1], 4 * HALF[:1], 4 * HALF[:1])
+        cut(torch.tensor([1.0, 0.0]), torch.tensor([0.0, 0.9]), EDGES[:1], 4 * HALF[:1], 4 * HALF[:1])
 
 
-@given(SEEDS, st.booleans(), st.booleans(), st.booleans())
-@example(237, False, True, False)  # leaves open nodes that nothing holds on either side
+@given(SEEDS, st.booleans(), st.booleans())
+@example(237, True, False)  # leaves open nodes that nothing holds on either side
 @settings(max_examples=60, deadline=None)
-def test_no_expansion_of_any_label_lowers_the_energy_and_the_bound_holds(seed, general, costly, seams):
+def test_no_expansion_of_any_label_lowers_the_energy_and_the_bound_holds(seed, costly, seams):
     unary, edges, weights = labeling_problem(seed)
     generator = torch.Generator().manual_seed(seed)
-    places = torch.rand(3, 2, generator=generator, dtype=torch.float64)
-    metric = torch.cdist(places, places) if general else 1 - torch.eye(3, dtype=torch.float64)
     costs = torch.rand(3, generator=generator, dtype=torch.float64) if costly else torch.zeros(3)
     given_seams = seam_problem(edges, 3, generator) if seams else {}
     result = alpha_expansion(
         unary,
         edges,
         weights,
-        metric=metric if general else None,
         label_costs=costs if costly else None,
         **given_seams,
     )
-    problem = (unary, edges, weights, metric.tolist(), costs, *given_seams.values())
+    problem = (unary, edges, weights, potts(3), costs, *given_seams.values())
     labels = result.labels.tolist()
     assert result.converged
     assert result.energy == pytest.approx(energy_of(labels, *problem), rel=1e-12)
     least = min(energy_of(f, *problem) for f in product(range(3), repeat=6))
     if not costly and not seams:
-        apart = metric[~torch.eye(3, dtype=torch.bool)]
-        assert result.energy <= 2 * float(apart.max() / apart.min()) * least
+        assert result.energy <= 2 * least
     for alpha in range(3):
         for moves in product([False, True], repeat=6):
             moved = [alpha if move else label for move, label in zip(moves, labels, strict=True)]
@@ -197,9 +211,9 @@ def test_two_labels_end_in_the_least_energy_from_any_start(seed):
     initial = torch.randint(0, 2, (6,), generator=torch.Generator().manual_seed(seed))
     result = alpha_expansion(unary, edges, weights, initial=initial)
     least = min(energy_of(f, unary, edges, weights, potts(2), [0, 0]) for f in product(range(2), repeat=6))
-    cut = min_cut(unary[:, 1], unary[:, 0], edges, weights, weights)
+    least_cut = cut(unary[:, 1], unary[:, 0], edges, weights, weights)
     assert result.energy == pytest.approx(least, abs=1e-7)
-    assert cut.value == pytest.approx(least, abs=1e-7)
+    assert least_cut.value == pytest.approx(least, abs=1e-7)
 
 
 def test_the_energy_never_rises_over_sweeps_and_sweeps_can_be_continued():
@@ -218,18 +232,6 @@ def test_one_sweep_from_a_random_start_has_not_converged():
     unary, edges, weights = labeling_problem(1, num_nodes=60, num_labels=6, num_edges=200)
     initial = torch.randint(0, 6, (60,), generator=torch.Generator().manual_seed(0))
     assert not alpha_expansion(unary, edges, 0.3 * weights, initial=initial, max_sweeps=1).converged
-
-
-def test_the_generator_decides_the_order_and_nothing_else():
-    unary, edges, weights = labeling_problem(2, num_nodes=80, num_labels=7, num_edges=300)
-    runs = [
-        alpha_expansion(unary, edges, 0.2 * weights, generator=torch.Generator().manual_seed(seed))
-        for seed in (0, 0, 1, 2, 3)
-    ]
-    assert torch.equal(runs[0].labels, runs[1].labels)
-    energies = torch.tensor([run.energy for run in runs])
-    assert energies.max() <= 1.05 * energies.min()
-    assert any(not torch.equal(runs[0].labels, run.labels) for run in runs[2:])
 
 
 def test_labels_follow_a_permutation_of_nodes_and_a_common_scale():
@@ -263,16 +265,16 @@ def test_seams_depend_on_distances_alone_and_are_potts_beyond_one():
     seams = seam_problem(edges, 4, torch.Generator().manual_seed(3))
     plain = alpha_expansion(unary, edges, 0.1 * weights, **seams)
     turn = torch.tensor([[0.6, -0.8], [0.8, 0.6]], dtype=torch.float64)
-    moved = alpha_expansion(unary, edges, 0.1 * weights, **(seams | {"places": seams["places"] @ turn + 7.0}))
+    moved = alpha_expansion(unary, edges, 0.1 * weights, **(seams | {"positions": seams["positions"] @ turn + 7.0}))
     assert torch.equal(moved.labels, plain.labels)
     assert moved.energy == pytest.approx(plain.energy)
     far = 5.0 * torch.arange(4, dtype=torch.float64)[None, :, None].expand(120, 4, 1)
     potts_alone = alpha_expansion(unary, edges, 0.1 * weights + 0.2)
-    apart = alpha_expansion(unary, edges, 0.1 * weights, places=far, place_weights=torch.full((120,), 0.2))
+    apart = alpha_expansion(unary, edges, 0.1 * weights, positions=far, position_weights=torch.full((120,), 0.2))
     assert torch.equal(apart.labels, potts_alone.labels)
     assert apart.energy == pytest.approx(potts_alone.energy)
-    ones = alpha_expansion(unary, edges, weights, places=far, place_weights=torch.ones(120))
-    assert alpha_expansion(unary, edges, weights, places=far).energy == ones.energy
+    ones = alpha_expansion(unary, edges, weights, positions=far, position_weights=torch.ones(120))
+    assert alpha_expansion(unary, edges, weights, positions=far).energy == ones.energy
 
 
 def test_a_seam_runs_where_labels_agree():
@@ -283,7 +285,7 @@ def test_a_seam_runs_where_labels_agree():
     for agree in (0, 3, 7):
         places = torch.zeros(8, 2, 3)
         places[:, 1, 0] = 0.1 + 0.1 * (torch.arange(8) - agree).abs()
-        labels = alpha_expansion(unary, edges, torch.full((8,), 0.01), places=places).labels
+        labels = alpha_expansion(unary, edges, torch.full((8,), 0.01), positions=places).labels
         assert labels.tolist() == [0] * (agree + 1) + [1] * (8 - agree)
 
 
@@ -311,59 +313,3 @@ def test_what_is_given_stays_as_it_was_and_dtypes_do_not_matter():
     assert initial.tolist() == [0] * 6
     assert torch.equal(double.labels, single.labels)
     assert double.labels.dtype == torch.int64
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"unary": torch.zeros(3)}, InputError, r"unary must have shape \(N, L\)"),
-        ({"unary": torch.full((3, 2), torch.inf)}, InputError, "forbid a label by a large cost"),
-        ({"unary": torch.zeros(3, 0)}, InputError, "at least one label"),
-        ({"unary": "none"}, InputTypeError, "unary must be a tensor"),
-        ({"edges": EDGES.float()}, InputTypeError, "edges must hold integers"),
-        ({"edges": EDGES + 1}, InputError, "edges must name nodes 0 to 2, got 1 to 3"),
-        ({"edges": EDGES - 1}, InputError, "got -1 to 1"),
-        ({"edges": torch.ones(2, 2, dtype=torch.long)}, InputError, "join different nodes, got 2"),
-        ({"weights": torch.zeros(3)}, InputError, "weights must have 2 entries, one per edge, got 3"),
-        ({"weights": -HALF}, InputError, "weights must not be negative, got -0.5"),
-        ({"weights": HALF * torch.nan}, InputError, "weights must be finite"),
-        ({"label_costs": torch.ones(3)}, InputError, "label_costs must have 2 entries, one per label"),
-        ({"metric": torch.zeros(3, 3)}, InputError, r"metric must have shape \(2, 2\)"),
-        ({"metric": torch.ones(2, 2)}, InputError, "zero on the diagonal"),
-        ({"metric": torch.tensor([[0.0, 1.0], [2.0, 0.0]])}, InputError, "symmetric"),
-        ({"places": torch.zeros(2, 3, 1)}, InputError, r"places must have shape \(2, 2, D\)"),
-        ({"places": torch.full((2, 2, 1), torch.nan)}, InputError, "places must be finite"),
-        ({"places": torch.zeros(2, 2, 1), "place_weights": -HALF}, InputError, "place_weights must not be negative"),
-        ({"place_weights": HALF}, InputError, "place_weights are those of places"),
-        ({"initial": torch.zeros(3)}, InputTypeError, "initial must hold integers"),
-        ({"initial": torch.full((3,), 2)}, InputError, "initial must name labels 0 to 1, got 2 to 2"),
-        ({"initial": torch.zeros(2, dtype=torch.long)}, InputError, r"initial must have shape \(3\)"),
-        ({"max_sweeps": 0}, InputError, "max_sweeps must be at least 1"),
-    ],
-)
-def test_labelings_refuse_what_makes_no_sense(change, error, message):
-    given_arguments = {"unary": torch.zeros(3, 2), "edges": EDGES, "weights": HALF} | change
-    with pytest.raises(error, match=message):
-        alpha_expansion(**given_arguments)
-
-
-def test_a_table_without_triangle_inequality_is_refused():
-    table = torch.tensor([[0.0, 1.0, 5.0], [1.0, 0.0, 1.0], [5.0, 1.0, 0.0]])
-    with pytest.raises(InputError, match="triangle inequality"):
-        alpha_expansion(torch.zeros(3, 3), EDGES, HALF, metric=table)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"source": torch.zeros(3, 1)}, r"source must have shape \(N\)"),
-        ({"source": -torch.ones(3)}, "source must not be negative, got -1.0"),
-        ({"sink": torch.ones(2)}, "sink must have 3 entries, one per node, got 2"),
-        ({"capacities": torch.ones(3)}, "capacities must have 2 entries"),
-        ({"reverse_capacities": torch.full((2,), torch.inf)}, "reverse_capacities must be finite"),
-    ],
-)
-def test_cuts_refuse_what_makes_no_sense(change, message):
-    given_arguments = {"source": torch.ones(3), "sink": torch.ones(3), "edges": EDGES, "capacities": HALF} | change
-    with pytest.raises(InputError, match=message):
-        min_cut(**given_arguments)

@@ -1,4 +1,4 @@
-"""Sparse least squares under x >= 0: against scipy, against bounds by quasi-Newton, degenerate systems, refusals."""
+"""Sparse least squares under x >= 0: against scipy, against bounds by quasi-Newton, degenerate systems."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,7 @@ from scipy.optimize import lsq_linear, minimize
 from scipy.optimize import nnls as dense_nnls
 
 import torchreg.solvers.nnls as module
-from torchreg.errors import InputError, InputTypeError, SolverError
-from torchreg.solvers.nnls import nnls, nnls_normal
+from torchreg.solvers.nnls import nnls
 
 SEEDS = st.integers(0, 10_000)
 
@@ -19,6 +18,12 @@ SEEDS = st.integers(0, 10_000)
 def dense_problem(seed, rows=30, columns=12):
     generator = np.random.default_rng(seed)
     return generator.normal(size=(rows, columns)), generator.normal(size=rows)
+
+
+def solved(matrix, target, start=None, **options):
+    """Return the solution for arrays or tensors."""
+    matrix, target, start = (torch.from_numpy(a) if isinstance(a, np.ndarray) else a for a in (matrix, target, start))
+    return nnls(matrix, target, start=start, **options)
 
 
 def weight_problem(side=16, num_bones=6, rows=1200, seed=0):
@@ -56,7 +61,7 @@ def weight_problem(side=16, num_bones=6, rows=1200, seed=0):
 @settings(max_examples=60, deadline=None)
 def test_small_dense_problems_agree_with_scipy(seed, rows, columns):
     matrix, target = dense_problem(seed, rows, columns)
-    result = nnls(torch.from_numpy(matrix), torch.from_numpy(target))
+    result = solved(torch.from_numpy(matrix), torch.from_numpy(target))
     expected = dense_nnls(matrix, target)[1] ** 2
     assert result.converged
     assert result.objective <= expected + 1e-6 * (target @ target)
@@ -68,12 +73,12 @@ def test_small_dense_problems_agree_with_scipy(seed, rows, columns):
 def test_the_solution_itself_is_scipys_where_it_is_unique(seed):
     matrix, target = dense_problem(seed, 60, 25)
     expected = torch.from_numpy(dense_nnls(matrix, target)[0])
-    torch.testing.assert_close(nnls(sp.csr_matrix(matrix), target).x, expected, atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(solved(sp.csr_matrix(matrix), target).x, expected, atol=1e-6, rtol=1e-6)
 
 
 def test_a_problem_of_weights_agrees_with_two_other_methods():
     matrix, target, start = weight_problem()
-    result = nnls(matrix, torch.from_numpy(target), start=torch.from_numpy(start))
+    result = solved(matrix, torch.from_numpy(target), start=torch.from_numpy(start))
     assert len(result.x) == 1536
     assert result.converged
     assert result.ridge == 0
@@ -92,21 +97,19 @@ def test_a_problem_of_weights_agrees_with_two_other_methods():
     assert result.objective == pytest.approx(2 * interior.cost, rel=1e-6)
 
 
-def test_every_start_and_support_leads_to_the_same_solution():
+def test_every_start_leads_to_the_same_solution():
     matrix, target, start = weight_problem(side=10)
-    expected = nnls(matrix, target, start=start)
-    everything = nnls(matrix, target)
-    nothing = nnls(matrix, target, support=np.zeros(len(start), dtype=bool))
-    wrong = nnls(matrix, target, support=torch.from_numpy(start == 0))
-    for result in (everything, nothing, wrong):
+    expected = solved(matrix, target, start=start)
+    for first in (None, np.zeros(len(start)), (start == 0).astype(float)):
+        result = solved(matrix, target, start=first)
         assert result.converged
         torch.testing.assert_close(result.x, expected.x, atol=1e-6, rtol=0)
 
 
 def test_the_solution_as_start_needs_no_round():
     matrix, target, start = weight_problem(side=10)
-    cold = nnls(matrix, target, start=start)
-    warm = nnls(matrix, target, start=cold.x)
+    cold = solved(matrix, target, start=start)
+    warm = solved(matrix, target, start=cold.x)
     assert warm.num_steps == 0
     assert warm.num_solves < cold.num_solves
     torch.testing.assert_close(warm.x, cold.x, atol=1e-7, rtol=0)
@@ -115,24 +118,12 @@ def test_the_solution_as_start_needs_no_round():
 def test_sums_of_one_held_by_a_penalty_come_out_as_one():
     matrix, target, start = weight_problem(side=8)
     sums = sp.kron(sp.eye(64), np.ones((1, 6)))
-    tight = nnls(sp.vstack([matrix, 1e3 * sums]), np.r_[target, 1e3 * np.ones(64)], start=start)
-    loose = nnls(matrix, target, start=start)
+    tight = solved(sp.vstack([matrix, 1e3 * sums]), np.r_[target, 1e3 * np.ones(64)], start=start)
+    loose = solved(matrix, target, start=start)
     totals = tight.x.reshape(64, 6).sum(1)
     assert tight.converged
     torch.testing.assert_close(totals, torch.ones_like(totals), atol=1e-5, rtol=0)
     assert (loose.x.reshape(64, 6).sum(1) - 1).abs().max() > 0.05
-
-
-def test_a_regularizer_equals_rows_stacked_below_and_the_normal_form():
-    matrix, target = dense_problem(7)
-    root = np.random.default_rng(1).normal(size=(5, 12))
-    stacked = nnls(np.vstack([matrix, root]), np.r_[target, np.zeros(5)])
-    split = nnls(matrix, target, regularizer=root.T @ root)
-    normal = nnls_normal(torch.from_numpy(matrix.T @ matrix + root.T @ root), torch.from_numpy(matrix.T @ target))
-    for result in (split, normal):
-        torch.testing.assert_close(result.x, stacked.x, atol=1e-9, rtol=1e-9)
-    assert split.objective == pytest.approx(stacked.objective, rel=1e-12)
-    assert normal.objective == pytest.approx(stacked.objective - target @ target, rel=1e-9)
 
 
 def test_every_form_of_matrix_gives_the_same():
@@ -140,14 +131,14 @@ def test_every_form_of_matrix_gives_the_same():
     matrix[np.abs(matrix) < 0.7] = 0
     dense, b = torch.from_numpy(matrix), torch.from_numpy(target)
     forms = [dense, dense.to_sparse_coo(), sp.coo_matrix(matrix), matrix]
-    solutions = [nnls(form, b).x for form in forms]
+    solutions = [solved(form, b).x for form in forms]
     for solution in solutions[1:]:
         assert torch.equal(solution, solutions[0])
 
 
 def test_the_solution_takes_the_dtype_of_the_target():
     matrix, target = dense_problem(3)
-    result = nnls(torch.from_numpy(matrix).float(), torch.from_numpy(target).float())
+    result = solved(torch.from_numpy(matrix).float(), torch.from_numpy(target).float())
     assert result.x.dtype == torch.float32
     assert result.objective == pytest.approx(dense_nnls(matrix, target)[1] ** 2, rel=1e-5)
 
@@ -156,7 +147,7 @@ def test_the_solution_takes_the_dtype_of_the_target():
 def test_units_of_variables_and_of_the_target_change_nothing_but_units(scale):
     matrix, target = dense_problem(5)
     units = np.logspace(-6, 6, 12)
-    plain, other = nnls(matrix, target), nnls(matrix * units, target * scale)
+    plain, other = solved(matrix, target), solved(matrix * units, target * scale)
     torch.testing.assert_close(other.x * torch.from_numpy(units) / scale, plain.x, atol=1e-9, rtol=1e-7)
     assert other.kkt_residual <= 1e-7
 
@@ -164,12 +155,12 @@ def test_units_of_variables_and_of_the_target_change_nothing_but_units(scale):
 def test_permuted_variables_give_the_permuted_solution():
     matrix, target = dense_problem(6)
     order = np.random.default_rng(0).permutation(12)
-    torch.testing.assert_close(nnls(matrix[:, order], target).x, nnls(matrix, target).x[order])
+    torch.testing.assert_close(solved(matrix[:, order], target).x, solved(matrix, target).x[order])
 
 
 def test_a_step_too_few_is_no_convergence_but_a_sound_point():
     matrix, target = dense_problem(4, 60, 40)
-    result = nnls(matrix, target, support=np.zeros(40, dtype=bool), max_steps=1)
+    result = solved(matrix, target, start=np.zeros(40), max_steps=1)
     assert not result.converged
     assert result.kkt_residual > 1e-7
     assert result.objective < target @ target
@@ -179,7 +170,7 @@ def test_a_step_too_few_is_no_convergence_but_a_sound_point():
 @pytest.mark.parametrize("seed", range(6))
 def test_steps_that_cannot_cycle_find_the_same_solution(seed, monkeypatch):
     matrix, target = dense_problem(seed, 40, 25)
-    expected = nnls(matrix, target)
+    expected = solved(matrix, target)
     # An elimination that loses everything after the first one makes every round fall back.
     eliminate, calls = module._eliminate, []
 
@@ -188,8 +179,7 @@ def test_steps_that_cannot_cycle_find_the_same_solution(seed, monkeypatch):
         return eliminate(problem, free, start) if len(calls) == 1 else np.zeros_like(start)
 
     monkeypatch.setattr(module, "_eliminate", useless)
-    some = np.arange(25) % 3 == 0
-    result = nnls(matrix, target, support=some)
+    result = solved(matrix, target, start=(np.arange(25) % 3 == 0).astype(float))
     assert len(calls) > 1
     assert result.converged
     torch.testing.assert_close(result.x, expected.x, atol=1e-7, rtol=1e-7)
@@ -198,7 +188,7 @@ def test_steps_that_cannot_cycle_find_the_same_solution(seed, monkeypatch):
 def test_zero_columns_stay_zero():
     matrix, target = dense_problem(2)
     matrix[:, [0, 5]] = 0
-    result = nnls(matrix, target, start=np.ones(12))
+    result = solved(matrix, target, start=np.ones(12))
     assert result.converged
     assert result.ridge == 0
     assert result.x[[0, 5]].tolist() == [0, 0]
@@ -209,7 +199,7 @@ def test_zero_columns_stay_zero():
 def test_equal_columns_are_solved_with_a_visible_ridge_at_most(repeats):
     matrix, target = dense_problem(8)
     twice = np.tile(matrix, (1, repeats))
-    result = nnls(twice, target)
+    result = solved(twice, target)
     assert 0 <= result.ridge <= 1e-8
     assert result.objective == pytest.approx(dense_nnls(matrix, target)[1] ** 2, rel=1e-6)
 
@@ -217,66 +207,27 @@ def test_equal_columns_are_solved_with_a_visible_ridge_at_most(repeats):
 def test_fewer_rows_than_columns_leave_no_residual_and_a_recorded_ridge():
     generator = np.random.default_rng(0)
     matrix = generator.normal(size=(6, 20))
-    result = nnls(matrix, matrix @ generator.random(20))
+    result = solved(matrix, matrix @ generator.random(20))
     assert 0 < result.ridge <= 1e-8
     assert result.objective < 1e-10
 
 
 def test_when_nothing_helps_the_solution_is_zero():
     matrix = np.abs(dense_problem(1)[0])
-    result = nnls(matrix, -np.ones(30))
+    result = solved(matrix, -np.ones(30))
     assert result.x.tolist() == [0] * 12
     assert result.objective == 30
     assert result.converged
-    assert nnls(matrix, np.zeros(30)).x.tolist() == [0] * 12
-    assert nnls(sp.csr_matrix((3, 2)), np.ones(3)).x.tolist() == [0, 0]
+    assert solved(matrix, np.zeros(30)).x.tolist() == [0] * 12
+    assert solved(sp.csr_matrix((3, 2)), np.ones(3)).x.tolist() == [0, 0]
 
 
 def test_a_long_chain_beyond_conjugate_gradients_is_factored():
     size = 3000
     first = sp.diags([1.0, -1.0], [0, 1], shape=(size - 1, size))
     ends = sp.csr_matrix(([1.0, 1.0], ([0, 1], [0, size - 1])), shape=(2, size))
-    result = nnls(sp.vstack([first, ends]), np.r_[np.zeros(size - 1), 1.0, 2.0])
+    result = solved(sp.vstack([first, ends]), np.r_[np.zeros(size - 1), 1.0, 2.0])
     low, high = 1 + 1 / (size + 1), 2 - 1 / (size + 1)
     expected = torch.linspace(low, high, size, dtype=torch.float64)
     torch.testing.assert_close(result.x, expected, atol=1e-5, rtol=0)
     assert result.ridge == 0
-
-
-@pytest.mark.parametrize("count", [1, 200])
-def test_an_indefinite_matrix_is_an_error(count):
-    hessian = sp.kron(sp.eye(count), np.array([[1.0, 2.0], [2.0, 1.0]]))
-    with pytest.raises(SolverError, match="not positive semidefinite"):
-        nnls_normal(hessian, 1 + 0.1 * np.random.default_rng(0).random(2 * count))
-
-
-def test_no_least_value_is_an_error():
-    with pytest.raises(SolverError, match="no least value"):
-        nnls_normal(np.diag([1.0, 0.0]), np.ones(2))
-    flat = np.array([[1.0, -1.0], [-1.0, 1.0]])
-    with pytest.raises(SolverError, match="add a regularizer"):
-        nnls_normal(flat, np.ones(2))
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        ({"matrix": [[1.0]]}, InputTypeError, "matrix must be a scipy sparse matrix or a tensor, got list"),
-        ({"matrix": torch.ones(3)}, InputError, r"matrix must have shape \(rows, columns\)"),
-        ({"matrix": torch.full((3, 2), torch.nan)}, InputError, "matrix must be finite, got 6"),
-        ({"target": torch.ones(2)}, InputError, r"target must have shape \(3\), got \(2,\)"),
-        ({"target": torch.full((3,), torch.inf)}, InputError, "target must be finite"),
-        ({"regularizer": torch.eye(3)}, InputError, r"regularizer must have shape \(2, 2\)"),
-        ({"regularizer": torch.tensor([[1.0, 1.0], [0.0, 1.0]])}, InputError, "regularizer must be symmetric"),
-        ({"regularizer": torch.diag(torch.tensor([-9.0, 1.0]))}, InputError, "positive semidefinite"),
-        ({"start": torch.ones(3)}, InputError, r"start must have shape \(2\)"),
-        ({"support": torch.ones(2)}, InputTypeError, "support must hold True or False"),
-        ({"support": torch.ones(3, dtype=torch.bool)}, InputError, r"support must have shape \(2\)"),
-        ({"max_steps": 0}, InputError, "max_steps must be at least 1"),
-        ({"tol": 0.0}, InputError, "tol must be positive"),
-    ],
-)
-def test_what_makes_no_sense_is_refused(change, error, message):
-    given_arguments = {"matrix": torch.tensor([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]), "target": torch.ones(3)} | change
-    with pytest.raises(error, match=message):
-        nnls(**given_arguments)

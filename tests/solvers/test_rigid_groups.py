@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from torchreg.solvers.rigid_groups import joined_alike
+from torchreg.solvers.rigid_groups import merge_alike
 
 ALL = torch.ones(4, 4, dtype=torch.bool)
 
@@ -18,7 +18,7 @@ def groups(part):
 
 
 def joined(apart, counts, meet=ALL, tolerance=0.1):
-    return groups(joined_alike(apart.reshape(-1, 4, 4), counts, meet, tolerance))
+    return groups(merge_alike(apart.reshape(-1, 4, 4), counts, meet, tolerance))
 
 
 def test_pieces_that_moved_alike_are_one_part():
@@ -57,7 +57,7 @@ def test_numbers_of_pieces_do_not_matter(seed):
     places, order = torch.rand(4, generator=generator), torch.randperm(4, generator=generator)
     apart, counts = row(*places.tolist(), counts=(3.0, 1.0, 2.0, 5.0))
     plain, other = (
-        joined_alike(apart[which][:, which].unsqueeze(0), counts[which], ALL, 0.3) for which in (torch.arange(4), order)
+        merge_alike(apart[which][:, which].unsqueeze(0), counts[which], ALL, 0.3) for which in (torch.arange(4), order)
     )
     assert groups(plain) == {tuple(sorted(order[list(part)].tolist())) for part in groups(other)}
 
@@ -65,6 +65,6 @@ def test_numbers_of_pieces_do_not_matter(seed):
 def test_arguments_stay_as_they_are():
     apart, counts = row(0.0, 0.0, 0.0, 0.0)
     meet = ALL.clone()
-    joined_alike(apart.unsqueeze(0), counts, meet, 1.0)
+    merge_alike(apart.unsqueeze(0), counts, meet, 1.0)
     assert torch.equal(apart, row(0.0, 0.0, 0.0, 0.0)[0])
     assert torch.equal(meet, ALL)

@@ -162,7 +162,7 @@ def _squares(model: Tensor, data: Tensor) -> Tensor:
 def _kernel(model: Tensor, data: Tensor) -> Tensor:
     if torch.is_grad_enabled():
         return _squares(model, data).neg().exp()
-    return gaussian_kernel(model, data, expand=False)
+    return gaussian_kernel(model, data)
 
 
 def _balanced(
