@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torchreg.errors import InputError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.articulation import BASE_DOF_NAMES
+from torchreg.shapes.pose_algebra import BASE_DOF_NAMES
 from torchreg.shapes.primitives import Primitive
 
 # torch builds its forward-mode rules with torch.jit.script, and warns about it.

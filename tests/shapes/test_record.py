@@ -13,7 +13,7 @@ from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.record import build_shape, record_shape
-from torchreg.shapes.rigs import RigSurface
+from torchreg.shapes.spec import RigSurface
 
 
 def offset(*values):

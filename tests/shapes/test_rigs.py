@@ -15,7 +15,8 @@ from torchreg.io.urdf import UrdfPrimitive
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.primitive_refinement import refine_primitives
 from torchreg.shapes.primitives import Primitive
-from torchreg.shapes.rigs import solid_mesh, spec_from_arrays
+from torchreg.shapes.rigs import spec_from_arrays
+from torchreg.shapes.robots import solid_mesh
 from torchreg.shapes.skin import BendingSkin, sample_skin
 
 HAND = Path(__file__).resolve().parents[3] / "shared" / "data" / "webxr_hand_right.glb"

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchreg.shapes.pose_algebra import difference
 from torchreg.shapes.skin import LinearBlendSkin
-from torchreg.shapes.surface import Surface
+from torchreg.shapes.surface import ShapeSurface
 from torchreg.solvers.e_step import EStep
 from torchreg.solvers.levenberg_marquardt import Linearization
 from torchreg.solvers.robust import welsch_weight
@@ -110,7 +110,7 @@ class SurfaceObjective:
 
     def __init__(
         self,
-        surface: Surface,
+        surface: ShapeSurface,
         data: Tensor,
         valid: Tensor,
         sigma: Tensor,

@@ -15,7 +15,7 @@ from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.kinematics import stack_sizes
 from torchreg.shapes.skin import LinearBlendSkin
-from torchreg.shapes.surface import FusedSurface, SkinSurface, Surface, dense_file_skin
+from torchreg.shapes.surface import FusedSurface, ShapeSurface, SkinSurface, dense_file_skin
 from torchreg.solvers.levenberg_marquardt import (
     Linearization,
     LMResult,
@@ -57,7 +57,7 @@ class AlignProblem:
     """
 
     skin: LinearBlendSkin
-    surface: Surface
+    surface: ShapeSurface
     data: Tensor
     valid: Tensor
     size: float
@@ -218,7 +218,7 @@ def centered_problem(
     )
 
 
-def _surface(shape: Articulation, skin: LinearBlendSkin) -> Surface:
+def _surface(shape: Articulation, skin: LinearBlendSkin) -> ShapeSurface:
     """Return what is fitted: the file's own surface where there is one, else the fused solids."""
     if shape.surface is None:
         return FusedSurface(shape)

@@ -12,8 +12,8 @@ def assign(costs: Tensor, unmatched_cost: Tensor | float | None = None) -> Tenso
 
     Args:
         costs: (N, M), finite.
-        unmatched_cost: cost, or (N,) costs, of leaving a row without a column; None: rows stay unmatched only if there are
-            too few columns.
+        unmatched_cost: cost of leaving a row without a column, or (N,) costs; None: rows stay unmatched only if there
+            are too few columns.
 
     Returns:
         Columns (N,) int64, -1 for unmatched rows.
