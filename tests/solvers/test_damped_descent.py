@@ -72,16 +72,16 @@ def test_problems_of_a_batch_proceed_by_themselves():
     def settled(trial, before, after):
         return (before - after).abs() <= 1e-3 * before
 
-    both = run(settled=settled)
+    both = run(converged=settled)
     for row in range(3):
-        alone = run(Place(*(value[row : row + 1] for value in STARTS)), settled=settled)
+        alone = run(Place(*(value[row : row + 1] for value in STARTS)), converged=settled)
         torch.testing.assert_close(both.state.x[row : row + 1], alone.state.x)
         assert bool(alone.done)
     assert both.num_steps < 200
 
 
 def test_steps_that_are_not_sound_change_nothing_but_the_damping():
-    found = run(max_steps=1, settled=lambda trial, before, after: torch.ones_like(before, dtype=torch.bool))
+    found = run(max_steps=1, converged=lambda trial, before, after: torch.ones_like(before, dtype=torch.bool))
     assert torch.equal(found.state.x, STARTS.x)
     torch.testing.assert_close(found.damping, torch.full((3,), 1e-7, dtype=D))
     assert not bool(found.done.any())
@@ -111,7 +111,7 @@ def test_the_damping_follows_the_rule(promised, factor):
 
 def test_what_is_done_stays_and_a_final_cost_is_enough():
     done = torch.tensor([False, True, False])
-    found = run(max_steps=5, settled=lambda trial, before, after: torch.zeros_like(done), done=done)
+    found = run(max_steps=5, converged=lambda trial, before, after: torch.zeros_like(done), done=done)
     assert float(found.state.x[1]) == float(STARTS.x[1])
     cheap = run(max_steps=5, final_cost=lambda place: banana(place).cost)
     torch.testing.assert_close(cheap.system.cost, run(max_steps=5).system.cost)

@@ -31,6 +31,8 @@ class NormalSettings:
     least_mean: float = 0.2
     # Relative spread of normals, and distance of a plane from the origin, below which a part is flat.
     flat: float = 5e-3
+    # Share of neighbors with opposed normals from which given normals count as unoriented; at random it is a half.
+    unoriented: float = 0.25
     # Share of a component's area whose winding decides about the rest.
     majority: float = 0.75
 

@@ -20,6 +20,7 @@ from torchreg._checks import (
     check_shape,
 )
 from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.boundary import BOUNDARY, boundary_of_faces, boundary_of_points, distinct_faces
 from torchreg.geometry.depth_image import unproject
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.neighbors import distinct_positions, k_nearest_others, nearest_neighbor, sampling_distance
@@ -35,21 +36,6 @@ from torchreg.geometry.normals import (
 )
 from torchreg.geometry.poisson_disk import poisson_disk, poisson_disk_count
 from torchreg.geometry.rigid import RIGID_TOLERANCE, transform_points
-
-
-@dataclass(frozen=True)
-class _Boundary:
-    """Rules by which points without triangles are boundary, and normals unoriented."""
-
-    # Neighbors around a point.
-    num_neighbors: int = 24
-    # Widest angle between neighbors off the boundary: of 24 random directions 1 in 500 leave a wider one.
-    widest_angle: float = math.pi * 2 / 3
-    # Share of neighbors with opposed normals from which given normals count as unoriented; at random it is a half.
-    unoriented: float = 0.25
-
-
-_BOUNDARY = _Boundary()
 
 
 @dataclass(frozen=True, eq=False, repr=False, init=False)
@@ -254,8 +240,8 @@ class RangeScan:
                     boundary = boundary.index_fill(0, corners[corners >= 0], True)
             elif mark_cut:
                 guide = torch.zeros_like(positions).index_copy(0, position, normals.detach().cpu().double())
-                near, _ = k_nearest_others(positions, _BOUNDARY.num_neighbors)
-                boundary = boundary | _boundary_of_points(positions, guide, near)[position].to(boundary.device)
+                near, _ = k_nearest_others(positions, BOUNDARY.num_neighbors)
+                boundary = boundary | boundary_of_points(positions, guide, near)[position].to(boundary.device)
         return self._with(points=points, faces=faces, normals=normals, boundary=boundary, spacing=spacing)
 
     def _indices(self, which: Any) -> Tensor:
@@ -368,8 +354,8 @@ def _measure(
 ) -> tuple[Tensor, Tensor, float]:
     """Return normals and boundary on the device of the points, and the spacing."""
     positions, which = _three_positions(points)
-    near, distance = k_nearest_others(positions, 1 if faces is not None else _BOUNDARY.num_neighbors)
-    corners = None if faces is None else _plain_faces(which[faces.cpu()])
+    near, distance = k_nearest_others(positions, 1 if faces is not None else BOUNDARY.num_neighbors)
+    corners = None if faces is None else distinct_faces(which[faces.cpu()])
     if normals is not None:
         normals = _given_normals(points, normals.detach(), near, which, viewpoint)
     elif corners is not None:
@@ -380,10 +366,10 @@ def _measure(
         normals = orient_along_graph(positions, fitted, nearest, viewpoint)[which].to(points)
     normals = _without_zeros(points, normals, viewpoint)
     if corners is not None:
-        edge = _boundary_of_faces(corners, len(positions))
+        edge = boundary_of_faces(corners, len(positions))
     else:
         guide = torch.zeros_like(positions).index_copy(0, which, normals.cpu().double())
-        edge = _boundary_of_points(positions, guide, near)
+        edge = boundary_of_points(positions, guide, near)
     return normals, edge[which].to(points.device), float(distance[:, 0].median())
 
 
@@ -392,7 +378,7 @@ def _given_normals(points: Tensor, normals: Tensor, near: Tensor, which: Tensor,
     normals = normals / normals.abs().amax(dim=-1, keepdim=True).clamp(min=torch.finfo(normals.dtype).tiny)
     normals = torch.nn.functional.normalize(normals, dim=-1)
     guide = torch.zeros(len(near), 3, dtype=torch.float64).index_copy(0, which, normals.cpu().double())
-    if neighbors_disagree(guide, near) > _BOUNDARY.unoriented:
+    if neighbors_disagree(guide, near) > NORMALS.unoriented:
         return orient_normals(points, normals, viewpoint=viewpoint)
     return normals
 
@@ -408,47 +394,3 @@ def _without_zeros(points: Tensor, normals: Tensor, viewpoint: Tensor | None) ->
     nearest, _ = nearest_neighbor(points[empty].detach(), points[~empty].detach())
     flip = (estimate * normals[~empty][nearest]).sum(-1, keepdim=True) < 0
     return normals.index_put((empty,), torch.where(flip, -estimate, estimate))
-
-
-def _plain_faces(faces: Tensor) -> Tensor:
-    """Return the faces with three different corners, each once."""
-    ordered = faces.sort(dim=-1).values
-    plain = (ordered[:, 0] != ordered[:, 1]) & (ordered[:, 1] != ordered[:, 2])
-    faces, ordered = faces[plain], ordered[plain]
-    if len(faces) == 0:
-        return faces
-    size = int(ordered.max()) + 1
-    if size**3 <= torch.iinfo(torch.int64).max:
-        _, which = ((ordered[:, 0] * size + ordered[:, 1]) * size + ordered[:, 2]).unique(return_inverse=True)
-    else:
-        _, which = ordered.unique(dim=0, return_inverse=True)  # slower by far
-    first = torch.full((int(which.max()) + 1,), len(faces)).scatter_reduce(0, which, torch.arange(len(faces)), "amin")
-    return faces[first.sort().values]
-
-
-def _boundary_of_faces(faces: Tensor, count: int) -> Tensor:
-    """Return a mask (N,) of the points on an edge of one face alone, or on no face."""
-    sides = torch.stack((faces, faces.roll(-1, dims=1)), dim=-1).sort(dim=-1).values.reshape(-1, 2)
-    key, uses = (sides[:, 0] * count + sides[:, 1]).unique(return_counts=True)
-    rim = key[uses == 1]
-    boundary = torch.ones(count, dtype=torch.bool).index_fill(0, faces.reshape(-1), False)
-    return boundary.index_fill(0, torch.cat((rim // count, rim % count)), True)
-
-
-def _boundary_of_points(points: Tensor, normals: Tensor, near: Tensor) -> Tensor:
-    """Return a mask (N,) of the points whose neighbors (N, K) leave a wide angle empty in the tangent plane."""
-    axis = torch.zeros_like(normals).scatter(1, normals.abs().argmin(dim=1, keepdim=True), 1.0)
-    first = torch.nn.functional.normalize(torch.linalg.cross(normals, axis), dim=-1)
-    second = torch.linalg.cross(normals, first)
-    offset = points[near] - points[:, None]
-    frame = torch.stack((first, second, normals), dim=-1)
-    right, up, height = (offset @ frame).unbind(-1)
-    # Neighbors steeply above or below belong to another surface in front or behind.
-    level = height.abs() <= torch.hypot(right, up)
-    angle = torch.where(level, torch.atan2(up, right), torch.inf).sort(dim=-1).values
-    number = level.sum(dim=-1)
-    last = angle.gather(1, (number - 1).clamp(min=0)[:, None])[:, 0]
-    around = 2 * torch.pi + angle[:, 0] - last
-    between = torch.where(angle[:, 1:].isfinite(), angle[:, 1:] - angle[:, :-1], 0.0)
-    widest = torch.maximum(around, between.amax(dim=-1)) if angle.shape[1] > 1 else around
-    return (widest > _BOUNDARY.widest_angle) | (number == 0)

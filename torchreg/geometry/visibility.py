@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,86 +11,23 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg.errors import InputError
 from torchreg.geometry.budget import BUDGET
-from torchreg.geometry.mesh import TriangleMesh, cross_2d, interpolate, sample_surface
+from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
+from torchreg.geometry.z_buffer import FlatMesh, Raster, View, draw, flatten
 
 
 @dataclass(frozen=True)
-class _Rasterization:
-    """Tolerances of the z-buffer."""
+class _Visibility:
+    """Numbers by which points are hidden and samples drawn."""
 
-    # Negative barycentric weight up to which a pixel counts as inside a triangle, against rounding.
-    edge_slack: float = 1e-7
     # Depth behind the nearest surface up to which a point counts as on it, in pixel widths.
     tolerance_pixels: float = 2.0
     # Rounds of samples drawn until enough of them are visible.
     max_rounds: int = 32
+    # Pixels along the longer side of the z-buffer that decides which points are hidden.
+    resolution: int = 256
 
 
-_RASTERIZATION = _Rasterization()
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A pinhole or parallel camera and its grid of pixels; made by `aim`.
-
-    Convention: camera coordinates are (right, down, forward); pixel (row i, column j) covers [j, j+1] x [i, i+1].
-
-    Args:
-        position: (3,) float64, the pinhole; for a parallel view any point of the image plane.
-        rotation: (3, 3) float64 ``R_camera_world``, rows right, down, forward.
-        corner: (2,) float64 image-plane coordinates of the upper left corner of the grid.
-        pitch: size of a pixel: metres for a parallel view, tangent of the angle else.
-        width: number of columns.
-        height: number of rows.
-        parallel: True for parallel rays.
-    """
-
-    position: Tensor
-    rotation: Tensor
-    corner: Tensor
-    pitch: float
-    width: int
-    height: int
-    parallel: bool = False
-
-    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return pixel coordinates (..., N, 2) as (column, row), and depths (..., N) along the view, in float64.
-
-        Args:
-            points: (..., N, 3) in world coordinates, metres.
-
-        Points behind a pinhole have NaN pixels.
-
-        Differentiable: in ``points``.
-        """
-        local = (points.double() - self.position.to(points.device)) @ self.rotation.to(points.device).mT
-        plane, depth = local[..., :2], local[..., 2]
-        if not self.parallel:
-            plane = plane / torch.where(depth > 0, depth, torch.nan).unsqueeze(-1)
-        return (plane - self.corner.to(points.device)) / self.pitch, depth
-
-    def nearness(self, depth: Tensor) -> Tensor:
-        """Return a measure that grows towards the camera and is linear in pixels on a plane; it is its own inverse."""
-        return -depth if self.parallel else 1 / depth
-
-    def footprint(self, depth: Tensor) -> Tensor:
-        """Return the width of a pixel at the given depths, metres."""
-        return torch.full_like(depth, self.pitch) if self.parallel else self.pitch * depth
-
-
-@dataclass(frozen=True, eq=False)
-class Raster:
-    """The z-buffer of a mesh: the nearest face at the center of every pixel.
-
-    Args:
-        face_index: (H, W) int64 nearest face, -1 for none.
-        barycentric: (H, W, 3) float64 weights of that face's vertices, perspective-correct.
-        depth: (H, W) float64 along the view, infinite without a face.
-    """
-
-    face_index: Tensor
-    barycentric: Tensor
-    depth: Tensor
+_VISIBILITY = _Visibility()
 
 
 def view_rotation(camera: Tensor, target: Tensor, up: Tensor | None = None) -> Tensor:
@@ -210,41 +146,7 @@ def rasterize(mesh: TriangleMesh, view: View, *, cull_back: bool = False) -> Ras
     Cost: a few operations per pixel in the bounding box of every projected face; 0.05 s for 20,000 faces at 512 x 512.
     """
     with torch.no_grad():
-        return _rasterize(_flatten(mesh, view), view, cull_back)
-
-
-@dataclass(frozen=True, eq=False)
-class _FlatMesh:
-    """A projected mesh: faces (F, 3), their corners' pixels (F, 3, 2) and depths (F, 3), and twice their areas (F,)."""
-
-    faces: Tensor
-    corners: Tensor
-    depths: Tensor
-    area: Tensor
-
-    def drawn(self, cull_back: bool) -> Tensor:
-        """Return the indices of faces with an area, which is negative for faces towards the camera: +y is down."""
-        return ((self.area < 0) if cull_back else (self.area != 0)).nonzero()[:, 0]
-
-    def weights(self, face: Tensor, pixels: Tensor) -> Tensor:
-        """Return the (N, 3) barycentric weights of positions in the picture with respect to the given faces."""
-        origin, second_corner, third_corner = self.corners[face].unbind(1)
-        offset = pixels - origin
-        areas = torch.stack((cross_2d(offset, third_corner - origin), cross_2d(second_corner - origin, offset)))
-        second, third = (areas / self.area[face]).unbind()
-        return torch.stack((1 - second - third, second, third), dim=-1)
-
-
-def _flatten(mesh: TriangleMesh, view: View) -> _FlatMesh:
-    pixels, depth = view.project(mesh.vertices.detach())
-    depths = depth[mesh.faces]
-    if not view.parallel and bool((depths <= 0).any()):
-        raise InputError(
-            f"mesh must lie before the camera, got {int((depths <= 0).any(-1).sum())} faces beside or behind it"
-        )
-    corners = pixels[mesh.faces]
-    area = cross_2d(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return _FlatMesh(mesh.faces, corners, depths, area)
+        return draw(flatten(mesh, view), view, cull_back)
 
 
 def _used_vertices(mesh: TriangleMesh) -> Tensor:
@@ -253,67 +155,21 @@ def _used_vertices(mesh: TriangleMesh) -> Tensor:
     return mesh.vertices[used]
 
 
-def _rasterize(flat: _FlatMesh, view: View, cull_back: bool) -> Raster:
-    nearness = view.nearness(flat.depths)
-    count = view.width * view.height
-    best = torch.full((count,), -torch.inf, dtype=torch.float64, device=nearness.device)
-    face_index = torch.full((count,), -1, device=nearness.device)
-    weights = torch.zeros(count, 3, dtype=torch.float64, device=nearness.device)
-    for face, pixel, barycentric in _covered(flat, flat.drawn(cull_back), view):
-        near = (barycentric * nearness[face]).sum(-1)
-        best.scatter_reduce_(0, pixel, near, "amax")
-        first = (near >= best[pixel]).nonzero()[:, 0]
-        winner = torch.full_like(face_index, -1).scatter_reduce_(0, pixel[first], first, "amax")
-        hit = (winner >= 0).nonzero()[:, 0]
-        face_index[hit], weights[hit] = face[winner[hit]], barycentric[winner[hit]]
-    seen = face_index >= 0
-    depth = torch.where(seen, view.nearness(best), torch.inf)
-    if not view.parallel:
-        weights = torch.where(seen.unsqueeze(-1), weights * nearness[face_index] * depth.unsqueeze(-1), 0.0)
-    shape = (view.height, view.width)
-    return Raster(face_index.reshape(shape), weights.reshape(*shape, 3), depth.reshape(shape))
-
-
-def _covered(flat: _FlatMesh, drawn: Tensor, view: View) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Yield faces, flat pixels and image-plane weights of all pixel centers inside the drawn faces, in chunks."""
-    corners = flat.corners[drawn]
-    limit = corners.new_tensor([view.width - 1, view.height - 1])
-    lower = (corners.amin(1) - 0.5).ceil().clamp(min=0)
-    upper = torch.minimum((corners.amax(1) - 0.5).floor(), limit)
-    sides = (upper - lower + 1).clamp(min=0).long()
-    counts = sides.prod(-1)
-    lower = lower.long()
-    groups = counts.cumsum(0) // BUDGET.raster_pixels
-    for group in groups.unique().tolist():
-        part = ((groups == group) & (counts > 0)).nonzero()[:, 0]
-        which = part.repeat_interleave(counts[part])
-        starts = (counts[part].cumsum(0) - counts[part]).repeat_interleave(counts[part])
-        offset = torch.arange(len(which), device=which.device) - starts
-        column = lower[which, 0] + offset % sides[which, 0]
-        row = lower[which, 1] + offset // sides[which, 0]
-        face = drawn[which]
-        weights = flat.weights(face, torch.stack((column, row), dim=-1) + 0.5)
-        inside = (weights.amin(-1) >= -_RASTERIZATION.edge_slack).nonzero()[:, 0]
-        yield face[inside], (row * view.width + column)[inside], weights[inside]
-
-
 def visible_points(
     mesh: TriangleMesh,
     points: Tensor,
     camera: Tensor,
     *,
-    parallel: bool = False,
-    resolution: int = 256,
     tolerance: float | None = None,
 ) -> Tensor:
     """Return a mask (N,) of the points that a mesh does not hide from a camera; points behind the camera are hidden.
 
+    Along outlines of the mesh the mask is right to a pixel of a picture of 256 pixels.
+
     Args:
         mesh: the occluding surface, at least one face.
         points: (N, 3), metres; on the surface or anywhere else.
-        camera: (3,) position; for a parallel view the direction in which it looks.
-        parallel: parallel rays instead of a pinhole.
-        resolution: pixels along the longer side of the mesh's picture; along outlines the mask is right to a pixel.
+        camera: (3,) position.
         tolerance: depth behind the nearest surface up to which a point counts as on it, metres; two pixels by default.
 
     Raises:
@@ -323,13 +179,13 @@ def visible_points(
     """
     points = points.to(mesh.vertices)
     with torch.no_grad():
-        view = aim(_used_vertices(mesh), camera, parallel=parallel, size=resolution)
-        flat = _flatten(mesh, view)
-        return _unhidden(flat, view, _rasterize(flat, view, False), points, tolerance)
+        view = aim(_used_vertices(mesh), camera, size=_VISIBILITY.resolution)
+        flat = flatten(mesh, view)
+        return _unhidden(flat, view, draw(flat, view, False), points, tolerance)
 
 
 def _unhidden(
-    flat: _FlatMesh,
+    flat: FlatMesh,
     view: View,
     raster: Raster,
     points: Tensor,
@@ -346,7 +202,7 @@ def _unhidden(
     # The face's own plane at the point itself, not at the pixel's middle: slanted surfaces do not hide themselves.
     near = view.nearness(flat.depths[face])
     surface = (flat.weights(face, pixels[framed]) * near).sum(-1).clamp(near.amin(-1), near.amax(-1))
-    slack = _RASTERIZATION.tolerance_pixels * view.footprint(depth[framed]) if tolerance is None else tolerance
+    slack = _VISIBILITY.tolerance_pixels * view.footprint(depth[framed]) if tolerance is None else tolerance
     seen = torch.ones_like(depth, dtype=torch.bool) if view.parallel else depth > 0
     clear = depth[framed] <= view.nearness(surface) + slack
     if faces is not None:
@@ -363,21 +219,15 @@ def sample_visible(
     generator: torch.Generator | None = None,
     *,
     density: str = "area",
-    parallel: bool = False,
-    cull_back: bool = True,
-    resolution: int = 256,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return ``count`` points drawn independently and uniformly from the side of a surface that a camera sees.
+    """Return ``count`` points drawn independently and uniformly from the side of a surface that faces a camera.
 
     Args:
         mesh: the surface, at least one face.
-        camera: (3,) position; for a parallel view the direction in which it looks.
+        camera: (3,) position.
         count: number of points.
         generator: source of randomness; None draws from a fresh generator with seed 0, the same points at every call.
         density: "area" is uniform over the surface; "pixel" is uniform over the picture, as a range camera sees it.
-        parallel: parallel rays instead of a pinhole.
-        cull_back: faces seen from behind give no points; False for open sheets.
-        resolution: see `visible_points`.
 
     Returns:
         Points (count, 3), face_index (count,) int64, barycentric (count, 3) weights of the face's three vertices.
@@ -388,12 +238,12 @@ def sample_visible(
     Differentiable: in the vertices, with the drawn faces and weights held fixed.
     """
     still = TriangleMesh(mesh.vertices.detach().double(), mesh.faces)
-    view = aim(_used_vertices(still), camera, parallel=parallel, size=resolution)
-    flat = _flatten(still, view)
-    raster = _rasterize(flat, view, cull_back)
-    shown = flat.drawn(cull_back)
+    view = aim(_used_vertices(still), camera, size=_VISIBILITY.resolution)
+    flat = flatten(still, view)
+    raster = draw(flat, view, True)
+    shown = flat.drawn(True)
     if len(shown) == 0:
-        raise InputError("mesh must turn a face to the camera, got none; move the camera or pass cull_back=False")
+        raise InputError("mesh must turn a face to the camera, got none; move the camera or turn the faces")
     vertices = still.vertices
     if density == "pixel":
         vertices = torch.nn.functional.pad(view.project(vertices)[0].nan_to_num(), (0, 1))
@@ -401,9 +251,9 @@ def sample_visible(
     if generator is None:
         generator = torch.Generator(device=mesh.vertices.device).manual_seed(0)
     faces, weights, num_found, num_drawn, batch = [shown[:0]], [flat.area.new_zeros(0, 3)], 0, 0, 2 * count
-    for _ in range(_RASTERIZATION.max_rounds):
+    for _ in range(_VISIBILITY.max_rounds):
         _, drawn, barycentric = sample_surface(source, batch, generator)
-        if density == "pixel" and not parallel:
+        if density == "pixel":
             barycentric = barycentric / flat.depths[shown[drawn]]
             barycentric = barycentric / barycentric.sum(-1, keepdim=True)
         points = interpolate(still.vertices, source.faces, drawn, barycentric)

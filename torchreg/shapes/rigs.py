@@ -83,7 +83,7 @@ def spec_from_arrays(
         raise InputError(f"{count} joints need {count} names and parents, got {len(names)} and {len(parent_list)}")
     order = topological_order(parent_list, names)
     used = _carries_skin(parent_list, order, weights)
-    tree, last_frame = _ball_joint_tree(order, parent_list, names, frames, used, axes or {}, limits or {})
+    tree, last_frame = _ball_joint_tree(order, parent_list, names, frames, used, axes=axes or {}, limits=limits or {})
     parts = [index for index in order if bool(weights[:, index].max() > 0)]
     part_frames = tuple(last_frame[index] for index in parts)
     solids = [fitted_solid(_owned_vertices(vertices, weights, index), primitive) for index in parts]
@@ -174,6 +174,7 @@ def _ball_joint_tree(
     names: Sequence[str],
     frames: Tensor,
     used: Sequence[bool],
+    *,
     axes: Axes,
     limits: Limits,
 ) -> tuple[KinematicTree, dict[int, str]]:

@@ -91,7 +91,7 @@ def damped_descent(
     *,
     rule: DampingRule,
     max_steps: int,
-    settled: Callable[[Trial[State], Tensor, Tensor], Tensor] | None = None,
+    converged: Callable[[Trial[State], Tensor, Tensor], Tensor] | None = None,
     done: Tensor | None = None,
     start: AnySystem | None = None,
     final_cost: Callable[[State], Tensor] | None = None,
@@ -108,7 +108,7 @@ def damped_descent(
         damping: (...) initial damping.
         rule: update of the damping.
         max_steps: largest number of steps tried.
-        settled: (trial, cost before, cost after) to (...) whether a problem has converged, and stays at its state; None
+        converged: (trial, cost before, cost after) to (...) whether a problem has converged and keeps its state; None:
             never.
         done: (...) problems that have converged already.
         start: the problem around the initial state, if known.
@@ -121,7 +121,7 @@ def damped_descent(
     current = linearize(state) if start is None else start
     done = torch.zeros_like(current.cost, dtype=torch.bool) if done is None else done
     last_step, num_steps = None, 0
-    while num_steps < max_steps and not (settled is not None and bool(done.all())):
+    while num_steps < max_steps and not (converged is not None and bool(done.all())):
         num_steps += 1
         trial = solve(state, current, damping)
         last = final_cost is not None and num_steps == max_steps
@@ -133,8 +133,8 @@ def damped_descent(
         damping = torch.where(lower, lowered, rule.up * damping).clamp(rule.least, rule.most)
         keep = lower & ~done
         last_step = _chosen(keep, trial.step, torch.zeros_like(trial.step) if last_step is None else last_step)
-        if settled is not None:
-            done = done | (settled(trial, current.cost, after.cost) & trial.sound)
+        if converged is not None:
+            done = done | (converged(trial, current.cost, after.cost) & trial.sound)
         state, current = _chosen(keep, trial.state, state), _chosen(keep, after, current)
     last_step = current.cost.new_zeros(()) if last_step is None else last_step
     return Descent(state, current, damping, last_step, num_steps, done)

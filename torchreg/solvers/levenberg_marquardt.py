@@ -128,7 +128,7 @@ def levenberg_marquardt(
         state.new_full(state.shape[:1], _DAMPING.initial) if damping is None else damping,
         rule=replace(_DAMPING, least=max(_DAMPING.least, rounding)),
         max_steps=max_steps,
-        settled=small if atol > 0 else None,
+        converged=small if atol > 0 else None,
         start=start,
         final_cost=cost,
     )

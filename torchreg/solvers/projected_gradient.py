@@ -76,7 +76,9 @@ def projected_gradient(
     while steps < max_steps and not bool(done.all()):
         steps += 1
         reference, gradient = _value_and_gradient(cost, ahead)
-        trial, lower, curvature = _bounded_step(cost, ahead, reference, gradient, scale, curvature, done)
+        trial, lower, curvature = _bounded_step(
+            cost, ahead, reference, gradient, scale=scale, curvature=curvature, done=done
+        )
         step = trial - ahead
         without_momentum = (ahead == x).all(-1)
         small = step.abs().amax(-1) <= tol * trial.abs().amax(-1)
@@ -120,6 +122,7 @@ def _bounded_step(
     ahead: Tensor,
     value: Tensor,
     gradient: Tensor,
+    *,
     scale: Tensor,
     curvature: Tensor,
     done: Tensor,
