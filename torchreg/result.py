@@ -36,7 +36,7 @@ def formerly(name: str) -> dict[str, Any]:
     return {"formerly": name}
 
 
-def _summary(value: Any) -> str:
+def _field_summary(value: Any) -> str:
     """Return a field's value in few words."""
     if isinstance(value, Tensor):
         if value.numel() == 1 and not value.is_complex():
@@ -83,7 +83,7 @@ class Result:
         return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
 
     def _summaries(self) -> list[tuple[str, str]]:
-        return [(item.name, _summary(getattr(self, item.name))) for item in fields(self)]  # type: ignore[arg-type]
+        return [(item.name, _field_summary(getattr(self, item.name))) for item in fields(self)]  # type: ignore[arg-type]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result to ``path``, which ends in .safetensors, and a JSON file beside it.

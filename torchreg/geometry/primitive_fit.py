@@ -49,7 +49,7 @@ def fit_primitive(points: Tensor, kind: str = "auto") -> FittedPrimitive:
     points = points.detach().double()
     kinds = (kind,) if kind != "auto" else ("ellipsoid",) if _has_no_shape(points) else tuple(PRIMITIVE_KINDS)
     fits = [
-        _measured(points, name, candidate)
+        _with_error(points, name, candidate)
         for name in kinds
         for frame in _principal_frames(points)
         for candidate in PRIMITIVE_KINDS[name].candidates(points, frame)
@@ -65,7 +65,7 @@ def _has_no_shape(points: Tensor) -> bool:
     return bool(spreads[1] <= _LINE_SHARE * spreads[0])
 
 
-def _measured(points: Tensor, kind: str, candidate: Candidate) -> FittedPrimitive:
+def _with_error(points: Tensor, kind: str, candidate: Candidate) -> FittedPrimitive:
     sizes, frame = candidate
     local = (points - frame[:3, 3]) @ frame[:3, :3]
     row = torch.tensor(sizes, dtype=points.dtype)

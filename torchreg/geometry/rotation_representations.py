@@ -37,16 +37,16 @@ def rotation_from_6d(columns: Tensor) -> Tensor:
     """
     axes = torch.eye(3, dtype=columns.dtype, device=columns.device)
     first, second = columns[..., :3], columns[..., 3:]
-    first = _normalized(torch.where(_length(first) < _LEAST_LENGTH, axes[0], first))
+    first = _to_unit(torch.where(_length(first) < _LEAST_LENGTH, axes[0], first))
     length = _length(second)
     direction = second / length.clamp_min(_LEAST_LENGTH)
     across = direction - (first * direction).sum(-1, keepdim=True) * first
     undetermined = (length < _LEAST_LENGTH) | (_length(across) < _LEAST_SINE)
     substitute = axes[first.detach().abs().argmin(-1)]
     substitute = substitute - (first * substitute).sum(-1, keepdim=True) * first
-    second = _normalized(torch.where(undetermined, substitute, across))
+    second = _to_unit(torch.where(undetermined, substitute, across))
     # A second time: the difference of nearly collinear columns is mostly rounding.
-    second = _normalized(second - (first * second).sum(-1, keepdim=True) * first)
+    second = _to_unit(second - (first * second).sum(-1, keepdim=True) * first)
     return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)
 
 
@@ -105,7 +105,7 @@ def quaternion_from_rotation(rotation: Tensor) -> Tensor:
     table = torch.stack([torch.stack(row, dim=-1) for row in outer], dim=-2)
     largest = table.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)
     index = largest[..., None, None].expand(*largest.shape, 1, 4)
-    return _positive_scalar(_normalized(table.gather(-2, index).squeeze(-2)))
+    return _positive_scalar(_to_unit(table.gather(-2, index).squeeze(-2)))
 
 
 def rotation_vector_from_quaternion(quaternion: Tensor) -> Tensor:
@@ -173,7 +173,7 @@ def rotation_vector_to_6d(rotation_vector: Tensor) -> Tensor:
 
 def _normalized_quaternion(quaternion: Tensor) -> Tensor:
     identity = quaternion.new_tensor([1.0, 0.0, 0.0, 0.0])
-    return _normalized(torch.where(_length(quaternion) < _LEAST_LENGTH, identity, quaternion))
+    return _to_unit(torch.where(_length(quaternion) < _LEAST_LENGTH, identity, quaternion))
 
 
 def _positive_scalar(quaternion: Tensor) -> Tensor:
@@ -184,7 +184,7 @@ def _length(vector: Tensor) -> Tensor:
     return torch.linalg.vector_norm(vector.detach(), dim=-1, keepdim=True)
 
 
-def _normalized(vector: Tensor) -> Tensor:
+def _to_unit(vector: Tensor) -> Tensor:
     # By the largest entry first, so that the squares of short vectors do not vanish.
     scaled = vector / vector.detach().abs().amax(-1, keepdim=True)
     return scaled * (scaled * scaled).sum(-1, keepdim=True).rsqrt()

@@ -16,7 +16,7 @@ from torchreg.solvers.robust import cauchy_loss, cauchy_weight
 
 
 @dataclass(frozen=True)
-class _Settings:
+class _RefinementSettings:
     """Weights of the refinement."""
 
     # Robust scale of the residuals, in fusion lengths.
@@ -32,7 +32,7 @@ class _Settings:
     atol: float = 1e-5
 
 
-_REFINEMENT = _Settings()
+_REFINEMENT = _RefinementSettings()
 
 
 def refine_primitives(
@@ -63,7 +63,7 @@ def refine_primitives(
     References: Marquardt 1963.
     """
     solids = PrimitiveSet(primitives).requires_grad_(False)
-    problem = _Problem(solids, neighbors, nu, points.double(), owners)
+    problem = _RefinementProblem(solids, neighbors, nu, points.double(), owners)
     start = torch.zeros(1, len(primitives) * problem.width, dtype=torch.float64)
     found = levenberg_marquardt(
         problem.linearize, start, retract=problem.retract, max_steps=max_steps, atol=_REFINEMENT.atol
@@ -76,7 +76,7 @@ def refine_primitives(
 
 
 @dataclass(frozen=True)
-class _Problem:
+class _RefinementProblem:
     """The problem of `refine_primitives`; a state has a row per part: center (3), rotation (3), logarithms of sizes."""
 
     solids: PrimitiveSet

@@ -100,14 +100,14 @@ def _link_solids(record: UrdfRecord, link: int, surface: TriangleMesh, kind: str
 
 
 @dataclass(frozen=True)
-class _Geometry:
+class _LinkSolid:
     """A solid of a robot description: its kind and sizes among the solids of shapes, and its closed mesh."""
 
     solid: tuple[str, tuple[float, ...]]
     mesh: TriangleMesh
 
 
-def _box(size: Sequence[float]) -> _Geometry:
+def _box(size: Sequence[float]) -> _LinkSolid:
     x, y, z = (0.5 * edge for edge in size)
     corners = torch.tensor([[i, j, k] for i in (-0.5, 0.5) for j in (-0.5, 0.5) for k in (-0.5, 0.5)]).double()
     faces = torch.tensor(
@@ -115,25 +115,25 @@ def _box(size: Sequence[float]) -> _Geometry:
          [1, 5, 7], [1, 7, 3]]
     )  # fmt: skip
     mesh = TriangleMesh(corners * torch.tensor(size, dtype=torch.float64), faces)
-    return _Geometry(("superquadric", (x, y, z, _FIT.box_exponent, _FIT.box_exponent)), mesh)
+    return _LinkSolid(("superquadric", (x, y, z, _FIT.box_exponent, _FIT.box_exponent)), mesh)
 
 
-def _cylinder(size: Sequence[float]) -> _Geometry:
+def _cylinder(size: Sequence[float]) -> _LinkSolid:
     radius, half = size[0], 0.5 * size[1]
     outline = torch.tensor([[0.0, -half], [radius, -half], [radius, half], [0.0, half]], dtype=torch.float64)
-    return _Geometry(("cone", (half, radius, radius)), _revolved(outline))
+    return _LinkSolid(("cone", (half, radius, radius)), _revolved(outline))
 
 
-def _capsule(size: Sequence[float]) -> _Geometry:
-    return _Geometry(("capsule", (0.5 * size[1], size[0])), _revolved(_round_outline(size[0], 0.5 * size[1])))
+def _capsule(size: Sequence[float]) -> _LinkSolid:
+    return _LinkSolid(("capsule", (0.5 * size[1], size[0])), _revolved(_round_outline(size[0], 0.5 * size[1])))
 
 
-def _sphere(size: Sequence[float]) -> _Geometry:
-    return _Geometry(("ellipsoid", (*size, *size, *size)), _revolved(_round_outline(size[0], 0.0)))
+def _sphere(size: Sequence[float]) -> _LinkSolid:
+    return _LinkSolid(("ellipsoid", (*size, *size, *size)), _revolved(_round_outline(size[0], 0.0)))
 
 
 # Kinds of geometry that a robot description may hold beside meshes; cylinders and capsules lie along z, centered.
-_GEOMETRY: dict[str, Callable[[Sequence[float]], _Geometry]] = {
+_GEOMETRY: dict[str, Callable[[Sequence[float]], _LinkSolid]] = {
     "box": _box,
     "cylinder": _cylinder,
     "capsule": _capsule,

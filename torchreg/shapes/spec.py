@@ -73,10 +73,10 @@ def with_long_axis(solid: Primitive, direction: Tensor | None = None) -> Primiti
 
 def fusion_length(primitives: Sequence[Primitive], share: float) -> float:
     """Return the given share of the median half thickness of solids, metres."""
-    lengths = [min(_lengths(primitive)) for primitive in primitives]
+    lengths = [min(_length_sizes(primitive)) for primitive in primitives]
     return share * float(torch.tensor(lengths, dtype=torch.float64).median())
 
 
-def _lengths(primitive: Primitive) -> list[float]:
+def _length_sizes(primitive: Primitive) -> list[float]:
     kind = PRIMITIVE_KINDS[primitive.kind]
     return [value for value, size in zip(primitive.sizes, kind.sizes, strict=True) if size.is_length]

@@ -96,20 +96,20 @@ def alpha_expansion(
     num_labels = unary.shape[1]
     seams = None
     if positions is not None:
-        ones = np.ones(len(edges))
-        seams = _Seams(_floats(positions), ones if position_weights is None else _floats(position_weights))
-    energy = _Energy(
-        unary=_floats(unary),
+        scale = np.ones(len(edges)) if position_weights is None else _float64_array(position_weights)
+        seams = _Seams(positions=_float64_array(positions), weights=scale)
+    energy = _LabelingEnergy(
+        unary=_float64_array(unary),
         edges=edges.detach().cpu().long().numpy(),
-        weights=_floats(weights),
-        label_costs=np.zeros(num_labels) if label_costs is None else _floats(label_costs),
+        weights=_float64_array(weights),
+        label_costs=np.zeros(num_labels) if label_costs is None else _float64_array(label_costs),
         seams=seams,
     )
     labels = energy.unary.argmin(1) if initial is None else initial.detach().cpu().long().numpy().copy()
     return _sweep(energy, labels, max_sweeps, unary.device)
 
 
-def _floats(values: Tensor) -> Floats:
+def _float64_array(values: Tensor) -> Floats:
     array: Floats = values.detach().cpu().double().numpy()
     return array
 
@@ -130,7 +130,7 @@ class _Seams:
 
 
 @dataclass(frozen=True)
-class _Energy:
+class _LabelingEnergy:
     """An energy over labelings, in float64, see `alpha_expansion`."""
 
     unary: Floats
@@ -193,7 +193,7 @@ class _Energy:
         return terminal, edges, arcs
 
 
-def _sweep(energy: _Energy, labels: Integers, max_sweeps: int, device: torch.device) -> Labeling:
+def _sweep(energy: _LabelingEnergy, labels: Integers, max_sweeps: int, device: torch.device) -> Labeling:
     """Return the labeling after expansions of all labels in turn, skipping those since whose turn nothing changed."""
     unchanged = np.zeros(len(energy.label_costs), dtype=np.bool_)
     value, num_sweeps = energy(labels), 0

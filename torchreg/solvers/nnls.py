@@ -20,7 +20,7 @@ Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class _Settings:
+class _EliminationSettings:
     """Numbers of the elimination and of its linear systems."""
 
     # Ridges, relative to the diagonal of the Hessian, each tried after a system was unsolvable with the one before.
@@ -39,7 +39,7 @@ class _Settings:
     max_cg_steps: int = 2000
 
 
-_SETTINGS = _Settings()
+_SETTINGS = _EliminationSettings()
 
 
 @dataclass(frozen=True)

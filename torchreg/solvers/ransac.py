@@ -241,7 +241,7 @@ def _third_weights(matches: _Matches, origin: Tensor, across: Tensor, from_first
 
 def _compatible(matches: _Matches, index: Tensor) -> Tensor:
     """Return weights (G, C, N) of matches that can lie on one rigid body with match ``index`` (G, C), else zero."""
-    source, target = _distances(matches.source, index), _distances(matches.target, index)
+    source, target = _exact_distances(matches.source, index), _exact_distances(matches.target, index)
     fits = (source - target).abs_() <= _SAMPLING.pair_slack * matches.threshold
     fits &= torch.minimum(source, target) >= _SAMPLING.min_baseline * matches.threshold
     if matches.normals is not None:
@@ -253,7 +253,7 @@ def _compatible(matches: _Matches, index: Tensor) -> Tensor:
     return source.mul_(fits).mul_(matches.weights.unsqueeze(1))
 
 
-def _distances(points: Tensor, index: Tensor) -> Tensor:
+def _exact_distances(points: Tensor, index: Tensor) -> Tensor:
     # The matrix product of the default mode is off by far more than a threshold in float32.
     return torch.cdist(_rows(points, index), points, compute_mode="donot_use_mm_for_euclid_dist")
 
