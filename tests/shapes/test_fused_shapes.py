@@ -363,3 +363,16 @@ def test_poses_and_points_of_the_wrong_kind_are_refused():
 def test_a_shape_without_a_file_has_no_file_skin():
     with pytest.raises(InputError, match="this shape has no file skin"):
         crane().file_skin()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"spacing": 0.0}, "spacing must be positive"),
+        ({"spacing": 1e-6}, "choose a larger one"),
+        ({"pose": torch.full((27,), torch.nan)}, "pose must be finite"),
+    ],
+)
+def test_a_surface_mesh_needs_a_spacing_and_a_pose(plain_hand, options, message):
+    with pytest.raises(InputError, match=message):
+        plain_hand.surface_mesh(**options)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchreg.errors import InputError
+from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
@@ -214,3 +214,9 @@ def test_bending_skins_that_do_not_fit_are_refused(hand):
         BendingSkin(hand, torch.zeros(0, 3))
     with pytest.raises(InputError, match="this skin has no normals; pass normals="):
         BendingSkin(hand, torch.zeros(2, 3)).posed_normals(hand.rest_pose())
+
+
+@pytest.mark.parametrize(("count", "error"), [(0, InputError), (-3, InputError), (2.5, InputTypeError)])
+def test_samples_of_a_skin_are_counted(plain_hand, count, error):
+    with pytest.raises(error, match="count must be"):
+        sample_skin(plain_hand, count)

@@ -22,22 +22,6 @@ class BoundarySettings:
 BOUNDARY = BoundarySettings()
 
 
-def distinct_faces(faces: Tensor) -> Tensor:
-    """Return the faces with three different corners, each once."""
-    ordered = faces.sort(dim=-1).values
-    plain = (ordered[:, 0] != ordered[:, 1]) & (ordered[:, 1] != ordered[:, 2])
-    faces, ordered = faces[plain], ordered[plain]
-    if len(faces) == 0:
-        return faces
-    size = int(ordered.max()) + 1
-    if size**3 <= torch.iinfo(torch.int64).max:
-        _, which = ((ordered[:, 0] * size + ordered[:, 1]) * size + ordered[:, 2]).unique(return_inverse=True)
-    else:
-        _, which = ordered.unique(dim=0, return_inverse=True)  # slower by far
-    first = torch.full((int(which.max()) + 1,), len(faces)).scatter_reduce(0, which, torch.arange(len(faces)), "amin")
-    return faces[first.sort().values]
-
-
 def boundary_of_faces(faces: Tensor, count: int) -> Tensor:
     """Return a mask (N,) of the points on an edge of one face alone, or on no face."""
     sides = torch.stack((faces, faces.roll(-1, dims=1)), dim=-1).sort(dim=-1).values.reshape(-1, 2)

@@ -240,6 +240,21 @@ def unit_sphere(subdivisions: int = 3, *, dtype: torch.dtype | None = None) -> T
     return TriangleMesh(vertices.to(dtype or torch.get_default_dtype()), faces)
 
 
+def distinct_faces(faces: Tensor) -> Tensor:
+    """Return the faces (F, 3) with three different corners, each once."""
+    low, middle, high = faces.sort(dim=1).values.unbind(1)
+    proper = (low != middle) & (middle != high)
+    faces, low, middle, high = (values[proper] for values in (faces, low, middle, high))
+    if len(faces) == 0:
+        return faces
+    count = int(high.max()) + 1
+    # Two numbers per face instead of three: three might not fit into 64 bits.
+    pair = (low * count + middle).unique(return_inverse=True)[1]
+    key, order = (pair * count + high).sort(stable=True)
+    first = torch.cat((key.new_ones(1, dtype=torch.bool), key[1:] != key[:-1]))
+    return faces[order[first].sort().values]
+
+
 def _icosahedron() -> tuple[Tensor, Tensor]:
     # Two poles and two rings of five, turned against each other by 36 degrees, at heights +-1/sqrt(5).
     height, step = 0.2**0.5, torch.pi / 5

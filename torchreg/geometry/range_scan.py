@@ -20,9 +20,9 @@ from torchreg._checks import (
     check_shape,
 )
 from torchreg.errors import InputError, InputTypeError
-from torchreg.geometry.boundary import BOUNDARY, boundary_of_faces, boundary_of_points, distinct_faces
+from torchreg.geometry.boundary import BOUNDARY, boundary_of_faces, boundary_of_points
 from torchreg.geometry.depth_image import unproject
-from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.mesh import TriangleMesh, distinct_faces
 from torchreg.geometry.neighbors import distinct_positions, k_nearest_others, nearest_neighbor, sampling_distance
 from torchreg.geometry.normals import (
     NORMALS,

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchreg.errors import InputError
 from torchreg.geometry.graphs import connected_components, minimum_spanning_forest
-from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.mesh import TriangleMesh, distinct_faces
 from torchreg.geometry.neighbors import NeighborTree, weld
 
 PIECES = ("largest", "bridge", "error")
@@ -80,13 +80,12 @@ def one_piece(mesh: TriangleMesh, pieces: str = "largest") -> OnePiece:
     """
     position = weld(mesh.vertices.detach().cpu().double())
     faces = position[mesh.faces.cpu()]
-    faces = faces[(faces != faces.roll(1, dims=1)).all(1)]
-    if len(faces) == 0:
+    if not bool((faces != faces.roll(1, dims=1)).all(1).any()):
         raise InputError(f"mesh must have a triangle with three different corners, got {mesh.num_faces} faces without")
     if not float(TriangleMesh(mesh.vertices.detach().cpu().double(), mesh.faces.cpu()).face_areas().sum()) > 0:
         raise InputError("mesh must have a surface, got triangles without area")
     # A face used twice would make its edges look shared.
-    faces = _distinct_faces(faces)
+    faces = distinct_faces(faces)
     original = torch.zeros(int(position.max()) + 1, dtype=torch.int64)
     original = original.index_copy(0, position, torch.arange(len(position)))
     vertices = mesh.vertices.detach().cpu().double()[original]
@@ -139,17 +138,6 @@ def coarsened(mesh: TriangleMesh, count: int) -> TriangleMesh:
     faces = patch[faces]
     faces = faces[(faces != faces.roll(1, dims=1)).all(1)]
     return TriangleMesh(total / torch.bincount(patch)[:, None], faces)
-
-
-def _distinct_faces(faces: Tensor) -> Tensor:
-    """Return the faces (F, 3) without those that have the corners of another."""
-    low, middle, high = faces.sort(dim=1).values.unbind(1)
-    count = int(faces.max()) + 1
-    # Two numbers per face instead of three: three might not fit into 64 bits.
-    pair = (low * count + middle).unique(return_inverse=True)[1]
-    key, order = (pair * count + high).sort(stable=True)
-    first = torch.cat((key.new_ones(1, dtype=torch.bool), key[1:] != key[:-1]))
-    return faces[order[first].sort().values]
 
 
 def _kept_pieces(vertices: Tensor, faces: Tensor, pieces: str) -> tuple[Tensor, int, tuple[str, ...], Tensor]:
