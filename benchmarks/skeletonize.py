@@ -98,7 +98,7 @@ def drawn(name: str, meshes: Iterator[tr.TriangleMesh], tips: tuple[int, int], j
 def tube(axis: Tensor, radii: Tensor, spacing: float) -> tr.TriangleMesh:
     margin = float(radii.max()) + 2 * spacing
     lower, upper = axis.amin(0) - margin, axis.amax(0) + margin
-    return isosurface(lambda points: (torch.cdist(points, axis) - radii).amin(1), lower, upper, spacing, chunk=4096)
+    return isosurface(lambda points: (torch.cdist(points, axis) - radii).amin(1), lower, upper, spacing)
 
 
 def off_axis(radius: tuple[float, float]) -> float:

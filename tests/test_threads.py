@@ -5,7 +5,7 @@ import threading
 import pytest
 import torch
 
-from torchreg._threads import both, one_thread
+from torchreg._threads import one_thread, run_both
 
 
 @pytest.fixture(autouse=True)
@@ -82,7 +82,7 @@ def test_two_calls_are_made_side_by_side():
         return who()
 
     with one_thread(), torch.no_grad():
-        (here, *own), (there, *others) = both(call, call)
+        (here, *own), (there, *others) = run_both(call, call)
     assert here is threading.current_thread()
     assert there is not here
     assert own == others == [1, False, False]
@@ -91,14 +91,14 @@ def test_two_calls_are_made_side_by_side():
 @pytest.mark.parametrize("mode", [torch.no_grad, torch.enable_grad, torch.inference_mode])
 def test_gradients_are_recorded_beside_as_here(mode):
     with mode():
-        (_, *own), (_, *others) = both(who, who)
+        (_, *own), (_, *others) = run_both(who, who)
     assert own == others
 
 
 def test_one_thread_makes_both_calls_where_torch_has_one():
     torch.set_num_threads(1)
     with one_thread():
-        one, other = both(who, who)
+        one, other = run_both(who, who)
     assert one == other
     assert one[0] is threading.current_thread()
 
@@ -108,10 +108,10 @@ def test_calls_within_calls_share_what_is_left(allowed, most):
     torch.set_num_threads(allowed)
 
     def pair():
-        return both(who, who)
+        return run_both(who, who)
 
     with one_thread():
-        found = [each[0] for two in both(pair, pair) for each in two]
+        found = [each[0] for two in run_both(pair, pair) for each in two]
         again = [each[0] for each in pair()]
     assert len(set(found)) == most
     assert len(set(again)) == 2
@@ -124,9 +124,9 @@ def test_an_error_of_either_call_is_raised_once_both_have_ended():
         raise RuntimeError("inside")
 
     with pytest.raises(RuntimeError, match="inside"):
-        both(fails, ended.set)
+        run_both(fails, ended.set)
     assert ended.is_set()
     with pytest.raises(RuntimeError, match="inside"):
-        both(int, fails)
+        run_both(int, fails)
     with one_thread():
-        assert both(who, who)[1][0] is not threading.current_thread()
+        assert run_both(who, who)[1][0] is not threading.current_thread()

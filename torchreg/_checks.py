@@ -1,4 +1,4 @@
-"""Argument checks; every message names the argument, what was expected, what came and what to do."""
+"""Argument checks; every message names the argument, the expected value, the given one and a remedy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchreg.errors import InputError, InputTypeError
 
 
 def as_tensor(value: Any, name: str, content: str) -> Tensor:
-    """Return ``value`` as a tensor of its own dtype; ``content`` says what it should hold, such as "integers".
+    """Return ``value`` as a tensor of its dtype; ``content`` names the expected entries, such as "integers".
 
     Raises:
         InputTypeError: if ``value`` cannot become a tensor.
@@ -44,7 +44,7 @@ def check_shape(value: Tensor, name: str, expected: Sequence[int | str | None], 
     """Raise InputError unless the trailing sizes of ``value`` are ``expected`` (None or a str: any size).
 
     Args:
-        value: the tensor to look at.
+        value: the tensor.
         name: the argument's name, for the message.
         expected: trailing sizes; a str names a free size in the message.
         batch: allow leading batch dimensions.
@@ -59,7 +59,7 @@ def check_shape(value: Tensor, name: str, expected: Sequence[int | str | None], 
 
 
 def check_finite(value: Tensor, name: str, hint: str = "") -> None:
-    """Raise InputError if ``value`` holds NaN or infinity, saying how many."""
+    """Raise InputError with their number if ``value`` holds NaN or infinity."""
     bad = int((~torch.isfinite(value)).sum())
     if bad:
         raise InputError(
@@ -97,10 +97,10 @@ def check_choice(value: str, name: str, choices: Sequence[str]) -> None:
         raise InputError(f"{name} must be one of {', '.join(choices)}; got {value!r}")
 
 
-def check_same_kind(value: Tensor, name: str, other: Tensor, other_name: str) -> None:
+def check_same_kind(value: Tensor, name: str, like: Tensor, like_name: str) -> None:
     """Raise InputTypeError unless the two tensors share dtype and device."""
-    if value.dtype != other.dtype or value.device != other.device:
+    if value.dtype != like.dtype or value.device != like.device:
         raise InputTypeError(
-            f"{name} is {value.dtype} on {value.device} but {other_name} is {other.dtype} on {other.device}; "
+            f"{name} is {value.dtype} on {value.device} but {like_name} is {like.dtype} on {like.device}; "
             f"convert one with .to()"
         )

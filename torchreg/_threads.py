@@ -1,4 +1,4 @@
-"""Threads for work on many small tensors: one for each, as waking others takes longer than what they would do."""
+"""Threads for work on many small tensors: a single thread per operation, and two pieces of work side by side."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ from typing import TypeVar
 
 import torch
 
-_One = TypeVar("_One")
-_Other = TypeVar("_Other")
-# How many threads this one and those it starts may be.
-_here = threading.local()
+_First = TypeVar("_First")
+_Second = TypeVar("_Second")
+# Number of threads that this thread and those it starts may use.
+_budget = threading.local()
 
 
 @contextmanager
 def one_thread(only: bool = True) -> Iterator[None]:
-    """Let torch use one thread on the CPU for what the calling Python thread does inside, and as many as before after.
+    """Let torch use one thread on the CPU for the work of the calling Python thread in a ``with`` block.
 
-    Where other programs keep the cores busy, several threads wait for each other most of the time. What is inside may
-    still do two things at once, see `both`, where torch could use more threads before.
+    Waking further threads takes longer than operations on small tensors, and where other programs keep the cores busy,
+    several threads wait for each other most of the time. `run_both` still runs two pieces of work at once where torch
+    could use more threads before.
 
     Args:
-        only: whether the work is on small tensors at all; False changes nothing.
+        only: whether the work is on small tensors; False changes nothing.
     """
     if not only:
         yield
@@ -38,42 +39,43 @@ def one_thread(only: bool = True) -> Iterator[None]:
             torch.set_num_threads(before)
 
 
-def both(one: Callable[[], _One], other: Callable[[], _Other]) -> tuple[_One, _Other]:
-    """Return what two calls return, the second made meanwhile by another thread where torch may use more than one.
+def run_both(first: Callable[[], _First], second: Callable[[], _Second]) -> tuple[_First, _Second]:
+    """Return the results of two calls, the second made at the same time by another thread if torch may use several.
 
-    Both share the threads that are left. Gradients are recorded in both or none, as outside. An error of the first call
-    is raised when the second has ended.
+    The two calls share the caller's threads. Gradients are recorded as in the caller. An error of the first call is
+    raised when the second has ended.
 
     Args:
-        one: called in the calling thread.
-        other: called beside it; must not depend on it.
+        first: called in the calling thread.
+        second: called in a thread beside it; must not depend on the first.
     """
     allowed = _num_allowed()
     if allowed < 2:
-        return one(), other()
+        return first(), second()
     grad, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
-    def aside() -> _Other:
+    def in_second_thread() -> _Second:
         with _allowed(allowed // 2), torch.inference_mode(inference), torch.set_grad_enabled(grad):
-            return other()
+            return second()
 
     with ThreadPoolExecutor(1) as pool:
-        later = pool.submit(aside)
+        pending = pool.submit(in_second_thread)
         with _allowed(allowed - allowed // 2):
-            first = one()
-        return first, later.result()
+            result = first()
+        return result, pending.result()
 
 
 def _num_allowed() -> int:
-    """Return how many threads may work for the caller, itself included."""
-    return getattr(_here, "allowed", None) or torch.get_num_threads()
+    """Return the number of threads that may work for the caller, itself included."""
+    return getattr(_budget, "allowed", None) or torch.get_num_threads()
 
 
 @contextmanager
 def _allowed(number: int) -> Iterator[None]:
-    before = getattr(_here, "allowed", None)
-    _here.allowed = number
+    """Let the calling thread and those it starts use a number of threads in a ``with`` block."""
+    before = getattr(_budget, "allowed", None)
+    _budget.allowed = number
     try:
         yield
     finally:
-        _here.allowed = before
+        _budget.allowed = before

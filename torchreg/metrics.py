@@ -1,4 +1,4 @@
-"""How far a result is from the truth: distances of points and keypoints, agreement of labelings."""
+"""Errors of results against the truth: distances of points and keypoints, agreement of labelings."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from torchreg.errors import InputError, InputTypeError
 
 
 def endpoint_error(predicted: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return the mean Euclidean distance between points and the places where they belong.
+    """Return the mean Euclidean distance between points and their true positions.
 
-    ``mean_i |predicted_i - target_i|`` over the points that ``mask`` selects. Values outside the mask are never looked
-    at, so they may be NaN.
+    ``mean_i |predicted_i - target_i|`` over the points that ``mask`` selects. Values outside the mask are ignored, so
+    they may be NaN.
 
     Args:
         predicted: (..., N, 3) points.
@@ -31,7 +31,7 @@ def endpoint_error(predicted: Tensor, target: Tensor, mask: Tensor | None = None
         mask: (..., N) bool, True where a point counts; all of them by default.
 
     Returns:
-        (...) mean distance per batch entry, in the unit of the points.
+        Mean distances (...), one per batch entry, in the unit of the points.
 
     Raises:
         InputError: if shapes differ, values are not finite or a batch entry has no point that counts.
@@ -52,16 +52,16 @@ def endpoint_error(predicted: Tensor, target: Tensor, mask: Tensor | None = None
 def chamfer(a: Tensor, b: Tensor, *, chunk_size: int = 4096) -> Tensor:
     """Return the symmetric Chamfer distance of two clouds: the mean of plain (not squared) closest-point distances.
 
-    ``(mean_i min_j |a_i - b_j| + mean_j min_i |a_i - b_j|) / 2``, so that two parallel copies of a surface are as far
-    apart as the step between them.
+    ``(mean_i min_j |a_i - b_j| + mean_j min_i |a_i - b_j|) / 2``, which is the offset between two parallel copies of a
+    surface.
 
     Args:
         a: (..., N, 3) points.
         b: (..., M, 3) points in the same unit, with the same batch dimensions.
-        chunk_size: how many points of one cloud are compared with all of the other at once.
+        chunk_size: number of points of a cloud that are compared with the opposite cloud at once.
 
     Returns:
-        (...) distance per batch entry, in the unit of the points.
+        Distances (...), one per batch entry, in the unit of the points.
 
     Raises:
         InputError: if a cloud is empty or not finite, batch dimensions differ or ``chunk_size`` is not positive.
@@ -86,7 +86,7 @@ def chamfer(a: Tensor, b: Tensor, *, chunk_size: int = 4096) -> Tensor:
 def keypoint_error(predicted: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return each keypoint's mean distance from its true position, over all frames in which it counts.
 
-    ``.nanmean()`` of the answer is the mean per-keypoint position error (MPJPE when every keypoint always counts).
+    ``.nanmean()`` of the result is the mean per-keypoint position error (MPJPE if every keypoint always counts).
 
     Args:
         predicted: (..., K, 3) keypoints; every leading dimension counts as frames.
@@ -94,7 +94,7 @@ def keypoint_error(predicted: Tensor, target: Tensor, mask: Tensor | None = None
         mask: (..., K) bool, True where a keypoint counts, for example where it is seen; all of them by default.
 
     Returns:
-        (K,) mean distances, in the unit of the keypoints; NaN for a keypoint that never counts.
+        Mean distances (K,), in the unit of the keypoints; NaN for a keypoint that never counts.
 
     Raises:
         InputError: if shapes differ or values that count are not finite.
@@ -113,16 +113,16 @@ def keypoint_error(predicted: Tensor, target: Tensor, mask: Tensor | None = None
 
 
 def pck(predicted: Tensor, target: Tensor, threshold: float, mask: Tensor | None = None) -> Tensor:
-    """Return the percentage of correct keypoints as a fraction: how many lie within ``threshold`` of the truth.
+    """Return the fraction of correct keypoints (PCK), those within ``threshold`` of the truth.
 
     Args:
         predicted: (..., K, 3) keypoints.
         target: (..., K, 3) their true positions, in the same unit.
-        threshold: largest distance, in the unit of the keypoints, that still is correct.
+        threshold: largest distance of a correct keypoint, in the unit of the keypoints.
         mask: (..., K) bool, True where a keypoint counts; all of them by default.
 
     Returns:
-        (...) fraction from 0 to 1 per batch entry.
+        Fractions (...) from 0 to 1, one per batch entry.
 
     Raises:
         InputError: if shapes differ, values that count are not finite, ``threshold`` is not positive or a batch entry
@@ -144,18 +144,18 @@ def pck(predicted: Tensor, target: Tensor, threshold: float, mask: Tensor | None
 
 
 def adjusted_rand(labels_a: Tensor, labels_b: Tensor) -> float:
-    """Return the adjusted Rand index of two labelings: 1 when they are the same up to names, about 0 by chance.
+    """Return the adjusted Rand index of two labelings: 1 if they are the same up to names, about 0 by chance.
 
-    With n_ij points labeled i by one and j by the other, a_i and b_j the row and column sums and C(n) = n (n - 1) / 2:
+    With n_ij points labeled i by the first and j by the second, row and column sums a_i and b_j, C(n) = n (n - 1) / 2:
     ``(sum_ij C(n_ij) - E) / ((sum_i C(a_i) + sum_j C(b_j)) / 2 - E)``, ``E = sum_i C(a_i) sum_j C(b_j) / C(n)``.
 
     Args:
         labels_a: (N,) integers.
-        labels_b: (N,) integers; the two need not use the same names.
+        labels_b: (N,) integers; the names of the two labelings may differ.
 
     Returns:
-        A number of at most 1; it is negative when the labelings agree less than by chance. Two labelings that both put
-        every point in one class, or both every point in its own, agree: 1.
+        A number of at most 1, negative if the labelings agree less than by chance. Two labelings agree with 1 if both
+        have a single class, or both a class per point.
 
     Raises:
         InputError: if the labels are empty, not one-dimensional or of different lengths.
@@ -180,7 +180,7 @@ def adjusted_rand(labels_a: Tensor, labels_b: Tensor) -> float:
 
 
 def _same_kind(first: Any, first_name: str, second: Any, second_name: str) -> tuple[Tensor, Tensor]:
-    """Return both as floating-point tensors; an array follows the other argument's dtype and device."""
+    """Return two arguments as floating-point tensors; an array takes dtype and device of the tensor beside it."""
     if isinstance(first, Tensor) and isinstance(second, Tensor):
         first, second = as_float_tensor(first, first_name), as_float_tensor(second, second_name)
         check_same_kind(first, first_name, second, second_name)
@@ -220,7 +220,7 @@ def _paired_distances(predicted: Tensor, target: Tensor, mask: Tensor | None) ->
 def _to_closest(source: Tensor, target: Tensor, step: int) -> Tensor:
     """Return the (..., N) distance from each source point to the closest target point."""
     with torch.no_grad():
-        # Exact differences: the matrix-product shortcut of cdist loses float32 digits away from the origin.
+        # Exact differences: the matrix product of cdist's default mode loses float32 digits away from the origin.
         closest = [
             torch.cdist(chunk, target, compute_mode="donot_use_mm_for_euclid_dist").argmin(-1)
             for chunk in source.split(step, dim=-2)

@@ -1,4 +1,4 @@
-"""What all results share: they are frozen records of tensors that print in one line and save themselves."""
+"""The base of all results: frozen records of tensors that print in one line and save themselves."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Record = TypeVar("Record")
 
 
 def public(name: str) -> Any:
-    """Return what a public name of the library stands for, the one way from here to the rooms above."""
+    """Return the object of a public name of the library, the only way from this module to the rooms above."""
     return getattr(import_module("torchreg"), name)
 
 
 def stored_as(to_record: Callable[[Any], Any], from_record: Callable[[Any], Any]) -> dict[str, Any]:
-    """Return the metadata of a result's field that is no plain data, such as a module.
+    """Return the metadata of a result's field that is not plain data, such as a module.
 
     Args:
         to_record: from its value to a dataclass of tensors and plain data, annotated with that class.
@@ -36,8 +36,8 @@ def formerly(name: str) -> dict[str, Any]:
     return {"formerly": name}
 
 
-def _described(value: Any) -> str:
-    """Return what is said of a field in few words."""
+def _field_summary(value: Any) -> str:
+    """Return a field's value in few words."""
     if isinstance(value, Tensor):
         if value.numel() == 1 and not value.is_complex():
             return f"{value.item():.4g}"
@@ -47,7 +47,7 @@ def _described(value: Any) -> str:
     if isinstance(value, tuple):
         words = [str(item.value) if isinstance(item, Enum) else item for item in value if isinstance(item, (Enum, str))]
         kinds = sorted(set(words))
-        if len(words) < len(value) or len(kinds) > _FEW:
+        if len(words) < len(value) or len(kinds) > _MAX_KINDS:
             return f"{len(value)} x {type(value[0]).__name__}"
         return ", ".join(f"{words.count(kind)} {kind}" for kind in kinds) or "none"
     if isinstance(value, (Result, nn.Module)):
@@ -55,35 +55,35 @@ def _described(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-# Different words that are counted one by one.
-_FEW = 6
+# Different words in a tuple up to which each is printed with its count.
+_MAX_KINDS = 6
 
 
 class Result:
-    """What a pipeline returns: a frozen record that can be saved.
+    """The result of a pipeline: a frozen record that can be saved.
 
     It prints in one line, and in notebooks as a table: tensors by type and shape, not by their numbers.
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        # A class that has these already is given no others by @dataclass.
+        # @dataclass does not replace a __repr__ that the class has already.
         cls.__repr__ = Result.__repr__  # type: ignore[method-assign]
 
     def __repr__(self) -> str:
-        parts = ", ".join(f"{name}={text}" for name, text in self._described())
+        parts = ", ".join(f"{name}={text}" for name, text in self._summaries())
         return f"{type(self).__name__}({parts})"
 
     def _repr_html_(self) -> str:
-        """Return a table of the fields, which notebooks show."""
+        """Return a table of the fields, for notebooks."""
         rows = "".join(
             f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:left'>{escape(text)}</td></tr>"
-            for name, text in self._described()
+            for name, text in self._summaries()
         )
         return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
 
-    def _described(self) -> list[tuple[str, str]]:
-        return [(item.name, _described(getattr(self, item.name))) for item in fields(self)]  # type: ignore[arg-type]
+    def _summaries(self) -> list[tuple[str, str]]:
+        return [(item.name, _field_summary(getattr(self, item.name))) for item in fields(self)]  # type: ignore[arg-type]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result to ``path``, which ends in .safetensors, and a JSON file beside it.
@@ -94,7 +94,7 @@ class Result:
             path: a local file ending in .safetensors; an existing pair is replaced, each file whole or not at all.
 
         Raises:
-            InputError: if the ending is another.
+            InputError: if the path has another ending.
             InputTypeError: if a field holds something that cannot be stored.
             FileNotFoundError: if the folder does not exist.
         """
@@ -103,7 +103,7 @@ class Result:
 
 
 class Status(Enum):
-    """How a pipeline ended."""
+    """The outcome of a pipeline."""
 
     CONVERGED = "converged"
     MAX_STEPS = "max_steps"
@@ -120,7 +120,7 @@ class Status(Enum):
 
 
 def normal_copy(record: Record) -> Record:
-    """Return a copy of a dataclass whose tensors can take part in autograd, as those made in inference mode cannot."""
+    """Return a copy of a dataclass with tensors that autograd accepts, unlike those made in inference mode."""
     values = {item.name: getattr(record, item.name) for item in fields(record)}  # type: ignore[arg-type]
     with torch.inference_mode(False), torch.no_grad():
         copies = {name: value.clone() for name, value in values.items() if isinstance(value, Tensor)}

@@ -18,8 +18,8 @@ from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.primitives import Primitive
-from torchreg.shapes.rigs import RigSurface
 from torchreg.shapes.skin import sample_skin
+from torchreg.shapes.spec import RigSurface
 from torchreg.shapes.surface import FusedSurface, SkinSurface
 
 

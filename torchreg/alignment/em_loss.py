@@ -259,6 +259,6 @@ def _parts(model: Tensor, data: Tensor) -> Iterator[slice]:
 def _kernel(model: Tensor, data: Tensor) -> Tensor:
     """Return ``exp(-|x - y|^2)`` (B, N, m), by differences: exact however far the points are from each other."""
     if not torch.is_grad_enabled():
-        return gaussian_kernel(model, data, expand=False)
+        return gaussian_kernel(model, data)
     squares = (model.unsqueeze(-2) - data.unsqueeze(-3)).square().sum(-1)
     return squares.neg().exp()

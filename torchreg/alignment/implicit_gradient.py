@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 from torchreg.geometry.rotation import left_jacobian, so3_exp
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import BASE_DOFS, difference, retract
-from torchreg.shapes.surface import Surface
+from torchreg.shapes.surface import ShapeSurface
 from torchreg.solvers.levenberg_marquardt import held_at_limits
 from torchreg.solvers.robust import welsch_loss
 
@@ -41,7 +41,7 @@ class FixedPoint:
     """
 
     shape: ArticulatedShape
-    surface: Surface
+    surface: ShapeSurface
     valid: Tensor
     sigma: Tensor
     noise: Tensor

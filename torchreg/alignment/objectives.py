@@ -10,7 +10,7 @@ from torch.nn.functional import pad
 
 from torchreg.shapes.pose_algebra import BASE_DOFS, difference
 from torchreg.shapes.skin import LinearBlendSkin
-from torchreg.shapes.surface import Surface
+from torchreg.shapes.surface import ShapeSurface
 from torchreg.solvers.e_step import EStep
 from torchreg.solvers.levenberg_marquardt import Linearization
 from torchreg.solvers.robust import welsch_weight
@@ -109,7 +109,7 @@ class SurfaceObjective:
 
     def __init__(
         self,
-        surface: Surface,
+        surface: ShapeSurface,
         data: Tensor,
         valid: Tensor,
         sigma: Tensor,

@@ -12,7 +12,7 @@ from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.kinematics import stack_sizes
 from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.skin import LinearBlendSkin
-from torchreg.shapes.surface import FusedSurface, SkinSurface, Surface, dense_file_skin
+from torchreg.shapes.surface import FusedSurface, ShapeSurface, SkinSurface, dense_file_skin
 from torchreg.solvers.levenberg_marquardt import (
     Linearization,
     LMResult,
@@ -68,7 +68,7 @@ class AlignProblem:
     """
 
     skin: LinearBlendSkin
-    surface: Surface
+    surface: ShapeSurface
     data: Tensor
     valid: Tensor
     size: float
@@ -219,7 +219,7 @@ def _joint_precision(shape: Articulation, size: float, std: float | None) -> Ten
     return precision
 
 
-def _surface(shape: Articulation, skin: LinearBlendSkin) -> Surface:
+def _surface(shape: Articulation, skin: LinearBlendSkin) -> ShapeSurface:
     """Return the surface to fit: that of the shape's file where there is one, else the fused solids."""
     if shape.surface is None:
         return FusedSurface(shape)

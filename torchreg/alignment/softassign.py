@@ -96,7 +96,7 @@ def _scaled(model: Tensor, data: Tensor, sigma: Tensor) -> tuple[Tensor, Tensor,
 def _kernel(model: Tensor, data: Tensor) -> Tensor:
     if torch.is_grad_enabled():
         return (model.unsqueeze(-2) - data.unsqueeze(-3)).square().sum(-1).neg().exp()
-    return gaussian_kernel(model, data, expand=False)
+    return gaussian_kernel(model, data)
 
 
 def _balanced(

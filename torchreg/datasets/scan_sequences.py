@@ -21,7 +21,7 @@ from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.visibility import View, visible_points
-from torchreg.solvers.rigid_groups import joined_alike
+from torchreg.solvers.rigid_groups import merge_alike
 
 # The camera stands this many diagonals of the rest pose away.
 _DISTANCE = 1.7
@@ -95,7 +95,7 @@ def _moving_labels(
     for hidden in (counts == 0).nonzero()[:, 0]:
         # Nothing seen tells apart what hangs on either side of a part that is not seen.
         meet |= meet[hidden].unsqueeze(1) & meet[hidden]
-    return joined_alike(apart, counts, meet, tolerance)[labels]
+    return merge_alike(apart, counts, meet, tolerance)[labels]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,8 @@
-"""Calibrated pinhole cameras: where a point of space appears in the picture, and where a pixel looks."""
+"""Calibrated pinhole cameras: projection of points to pixels, and viewing rays of pixels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -10,29 +10,26 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_count, check_finite, check_positive, check_shape
 from torchreg.errors import InputError
-from torchreg.geometry.rigid import invert_rigid, rigid_matrix, transform_points
+from torchreg.geometry.budget import BUDGET
+from torchreg.geometry.rigid import RIGID_TOLERANCE, invert_rigid, rigid_matrix, rotation_error, transform_points
 from torchreg.geometry.visibility import View, view_rotation
 
-# Sides of pictures and, further on, their number of pixels; more is a damaged file rather than a camera.
-MAX_PIXELS = 64_000_000
-_NUM_DISTORTIONS = (0, 4, 5, 8)
-# Newton's method on two unknowns: from within a picture it takes about four steps.
+# Steps of Newton's method on two unknowns: within a picture about four are taken.
 _NEWTON_STEPS = 20
-_RIGID_SLACK = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Camera:
-    """A pinhole camera with its lens, its place and the size of its picture.
+    """A pinhole camera: the size of its picture, its intrinsics, its pose and the distortion of its lens.
 
-    A point ``(x, y, z)`` in camera coordinates (right, down, forward) has the picture ``(fx u + cx, fy v + cy)``, where
+    A point ``(x, y, z)`` in camera coordinates (right, down, forward) has the pixel ``(fx u + cx, fy v + cy)``, where
     ``(u, v)`` is ``(x / z, y / z)`` after the lens: with ``r^2 = u^2 + v^2`` and
     ``s = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)``
 
     ``u' = s u + 2 p1 u v + p2 (r^2 + 2 u^2)``, ``v' = s v + p1 (r^2 + 2 v^2) + 2 p2 u v``.
 
-    Convention: OpenCV's. Pixels are (column, row), and whole numbers are the middles of pixels: the picture covers
-    ``[-0.5, width - 0.5] x [-0.5, height - 0.5]``. The motion takes world coordinates to camera coordinates.
+    Convention: OpenCV's. Pixels are (column, row) and have their centers at integers: the picture covers
+    ``[-0.5, width - 0.5] x [-0.5, height - 0.5]``. ``world_to_camera`` takes world to camera coordinates.
 
     Args:
         width: of the picture, pixels.
@@ -40,7 +37,7 @@ class Camera:
         intrinsics: (4,) fx, fy, cx, cy, pixels.
         world_to_camera: (4, 4) rigid motion, metres; the identity by default.
         distortion: k1, k2, p1, p2, then k3, then k4, k5, k6: none, 4, 5 or 8 numbers; stored as (8,).
-        name: what files call the camera.
+        name: name of the camera in files.
 
     Raises:
         InputError: if a size does not fit, a number is not finite, a focal length not positive, the motion not rigid
@@ -52,59 +49,68 @@ class Camera:
     width: int
     height: int
     intrinsics: Tensor
-    world_to_camera: Tensor = None  # type: ignore[assignment]  # filled in below
-    distortion: Tensor = None  # type: ignore[assignment]  # filled in below
-    name: str = ""
+    world_to_camera: Tensor
+    distortion: Tensor
+    name: str
 
-    def __post_init__(self) -> None:
-        check_count(self.width, "width", 1)
-        check_count(self.height, "height", 1)
-        if self.width * self.height > MAX_PIXELS:
-            raise InputError(f"pictures have at most 64 megapixels, got {self.width} x {self.height}")
-        intrinsics = _numbers(self.intrinsics, "intrinsics (fx, fy, cx, cy)")
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        intrinsics: Any,
+        world_to_camera: Any = None,
+        distortion: Any = None,
+        name: str = "",
+    ) -> None:
+        check_count(width, "width", 1)
+        check_count(height, "height", 1)
+        if width * height > BUDGET.picture_pixels:
+            raise InputError(f"pictures have at most 64 megapixels, got {width} x {height}")
+        intrinsics = _finite_numbers(intrinsics, "intrinsics (fx, fy, cx, cy)")
         check_shape(intrinsics, "intrinsics", (4,))
-        for value, name in zip(intrinsics[:2].tolist(), ("fx", "fy"), strict=True):
-            check_positive(value, f"intrinsics ({name})")
-        motion = torch.eye(4, dtype=torch.float64) if self.world_to_camera is None else self.world_to_camera
-        motion = _numbers(motion, "world_to_camera").to(intrinsics)
-        check_rigid(motion, "world_to_camera")
-        lens = _numbers(() if self.distortion is None else self.distortion, "distortion").to(intrinsics)
-        if lens.ndim != 1 or len(lens) not in _NUM_DISTORTIONS:
+        for value, part in zip(intrinsics[:2].tolist(), ("fx", "fy"), strict=True):
+            check_positive(value, f"intrinsics ({part})")
+        motion = torch.eye(4, dtype=torch.float64) if world_to_camera is None else world_to_camera
+        motion = _finite_numbers(motion, "world_to_camera").to(intrinsics)
+        check_rigid_motion(motion, "world_to_camera")
+        lens = _finite_numbers(() if distortion is None else distortion, "distortion").to(intrinsics)
+        if lens.ndim != 1 or len(lens) not in (0, 4, 5, 8):
             raise InputError(f"distortion must hold 0, 4, 5 or 8 numbers, got shape {tuple(lens.shape)}")
-        object.__setattr__(self, "intrinsics", intrinsics)
-        object.__setattr__(self, "world_to_camera", motion)
-        object.__setattr__(self, "distortion", torch.nn.functional.pad(lens, (0, 8 - len(lens))))
+        lens = torch.nn.functional.pad(lens, (0, 8 - len(lens)))
+        values = {"width": width, "height": height, "intrinsics": intrinsics, "name": name}
+        for field, value in (values | {"world_to_camera": motion, "distortion": lens}).items():
+            object.__setattr__(self, field, value)
 
     @classmethod
     def looking_at(
         cls, position: Any, target: Any, *, focal: float, width: int, height: int, up: Any = None, name: str = ""
     ) -> Camera:
-        """Return a camera without distortion that has a target in the middle of its picture.
+        """Return a camera without distortion that has a target at the center of its picture.
 
         Args:
             position: (3,) of the pinhole, metres.
-            target: (3,) what it looks at.
+            target: (3,) point looked at, metres.
             focal: focal length, pixels.
             width: of the picture, pixels.
             height: of the picture, pixels.
-            up: (3,) what appears upright; -y by default.
+            up: (3,) direction that appears upright; -y by default.
             name: see `Camera`.
 
         Raises:
             InputError: if position and target coincide, and as `Camera`.
         """
         rotation = view_rotation(position, target, up)
-        place = as_float_tensor(position, "position", like=rotation)
-        middle = (0.5 * (width - 1), 0.5 * (height - 1))
-        motion = rigid_matrix(rotation, -(rotation @ place))
-        return cls(width, height, torch.tensor([focal, focal, *middle], dtype=torch.float64), motion, name=name)
+        pinhole = as_float_tensor(position, "position", like=rotation)
+        center = (0.5 * (width - 1), 0.5 * (height - 1))
+        motion = rigid_matrix(rotation, -(rotation @ pinhole))
+        return cls(width, height, torch.tensor([focal, focal, *center], dtype=torch.float64), motion, name=name)
 
     @property
     def matrix(self) -> Tensor:
         """The (3, 3) matrix ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``."""
         fx, fy, cx, cy = self.intrinsics.unbind()
-        zero, one = torch.zeros_like(fx), torch.ones_like(fx)
-        return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, one)).reshape(3, 3)
+        zero = torch.zeros_like(fx)
+        return torch.stack((fx, zero, cx, zero, fy, cy, zero, zero, torch.ones_like(fx))).reshape(3, 3)
 
     @property
     def camera_to_world(self) -> Tensor:
@@ -113,7 +119,7 @@ class Camera:
 
     @property
     def position(self) -> Tensor:
-        """Where the pinhole is, (3,)."""
+        """Position (3,) of the pinhole, metres."""
         return self.camera_to_world[:3, 3]
 
     @property
@@ -122,7 +128,7 @@ class Camera:
         return bool((self.distortion != 0).any())
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the pixels (..., N, 2) as (column, row) and the depths (..., N) of points, NaN pixels behind it.
+        """Return the pixels (..., N, 2) of points as (column, row), NaN behind the camera, and their depths (..., N).
 
         Args:
             points: (..., N, 3) in world coordinates, metres.
@@ -131,20 +137,20 @@ class Camera:
         """
         local = transform_points(self.world_to_camera.to(points), points)
         depth = local[..., 2]
-        seen = depth > 0
-        plane = local[..., :2] / torch.where(seen, depth, 1.0).unsqueeze(-1)
+        in_front = depth > 0
+        plane = local[..., :2] / torch.where(in_front, depth, 1.0).unsqueeze(-1)
         focal, center = self.intrinsics.to(points).split(2)
         pixels = self.distorted(plane) * focal + center
-        return torch.where(seen.unsqueeze(-1), pixels, torch.nan), depth
+        return torch.where(in_front.unsqueeze(-1), pixels, torch.nan), depth
 
     def directions(self, pixels: Tensor) -> Tensor:
-        """Return where pixels look, (..., N, 3) in world coordinates, as long as their depth is one.
+        """Return the viewing directions (..., N, 3) of pixels in world coordinates, scaled to unit depth.
 
         Args:
             pixels: (..., N, 2) as (column, row).
 
         Returns:
-            NaN where the lens maps nothing to a pixel.
+            Directions (..., N, 3); NaN at pixels that no ray through the lens reaches.
 
         Differentiable: once, in ``pixels`` and all of the camera's tensors.
         """
@@ -154,7 +160,7 @@ class Camera:
         return local @ self.world_to_camera[:3, :3].to(pixels)
 
     def unproject(self, pixels: Tensor, depth: Tensor) -> Tensor:
-        """Return the points (..., N, 3) in world coordinates that pixels show at given depths along the camera's axis.
+        """Return the points (..., N, 3) of pixels at given depths along the optical axis, in world coordinates.
 
         Args:
             pixels: (..., N, 2) as (column, row).
@@ -165,14 +171,14 @@ class Camera:
         return self.position.to(pixels) + depth.unsqueeze(-1) * self.directions(pixels)
 
     def distorted(self, plane: Tensor) -> Tensor:
-        """Return where the lens shows points (..., 2) of the plane at depth one.
+        """Return the distorted positions (..., 2) of points (..., 2) of the plane at depth one.
 
         Differentiable: in ``plane`` and the distortion.
         """
-        return _lens(plane, self.distortion.to(plane)) if self.is_distorted else plane
+        return _distort(plane, self.distortion.to(plane)) if self.is_distorted else plane
 
     def undistorted(self, plane: Tensor) -> Tensor:
-        """Return the points (..., 2) of the plane at depth one that the lens shows at given ones; NaN if there is none.
+        """Return the points (..., 2) of the plane at depth one with given distorted positions; NaN if there are none.
 
         Differentiable: once, in ``plane`` and the distortion.
         """
@@ -182,18 +188,18 @@ class Camera:
         with torch.no_grad():
             found = plane.clone()
             for _ in range(_NEWTON_STEPS):
-                found = found - _solved(lens_jacobian(found, lens), _lens(found, lens) - plane)
+                found = found - _solve_2x2(lens_jacobian(found, lens), _distort(found, lens) - plane)
             jacobian = lens_jacobian(found, lens)
             slack = 1e3 * torch.finfo(plane.dtype).eps * (1 + plane.norm(dim=-1))
-            valid = ((_lens(found, lens) - plane).norm(dim=-1) <= slack) & (torch.linalg.det(jacobian) > 0)
+            valid = ((_distort(found, lens) - plane).norm(dim=-1) <= slack) & (torch.linalg.det(jacobian) > 0)
             found = torch.where(valid.unsqueeze(-1), found, torch.zeros_like(found))
             jacobian = torch.where(valid[..., None, None], jacobian, torch.eye(2).to(jacobian))
         # One more step with the derivative of the solution (implicit function theorem).
-        found = found - _solved(jacobian, _lens(found, lens) - plane)
+        found = found - _solve_2x2(jacobian, _distort(found, lens) - plane)
         return torch.where(valid.unsqueeze(-1), found, torch.nan)
 
     def pixel_grid(self, *, like: Tensor | None = None) -> Tensor:
-        """Return the middles (H, W, 2) of all pixels as (column, row), in the dtype and on the device of ``like``."""
+        """Return the centers (H, W, 2) of all pixels as (column, row), in the dtype and on the device of ``like``."""
         like = self.intrinsics if like is None else like
         row = torch.arange(self.height, dtype=like.dtype, device=like.device)
         column = torch.arange(self.width, dtype=like.dtype, device=like.device)
@@ -201,7 +207,7 @@ class Camera:
         return torch.stack((columns, rows), dim=-1)
 
     def contains(self, pixels: Tensor) -> Tensor:
-        """Return which pixels (..., 2) lie in the picture, (...,) bool; NaN never does."""
+        """Return a mask (...,) of the pixels (..., 2) that lie in the picture; NaN never does."""
         limit = pixels.new_tensor([self.width, self.height]) - 0.5
         return ((pixels >= -0.5) & (pixels <= limit)).all(-1)
 
@@ -218,19 +224,17 @@ class Camera:
         ratio = self.intrinsics.new_tensor([size[0] / self.width, size[1] / self.height])
         focal, center = self.intrinsics.split(2)
         intrinsics = torch.cat((focal * ratio, (center + 0.5) * ratio - 0.5))
-        return Camera(size[0], size[1], intrinsics, self.world_to_camera, self.distortion, self.name)
+        return replace(self, width=size[0], height=size[1], intrinsics=intrinsics)
 
     def moved(self, motion: Tensor) -> Camera:
-        """Return the camera carried along with the world by a rigid motion (4, 4)."""
-        check_rigid(motion, "motion")
-        placed = self.world_to_camera @ invert_rigid(motion.to(self.world_to_camera))
-        return Camera(self.width, self.height, self.intrinsics, placed, self.distortion, self.name)
+        """Return the camera after a rigid motion (4, 4) of the world that it stands in."""
+        check_rigid_motion(motion, "motion")
+        return replace(self, world_to_camera=self.world_to_camera @ invert_rigid(motion.to(self.world_to_camera)))
 
     def to(self, *args: Any, **kwargs: Any) -> Camera:
         """Return the camera on another device or in another dtype; takes what ``Tensor.to`` takes."""
-        parts = (self.intrinsics, self.world_to_camera, self.distortion)
-        intrinsics, motion, lens = (part.to(*args, **kwargs) for part in parts)
-        return Camera(self.width, self.height, intrinsics, motion, lens, self.name)
+        names = ("intrinsics", "world_to_camera", "distortion")
+        return replace(self, **{name: getattr(self, name).to(*args, **kwargs) for name in names})
 
     def view(self) -> View:
         """Return the camera as a view to rasterize with.
@@ -243,41 +247,47 @@ class Camera:
             raise InputError(f"camera must have square pixels and no distortion to rasterize, got fx {fx} and fy {fy}")
         motion = self.world_to_camera.detach().double().cpu()
         corner = torch.tensor([-0.5 - cx, -0.5 - cy], dtype=torch.float64) / fx
-        return View(self.position.detach().double().cpu(), motion[:3, :3], corner, 1 / fx, self.width, self.height)
+        return View(
+            position=self.position.detach().double().cpu(),
+            rotation=motion[:3, :3],
+            corner=corner,
+            pitch=1 / fx,
+            width=self.width,
+            height=self.height,
+        )
 
 
-def check_rigid(motion: Tensor, name: str) -> None:
+def check_rigid_motion(motion: Tensor, name: str) -> None:
     """Raise InputError unless ``motion`` is a finite (4, 4) rotation and translation, to 1e-6 (float32: 1e-4)."""
     check_shape(motion, name, (4, 4))
     check_finite(motion, name)
     still = motion.detach().double()
-    linear, eye = still[:3, :3], torch.eye(4, dtype=torch.float64, device=motion.device)
-    slack = _RIGID_SLACK if motion.dtype == torch.float64 else 100 * _RIGID_SLACK
-    off = float((linear @ linear.mT - eye[:3, :3]).abs().max())
-    if off > slack or float(torch.linalg.det(linear)) < 0 or float((still[3] - eye[3]).abs().max()) > slack:
+    error, last_row = rotation_error(still[:3, :3]), still[3] - still.new_tensor([0.0, 0.0, 0.0, 1.0])
+    tolerance = RIGID_TOLERANCE.double if motion.dtype == torch.float64 else RIGID_TOLERANCE.single
+    if error > tolerance or float(torch.linalg.det(still[:3, :3])) < 0 or float(last_row.abs().max()) > tolerance:
         raise InputError(
             f"{name} must be a rotation and a translation with the last row 0 0 0 1, got {still.tolist()}, whose "
-            f"rotation is off by {off:.2g}"
+            f"rotation is off by {error:.2g}"
         )
 
 
-def _numbers(value: Any, name: str) -> Tensor:
-    """Return a finite tensor of floating-point numbers, float64 unless it came as a floating-point tensor."""
+def _finite_numbers(value: Any, name: str) -> Tensor:
+    """Return the numbers as a finite floating-point tensor, float64 unless they came as a floating-point tensor."""
     if not hasattr(value, "dtype"):
-        value = _listed(value, name)
+        value = _float64(value, name)
     value = as_float_tensor(value, name)
     check_finite(value, name)
     return value
 
 
-def _listed(value: Any, name: str) -> Tensor:
+def _float64(value: Any, name: str) -> Tensor:
     try:
         return torch.tensor(value, dtype=torch.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} must hold numbers, got {value!r}") from error
 
 
-def _lens(plane: Tensor, lens: Tensor) -> Tensor:
+def _distort(plane: Tensor, lens: Tensor) -> Tensor:
     k1, k2, p1, p2, k3, k4, k5, k6 = lens.unbind()
     u, v = plane.unbind(-1)
     square = u * u + v * v
@@ -288,7 +298,7 @@ def _lens(plane: Tensor, lens: Tensor) -> Tensor:
 
 
 def lens_jacobian(plane: Tensor, lens: Tensor) -> Tensor:
-    """Return the (..., 2, 2) derivative of what the lens does to points (..., 2) of the plane at depth one.
+    """Return the derivative (..., 2, 2) of the distorted positions of points (..., 2) of the plane at depth one.
 
     Args:
         plane: (..., 2).
@@ -307,8 +317,8 @@ def lens_jacobian(plane: Tensor, lens: Tensor) -> Tensor:
     return torch.stack((uu, uv, uv, vv), dim=-1).unflatten(-1, (2, 2))
 
 
-def _solved(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Return the solutions (..., 2) of 2 x 2 systems; singular ones give something large, never an exception."""
+def _solve_2x2(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Return the solutions (..., 2) of 2 x 2 systems; large ones, not an exception, where the matrix is singular."""
     (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
     x, y = vector.unbind(-1)
     det = a * d - b * c

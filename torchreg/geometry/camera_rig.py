@@ -11,20 +11,20 @@ from torch import Tensor
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.camera import Camera
 
-# Rows of a rectified pair may differ by this many pixels.
+# Pixels by which rows of a rectified pair may differ.
 _ROW_SLACK = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class CameraRig:
-    """Cameras in one world, each under a name of its own.
+    """Cameras in a common world, by name.
 
     Args:
-        cameras: at least one; those without a name get their number.
+        cameras: at least one; those without a name are called camera0, camera1, ... by their number.
 
     Raises:
-        InputError: if there is none or two share a name.
-        InputTypeError: if something else than a camera is among them.
+        InputError: if there are none or two share a name.
+        InputTypeError: if an entry is not a camera.
     """
 
     cameras: tuple[Camera, ...]
@@ -40,14 +40,14 @@ class CameraRig:
         if not named:
             raise InputError("cameras must hold at least one camera, got none")
         names = [camera.name for camera in named]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise InputError(f"cameras must have different names, got {', '.join(twice)} more than once")
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
+            raise InputError(f"cameras must have different names, got {', '.join(repeated)} more than once")
         object.__setattr__(self, "cameras", named)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The cameras' names, in order."""
+        """Names of the cameras, in order."""
         return tuple(camera.name for camera in self.cameras)
 
     def __len__(self) -> int:
@@ -57,10 +57,10 @@ class CameraRig:
         return iter(self.cameras)
 
     def __getitem__(self, which: int | str) -> Camera:
-        """Return a camera by its place or name.
+        """Return a camera by its index or name.
 
         Raises:
-            InputError: if there is none of that name.
+            InputError: if there is no camera of that name.
         """
         if isinstance(which, int):
             return self.cameras[which]
@@ -72,7 +72,7 @@ class CameraRig:
         """Return two of the cameras as a pair.
 
         Raises:
-            InputError: as `StereoPair`, and if there are not two.
+            InputError: as `StereoPair`, and if the rig has fewer than two cameras.
         """
         if len(self) < 2:
             raise InputError(f"a stereo pair takes two cameras, the rig has {len(self)}")
@@ -91,8 +91,7 @@ class StereoPair:
         right: the camera on the right.
 
     Raises:
-        InputError: if the cameras stand at one place, look away from each other by more than 60 degrees, or are
-            swapped: the right one on the left of the left one.
+        InputError: if the cameras stand at one position, look apart by more than 60 degrees, or are swapped.
     """
 
     left: Camera
@@ -112,19 +111,17 @@ class StereoPair:
 
     @property
     def displacement(self) -> Tensor:
-        """Where the right camera stands in the coordinates of the left one, (3,) float64."""
-        motion = (
-            self.left.world_to_camera.double() @ self.right.camera_to_world.to(self.left.intrinsics.device).double()
-        )
-        return motion[:3, 3]
+        """Position (3,) float64 of the right camera in the coordinates of the left one."""
+        return self._right_to_left()[:3, 3]
 
     @property
     def rotation(self) -> Tensor:
-        """How the right camera is turned against the left one, ``R_left_right`` (3, 3) float64."""
-        motion = (
-            self.left.world_to_camera.double() @ self.right.camera_to_world.to(self.left.intrinsics.device).double()
-        )
-        return motion[:3, :3]
+        """Rotation (3, 3) float64 of the right camera relative to the left one, ``R_left_right``."""
+        return self._right_to_left()[:3, :3]
+
+    def _right_to_left(self) -> Tensor:
+        back = self.right.camera_to_world.to(self.left.intrinsics.device).double()
+        return self.left.world_to_camera.double() @ back
 
     @property
     def baseline(self) -> float:
@@ -132,19 +129,19 @@ class StereoPair:
         return float(self.displacement.norm())
 
     def row_error(self) -> float:
-        """Return the largest distance in pixels between rows or scales of the pictures that should be the same."""
+        """Return the largest difference in pixels between rows or scales of the pictures; infinite if distorted."""
         left, right = self.left, self.right
         if left.is_distorted or right.is_distorted or (left.width, left.height) != (right.width, right.height):
             return torch.inf
-        edge = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
-        pixels = edge * edge.new_tensor([left.width - 1, left.height - 1])
+        corners = torch.tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]], dtype=torch.float64)
+        pixels = corners * corners.new_tensor([left.width - 1, left.height - 1])
         left, right = left.to(device="cpu", dtype=torch.float64), right.to(device="cpu", dtype=torch.float64)
         far = left.unproject(pixels, torch.full((4,), 1e6 * self.baseline, dtype=torch.float64))
         near = left.unproject(pixels, torch.full((4,), 10 * self.baseline, dtype=torch.float64))
-        (there, _), (here, _) = right.project(far), right.project(near)
-        rows = torch.stack((there[:, 1], here[:, 1])) - pixels[:, 1]
-        # Far away there is no disparity but that of the principal points, the same all over the picture.
-        shift = there[:, 0] - pixels[:, 0] - (right.intrinsics[2] - left.intrinsics[2])
+        (far_pixels, _), (near_pixels, _) = right.project(far), right.project(near)
+        rows = torch.stack((far_pixels[:, 1], near_pixels[:, 1])) - pixels[:, 1]
+        # Far away the disparity is that of the principal points alone, the same all over the picture.
+        shift = far_pixels[:, 0] - pixels[:, 0] - (right.intrinsics[2] - left.intrinsics[2])
         return float(torch.cat((rows.flatten(), shift)).abs().nan_to_num(torch.inf).max())
 
     @property
@@ -161,11 +158,11 @@ class StereoPair:
             )
 
     def disparity(self, depth: Tensor) -> Tensor:
-        """Return the disparities (...,) in pixels of depths (...,) before a rectified pair."""
+        """Return the disparities (...,) in pixels of depths (...,) in front of a rectified pair."""
         return self._scale() / depth + self._shift()
 
     def depth(self, disparity: Tensor) -> Tensor:
-        """Return the depths (...,) of disparities (...,) of a rectified pair; NaN where there is no such depth."""
+        """Return the depths (...,) of disparities (...,) of a rectified pair; NaN for disparities beyond infinity."""
         parallax = disparity - self._shift()
         return torch.where(parallax > 0, self._scale() / torch.where(parallax > 0, parallax, 1.0), torch.nan)
 

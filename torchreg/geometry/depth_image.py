@@ -1,24 +1,20 @@
-"""Depth images as surfaces: pixels become points, and neighbors on one surface become triangles."""
+"""Depth images as surfaces: pixels become points, and neighboring pixels of a surface are joined by triangles."""
 
 from __future__ import annotations
-
-import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_positive, check_shape
-from torchreg.errors import InputError, InputTypeError
+from torchreg.errors import InputError
 
-# A surface this many times steeper than the jump that is allowed is cut in any case.
+# Largest difference in depth of joined pixels, in allowed jumps: steeper surfaces are cut even where they continue.
 _STEEPEST = 4.0
 
 
-def unproject(depth: Tensor, intrinsics: Sequence[float], max_jump: float) -> tuple[Tensor, Tensor]:
+def unproject(depth: Tensor, intrinsics: tuple[float, float, float, float], max_jump: float) -> tuple[Tensor, Tensor]:
     """Return the points (N, 3) and triangles (F, 3) of a depth image in camera coordinates: right, down, forward.
 
-    Triangles are wound towards the camera; pixels without one are left out. For the rule that joins pixels see
+    Triangles are wound towards the camera; pixels without a triangle are left out. For the rule that joins pixels see
     `RangeScan.from_depth`.
 
     Args:
@@ -27,14 +23,13 @@ def unproject(depth: Tensor, intrinsics: Sequence[float], max_jump: float) -> tu
         max_jump: allowed difference from a continued surface, in pixel widths.
 
     Raises:
-        InputError: if a size or number does not fit, or no three pixels join.
+        InputError: if no three pixels join.
     """
-    check_shape(depth, "depth", ("H", "W"))
-    focal_x, focal_y, center_x, center_y = _check_intrinsics(intrinsics)
+    focal_x, focal_y, center_x, center_y = intrinsics
     depth = torch.where(depth.isfinite() & (depth > 0), depth, torch.nan)
-    across = _joined(depth, focal_x, max_jump)
-    down = _joined(depth.mT, focal_y, max_jump).mT
-    faces = _triangles(depth, across, down)
+    across = _continues(depth, focal_x, max_jump)
+    down = _continues(depth.mT, focal_y, max_jump).mT
+    faces = _pixel_triangles(depth, across, down)
     if len(faces) == 0:
         valid = int(depth.isfinite().sum())
         raise InputError(
@@ -48,36 +43,24 @@ def unproject(depth: Tensor, intrinsics: Sequence[float], max_jump: float) -> tu
     return points.reshape(-1, 3)[used], faces
 
 
-def _check_intrinsics(intrinsics: Sequence[float]) -> tuple[float, float, float, float]:
-    try:
-        focal_x, focal_y, center_x, center_y = (float(value) for value in intrinsics)
-    except (TypeError, ValueError) as error:
-        raise InputTypeError(f"intrinsics must be the four numbers fx, fy, cx, cy, got {intrinsics!r}") from error
-    check_positive(focal_x, "intrinsics[0] (fx)")
-    check_positive(focal_y, "intrinsics[1] (fy)")
-    if not math.isfinite(center_x) or not math.isfinite(center_y):
-        raise InputError(f"intrinsics must be finite, got cx {center_x} and cy {center_y}")
-    return focal_x, focal_y, center_x, center_y
-
-
-def _joined(depth: Tensor, focal: float, max_jump: float) -> Tensor:
-    """Return which pixels are on one surface with the next in their row, (H, W - 1) bool; NaN depths never are."""
+def _continues(depth: Tensor, focal: float, max_jump: float) -> Tensor:
+    """Return a mask (H, W - 1) of the pixels whose surface continues to the next in their row; NaN depths never do."""
     step = depth[:, 1:] - depth[:, :-1]
-    gap = torch.full_like(depth[:, :1], torch.nan)
-    bend = (step[:, 1:] - step[:, :-1]).abs()
+    unknown = torch.full_like(depth[:, :1], torch.nan)
+    curvature = (step[:, 1:] - step[:, :-1]).abs()
     width = torch.minimum(depth[:, 1:], depth[:, :-1]) / focal
-    relative = (bend / width[:, 1:]).reshape(-1)
+    relative = (curvature / width[:, 1:]).reshape(-1)
     relative = relative[relative.isfinite()]
     noise = float(relative.median()) if len(relative) else 0.0
     unit = width * max(1.0, noise)
-    # The surface on either side, continued; or a level one, which is all there is to go by at its rim.
-    before, after = torch.cat((gap, step), dim=1)[:, : step.shape[1]], torch.cat((step, gap), dim=1)[:, 1:]
-    misses = torch.stack((step, step - before, step - after)).abs().nan_to_num(torch.inf).amin(dim=0)
-    return (misses <= max_jump * unit) & (step.abs() <= _STEEPEST * max_jump * unit)
+    # Predictions: the surface on either side, continued, or a level one, the only prediction at its rim.
+    before, after = torch.cat((unknown, step), dim=1)[:, : step.shape[1]], torch.cat((step, unknown), dim=1)[:, 1:]
+    residuals = torch.stack((step, step - before, step - after)).abs().nan_to_num(torch.inf).amin(dim=0)
+    return (residuals <= max_jump * unit) & (step.abs() <= _STEEPEST * max_jump * unit)
 
 
-def _triangles(depth: Tensor, across: Tensor, down: Tensor) -> Tensor:
-    """Return (F, 3) flat pixel indices; of two ways to split four pixels the one with more triangles, or flatter."""
+def _pixel_triangles(depth: Tensor, across: Tensor, down: Tensor) -> Tensor:
+    """Return triangles (F, 3) of flat pixel indices; four pixels are split along the diagonal with more, or flatter."""
     height, width = depth.shape
     top, bottom, left, right = across[:-1], across[1:], down[:, :-1], down[:, 1:]
     upper_left, upper_right = depth[:-1, :-1], depth[:-1, 1:]

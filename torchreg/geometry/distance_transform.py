@@ -1,4 +1,4 @@
-"""Masks on a grid as fields: how far every cell is from the border, and which cell of the mask is nearest."""
+"""Distance transforms of masks on a grid: each cell's signed distance to the border, and its nearest cell inside."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from torch import Tensor
 
 
 def signed_distance(mask: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return the distance of every cell's middle to the border of a mask, negative inside, in cells.
+    """Return the distance of every cell's center to the border of a mask, negative inside, in cells.
 
-    The border runs half a cell beside the middles of the cells along it.
+    The border runs half a cell beside the centers of the cells along it.
 
     Args:
         mask: bool of any shape and at least one cell.
@@ -28,21 +28,20 @@ def signed_distance(mask: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
     if inside.all() or not inside.any():
         distance = torch.full(mask.shape, torch.inf, dtype=dtype)
     else:
-        # One of the two is zero everywhere.
-        apart = distance_transform_edt(inside) + distance_transform_edt(~inside)
-        distance = torch.from_numpy(apart).to(dtype) - 0.5
+        # In every cell either term is zero.
+        unsigned = distance_transform_edt(inside) + distance_transform_edt(~inside)
+        distance = torch.from_numpy(unsigned).to(dtype) - 0.5
     distance = distance.to(mask.device)
     return torch.where(mask, -distance, distance)
 
 
 def nearest_inside(mask: Tensor) -> Tensor:
-    """Return the running number (...) int64 of the cell of a mask (...) bool nearest to each cell of its grid.
+    """Return the flat index (...) int64 of the cell inside a mask that is nearest to each cell of its grid.
 
     Args:
-        mask: with at least one cell inside.
+        mask: (...) bool, at least one cell inside.
 
     Differentiable: no.
     """
-    at = distance_transform_edt(~mask.cpu().numpy(), return_distances=False, return_indices=True)
-    number = np.ravel_multi_index(tuple(at), tuple(mask.shape))
-    return torch.from_numpy(number).to(mask.device)
+    indices = distance_transform_edt(~mask.cpu().numpy(), return_distances=False, return_indices=True)
+    return torch.from_numpy(np.ravel_multi_index(tuple(indices), tuple(mask.shape))).to(mask.device)

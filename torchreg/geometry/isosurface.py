@@ -9,79 +9,64 @@ from itertools import permutations
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_finite, check_positive, check_shape
 from torchreg.errors import InputError
+from torchreg.geometry.budget import BUDGET
 from torchreg.geometry.mesh import TriangleMesh
 
 # Kuhn's six tetrahedra of a cube: the monotone paths from corner 0 to corner 7; they match across cube faces.
 _TETRAHEDRA = [[0, 1 << a, (1 << a) | (1 << b), 7] for a, b, _ in permutations(range(3))]
 # Offsets of the 8 corners: bit a of a corner's number is its step along axis a.
 _CORNERS = [(c & 1, c >> 1 & 1, c >> 2 & 1) for c in range(8)]
-# Per number of inside corners (which come first): triangles as three (inside, outside) edges, with normals towards the
+# Triangles per number of inside corners, which come first: three (inside, outside) edges each, with normals towards the
 # outside where the four corners are right-handed.
 _TRIANGLES = {
     1: [((0, 1), (0, 2), (0, 3))],
     2: [((0, 2), (0, 3), (1, 2)), ((1, 2), (0, 3), (1, 3))],
     3: [((0, 3), (1, 3), (2, 3))],
 }
-_MAX_GRID_POINTS = 50_000_000
-_CHUNK = 65_536
 
 
-def isosurface(
-    field: Callable[[Tensor], Tensor], lower: Tensor, upper: Tensor, spacing: float, *, chunk: int = _CHUNK
-) -> TriangleMesh:
+def isosurface(field: Callable[[Tensor], Tensor], lower: Tensor, upper: Tensor, spacing: float) -> TriangleMesh:
     """Return the triangle mesh on which a field is zero, oriented from negative to positive values.
 
     Marching tetrahedra: the field is linear on each tetrahedron of a cubic grid. The mesh is closed where the surface
     stays inside the box.
 
     Args:
-        field: (n, 3) points to (n,) values.
+        field: (n, 3) points to (n,) finite values.
         lower: (3,) lower corner of the box.
         upper: (3,) upper corner of the box; the grid may reach up to one spacing beyond it.
         spacing: edge length of the grid's cubes, in the unit of the box.
-        chunk: number of points the field is asked for at a time.
 
     Returns:
-        the mesh; without faces if the field does not change sign on the grid.
+        The mesh; without faces if the field does not change sign on the grid.
 
     Raises:
-        InputError: if the box is empty or would need more than 50 million grid points, or the field does not return
-            one finite value per point.
+        InputError: if the grid would hold more than 50 million samples.
 
     Differentiable: no.
 
-    Cost: one evaluation of the field per grid point.
+    Cost: one evaluation of the field per sample.
 
     References: Doi and Koide 1991.
     """
-    grid = _Grid(as_float_tensor(lower, "lower"), as_float_tensor(upper, "upper"), spacing)
+    grid = _Grid(lower, upper, spacing)
     with torch.no_grad():
-        count = math.prod(grid.sizes)
-        parts = [(start, min(start + chunk, count)) for start in range(0, count, chunk)]
-        device = grid.lower.device
-        values = torch.cat([_evaluate(field, grid.points(torch.arange(*part, device=device))) for part in parts])
-        check_finite(values, "the field's values")
-        return _march(grid, values)
+        samples = torch.arange(math.prod(grid.sizes), device=lower.device).split(BUDGET.field_points)
+        return _march(grid, torch.cat([field(grid.points(index)) for index in samples]))
 
 
 class _Grid:
     """A cubic grid: flat indices to points, without holding the points."""
 
     def __init__(self, lower: Tensor, upper: Tensor, spacing: float) -> None:
-        for name, corner in (("lower", lower), ("upper", upper)):
-            check_shape(corner, name, (3,))
-            check_finite(corner, name)
-        check_positive(spacing, "spacing")
-        if not bool((upper > lower).all()):
-            raise InputError(f"upper must be above lower on every axis, got {upper.tolist()} and {lower.tolist()}")
         self.lower = lower
         self.spacing = spacing
         self.sizes = [math.ceil(extent / spacing) + 1 for extent in (upper - lower).tolist()]
-        if math.prod(self.sizes) > _MAX_GRID_POINTS:
+        if math.prod(self.sizes) > BUDGET.volume_samples:
             raise InputError(
-                f"spacing {spacing} gives a grid of {self.sizes} points, over {_MAX_GRID_POINTS}; choose a larger one"
+                f"spacing {spacing} gives a grid of {self.sizes} points, over {BUDGET.volume_samples}; choose a larger "
+                f"one"
             )
 
     def steps(self, index: Tensor) -> Tensor:
@@ -94,14 +79,8 @@ class _Grid:
         return self.lower + self.spacing * self.steps(index).to(self.lower.dtype)
 
 
-def _evaluate(field: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
-    values = field(points)
-    check_shape(values, "the field's values", (len(points),))
-    return values
-
-
 def _march(grid: _Grid, values: Tensor) -> TriangleMesh:
-    corners = _cut_cubes(values, grid.sizes)
+    corners = _mixed_cubes(values, grid.sizes)
     tetrahedra = corners[:, torch.tensor(_TETRAHEDRA, device=values.device)].reshape(-1, 4)
     inside = values[tetrahedra] < 0
     count = inside.sum(-1)
@@ -119,11 +98,11 @@ def _march(grid: _Grid, values: Tensor) -> TriangleMesh:
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
     keys, faces = faces.unique(return_inverse=True)
     edges = torch.stack([keys // values.numel(), keys % values.numel()], dim=-1)
-    return TriangleMesh(_crossings(grid, values, edges), faces.reshape(-1, 3))
+    return TriangleMesh(_edge_zeros(grid, values, edges), faces.reshape(-1, 3))
 
 
-def _crossings(grid: _Grid, values: Tensor, edges: Tensor) -> Tensor:
-    """Return the zeros of the field, linear along (inside, outside) edges; the corner itself for a doubled corner."""
+def _edge_zeros(grid: _Grid, values: Tensor, edges: Tensor) -> Tensor:
+    """Return the zeros of the field, linear along (inside, outside) edges; the corner of an edge between equal ends."""
     inner, outer = values[edges].unbind(-1)
     span = inner - outer
     share = torch.where(span == 0, 0.0, inner / torch.where(span == 0, 1.0, span))
@@ -132,23 +111,23 @@ def _crossings(grid: _Grid, values: Tensor, edges: Tensor) -> Tensor:
 
 
 def _left_handed(grid: _Grid, tetrahedra: Tensor) -> Tensor:
-    """Return whether the corners of tetrahedra (T, 4) are left-handed; on integer steps, so never in doubt."""
+    """Return a mask of the tetrahedra (T, 4) with left-handed corners; on integer steps, so free of rounding."""
     steps = grid.steps(tetrahedra)
     a, b, c = (steps[:, 1:] - steps[:, :1]).unbind(1)
     return (torch.linalg.cross(a, b) * c).sum(-1) < 0
 
 
-def _cut_cubes(values: Tensor, sizes: list[int]) -> Tensor:
+def _mixed_cubes(values: Tensor, sizes: list[int]) -> Tensor:
     """Return the (C, 8) flat corner indices of every cube in which the field changes sign."""
     negative = (values < 0).reshape(sizes)
     shape = [size - 1 for size in sizes]
-    some = torch.zeros(shape, dtype=torch.bool, device=values.device)
-    every = torch.ones_like(some)
+    any_inside = torch.zeros(shape, dtype=torch.bool, device=values.device)
+    all_inside = torch.ones_like(any_inside)
     for x, y, z in _CORNERS:
         corner = negative[x : x + shape[0], y : y + shape[1], z : z + shape[2]]
-        some |= corner
-        every &= corner
-    first = (some & ~every).nonzero()
+        any_inside |= corner
+        all_inside &= corner
+    first = (any_inside & ~all_inside).nonzero()
     strides = torch.tensor([sizes[1] * sizes[2], sizes[2], 1], device=values.device)
     offsets = torch.tensor(_CORNERS, device=values.device)
     return ((first.unsqueeze(1) + offsets) * strides).sum(-1)

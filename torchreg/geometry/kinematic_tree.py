@@ -1,4 +1,4 @@
-"""The kinematic tree as plain data: what files deliver and what models are built from."""
+"""Kinematic trees as plain data: read from files, and the basis of articulated shapes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import torch
 from torch import Tensor
 
 from torchreg.errors import ModelError
+from torchreg.geometry.rigid import RIGID_TOLERANCE, rotation_error
 
 JOINT_TYPES = ("fixed", "revolute", "prismatic")
 
 
 @dataclass(frozen=True)
 class Joint:
-    """One frame of the tree and the joint that carries it on its parent.
+    """A frame of the tree and the joint that connects it to its parent.
 
     A frame moves with its joint: ``T_parent_frame = offset @ motion(value)``, the motion about or along ``axis`` in the
     frame's own coordinates. Joints with several degrees of freedom are stacked frames, which coincide.
@@ -89,10 +90,10 @@ def _check_joint(index: int, joint: Joint, count: int) -> None:
         raise ModelError(f"joint {joint.name!r} has kind {joint.kind!r}; known: {', '.join(JOINT_TYPES)}")
     if tuple(joint.offset.shape) != (4, 4) or not bool(torch.isfinite(joint.offset).all()):
         raise ModelError(f"joint {joint.name!r} needs a finite (4, 4) offset")
-    rotation, bottom = joint.offset[:3, :3].double(), joint.offset[3].tolist()
-    if bottom != [0.0, 0.0, 0.0, 1.0]:
-        raise ModelError(f"joint {joint.name!r} has an offset whose last row is {bottom}; it must be 0, 0, 0, 1")
-    if not torch.allclose(rotation @ rotation.mT, torch.eye(3, dtype=torch.float64), atol=1e-4) or rotation.det() < 0:
+    rotation, last_row = joint.offset[:3, :3].double(), joint.offset[3].tolist()
+    if last_row != [0.0, 0.0, 0.0, 1.0]:
+        raise ModelError(f"joint {joint.name!r} has an offset whose last row is {last_row}; it must be 0, 0, 0, 1")
+    if rotation_error(rotation) > RIGID_TOLERANCE.single or rotation.det() < 0:
         raise ModelError(f"joint {joint.name!r} has an offset that is not a rigid motion (scale, shear or mirror)")
 
 
@@ -107,20 +108,20 @@ def _check_axis_and_limits(joint: Joint) -> None:
 
 
 def _check_mimic(joint: Joint, joints: tuple[Joint, ...]) -> None:
-    """Follow the chain of joints that ``joint`` mimics to one that moves by itself."""
+    """Raise ModelError unless the chain of joints that ``joint`` mimics ends in a joint that moves by itself."""
     seen = [joint.name]
-    at = joint
-    while at.mimic is not None:
-        followed, multiplier, offset = at.mimic
+    source = joint
+    while source.mimic is not None:
+        followed, multiplier, offset = source.mimic
         if not 0 <= followed < len(joints):
-            raise ModelError(f"joint {at.name!r} mimics the joint of index {followed}, but there are {len(joints)}")
+            raise ModelError(f"joint {source.name!r} mimics the joint of index {followed}, but there are {len(joints)}")
         if not (math.isfinite(multiplier) and math.isfinite(offset)):
             raise ModelError(
-                f"joint {at.name!r} has a mimic of multiplier {multiplier} and offset {offset}; not finite"
+                f"joint {source.name!r} has a mimic of multiplier {multiplier} and offset {offset}; not finite"
             )
-        at = joints[followed]
-        if at.name in seen:
+        source = joints[followed]
+        if source.name in seen:
             raise ModelError(f"joint {joint.name!r} follows itself through its mimic joints: {', '.join(seen)}")
-        seen.append(at.name)
-    if len(seen) > 1 and "fixed" in (joint.kind, at.kind):
-        raise ModelError(f"joint {joint.name!r} mimics {at.name!r}: neither of the two may be fixed")
+        seen.append(source.name)
+    if len(seen) > 1 and "fixed" in (joint.kind, source.kind):
+        raise ModelError(f"joint {joint.name!r} mimics {source.name!r}: neither of the two may be fixed")

@@ -1,4 +1,4 @@
-"""Meshing a sampled volume by marching cubes whose table of cases is derived, not copied: closed, without ambiguity."""
+"""Meshing a sampled volume by marching cubes; the table of cases is derived such that meshes close unambiguously."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_finite, check_positive, check_shape
-from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 
-# Bit a of a corner's number is its step along axis a. An edge is its lower corner and its axis.
+# Edges as (lower corner, axis); bit a of a corner's number is its step along axis a.
 _EDGES = tuple((corner, axis) for axis in range(3) for corner in range(8) if not corner >> axis & 1)
-# Crossings keep this share of an edge away from its ends, so that no triangle collapses.
+# Least distance of a vertex from the ends of its edge, as a share of the edge, so that no triangle collapses.
 _MARGIN = 1e-3
 
 
@@ -26,15 +24,12 @@ def marching_cubes(values: Tensor, origin: Tensor, spacing: float) -> TriangleMe
     the same rule in both cubes.
 
     Args:
-        values: (X, Y, Z) samples on a cubic grid, at least two along each axis.
-        origin: (3,) where sample (0, 0, 0) lies.
+        values: (X, Y, Z) finite samples on a cubic grid, at least two along each axis.
+        origin: (3,) position of sample (0, 0, 0).
         spacing: between samples, in the unit of ``origin``.
 
     Returns:
-        the mesh, in the dtype of ``values``; without faces if there is no change of sign.
-
-    Raises:
-        InputError: if a shape is wrong or a number not finite.
+        The mesh, in the dtype of ``values``; without faces if there is no change of sign.
 
     Differentiable: no.
 
@@ -42,25 +37,16 @@ def marching_cubes(values: Tensor, origin: Tensor, spacing: float) -> TriangleMe
 
     References: Lorensen and Cline 1987.
     """
-    values = as_float_tensor(values, "values")
-    check_shape(values, "values", ("X", "Y", "Z"))
-    if min(values.shape) < 2:
-        raise InputError(f"values must have at least two samples along each axis, got {tuple(values.shape)}")
-    check_finite(values, "values")
-    origin = as_float_tensor(origin, "origin", like=values)
-    check_shape(origin, "origin", (3,))
-    check_finite(origin, "origin")
-    check_positive(spacing, "spacing")
     with torch.no_grad():
         negative = values < 0
         keys, vertices = _crossings(values, negative)
         cubes, cases = _cut_cubes(negative)
-        faces = torch.searchsorted(keys, _triangles(cubes, cases, values.shape).reshape(-1)).reshape(-1, 3)
-        return TriangleMesh(origin + spacing * vertices, faces)
+        faces = torch.searchsorted(keys, _case_triangles(cubes, cases, values.shape).reshape(-1)).reshape(-1, 3)
+        return TriangleMesh(origin.to(values) + spacing * vertices, faces)
 
 
 def _crossings(values: Tensor, negative: Tensor) -> tuple[Tensor, Tensor]:
-    """Return sorted keys of the grid's edges on which the sign changes, and where (in steps of the grid)."""
+    """Return sorted keys of the grid's edges on which the sign changes, and positions of the zeros in grid steps."""
     count, keys, points = values.numel(), [], []
     strides = torch.tensor([values.shape[1] * values.shape[2], values.shape[2], 1], device=values.device)
     flat = values.reshape(-1)
@@ -70,10 +56,10 @@ def _crossings(values: Tensor, negative: Tensor) -> tuple[Tensor, Tensor]:
         steps = changes.nonzero()
         lower = steps @ strides
         start, end = flat[lower], flat[lower + int(strides[axis])]
-        place = steps.to(values)
-        place[:, axis] += (start / (start - end)).clamp(_MARGIN, 1 - _MARGIN)
+        zeros = steps.to(values)
+        zeros[:, axis] += (start / (start - end)).clamp(_MARGIN, 1 - _MARGIN)
         keys.append(axis * count + lower)
-        points.append(place)
+        points.append(zeros)
     return torch.cat(keys), torch.cat(points)
 
 
@@ -89,8 +75,8 @@ def _cut_cubes(negative: Tensor) -> tuple[Tensor, Tensor]:
     return cubes, code[cubes[:, 0], cubes[:, 1], cubes[:, 2]].long()
 
 
-def _triangles(cubes: Tensor, cases: Tensor, shape: torch.Size) -> Tensor:
-    """Return the keys (F, 3) of the crossings that each triangle joins."""
+def _case_triangles(cubes: Tensor, cases: Tensor, shape: torch.Size) -> Tensor:
+    """Return the keys (F, 3) of the edges that carry the vertices of each triangle."""
     table, first, count = (part.to(cases.device) for part in _table())
     strides = torch.tensor([shape[1] * shape[2], shape[2], 1], device=cases.device)
     corners = torch.tensor([[corner >> axis & 1 for axis in range(3)] for corner, _ in _EDGES], device=cases.device)
@@ -105,22 +91,22 @@ def _triangles(cubes: Tensor, cases: Tensor, shape: torch.Size) -> Tensor:
 
 @cache
 def _table() -> tuple[Tensor, Tensor, Tensor]:
-    """Return the triangles (N, 3) of all 256 cases as edges, and where each case's begin and how many they are."""
+    """Return the triangles (N, 3) of all 256 cases as edge indices, and per case its first triangle and their count."""
     rows = [[triangle for loop in _loops(case) for triangle in _triangulated(loop)] for case in range(256)]
     count = torch.tensor([len(row) for row in rows])
     return torch.tensor([triangle for row in rows for triangle in row]), count.cumsum(0) - count, count
 
 
 def _loops(case: int) -> list[list[int]]:
-    """Return the closed polygons of crossed edges that part the negative corners of a cube from the others."""
+    """Return the closed polygons of crossed edges that separate negative from positive corners of a cube."""
     follows: dict[int, int] = {}
-    for corners in _faces():
+    for corners in _cube_faces():
         inside = [bool(case >> corner & 1) for corner in corners]
         for k in range(4):
             if inside[k] and not inside[k - 1]:  # a run of negative corners begins: cut it off where it ends
                 end = next(j for j in range(k + 1, k + 4) if not inside[j % 4])
-                entering = _edge(corners[k - 1], corners[k])
-                follows[entering] = _edge(corners[(end - 1) % 4], corners[end % 4])
+                entering = _edge_index(corners[k - 1], corners[k])
+                follows[entering] = _edge_index(corners[(end - 1) % 4], corners[end % 4])
     loops = []
     while follows:
         loop = [next(iter(follows))]
@@ -130,7 +116,7 @@ def _loops(case: int) -> list[list[int]]:
     return loops
 
 
-def _faces() -> list[list[int]]:
+def _cube_faces() -> list[list[int]]:
     """Return the four corners of each face of a cube, counterclockwise as seen from outside."""
     faces = []
     for axis in range(3):
@@ -140,21 +126,21 @@ def _faces() -> list[list[int]]:
     return faces
 
 
-def _edge(corner: int, other: int) -> int:
-    return _EDGES.index((min(corner, other), (corner ^ other).bit_length() - 1))
+def _edge_index(start: int, end: int) -> int:
+    return _EDGES.index((min(start, end), (start ^ end).bit_length() - 1))
 
 
 def _triangulated(loop: list[int]) -> list[tuple[int, int, int]]:
-    """Return triangles of a polygon no diagonal of which lies in a face, where the next cube could have one too."""
+    """Return triangles of a polygon without diagonals in a face of the cube, where the next cube could have one too."""
     if len(loop) == 3:
         return [(loop[0], loop[1], loop[2])]
     count = len(loop)
     start, end = next(
-        (k, m) for k, m in combinations(range(count), 2) if 1 < m - k < count - 1 and not _on_one_face(loop[k], loop[m])
+        (k, m) for k, m in combinations(range(count), 2) if 1 < m - k < count - 1 and not _share_face(loop[k], loop[m])
     )
     return _triangulated(loop[start : end + 1]) + _triangulated(loop[end:] + loop[: start + 1])
 
 
-def _on_one_face(first: int, second: int) -> bool:
+def _share_face(first: int, second: int) -> bool:
     corners = {corner | bit for corner, axis in (_EDGES[first], _EDGES[second]) for bit in (0, 1 << axis)}
-    return any(corners <= set(face) for face in _faces())
+    return any(corners <= set(face) for face in _cube_faces())

@@ -1,4 +1,4 @@
-"""Triangle meshes as plain data, with the few operations that everything above them shares."""
+"""Triangle meshes as plain data: areas, normals, surface samples, interpolation over faces, spheres."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_choice, check_finite, check_same_kind, check_shape
+from torchreg._checks import as_float_tensor, check_choice, check_finite, check_shape
 from torchreg.errors import InputError, InputTypeError
-
-MAX_SUBDIVISIONS = 8
+from torchreg.geometry.budget import BUDGET
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,17 +69,17 @@ class TriangleMesh:
         return _unit_cross(first, second)[0]
 
     def vertex_normals(self, weighting: str = "angle") -> Tensor:
-        """Return the (V, 3) unit normals at the vertices, averaged over the adjoining faces.
+        """Return the (V, 3) unit normals at the vertices, averaged over the adjacent faces.
 
         Args:
-            weighting: ``"angle"`` weighs each face with its angle at the vertex, which does not depend on how the
-                surface was cut into triangles; ``"area"`` weighs it with its area, which is cheaper.
+            weighting: ``"angle"`` weighs each face with its angle at the vertex, so that normals do not depend on the
+                triangulation; ``"area"`` weighs it with its area, which is cheaper.
 
         Returns:
-            Unit vectors; zero at vertices without a face (of nonzero area), or where the normals cancel.
+            Unit vectors (V, 3); zero at vertices without a face of nonzero area, or where the normals cancel.
 
         Raises:
-            InputError: if ``weighting`` is neither.
+            InputError: if ``weighting`` is unknown.
 
         Differentiable: in the vertices.
 
@@ -94,7 +93,7 @@ class TriangleMesh:
         else:
             corners = normals[:, None] * _corner_angles(first, second, flat)[..., None]
         total = torch.zeros_like(self.vertices).index_add(0, self.faces.reshape(-1), corners.reshape(-1, 3))
-        return _unit(total)[0]
+        return _unit_or_zero(total)[0]
 
     def bounds(self) -> Tensor:
         """Return the (2, 3) smallest and largest coordinates of the vertices; InputError if there are none."""
@@ -129,8 +128,8 @@ def _check_faces(faces: Any, vertices: Tensor) -> Tensor:
     return faces
 
 
-def _unit(vectors: Tensor) -> tuple[Tensor, Tensor]:
-    """Return unit vectors and the (...,) mask of those that have none and are zero instead, also to the gradient."""
+def _unit_or_zero(vectors: Tensor) -> tuple[Tensor, Tensor]:
+    """Return unit vectors, zero for zero vectors and to their gradient, and the mask (...,) of these."""
     # Scaled by the largest component first: squares of tiny lengths underflow in float32.
     scale = vectors.detach().abs().amax(dim=-1, keepdim=True)
     empty = scale <= torch.finfo(vectors.dtype).tiny
@@ -140,13 +139,13 @@ def _unit(vectors: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _unit_cross(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Return unit vectors along first x second, zero where the two are parallel to rounding, and the mask of those."""
-    first, first_empty = _unit(first)
-    second, second_empty = _unit(second)
+    """Return unit vectors along first x second, zero where the two are parallel to rounding, and the mask of these."""
+    first, first_empty = _unit_or_zero(first)
+    second, second_empty = _unit_or_zero(second)
     cross = torch.linalg.cross(first, second, dim=-1)
     sine = torch.linalg.vector_norm(cross.detach(), dim=-1)
     flat = first_empty | second_empty | (sine <= 8 * torch.finfo(first.dtype).eps)
-    unit, _ = _unit(torch.where(flat[..., None], torch.zeros_like(cross), cross))
+    unit, _ = _unit_or_zero(torch.where(flat[..., None], torch.zeros_like(cross), cross))
     return unit, flat
 
 
@@ -157,11 +156,16 @@ def _corner_angles(first: Tensor, second: Tensor, flat: Tensor) -> Tensor:
     first = torch.where(flat[:, None], stand_in[0], first)
     second = torch.where(flat[:, None], stand_in[1], second)
     sides = torch.stack((first, second - first, -second), dim=1)
-    outgoing = _unit(sides)[0]
+    outgoing = _unit_or_zero(sides)[0]
     incoming = -outgoing.roll(1, dims=1)
     sine = torch.linalg.vector_norm(torch.linalg.cross(outgoing, incoming, dim=-1), dim=-1)
     angles = torch.atan2(sine, (outgoing * incoming).sum(dim=-1))
     return torch.where(flat[:, None], torch.zeros_like(angles), angles)
+
+
+def cross_2d(first: Tensor, second: Tensor) -> Tensor:
+    """Return the cross products (N,) of plane vectors (N, 2), twice the signed areas of the triangles they span."""
+    return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
 
 
 def sample_surface(
@@ -175,26 +179,25 @@ def sample_surface(
         generator: source of randomness; None draws from a fresh generator with seed 0, the same points at every call.
 
     Returns:
-        points (count, 3), face_index (count,) int64, barycentric (count, 3) weights of the face's three vertices.
+        Points (count, 3), face_index (count,) int64, barycentric (count, 3) weights of the face's three vertices.
 
     Raises:
-        InputError: if ``count`` is negative or the surface has no area.
+        InputError: if the surface has no area.
 
     Differentiable: in the vertices, with the drawn faces and weights held fixed.
     """
-    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
-        raise InputError(f"count must be a non-negative integer, got {count!r}")
     device, dtype = mesh.vertices.device, mesh.vertices.dtype
     # Cumulative areas in double precision: float32 sums stop growing on large meshes.
-    reach = TriangleMesh(mesh.vertices.detach().double(), mesh.faces).face_areas().cumsum(dim=0)
-    if mesh.num_faces == 0 or not float(reach[-1]) > 0:
+    cumulative = TriangleMesh(mesh.vertices.detach().double(), mesh.faces).face_areas().cumsum(dim=0)
+    if mesh.num_faces == 0 or not float(cumulative[-1]) > 0:
         raise InputError(f"mesh must have a surface to sample, got {mesh.num_faces} faces of total area 0")
     if generator is None:
         generator = torch.Generator(device=device).manual_seed(0)
     draws = torch.rand(3, count, generator=generator, device=generator.device, dtype=torch.float64).to(device)
     # Stay below the last value: faces of zero area at the end must not be drawn.
-    place = torch.minimum(draws[0] * reach[-1], torch.nextafter(reach[-1], torch.zeros_like(reach[-1])))
-    face_index = torch.searchsorted(reach, place, right=True)
+    total = cumulative[-1]
+    level = torch.minimum(draws[0] * total, torch.nextafter(total, torch.zeros_like(total)))
+    face_index = torch.searchsorted(cumulative, level, right=True)
     root = draws[1].sqrt()
     barycentric = torch.stack((1 - root, root * (1 - draws[2]), root * draws[2]), dim=-1).to(dtype)
     return interpolate(mesh.vertices, mesh.faces, face_index, barycentric), face_index, barycentric
@@ -207,21 +210,13 @@ def interpolate(values: Tensor, faces: Tensor, face_index: Tensor, barycentric: 
         values: (V, ...) floating-point values at the vertices.
         faces: (F, 3) vertex indices.
         face_index: (N,) face that each point lies on.
-        barycentric: (N, 3) weights of that face's vertices.
+        barycentric: (N, 3) weights of that face's vertices, of the dtype of the values.
 
     Returns:
-        (N, ...) interpolated values.
-
-    Raises:
-        InputError: if the sizes do not fit together.
-        InputTypeError: if values and weights differ in dtype or device.
+        Interpolated values (N, ...).
 
     Differentiable: in ``values`` and ``barycentric``.
     """
-    check_shape(faces, "faces", ("F", 3))
-    check_shape(face_index, "face_index", ("N",))
-    check_shape(barycentric, "barycentric", (face_index.shape[0], 3))
-    check_same_kind(barycentric, "barycentric", values, "values")
     return torch.einsum("nc,nc...->n...", barycentric, values[faces[face_index]])
 
 
@@ -229,19 +224,35 @@ def unit_sphere(subdivisions: int = 3, *, dtype: torch.dtype | None = None) -> T
     """Return a closed, outward-facing approximation of the unit sphere: an icosahedron with its faces split in four.
 
     Args:
-        subdivisions: how often the 20 faces are split; 10 * 4**subdivisions + 2 vertices; 0 to 8.
+        subdivisions: times that the faces are split, 0 to 8; there are 10 * 4**subdivisions + 2 vertices.
         dtype: floating-point type of the vertices; torch's default when None.
 
     Raises:
         InputError: if ``subdivisions`` is out of range.
     """
-    if isinstance(subdivisions, bool) or not isinstance(subdivisions, int) or not 0 <= subdivisions <= MAX_SUBDIVISIONS:
-        raise InputError(f"subdivisions must be an integer from 0 to {MAX_SUBDIVISIONS}, got {subdivisions!r}")
+    most = BUDGET.subdivisions
+    if isinstance(subdivisions, bool) or not isinstance(subdivisions, int) or not 0 <= subdivisions <= most:
+        raise InputError(f"subdivisions must be an integer from 0 to {most}, got {subdivisions!r}")
     vertices, faces = _icosahedron()
     for _ in range(subdivisions):
         vertices, faces = _split_in_four(vertices, faces)
         vertices = vertices / torch.linalg.vector_norm(vertices, dim=-1, keepdim=True)
     return TriangleMesh(vertices.to(dtype or torch.get_default_dtype()), faces)
+
+
+def distinct_faces(faces: Tensor) -> Tensor:
+    """Return the faces (F, 3) with three different corners, each once."""
+    low, middle, high = faces.sort(dim=1).values.unbind(1)
+    proper = (low != middle) & (middle != high)
+    faces, low, middle, high = (values[proper] for values in (faces, low, middle, high))
+    if len(faces) == 0:
+        return faces
+    count = int(high.max()) + 1
+    # Two numbers per face instead of three: three might not fit into 64 bits.
+    pair = (low * count + middle).unique(return_inverse=True)[1]
+    key, order = (pair * count + high).sort(stable=True)
+    first = torch.cat((key.new_ones(1, dtype=torch.bool), key[1:] != key[:-1]))
+    return faces[order[first].sort().values]
 
 
 def _icosahedron() -> tuple[Tensor, Tensor]:
@@ -256,9 +267,9 @@ def _icosahedron() -> tuple[Tensor, Tensor]:
     ]
     poles = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
     faces = []
-    for here in range(5):
-        after = (here + 1) % 5
-        upper, upper_after, lower, lower_after = 1 + here, 1 + after, 6 + here, 6 + after
+    for corner in range(5):
+        after = (corner + 1) % 5
+        upper, upper_after, lower, lower_after = 1 + corner, 1 + after, 6 + corner, 6 + after
         faces += [(0, upper, upper_after), (upper, lower, upper_after)]
         faces += [(lower, lower_after, upper_after), (11, lower_after, lower)]
     return torch.cat((poles[:1], *rings, poles[1:])), torch.tensor(faces)
@@ -278,17 +289,10 @@ def concatenate(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
     Args:
         meshes: at least one mesh, all of one dtype and device.
 
-    Raises:
-        InputError: if there is none.
-        InputTypeError: if dtypes or devices differ.
-
     Differentiable: in the vertices.
     """
-    if not meshes:
-        raise InputError("meshes must hold at least one mesh, got none")
     faces, offset = [], 0
-    for index, mesh in enumerate(meshes):
-        check_same_kind(mesh.vertices, f"meshes[{index}]", meshes[0].vertices, "meshes[0]")
+    for mesh in meshes:
         faces.append(mesh.faces + offset)
         offset += mesh.num_vertices
     return TriangleMesh(torch.cat([mesh.vertices for mesh in meshes]), torch.cat(faces))

@@ -1,4 +1,4 @@
-"""Which points are near which: nearest neighbors, pairs within a radius, sampling distances, points at one place."""
+"""Nearest neighbors, pairs within a radius, sampling distances, and points at one position."""
 
 from __future__ import annotations
 
@@ -9,15 +9,11 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchreg._checks import check_count, check_points, check_shape
-from torchreg.errors import InputError
-
-# Entries of the table of distances held at a time.
-_CHUNK_ENTRIES = 16_000_000
+from torchreg.geometry.budget import BUDGET
 
 
 def nearest_neighbor(points: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-    """Return which of ``targets`` is nearest to each of ``points``, and how far it is.
+    """Return the index of the target nearest to each point, and its distance.
 
     Args:
         points: (..., N, 3).
@@ -25,10 +21,7 @@ def nearest_neighbor(points: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
             points'.
 
     Returns:
-        index (..., N) int64 into the targets, and distance (..., N).
-
-    Raises:
-        InputError: if a shape, dtype or device does not fit, or there are no targets.
+        Indices (..., N) int64 into the targets, and distances (..., N).
 
     Differentiable: the distance, in both, away from zero. Not under `torch.func` on a CPU.
 
@@ -36,15 +29,6 @@ def nearest_neighbor(points: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
 
     References: Maneewongvatana and Mount 1999, the tree of `scipy.spatial.cKDTree`.
     """
-    check_shape(points, "points", ("N", 3), batch=True)
-    check_shape(targets, "targets", ("K", 3), batch=True)
-    if targets.shape[-2] == 0:
-        raise InputError("targets must hold at least one point, got none")
-    if points.dtype != targets.dtype or points.device != targets.device:
-        raise InputError(
-            f"points are {points.dtype} on {points.device} but targets are {targets.dtype} on {targets.device}; "
-            f"convert one of them with .to()"
-        )
     batch = points.shape[:-2]
     if batch != targets.shape[:-2]:  # broadcast_shapes is slow, and imports sympy when first called
         batch = torch.broadcast_shapes(batch, targets.shape[:-2])
@@ -70,7 +54,7 @@ def _by_tree(points: Tensor, targets: Tensor) -> Tensor:
 
 def _by_table(points: Tensor, targets: Tensor) -> Tensor:
     """Return indices (B, N), from differences of coordinates: an expanded square would round, and swap neighbors."""
-    size = max(1, _CHUNK_ENTRIES // max(1, len(targets) * targets.shape[-2]))
+    size = max(1, BUDGET.distance_entries // max(1, len(targets) * targets.shape[-2]))
     parts = [
         torch.cdist(part, targets, compute_mode="donot_use_mm_for_euclid_dist").argmin(-1)
         for part in points.split(size, dim=-2)
@@ -79,30 +63,23 @@ def _by_table(points: Tensor, targets: Tensor) -> Tensor:
 
 
 class NeighborTree:
-    """Points in any number of dimensions, to be searched again and again for those nearest to others.
+    """Points in any number of dimensions, to be searched repeatedly for those nearest to query points.
 
     Args:
         targets: (K, D) finite, at least one.
 
-    Raises:
-        InputError: if the shape does not fit or there are none.
-
     Differentiable: no.
 
-    Cost: O(K log K) to make, O(log K) per neighbor where D is small or targets are near; always on the CPU.
+    Cost: O(K log K) to build, O(log K) per neighbor where D is small or targets are near; always on the CPU.
 
     References: Maneewongvatana and Mount 1999, the tree of `scipy.spatial.cKDTree`.
     """
 
     def __init__(self, targets: Tensor) -> None:
-        check_shape(targets, "targets", ("K", "D"))
-        if len(targets) == 0:
-            raise InputError("targets must hold at least one point, got none")
         self._tree = cKDTree(_coordinates(targets))
 
     def nearest(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the index (N,) int64 of the target nearest to each of points (N, D), and the distance (N,) float64."""
-        check_shape(points, "points", ("N", self._tree.m))
         distance, index = self._tree.query(_coordinates(points))
         return torch.from_numpy(index).to(points.device), torch.from_numpy(distance).to(points.device)
 
@@ -111,17 +88,11 @@ class NeighborTree:
 
         Args:
             points: (N, D) finite.
-            count: how many.
+            count: 1 to K.
 
         Returns:
-            index (N, count) int64, and distance (N, count) float64, both on the points' device.
-
-        Raises:
-            InputError: if the shape does not fit or there are too few targets.
+            Indices (N, count) int64 and distances (N, count) float64, both on the points' device.
         """
-        check_shape(points, "points", ("N", self._tree.m))
-        if not 1 <= count <= self._tree.n:
-            raise InputError(f"count must be between 1 and the number of targets {self._tree.n}, got {count}")
         distance, index = self._tree.query(_coordinates(points), list(range(1, count + 1)))
         return torch.from_numpy(index).to(points.device), torch.from_numpy(distance).to(points.device)
 
@@ -132,79 +103,67 @@ def k_nearest(points: Tensor, targets: Tensor, count: int) -> tuple[Tensor, Tens
 
 
 def k_nearest_others(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the nearest other points of each point, nearest first.
+    """Return the nearest neighbors of each point, itself excluded, nearest first.
 
     Args:
-        points: (N, D) finite, at least two; points at one place are zero apart.
-        count: how many; N - 1 at most are returned.
+        points: (N, D) finite, at least two; points at one position are zero apart.
+        count: neighbors of each point, at least one; N - 1 at most are returned.
 
     Returns:
-        index (N, K) int64 and distance (N, K) float64, both on the points' device.
-
-    Raises:
-        InputError: if there are fewer than two points or ``count`` is below one.
+        Indices (N, K) int64 and distances (N, K) float64, both on the points' device.
     """
-    check_shape(points, "points", ("N", "D"))
-    check_count(count, "count", 1)
-    if len(points) < 2:
-        raise InputError(f"points must hold at least 2 point(s), got {len(points)}")
     index, distance = k_nearest(points, points, min(count + 1, len(points)))
-    own = index == torch.arange(len(points), device=points.device).unsqueeze(1)
-    if bool(own[:, 0].all()):
+    is_self = index == torch.arange(len(points), device=points.device).unsqueeze(1)
+    if bool(is_self[:, 0].all()):
         return index[:, 1:].contiguous(), distance[:, 1:].contiguous()
-    # Copies may come before a point itself, or in its stead.
-    own[:, -1] |= ~own.any(1)
-    return index[~own].view(len(points), -1), distance[~own].view(len(points), -1)
+    # Copies may come before a point itself, or instead of it.
+    is_self[:, -1] |= ~is_self.any(1)
+    return index[~is_self].view(len(points), -1), distance[~is_self].view(len(points), -1)
 
 
 def pairs_within(points: Tensor, radius: float) -> Tensor:
     """Return the pairs (P, 2) int64 of points (N, D) no farther than ``radius`` apart, the lower index first."""
-    check_shape(points, "points", ("N", "D"))
     pairs = cKDTree(_coordinates(points)).query_pairs(radius, output_type="ndarray")
     return torch.from_numpy(pairs).to(points.device)
 
 
-def sampling_distance(points: Tensor, at: Tensor | None = None) -> float:
-    """Return the median distance of a point to the nearest other one; infinite where there are no two.
+def sampling_distance(points: Tensor, subset: Tensor | None = None) -> float:
+    """Return the median distance of a point to its nearest neighbor; infinite for fewer than two points.
 
     Args:
-        points: (N, D) finite; points at one place are zero apart.
-        at: (M, D) some of the points, the only ones that count; all by default.
+        points: (N, D) finite; points at one position are zero apart.
+        subset: (M, D) those of the points over which the median is taken; all by default.
 
     Differentiable: no.
     """
     if len(points) < 2:
         return math.inf
-    return float(k_nearest(points if at is None else at, points, 2)[1][:, 1].median())
+    return float(k_nearest(points if subset is None else subset, points, 2)[1][:, 1].median())
 
 
 def weld(points: Tensor) -> Tensor:
-    """Return a number (N,) int64 per point from 0 upward, the same for points at exactly one place."""
+    """Return the index (N,) int64 of each point's position among the distinct positions, sorted lexicographically.
+
+    If no two points coincide, the index is that of the point.
+    """
     values = _coordinates(points) + 0.0  # -0 is 0
     order = np.lexsort(values.T)
     changes = (np.diff(values[order], axis=0) != 0).any(axis=-1)
     if changes.all():
         return torch.arange(len(values))
-    which = np.empty(len(values), dtype=np.int64)
-    which[order] = np.concatenate(([0], np.cumsum(changes)))
-    return torch.from_numpy(which)
+    index = np.empty(len(values), dtype=np.int64)
+    index[order] = np.concatenate(([0], np.cumsum(changes)))
+    return torch.from_numpy(index)
 
 
-def distinct_places(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the different places (M, 3), float64 on the CPU, and which (N,) of them each point is at.
-
-    Raises:
-        InputError: if a number is not finite, or there are fewer than three places.
-    """
-    check_points(points, "points", min_count=3, batch=False)
-    places = points.detach().cpu().double()
-    which = weld(places)
-    count = int(which.max()) + 1
-    if count < 3:
-        raise InputError(f"points must lie at 3 places or more, got {len(points)} points at {count}")
+def distinct_positions(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the distinct positions (M, 3) of points (N, 3), float64 on the CPU, and the index (N,) of each point's."""
+    positions = points.detach().cpu().double()
+    index = weld(positions)
+    count = int(index.max()) + 1
     if count < len(points):
-        places = places.new_zeros(count, 3).index_copy(0, which, places)
-    return places, which
+        positions = positions.new_zeros(count, 3).index_copy(0, index, positions)
+    return positions, index
 
 
 def _coordinates(points: Tensor) -> np.ndarray:

@@ -2,48 +2,56 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_shape
-from torchreg.errors import InputError
 from torchreg.geometry.graphs import minimum_spanning_forest
 from torchreg.geometry.mesh import TriangleMesh
-from torchreg.geometry.neighbors import distinct_places, k_nearest, k_nearest_others
-
-_LEAST_WEIGHT = 1e-3
-# Points of the coarse copy that tells bulges from hollows, and their neighbors.
-_COARSE_POINTS, _COARSE_NEIGHBORS = 2000, 12
-# A scan counts as taken from one side when this share of its normals looks there.
-_ONE_SIDED = 0.97
-# Cosine beyond which a normal that looks away from a known camera is turned; nearer to 90 degrees it may be noise.
-_AWAY = -0.25
-# Share of the length of all normals that their sum must have to point to a camera.
-_LOOKING = 0.2
-# Least spread of normals, and distance of a plane from the origin, that tell the outside from the inside.
-_FLAT = 5e-3
-# Share of a component's area whose winding decides about the rest.
-_MAJORITY = 0.75
+from torchreg.geometry.neighbors import distinct_positions, k_nearest, k_nearest_others
 
 
-def estimate_normals(points: Tensor, *, viewpoint: Tensor | None = None, num_neighbors: int = 16) -> Tensor:
-    """Return the unit normals of a surface known by points alone, turned to one side.
+@dataclass(frozen=True)
+class NormalSettings:
+    """Numbers by which normals are fitted and given a side."""
 
-    Each normal is the direction in which the point's nearest neighbors spread least, the nearer weighing more; the
-    sides are told as by `orient_normals`.
+    # Neighbors that a normal is fitted to; more of them smooth noise, and edges too.
+    num_neighbors: int = 16
+    # Weight of the farthest neighbors: next to nothing, so that the choice between two equally far ones hardly counts.
+    least_weight: float = 1e-3
+    # Points of the coarse copy that tells convex from concave sides, and their neighbors.
+    num_coarse: int = 2000
+    coarse_neighbors: int = 12
+    # Share of normals on one side from which a scan counts as taken from there.
+    one_sided: float = 0.97
+    # Cosine to the direction of the camera below which a normal is flipped; nearer to 90 degrees it may be noise.
+    flipped_cosine: float = -0.25
+    # Length of the sum of normals, as a share of all their lengths, from which it points to a camera.
+    least_mean: float = 0.2
+    # Relative spread of normals, and distance of a plane from the origin, below which a part is flat.
+    flat: float = 5e-3
+    # Share of neighbors with opposed normals from which given normals count as unoriented; at random it is a half.
+    unoriented: float = 0.25
+    # Share of a component's area whose winding decides about the rest.
+    majority: float = 0.75
+
+
+NORMALS = NormalSettings()
+
+
+def estimate_normals(points: Tensor, *, viewpoint: Tensor | None = None) -> Tensor:
+    """Return the unit normals of a surface sampled by points, consistently oriented.
+
+    Each normal is the direction of least spread of the point's nearest 16 neighbors, the nearer ones weighing more;
+    signs are those of `orient_normals`.
 
     Args:
-        points: (N, 3), any unit; points at one place share a normal.
-        viewpoint: (3,) where the camera was; None if that is not known.
-        num_neighbors: that a normal is fitted to; more of them smooth noise, and edges too.
+        points: (N, 3), any unit, at three distinct positions or more; coincident points share a normal.
+        viewpoint: (3,) float64 position of the camera; None if unknown.
 
     Returns:
-        (N, 3), of the dtype and device of the points.
-
-    Raises:
-        InputError: if there are fewer than three different places, or a number is not finite.
+        Normals (N, 3), of the dtype and device of the points.
 
     Differentiable: no.
 
@@ -51,93 +59,70 @@ def estimate_normals(points: Tensor, *, viewpoint: Tensor | None = None, num_nei
 
     References: Hoppe et al., "Surface reconstruction from unorganized points", 1992.
     """
-    points = as_float_tensor(points, "points")
-    places, which = distinct_places(points)
-    index, _ = k_nearest_others(places, num_neighbors)
-    normals = orient_along_graph(places, fit_normals(places, index), index, check_viewpoint(viewpoint))
-    return normals[which].to(points)
+    positions, which = distinct_positions(points)
+    index, _ = k_nearest_others(positions, NORMALS.num_neighbors)
+    return orient_along_graph(positions, fit_normals(positions, index), index, viewpoint)[which].to(points)
 
 
-def orient_normals(
-    points: Tensor, normals: Tensor, *, viewpoint: Tensor | None = None, num_neighbors: int = 16
-) -> Tensor:
-    """Return the normals with signs that agree from neighbor to neighbor and look to where the scan was taken from.
+def orient_normals(points: Tensor, normals: Tensor, *, viewpoint: Tensor | None = None) -> Tensor:
+    """Return the normals with signs that agree between neighbors and face the camera.
 
-    Signs spread along the minimum spanning tree of the neighbor graph, which crosses sharp edges last. Each connected
-    part then turns to the viewpoint; if that is not known, the largest part turns such that it bulges, as what a camera
-    sees of a body does, and the others look to the same side. What is as flat as a plane turns to the origin.
+    Signs propagate along the minimum spanning tree of the neighbor graph, which crosses sharp edges last. Each
+    connected component then faces the viewpoint; without one, the largest component is taken to be convex, as the
+    visible side of a body is, and the others face the same side. Planar components face the origin.
 
     Args:
-        points: (N, 3), any unit.
+        points: (N, 3), any unit, at three distinct positions or more.
         normals: (N, 3) of any sign.
-        viewpoint: (3,) where the camera was; None if that is not known.
-        num_neighbors: edges of each point in the graph.
+        viewpoint: (3,) float64 position of the camera; None if unknown.
 
     Returns:
-        (N, 3), each the given normal or its opposite; at one place all follow the first.
-
-    Raises:
-        InputError: if there are fewer than three different places, or a number is not finite.
+        Normals (N, 3), each the given one or its opposite; coincident points take the side of the first.
 
     Differentiable: no.
 
     References: Hoppe et al., "Surface reconstruction from unorganized points", 1992, section 3.3.
     """
-    points = as_float_tensor(points, "points")
-    normals = as_float_tensor(normals, "normals", like=points)
-    check_shape(normals, "normals", tuple(points.shape))
-    places, which = distinct_places(points)
-    first = torch.full((len(places),), len(points)).scatter_reduce(0, which, torch.arange(len(points)), "amin")
-    guide = normals.detach().cpu().double()[first]
-    index, _ = k_nearest_others(places, num_neighbors)
-    turned = orient_along_graph(places, guide, index, check_viewpoint(viewpoint))
-    turn = (turned[which] * normals.detach().cpu().double()).sum(-1, keepdim=True) < 0
-    return torch.where(turn.to(points.device), -normals, normals)
+    positions, which = distinct_positions(points)
+    first = torch.full((len(positions),), len(points)).scatter_reduce(0, which, torch.arange(len(points)), "amin")
+    exact = normals.detach().cpu().double()
+    index, _ = k_nearest_others(positions, NORMALS.num_neighbors)
+    oriented = orient_along_graph(positions, exact[first], index, viewpoint)
+    flip = (oriented[which] * exact).sum(-1, keepdim=True) < 0
+    return torch.where(flip.to(points.device), -normals, normals)
 
 
 def fit_normals(points: Tensor, index: Tensor) -> Tensor:
-    """Return unit normals (N, 3) of either sign: the direction in which each point's neighbors (N, K) spread least."""
+    """Return unit normals (N, 3) of either sign: the directions of least spread of each point's neighbors (N, K)."""
     return _least_spread(torch.cat((points[:, None], points[index]), dim=1))
 
 
 def _least_spread(around: Tensor) -> Tensor:
-    """Return unit normals (N, 3) to points (N, K, 3), of which the first is the one that the normal is at."""
+    """Return unit normals (N, 3) of neighborhoods (N, K, 3), each with the point that its normal belongs to first."""
     around = around - around[:, :1]
     # Squares of tiny lengths underflow.
     around = around / around.abs().amax(dim=(1, 2), keepdim=True)
-    # The farthest weigh next to nothing, so that it does not matter which of two equally far ones was found.
     square = around.square().sum(dim=-1)
-    weight = (1 - square / square.amax(dim=-1, keepdim=True) + _LEAST_WEIGHT)[..., None]
+    weight = (1 - square / square.amax(dim=-1, keepdim=True) + NORMALS.least_weight)[..., None]
     around = around - (weight * around).sum(dim=1, keepdim=True) / weight.sum(dim=1, keepdim=True)
     return torch.linalg.eigh(around.mT @ (weight * around)).eigenvectors[..., 0]
 
 
-def check_viewpoint(viewpoint: Any) -> Tensor | None:
-    """Return a viewpoint (3,) as float64 on the CPU, or None; InputError unless it is three finite numbers."""
-    if viewpoint is None:
-        return None
-    viewpoint = as_float_tensor(viewpoint, "viewpoint").detach().cpu().double()
-    check_shape(viewpoint, "viewpoint", (3,))
-    if not bool(viewpoint.isfinite().all()):
-        raise InputError(f"viewpoint must be finite, got {viewpoint.tolist()}; pass None if it is not known")
-    return viewpoint
-
-
-def fit_normals_at(points: Tensor, at: Tensor, num_neighbors: int = 16) -> Tensor:
-    """Return unit normals (M, 3) of either sign at a few of the points (N, 3), given by their indices (M,)."""
-    places, which = distinct_places(points)
-    near, _ = k_nearest(places[which[at.cpu()]], places, min(num_neighbors + 1, len(places)))
-    return _least_spread(places[near]).to(points)
+def fit_normals_at(points: Tensor, index: Tensor) -> Tensor:
+    """Return unit normals (M, 3) of either sign at those of the points (N, 3) with the given indices (M,)."""
+    positions, which = distinct_positions(points)
+    near, _ = k_nearest(positions[which[index.cpu()]], positions, min(NORMALS.num_neighbors + 1, len(positions)))
+    return _least_spread(positions[near]).to(points)
 
 
 def face_vertex_normals(points: Tensor, faces: Tensor, viewpoint: Tensor | None = None) -> Tensor:
     """Return unit normals (N, 3) at the points of a surface of triangles, zero where no face has an area.
 
-    Triangles wound against their neighbors count as turned. A connected part keeps the winding of three quarters of its
-    area or more; where there is none, or a viewpoint is known, it turns to the camera as points do.
+    Triangles wound against their neighbors are flipped. A connected component keeps the winding of three quarters of
+    its area or more; where there is no such majority, or a viewpoint is known, it faces the camera as points do.
 
     Args:
-        points: (N, 3) float64, no two at one place.
+        points: (N, 3) float64, no two at one position.
         faces: (F, 3) indices, no two equal in a row.
         viewpoint: (3,) float64 or None.
     """
@@ -146,31 +131,33 @@ def face_vertex_normals(points: Tensor, faces: Tensor, viewpoint: Tensor | None 
         return TriangleMesh(points, faces).vertex_normals()
     key, which, shared = (pairs @ pairs.new_tensor([len(faces), 1])).unique(return_inverse=True, return_counts=True)
     pairs = torch.stack((key // len(faces), key % len(faces)), dim=-1)
-    opposed = _sums((~agree).double(), which, len(pairs)) > 0
+    opposed = _label_sums((~agree).double(), which, len(pairs)) > 0
     parents, edge, label = minimum_spanning_forest(pairs, shared, len(faces))
     steps = torch.where((parents >= 0) & opposed[edge], -1.0, 1.0).double()
     sign = _products_to_root(parents, steps)
     areas = TriangleMesh(points, faces).face_areas()
     areas = areas / areas.mean().clamp(min=torch.finfo(areas.dtype).tiny)
-    side = _sums(areas * sign, label)
-    weak = side.abs() < (2 * _MAJORITY - 1) * _sums(areas, label) if viewpoint is None else torch.ones_like(side) > 0
-    if bool(weak.any()):
+    side = _label_sums(areas * sign, label)
+    undecided = torch.ones_like(side) > 0
+    if viewpoint is None:
+        undecided = side.abs() < (2 * NORMALS.majority - 1) * _label_sums(areas, label)
+    if bool(undecided.any()):
         normals = TriangleMesh(points, faces).face_normals() * (sign * areas)[:, None]
-        side = torch.where(weak, _sides(points[faces].mean(dim=1), normals, label, viewpoint), side)
-    turned = torch.where((sign * side[label] < 0)[:, None], faces.flip(-1), faces)
-    return TriangleMesh(points, turned).vertex_normals()
+        side = torch.where(undecided, _sides(points[faces].mean(dim=1), normals, label, viewpoint), side)
+    oriented = torch.where((sign * side[label] < 0)[:, None], faces.flip(-1), faces)
+    return TriangleMesh(points, oriented).vertex_normals()
 
 
 def _adjacent_faces(faces: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return pairs (E, 2) of faces across the edges that two faces share, and whether their windings agree (E,)."""
+    """Return pairs (E, 2) of faces across edges of two faces, and a mask (E,) of those whose windings agree."""
     start, end = faces.reshape(-1), faces.roll(-1, dims=1).reshape(-1)
     key, order = (torch.minimum(start, end) * count + torch.maximum(start, end)).sort(stable=True)
     same = torch.cat((key.new_zeros(1), (key[1:] == key[:-1]).long(), key.new_zeros(1)))
     first = ((same[:-1] == 0) & (same[1:] == 1)).nonzero()[:, 0]
-    # Edges of three faces or more do not tell which of them belong together.
+    # Edges of three faces or more leave open which of them belong together.
     first = first[torch.cat((same, same.new_zeros(1)))[first + 2] == 0]
-    left, right = order[first], order[first + 1]
-    return torch.stack((left // 3, right // 3), dim=-1), start[left] != start[right]
+    side, next_side = order[first], order[first + 1]
+    return torch.stack((side // 3, next_side // 3), dim=-1), start[side] != start[next_side]
 
 
 def neighbors_disagree(normals: Tensor, index: Tensor) -> float:
@@ -179,7 +166,7 @@ def neighbors_disagree(normals: Tensor, index: Tensor) -> float:
 
 
 def orient_along_graph(points: Tensor, normals: Tensor, index: Tensor, viewpoint: Tensor | None) -> Tensor:
-    """Return normals with signs by spanning tree and camera; points (N, 3), normals, neighbors (N, K), on the CPU."""
+    """Return normals (N, 3) oriented along the spanning tree of neighbors (N, K), and to the camera; on the CPU."""
     count, width = index.shape
     edges = torch.stack((torch.arange(count).repeat_interleave(width), index.flatten()), dim=-1)
     cost = 1 - (normals[:, None] * normals[index]).sum(-1).abs().clamp(max=1)
@@ -191,16 +178,16 @@ def orient_along_graph(points: Tensor, normals: Tensor, index: Tensor, viewpoint
     if viewpoint is None:
         view = torch.nn.functional.normalize(normals.mean(dim=0), dim=0).expand_as(normals)
         facing = float(((normals * view).sum(-1) > 0).double().mean())
-        if facing < _ONE_SIDED:
+        if facing < NORMALS.one_sided:
             return normals
     else:
         view = torch.nn.functional.normalize(viewpoint - points, dim=-1)
-    away = (normals * view).sum(-1) < _AWAY
-    return torch.where(away[:, None], -normals, normals)
+    turned_away = (normals * view).sum(-1) < NORMALS.flipped_cosine
+    return torch.where(turned_away[:, None], -normals, normals)
 
 
 def _products_to_root(parents: Tensor, steps: Tensor) -> Tensor:
-    """Return for each node the product of the steps from it up to its root, whose own step is 1."""
+    """Return the product of the steps on each node's path up to its root, whose own step is 1."""
     above = torch.where(parents < 0, torch.arange(len(parents)), parents)
     product = steps.clone()
     while True:
@@ -212,47 +199,47 @@ def _products_to_root(parents: Tensor, steps: Tensor) -> Tensor:
 
 
 def _sides(points: Tensor, normals: Tensor, label: Tensor, viewpoint: Tensor | None) -> Tensor:
-    """Return +1 or -1 per label (C,): the sign that turns its normals to the viewpoint or the likely camera."""
+    """Return the sign (C,) of each component that turns its normals to the viewpoint or the likely camera."""
     if viewpoint is not None:
-        return _signs(_sums((normals * (viewpoint - points)).sum(-1), label))
-    total = torch.stack([_sums(part, label) for part in normals.unbind(-1)], dim=-1)
-    own = _bulging(points, normals, label)
-    size = _sums(normals.norm(dim=-1), label)
-    main = int(size.argmax())
-    camera = total[main] * own[main]
+        return _signs(_label_sums((normals * (viewpoint - points)).sum(-1), label))
+    total = torch.stack([_label_sums(part, label) for part in normals.unbind(-1)], dim=-1)
+    convex = _convex_sides(points, normals, label)
+    size = _label_sums(normals.norm(dim=-1), label)
+    largest = int(size.argmax())
+    camera = total[largest] * convex[largest]
     strength = camera.norm()
-    if not float(strength) > _LOOKING * float(size[main]):
-        return own
+    if not float(strength) > NORMALS.least_mean * float(size[largest]):
+        return convex
     seen = total @ (camera / strength)
-    return torch.where(seen.abs() > _LOOKING * size, _signs(seen), own)
+    return torch.where(seen.abs() > NORMALS.least_mean * size, _signs(seen), convex)
 
 
-def _bulging(points: Tensor, normals: Tensor, label: Tensor) -> Tensor:
-    """Return +1 or -1 per label: the sign with which normals spread apart, as they do outside of a body."""
+def _convex_sides(points: Tensor, normals: Tensor, label: Tensor) -> Tensor:
+    """Return the sign (C,) of each component with which its normals diverge, as they do outside of a body."""
     generator = torch.Generator().manual_seed(0)
-    few = torch.randperm(len(points), generator=generator)[:_COARSE_POINTS]
-    near, _ = k_nearest(points[few], points[few], min(_COARSE_NEIGHBORS + 1, len(few)))
-    first, second = few.repeat_interleave(near.shape[1]), few[near.flatten()]
+    sample = torch.randperm(len(points), generator=generator)[: NORMALS.num_coarse]
+    near, _ = k_nearest(points[sample], points[sample], min(NORMALS.coarse_neighbors + 1, len(sample)))
+    first, second = sample.repeat_interleave(near.shape[1]), sample[near.flatten()]
     kept = (label[first] == label[second]) & (first != second)
     first, second = first[kept], second[kept]
     apart = torch.nn.functional.normalize(points[first] - points[second], dim=-1, eps=torch.finfo(points.dtype).tiny)
-    spread = _sums((apart * (normals[first] - normals[second])).sum(-1), label[first], int(label.max()) + 1)
-    weight = _sums(normals[first].norm(dim=-1) + normals[second].norm(dim=-1), label[first], len(spread))
-    flat = spread.abs() <= _FLAT * weight
-    total = torch.stack([_sums(part, label) for part in normals.unbind(-1)], dim=-1)
-    back = -_sums((normals * points).sum(-1), label)
-    # A plane through the origin: any rule that does not depend on the signs that came.
+    divergence = _label_sums((apart * (normals[first] - normals[second])).sum(-1), label[first], int(label.max()) + 1)
+    weight = _label_sums(normals[first].norm(dim=-1) + normals[second].norm(dim=-1), label[first], len(divergence))
+    flat = divergence.abs() <= NORMALS.flat * weight
+    total = torch.stack([_label_sums(part, label) for part in normals.unbind(-1)], dim=-1)
+    to_origin = -_label_sums((normals * points).sum(-1), label)
+    # A plane through the origin: any rule that does not depend on the given signs.
     largest = total.gather(-1, total.abs().argmax(dim=-1, keepdim=True))[:, 0]
-    reach = float(points.norm(dim=-1).max()) * _sums(normals.norm(dim=-1), label)
-    back = torch.where(back.abs() > _FLAT * reach, back, largest)
-    return _signs(torch.where(flat, back, spread))
+    reach = float(points.norm(dim=-1).max()) * _label_sums(normals.norm(dim=-1), label)
+    to_origin = torch.where(to_origin.abs() > NORMALS.flat * reach, to_origin, largest)
+    return _signs(torch.where(flat, to_origin, divergence))
 
 
 def _signs(values: Tensor) -> Tensor:
     return torch.where(values < 0, -1.0, 1.0).to(values.dtype)
 
 
-def _sums(values: Tensor, label: Tensor, count: int | None = None) -> Tensor:
-    """Return the sums of values (N,) that carry the same label."""
+def _label_sums(values: Tensor, label: Tensor, count: int | None = None) -> Tensor:
+    """Return the sum (C,) of the values (N,) of each label."""
     count = int(label.max()) + 1 if count is None else count
     return values.new_zeros(count).index_add(0, label, values)

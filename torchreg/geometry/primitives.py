@@ -1,48 +1,97 @@
-"""Signed distances to the solids that make up an articulated shape, with analytic gradients.
+"""Kinds of solids that make up an articulated shape: signed distances, analytic gradients and fits to points.
 
-Every function takes points in the solid's own frame (long axis z, center at the origin) and one row of sizes per solid,
-and returns a signed distance that is negative inside and zero on the surface. It is Euclidean for capsules and cones,
-Euclidean to first order at the surface for ellipsoids, and measured along rays from the center for superquadrics.
+Distances take points in the solid's own frame (long axis z, center at the origin) and one row of sizes per solid; they
+are negative inside and zero on the surface. They are Euclidean for capsules and cones, Euclidean to first order at the
+surface for ellipsoids, and measured along rays from the center for superquadrics.
 
 The formulas work on planes, all x, all y and all z, each contiguous: many times as fast as on interleaved points.
+
+A further kind is one subclass of `PrimitiveKind` and one entry of `PRIMITIVE_KINDS`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from torchreg.geometry.rigid import rigid_matrix
+
 Planes = tuple[Tensor, Tensor, Tensor]
+# Sizes of a solid, metres and exponents, and its frame (4, 4) in the coordinates of the points it is fitted to.
+Candidate = tuple[list[float], Tensor]
 
 # Squared distance from an ellipsoid's center, in radii, below which the ratio of its norms means nothing.
 _CENTER = 1e-12
 
 
 @dataclass(frozen=True)
-class PrimitiveKind:
-    """What a kind of solid is called, measured by, and how its distance is evaluated.
+class FitSettings:
+    """Numbers by which solids are fitted to points."""
+
+    # Least half extent of flat and thin clouds: as a share of the largest, and metres.
+    least_share: float = 1e-2
+    least_extent: float = 1e-6
+    # Largest radius of an ellipsoid in half extents: a tube open at both ends says little about its length.
+    overshoot: float = 1.4
+    # Points from which the least-squares ellipsoid, of six unknowns, is fitted.
+    ellipsoid_points: int = 10
+    # Quantile of the distances from the axis that is a capsule's radius: points on the round ends lie nearer.
+    radius_quantile: float = 0.7
+    # Share of a cone's half height within which points belong to the mantle.
+    mantle_share: float = 0.95
+    # Exponents tried for superquadrics, from near boxes to ellipsoids.
+    exponents: tuple[float, ...] = (0.2, 0.5, 1.0)
+
+
+FIT = FitSettings()
+
+
+@dataclass(frozen=True)
+class Size:
+    """One of the sizes of a kind of solid.
 
     Args:
-        name: the kind's name.
-        sizes: names of the sizes, in the order of the size row.
-        plane_distance: (planes of points, sizes (..., S)) -> distances of the planes' shape.
-        plane_gradient: (planes of points, sizes (..., S)) -> (distances, planes of the gradient).
-        long_sizes: which sizes lie along the long axis z.
-        scalable: which sizes are lengths (the others are exponents).
+        name: its name.
+        is_long: whether it lies along the long axis z.
+        is_length: whether it is a length; exponents are not.
     """
 
     name: str
-    sizes: tuple[str, ...]
-    plane_distance: Callable[[Planes, Tensor], Tensor]
-    plane_gradient: Callable[[Planes, Tensor], tuple[Tensor, Planes]]
-    long_sizes: tuple[bool, ...]
-    scalable: tuple[bool, ...]
+    is_long: bool = False
+    is_length: bool = True
+
+
+class PrimitiveKind(ABC):
+    """A kind of solid.
+
+    Attributes:
+        name: its name.
+        sizes: its sizes, in the order of size rows.
+    """
+
+    name: str
+    sizes: tuple[Size, ...]
+
+    @abstractmethod
+    def plane_distance(self, points: Planes, sizes: Tensor) -> Tensor:
+        """Return the distances of planes of points to solids of sizes (..., S), in the planes' shape."""
+
+    @abstractmethod
+    def plane_gradient(self, points: Planes, sizes: Tensor) -> tuple[Tensor, Planes]:
+        """Return the distances of planes of points to solids of sizes (..., S), and the planes of their gradients."""
+
+    @abstractmethod
+    def candidates(self, points: Tensor, frame: Tensor) -> list[Candidate]:
+        """Return solids that fit surface points (N, 3) float64, with the axes of a frame (4, 4) at their center."""
 
     def distance(self, points: Tensor, sizes: Tensor) -> Tensor:
-        """Return the distances (...) of points (..., 3) to solids of sizes (..., S)."""
+        """Return the distances (...) of points (..., 3) to solids of sizes (..., S).
+
+        Differentiable: in both; the gradient at the center, or on the axis, is zero.
+        """
         return self.plane_distance(_planes(points), sizes)
 
     def gradient(self, points: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
@@ -56,41 +105,61 @@ def _planes(points: Tensor) -> Planes:
     return x, y, z
 
 
-def ellipsoid_distance(points: Tensor, sizes: Tensor) -> Tensor:
-    """Return the pseudo-Euclidean distance to ellipsoids, ``k0 (k0 - 1) / k1``, ``k0 = |x / r|``, ``k1 = |x / r^2|``.
+def _squared_norm(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    return torch.addcmul(torch.addcmul(x * x, y, y), z, z)
+
+
+def _half_extents(points: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the points in a frame, and the half extents (3,) of their bounding box, none of them zero."""
+    local = (points - frame[:3, 3]) @ frame[:3, :3]
+    half = (local.amax(0) - local.amin(0)) / 2
+    return local, half.clamp_min(float(half.max()) * FIT.least_share).clamp_min(FIT.least_extent)
+
+
+class Ellipsoid(PrimitiveKind):
+    """Ellipsoids with the pseudo-Euclidean distance ``k0 (k0 - 1) / k1``, ``k0 = |x / r|``, ``k1 = |x / r^2|``.
 
     It agrees with the Euclidean distance to first order at the surface and is too deep inside; at the center, where
-    the ratio is 0/0, it returns minus the smallest radius.
-
-    Args:
-        points: (..., 3), metres, in the ellipsoid's frame.
-        sizes: (..., 3) radii along x, y, z, metres.
-
-    Returns:
-        (...), metres.
-
-    Differentiable: in both; the gradient at the center is zero.
+    the ratio is 0/0, it is minus the smallest radius. Sizes are the radii along x, y and z, metres.
 
     References: Dewaele et al. 2006, section 2.
     """
-    return _ellipsoid_distance(_planes(points), sizes)
 
+    name = "ellipsoid"
+    sizes = (Size("radius_x"), Size("radius_y"), Size("radius_z", is_long=True))
 
-def _ellipsoid_distance(points: Planes, sizes: Tensor) -> Tensor:
-    return _EllipsoidNorms(points, sizes).distance()
+    def plane_distance(self, points: Planes, sizes: Tensor) -> Tensor:
+        """Return the distances of planes of points; see `PrimitiveKind`."""
+        return _EllipsoidNorms(points, sizes).distance()
 
+    def plane_gradient(self, points: Planes, sizes: Tensor) -> tuple[Tensor, Planes]:
+        """Return the distances of planes of points and the planes of their gradients; see `PrimitiveKind`."""
+        norms = _EllipsoidNorms(points, sizes)
+        distance = norms.distance()
+        # With grad k0 = x / (r^2 k0) and grad k1 = x / (r^4 k1).
+        along_k0 = (2 - norms.inverse_k0) * norms.inverse_k1
+        along_k1 = -distance * norms.inverse_k1 * norms.inverse_k1
+        x, y, z = (
+            plane * torch.addcmul(along_k0, along_k1, inverse * inverse)
+            for plane, inverse in zip(norms.second, norms.inverse, strict=True)
+        )
+        return distance, (x, y, z)
 
-def _ellipsoid_gradient(points: Planes, sizes: Tensor) -> tuple[Tensor, Planes]:
-    norms = _EllipsoidNorms(points, sizes)
-    distance = norms.distance()
-    # With grad k0 = x / (r^2 k0) and grad k1 = x / (r^4 k1).
-    along_k0 = (2 - norms.inverse_k0) * norms.inverse_k1
-    along_k1 = -distance * norms.inverse_k1 * norms.inverse_k1
-    x, y, z = (
-        plane * torch.addcmul(along_k0, along_k1, inverse * inverse)
-        for plane, inverse in zip(norms.second, norms.inverse, strict=True)
-    )
-    return distance, (x, y, z)
+    def candidates(self, points: Tensor, frame: Tensor) -> list[Candidate]:
+        """Return the ellipsoid of the bounding box and the algebraic least-squares one."""
+        local, half = _half_extents(points, frame)
+        found = [(half.tolist(), frame)]
+        if len(points) < FIT.ellipsoid_points:
+            return found
+        scaled = local / half
+        design, ones = torch.cat([scaled.square(), scaled], dim=-1), torch.ones(len(points), 1, dtype=points.dtype)
+        solution = torch.linalg.lstsq(design, ones, driver="gelsd").solution[:, 0]
+        curvature = solution[:3].clamp_min(FIT.overshoot**-2)
+        center = (-0.5 * solution[3:] / curvature).clamp(-0.5, 0.5)
+        level = 1 + (curvature * center.square()).sum()
+        radii = (level / curvature).sqrt().clamp(0.5, FIT.overshoot)
+        moved = rigid_matrix(frame[:3, :3], frame[:3, 3] + frame[:3, :3] @ (center * half))
+        return [*found, ((radii * half).tolist(), moved)]
 
 
 class _EllipsoidNorms:
@@ -115,38 +184,32 @@ class _EllipsoidNorms:
         return torch.lerp(distance, -self.smallest.expand_as(distance), at_center)
 
 
-def _squared_norm(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    return torch.addcmul(torch.addcmul(x * x, y, y), z, z)
+class Capsule(PrimitiveKind):
+    """Capsules, segments of the z axis grown by a radius, with the exact distance; sizes in metres."""
 
+    name = "capsule"
+    sizes = (Size("half_length", is_long=True), Size("radius"))
 
-def capsule_distance(points: Tensor, sizes: Tensor) -> Tensor:
-    """Return the exact distance to capsules, segments of the z axis grown by a radius.
+    def plane_distance(self, points: Planes, sizes: Tensor) -> Tensor:
+        """Return the distances of planes of points; see `PrimitiveKind`."""
+        squared = _squared_norm(*_capsule_offset(points, sizes))
+        on_axis = squared == 0
+        return squared.masked_fill(on_axis, 1.0).sqrt().masked_fill(on_axis, 0.0) - sizes[..., 1]
 
-    Args:
-        points: (..., 3), metres, in the capsule's frame.
-        sizes: (..., 2): half length of the segment, radius; metres.
+    def plane_gradient(self, points: Planes, sizes: Tensor) -> tuple[Tensor, Planes]:
+        """Return the distances of planes of points and the planes of their gradients; see `PrimitiveKind`."""
+        x, y, z = _capsule_offset(points, sizes)
+        squared = _squared_norm(x, y, z)
+        on_axis = squared == 0
+        norm = squared.masked_fill(on_axis, 1.0).sqrt()
+        inverse = norm.reciprocal()
+        return norm.masked_fill(on_axis, 0.0) - sizes[..., 1], (x * inverse, y * inverse, z * inverse)
 
-    Returns:
-        (...), metres.
-
-    Differentiable: in both; the gradient on the segment is zero.
-    """
-    return _capsule_distance(_planes(points), sizes)
-
-
-def _capsule_distance(points: Planes, sizes: Tensor) -> Tensor:
-    squared = _squared_norm(*_capsule_offset(points, sizes))
-    on_axis = squared == 0
-    return squared.masked_fill(on_axis, 1.0).sqrt().masked_fill(on_axis, 0.0) - sizes[..., 1]
-
-
-def _capsule_gradient(points: Planes, sizes: Tensor) -> tuple[Tensor, Planes]:
-    x, y, z = _capsule_offset(points, sizes)
-    squared = _squared_norm(x, y, z)
-    on_axis = squared == 0
-    norm = squared.masked_fill(on_axis, 1.0).sqrt()
-    inverse = norm.reciprocal()
-    return norm.masked_fill(on_axis, 0.0) - sizes[..., 1], (x * inverse, y * inverse, z * inverse)
+    def candidates(self, points: Tensor, frame: Tensor) -> list[Candidate]:
+        """Return the capsule whose radius is a quantile of the distances from the axis."""
+        local, half = _half_extents(points, frame)
+        radius = float(local[:, :2].norm(dim=-1).quantile(FIT.radius_quantile).clamp_min(FIT.least_extent))
+        return [([max(float(half[2]) - radius, 1e-3 * radius), radius], frame)]
 
 
 def _capsule_offset(points: Planes, sizes: Tensor) -> Planes:
@@ -155,35 +218,41 @@ def _capsule_offset(points: Planes, sizes: Tensor) -> Planes:
     return x, y, z - torch.minimum(torch.maximum(z, -half), half)
 
 
-def cone_distance(points: Tensor, sizes: Tensor) -> Tensor:
-    """Return the exact distance to truncated cones with flat ends on the z axis.
+class Cone(PrimitiveKind):
+    """Truncated cones with flat ends on the z axis, with the exact distance; sizes in metres.
 
-    Inside it is the larger of the signed distances to mantle and end; outside, the distance to the mantle, the end or
-    the rim between them, whichever is nearest.
-
-    Args:
-        points: (..., 3), metres, in the cone's frame.
-        sizes: (..., 3): half height, radius at -z, radius at +z; metres.
-
-    Returns:
-        (...), metres.
-
-    Differentiable: in both; where the nearest face changes, one side's gradient is taken.
+    Inside it is the larger of the signed distances to mantle and end; outside, the distance to the nearest of mantle,
+    end and the rim between them. Where the nearest face changes, the gradient is that of one side.
     """
-    return _cone_distance(_planes(points), sizes)
 
+    name = "cone"
+    sizes = (Size("half_length", is_long=True), Size("radius_bottom"), Size("radius_top"))
 
-def _cone_distance(points: Planes, sizes: Tensor) -> Tensor:
-    return _ConeFaces(points, sizes).distance()
+    def plane_distance(self, points: Planes, sizes: Tensor) -> Tensor:
+        """Return the distances of planes of points; see `PrimitiveKind`."""
+        return _ConeFaces(points, sizes).distance()
 
+    def plane_gradient(self, points: Planes, sizes: Tensor) -> tuple[Tensor, Planes]:
+        """Return the distances of planes of points and the planes of their gradients; see `PrimitiveKind`."""
+        faces = _ConeFaces(points, sizes)
+        cosine = (faces.cosine * faces.at_mantle) * faces.inverse_radial
+        radial = torch.where(faces.at_rim, faces.rim_radial / faces.rim * faces.inverse_radial, cosine)
+        lift = torch.where(faces.at_mantle, -faces.slope * faces.cosine, points[2].sign())
+        lift = torch.where(faces.at_rim, faces.rim_axial / faces.rim, lift)
+        return faces.distance(), (points[0] * radial, points[1] * radial, lift)
 
-def _cone_gradient(points: Planes, sizes: Tensor) -> tuple[Tensor, Planes]:
-    faces = _ConeFaces(points, sizes)
-    cosine = (faces.cosine * faces.at_mantle) * faces.inverse_radial
-    radial = torch.where(faces.at_rim, faces.rim_radial / faces.rim * faces.inverse_radial, cosine)
-    lift = torch.where(faces.at_mantle, -faces.slope * faces.cosine, points[2].sign())
-    lift = torch.where(faces.at_rim, faces.rim_axial / faces.rim, lift)
-    return faces.distance(), (points[0] * radial, points[1] * radial, lift)
+    def candidates(self, points: Tensor, frame: Tensor) -> list[Candidate]:
+        """Return the cone whose mantle is the regression of the radius on the height, over the points off the ends."""
+        local, half = _half_extents(points, frame)
+        side = local[:, 2].abs() < FIT.mantle_share * half[2]
+        side = side if int(side.sum()) >= 4 else torch.ones_like(side)
+        height, radial = local[side, 2], local[side, :2].norm(dim=-1)
+        spread = (height - height.mean()).square().mean()
+        slope = ((height - height.mean()) * radial).mean() / spread.clamp_min(1e-12)
+        middle = radial.mean() - slope * height.mean()
+        least = FIT.least_share * float(half[:2].max())
+        ends = torch.stack([middle - slope * half[2], middle + slope * half[2]]).clamp_min(least)
+        return [([float(half[2]), *ends.tolist()], frame)]
 
 
 class _ConeFaces:
@@ -218,51 +287,56 @@ class _ConeFaces:
         return torch.where(self.at_rim, self.rim, torch.where(self.at_mantle, self.mantle, self.end))
 
 
-def superquadric_distance(points: Tensor, sizes: Tensor) -> Tensor:
-    """Return the radial distance to superquadrics, ``|x| (1 - 1 / k)``, k the inside-outside function of degree one.
+class Superquadric(PrimitiveKind):
+    """Superquadrics with the radial distance ``|x| (1 - 1 / k)``, k the inside-outside function of degree one.
 
     ``k = ((|x/a|^(2/e2) + |y/b|^(2/e2))^(e2/e1) + |z/c|^(2/e1))^(e1/2)``. It is measured along the ray from the center,
-    so it exceeds the Euclidean distance on oblique faces.
-
-    Args:
-        points: (..., 3), metres, in the superquadric's frame.
-        sizes: (..., 5): radii along x, y, z in metres; exponents e1, e2 in [0.1, 1.9] (1: ellipsoid, 0.1: near a box).
-
-    Returns:
-        (...), metres; minus the smallest radius at the center.
-
-    Differentiable: in both, away from the coordinate planes for exponents above 1; the gradient at the center is zero.
+    so it exceeds the Euclidean distance on oblique faces; at the center it is minus the smallest radius. Sizes are the
+    radii along x, y and z in metres, and the exponents e1 and e2 in [0.1, 1.9] (1: ellipsoid, 0.1: near a box), above 1
+    of which there is no derivative on the coordinate planes.
 
     References: Gross and Boult 1988.
     """
-    return _superquadric_distance(_planes(points), sizes)
 
-
-def _superquadric_distance(points: Planes, sizes: Tensor) -> Tensor:
-    norm, level, _, center = _superquadric_level(points, sizes)
-    return torch.where(center, -sizes[..., :3].amin(-1).expand_as(norm), norm * (1 - 1 / level))
-
-
-def _superquadric_gradient(points: Planes, sizes: Tensor) -> tuple[Tensor, Planes]:
-    norm, level, level_gradient, center = _superquadric_level(points, sizes)
-    distance = torch.where(center, -sizes[..., :3].amin(-1).expand_as(norm), norm * (1 - 1 / level))
-    outward = ((1 - 1 / level) / norm).masked_fill(center, 0.0)
-    steep = (norm / level.square()).masked_fill(center, 0.0)
-    x, y, z = (
-        torch.addcmul(plane * outward, slope, steep) for plane, slope in zip(points, level_gradient, strict=True)
+    name = "superquadric"
+    sizes = (
+        *Ellipsoid.sizes,
+        Size("exponent_1", is_length=False),
+        Size("exponent_2", is_length=False),
     )
-    return distance, (x, y, z)
+
+    def plane_distance(self, points: Planes, sizes: Tensor) -> Tensor:
+        """Return the distances of planes of points; see `PrimitiveKind`."""
+        norm, level, _, center = _superquadric_level(points, sizes)
+        return torch.where(center, -sizes[..., :3].amin(-1).expand_as(norm), norm * (1 - 1 / level))
+
+    def plane_gradient(self, points: Planes, sizes: Tensor) -> tuple[Tensor, Planes]:
+        """Return the distances of planes of points and the planes of their gradients; see `PrimitiveKind`."""
+        norm, level, level_gradient, center = _superquadric_level(points, sizes)
+        distance = torch.where(center, -sizes[..., :3].amin(-1).expand_as(norm), norm * (1 - 1 / level))
+        outward = ((1 - 1 / level) / norm).masked_fill(center, 0.0)
+        steep = (norm / level.square()).masked_fill(center, 0.0)
+        x, y, z = (
+            torch.addcmul(plane * outward, slope, steep) for plane, slope in zip(points, level_gradient, strict=True)
+        )
+        return distance, (x, y, z)
+
+    def candidates(self, points: Tensor, frame: Tensor) -> list[Candidate]:
+        """Return the superquadrics of the bounding box with all pairs of a few exponents."""
+        _, half = _half_extents(points, frame)
+        return [([*half.tolist(), e1, e2], frame) for e1 in FIT.exponents for e2 in FIT.exponents]
 
 
 def _superquadric_level(points: Planes, sizes: Tensor) -> tuple[Tensor, Tensor, Planes, Tensor]:
+    """Return the norms of points, their level k, the planes of its gradient, and the mask of points at the center."""
     e1, e2 = sizes[..., 3], sizes[..., 4]
     inverse = _planes(sizes[..., :3].reciprocal())
     scaled = [(plane * radius).abs() for plane, radius in zip(points, inverse, strict=True)]
     largest = torch.maximum(torch.maximum(scaled[0], scaled[1]), scaled[2])
     center = largest < 1e-6
     largest = largest.masked_fill(center, 1.0)
-    # Degree one lets the largest coordinate be taken out, of the plane and of the whole, so that high powers of small
-    # numbers are only ever added to one and neither overflow, nor vanish, nor divide by zero.
+    # The largest coordinate is factored out, of the plane and of all three, so that high powers of small numbers are
+    # only ever added to one and neither overflow, nor vanish, nor divide by zero.
     u = [(plane.masked_fill(center, 1.0) / largest).clamp_min(1e-12) for plane in scaled]
     widest = torch.maximum(u[0], u[1])
     v = [u[0] / widest, u[1] / widest]
@@ -278,21 +352,6 @@ def _superquadric_level(points: Planes, sizes: Tensor) -> tuple[Tensor, Tensor, 
     return norm, level.masked_fill(center, 1.0), (x, y, z), center
 
 
-ELLIPSOID = PrimitiveKind(
-    "ellipsoid", ("radius_x", "radius_y", "radius_z"), _ellipsoid_distance, _ellipsoid_gradient,
-    long_sizes=(False, False, True), scalable=(True, True, True),
-)  # fmt: skip
-CAPSULE = PrimitiveKind(
-    "capsule", ("half_length", "radius"), _capsule_distance, _capsule_gradient,
-    long_sizes=(True, False), scalable=(True, True),
-)  # fmt: skip
-CONE = PrimitiveKind(
-    "cone", ("half_length", "radius_bottom", "radius_top"), _cone_distance, _cone_gradient,
-    long_sizes=(True, False, False), scalable=(True, True, True),
-)  # fmt: skip
-SUPERQUADRIC = PrimitiveKind(
-    "superquadric", ("radius_x", "radius_y", "radius_z", "exponent_1", "exponent_2"),
-    _superquadric_distance, _superquadric_gradient,
-    long_sizes=(False, False, True, False, False), scalable=(True, True, True, False, False),
-)  # fmt: skip
-PRIMITIVE_KINDS = {kind.name: kind for kind in (ELLIPSOID, CAPSULE, CONE, SUPERQUADRIC)}
+PRIMITIVE_KINDS: dict[str, PrimitiveKind] = {
+    kind.name: kind for kind in (Ellipsoid(), Capsule(), Cone(), Superquadric())
+}

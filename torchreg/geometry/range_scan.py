@@ -1,7 +1,8 @@
-"""Range scans: a surface seen from one or more sides, by points with or without triangles."""
+"""Range scans: partial surfaces given by points, with or without triangles."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,13 +10,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, as_tensor, check_finite, check_points, check_positive, check_shape
+from torchreg._checks import (
+    as_float_tensor,
+    as_tensor,
+    check_count,
+    check_finite,
+    check_points,
+    check_positive,
+    check_shape,
+)
 from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.boundary import BOUNDARY, boundary_of_faces, boundary_of_points
 from torchreg.geometry.depth_image import unproject
-from torchreg.geometry.mesh import TriangleMesh
-from torchreg.geometry.neighbors import distinct_places, k_nearest_others, nearest_neighbor, sampling_distance
+from torchreg.geometry.mesh import TriangleMesh, distinct_faces
+from torchreg.geometry.neighbors import distinct_positions, k_nearest_others, nearest_neighbor, sampling_distance
 from torchreg.geometry.normals import (
-    check_viewpoint,
+    NORMALS,
     estimate_normals,
     face_vertex_normals,
     fit_normals,
@@ -25,46 +35,37 @@ from torchreg.geometry.normals import (
     orient_normals,
 )
 from torchreg.geometry.poisson_disk import poisson_disk, poisson_disk_count
-from torchreg.geometry.rigid import transform_points
-
-_NORMAL_NEIGHBORS, _BOUNDARY_NEIGHBORS = 16, 24
-# Widest angle without a neighbor that is no boundary yet; of 24 directions at random 1 in 500 leave one that wide.
-_BOUNDARY_GAP = torch.pi * 2 / 3
-# Share of opposed neighbors from which given normals count as unoriented; at random it is a half.
-_UNORIENTED = 0.25
-
-# The largest number whose third power is an int64.
-_LARGEST_CUBED = 2_097_151
+from torchreg.geometry.rigid import RIGID_TOLERANCE, transform_points
 
 
 @dataclass(frozen=True, eq=False, repr=False, init=False)
 class RangeScan:
-    """A partial surface as a scanner sees it, with all that registration asks of it; what is not given is computed.
+    """A partial surface from a scanner, with normals, boundary and spacing; what is not given is computed.
 
-    Any unit will do: nothing here compares with an absolute length.
+    Any unit will do: nothing is compared with an absolute length.
 
-    Normals come from the faces (weighed by angle; triangles wound against their neighbors are turned), or without faces
-    from the nearest 16 points. They look to the viewpoint; if there is none, faces decide by their winding, and points
-    alone turn so that the surface bulges towards the camera, as what one sees of a body does. Given normals are kept,
-    scaled to unit length; where they are zero they are estimated, and where their signs are random they are oriented.
+    Normals come from the faces (weighed by angle; triangles wound against their neighbors are flipped), or without
+    faces from the nearest 16 points. They face the viewpoint; without one, the winding of faces decides, and points
+    alone are oriented such that the surface is convex towards the camera, as the visible side of a body is. Given
+    normals are kept, scaled to unit length; zero ones are estimated, and ones of random signs are oriented.
 
-    A point is on the boundary if an edge of one triangle alone ends there, or no triangle does; without faces, if its
-    neighbors in the tangent plane leave a gap of more than 120 degrees.
+    A point is on the boundary if it is on an edge of a single triangle, or on no triangle; without faces, if its
+    neighbors in the tangent plane leave an angle of more than 120 degrees empty.
 
-    Points at one place are fine: they share normal and boundary, and triangles on them count as connected.
+    Coincident points are fine: they share normal and boundary, and triangles on them count as connected.
 
     Args:
-        points: (N, 3) finite coordinates, float32 or float64, at three places or more.
-        faces: (F, 3) point indices, or None; none at all is None.
+        points: (N, 3) finite coordinates, float32 or float64, at three positions or more.
+        faces: (F, 3) point indices, or None; an empty table counts as None.
         normals: (N, 3) outward, of any length, or None.
-        viewpoint: (3,) where the camera was, or None if that is not known.
+        viewpoint: (3,) position of the camera, or None if unknown.
 
     Attributes:
         points: (N, 3).
         faces: (F, 3) int64, or None.
         normals: (N, 3) unit vectors.
         boundary: (N,) bool.
-        spacing: median distance of a point to the nearest other one, the sampling distance.
+        spacing: median distance of a point to its nearest neighbor, the sampling distance.
         diagonal: of the bounding box.
         viewpoint: (3,) or None.
 
@@ -87,7 +88,7 @@ class RangeScan:
     spacing: float
     diagonal: float
     viewpoint: Tensor | None
-    # Even samples that were asked for, by their count: every stage of a registration asks anew.
+    # Uniform subsamples by their count: every stage of a registration asks for the same ones.
     _even: dict[int, Tensor]
 
     def __init__(self, points: Any, faces: Any = None, normals: Any = None, *, viewpoint: Any = None) -> None:
@@ -102,52 +103,43 @@ class RangeScan:
             normals = as_float_tensor(normals, "normals", like=points)
             check_shape(normals, "normals", tuple(points.shape))
             check_finite(normals, "normals", "pass normals=None to have them estimated")
-        eye = check_viewpoint(viewpoint)
+        camera = None if viewpoint is None else _as_viewpoint(viewpoint)
         with torch.no_grad():
-            normals, boundary, spacing = _measure(points, faces, normals, eye)
-        self._set(points, faces, normals, boundary, spacing, None if eye is None else eye.to(points))
+            normals, boundary, spacing = _measure(points, faces, normals, camera)
+        self._set(
+            points=points,
+            faces=faces,
+            normals=normals,
+            boundary=boundary,
+            spacing=spacing,
+            viewpoint=None if camera is None else camera.to(points),
+        )
 
-    def _set(
-        self,
-        points: Tensor,
-        faces: Tensor | None,
-        normals: Tensor,
-        boundary: Tensor,
-        spacing: float,
-        viewpoint: Tensor | None,
-    ) -> None:
+    def _set(self, *, points: Tensor, **values: Any) -> None:
         box = points.detach().double()
-        values: dict[str, Any] = {
-            "points": points,
-            "faces": faces,
-            "normals": normals,
-            "boundary": boundary,
-            "spacing": spacing,
-            "diagonal": float((box.amax(dim=0) - box.amin(dim=0)).norm()),
-            "viewpoint": viewpoint,
-            "_even": {},
-        }
-        for name, value in values.items():
+        diagonal = float((box.amax(dim=0) - box.amin(dim=0)).norm())
+        for name, value in {"points": points, "diagonal": diagonal, "_even": {}, **values}.items():
             object.__setattr__(self, name, value)
 
-    @classmethod
-    def _of(cls, *values: Any) -> RangeScan:
-        scan = cls.__new__(cls)
-        scan._set(*values)
+    def _with(self, **values: Any) -> RangeScan:
+        """Return the scan with some fields replaced; the others are not computed anew."""
+        names = ("points", "faces", "normals", "boundary", "spacing", "viewpoint")
+        scan = RangeScan.__new__(RangeScan)
+        scan._set(**{name: getattr(self, name) for name in names} | values)
         return scan
 
     @classmethod
     def from_depth(
         cls, depth: Any, intrinsics: Sequence[float], camera_to_world: Any = None, *, max_jump: float = 3.0
     ) -> RangeScan:
-        """Return the scan that a depth image holds, its pixels joined by triangles except across jumps in depth.
+        """Return the scan of a depth image, its pixels joined by triangles except across jumps in depth.
 
         Convention: pixel (row i, column j) with depth z is at ``((j - cx) z / fx, (i - cy) z / fy, z)``: right, down
         and forward of the camera.
 
         Two neighboring pixels are joined unless their depths differ by more than ``max_jump`` pixel widths (at that
-        depth; or the noise of the image, if that is more) from what the surface on either side continues to, or by four
-        times that in all. Pixels that nothing joins are left out.
+        depth; or the noise of the image, if that is more) from the linear continuation of the surface on either side,
+        or by four times that in all. Pixels without a triangle are left out.
 
         Args:
             depth: (H, W) distances along the axis of the camera, any unit; zero, negative or not finite where nothing
@@ -157,7 +149,7 @@ class RangeScan:
             max_jump: see above.
 
         Returns:
-            the scan, its points in the order of the rows, its viewpoint the camera.
+            The scan, its points in the order of the rows, its viewpoint the camera.
 
         Raises:
             InputError: if a size or number does not fit, or no three pixels join.
@@ -166,14 +158,16 @@ class RangeScan:
         """
         depth = as_float_tensor(depth, "depth")
         depth = depth if depth.dtype == torch.float64 else depth.float()
+        check_shape(depth, "depth", ("H", "W"))
+        numbers = _as_intrinsics(intrinsics)
         check_positive(max_jump, "max_jump")
         motion = torch.eye(4, dtype=depth.dtype, device=depth.device)
         if camera_to_world is not None:
             motion = as_float_tensor(camera_to_world, "camera_to_world", like=depth)
-            if abs(_similarity_scale(motion, "camera_to_world") - 1) > 1e-3:
+            if abs(_similarity_scale(motion, "camera_to_world") - 1) > RIGID_TOLERANCE.rounded:
                 raise InputError("camera_to_world must be a rigid motion, got one that scales; scale the depth instead")
         with torch.no_grad():
-            points, faces = unproject(depth, intrinsics, max_jump)
+            points, faces = unproject(depth, numbers, max_jump)
             # Wound towards the camera already.
             normals = TriangleMesh(points, faces).vertex_normals()
             points, normals = transform_points(motion, points), normals @ motion[:3, :3].mT
@@ -192,7 +186,7 @@ class RangeScan:
         """Return indices (M,) of points spread evenly over the surface, however unevenly it was scanned; ascending.
 
         Args:
-            count: how many; all where there are no more. Either this or ``spacing``.
+            count: number of points; all if there are no more. Either this or ``spacing``.
             spacing: least distance between two of them; as many as fit.
             generator: source of randomness; None draws from a fresh generator with seed 0, the same at every call.
 
@@ -206,7 +200,8 @@ class RangeScan:
         if spacing is not None:
             check_positive(spacing, "spacing")
             return poisson_disk(self.points, spacing, generator)
-        number = count or 0
+        number = 0 if count is None else count
+        check_count(number, "count", 1)
         if generator is not None:
             return poisson_disk_count(self.points, number, generator)
         if number not in self._even:
@@ -214,25 +209,25 @@ class RangeScan:
         return self._even[number].clone()
 
     def subset(self, which: Any, *, mark_cut: bool = False) -> RangeScan:
-        """Return the scan of some of the points: their normals and boundary as they are, and the faces among them.
+        """Return the scan of a subset of the points: their normals and boundary as they are, and the faces among them.
 
         Args:
             which: (N,) bool mask, or (M,) indices, all different.
             mark_cut: the points are cut out of the surface, not a sample of it: those that lose a face, or without
-                faces those next to a gap, become boundary too.
+                faces those next to an empty angle, become boundary too.
 
         Returns:
-            the scan, with its own spacing and diagonal, and no faces if none has kept all its corners.
+            The scan, with its own spacing and diagonal, and without faces if none keeps all its corners.
 
         Raises:
-            InputError: if an index is out of range or there twice, or fewer than three places are left.
+            InputError: if an index is out of range or repeated, or fewer than three positions remain.
             InputTypeError: if ``which`` holds neither bool nor integers.
         """
         index = self._indices(which)
         points, normals, boundary = self.points[index], self.normals[index], self.boundary[index]
         with torch.no_grad():
-            places, place = distinct_places(points)
-            spacing = sampling_distance(places)
+            positions, position = _three_positions(points)
+            spacing = sampling_distance(positions)
             faces = None
             if self.faces is not None:
                 new = torch.full((len(self),), -1, device=points.device)
@@ -244,10 +239,10 @@ class RangeScan:
                     corners = moved[~kept].reshape(-1)
                     boundary = boundary.index_fill(0, corners[corners >= 0], True)
             elif mark_cut:
-                guide = torch.zeros_like(places).index_copy(0, place, normals.detach().cpu().double())
-                near, _ = k_nearest_others(places, _BOUNDARY_NEIGHBORS)
-                boundary = boundary | _boundary_of_points(places, guide, near)[place].to(boundary.device)
-        return RangeScan._of(points, faces, normals, boundary, spacing, self.viewpoint)
+                guide = torch.zeros_like(positions).index_copy(0, position, normals.detach().cpu().double())
+                near, _ = k_nearest_others(positions, BOUNDARY.num_neighbors)
+                boundary = boundary | boundary_of_points(positions, guide, near)[position].to(boundary.device)
+        return self._with(points=points, faces=faces, normals=normals, boundary=boundary, spacing=spacing)
 
     def _indices(self, which: Any) -> Tensor:
         which = as_tensor(which, "which", "bool or integers")
@@ -282,23 +277,60 @@ class RangeScan:
         motion = as_float_tensor(motion, "motion", like=self.points)
         scale = _similarity_scale(motion, "motion")
         normals = torch.nn.functional.normalize(self.normals @ motion[:3, :3].mT, dim=-1)
-        eye = None if self.viewpoint is None else transform_points(motion, self.viewpoint[None])[0]
-        return RangeScan._of(
-            transform_points(motion, self.points), self.faces, normals, self.boundary, self.spacing * scale, eye
+        return self._with(
+            points=transform_points(motion, self.points),
+            normals=normals,
+            spacing=self.spacing * scale,
+            viewpoint=None if self.viewpoint is None else transform_points(motion, self.viewpoint[None])[0],
         )
 
     def to(self, *args: Any, **kwargs: Any) -> RangeScan:
         """Return the scan on another device or in another dtype; takes what ``Tensor.to`` takes."""
         points = self.points.to(*args, **kwargs)
         _check_precision(points)
-        faces = None if self.faces is None else self.faces.to(points.device)
-        eye = None if self.viewpoint is None else self.viewpoint.to(points)
-        return RangeScan._of(points, faces, self.normals.to(points), self.boundary.to(points.device), self.spacing, eye)
+        return self._with(
+            points=points,
+            faces=None if self.faces is None else self.faces.to(points.device),
+            normals=self.normals.to(points),
+            boundary=self.boundary.to(points.device),
+            viewpoint=None if self.viewpoint is None else self.viewpoint.to(points),
+        )
 
 
 def _check_precision(points: Tensor) -> None:
     if points.dtype not in (torch.float32, torch.float64):
         raise InputTypeError(f"points must be float32 or float64, got {points.dtype}; convert with .float()")
+
+
+def _as_viewpoint(viewpoint: Any) -> Tensor:
+    """Return a viewpoint (3,) as float64 on the CPU; InputError unless it is three finite numbers."""
+    viewpoint = as_float_tensor(viewpoint, "viewpoint").detach().cpu().double()
+    check_shape(viewpoint, "viewpoint", (3,))
+    if not bool(viewpoint.isfinite().all()):
+        raise InputError(f"viewpoint must be finite, got {viewpoint.tolist()}; pass None if it is not known")
+    return viewpoint
+
+
+def _as_intrinsics(intrinsics: Sequence[float]) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy; InputTypeError unless they are four numbers, InputError unless they are a camera's."""
+    try:
+        focal_x, focal_y, center_x, center_y = (float(value) for value in intrinsics)
+    except (TypeError, ValueError) as error:
+        raise InputTypeError(f"intrinsics must be the four numbers fx, fy, cx, cy, got {intrinsics!r}") from error
+    check_positive(focal_x, "intrinsics[0] (fx)")
+    check_positive(focal_y, "intrinsics[1] (fy)")
+    if not math.isfinite(center_x) or not math.isfinite(center_y):
+        raise InputError(f"intrinsics must be finite, got cx {center_x} and cy {center_y}")
+    return focal_x, focal_y, center_x, center_y
+
+
+def _three_positions(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the distinct positions, and the index of each point's; InputError if there are fewer than three."""
+    check_points(points, "points", min_count=3, batch=False)
+    positions, index = distinct_positions(points)
+    if len(positions) < 3:
+        raise InputError(f"points must lie at 3 places or more, got {len(points)} points at {len(positions)}")
+    return positions, index
 
 
 def _similarity_scale(motion: Tensor, name: str) -> float:
@@ -307,9 +339,10 @@ def _similarity_scale(motion: Tensor, name: str) -> float:
     linear = motion[:3, :3].detach().double()
     volume = float(torch.linalg.det(linear))
     scale = abs(volume) ** (1 / 3)
-    rest = linear.mT @ linear - scale**2 * torch.eye(3, dtype=linear.dtype, device=linear.device)
-    bottom = motion[3].detach().double() - torch.eye(4, dtype=linear.dtype, device=linear.device)[3]
-    if not volume > 0 or float(rest.abs().max()) > 1e-3 * scale**2 or float(bottom.abs().max()) > 1e-6:
+    shear = linear.mT @ linear - scale**2 * torch.eye(3, dtype=linear.dtype, device=linear.device)
+    last_row = motion[3].detach().double() - linear.new_tensor([0.0, 0.0, 0.0, 1.0])
+    is_sheared = float(shear.abs().max()) > RIGID_TOLERANCE.rounded * scale**2
+    if not volume > 0 or is_sheared or float(last_row.abs().max()) > RIGID_TOLERANCE.double:
         raise InputError(
             f"{name} must be a rotation, a scale and a translation with the last row 0 0 0 1, got {motion.tolist()}"
         )
@@ -317,91 +350,47 @@ def _similarity_scale(motion: Tensor, name: str) -> float:
 
 
 def _measure(
-    points: Tensor, faces: Tensor | None, normals: Tensor | None, eye: Tensor | None
+    points: Tensor, faces: Tensor | None, normals: Tensor | None, viewpoint: Tensor | None
 ) -> tuple[Tensor, Tensor, float]:
     """Return normals and boundary on the device of the points, and the spacing."""
-    places, which = distinct_places(points)
-    count = 1 if faces is not None else _BOUNDARY_NEIGHBORS
-    near, distance = k_nearest_others(places, count)
-    corners = None if faces is None else _plain_faces(which[faces.cpu()])
+    positions, which = _three_positions(points)
+    near, distance = k_nearest_others(positions, 1 if faces is not None else BOUNDARY.num_neighbors)
+    corners = None if faces is None else distinct_faces(which[faces.cpu()])
     if normals is not None:
-        normals = _given_normals(points, normals.detach(), near, which, eye)
+        normals = _given_normals(points, normals.detach(), near, which, viewpoint)
     elif corners is not None:
-        normals = face_vertex_normals(places, corners, eye)[which].to(points)
+        normals = face_vertex_normals(positions, corners, viewpoint)[which].to(points)
     else:
-        few = near[:, :_NORMAL_NEIGHBORS]
-        normals = orient_along_graph(places, fit_normals(places, few), few, eye)[which].to(points)
-    normals = _without_zeros(points, normals, eye)
+        nearest = near[:, : NORMALS.num_neighbors]
+        fitted = fit_normals(positions, nearest)
+        normals = orient_along_graph(positions, fitted, nearest, viewpoint)[which].to(points)
+    normals = _without_zeros(points, normals, viewpoint)
     if corners is not None:
-        edge = _boundary_of_faces(corners, len(places))
+        edge = boundary_of_faces(corners, len(positions))
     else:
-        guide = torch.zeros_like(places).index_copy(0, which, normals.cpu().double())
-        edge = _boundary_of_points(places, guide, near)
+        guide = torch.zeros_like(positions).index_copy(0, which, normals.cpu().double())
+        edge = boundary_of_points(positions, guide, near)
     return normals, edge[which].to(points.device), float(distance[:, 0].median())
 
 
-def _given_normals(points: Tensor, normals: Tensor, near: Tensor, which: Tensor, eye: Tensor | None) -> Tensor:
+def _given_normals(points: Tensor, normals: Tensor, near: Tensor, which: Tensor, viewpoint: Tensor | None) -> Tensor:
     # Scaled by the largest component first: squares of tiny lengths underflow.
     normals = normals / normals.abs().amax(dim=-1, keepdim=True).clamp(min=torch.finfo(normals.dtype).tiny)
     normals = torch.nn.functional.normalize(normals, dim=-1)
     guide = torch.zeros(len(near), 3, dtype=torch.float64).index_copy(0, which, normals.cpu().double())
-    if neighbors_disagree(guide, near) > _UNORIENTED:
-        return orient_normals(points, normals, viewpoint=eye)
+    if neighbors_disagree(guide, near) > NORMALS.unoriented:
+        return orient_normals(points, normals, viewpoint=viewpoint)
     return normals
 
 
-def _without_zeros(points: Tensor, normals: Tensor, eye: Tensor | None) -> Tensor:
-    """Return normals with estimates where there were none, on the side of the nearest that there is."""
+def _without_zeros(points: Tensor, normals: Tensor, viewpoint: Tensor | None) -> Tensor:
+    """Return normals with estimates instead of zeros, each on the side of the nearest given normal."""
     empty = normals.norm(dim=-1) < 0.5
     if not bool(empty.any()):
         return normals
     if bool(empty.all()):
-        return estimate_normals(points, viewpoint=eye)
+        return estimate_normals(points, viewpoint=viewpoint)
     estimate = fit_normals_at(points, empty.nonzero()[:, 0])
     nearest, _ = nearest_neighbor(points[empty].detach(), points[~empty].detach())
-    turn = (estimate * normals[~empty][nearest]).sum(-1, keepdim=True) < 0
-    return normals.index_put((empty,), torch.where(turn, -estimate, estimate))
-
-
-def _plain_faces(faces: Tensor) -> Tensor:
-    """Return the faces without those that name a point twice, and each once."""
-    ordered = faces.sort(dim=-1).values
-    plain = (ordered[:, 0] != ordered[:, 1]) & (ordered[:, 1] != ordered[:, 2])
-    faces, ordered = faces[plain], ordered[plain]
-    if len(faces) == 0:
-        return faces
-    size = int(ordered.max()) + 1
-    if size <= _LARGEST_CUBED:
-        _, which = ((ordered[:, 0] * size + ordered[:, 1]) * size + ordered[:, 2]).unique(return_inverse=True)
-    else:
-        _, which = ordered.unique(dim=0, return_inverse=True)  # slower by far
-    first = torch.full((int(which.max()) + 1,), len(faces)).scatter_reduce(0, which, torch.arange(len(faces)), "amin")
-    return faces[first.sort().values]
-
-
-def _boundary_of_faces(faces: Tensor, count: int) -> Tensor:
-    """Return a mask (N,) of the points on an edge of one face alone, or on no face."""
-    sides = torch.stack((faces, faces.roll(-1, dims=1)), dim=-1).sort(dim=-1).values.reshape(-1, 2)
-    key, uses = (sides[:, 0] * count + sides[:, 1]).unique(return_counts=True)
-    rim = key[uses == 1]
-    boundary = torch.ones(count, dtype=torch.bool).index_fill(0, faces.reshape(-1), False)
-    return boundary.index_fill(0, torch.cat((rim // count, rim % count)), True)
-
-
-def _boundary_of_points(points: Tensor, normals: Tensor, near: Tensor) -> Tensor:
-    """Return a mask (N,) of the points whose neighbors (N, K) leave a wide gap around them in the tangent plane."""
-    axis = torch.zeros_like(normals).scatter(1, normals.abs().argmin(dim=1, keepdim=True), 1.0)
-    first = torch.nn.functional.normalize(torch.linalg.cross(normals, axis), dim=-1)
-    second = torch.linalg.cross(normals, first)
-    offset = points[near] - points[:, None]
-    frame = torch.stack((first, second, normals), dim=-1)
-    right, up, out = (offset @ frame).unbind(-1)
-    # What lies steeply above or below is another surface behind or before this one.
-    level = out.abs() <= torch.hypot(right, up)
-    angle = torch.where(level, torch.atan2(up, right), torch.inf).sort(dim=-1).values
-    number = level.sum(dim=-1)
-    last = angle.gather(1, (number - 1).clamp(min=0)[:, None])[:, 0]
-    around = 2 * torch.pi + angle[:, 0] - last
-    between = torch.where(angle[:, 1:].isfinite(), angle[:, 1:] - angle[:, :-1], 0.0)
-    widest = torch.maximum(around, between.amax(dim=-1)) if angle.shape[1] > 1 else around
-    return (widest > _BOUNDARY_GAP) | (number == 0)
+    flip = (estimate * normals[~empty][nearest]).sum(-1, keepdim=True) < 0
+    return normals.index_put((empty,), torch.where(flip, -estimate, estimate))

@@ -2,10 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from torchreg.geometry.rotation import left_jacobian, so3_exp
+
+
+@dataclass(frozen=True)
+class RigidTolerance:
+    """Largest entries of ``|R R^T - I|`` and of the last row's error that a rigid motion may have."""
+
+    # Computed in float64.
+    double: float = 1e-6
+    # Computed in float32, or by a chain of products.
+    single: float = 1e-4
+    # Written by other programs with few digits.
+    rounded: float = 1e-3
+
+
+RIGID_TOLERANCE = RigidTolerance()
+
+
+def rotation_error(matrices: Tensor) -> float:
+    """Return the largest entry of ``|R R^T - I|`` over matrices (..., 3, 3), zero for rotations and mirror images."""
+    identity = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
+    return float((matrices @ matrices.mT - identity).abs().max())
 
 
 def rigid_matrix(rotation: Tensor, translation: Tensor) -> Tensor:
@@ -73,7 +96,7 @@ def transform_points(matrix: Tensor, points: Tensor) -> Tensor:
 
 
 def fit_rigid(source: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Return the rigid motion that takes ``source`` nearest to ``target`` in the weighted least-squares sense.
+    """Return the rigid motion that takes ``source`` to ``target`` in the weighted least-squares sense.
 
     ``argmin_T sum_i w_i |T x_i - y_i|^2``, by SVD of the cross-covariance with det R = +1.
 
@@ -108,7 +131,7 @@ def rescale_motions(transforms: Tensor, scale: float, origin: Tensor) -> Tensor:
     Args:
         transforms: (..., 4, 4) rigid motions in the coordinates x.
         scale: of the new coordinates, positive.
-        origin: (3,) where the old origin is in the new coordinates.
+        origin: (3,) the old origin in the new coordinates.
 
     Returns:
         (..., 4, 4).

@@ -1,4 +1,4 @@
-"""Rigid motions of groups of matched points from sums that add up, so that groups can be joined and tried cheaply."""
+"""Rigid fits of groups of matched points from their moments, which add up when groups are joined."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_count, check_same_kind, check_shape
 from torchreg.geometry.rigid import rigid_matrix
 
 
 @dataclass(frozen=True)
 class RigidMoments:
-    """What a rigid fit asks of the matched points of G groups; moments of two groups add up to those of both.
+    """Sufficient statistics for rigid fits of G groups of matched points; those of two groups add up when joined.
 
     Args:
         sums: (..., G, 17) weighted sums of 1, x, y, ``|x|^2 + |y|^2`` and ``y x^T``, about the origins.
         source_origin: (..., 3) subtracted from the points before summing, against cancellation.
-        target_origin: (..., 3) of the matches.
+        target_origin: (..., 3) subtracted from the matches.
     """
 
     sums: Tensor
@@ -40,19 +39,19 @@ class RigidMoments:
         return least_cost(self.sums)
 
     def motions(self) -> Tensor:
-        """Return the best rigid motions (..., G, 4, 4); a group without mass stays where it is."""
+        """Return the best rigid motions (..., G, 4, 4); the identity for a group without mass."""
         mass, source, target, covariance, _ = _central(self.sums)
-        left, _, right = torch.linalg.svd(covariance)
-        sign = torch.where(torch.linalg.det(left @ right) < 0, -1.0, 1.0).to(mass)
-        left = torch.cat([left[..., :2], sign[..., None, None] * left[..., 2:]], dim=-1)
+        u, _, vh = torch.linalg.svd(covariance)
+        sign = torch.where(torch.linalg.det(u @ vh) < 0, -1.0, 1.0).to(mass)
+        u = torch.cat([u[..., :2], sign[..., None, None] * u[..., 2:]], dim=-1)
         identity = torch.eye(3, dtype=mass.dtype, device=mass.device)
-        rotation = torch.where(mass[..., None, None] > 0, left @ right, identity)
+        rotation = torch.where(mass[..., None, None] > 0, u @ vh, identity)
         source, target = source + self.source_origin.unsqueeze(-2), target + self.target_origin.unsqueeze(-2)
         shift = target - (rotation @ source.unsqueeze(-1)).squeeze(-1)
         return rigid_matrix(rotation, torch.where(mass[..., None] > 0, shift, 0.0))
 
     def joined(self, group: Tensor, count: int) -> RigidMoments:
-        """Return the moments of ``count`` groups, of which ``group`` (G,) names the one that each joins."""
+        """Return the moments of ``count`` joined groups, given the joined group (G,) of each group."""
         blank = self.sums.new_zeros(*self.sums.shape[:-2], count, self.sums.shape[-1])
         sums = blank.index_add(-2, group, self.sums)
         return RigidMoments(sums, self.source_origin, self.target_origin)
@@ -63,36 +62,26 @@ def rigid_moments(source: Tensor, target: Tensor, weights: Tensor, labels: Tenso
 
     Args:
         source: (N, 3).
-        target: (..., N, 3) the matches.
+        target: (..., N, 3) the matches, of the same dtype and device.
         weights: (..., N) not negative.
         labels: (N,) int64, the group of each.
         count: G.
 
-    Raises:
-        InputError: if a shape does not fit.
-        InputTypeError: if dtypes or devices differ.
-
     Differentiable: in ``source``, ``target`` and ``weights``.
 
-    References: Horn 1987, for what a rigid fit depends on.
+    References: Horn 1987, on the moments that a rigid fit depends on.
     """
-    check_count(count, "count", 1)
-    check_shape(source, "source", ("N", 3))
-    check_shape(target, "target", tuple(source.shape), batch=True)
-    check_same_kind(target, "target", source, "source")
-    check_shape(weights, "weights", tuple(target.shape[:-1]))
-    check_shape(labels, "labels", (len(source),))
-    here, there = source.mean(-2), target.mean(-2)
-    x, y = (source - here).expand(target.shape), target - there.unsqueeze(-2)
+    source_origin, target_origin = source.mean(-2), target.mean(-2)
+    x, y = (source - source_origin).expand(target.shape), target - target_origin.unsqueeze(-2)
     square = (x.square() + y.square()).sum(-1, keepdim=True)
     cross = (y.unsqueeze(-1) * x.unsqueeze(-2)).flatten(-2)
     rows = weights.unsqueeze(-1) * torch.cat([torch.ones_like(square), x, y, square, cross], dim=-1)
     sums = rows.new_zeros(*rows.shape[:-2], count, rows.shape[-1]).index_add(-2, labels, rows)
-    return RigidMoments(sums, here, there)
+    return RigidMoments(sums, source_origin, target_origin)
 
 
 def least_cost(sums: Tensor) -> Tensor:
-    """Return what `RigidMoments.cost` does, of sums (..., 17)."""
+    """Return the least cost (...) of sums (..., 17), see `RigidMoments.cost`."""
     _, _, _, covariance, spread = _central(sums)
     size = torch.linalg.svdvals(covariance)
     sign = torch.where(torch.linalg.det(covariance) < 0, -1.0, 1.0).to(sums)

@@ -7,10 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-# Below this squared angle the series to fourth order is exact to float64 rounding.
-_SMALL_SQUARED_ANGLE = 1e-4
-# A quarter turn of the half angle is half a unit of sinc(x) = sin(pi x) / (pi x).
-_SINC_PER_ANGLE = 0.5 / math.pi
+# Squared angle, radians^2, below which series to fourth order are exact to float64 rounding.
+SMALL_SQUARED_ANGLE = 1e-4
 
 
 def skew(vector: Tensor) -> Tensor:
@@ -42,7 +40,7 @@ def so3_exp(rotation_vector: Tensor) -> Tensor:
 
     Differentiable: in ``rotation_vector``, to any order, also at zero.
     """
-    scalar, vector = _unit_quaternion(rotation_vector)
+    scalar, vector = _exp_quaternion(rotation_vector)
     identity = torch.eye(3, dtype=rotation_vector.dtype, device=rotation_vector.device)
     generator = skew(vector)
     half = torch.addcmul(generator @ generator, scalar.unsqueeze(-1), generator)
@@ -95,8 +93,8 @@ def compose_rotation_vectors(first: Tensor, second: Tensor) -> Tensor:
 
     Differentiable: in both, where the resulting angle is below pi.
     """
-    # Both in one tensor: these operations on a few numbers each are what a solver's step spends its time on.
-    scalars, vectors = _unit_quaternion(torch.stack(torch.broadcast_tensors(first, second)))
+    # In one tensor, since the time of a solver's step goes into the number of such small operations.
+    scalars, vectors = _exp_quaternion(torch.stack(torch.broadcast_tensors(first, second)))
     (w1, w2), (v1, v2) = scalars.unbind(), vectors.unbind()
     scalar = w1 * w2 - (v1 * v2).sum(-1, keepdim=True)
     vector = torch.addcmul(torch.linalg.cross(v1, v2), w1, v2)
@@ -114,18 +112,18 @@ def wrap_rotation_vector(rotation_vector: Tensor) -> Tensor:
 
     Differentiable: in ``rotation_vector``, except at odd multiples of pi.
     """
-    scalar, vector = _unit_quaternion(rotation_vector)
+    scalar, vector = _exp_quaternion(rotation_vector)
     return _quaternion_log(scalar, vector)
 
 
-def _unit_quaternion(rotation_vector: Tensor) -> tuple[Tensor, Tensor]:
+def _exp_quaternion(rotation_vector: Tensor) -> tuple[Tensor, Tensor]:
     """Return scalar (..., 1) and vector (..., 3) of the unit quaternion of a rotation vector."""
     if not torch.compiler.is_compiling() and torch.is_inference_mode_enabled():
-        # Without derivatives, half the operations do.
+        # Without derivatives, half the operations do; sinc(x) is sin(pi x) / (pi x).
         angle = torch.linalg.vector_norm(rotation_vector, dim=-1, keepdim=True)
-        return (0.5 * angle).cos(), torch.sinc(angle * _SINC_PER_ANGLE) * (0.5 * rotation_vector)
+        return (0.5 * angle).cos(), torch.sinc(angle * (0.5 / math.pi)) * (0.5 * rotation_vector)
     square = (rotation_vector * rotation_vector).sum(-1, keepdim=True)
-    small = square < _SMALL_SQUARED_ANGLE
+    small = square < SMALL_SQUARED_ANGLE
     angle = square.masked_fill(small, 1.0).sqrt()
     half = angle / 2
     cosine = torch.where(small, _series(square, 1, -1 / 8, 1 / 384), half.cos())
@@ -139,13 +137,13 @@ def _series(x: Tensor, first: float, second: float, third: float) -> Tensor:
 
 
 def _quaternion_log(scalar: Tensor, vector: Tensor) -> Tensor:
-    """Return the rotation vector of a unit quaternion; half the operations of the general one, which solvers feel."""
+    """Return the rotation vector of a unit quaternion, in half the operations of the logarithm of any quaternion."""
     if not torch.compiler.is_compiling() and torch.is_inference_mode_enabled():
         sine = torch.linalg.vector_norm(vector, dim=-1, keepdim=True).clamp_min(torch.finfo(vector.dtype).tiny)
         half = torch.atan2(torch.where(scalar < 0, -sine, sine), scalar.abs())
         return (half / sine) * (vector + vector)
     square = (vector * vector).sum(-1, keepdim=True)
-    small = square < _SMALL_SQUARED_ANGLE / 4
+    small = square < SMALL_SQUARED_ANGLE / 4
     sine = square.masked_fill(small, 1.0).sqrt()
     # asin(s) / s to fourth order, where the angle is small.
     half = torch.where(small, _series(square, 1, 1 / 6, 0.075), torch.atan2(sine, scalar.abs()) / sine)

@@ -1,8 +1,8 @@
-"""Rotations as networks give them: six numbers or a quaternion of any length, and the way to rotation vectors.
+"""Rotation representations for networks: six numbers or a quaternion of any length, and rotation vectors.
 
-Three numbers cannot describe all rotations without a jump; six, or four up to a sign, can. What a network gives is made
-a rotation here, and a rotation a rotation vector, so that the way from the numbers to the rotation that the vector
-stands for is smooth at every angle: the vector itself changes its sign at a half turn, the rotation does not.
+Three numbers cannot parametrize all rotations continuously; six, or four up to a sign, can. The maps from outputs of a
+network to rotations, and on to rotation vectors, are such that the rotation of the vector is smooth at every angle: the
+vector itself changes its sign at a half turn, the rotation does not.
 """
 
 from __future__ import annotations
@@ -10,21 +10,20 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_shape
-from torchreg.geometry.rotation import so3_exp
+from torchreg.geometry.rotation import SMALL_SQUARED_ANGLE, so3_exp
 
-# Columns shorter than this, and columns whose sine to each other is below the second, point nowhere.
-_SHORT, _COLLINEAR = 1e-12, 1e-6
-# Below this squared angle the series to fourth order is exact to float64 rounding.
-_SMALL_SQUARE = 1e-4 / 4
+# Length below which a column or quaternion has no direction.
+_LEAST_LENGTH = 1e-12
+# Sine of the angle between two columns below which they are collinear.
+_LEAST_SINE = 1e-6
 
 
 def rotation_from_6d(columns: Tensor) -> Tensor:
     """Return the rotation matrix of two columns made orthonormal, ``b1 = a1 / |a1|``, ``b2 ~ a2 - (b1 . a2) b1``.
 
-    The third column is ``b1 x b2``. Where a column is zero or both are collinear no rotation is nearer than another: a
-    first column of zero length becomes x, a second one that points nowhere the coordinate axis that lies most across
-    the first. The numbers so replaced get no gradient.
+    The third column is ``b1 x b2``. Zero or collinear columns determine no rotation: a first column of zero length
+    becomes x, a second one of zero length or along the first the coordinate axis nearest to perpendicular to the first.
+    The numbers so replaced get no gradient.
 
     Args:
         columns: (..., 6), the first column and then the second, of any length.
@@ -32,38 +31,30 @@ def rotation_from_6d(columns: Tensor) -> Tensor:
     Returns:
         (..., 3, 3) rotation matrices.
 
-    Raises:
-        InputError: if the last size is not 6.
-
     Differentiable: in ``columns``; finite everywhere, and smooth where the columns are not collinear.
 
     References: Zhou et al. 2019, On the continuity of rotation representations in neural networks, eq. 15.
     """
-    check_shape(columns, "columns", (6,), batch=True)
     axes = torch.eye(3, dtype=columns.dtype, device=columns.device)
     first, second = columns[..., :3], columns[..., 3:]
-    first = _unit(torch.where(_length(first) < _SHORT, axes[0], first))
+    first = _to_unit(torch.where(_length(first) < _LEAST_LENGTH, axes[0], first))
     length = _length(second)
-    direction = second / length.clamp_min(_SHORT)
+    direction = second / length.clamp_min(_LEAST_LENGTH)
     across = direction - (first * direction).sum(-1, keepdim=True) * first
-    lost = (length < _SHORT) | (_length(across) < _COLLINEAR)
-    spare = axes[first.detach().abs().argmin(-1)]
-    spare = spare - (first * spare).sum(-1, keepdim=True) * first
-    second = _unit(torch.where(lost, spare, across))
-    # Once more: nearly collinear columns leave a difference of mostly rounding.
-    second = _unit(second - (first * second).sum(-1, keepdim=True) * first)
+    undetermined = (length < _LEAST_LENGTH) | (_length(across) < _LEAST_SINE)
+    substitute = axes[first.detach().abs().argmin(-1)]
+    substitute = substitute - (first * substitute).sum(-1, keepdim=True) * first
+    second = _to_unit(torch.where(undetermined, substitute, across))
+    # A second time: the difference of nearly collinear columns is mostly rounding.
+    second = _to_unit(second - (first * second).sum(-1, keepdim=True) * first)
     return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)
 
 
 def rotation_to_6d(rotation: Tensor) -> Tensor:
     """Return the first two columns (..., 6) of rotation matrices (..., 3, 3), see `rotation_from_6d`.
 
-    Raises:
-        InputError: if the last sizes are not 3 x 3.
-
     Differentiable: in ``rotation``.
     """
-    check_shape(rotation, "rotation", (3, 3), batch=True)
     return rotation[..., :2].mT.flatten(-2)
 
 
@@ -78,12 +69,9 @@ def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
     Returns:
         (..., 3, 3) rotation matrices.
 
-    Raises:
-        InputError: if the last size is not 4.
-
     Differentiable: in ``quaternion``; finite everywhere, and smooth away from zero.
     """
-    w, x, y, z = _unit_quaternion(quaternion).unbind(-1)
+    w, x, y, z = _normalized_quaternion(quaternion).unbind(-1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
         (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
@@ -103,14 +91,10 @@ def quaternion_from_rotation(rotation: Tensor) -> Tensor:
     Returns:
         (..., 4), scalar first.
 
-    Raises:
-        InputError: if the last sizes are not 3 x 3.
-
     Differentiable: in ``rotation``, also at zero; at half turns up to the sign, which may change there.
 
     References: Shepperd 1978.
     """
-    check_shape(rotation, "rotation", (3, 3), batch=True)
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in rotation.unbind(-2))
     outer = (
         (1 + xx + yy + zz, zy - yz, xz - zx, yx - xy),
@@ -121,7 +105,7 @@ def quaternion_from_rotation(rotation: Tensor) -> Tensor:
     table = torch.stack([torch.stack(row, dim=-1) for row in outer], dim=-2)
     largest = table.detach().diagonal(dim1=-2, dim2=-1).argmax(-1)
     index = largest[..., None, None].expand(*largest.shape, 1, 4)
-    return _upper(_unit(table.gather(-2, index).squeeze(-2)))
+    return _positive_scalar(_to_unit(table.gather(-2, index).squeeze(-2)))
 
 
 def rotation_vector_from_quaternion(quaternion: Tensor) -> Tensor:
@@ -133,18 +117,15 @@ def rotation_vector_from_quaternion(quaternion: Tensor) -> Tensor:
     Returns:
         (..., 3), radians.
 
-    Raises:
-        InputError: if the last size is not 4.
-
     Differentiable: in ``quaternion``, also at zero rotation and, as a rotation, at half turns: there the vector jumps
         to its negative, and ``so3_exp`` of it stays smooth.
     """
-    unit = _upper(_unit_quaternion(quaternion))
+    unit = _positive_scalar(_normalized_quaternion(quaternion))
     scalar, vector = unit[..., :1], unit[..., 1:]
     square = (vector * vector).sum(-1, keepdim=True)
-    small = square < _SMALL_SQUARE
+    small = square < SMALL_SQUARED_ANGLE / 4
     sine = square.masked_fill(small, 1.0).sqrt()
-    # Both branches depend on the scalar as atan2 does; atan(t) / t with t = sine / scalar where that is small.
+    # Each branch depends on the scalar as atan2 does; atan(t) / t with t = sine / scalar where that is small.
     ratio = (square / scalar.masked_fill(~small, 1.0).square()).masked_fill(~small, 0.0)
     series = (1 - ratio / 3 + ratio * ratio / 5) / scalar.masked_fill(~small, 1.0)
     return 2 * torch.where(small, series, torch.atan2(sine, scalar) / sine) * vector
@@ -153,12 +134,8 @@ def rotation_vector_from_quaternion(quaternion: Tensor) -> Tensor:
 def quaternion_from_rotation_vector(rotation_vector: Tensor) -> Tensor:
     """Return the unit quaternion (..., 4), scalar first and not negative, of rotation vectors (..., 3), radians.
 
-    Raises:
-        InputError: if the last size is not 3.
-
     Differentiable: in ``rotation_vector``, also at zero.
     """
-    check_shape(rotation_vector, "rotation_vector", (3,), batch=True)
     return quaternion_from_rotation(so3_exp(rotation_vector))
 
 
@@ -173,9 +150,6 @@ def rotation_vector_from_rotation(rotation: Tensor) -> Tensor:
     Returns:
         (..., 3), radians.
 
-    Raises:
-        InputError: if the last sizes are not 3 x 3.
-
     Differentiable: in ``rotation``, at every angle.
     """
     return rotation_vector_from_quaternion(quaternion_from_rotation(rotation))
@@ -183,9 +157,6 @@ def rotation_vector_from_rotation(rotation: Tensor) -> Tensor:
 
 def rotation_vector_from_6d(columns: Tensor) -> Tensor:
     """Return the rotation vectors (..., 3), radians, of six numbers (..., 6), see `rotation_from_6d`.
-
-    Raises:
-        InputError: if the last size is not 6.
 
     Differentiable: in ``columns``, see `rotation_from_6d`.
     """
@@ -195,22 +166,17 @@ def rotation_vector_from_6d(columns: Tensor) -> Tensor:
 def rotation_vector_to_6d(rotation_vector: Tensor) -> Tensor:
     """Return the six numbers (..., 6) of rotation vectors (..., 3), radians, see `rotation_to_6d`.
 
-    Raises:
-        InputError: if the last size is not 3.
-
     Differentiable: in ``rotation_vector``, also at zero.
     """
-    check_shape(rotation_vector, "rotation_vector", (3,), batch=True)
     return rotation_to_6d(so3_exp(rotation_vector))
 
 
-def _unit_quaternion(quaternion: Tensor) -> Tensor:
-    check_shape(quaternion, "quaternion", (4,), batch=True)
+def _normalized_quaternion(quaternion: Tensor) -> Tensor:
     identity = quaternion.new_tensor([1.0, 0.0, 0.0, 0.0])
-    return _unit(torch.where(_length(quaternion) < _SHORT, identity, quaternion))
+    return _to_unit(torch.where(_length(quaternion) < _LEAST_LENGTH, identity, quaternion))
 
 
-def _upper(quaternion: Tensor) -> Tensor:
+def _positive_scalar(quaternion: Tensor) -> Tensor:
     return torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
 
 
@@ -218,7 +184,7 @@ def _length(vector: Tensor) -> Tensor:
     return torch.linalg.vector_norm(vector.detach(), dim=-1, keepdim=True)
 
 
-def _unit(vector: Tensor) -> Tensor:
+def _to_unit(vector: Tensor) -> Tensor:
     # By the largest entry first, so that the squares of short vectors do not vanish.
     scaled = vector / vector.detach().abs().amax(-1, keepdim=True)
     return scaled * (scaled * scaled).sum(-1, keepdim=True).rsqrt()

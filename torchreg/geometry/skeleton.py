@@ -1,4 +1,4 @@
-"""Skeletons: trees of nodes with radius and frame, and what one reads off them: tips, junctions, limbs, topology."""
+"""Skeletons: trees of nodes with radii and frames, their tips, junctions, limbs and topology."""
 
 from __future__ import annotations
 
@@ -11,38 +11,29 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchreg._checks import (
-    as_float_tensor,
-    as_tensor,
-    check_count,
-    check_finite,
-    check_points,
-    check_same_kind,
-    check_shape,
-)
+from torchreg._checks import as_float_tensor, as_tensor, check_count, check_finite, check_points, check_shape
 from torchreg.errors import InputError, InputTypeError
-from torchreg.geometry.rigid import transform_points
+from torchreg.geometry.rigid import RIGID_TOLERANCE, rotation_error, transform_points
 
-# Neighbors of every node; how far a frame may be from a rotation before it is refused.
+# Neighbors of every node.
 _Neighbors = list[list[int]]
-_ROTATION_SLACK = 1e-3
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False, init=False)
 class Skeleton:
-    """A tree of curves in the middle of a body; its leaves are the tips, its branchings the junctions.
+    """A tree of curves along the medial axis of a body; its leaves are the tips, its branch nodes the junctions.
 
     Convention: ``frames[n]`` is ``R_world_node``: its columns are the major and minor axis of the ring of surface
-    around the node and, right-handed to these, the direction of the limb; signs carry on along a limb, from its start
-    to its end.
+    around the node and, right-handed to these, the direction of the limb; signs are consistent along a limb, from its
+    start to its end.
 
     Args:
         nodes: (N, 3) finite coordinates in the unit of the surface, float32 or float64; at least one.
         edges: (N - 1, 2) node indices; together they must join all nodes.
         radii: (N,) distance from a node to the surface around it, in the unit of the surface.
         frames: (N, 3, 3) rotations; identities by default.
-        confidence: (K,) from 0 to 1, how surely each of `tips` is the end of a limb; ones by default.
-        notes: what was done to the surface that the caller may want to know, such as fragments left out or loops cut.
+        confidence: (K,) from 0 to 1, confidence that each of `tips` is the end of a limb; ones by default.
+        notes: repairs of the surface, in words, such as fragments left out or loops cut.
 
     Raises:
         InputError: if a shape is wrong, a number is not finite, a frame is no rotation, or the graph is no tree.
@@ -56,24 +47,32 @@ class Skeleton:
     nodes: Tensor
     edges: Tensor
     radii: Tensor
-    frames: Tensor = None  # type: ignore[assignment]
-    confidence: Tensor = None  # type: ignore[assignment]
-    notes: tuple[str, ...] = ()
+    frames: Tensor
+    confidence: Tensor
+    notes: tuple[str, ...]
 
-    def __post_init__(self) -> None:
-        nodes = as_float_tensor(self.nodes, "nodes")
+    def __init__(
+        self,
+        nodes: Any,
+        edges: Any,
+        radii: Any,
+        frames: Any = None,
+        confidence: Any = None,
+        notes: Sequence[str] = (),
+    ) -> None:
+        nodes = as_float_tensor(nodes, "nodes")
         check_points(nodes, "nodes", batch=False)
-        radii = as_float_tensor(self.radii, "radii", like=nodes)
+        radii = as_float_tensor(radii, "radii", like=nodes)
         check_shape(radii, "radii", (len(nodes),))
         check_finite(radii, "radii")
-        for name, value in (("nodes", nodes), ("radii", radii), ("edges", _check_tree(self.edges, nodes))):
+        edges, frames = _check_tree(edges, nodes), _check_frames(frames, nodes)
+        values = {"nodes": nodes, "radii": radii, "edges": edges, "frames": frames, "notes": tuple(notes)}
+        for name, value in values.items():
             object.__setattr__(self, name, value)
-        object.__setattr__(self, "frames", _check_frames(self.frames, nodes))
-        confidence = nodes.new_ones(len(self.tips)) if self.confidence is None else self.confidence
+        confidence = nodes.new_ones(len(self.tips)) if confidence is None else confidence
         confidence = as_float_tensor(confidence, "confidence", like=nodes)
         check_shape(confidence, "confidence", (len(self.tips),))
         object.__setattr__(self, "confidence", confidence)
-        object.__setattr__(self, "notes", tuple(self.notes))
 
     def __len__(self) -> int:
         return self.nodes.shape[0]
@@ -86,22 +85,22 @@ class Skeleton:
 
     @cached_property
     def degrees(self) -> Tensor:
-        """How many edges end in each node, (N,)."""
+        """Number (N,) of edges at each node."""
         return torch.bincount(self.edges.reshape(-1), minlength=len(self))
 
     @cached_property
     def tips(self) -> Tensor:
-        """Indices (K,) of the nodes in which one edge ends, ascending; the node itself where there is only one."""
+        """Indices (K,) of the nodes with one edge, ascending; the node itself if there is only one."""
         return (self.degrees <= 1).nonzero()[:, 0]
 
     @cached_property
     def junctions(self) -> Tensor:
-        """Indices (J,) of the nodes in which three or more edges meet, ascending; ``degrees`` says how many."""
+        """Indices (J,) of the nodes with three or more edges, ascending; see `degrees`."""
         return (self.degrees >= 3).nonzero()[:, 0]
 
     @cached_property
     def limbs(self) -> tuple[Tensor, ...]:
-        """One (n,) tensor of node indices per limb, both ends included.
+        """Node indices (n,) of each limb, with its two ends.
 
         Limbs that end in tips come first, in the order of `tips`, and start there; a tree without junctions is a single
         limb. Limbs between junctions follow, sorted by the indices of their ends, and start at the smaller one.
@@ -113,7 +112,7 @@ class Skeleton:
                 chain = [start, first]
                 while chain[-1] not in stops:
                     chain.append(next(n for n in neighbors[chain[-1]] if n != chain[-2]))
-                # Found again from its other end; a limb has its place where it was found first.
+                # The same limb found from its second end is left out.
                 chains.setdefault(frozenset((start, chain[-1])), chain)
         tips = set(self.tips.tolist())
         ordered = sorted(chains.values(), key=lambda chain: (chain[0] not in tips, chain[0], chain[-1]))
@@ -121,7 +120,7 @@ class Skeleton:
 
     @cached_property
     def limb_ends(self) -> Tensor:
-        """Node indices (L, 2) in which the limbs start and end."""
+        """Node indices (L, 2) of the start and end of each limb."""
         ends = [torch.stack((limb[0], limb[-1])) for limb in self.limbs]
         return torch.stack(ends) if ends else self.edges.new_zeros(0, 2)
 
@@ -138,12 +137,12 @@ class Skeleton:
 
     @cached_property
     def topology(self) -> str:
-        """Canonical form of the tree of tips and junctions: equal for two skeletons exactly if their trees are alike.
+        """Canonical form of the tree of tips and junctions, equal for two skeletons exactly if these are isomorphic.
 
-        Nodes of degree two, lengths and the numbering have no part in it. Every node is a pair of brackets around its
-        branches, seen from the middle of the tree: ``(()()()()())`` is a junction with five tips.
+        Nodes of degree two, lengths and the numbering do not count. Every node is a pair of brackets around its
+        branches, from the center of the tree: ``(()()()()())`` is a junction with five tips.
 
-        References: Aho, Hopcroft and Ullman 1974, example 3.2; Jordan 1869 on the middle of a tree.
+        References: Aho, Hopcroft and Ullman 1974, example 3.2; Jordan 1869 on the center of a tree.
         """
         graph = _Neighbors()
         number: dict[int, int] = {}
@@ -153,13 +152,13 @@ class Skeleton:
         for start, end in self.limb_ends.tolist():
             graph[number[start]].append(number[end])
             graph[number[end]].append(number[start])
-        return min(_bracketed(graph, middle) for middle in _middles(graph))
+        return min(_bracketed(graph, center) for center in _tree_centers(graph))
 
     def limb_of(self, points: Tensor) -> Tensor:
-        """Return the limb (N,) whose surface is nearest to each point (N, 3): a first guess of the parts of a body.
+        """Return the limb (N,) with the nearest surface to each point (N, 3): a first guess of the parts of a body.
 
-        A limb ends where the surface around the junction begins: its own nodes within the radius of a junction, which
-        lie inside the trunk, do not count, unless it has no others. Distances are to nodes, less their radii.
+        A limb ends at the sphere around its junction: its nodes within the radius of the junction, which lie inside the
+        trunk, do not count, unless all of them do. Distances are to nodes, less their radii.
 
         Raises:
             InputError: if points have another shape, or the skeleton has no limb.
@@ -179,7 +178,7 @@ class Skeleton:
         return kept if len(kept) else limb
 
     def path(self, start: int, end: int) -> Tensor:
-        """Return the node indices (n,) from one node to another along the tree, both included.
+        """Return the node indices (n,) of the path between two nodes of the tree, with these.
 
         Raises:
             InputError: if there is no such node.
@@ -187,24 +186,25 @@ class Skeleton:
         for name, node in (("start", start), ("end", end)):
             if not 0 <= node < len(self):
                 raise InputError(f"{name} must be a node from 0 to {len(self) - 1}, got {node}")
-        towards = _parents(self._neighbors, int(end))
+        towards = _parent_map(self._neighbors, int(end))
         chain = [int(start)]
         while chain[-1] != end:
             chain.append(towards[chain[-1]])
         return torch.tensor(chain, device=self.nodes.device)
 
     def resample(self, count: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Return every limb at equal steps of its own length.
+        """Return samples of every limb at equal steps of its arc length.
 
         Args:
-            count: samples per limb, both ends included; at least 2.
+            count: samples per limb, with its two ends; at least 2.
 
         Returns:
-            curves (L, count, 3), radii (L, count) and frames (L, count, 3, 3); see `resample_curve`.
+            Curves (L, count, 3), radii (L, count) and frames (L, count, 3, 3); see `resample_curve`.
 
         Raises:
             InputError: if ``count`` is too small, or the skeleton is a single node.
         """
+        check_count(count, "count", 2)
         if not self.limbs:
             raise InputError("skeleton must have a limb to resample, got a single node")
         parts = [resample_curve(self.nodes[limb], self.radii[limb], self.frames[limb], count) for limb in self.limbs]
@@ -229,29 +229,24 @@ class Skeleton:
         for start, end in self.edges.tolist():
             neighbors[start].append(end)
             neighbors[end].append(start)
-        return [sorted(some) for some in neighbors]
+        return [sorted(adjacent) for adjacent in neighbors]
 
 
 def resample_curve(points: Tensor, radii: Tensor, frames: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a polyline at equal steps of its length, with its radii and frames.
+    """Return samples of a polyline at equal steps of its arc length, with radii and frames.
 
     Args:
         points: (n, 3) in order, at least two.
         radii: (n,).
         frames: (n, 3, 3) rotations.
-        count: samples, both ends included; at least 2.
+        count: samples, with the two ends; at least 2.
 
     Returns:
-        points (count, 3), radii (count,), both linear between the points, and frames (count, 3, 3), which are the
-        rotations nearest to the linear mean.
+        Points (count, 3) and radii (count,), linear between those given, and frames (count, 3, 3), the rotations
+        nearest to the linear mean.
 
-    Raises:
-        InputError: if ``count`` or the number of points is too small.
-
-    Differentiable: in points and radii; the place along the polyline is held fixed.
+    Differentiable: in points and radii; the arc lengths of the samples are held fixed.
     """
-    check_count(count, "count", 2)
-    check_points(points, "points", min_count=2, batch=False)
     with torch.no_grad():
         along = torch.cat((points.new_zeros(1), (points[1:] - points[:-1]).norm(dim=-1).cumsum(0)))
         wanted = torch.linspace(0, 1, count, dtype=points.dtype, device=points.device) * along[-1]
@@ -260,11 +255,11 @@ def resample_curve(points: Tensor, radii: Tensor, frames: Tensor, count: int) ->
         share = torch.where(step > 0, (wanted - along[after - 1]) / torch.where(step > 0, step, 1.0), 0.0)
         share = share.clamp(0, 1)
 
-    def mixed(values: Tensor) -> Tensor:
+    def interpolated(values: Tensor) -> Tensor:
         weight = share.reshape(-1, *(1,) * (values.ndim - 1))
         return values[after - 1] + weight * (values[after] - values[after - 1])
 
-    return mixed(points), mixed(radii), nearest_rotation(mixed(frames.detach()))
+    return interpolated(points), interpolated(radii), nearest_rotation(interpolated(frames.detach()))
 
 
 def nearest_rotation(matrices: Tensor) -> Tensor:
@@ -272,10 +267,10 @@ def nearest_rotation(matrices: Tensor) -> Tensor:
 
     References: Arun, Huang and Blostein 1987; Umeyama 1991 for the determinant.
     """
-    left, _, right = torch.linalg.svd(matrices)
+    u, _, vh = torch.linalg.svd(matrices)
     sign = torch.ones_like(matrices[..., 0])
-    sign[..., 2] = torch.linalg.det(left @ right)
-    return left * sign.unsqueeze(-2) @ right
+    sign[..., 2] = torch.linalg.det(u @ vh)
+    return u * sign.unsqueeze(-2) @ vh
 
 
 def build_skeleton(
@@ -284,24 +279,19 @@ def build_skeleton(
     """Return the skeleton whose limbs are given as polylines that share their end nodes.
 
     Args:
-        limbs: per limb points (n, 3), radii (n,) and frames (n, 3, 3), n >= 2, all of one dtype and device.
-        ends: per limb the numbers of its first and last node, any integers; limbs with the same number meet there. The
-            place, radius and frame of such a node come from the first limb that names it.
+        limbs: points (n, 3), radii (n,) and frames (n, 3, 3) of each limb, n >= 2, all of one dtype and device.
+        ends: names of the first and last node of each limb, any integers; limbs meet at nodes of the same name. The
+            position, radius and frame of such a node come from the first limb that names it.
         notes: see `Skeleton`.
 
     Raises:
         InputError: if the limbs do not make a tree.
     """
-    if not limbs or len(limbs) != len(ends):
-        raise InputError(f"limbs must be at least one and as many as ends, got {len(limbs)} and {len(ends)}")
     number: dict[int, int] = {}
     values: list[tuple[Tensor, Tensor, Tensor]] = []
     edges: list[tuple[int, int]] = []
-    for index, (limb, (first, last)) in enumerate(zip(limbs, ends, strict=True)):
-        check_same_kind(limb[0], f"limbs[{index}]", limbs[0][0], "limbs[0]")
+    for limb, (first, last) in zip(limbs, ends, strict=True):
         names = [first, *[None] * (len(limb[0]) - 2), last]
-        if len(names) != len(limb[0]):
-            raise InputError(f"limbs[{index}] must have at least 2 points, got {len(limb[0])}")
         chain = []
         for name, *value in zip(names, *limb, strict=True):
             if name is None or name not in number:
@@ -331,43 +321,42 @@ def _check_tree(edges: Any, nodes: Tensor) -> Tensor:
 
 
 def _count_reached(edges: Tensor, count: int) -> int:
-    """Return how many nodes the edges join with node 0, itself included."""
+    """Return the number of nodes that edges connect with node 0, itself included."""
     neighbors: _Neighbors = [[] for _ in range(count)]
     for start, end in edges.tolist():
         neighbors[start].append(end)
         neighbors[end].append(start)
-    return len(_parents(neighbors, 0))
+    return len(_parent_map(neighbors, 0))
 
 
 def _check_frames(frames: Any, nodes: Tensor) -> Tensor:
-    eye = torch.eye(3, dtype=nodes.dtype, device=nodes.device).expand(len(nodes), 3, 3)
     if frames is None:
-        return eye.clone()
+        return torch.eye(3, dtype=nodes.dtype, device=nodes.device).repeat(len(nodes), 1, 1)
     frames = as_float_tensor(frames, "frames", like=nodes)
     check_shape(frames, "frames", (len(nodes), 3, 3))
     check_finite(frames, "frames")
-    off = float((frames @ frames.mT - eye).abs().max())
-    if off > _ROTATION_SLACK or bool((torch.linalg.det(frames) < 0).any()):
-        raise InputError(f"frames must be rotations, got matrices {off:.3g} from orthogonal or with determinant -1")
+    error = rotation_error(frames)
+    if error > RIGID_TOLERANCE.rounded or bool((torch.linalg.det(frames) < 0).any()):
+        raise InputError(f"frames must be rotations, got matrices {error:.3g} from orthogonal or with determinant -1")
     return frames
 
 
-def _parents(neighbors: _Neighbors, root: int) -> dict[int, int]:
-    """Return every node that the root reaches with the next node towards the root; in order of distance."""
+def _parent_map(neighbors: _Neighbors, root: int) -> dict[int, int]:
+    """Return the parent of every node reached from the root, whose parent is itself, in order of distance."""
     parents = {root: root}
     queue = [root]
     for node in queue:
-        for other in neighbors[node]:
-            if other not in parents:
-                parents[other] = node
-                queue.append(other)
+        for neighbor in neighbors[node]:
+            if neighbor not in parents:
+                parents[neighbor] = node
+                queue.append(neighbor)
     return parents
 
 
-def _middles(graph: _Neighbors) -> list[int]:
-    """Return the one or two nodes of a tree whose farthest node is nearest: in the middle of a longest path."""
-    far = list(_parents(graph, 0))[-1]
-    parents = _parents(graph, far)
+def _tree_centers(graph: _Neighbors) -> list[int]:
+    """Return the one or two centers of a tree, in the middle of a longest path."""
+    far = list(_parent_map(graph, 0))[-1]
+    parents = _parent_map(graph, far)
     chain = [list(parents)[-1]]
     while chain[-1] != far:
         chain.append(parents[chain[-1]])
@@ -375,7 +364,8 @@ def _middles(graph: _Neighbors) -> list[int]:
 
 
 def _bracketed(graph: _Neighbors, root: int) -> str:
-    parents = _parents(graph, root)
+    """Return the canonical form of a rooted tree."""
+    parents = _parent_map(graph, root)
     branches: dict[int, list[str]] = {node: [] for node in parents}
     for node in reversed(parents):
         form = "(" + "".join(sorted(branches[node])) + ")"

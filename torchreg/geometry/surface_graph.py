@@ -1,4 +1,4 @@
-"""Surfaces as graphs: edges, pieces that hang together, holes closed, one piece made of several."""
+"""Meshes as graphs: edges, connected pieces, closed holes, coarser meshes."""
 
 from __future__ import annotations
 
@@ -7,18 +7,27 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_choice
 from torchreg.errors import InputError
 from torchreg.geometry.graphs import connected_components, minimum_spanning_forest
-from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.mesh import TriangleMesh, distinct_faces
 from torchreg.geometry.neighbors import NeighborTree, weld
 
 PIECES = ("largest", "bridge", "error")
-# Fragments with a smaller share of the faces are dust: never bridged to, and no reason for an error.
-_DUST = 1e-3
-_NEAR_PIECES = 12
-# Edge of a cell in which vertices fall together, in square roots of the area per vertex wanted.
-_CELL = 1.15
+
+
+@dataclass(frozen=True)
+class _Repair:
+    """Numbers by which meshes are repaired and coarsened."""
+
+    # Share of the faces below which a piece is dust: never bridged to, and no reason for an error.
+    dust: float = 1e-3
+    # Pieces with the nearest boxes to which bridges are searched.
+    near_pieces: int = 12
+    # Edge of a cell whose vertices are merged, in square roots of the wanted area per vertex.
+    cell: float = 1.15
+
+
+_REPAIR = _Repair()
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,10 +35,10 @@ class OnePiece:
     """A surface without holes or loose parts, made from any triangles.
 
     Args:
-        mesh: the surface; its vertices are float64 on the CPU, the middles of closed holes last.
-        vertex: (V,) vertex of the original mesh that each one comes from; -1 for the middle of a hole.
-        bridges: (B, 2) vertices to be thought of as joined, empty unless pieces were bridged.
-        notes: what was done, in words; empty for a clean surface.
+        mesh: the surface; its vertices are float64 on the CPU, the centers of closed holes last.
+        vertex: (V,) original vertex of each vertex; -1 for the center of a hole.
+        bridges: (B, 2) vertices that count as joined, empty unless pieces were bridged.
+        notes: the repairs, in words; empty for a clean surface.
     """
 
     mesh: TriangleMesh
@@ -39,7 +48,7 @@ class OnePiece:
 
 
 def unique_edges(faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the edges (E, 2) of triangles, smaller index first, and the edges (F, 3) of each: 01, 12, 20.
+    """Return the edges (E, 2) of triangles, smaller index first, and the edges 01, 12, 20 (F, 3) of each triangle.
 
     Args:
         faces: (F, 3) vertex indices.
@@ -53,37 +62,36 @@ def unique_edges(faces: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def one_piece(mesh: TriangleMesh, pieces: str = "largest") -> OnePiece:
-    """Return a surface with its duplicate vertices welded, its holes closed and its loose parts dealt with.
+    """Return a surface with duplicate vertices welded, holes closed and loose parts dropped or bridged.
 
-    A hole is closed by triangles from its rim to the mean of the rim. Triangles that repeat a vertex and vertices that
-    no triangle uses are dropped. Edges with more than two triangles and any winding are fine.
+    A hole is closed by triangles from its rim to the mean of the rim. Triangles that repeat a vertex and vertices
+    without triangles are dropped. Edges with more than two triangles and any winding are fine.
 
     Args:
-        mesh: at least one triangle with three different places.
+        mesh: at least one triangle with three distinct corners.
         pieces: ``"largest"`` keeps the piece with the largest area; ``"bridge"`` also joins the others to it, each by
             the shortest segment between vertices; ``"error"`` raises. Dust, pieces with less than a thousandth of the
             triangles, is left out by all three.
 
     Raises:
-        InputError: if no triangle is left, all are without area, or ``pieces`` is "error" and there are several.
+        InputError: if there is no such triangle, all are without area, or ``pieces`` is "error" and there are several.
 
     Differentiable: no.
     """
-    check_choice(pieces, "pieces", PIECES)
-    place = weld(mesh.vertices.detach().cpu().double())
-    faces = place[mesh.faces.cpu()]
-    faces = faces[(faces != faces.roll(1, dims=1)).all(1)]
-    if len(faces) == 0:
+    position = weld(mesh.vertices.detach().cpu().double())
+    faces = position[mesh.faces.cpu()]
+    if not bool((faces != faces.roll(1, dims=1)).all(1).any()):
         raise InputError(f"mesh must have a triangle with three different corners, got {mesh.num_faces} faces without")
     if not float(TriangleMesh(mesh.vertices.detach().cpu().double(), mesh.faces.cpu()).face_areas().sum()) > 0:
         raise InputError("mesh must have a surface, got triangles without area")
     # A face used twice would make its edges look shared.
-    faces = _distinct_faces(faces)
-    original = torch.zeros(int(place.max()) + 1, dtype=torch.int64).index_copy(0, place, torch.arange(len(place)))
+    faces = distinct_faces(faces)
+    original = torch.zeros(int(position.max()) + 1, dtype=torch.int64)
+    original = original.index_copy(0, position, torch.arange(len(position)))
     vertices = mesh.vertices.detach().cpu().double()[original]
-    faces, kept, notes, labels = _choose(vertices, faces, pieces)
-    used, which = faces.unique(return_inverse=True)
-    faces, vertices, original = which, vertices[used], original[used]
+    faces, kept, notes, labels = _kept_pieces(vertices, faces, pieces)
+    used, faces = faces.unique(return_inverse=True)
+    vertices, original = vertices[used], original[used]
     bridges = _bridges(vertices, labels[used], kept) if kept > 1 else faces.new_zeros(0, 2)
     if kept > 1:
         notes += (f"{kept} pieces joined by {len(bridges)} bridges",)
@@ -95,14 +103,14 @@ def one_piece(mesh: TriangleMesh, pieces: str = "largest") -> OnePiece:
 
 
 def coarsened(mesh: TriangleMesh, count: int) -> TriangleMesh:
-    """Return a surface with about ``count`` vertices at most, each in the middle of a patch of the old ones.
+    """Return a surface with about ``count`` vertices at most, each the mean of a patch of the given ones.
 
-    A patch is what hangs together within a cubic cell, so that sheets and limbs that only come near each other stay
-    apart; where that is no disk, as where a limb is thinner than a cell, the vertices stay as they are.
+    A patch is a connected part of the surface within a cubic cell, so that sheets and limbs that only come near each
+    other stay apart; vertices of patches that are no disks, as where a limb is thinner than a cell, stay as they are.
 
     Args:
         mesh: returned as it is if it has no more vertices.
-        count: number of vertices to aim at; the triangles where patches meet at a point may leave small holes.
+        count: wanted number of vertices; triangles at points where several patches meet may leave small holes.
 
     Differentiable: no.
 
@@ -113,7 +121,7 @@ def coarsened(mesh: TriangleMesh, count: int) -> TriangleMesh:
     if mesh.num_vertices <= count:
         return mesh
     vertices, faces = mesh.vertices, mesh.faces
-    size = _CELL * (mesh.face_areas().sum() / count).sqrt()
+    size = _REPAIR.cell * (mesh.face_areas().sum() / count).sqrt()
     cells = ((vertices - vertices.amin(0)) / size).floor().long()
     number = cells.amax(0) + 1
     cell = (cells[:, 0] * number[1] + cells[:, 1]) * number[2] + cells[:, 2]
@@ -132,38 +140,27 @@ def coarsened(mesh: TriangleMesh, count: int) -> TriangleMesh:
     return TriangleMesh(total / torch.bincount(patch)[:, None], faces)
 
 
-def _distinct_faces(faces: Tensor) -> Tensor:
-    """Return the faces (F, 3) without those that have the corners of another."""
-    low, middle, high = faces.sort(dim=1).values.unbind(1)
-    count = int(faces.max()) + 1
-    # Two numbers per face instead of three: three might not fit into 64 bits.
-    pair = (low * count + middle).unique(return_inverse=True)[1]
-    key, order = (pair * count + high).sort(stable=True)
-    first = torch.cat((key.new_ones(1, dtype=torch.bool), key[1:] != key[:-1]))
-    return faces[order[first].sort().values]
-
-
-def _choose(vertices: Tensor, faces: Tensor, pieces: str) -> tuple[Tensor, int, tuple[str, ...], Tensor]:
-    """Return the faces of the pieces to keep, their number, notes and the piece (V,) of each vertex."""
+def _kept_pieces(vertices: Tensor, faces: Tensor, pieces: str) -> tuple[Tensor, int, tuple[str, ...], Tensor]:
+    """Return the faces of the pieces to keep, the number of these, notes and the piece (V,) of each vertex."""
     labels = connected_components(torch.cat((faces[:, :2], faces[:, 1:])), len(vertices))
     piece = labels[faces[:, 0]]
     number = torch.bincount(piece)
     areas = torch.bincount(piece, TriangleMesh(vertices, faces).face_areas(), minlength=len(number))
-    large = number >= _DUST * len(faces)
+    large = number >= _REPAIR.dust * len(faces)
     count = int(large.sum())
     if count > 1 and pieces == "error":
         shares = ", ".join(f"{share:.1%}" for share in (areas[large] / areas.sum()).sort(descending=True).values[:5])
         raise InputError(f"mesh must be one piece, got {count} (area {shares}); choose pieces='largest' or 'bridge'")
     keep = large if pieces == "bridge" else torch.arange(len(number)) == areas.argmax()
-    left_out = int((number > 0).sum()) - int(keep.sum())
-    notes = (f"{left_out} fragment(s) left out, {1 - float(number[keep].sum()) / len(faces):.2%} of the faces",)
-    return faces[keep[piece]], int(keep.sum()), notes if left_out else (), labels
+    dropped = int((number > 0).sum()) - int(keep.sum())
+    notes = (f"{dropped} fragment(s) left out, {1 - float(number[keep].sum()) / len(faces):.2%} of the faces",)
+    return faces[keep[piece]], int(keep.sum()), notes if dropped else (), labels
 
 
 def _bridges(vertices: Tensor, labels: Tensor, count: int) -> Tensor:
-    """Return the vertex pairs (count - 1, 2) that join all pieces with the least total length.
+    """Return the vertex pairs (count - 1, 2) of least total length that join all pieces.
 
-    Of many pieces each is compared with those whose boxes are nearest.
+    Of many pieces each is compared with those of the nearest boxes.
     """
     groups = [(labels == label).nonzero()[:, 0] for label in labels.unique().tolist()]
     trees = [NeighborTree(vertices[group]) for group in groups]
@@ -179,14 +176,14 @@ def _bridges(vertices: Tensor, labels: Tensor, count: int) -> Tensor:
 
 
 def _near_pairs(pieces: list[Tensor]) -> Tensor:
-    """Return pairs (P, 2) of pieces, the first before the second, that join all: all, or those with near boxes."""
+    """Return pairs (P, 2) of pieces with near boxes that together connect all pieces, the first before the second."""
     low = torch.stack([piece.amin(0) for piece in pieces])
     high = torch.stack([piece.amax(0) for piece in pieces])
-    gaps = (torch.maximum(low[:, None], low) - torch.minimum(high[:, None], high)).clamp(min=0).norm(dim=-1)
-    near = gaps <= gaps.sort(dim=1).values[:, min(_NEAR_PIECES, len(pieces) - 1), None]
+    distance = (torch.maximum(low[:, None], low) - torch.minimum(high[:, None], high)).clamp(min=0).norm(dim=-1)
+    near = distance <= distance.sort(dim=1).values[:, min(_REPAIR.near_pieces, len(pieces) - 1), None]
     pairs = torch.combinations(torch.arange(len(pieces)))
     kept = (near | near.mT)[pairs[:, 0], pairs[:, 1]]
-    kept[minimum_spanning_forest(pairs, gaps[pairs[:, 0], pairs[:, 1]], len(pieces)).chosen()] = True
+    kept[minimum_spanning_forest(pairs, distance[pairs[:, 0], pairs[:, 1]], len(pieces)).chosen()] = True
     return pairs[kept]
 
 
@@ -199,12 +196,12 @@ def close_holes(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, int]:
     rim = torch.bincount(which.reshape(-1), minlength=len(sides)) == 1
     if not bool(rim.any()):
         return vertices, faces, 0
-    corner = (rim[which]).nonzero()
-    edges = torch.stack((faces[corner[:, 0], corner[:, 1]], faces[corner[:, 0], (corner[:, 1] + 1) % 3]), dim=-1)
+    face, corner = rim[which].nonzero().unbind(1)
+    edges = torch.stack((faces[face, corner], faces[face, (corner + 1) % 3]), dim=-1)
     around, ends = edges.unique(return_inverse=True)
     label = connected_components(ends, len(around))
     holes = int(label.max()) + 1
     number = torch.bincount(label).unsqueeze(-1)
-    middles = vertices.new_zeros(holes, 3).index_add(0, label, vertices[around]) / number
+    centers = vertices.new_zeros(holes, 3).index_add(0, label, vertices[around]) / number
     fan = torch.cat((edges.flip(-1), len(vertices) + label[ends[:, :1]]), dim=-1)
-    return torch.cat((vertices, middles)), torch.cat((faces, fan)), holes
+    return torch.cat((vertices, centers)), torch.cat((faces, fan)), holes

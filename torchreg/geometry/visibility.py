@@ -1,89 +1,33 @@
-"""What a camera sees of a mesh: views, rasterized triangles, visible points and samples of the visible side."""
+"""Visibility of meshes from a camera: views, z-buffers, visible points and samples of the visible side."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_choice, check_finite, check_points, check_positive, check_shape
+from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg.errors import InputError
+from torchreg.geometry.budget import BUDGET
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
-
-_MAX_RESOLUTION = 4096
-# Pixels looked at in one go; bounds memory at about 100 MB.
-_CHUNK = 1_000_000
-_EDGE_SLACK = 1e-7
-_TOLERANCE_PIXELS = 2.0
-_MAX_ROUNDS = 32
+from torchreg.geometry.z_buffer import FlatMesh, Raster, View, draw, flatten
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """A pinhole or parallel camera and its grid of pixels; made by `aim`.
+@dataclass(frozen=True)
+class _Visibility:
+    """Numbers by which points are hidden and samples drawn."""
 
-    Convention: camera coordinates are (right, down, forward); pixel (row i, column j) covers [j, j+1] x [i, i+1].
-
-    Args:
-        position: (3,) float64, the pinhole; for a parallel view any point of the image plane.
-        rotation: (3, 3) float64 ``R_camera_world``, rows right, down, forward.
-        corner: (2,) float64 image-plane coordinates of the upper left corner of the grid.
-        pitch: size of a pixel: metres for a parallel view, tangent of the angle else.
-        width: number of columns.
-        height: number of rows.
-        parallel: True for parallel rays.
-    """
-
-    position: Tensor
-    rotation: Tensor
-    corner: Tensor
-    pitch: float
-    width: int
-    height: int
-    parallel: bool = False
-
-    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return pixel coordinates (..., N, 2) as (column, row), and depths (..., N) along the view, in float64.
-
-        Args:
-            points: (..., N, 3) in world coordinates, metres.
-
-        Returns:
-            NaN pixels for points behind a pinhole.
-
-        Differentiable: in ``points``.
-        """
-        local = (points.double() - self.position.to(points.device)) @ self.rotation.to(points.device).mT
-        plane, depth = local[..., :2], local[..., 2]
-        if not self.parallel:
-            plane = plane / torch.where(depth > 0, depth, torch.nan).unsqueeze(-1)
-        return (plane - self.corner.to(points.device)) / self.pitch, depth
-
-    def nearness(self, depth: Tensor) -> Tensor:
-        """Return what is larger the nearer a point is and linear in pixel coordinates on a plane; its own inverse."""
-        return -depth if self.parallel else 1 / depth
-
-    def footprint(self, depth: Tensor) -> Tensor:
-        """Return the width of a pixel at the given depths, metres."""
-        return torch.full_like(depth, self.pitch) if self.parallel else self.pitch * depth
+    # Depth behind the nearest surface up to which a point counts as on it, in pixel widths.
+    tolerance_pixels: float = 2.0
+    # Rounds of samples drawn until enough of them are visible.
+    max_rounds: int = 32
+    # Pixels along the longer side of the z-buffer that decides which points are hidden.
+    resolution: int = 256
 
 
-@dataclass(frozen=True, eq=False)
-class Raster:
-    """What a view sees of a mesh in the middle of every pixel.
-
-    Args:
-        face_index: (H, W) int64 nearest face, -1 where there is none.
-        barycentric: (H, W, 3) float64 weights of that face's vertices (of the point in space, not of its picture).
-        depth: (H, W) float64 along the view, infinite where there is none.
-    """
-
-    face_index: Tensor
-    barycentric: Tensor
-    depth: Tensor
+_VISIBILITY = _Visibility()
 
 
 def view_rotation(camera: Tensor, target: Tensor, up: Tensor | None = None) -> Tensor:
@@ -91,14 +35,14 @@ def view_rotation(camera: Tensor, target: Tensor, up: Tensor | None = None) -> T
 
     Args:
         camera: (3,) position.
-        target: (3,) what is to appear in the middle.
-        up: (3,) what is to appear upright; -y by default, the up of a camera that looks along +z.
+        target: (3,) point that appears at the center.
+        up: (3,) direction that appears upright; -y by default, the up of a camera that looks along +z.
 
     Returns:
-        float64 rotation; where the view runs along ``up``, another axis takes its place.
+        The float64 rotation; a coordinate axis replaces ``up`` along which the view runs.
 
     Raises:
-        InputError: if camera and target coincide.
+        InputError: if camera and target coincide, or one is not three finite numbers.
     """
     camera, target = as_float_tensor(camera, "camera").double(), as_float_tensor(target, "target").double()
     for value, name in ((camera, "camera"), (target, "target")):
@@ -138,26 +82,30 @@ def aim(
         parallel: parallel rays instead of a pinhole.
         up: (3,) see `view_rotation`.
         size: pixels along the longer side of a tight grid, or (width, height) in which the points are centered.
-        margin: share of the grid left free on each side.
+        margin: empty share of the grid on each side, below 0.5.
 
     Returns:
-        the view, looking at the middle of the points' bounding box.
+        The view, looking at the center of the points' bounding box.
 
     Raises:
-        InputError: if a point lies beside or behind the camera, or sizes do not fit.
+        InputError: if a point lies beside or behind the camera, or this is not three finite numbers.
     """
-    points = as_float_tensor(points, "points")
-    check_points(points, "points", batch=False)
     camera = as_float_tensor(camera, "camera").detach().to(device=points.device, dtype=torch.float64)
     check_shape(camera, "camera", (3,))
     check_finite(camera, "camera")
-    if not 0 <= margin < 0.5:
-        raise InputError(f"margin must be between 0 and 0.5, got {margin}")
     points = points.detach().double()
     middle = (points.amin(0) + points.amax(0)) / 2
     position = middle - camera if parallel else camera
     rotation = view_rotation(position, middle, up)
-    plain = View(position, rotation, torch.zeros_like(camera[:2]), 1.0, 1, 1, parallel)
+    plain = View(
+        position=position,
+        rotation=rotation,
+        corner=torch.zeros_like(camera[:2]),
+        pitch=1.0,
+        width=1,
+        height=1,
+        parallel=parallel,
+    )
     plane, depth = plain.project(points)
     if not parallel and not float(depth.min()) > 1e-9 * float(depth.abs().max()):
         raise InputError(
@@ -168,9 +116,10 @@ def aim(
 
 
 def _fit_grid(plain: View, plane: Tensor, size: int | tuple[int, int], margin: float) -> View:
+    """Return the view with the pixels of a grid that fits points (N, 2) of its image plane."""
     sides = (size, size) if isinstance(size, int) else tuple(size)
-    if len(sides) != 2 or not all(isinstance(side, int) and 1 <= side <= _MAX_RESOLUTION for side in sides):
-        raise InputError(f"size must be 1 to {_MAX_RESOLUTION} pixels, or that for width and height, got {size}")
+    if len(sides) != 2 or not all(isinstance(side, int) and 1 <= side <= BUDGET.view_side for side in sides):
+        raise InputError(f"size must be 1 to {BUDGET.view_side} pixels, or that for width and height, got {size}")
     lower, upper = plane.amin(0), plane.amax(0)
     extent = [float(side) / (1 - 2 * margin) for side in upper - lower]
     pitch = max(extent[0] / sides[0], extent[1] / sides[1], 1e-12)
@@ -178,19 +127,16 @@ def _fit_grid(plain: View, plane: Tensor, size: int | tuple[int, int], margin: f
     if isinstance(size, int):
         width, height = (max(1, math.ceil(side / pitch - 1e-9)) for side in extent)
     corner = (lower + upper) / 2 - pitch / 2 * lower.new_tensor([width, height])
-    return View(plain.position, plain.rotation, corner, pitch, width, height, plain.parallel)
+    return replace(plain, corner=corner, pitch=pitch, width=width, height=height)
 
 
 def rasterize(mesh: TriangleMesh, view: View, *, cull_back: bool = False) -> Raster:
-    """Return the nearest face in the middle of every pixel (a z-buffer).
+    """Return the nearest face at the center of every pixel, by a z-buffer.
 
     Args:
         mesh: the surface.
         view: camera and pixels, see `aim`.
-        cull_back: leave out faces that turn their back to the camera.
-
-    Returns:
-        the picture, perspective-correct.
+        cull_back: leave out faces that face away from the camera.
 
     Raises:
         InputError: if a vertex lies beside or behind the pinhole.
@@ -200,46 +146,7 @@ def rasterize(mesh: TriangleMesh, view: View, *, cull_back: bool = False) -> Ras
     Cost: a few operations per pixel in the bounding box of every projected face; 0.05 s for 20,000 faces at 512 x 512.
     """
     with torch.no_grad():
-        return _rasterize(_flatten(mesh, view), view, cull_back)
-
-
-@dataclass(frozen=True, eq=False)
-class _FlatMesh:
-    """A mesh in the picture: per face the corners' pixels (F, 3, 2) and depths (F, 3), and twice its signed area."""
-
-    faces: Tensor
-    corners: Tensor
-    depths: Tensor
-    area: Tensor
-
-    def drawn(self, cull_back: bool) -> Tensor:
-        """Return the indices of faces with an area, which is negative where they look at the camera: down is +y."""
-        return ((self.area < 0) if cull_back else (self.area != 0)).nonzero()[:, 0]
-
-    def weights(self, face: Tensor, pixels: Tensor) -> Tensor:
-        """Return the (N, 3) barycentric weights of positions in the picture with respect to the given faces."""
-        origin, second_corner, third_corner = self.corners[face].unbind(1)
-        offset = pixels - origin
-        one = _cross(offset, third_corner - origin)
-        two = _cross(second_corner - origin, offset)
-        one, two = (torch.stack((one, two)) / self.area[face]).unbind()
-        return torch.stack((1 - one - two, one, two), dim=-1)
-
-
-def _cross(first: Tensor, second: Tensor) -> Tensor:
-    return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-
-
-def _flatten(mesh: TriangleMesh, view: View) -> _FlatMesh:
-    pixels, depth = view.project(mesh.vertices.detach())
-    depths = depth[mesh.faces]
-    if not view.parallel and bool((depths <= 0).any()):
-        raise InputError(
-            f"mesh must lie before the camera, got {int((depths <= 0).any(-1).sum())} faces beside or behind it"
-        )
-    corners = pixels[mesh.faces]
-    area = _cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return _FlatMesh(mesh.faces, corners, depths, area)
+        return draw(flatten(mesh, view), view, cull_back)
 
 
 def _used_vertices(mesh: TriangleMesh) -> Tensor:
@@ -248,98 +155,44 @@ def _used_vertices(mesh: TriangleMesh) -> Tensor:
     return mesh.vertices[used]
 
 
-def _rasterize(flat: _FlatMesh, view: View, cull_back: bool) -> Raster:
-    nearness = view.nearness(flat.depths)
-    count = view.width * view.height
-    best = torch.full((count,), -torch.inf, dtype=torch.float64, device=nearness.device)
-    face_index = torch.full((count,), -1, device=nearness.device)
-    weights = torch.zeros(count, 3, dtype=torch.float64, device=nearness.device)
-    for face, pixel, barycentric in _covered(flat, flat.drawn(cull_back), view):
-        near = (barycentric * nearness[face]).sum(-1)
-        best.scatter_reduce_(0, pixel, near, "amax")
-        first = (near >= best[pixel]).nonzero()[:, 0]
-        winner = torch.full_like(face_index, -1).scatter_reduce_(0, pixel[first], first, "amax")
-        hit = (winner >= 0).nonzero()[:, 0]
-        face_index[hit], weights[hit] = face[winner[hit]], barycentric[winner[hit]]
-    seen = face_index >= 0
-    depth = torch.where(seen, view.nearness(best), torch.inf)
-    if not view.parallel:
-        weights = torch.where(seen.unsqueeze(-1), weights * nearness[face_index] * depth.unsqueeze(-1), 0.0)
-    shape = (view.height, view.width)
-    return Raster(face_index.reshape(shape), weights.reshape(*shape, 3), depth.reshape(shape))
-
-
-def _covered(flat: _FlatMesh, drawn: Tensor, view: View) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Yield (face, flat pixel, weights in the picture) of all pixel centers inside the drawn faces, by chunks."""
-    corners = flat.corners[drawn]
-    limit = corners.new_tensor([view.width - 1, view.height - 1])
-    lower = (corners.amin(1) - 0.5).ceil().clamp(min=0)
-    upper = torch.minimum((corners.amax(1) - 0.5).floor(), limit)
-    sides = (upper - lower + 1).clamp(min=0).long()
-    counts = sides.prod(-1)
-    lower = lower.long()
-    groups = counts.cumsum(0) // _CHUNK
-    for group in groups.unique().tolist():
-        part = ((groups == group) & (counts > 0)).nonzero()[:, 0]
-        which = part.repeat_interleave(counts[part])
-        starts = (counts[part].cumsum(0) - counts[part]).repeat_interleave(counts[part])
-        place = torch.arange(len(which), device=which.device) - starts
-        column = lower[which, 0] + place % sides[which, 0]
-        row = lower[which, 1] + place // sides[which, 0]
-        face = drawn[which]
-        weights = flat.weights(face, torch.stack((column, row), dim=-1) + 0.5)
-        inside = (weights.amin(-1) >= -_EDGE_SLACK).nonzero()[:, 0]
-        yield face[inside], (row * view.width + column)[inside], weights[inside]
-
-
 def visible_points(
     mesh: TriangleMesh,
     points: Tensor,
     camera: Tensor,
     *,
-    parallel: bool = False,
-    resolution: int = 256,
     tolerance: float | None = None,
 ) -> Tensor:
-    """Return which points a camera sees past a mesh: those with no surface before them.
+    """Return a mask (N,) of the points that a mesh does not hide from a camera; points behind the camera are hidden.
+
+    Along outlines of the mesh the mask is right to a pixel of a picture of 256 pixels.
 
     Args:
-        mesh: the surface that hides.
+        mesh: the occluding surface, at least one face.
         points: (N, 3), metres; on the surface or anywhere else.
-        camera: (3,) position; for a parallel view the direction in which it looks.
-        parallel: parallel rays instead of a pinhole.
-        resolution: pixels along the longer side of the mesh's picture; along outlines the answer is right to a pixel.
-        tolerance: how far behind the nearest surface a point still counts as on it, metres; two pixels by default.
-
-    Returns:
-        (N,) bool; False for points behind the camera.
+        camera: (3,) position.
+        tolerance: depth behind the nearest surface up to which a point counts as on it, metres; two pixels by default.
 
     Raises:
-        InputError: if the mesh reaches beside or behind the camera, or sizes do not fit.
+        InputError: if the mesh reaches beside or behind the camera.
 
     Differentiable: no.
     """
-    points = as_float_tensor(points, "points", like=mesh.vertices)
-    check_points(points, "points", min_count=0, batch=False)
-    if tolerance is not None:
-        check_positive(tolerance, "tolerance", allow_zero=True)
-    if mesh.num_faces == 0:
-        raise InputError("mesh must have faces that can hide something, got none")
+    points = points.to(mesh.vertices)
     with torch.no_grad():
-        view = aim(_used_vertices(mesh), camera, parallel=parallel, size=resolution)
-        flat = _flatten(mesh, view)
-        return _seen(flat, view, _rasterize(flat, view, False), points, tolerance)
+        view = aim(_used_vertices(mesh), camera, size=_VISIBILITY.resolution)
+        flat = flatten(mesh, view)
+        return _unhidden(flat, view, draw(flat, view, False), points, tolerance)
 
 
-def _seen(
-    flat: _FlatMesh,
+def _unhidden(
+    flat: FlatMesh,
     view: View,
     raster: Raster,
     points: Tensor,
     tolerance: float | None = None,
-    own_face: Tensor | None = None,
+    faces: Tensor | None = None,
 ) -> Tensor:
-    """Return which points no surface hides; a face that touches a point's own one does not hide it."""
+    """Return a mask of the points that no surface hides; faces that touch a point's own face do not hide it."""
     pixels, depth = view.project(points)
     limit = pixels.new_tensor([view.width, view.height])
     framed = ((pixels >= 0) & (pixels < limit)).all(-1).nonzero()[:, 0]
@@ -348,12 +201,12 @@ def _seen(
     framed, face = framed[face >= 0], face[face >= 0]
     # The face's own plane at the point itself, not at the pixel's middle: slanted surfaces do not hide themselves.
     near = view.nearness(flat.depths[face])
-    there = (flat.weights(face, pixels[framed]) * near).sum(-1).clamp(near.amin(-1), near.amax(-1))
-    slack = _TOLERANCE_PIXELS * view.footprint(depth[framed]) if tolerance is None else tolerance
+    surface = (flat.weights(face, pixels[framed]) * near).sum(-1).clamp(near.amin(-1), near.amax(-1))
+    slack = _VISIBILITY.tolerance_pixels * view.footprint(depth[framed]) if tolerance is None else tolerance
     seen = torch.ones_like(depth, dtype=torch.bool) if view.parallel else depth > 0
-    clear = depth[framed] <= view.nearness(there) + slack
-    if own_face is not None:
-        touching = flat.faces[face].unsqueeze(-1) == flat.faces[own_face[framed]].unsqueeze(-2)
+    clear = depth[framed] <= view.nearness(surface) + slack
+    if faces is not None:
+        touching = flat.faces[face].unsqueeze(-1) == flat.faces[faces[framed]].unsqueeze(-2)
         clear |= touching.flatten(1).any(-1)
     seen[framed] = clear
     return seen
@@ -366,63 +219,54 @@ def sample_visible(
     generator: torch.Generator | None = None,
     *,
     density: str = "area",
-    parallel: bool = False,
-    cull_back: bool = True,
-    resolution: int = 256,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return ``count`` points drawn independently and uniformly from the side of a surface that a camera sees.
+    """Return ``count`` points drawn independently and uniformly from the side of a surface that faces a camera.
 
     Args:
-        mesh: the surface.
-        camera: (3,) position; for a parallel view the direction in which it looks.
+        mesh: the surface, at least one face.
+        camera: (3,) position.
         count: number of points.
         generator: source of randomness; None draws from a fresh generator with seed 0, the same points at every call.
         density: "area" is uniform over the surface; "pixel" is uniform over the picture, as a range camera sees it.
-        parallel: parallel rays instead of a pinhole.
-        cull_back: faces seen from behind give no points; False for open sheets.
-        resolution: see `visible_points`.
 
     Returns:
-        points (count, 3), face_index (count,) int64, barycentric (count, 3) weights of the face's three vertices.
+        Points (count, 3), face_index (count,) int64, barycentric (count, 3) weights of the face's three vertices.
 
     Raises:
-        InputError: if ``count`` is negative, the camera sees (next to) nothing or the mesh reaches behind it.
+        InputError: if the camera sees (next to) nothing or the mesh reaches behind it.
 
     Differentiable: in the vertices, with the drawn faces and weights held fixed.
     """
-    check_choice(density, "density", ("area", "pixel"))
-    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
-        raise InputError(f"count must be a non-negative integer, got {count!r}")
-    if mesh.num_faces == 0:
-        raise InputError("mesh must have faces to sample, got none")
     still = TriangleMesh(mesh.vertices.detach().double(), mesh.faces)
-    view = aim(_used_vertices(still), camera, parallel=parallel, size=resolution)
-    flat = _flatten(still, view)
-    raster = _rasterize(flat, view, cull_back)
-    shown = flat.drawn(cull_back)
+    view = aim(_used_vertices(still), camera, size=_VISIBILITY.resolution)
+    flat = flatten(still, view)
+    raster = draw(flat, view, True)
+    shown = flat.drawn(True)
     if len(shown) == 0:
-        raise InputError("mesh must turn a face to the camera, got none; move the camera or pass cull_back=False")
-    place = still.vertices
+        raise InputError("mesh must turn a face to the camera, got none; move the camera or turn the faces")
+    vertices = still.vertices
     if density == "pixel":
-        place = torch.nn.functional.pad(view.project(place)[0].nan_to_num(), (0, 1))
-    source = TriangleMesh(place, still.faces[shown])
+        vertices = torch.nn.functional.pad(view.project(vertices)[0].nan_to_num(), (0, 1))
+    source = TriangleMesh(vertices, still.faces[shown])
     if generator is None:
         generator = torch.Generator(device=mesh.vertices.device).manual_seed(0)
-    faces, weights, have, asked, ask = [shown[:0]], [flat.area.new_zeros(0, 3)], 0, 0, 2 * count
-    for _ in range(_MAX_ROUNDS):
-        _, drawn, barycentric = sample_surface(source, ask, generator)
-        if density == "pixel" and not parallel:
+    faces, weights, num_found, num_drawn, batch = [shown[:0]], [flat.area.new_zeros(0, 3)], 0, 0, 2 * count
+    for _ in range(_VISIBILITY.max_rounds):
+        _, drawn, barycentric = sample_surface(source, batch, generator)
+        if density == "pixel":
             barycentric = barycentric / flat.depths[shown[drawn]]
             barycentric = barycentric / barycentric.sum(-1, keepdim=True)
         points = interpolate(still.vertices, source.faces, drawn, barycentric)
-        kept = _seen(flat, view, raster, points, own_face=shown[drawn]).nonzero()[:, 0]
+        kept = _unhidden(flat, view, raster, points, faces=shown[drawn]).nonzero()[:, 0]
         faces.append(shown[drawn[kept]])
         weights.append(barycentric[kept])
-        have, asked = have + len(kept), asked + ask
-        if have >= count:
+        num_found, num_drawn = num_found + len(kept), num_drawn + batch
+        if num_found >= count:
             break
-        ask = min(_CHUNK, 1 + int(1.2 * (count - have) * asked / max(have, 1)))
+        batch = min(BUDGET.raster_pixels, 1 + int(1.2 * (count - num_found) * num_drawn / max(num_found, 1)))
     else:
-        raise InputError(f"camera must see the mesh, but of {asked} points of its surface only {have} are visible")
+        raise InputError(
+            f"camera must see the mesh, but of {num_drawn} points of its surface only {num_found} are visible"
+        )
     face_index, barycentric = torch.cat(faces)[:count], torch.cat(weights)[:count].to(mesh.vertices.dtype)
     return interpolate(mesh.vertices, mesh.faces, face_index, barycentric), face_index, barycentric

@@ -15,7 +15,8 @@ import torch
 from torch import Tensor
 
 from torchreg.errors import FormatError, MissingExtraError
-from torchreg.geometry.camera import MAX_PIXELS, Camera
+from torchreg.geometry.budget import BUDGET
+from torchreg.geometry.camera import Camera
 from torchreg.io.atomic import write_atomic
 from torchreg.io.frames import natural_key
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
@@ -177,7 +178,7 @@ def _save_png(path: str | os.PathLike[str], image: Any) -> None:
 
 def _check_pixels(shape: tuple[int, ...], place: Path) -> None:
     pixels = shape[0] * shape[1] if len(shape) == 2 else 0
-    if not 0 < pixels <= MAX_PIXELS:
+    if not 0 < pixels <= BUDGET.picture_pixels:
         raise FormatError(f"{place}: must be (H, W) with 1 to 64 million pixels, got shape {shape}")
 
 

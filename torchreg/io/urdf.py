@@ -22,11 +22,12 @@ from torchreg.io.strict_xml import parse_xml
 _MAX_LINKS = 2000
 _MAX_URDF_BYTES = 64 * 1024**2
 _KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": "fixed"}
+# Attributes of each kind of solid, with the count of their numbers.
 _PRIMITIVES = {
-    "box": ("size",),
-    "cylinder": ("radius", "length"),
-    "capsule": ("radius", "length"),
-    "sphere": ("radius",),
+    "box": {"size": 3},
+    "cylinder": {"radius": 1, "length": 1},
+    "capsule": {"radius": 1, "length": 1},
+    "sphere": {"radius": 1},
 }
 
 
@@ -341,9 +342,9 @@ class _Geometry:
 def _primitive(shape: ET.Element, origin: Tensor, what: str) -> UrdfPrimitive:
     if shape.tag not in _PRIMITIVES:
         raise ModelError(f"{what} has geometry <{shape.tag}>; known: mesh, {', '.join(_PRIMITIVES)}")
-    size: tuple[float, ...] = ()
-    for attribute in _PRIMITIVES[shape.tag]:
-        size += _floats(shape, attribute, 3 if shape.tag == "box" else 1, (), what)
-    if len(size) < (3 if shape.tag == "box" else len(_PRIMITIVES[shape.tag])) or min(size) <= 0:
-        raise ModelError(f"{what}: <{shape.tag}> needs a positive {' and '.join(_PRIMITIVES[shape.tag])}, got {size}")
+    attributes, size = _PRIMITIVES[shape.tag], tuple[float, ...]()
+    for attribute, count in attributes.items():
+        size += _floats(shape, attribute, count, (), what)
+    if len(size) < sum(attributes.values()) or min(size) <= 0:
+        raise ModelError(f"{what}: <{shape.tag}> needs a positive {' and '.join(attributes)}, got {size}")
     return UrdfPrimitive(shape.tag, size, origin)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.result import Result, Status, stored_as
-from torchreg.solvers.rigid_groups import joined_alike
+from torchreg.solvers.rigid_groups import merge_alike
 
 # Shared weight, as a share of all points, from which two bones meet.
 _MEETING = 1e-3
@@ -100,7 +100,7 @@ def _parts(moved: Tensor, transforms: Tensor, labels: Tensor, weights: Tensor, t
         [_misses(*frame, labels, own) for frame in zip(moved.double(), transforms.double(), strict=True)]
     )
     meet = blends.mT @ blends > _MEETING * len(labels)
-    part = joined_alike(apart, own.sum(0), meet, tolerance)
+    part = merge_alike(apart, own.sum(0), meet, tolerance)
     return part[labels].unique(return_inverse=True)[1]
 
 

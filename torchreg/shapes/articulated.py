@@ -11,8 +11,10 @@ from torch import Tensor
 
 from torchreg.errors import InputError
 from torchreg.shapes.articulation import Articulation
-from torchreg.shapes.rigs import ShapeSpec, spec_from_arrays, spec_from_gltf, spec_from_urdf
+from torchreg.shapes.rigs import spec_from_arrays, spec_from_gltf
+from torchreg.shapes.robots import spec_from_urdf
 from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.shapes.spec import ShapeSpec
 
 
 class ArticulatedShape(Articulation):
@@ -23,7 +25,7 @@ class ArticulatedShape(Articulation):
     neighbors fuse, so two fingers may touch.
 
     The base moves the root of the tree: ``T_world_frame = T(translation) R(rotation vector) T_root_frame``, so it turns
-    about the origin of the coordinates that the tree is given in (the file's origin), not about the root's own frame.
+    about the origin of the tree's coordinates (the file's origin), not about the root's frame.
 
     Args:
         tree: the kinematic tree.
@@ -74,7 +76,7 @@ class ArticulatedShape(Articulation):
             dtype: of the module; the default dtype if None.
 
         Returns:
-            the shape. Degrees of freedom are called like the joints, parts like the links; links without geometry are
+            The shape. Degrees of freedom are called like the joints, parts like the links; links without geometry are
             frames but not parts, and the further solids of a link with several are parts LINK_1, LINK_2, ...
 
         Raises:
@@ -96,7 +98,7 @@ class ArticulatedShape(Articulation):
         nu: float | None = None,
         dtype: torch.dtype | None = None,
     ) -> ArticulatedShape:
-        """Return the shape of a rigged glTF: skeleton to tree, solids fitted to the vertices each joint owns.
+        """Return the shape of a rigged glTF: its skeleton as tree, with solids fitted to the vertices of each joint.
 
         The rest pose (zeros) is the file's bind pose.
 
@@ -111,7 +113,7 @@ class ArticulatedShape(Articulation):
             dtype: of the module; the default dtype if None.
 
         Returns:
-            the shape; `file_skin` gives the file's own skin.
+            The shape; `file_skin` gives the file's own skin.
 
         Raises:
             FormatError: if the file is damaged, oversized, or has no skin.
@@ -136,7 +138,7 @@ class ArticulatedShape(Articulation):
         nu: float | None = None,
         dtype: torch.dtype | None = None,
     ) -> ArticulatedShape:
-        """Return the shape of a skinned mesh given as arrays, as owners of SMPL or MANO files have them.
+        """Return the shape of a skinned mesh given as arrays, such as those of SMPL or MANO files.
 
         Args:
             vertices: (V, 3) in the bind pose, metres.
@@ -152,7 +154,7 @@ class ArticulatedShape(Articulation):
             dtype: of the module; the default dtype if None.
 
         Returns:
-            the shape; `file_skin` gives the linear blend skin of the given weights.
+            The shape; `file_skin` gives the linear blend skin of the given weights.
 
         Raises:
             InputError: if the arrays do not fit together.
@@ -165,7 +167,7 @@ class ArticulatedShape(Articulation):
         return cls.from_spec(spec, nu=nu, dtype=dtype)
 
     def file_skin(self) -> LinearBlendSkin:
-        """Return the skin of the file this shape was read from: its vertices under its own weights.
+        """Return the skin of the file this shape was read from: its vertices under its weights.
 
         Its reference pose is all zeros, the pose of the file, whether or not the joint limits allow it.
 

@@ -15,55 +15,72 @@ from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.primitives import Primitive
 
 FINGER_NAMES = ("thumb", "index", "middle", "ring", "little")
-# Ellipsoids of inner phalanges reach past their joints by this factor, so that neighbors overlap and fuse smoothly.
-_OVERLAP = 1.12
+_Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class _Finger:
-    """Proportions of one finger of a right hand, millimeters and degrees; x: thumb side, y: back, z: to the tips."""
+    """Proportions of a finger of a right hand; x: thumb side, y: back, z: to the tips.
 
-    base: tuple[float, float, float]
-    lengths_mm: tuple[float, float, float]
-    radii_mm: tuple[float, float, float]
-    segments: tuple[str, str, str]
-    joints: tuple[tuple[str, tuple[tuple[str, float, float], ...]], ...]
-    direction: tuple[float, float, float]
-    dorsal: tuple[float, float, float]
+    Args:
+        base_mm: position of the base joint.
+        lengths_mm: of the phalanges, from the base to the tip.
+        radii_mm: of the phalanges, across.
+        direction: from the base to the tip at rest.
+        dorsal: direction of the finger's back at rest.
+        segments: names of the phalanges.
+        joints: names of the joints, each with its motions and their limits in degrees.
+        overlap: factor on the lengths of inner phalanges' ellipsoids, so that neighbors overlap and fuse smoothly.
+    """
+
+    base_mm: _Vector
+    lengths_mm: _Vector
+    radii_mm: _Vector
+    direction: _Vector
+    dorsal: _Vector = (0.0, 1.0, 0.0)
+    segments: tuple[str, str, str] = ("proximal", "middle", "distal")
+    joints: tuple[tuple[str, tuple[tuple[str, float, float], ...]], ...] = (
+        ("mcp", (("abduction", -20.0, 20.0), ("flexion", -20.0, 95.0))),
+        ("pip", (("flexion", -5.0, 110.0),)),
+        ("dip", (("flexion", -5.0, 85.0),)),
+    )
+    overlap: float = 1.12
+
+    @classmethod
+    def long(cls, base_mm: _Vector, spread_deg: float, lengths_mm: _Vector, radii_mm: _Vector) -> _Finger:
+        """Return a finger other than the thumb, spread to the thumb side by an angle."""
+        spread = math.radians(spread_deg)
+        return cls(base_mm, lengths_mm, radii_mm, (math.sin(spread), 0.0, math.cos(spread)))
 
 
-_FINGER_JOINTS = (
-    ("mcp", (("abduction", -20.0, 20.0), ("flexion", -20.0, 95.0))),
-    ("pip", (("flexion", -5.0, 110.0),)),
-    ("dip", (("flexion", -5.0, 85.0),)),
-)
-_THUMB_JOINTS = (
-    ("cmc", (("abduction", -35.0, 35.0), ("flexion", -30.0, 45.0))),
-    ("mcp", (("abduction", -15.0, 15.0), ("flexion", -15.0, 65.0))),
-    ("ip", (("flexion", -20.0, 85.0),)),
-)
-_PHALANGES = ("proximal", "middle", "distal")
+@dataclass(frozen=True)
+class _Palm:
+    """The palm's ellipsoid in a right hand, in the axes of `_Finger`."""
+
+    center_mm: _Vector = (-3.0, 0.0, 47.0)
+    radii_mm: _Vector = (44.0, 15.0, 56.0)
 
 
-def _long_finger(base: tuple[float, float, float], spread_deg: float, lengths: tuple[float, float, float],
-                 radii: tuple[float, float, float]) -> _Finger:  # fmt: skip
-    spread = math.radians(spread_deg)
-    direction = (math.sin(spread), 0.0, math.cos(spread))
-    return _Finger(base, lengths, radii, _PHALANGES, _FINGER_JOINTS, direction, (0.0, 1.0, 0.0))
-
-
+_PALM = _Palm()
 _FINGERS = {
     "thumb": _Finger(
-        (22.0, -8.0, 20.0), (46.0, 34.0, 29.0), (13.0, 10.5, 9.5), ("metacarpal", "proximal", "distal"),
-        _THUMB_JOINTS, (0.66, -0.36, 0.66), (0.68, 0.60, -0.42),
+        base_mm=(22.0, -8.0, 20.0),
+        lengths_mm=(46.0, 34.0, 29.0),
+        radii_mm=(13.0, 10.5, 9.5),
+        direction=(0.66, -0.36, 0.66),
+        dorsal=(0.68, 0.60, -0.42),
+        segments=("metacarpal", "proximal", "distal"),
+        joints=(
+            ("cmc", (("abduction", -35.0, 35.0), ("flexion", -30.0, 45.0))),
+            ("mcp", (("abduction", -15.0, 15.0), ("flexion", -15.0, 65.0))),
+            ("ip", (("flexion", -20.0, 85.0),)),
+        ),
     ),
-    "index": _long_finger((26.0, 3.0, 91.0), 4.0, (44.0, 26.0, 23.0), (9.5, 8.5, 7.5)),
-    "middle": _long_finger((4.0, 5.0, 94.0), 0.0, (48.0, 31.0, 24.0), (9.8, 8.7, 7.8)),
-    "ring": _long_finger((-16.0, 3.0, 87.0), -4.0, (44.0, 29.0, 24.0), (9.3, 8.2, 7.4)),
-    "little": _long_finger((-34.0, -1.0, 78.0), -9.0, (35.0, 21.0, 21.0), (8.3, 7.3, 6.5)),
-}  # fmt: skip
-_PALM_CENTER_MM = (-3.0, 0.0, 47.0)
-_PALM_RADII_MM = (44.0, 15.0, 56.0)
+    "index": _Finger.long((26.0, 3.0, 91.0), 4.0, (44.0, 26.0, 23.0), (9.5, 8.5, 7.5)),
+    "middle": _Finger.long((4.0, 5.0, 94.0), 0.0, (48.0, 31.0, 24.0), (9.8, 8.7, 7.8)),
+    "ring": _Finger.long((-16.0, 3.0, 87.0), -4.0, (44.0, 29.0, 24.0), (9.3, 8.2, 7.4)),
+    "little": _Finger.long((-34.0, -1.0, 78.0), -9.0, (35.0, 21.0, 21.0), (8.3, 7.3, 6.5)),
+}
 
 
 class Hand(ArticulatedShape):
@@ -96,9 +113,9 @@ class Hand(ArticulatedShape):
         unit = 1e-3 * scale
         mirror = 1.0 if side == "right" else -1.0
         joints, part_frames = [Joint("palm", -1, torch.eye(4, dtype=torch.float64))], ["palm"]
-        palm_pose = _translation(_PALM_CENTER_MM, unit, mirror)
-        primitives = [Primitive("ellipsoid", tuple(radius * unit for radius in _PALM_RADII_MM), palm_pose)]
-        bones = [math.hypot(*_FINGERS["middle"].base) * unit]
+        palm_pose = _translation(_PALM.center_mm, unit, mirror)
+        primitives = [Primitive("ellipsoid", tuple(radius * unit for radius in _PALM.radii_mm), palm_pose)]
+        bones = [math.hypot(*_FINGERS["middle"].base_mm) * unit]
         for name, finger in _FINGERS.items():
             _add_finger(joints, part_frames, name, finger, unit, mirror)
             primitives += _phalanx_primitives(finger, unit)
@@ -134,7 +151,7 @@ class Hand(ArticulatedShape):
 
     @property
     def length(self) -> float:
-        """From the wrist to the farthest fingertip at rest, metres."""
+        """Distance from the wrist to the farthest fingertip at rest, metres."""
         with torch.no_grad():
             points = self.keypoints(self.rest_pose())
         return float((points - points[0]).norm(dim=-1).max())
@@ -157,7 +174,8 @@ class Hand(ArticulatedShape):
         return torch.cat([origins[..., :1, :], fingers.flatten(-3, -2)], dim=-2)
 
 
-def _translation(offset_mm: tuple[float, float, float], unit: float, mirror: float) -> Tensor:
+def _translation(offset_mm: _Vector, unit: float, mirror: float) -> Tensor:
+    """Return the translation (4, 4), mirrored for a left hand; a millimeter is ``unit`` metres."""
     offset = torch.tensor(offset_mm, dtype=torch.float64) * unit * torch.tensor([mirror, 1.0, 1.0], dtype=torch.float64)
     return rigid_matrix(torch.eye(3, dtype=torch.float64), offset)
 
@@ -178,13 +196,21 @@ def _add_finger(
     joints: list[Joint], part_frames: list[str], name: str, finger: _Finger, unit: float, mirror: float
 ) -> None:
     parent = 0
-    base = torch.tensor(finger.base, dtype=torch.float64) * unit * torch.tensor([mirror, 1.0, 1.0], dtype=torch.float64)
-    offset = rigid_matrix(_finger_rotation(finger, mirror), base)
+    offset = _translation(finger.base_mm, unit, mirror)
+    offset[:3, :3] = _finger_rotation(finger, mirror)
     for (joint_name, motions), length in zip(finger.joints, finger.lengths_mm, strict=True):
         for motion, lower, upper in motions:
-            axis = (1.0, 0.0, 0.0) if motion == "flexion" else (0.0, mirror, 0.0)
-            frame = f"{name}_{joint_name}_{motion}"
-            joints.append(Joint(frame, parent, offset, "revolute", axis, math.radians(lower), math.radians(upper)))
+            joints.append(
+                Joint(
+                    name=f"{name}_{joint_name}_{motion}",
+                    parent=parent,
+                    offset=offset,
+                    kind="revolute",
+                    axis=(1.0, 0.0, 0.0) if motion == "flexion" else (0.0, mirror, 0.0),
+                    lower=math.radians(lower),
+                    upper=math.radians(upper),
+                )
+            )
             parent, offset = len(joints) - 1, torch.eye(4, dtype=torch.float64)
         part_frames.append(joints[-1].name)
         offset = _translation((0.0, 0.0, length), unit, 1.0)
@@ -193,7 +219,7 @@ def _add_finger(
 def _phalanx_primitives(finger: _Finger, unit: float) -> list[Primitive]:
     primitives = []
     for index, (length, radius) in enumerate(zip(finger.lengths_mm, finger.radii_mm, strict=True)):
-        half = 0.5 * length * (_OVERLAP if index < 2 else 1.0)
+        half = 0.5 * length * (finger.overlap if index < 2 else 1.0)
         center = _translation((0.0, 0.0, 0.5 * length), unit, 1.0)
         primitives.append(Primitive("ellipsoid", (radius * unit, radius * unit, half * unit), center))
     return primitives

@@ -1,4 +1,4 @@
-"""Forward kinematics of a tree: the one adapter to pytorch-kinematics, and the twists that its joints cause."""
+"""Forward kinematics of a tree, the twists of its joints, and the adapter to pytorch-kinematics."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchreg.geometry.rotation import skew
 if TYPE_CHECKING:
     import pytorch_kinematics as pk
 
-# pytorch-kinematics walks the tree recursively when it builds a chain.
+# Deepest tree: pytorch-kinematics walks it recursively when it builds a chain.
 _MAX_DEPTH = 300
 
 
@@ -25,7 +25,8 @@ class KinematicChain(nn.Module):
 
     Degrees of freedom are the joints that are neither fixed nor mimics, in the tree's order. Frames are as those of
     `to_pytorch_kinematics`, in a third of its time: the transform of a frame in its parent is linear in sine, cosine
-    and value of its joint, and each round of products doubles the number of ancestors that a frame is held in.
+    and value of its joint, and each round of products doubles the number of generations between a frame and the
+    ancestor that it is given in.
 
     Args:
         tree: the kinematic tree.
@@ -41,8 +42,8 @@ class KinematicChain(nn.Module):
     is_revolute: Tensor
     lower: Tensor
     upper: Tensor
-    turn_axes: Tensor
-    slide_axes: Tensor
+    rotation_axes: Tensor
+    translation_axes: Tensor
     frame_couplings: Tensor
     frame_values: Tensor
     still: Tensor
@@ -65,7 +66,7 @@ class KinematicChain(nn.Module):
         self.has_mimics = len(free) < len(moving)
         couplings, values = _mimic_couplings(tree, moving, free)
         self.has_slides = any(joints[index].kind == "prismatic" for index in moving)
-        axes = torch.stack([_unit_axis(joints[index]) for index in moving]) if moving else torch.zeros(0, 3).double()
+        axes = torch.stack([_axis_of(joints[index]) for index in moving]) if moving else torch.zeros(0, 3).double()
         is_revolute = torch.tensor([joints[index].kind == "revolute" for index in moving], dtype=torch.float64)
         buffers = {
             "axes": axes,
@@ -75,8 +76,8 @@ class KinematicChain(nn.Module):
             "is_revolute": is_revolute,
             "lower": torch.tensor([joints[index].lower for index in free], dtype=torch.float64),
             "upper": torch.tensor([joints[index].upper for index in free], dtype=torch.float64),
-            "turn_axes": (axes * is_revolute.unsqueeze(-1)).unsqueeze(-1),
-            "slide_axes": (axes * (1 - is_revolute.unsqueeze(-1))).unsqueeze(-1),
+            "rotation_axes": (axes * is_revolute.unsqueeze(-1)).unsqueeze(-1),
+            "translation_axes": (axes * (1 - is_revolute.unsqueeze(-1))).unsqueeze(-1),
             "frame_couplings": torch.zeros(len(joints), len(free), dtype=torch.float64),
             "frame_values": torch.zeros(len(joints), dtype=torch.float64),
         }
@@ -96,7 +97,7 @@ class KinematicChain(nn.Module):
         frames: list[pk.Frame] = []
         for index, joint in enumerate(self.tree.joints):
             offset = pk.Transform3d(matrix=joint.offset.double().unsqueeze(0), dtype=torch.float64)
-            # Indices as names: pytorch-kinematics strips and compares names, which here may hold any character.
+            # Indices as names: pytorch-kinematics strips and compares names, which may hold any character.
             name = str(index)
             frame = pk.Frame(name, link=pk.Link(name))
             frame.joint = pk.Joint(
@@ -147,28 +148,28 @@ class KinematicChain(nn.Module):
         return local.view(*local.shape[:-1], 4, 4)
 
     def joint_twists(self, frames: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the twists that the degrees of freedom cause, and which frames they move.
+        """Return the twists of the moving joints, and the frames that they move.
 
-        A degree of freedom k moves a point x of a frame that it carries by ``linear_k + angular_k x x`` per unit.
+        A joint k moves a point x of a frame below it by ``linear_k + angular_k x x`` per unit.
 
         Args:
-            frames: (..., F, 4, 4) frame transforms in the coordinates the twists are wanted in.
+            frames: (..., F, 4, 4) frame transforms, in the coordinates of the twists.
 
         Returns:
-            twists (..., J, 6) of the moving joints (translation, rotation), and which frames they move: (F, J) zeros
-            and ones. `couplings` (J, num_dofs) maps moving joints to degrees of freedom; without mimic joints it is
-            the identity.
+            Twists (..., J, 6) of the moving joints (translation, rotation), and the matrix (F, J) of zeros and ones of
+            the frames they move. `couplings` (J, num_dofs) maps moving joints to degrees of freedom; without mimic
+            joints it is the identity.
 
         Differentiable: in ``frames``.
 
         References: Murray, Li, Sastry 1994, the spatial manipulator Jacobian.
         """
-        at_joint = frames.index_select(-3, self.joint_frames)[..., :3, :]
-        rotation = at_joint[..., :3]
-        angular = (rotation @ self.turn_axes).squeeze(-1)
-        linear = torch.linalg.cross(at_joint[..., 3], angular)
+        joints = frames.index_select(-3, self.joint_frames)[..., :3, :]
+        rotation = joints[..., :3]
+        angular = (rotation @ self.rotation_axes).squeeze(-1)
+        linear = torch.linalg.cross(joints[..., 3], angular)
         if self.has_slides:
-            linear = linear + (rotation @ self.slide_axes).squeeze(-1)
+            linear = linear + (rotation @ self.translation_axes).squeeze(-1)
         return torch.cat([linear, angular], dim=-1), self.moves
 
 
@@ -202,6 +203,23 @@ def neighbor_matrix(parents: Sequence[int]) -> Tensor:
     return neighbors
 
 
+def offset_owners(tree: KinematicTree, frames: Sequence[int]) -> list[int]:
+    """Return, per frame of the tree, 1 + the part whose length scales its offset, or 0: the nearest part above it.
+
+    Args:
+        tree: the kinematic tree.
+        frames: index of each part's frame.
+    """
+    part_of = {frame: part for part, frame in enumerate(frames)}
+    owners = []
+    for joint in tree.joints:
+        ancestor = joint.parent
+        while ancestor >= 0 and ancestor not in part_of:
+            ancestor = tree.joints[ancestor].parent
+        owners.append(part_of.get(ancestor, -1) + 1)
+    return owners
+
+
 def _check_depth(tree: KinematicTree) -> None:
     depths: list[int] = []
     for joint in tree.joints:
@@ -210,13 +228,13 @@ def _check_depth(tree: KinematicTree) -> None:
             raise ModelError(f"frame {joint.name!r} lies {depths[-1]} frames deep; at most {_MAX_DEPTH} are supported")
 
 
-def _unit_axis(joint: Joint) -> Tensor:
+def _axis_of(joint: Joint) -> Tensor:
     axis = torch.tensor(joint.axis, dtype=torch.float64)
     return axis / axis.norm()
 
 
 def stack_sizes(tree: KinematicTree) -> list[int]:
-    """Return, per degree of freedom, how many revolute frames coincide in its joint: three for a ball joint."""
+    """Return, per degree of freedom, the number of coincident revolute frames in its joint: three for a ball joint."""
     stacks: list[list[int]] = []
     stack_of: dict[int, int] = {}
     identity = torch.eye(4, dtype=torch.float64)
@@ -234,9 +252,9 @@ def stack_sizes(tree: KinematicTree) -> list[int]:
 
 
 def _local_tables(offsets: Tensor, moving: list[int], axes: Tensor, is_revolute: Tensor) -> dict[str, Tensor]:
-    """Return the tables (F, 16) whose sum, times one, scale, sine, cosine and value, is a frame's place in its parent.
+    """Return tables (F, 16) whose sum, weighted by 1, scale, sine, cosine and value, is a frame's pose in its parent.
 
-    About a unit axis a a turn is ``a a^T + cos (I - a a^T) + sin [a]x``.
+    A rotation about a unit axis a is ``a a^T + cos (I - a a^T) + sin [a]x``.
     """
     motions = {name: torch.zeros(len(offsets), 4, 4, dtype=torch.float64) for name in ("sines", "cosines", "slides")}
     along = axes.unsqueeze(-1) * axes.unsqueeze(-2)
@@ -252,17 +270,17 @@ def _local_tables(offsets: Tensor, moving: list[int], axes: Tensor, is_revolute:
 
 
 def _doubling(tree: KinematicTree) -> tuple[Tensor, Tensor, list[int], list[Tensor]]:
-    """Return the order of frames by depth, its inverse, and for each round of products how many frames are complete.
+    """Return the order of frames by depth, its inverse, and per round of products the number of complete frames.
 
-    In a round every other frame is multiplied with what its next ancestor beyond holds so far, whose place in the order
-    comes last.
+    In a round every incomplete frame is multiplied with the product that its next ancestor holds so far; the indices of
+    these ancestors in the order come last.
     """
     depths: list[int] = []
     for joint in tree.joints:
         depths.append(0 if joint.parent < 0 else depths[joint.parent] + 1)
     order = sorted(range(len(tree)), key=lambda index: depths[index])
-    place = {index: number for number, index in enumerate(order)}
-    beyond = [place.get(tree.joints[index].parent, -1) for index in order]
+    rank = {index: number for number, index in enumerate(order)}
+    beyond = [rank.get(tree.joints[index].parent, -1) for index in order]
     complete, jumps, reach = [], [], 1
     while reach <= max(depths):
         complete.append(sum(depth < reach for depth in depths))

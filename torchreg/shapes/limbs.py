@@ -15,7 +15,7 @@ class Body:
 
     Args:
         parts: indices of the parts.
-        parent: index of a part of the body that this one hangs on, -1 for the base itself.
+        parent: index of a part of the parent body, -1 for the base itself.
         dofs: indices of the degrees of freedom between parent and body.
     """
 
@@ -30,7 +30,7 @@ class Limb:
 
     Args:
         bodies: from the one nearest to the base outwards.
-        level: how many limbs lie between this one and the base.
+        level: number of limbs between this one and the base.
     """
 
     bodies: tuple[Body, ...]
@@ -48,7 +48,7 @@ class Limb:
 
 
 def find_limbs(shape: Articulation) -> tuple[list[Limb], list[int]]:
-    """Return the limbs of a shape, parents before children, and the parts of its trunk, which only the base moves.
+    """Return the limbs of a shape, parents before children, and the parts of its trunk, moved by the base alone.
 
     A degree of freedom that moves several limbs, as of a gripper, belongs to the first of them.
 

@@ -1,4 +1,4 @@
-"""Poses as points of a manifold: steps and differences, in which no rotation of the base is special.
+"""Poses as a manifold: steps and differences for which no rotation of the base is singular.
 
 A pose is (translation of the base, rotation vector of the base, joints). A step has the same layout; its rotation is
 composed from the left.
@@ -28,8 +28,8 @@ def retract(pose: Tensor, step: Tensor) -> Tensor:
 
     Differentiable: in both.
     """
-    turned = compose_rotation_vectors(step[..., 3:6], pose[..., 3:6])
-    return torch.cat([pose[..., :3] + step[..., :3], turned, pose[..., 6:] + step[..., 6:]], dim=-1)
+    rotated = compose_rotation_vectors(step[..., 3:6], pose[..., 3:6])
+    return torch.cat([pose[..., :3] + step[..., :3], rotated, pose[..., 6:] + step[..., 6:]], dim=-1)
 
 
 def difference(start: Tensor, end: Tensor) -> Tensor:
@@ -44,5 +44,5 @@ def difference(start: Tensor, end: Tensor) -> Tensor:
 
     Differentiable: in both, where that angle is below pi.
     """
-    turned = compose_rotation_vectors(end[..., 3:6], -start[..., 3:6])
-    return torch.cat([end[..., :3] - start[..., :3], turned, end[..., 6:] - start[..., 6:]], dim=-1)
+    rotated = compose_rotation_vectors(end[..., 3:6], -start[..., 3:6])
+    return torch.cat([end[..., :3] - start[..., :3], rotated, end[..., 6:] - start[..., 6:]], dim=-1)

@@ -1,9 +1,8 @@
-"""A hand's pose and keypoints in the words of other models: MANO's joint rotations, keypoint orders, WebXR, OpenXR."""
+"""Conversions of a hand's pose and keypoints: MANO's joint rotations, keypoint orders, WebXR, OpenXR."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -12,24 +11,21 @@ from torchreg._checks import check_choice, check_shape
 from torchreg.errors import InputError
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.rotation_representations import rotation_vector_from_rotation
+from torchreg.shapes.hand import FINGER_NAMES, Hand
 
-if TYPE_CHECKING:
-    from torchreg.shapes.hand import Hand
-
-_FINGERS = ("thumb", "index", "middle", "ring", "little")
-_OURS = ("wrist", *(f"{finger}_{number}" for finger in _FINGERS for number in range(1, 5)))
+_KEYPOINTS = ("wrist", *(f"{finger}_{number}" for finger in FINGER_NAMES for number in range(1, 5)))
 _MANO_FINGERS = ("index", "middle", "little", "ring", "thumb")
 _MANO = (
     "wrist", *(f"{finger}_{number}" for finger in _MANO_FINGERS for number in range(1, 4)),
-    *(f"{finger}_4" for finger in _FINGERS),
+    *(f"{finger}_4" for finger in FINGER_NAMES),
 )  # fmt: skip
-_INTERHAND = (*(f"{finger}_{number}" for finger in _FINGERS for number in range(4, 0, -1)), "wrist")
+_INTERHAND = (*(f"{finger}_{number}" for finger in FINGER_NAMES for number in range(4, 0, -1)), "wrist")
 
 KEYPOINT_ORDERS: dict[str, tuple[str, ...]] = {
-    "torchreg": _OURS,
-    "openpose": _OURS,
-    "mediapipe": _OURS,
-    "freihand": _OURS,
+    "torchreg": _KEYPOINTS,
+    "openpose": _KEYPOINTS,
+    "mediapipe": _KEYPOINTS,
+    "freihand": _KEYPOINTS,
     "mano": _MANO,
     "interhand": _INTERHAND,
 }
@@ -39,17 +35,17 @@ KEYPOINT_ORDERS: dict[str, tuple[str, ...]] = {
 """
 
 # MANO's 15 joints as parts of the hand.
-_MANO_PARTS = tuple(3 * _FINGERS.index(finger) + number for finger in _MANO_FINGERS for number in (1, 2, 3))
+_MANO_PARTS = tuple(3 * FINGER_NAMES.index(finger) + number for finger in _MANO_FINGERS for number in (1, 2, 3))
 _PARTS = {"thumb": ("metacarpal", "proximal", "distal"), "long": ("proximal", "middle", "distal")}
 _WEBXR_PARTS = {"metacarpal": None, "proximal": "proximal", "intermediate": "middle", "distal": "distal"}
-# Alternations of two closed forms; exact after one wherever the joint can make the rotation.
+# Alternations of two closed forms, the first of which is exact where the joint can make the rotation.
 _ALTERNATIONS = 20
 
 
 def _webxr() -> dict[str, tuple[str, str | None]]:
-    """Return, per WebXR joint, the part that moves with it and the keypoint that lies there."""
+    """Return the part that moves with each WebXR joint, and the keypoint at its position."""
     joints: dict[str, tuple[str, str | None]] = {"wrist": ("palm", "wrist")}
-    for finger in _FINGERS:
+    for finger in FINGER_NAMES:
         word = "thumb" if finger == "thumb" else f"{'pinky' if finger == 'little' else finger}-finger"
         segments = _PARTS["thumb" if finger == "thumb" else "long"]
         if finger == "thumb":
@@ -79,7 +75,9 @@ WEBXR_PARTS: dict[str, str] = {name: part for name, (part, _) in _WEBXR.items()}
 OPENXR_PARTS: dict[str, str] = {"PALM": "palm", **{_openxr_name(name): part for name, part in WEBXR_PARTS.items()}}
 """The hand's part that moves with each OpenXR joint."""
 _XR_KEYPOINTS = {
-    "webxr": [WEBXR_JOINTS.index(name) for key in _OURS for name, (_, here) in _WEBXR.items() if here == key],
+    "webxr": [
+        WEBXR_JOINTS.index(name) for key in _KEYPOINTS for name, (_, keypoint) in _WEBXR.items() if keypoint == key
+    ],
 }
 _XR_KEYPOINTS["openxr"] = [index + 1 for index in _XR_KEYPOINTS["webxr"]]
 _XR_SIZES = {"webxr": len(WEBXR_JOINTS), "openxr": len(OPENXR_JOINTS)}
@@ -93,7 +91,7 @@ class ManoPose:
         global_orient: (..., 3) rotation vector of the wrist, radians.
         hand_pose: (..., 15, 3) rotation vectors of the joints in their parents: index, middle, little, ring, thumb,
             three each from base to tip.
-        wrist: (..., 3) place of the wrist, metres. MANO's ``transl`` is this less its own wrist in the rest pose.
+        wrist: (..., 3) position of the wrist, metres. MANO's ``transl`` is this less its own wrist in the rest pose.
     """
 
     global_orient: Tensor
@@ -154,9 +152,6 @@ def to_mano_pose(hand: Hand, pose: Tensor, *, flat_pose: Tensor | None = None) -
         pose: (..., 27).
         flat_pose: (27,) the pose in which the hand's bones point as MANO's do at rest; all zeros by default.
 
-    Returns:
-        a `ManoPose`.
-
     Raises:
         InputError: if a pose has the wrong size.
 
@@ -170,15 +165,15 @@ def to_mano_pose(hand: Hand, pose: Tensor, *, flat_pose: Tensor | None = None) -
     parents = [hand.part_parents[part] for part in _MANO_PARTS]
     local = turned[..., parents, :, :].mT @ turned[..., list(_MANO_PARTS), :, :]
     hand_pose = rotation_vector_from_rotation(axes @ local @ axes.mT)
-    # The wrist turns MANO's own axes: from its frame to the hand's, and on.
+    # The wrist's rotation starts from MANO's axes, not from the hand's.
     return ManoPose(rotation_vector_from_rotation(turned[..., 0, :, :] @ axes.mT), hand_pose, pose[..., :3])
 
 
 def from_mano_pose(hand: Hand, mano: ManoPose, *, flat_pose: Tensor | None = None) -> Tensor:
     """Return the hand's pose nearest to MANO's joint rotations, see `to_mano_pose`.
 
-    MANO's joints are balls; a joint of the hand takes the part of the rotation that it can make, nearest in the squared
-    difference of the matrices, and the next joint starts anew. Limits are not applied: see `ArticulatedShape.clamp`.
+    MANO's joints are ball joints; each joint of the hand takes its rotation nearest to MANO's in the squared difference
+    of the matrices, whatever the joints before it left over. Limits are not applied: see `ArticulatedShape.clamp`.
 
     Args:
         hand: the hand.
@@ -212,25 +207,25 @@ def from_mano_pose(hand: Hand, mano: ManoPose, *, flat_pose: Tensor | None = Non
         offset = rest[parent].mT @ rest[part]
         wanted = offset.mT @ flat[parent].mT @ local[..., number, :, :] @ flat[part]
         columns.update(_joint_angles(hand, part, wanted))
-    turn = rotation_vector_from_rotation(palm)
+    rotation = rotation_vector_from_rotation(palm)
     joints = torch.stack([columns[dof] for dof in range(6, hand.num_dofs)], dim=-1)
-    return torch.cat([mano.wrist.to(hand.rest), turn, joints], dim=-1)
+    return torch.cat([mano.wrist.to(hand.rest), rotation, joints], dim=-1)
 
 
 def _joint_angles(hand: Hand, part: int, wanted: Tensor) -> dict[int, Tensor]:
-    """Return the angles, by degree of freedom, that turn a part most nearly by ``wanted`` (..., 3, 3)."""
+    """Return the angles (...), by degree of freedom, whose rotation of a part is nearest to ``wanted`` (..., 3, 3)."""
     finger, number = divmod(part - 1, 3)
     joints = ("cmc", "mcp", "ip") if finger == 0 else ("mcp", "pip", "dip")
-    stem = f"{_FINGERS[finger]}_{joints[number]}"
+    stem = f"{FINGER_NAMES[finger]}_{joints[number]}"
     flexion = hand.dof_names.index(f"{stem}_flexion")
     if f"{stem}_abduction" not in hand.dof_names:
         return {flexion: _angle_about_x(wanted)}
     side = 1.0 if hand.side == "right" else -1.0
-    # Exact for a rotation about y and then x, at any angle: its first column tells that about y.
+    # Exact for a rotation about y and then x, at any angle: its first column depends on the angle about y alone.
     about_y = torch.atan2(-wanted[..., 2, 0], wanted[..., 0, 0])
     for _ in range(_ALTERNATIONS):
-        about_x = _angle_about_x(_turn(about_y, 1).mT @ wanted)
-        about_y = _angle_about_y(wanted @ _turn(about_x, 0).mT)
+        about_x = _angle_about_x(_axis_rotation(about_y, 1).mT @ wanted)
+        about_y = _angle_about_y(wanted @ _axis_rotation(about_x, 0).mT)
     return {hand.dof_names.index(f"{stem}_abduction"): side * about_y, flexion: about_x}
 
 
@@ -242,12 +237,12 @@ def _angle_about_y(rotation: Tensor) -> Tensor:
     return torch.atan2(rotation[..., 0, 2] - rotation[..., 2, 0], rotation[..., 0, 0] + rotation[..., 2, 2])
 
 
-def _turn(angle: Tensor, axis: int) -> Tensor:
+def _axis_rotation(angle: Tensor, axis: int) -> Tensor:
     return so3_exp(angle.unsqueeze(-1) * torch.eye(3, dtype=angle.dtype, device=angle.device)[axis])
 
 
 def _flat_rotations(hand: Hand, flat_pose: Tensor | None) -> Tensor:
-    """Return the rotations (16, 3, 3) of the parts in the flat pose, with the base unturned."""
+    """Return the rotations (16, 3, 3) of the parts in the flat pose, relative to the base."""
     flat = torch.zeros_like(hand.rest) if flat_pose is None else hand.check_pose(flat_pose, "flat_pose")
     check_shape(flat, "flat_pose", (hand.num_dofs,))
     flat = torch.cat([torch.zeros_like(flat[:6]), flat[6:]])

@@ -1,7 +1,9 @@
-"""The end of a pose network: numbers without limits to poses of a shape, and back."""
+"""The output layer of a pose network: features without limits to poses of a shape, and back."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -18,21 +20,36 @@ from torchreg.geometry.rotation_representations import (
 if TYPE_CHECKING:
     from torchreg.shapes.articulated import ArticulatedShape
 
-_SIZES = {"6d": 6, "quaternion": 4, "vector": 3}
-# Joints at a limit are taken this share of the range inside, where the sigmoid can be undone.
+# Distance of a joint from its limits, as a share of its range, at which the sigmoid is inverted for joints at a limit.
 _INSIDE = 1e-3
 
 
-class PoseHead(nn.Module):
-    """Maps what the last layer of a network gives to poses: translation, rotation, joints, in this order.
+@dataclass(frozen=True)
+class _Representation:
+    """A parametrization of the base rotation: its number of features, and the maps to and from rotation vectors."""
 
-    The base rotation is given as six numbers or a quaternion, both without jumps, or as a plain rotation vector. A pose
-    holds a rotation vector, whose sign changes at half turns: compare poses by keypoints or rotations, not by it.
+    size: int
+    to_vector: Callable[[Tensor], Tensor] = torch.Tensor.clone
+    from_vector: Callable[[Tensor], Tensor] = torch.Tensor.clone
+
+
+_REPRESENTATIONS = {
+    "6d": _Representation(6, rotation_vector_from_6d, rotation_vector_to_6d),
+    "quaternion": _Representation(4, rotation_vector_from_quaternion, quaternion_from_rotation_vector),
+    "vector": _Representation(3),
+}
+
+
+class PoseHead(nn.Module):
+    """Maps the features of a network's last layer to poses: translation, rotation, joints, in this order.
+
+    The base rotation is parametrized by six numbers or a quaternion, which are continuous, or by a rotation vector. A
+    pose holds a rotation vector, whose sign changes at half turns: compare poses by keypoints or rotations, not by it.
 
     Args:
         shape: the shape whose poses are meant; only its limits are kept.
         rotation: "6d", "quaternion" or "vector".
-        joints: "sigmoid" keeps every joint with finite limits inside them; "free" leaves joints as they come.
+        joints: "sigmoid" keeps every joint with finite limits inside them; "free" takes features as joint values.
 
     Raises:
         InputError: if ``rotation`` or ``joints`` is unknown.
@@ -46,7 +63,7 @@ class PoseHead(nn.Module):
 
     def __init__(self, shape: ArticulatedShape, *, rotation: str = "6d", joints: str = "free") -> None:
         super().__init__()
-        check_choice(rotation, "rotation", tuple(_SIZES))
+        check_choice(rotation, "rotation", tuple(_REPRESENTATIONS))
         check_choice(joints, "joints", ("free", "sigmoid"))
         self.rotation, self.joints = rotation, joints
         lower, upper = shape.lower[6:], shape.upper[6:]
@@ -57,8 +74,8 @@ class PoseHead(nn.Module):
 
     @property
     def num_features(self) -> int:
-        """How many numbers make a pose: the size of the layer before."""
-        return 3 + _SIZES[self.rotation] + len(self.limited)
+        """Number of features of a pose: the size of the layer before."""
+        return 3 + _REPRESENTATIONS[self.rotation].size + len(self.limited)
 
     @property
     def num_dofs(self) -> int:
@@ -66,7 +83,7 @@ class PoseHead(nn.Module):
         return 6 + len(self.limited)
 
     def forward(self, features: Tensor) -> Tensor:
-        """Return the poses that features stand for.
+        """Return the poses of features.
 
         Args:
             features: (..., num_features).
@@ -80,16 +97,14 @@ class PoseHead(nn.Module):
         Differentiable: in ``features``, see `rotation_from_6d` and `rotation_from_quaternion`.
         """
         check_shape(features, "features", (self.num_features,), batch=True)
-        place, turn, joints = features.split([3, _SIZES[self.rotation], len(self.limited)], dim=-1)
-        if self.rotation == "6d":
-            turn = rotation_vector_from_6d(turn)
-        elif self.rotation == "quaternion":
-            turn = rotation_vector_from_quaternion(turn)
+        representation = _REPRESENTATIONS[self.rotation]
+        translation, rotation, joints = features.split([3, representation.size, len(self.limited)], dim=-1)
         bounded = self.lower + (self.upper - self.lower) * torch.sigmoid(joints)
-        return torch.cat([place, turn, torch.where(self.limited, bounded, joints)], dim=-1)
+        joints = torch.where(self.limited, bounded, joints)
+        return torch.cat([translation, representation.to_vector(rotation), joints], dim=-1)
 
     def features(self, pose: Tensor) -> Tensor:
-        """Return features that give a pose; joints at their limits are taken a thousandth of the range inside.
+        """Return the features of a pose; joints at their limits are moved inside by a thousandth of their range.
 
         Args:
             pose: (..., num_dofs).
@@ -103,13 +118,10 @@ class PoseHead(nn.Module):
         Differentiable: in ``pose``.
         """
         check_shape(pose, "pose", (self.num_dofs,), batch=True)
-        place, turn, joints = pose.split([3, 3, len(self.limited)], dim=-1)
-        if self.rotation == "6d":
-            turn = rotation_vector_to_6d(turn)
-        elif self.rotation == "quaternion":
-            turn = quaternion_from_rotation_vector(turn)
+        translation, rotation, joints = pose.split([3, 3, len(self.limited)], dim=-1)
         extent = self.upper - self.lower
-        # A joint without range has nothing to tell.
+        # Any feature gives a joint without range.
         share = torch.where(extent > 0, (joints - self.lower) / torch.where(extent > 0, extent, 1.0), 0.5)
         logit = torch.logit(share.clamp(_INSIDE, 1 - _INSIDE))
-        return torch.cat([place, turn, torch.where(self.limited, logit, joints)], dim=-1)
+        rotation = _REPRESENTATIONS[self.rotation].from_vector(rotation)
+        return torch.cat([translation, rotation, torch.where(self.limited, logit, joints)], dim=-1)

@@ -1,4 +1,4 @@
-"""What poses are likely: the mean and the principal components of known ones, within the joint limits."""
+"""A prior of poses: a Gaussian by the mean and principal components of known poses, within the joint limits."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     from torchreg.shapes.articulated import ArticulatedShape
 
 _KIND = "PosePrior"
-# Steps to the mean rotation, which from the chordal mean converge quadratically.
+# Steps to the mean rotation, quadratically convergent from the chordal mean.
 _MEAN_STEPS = 20
-# A joint may be this far beyond a limit, radians, at the price of one standard deviation.
+# Standard deviation of the excess of a joint over its limits, radians or metres.
 _LIMIT_STD = 0.05
 
 
 class PosePrior(nn.Module):
     """A Gaussian on poses around a mean one, ``C = sum_k s_k^2 c_k c_k^T + r^2 I``, with soft joint limits.
 
-    It lives in the tangent space of the mean pose: the base's rotation differs from the mean by composition,
-    ``exp(step) exp(mean)``, so no rotation is special. Base and joints have components of their own, so metres and
-    radians do not mix. A prior whose base is free says nothing of where the shape is.
+    It is defined in the tangent space of the mean pose: the base's rotation differs from the mean by composition,
+    ``exp(step) exp(mean)``, so that no rotation is singular. Base and joints have separate components, so that metres
+    and radians do not mix. A prior with a free base is uniform over the base's pose.
 
     Args:
         mean: (num_dofs,), metres and radians.
@@ -96,18 +96,18 @@ class PosePrior(nn.Module):
         base: bool = True,
         min_deviation: float = 1e-3,
     ) -> PosePrior:
-        """Return the prior of poses, such as tracked ones; poses that are not finite (lost frames) are left out.
+        """Return the prior of given poses, such as tracked ones; those that are not finite (lost frames) are left out.
 
         Args:
             shape: the shape whose poses they are.
             poses: (T, num_dofs), at least two of them finite.
-            num_components: of the joints; by default as many as explain the share below.
+            num_components: of the joints; by default as many as explain the share ``explained``.
             explained: share of the joints' variance to explain.
             base: whether the base has a prior too.
             min_deviation: least standard deviation along any direction, radians and metres.
 
         Returns:
-            the prior, in the shape's dtype and on its device.
+            The prior, in the shape's dtype and on its device.
 
         Raises:
             InputError: if fewer than two poses are finite, or a number is out of range.
@@ -134,8 +134,8 @@ class PosePrior(nn.Module):
             base_values, base_vectors = _principal(tangent[:, :BASE_DOFS])
             rows.insert(0, nn.functional.pad(base_vectors, (0, num_joints)))
             deviations.insert(0, base_values.sqrt())
-        rest = values[count:]
-        residual = math.sqrt(float(rest.mean())) if len(rest) else 0.0
+        unexplained = values[count:]
+        residual = math.sqrt(float(unexplained.mean())) if len(unexplained) else 0.0
         prior = cls(
             mean, torch.cat(rows), torch.cat(deviations).clamp_min(min_deviation), max(residual, min_deviation),
             lower=shape.lower, upper=shape.upper, has_base=base,
@@ -148,7 +148,7 @@ class PosePrior(nn.Module):
         return len(self.components)
 
     def forward(self, coefficients: Tensor) -> Tensor:
-        """Return the poses of coefficients, which are standard deviations along the components; not limited.
+        """Return the poses of coefficients, in standard deviations along the components; joint limits are not applied.
 
         Args:
             coefficients: (..., K).
@@ -165,7 +165,7 @@ class PosePrior(nn.Module):
         return retract(self.mean, (coefficients * self.deviations) @ self.components)
 
     def coefficients(self, pose: Tensor) -> Tensor:
-        """Return the coefficients (..., K) of poses (..., num_dofs): what `forward` undoes, but for the residual.
+        """Return the coefficients (..., K) of poses (..., num_dofs), the inverse of `forward` up to the residual.
 
         Raises:
             InputError: if the pose has the wrong size.
@@ -178,8 +178,8 @@ class PosePrior(nn.Module):
     def log_prob(self, pose: Tensor) -> Tensor:
         """Return the log density of poses in tangent coordinates, less half the squared excess over the joint limits.
 
-        The excess is counted in twentieths of a radian (of a metre for sliding joints), and the density is not
-        normalized again for what the limits cut off. A free base does not count.
+        The excess is in twentieths of a radian (of a metre for sliding joints), and the density is not renormalized for
+        the limits. A free base does not count.
 
         Args:
             pose: (..., num_dofs).
@@ -198,19 +198,19 @@ class PosePrior(nn.Module):
         joints = self.components[BASE_DOFS:] if self.has_base else self.components
         beyond = tangent[..., BASE_DOFS:] - (tangent @ joints.mT) @ joints[:, BASE_DOFS:]
         squared = (along / self.deviations).square().sum(-1) + (beyond / self.residual).square().sum(-1)
-        others = beyond.shape[-1] - len(joints)
-        volume = self.deviations.log().sum() + others * math.log(self.residual)
-        volume = volume + 0.5 * (self.num_components + others) * math.log(2 * math.pi)
+        num_residual = beyond.shape[-1] - len(joints)
+        volume = self.deviations.log().sum() + num_residual * math.log(self.residual)
+        volume = volume + 0.5 * (self.num_components + num_residual) * math.log(2 * math.pi)
         low, high = self.lower[BASE_DOFS:], self.upper[BASE_DOFS:]
         excess = (low - pose[..., BASE_DOFS:]).clamp_min(0) + (pose[..., BASE_DOFS:] - high).clamp_min(0)
         return -0.5 * squared - volume - 0.5 * (excess / _LIMIT_STD).square().sum(-1)
 
     @torch.no_grad()
     def sample(self, count: int, generator: torch.Generator | None = None) -> Tensor:
-        """Return poses (count, num_dofs) drawn from the Gaussian and moved inside the limits; a free base at the mean.
+        """Return poses (count, num_dofs) drawn from the Gaussian and clamped to the limits; a free base at the mean.
 
         Args:
-            count: how many.
+            count: number of poses.
             generator: on the CPU; one with seed 0 by default.
 
         Raises:
@@ -228,15 +228,15 @@ class PosePrior(nn.Module):
 
     @torch.no_grad()
     def init_head_(self, linear: nn.Linear, head: PoseHead | None = None) -> nn.Linear:
-        """Set a regressor's last layer to give the mean pose plus likely deviations from it, and return it.
+        """Return a regressor's last layer after setting it to the mean pose plus likely deviations.
 
-        The bias becomes the mean pose; features of zero mean and unit variance that are not correlated give the prior's
-        covariance. Components are mixed over all features by rows of the discrete cosine transform: each row sums to
-        zero, so that what features have in common, as after a ReLU, moves no pose.
+        The bias becomes the mean pose; uncorrelated features of zero mean and unit variance give the covariance of the
+        prior. Components are spread over all features by rows of the discrete cosine transform: each row sums to zero,
+        so that a common offset of the features, as after a ReLU, moves no pose.
 
         Args:
-            linear: from features to poses, or to the numbers ``head`` takes; with a bias.
-            head: that follows the layer, if any; then components are taken to its numbers to first order.
+            linear: from features to poses, or to the inputs of ``head``; with a bias.
+            head: that follows the layer, if any; then components are mapped to its inputs to first order.
 
         Raises:
             InputTypeError: if ``linear`` is no linear layer with a bias.
@@ -287,7 +287,7 @@ class PosePrior(nn.Module):
 
 
 def _mean_rotation(vectors: Tensor) -> Tensor:
-    """Return the rotation vector (3,) with the least squared angles to all (T, 3), from the mean of quaternions."""
+    """Return the rotation vector (3,) of least squared angles to all given ones (T, 3)."""
     quaternions = quaternion_from_rotation_vector(vectors)
     mean = rotation_vector_from_quaternion(torch.linalg.eigh(quaternions.mT @ quaternions).eigenvectors[:, -1])
     for _ in range(_MEAN_STEPS):
@@ -296,7 +296,7 @@ def _mean_rotation(vectors: Tensor) -> Tensor:
 
 
 def _principal(steps: Tensor) -> tuple[Tensor, Tensor]:
-    """Return variances, largest first, and directions as rows."""
+    """Return the variances along the principal directions, largest first, and these directions as rows."""
     covariance = steps.mT @ steps / max(1, len(steps) - 1)
     values, vectors = torch.linalg.eigh(covariance)
     return values.flip(0).clamp_min(0), vectors.mT.flip(0)
@@ -304,6 +304,6 @@ def _principal(steps: Tensor) -> tuple[Tensor, Tensor]:
 
 def _cosine_rows(count: int, size: int) -> Tensor:
     """Return orthonormal rows (count, size) of the discrete cosine transform, without the constant one."""
-    place = (torch.arange(size, dtype=torch.float64) + 0.5) * math.pi / size
+    phase = (torch.arange(size, dtype=torch.float64) + 0.5) * math.pi / size
     frequency = torch.arange(1, count + 1, dtype=torch.float64)
-    return math.sqrt(2 / size) * (frequency.unsqueeze(-1) * place).cos()
+    return math.sqrt(2 / size) * (frequency.unsqueeze(-1) * phase).cos()

@@ -1,4 +1,4 @@
-"""Shapes as plain data: everything that an articulated shape consists of, for files."""
+"""Shapes as plain data, for files."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from torchreg.geometry.rigid import rigid_matrix
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.primitives import Primitive, PrimitiveSet
-from torchreg.shapes.rigs import ShapeSpec
+from torchreg.shapes.spec import ShapeSpec
 
 
 @dataclass(frozen=True)
 class HandSpec:
-    """What a `Hand` is built from.
+    """The arguments of a `Hand`.
 
     Args:
         side: "right" or "left".
@@ -35,7 +35,7 @@ class ShapeRecord:
     """A shape as plain data.
 
     Args:
-        spec: what it is built from.
+        spec: the tree, parts and solids that it is built from.
         free_base: whether its base moves.
         parameters: values of all parameters, in the order of the module's.
         learnable: which of them require gradients.
@@ -48,7 +48,7 @@ class ShapeRecord:
 
 
 def record_shape(shape: ArticulatedShape) -> ShapeRecord:
-    """Return what a shape consists of; its tensors are detached, on the CPU and not shared with it.
+    """Return a shape as plain data; its tensors are detached, on the CPU and not shared with it.
 
     Raises:
         InputTypeError: if the shape is of a class that this release does not know how to build.
@@ -60,7 +60,14 @@ def record_shape(shape: ArticulatedShape) -> ShapeRecord:
         tree = shape.chain.tree
         frames = tuple(tree.joints[index].name for index in shape.part_index.tolist())
         solids = tuple(_solids(shape.primitives))
-        spec = ShapeSpec(tree, frames, solids, shape.nu, shape.part_names, shape.surface)
+        spec = ShapeSpec(
+            tree=tree,
+            part_frames=frames,
+            primitives=solids,
+            nu=shape.nu,
+            part_names=shape.part_names,
+            surface=shape.surface,
+        )
     else:
         raise InputTypeError(
             f"only an ArticulatedShape or a Hand can be stored, got {type(shape).__name__}; store its state_dict"
@@ -75,7 +82,7 @@ def build_shape(record: ShapeRecord) -> ArticulatedShape:
     """Return the shape that a record describes, a new module on the CPU.
 
     Raises:
-        ModelError: if the parameters do not fit what the shape is built from, or that is impossible.
+        ModelError: if the parameters do not fit the spec, or no shape can be built from it.
         InputError: if a hand has an unknown side, or a scale or fusion length that is not positive.
     """
     dtypes = {value.dtype for value in record.parameters}
@@ -103,7 +110,7 @@ def build_shape(record: ShapeRecord) -> ArticulatedShape:
 
 
 def _solids(primitives: PrimitiveSet) -> list[Primitive]:
-    """Return the solids as they are now, in the order of the parts."""
+    """Return the solids with their present sizes and poses, in the order of the parts."""
     sizes = {
         int(part): tuple(row)
         for kind, rows in zip(primitives.kinds, primitives.sizes, strict=True)

@@ -1,11 +1,11 @@
-"""Skins: points that ride on an articulated shape."""
+"""Skins: points carried by an articulated shape."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
 
-from torchreg._checks import as_float_tensor, check_points, check_positive, check_shape
+from torchreg._checks import as_float_tensor, check_count, check_points, check_positive, check_shape
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
 from torchreg.geometry.rigid import invert_rigid, transform_points
@@ -76,10 +76,10 @@ class LinearBlendSkin(nn.Module):
         with torch.no_grad():
             inverse = invert_rigid(shape.part_transforms(reference_pose))
             local = transform_points(inverse, points.expand(shape.num_parts, -1, -1)).transpose(0, 1)
-            turned = None if normals is None else (normals @ inverse[:, :3, :3].mT).transpose(0, 1)
+            local_normals = None if normals is None else (normals @ inverse[:, :3, :3].mT).transpose(0, 1)
         self.register_buffer("basis", _weighted(local, weights, 1.0), persistent=False)
-        # Lengths of bones turn no part, so the normals in their parts' frames hold for all of them.
-        normal_basis = None if turned is None else _weighted(turned, weights, 0.0)
+        # Bone lengths rotate no part, so that the normals in the parts' frames are the same for all lengths.
+        normal_basis = None if local_normals is None else _weighted(local_normals, weights, 0.0)
         self.register_buffer("normal_basis", normal_basis, persistent=False)
 
     def __len__(self) -> int:
@@ -111,7 +111,7 @@ class LinearBlendSkin(nn.Module):
 
         Differentiable: in ``rows``.
         """
-        # With the three coordinates as the short side from the left, the product takes a fifth of the time or less.
+        # The product with the three coordinates as the short left side takes a fifth of the time or less.
         return nn.functional.linear(rows.mT, self.basis).mT
 
     def jacobian(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
@@ -131,7 +131,7 @@ class LinearBlendSkin(nn.Module):
         return self.place(rows), jacobian.unflatten(-1, derivative.shape[-2:])
 
     def posed_normals(self, pose: Tensor) -> Tensor:
-        """Return the unit normals in a pose, turned with the weighted mean of the part rotations.
+        """Return the unit normals in a pose, rotated by the weighted mean of the part rotations.
 
         Args:
             pose: (..., num_dofs).
@@ -152,8 +152,8 @@ class LinearBlendSkin(nn.Module):
         """
         if self.normal_basis is None:
             raise InputError("this skin has no normals; pass normals= when building it")
-        turned = nn.functional.linear(rows.mT, self.normal_basis)
-        return nn.functional.normalize(turned, dim=-2).mT
+        rotated = nn.functional.linear(rows.mT, self.normal_basis)
+        return nn.functional.normalize(rotated, dim=-2).mT
 
 
 def stacked_rows(transforms: Tensor) -> Tensor:
@@ -209,7 +209,7 @@ class BendingSkin(LinearBlendSkin):
 
 
 def bending_weights(shape: Articulation, points: Tensor, pose: Tensor, sharpness: float) -> Tensor:
-    """Return the weights (N, P) of eq. 3: the dominating part and its strongest neighbor share each point.
+    """Return the weights (N, P) of eq. 3, shared by the dominating part and its strongest neighbor.
 
     Args:
         shape: the articulated shape.
@@ -218,7 +218,7 @@ def bending_weights(shape: Articulation, points: Tensor, pose: Tensor, sharpness
         sharpness: a.
 
     Returns:
-        (N, P), rows sum to one, at most two entries per row.
+        Weights (N, P), rows sum to one, at most two entries per row.
 
     References: Dewaele et al. 2006, eq. 3.
     """
@@ -245,10 +245,14 @@ def sample_skin(shape: Articulation, count: int = 500, *, sharpness: float = 2.0
         seed: of the candidates among which the points are chosen.
 
     Returns:
-        a skin with ``count`` points.
+        A skin with ``count`` points.
+
+    Raises:
+        InputError: if ``count`` is not positive.
 
     Cost: meshing the fused surface takes about half a second; keep the skin when aligning many clouds.
     """
+    check_count(count, "count", 1)
     mesh = shape.surface_mesh() if shape.surface is None else TriangleMesh(
         shape.surface.vertices.to(shape.rest), shape.surface.faces.to(shape.rest.device)
     )  # fmt: skip

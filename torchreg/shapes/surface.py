@@ -1,7 +1,8 @@
-"""Two surfaces of an articulated shape behind one interface: its fused solids, or a skin's tangent planes."""
+"""Signed distances to an articulated shape: to its fused solids, or to the tangent planes of a skin."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -13,12 +14,28 @@ from torchreg.geometry.neighbors import nearest_neighbor, sampling_distance
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.skin import LinearBlendSkin, stacked_rows
 
-# Meshes with this many vertices carry their own sampling.
-_MIN_VERTICES, _MAX_VERTICES, _NUM_SAMPLES = 800, 6000, 4000
+
+@dataclass(frozen=True)
+class _DenseSkin:
+    """Numbers of dense skins and of distances to their tangent planes."""
+
+    # Vertices of a mesh that is dense enough, and not too large, to be a skin itself; other meshes are sampled.
+    min_vertices: int = 800
+    max_vertices: int = 6000
+    num_samples: int = 4000
+    # Points that tell the spacing of a skin.
+    num_spacings: int = 500
+    # A datum is off the rim of a skin if its offset is this oblique (distance to the plane over distance to the point)
+    # and longer than this many spacings.
+    rim_share: float = 0.2
+    rim_spacings: float = 2.0
 
 
-class Surface(Protocol):
-    """What a surface fit needs: signed distances and their Jacobian with respect to the pose."""
+_DENSE = _DenseSkin()
+
+
+class ShapeSurface(Protocol):
+    """A surface that data are fitted to: signed distances and their Jacobian with respect to the pose."""
 
     def distance(self, points: Tensor, pose: Tensor) -> Tensor:
         """Return the signed distances (..., N) of points (..., N, 3) in poses (..., num_dofs), metres."""
@@ -47,9 +64,9 @@ class FusedSurface:
 
 
 class SkinSurface:
-    """A surface given by a dense skin with normals: distance to the tangent plane of the nearest skin point.
+    """A dense skin with normals: distances to the tangent plane of the nearest skin point.
 
-    For shapes whose file brings a mesh this is closer to the thing than its fused solids.
+    For shapes from files with a mesh it is closer to the true surface than the fused solids.
 
     Args:
         skin: a skin with normals, dense enough that its points' tangent planes follow the surface.
@@ -58,7 +75,7 @@ class SkinSurface:
     def __init__(self, skin: LinearBlendSkin) -> None:
         self.skin = skin
         self.first = _first_copies(skin)
-        self.gap = _GAP_SPACINGS * _spacing(skin.points, self.first)
+        self.reach = _DENSE.rim_spacings * _spacing(skin.points, self.first)
 
     def distance(self, points: Tensor, pose: Tensor) -> Tensor:
         """Return the signed distances (..., N) of points (..., N, 3) in poses (..., num_dofs), metres."""
@@ -70,7 +87,7 @@ class SkinSurface:
         rows, derivative = self.skin.shape.transform_jacobian(pose, chart="tangent")
         posed, normals = self.skin.place(rows), self.skin.turn_normals(rows)
         distance, nearest, normal = self._plane_distance(points, posed, normals)
-        # Contracted with the normals first: their products with the basis are smaller than every point's motions.
+        # Contracted with the normals first: the products are smaller than the motions of all points.
         along = (self.skin.basis[nearest].unsqueeze(-1) * normal.unsqueeze(-2)).flatten(-2)
         return distance, -(along @ derivative.flatten(-3, -2))
 
@@ -80,37 +97,28 @@ class SkinSurface:
         offset = points - posed.expand(*nearest.shape[:-1], *posed.shape[-2:]).gather(-2, index)
         normal = normals.expand(*nearest.shape[:-1], *normals.shape[-2:]).gather(-2, index)
         along = (offset * normal).sum(-1)
-        # Beside the rim of a skin the tangent plane says little: the distance to the point takes over, with its sign.
-        reach = offset.norm(dim=-1)
-        beside = (along.abs() < _PLANE_SHARE * reach) & (reach > self.gap)
-        return torch.where(beside, _signed(reach, along), along), nearest, normal
-
-
-# A datum whose offset is this oblique, and longer than this many distances between skin points, lies beside the rim.
-_PLANE_SHARE = 0.2
-_GAP_SPACINGS = 2.0
-_NUM_SPACINGS = 500
+        # Off the rim of a skin the tangent plane means little: the distance to the point replaces it, with its sign.
+        distance = offset.norm(dim=-1)
+        off_rim = (along.abs() < _DENSE.rim_share * distance) & (distance > self.reach)
+        return torch.where(off_rim, torch.where(along < 0, -distance, distance), along), nearest, normal
 
 
 def _spacing(points: Tensor, first: Tensor) -> float:
-    """Return the median distance of points from their nearest neighbors elsewhere, zero for a single place."""
-    places = points[first.unique()]
-    return 0.0 if len(places) < 2 else sampling_distance(places, points[:: -(-len(points) // _NUM_SPACINGS)])
+    """Return the median distance of points from their nearest neighbors at other positions, zero without any."""
+    positions = points[first.unique()]
+    subset = points[:: -(-len(points) // _DENSE.num_spacings)]
+    return 0.0 if len(positions) < 2 else sampling_distance(positions, subset)
 
 
 def _first_copies(skin: LinearBlendSkin) -> Tensor:
-    """Return, per skin point, the first point that is everywhere where it is: files split vertices along seams.
+    """Return the first point that coincides with each skin point in every pose: files split vertices along seams.
 
-    Copies may have normals of their own, and which of them is nearest must not depend on how neighbors are searched.
+    Copies may differ in their normals, and the choice between them must not depend on the search for neighbors.
     """
     group = torch.unique(skin.points, dim=0, return_inverse=True)[1]
     index = torch.arange(len(skin), device=group.device)
     first = torch.full_like(index, len(skin)).scatter_reduce(0, group, index, "amin")[group]
     return torch.where((skin.weights[first] == skin.weights).all(-1), first, index)
-
-
-def _signed(size: Tensor, sign: Tensor) -> Tensor:
-    return torch.where(sign < 0, -size, size)
 
 
 def dense_file_skin(shape: Articulation) -> LinearBlendSkin:
@@ -119,16 +127,17 @@ def dense_file_skin(shape: Articulation) -> LinearBlendSkin:
     Raises:
         InputError: if the shape was not read from a file with a mesh.
     """
-    if shape.surface is None:
+    surface = shape.surface
+    if surface is None:
         raise InputError("this shape has no file surface: it was not read from a file with a mesh")
-    mesh = TriangleMesh(shape.surface.vertices, shape.surface.faces)
+    mesh = TriangleMesh(surface.vertices, surface.faces)
     used = mesh.faces.unique()
-    if _MIN_VERTICES <= len(used) <= _MAX_VERTICES:
-        points, normals, weights = mesh.vertices[used], mesh.vertex_normals()[used], shape.surface.weights[used]
+    if _DENSE.min_vertices <= len(used) <= _DENSE.max_vertices:
+        points, normals, weights = mesh.vertices[used], mesh.vertex_normals()[used], surface.weights[used]
     else:
-        points, face, barycentric = sample_surface(mesh, _NUM_SAMPLES)
+        points, face, barycentric = sample_surface(mesh, _DENSE.num_samples)
         normals = mesh.face_normals()[face]
-        weights = interpolate(shape.surface.weights.to(barycentric), mesh.faces, face, barycentric)
+        weights = interpolate(surface.weights.to(barycentric), mesh.faces, face, barycentric)
     # The file's vertices lie in the pose of all zeros, whether or not the joint limits allow it.
     reference = torch.zeros_like(shape.rest)
     return LinearBlendSkin(

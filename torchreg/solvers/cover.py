@@ -1,4 +1,4 @@
-"""Choosing one row of each of several tables so that together they cover all columns at least cost."""
+"""Combinations of one row from each of several tables that together cover all columns at least cost."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from itertools import combinations
 
 import torch
 from torch import Tensor
-
-from torchreg.errors import InputError
 
 
 def best_covers(
@@ -21,33 +19,28 @@ def best_covers(
     num_exchanged: int = 3,
     sweeps: int = 2,
 ) -> tuple[Tensor, Tensor]:
-    """Return the best choices of one row per table, ``min sum_j min(u_j, min_f T_f[k_f, j]) + sum_f c_f[k_f]``.
+    """Return the best combinations of one row per table, ``min sum_j min(u_j, min_f T_f[k_f, j]) + sum_f c_f[k_f]``.
 
-    A beam over the tables, in their order; then, for the best few, pairs of rows are exchanged for the best pair while
-    the others stay, which finds two rows that must change at once.
+    A beam search over the tables, in their order; then, for the best combinations, pairs of rows are exchanged for the
+    best pair given all other rows, which finds two rows that must change at once.
 
     Args:
-        uncovered: (B, M) what a column costs when nothing covers it.
-        tables: F tensors (B, K_f, M), what a column costs when a row covers it.
-        costs: F tensors (B, K_f), what choosing a row costs.
-        count: choices returned, at most.
-        beam: choices kept from table to table.
-        num_exchanged: of the best choices that are improved by exchanges; 0 leaves the exchanges out.
+        uncovered: (B, M) cost of a column that no row covers.
+        tables: F tensors (B, K_f, M), cost of a column covered by a row; at least one.
+        costs: F tensors (B, K_f), cost of choosing a row.
+        count: combinations returned, at most.
+        beam: combinations kept from table to table.
+        num_exchanged: best combinations that are improved by exchanges; 0 leaves the exchanges out.
         sweeps: over all pairs of tables.
 
     Returns:
-        index (B, C, F) int64 of the chosen rows and total cost (B, C), best first; C is at most ``count``. Where there
-        are fewer choices, repeats of them come last.
-
-    Raises:
-        InputError: if there is no table, or tables and costs do not match.
+        Indices (B, C, F) int64 of the chosen rows and total costs (B, C), best first; C is at most ``count``. If there
+        are fewer combinations, repeated ones come last.
 
     Differentiable: in the cost.
 
     Cost: O(B M beam sum K_f + B M num_exchanged sweeps sum_fg K_f K_g).
     """
-    if not tables or len(tables) != len(costs):
-        raise InputError(f"covers need one cost per table and at least one, got {len(tables)} and {len(costs)}")
     index, total = _beam(uncovered, tables, costs, max(beam, count))
     if num_exchanged > 0 and len(tables) > 1:
         chosen = index[:, :num_exchanged]
@@ -63,13 +56,13 @@ def best_covers(
 
 
 def _repeats(index: Tensor) -> Tensor:
-    """Return which choices (B, C) equal an earlier one."""
+    """Return a mask (B, C) of the combinations that equal an earlier one."""
     same = (index.unsqueeze(2) == index.unsqueeze(1)).all(-1)
     return same.tril(-1).any(-1)
 
 
 def _beam(uncovered: Tensor, tables: Sequence[Tensor], costs: Sequence[Tensor], width: int) -> tuple[Tensor, Tensor]:
-    """Return the choices (B, C, F) that survive a beam over the tables, and their costs (B, C)."""
+    """Return the combinations (B, C, F) that survive a beam search over the tables, and their costs (B, C)."""
     covered, paid = uncovered.unsqueeze(1), torch.zeros_like(uncovered[:, :1])
     index = torch.zeros(len(uncovered), 1, 0, dtype=torch.long, device=uncovered.device)
     for table, cost in zip(tables, costs, strict=True):
@@ -85,12 +78,12 @@ def _beam(uncovered: Tensor, tables: Sequence[Tensor], costs: Sequence[Tensor], 
 def _exchanged(
     uncovered: Tensor, tables: Sequence[Tensor], costs: Sequence[Tensor], index: Tensor, first: int, second: int
 ) -> Tensor:
-    """Return the choices with the rows of two tables replaced by the best pair, given the others."""
-    rest = uncovered.unsqueeze(1).expand(-1, index.shape[1], -1)
-    for other in range(len(tables)):
-        if other not in (first, second):
-            rest = torch.minimum(rest, _take(tables[other], index[..., other]))
-    with_first = torch.minimum(rest.unsqueeze(2), tables[first].unsqueeze(1))
+    """Return the combinations with the rows of two tables replaced by the best pair, given all other rows."""
+    covered = uncovered.unsqueeze(1).expand(-1, index.shape[1], -1)
+    for number in range(len(tables)):
+        if number not in (first, second):
+            covered = torch.minimum(covered, _take(tables[number], index[..., number]))
+    with_first = torch.minimum(covered.unsqueeze(2), tables[first].unsqueeze(1))
     # One row of the second table at a time keeps the table of pairs and columns small.
     totals = torch.stack(
         [torch.minimum(with_first, row[:, None, None]).sum(-1) for row in tables[second].unbind(1)], dim=-1

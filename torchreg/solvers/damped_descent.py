@@ -1,4 +1,4 @@
-"""The one damped Gauss-Newton loop: who linearizes a least-squares problem and solves for a step is handed in."""
+"""The damped Gauss-Newton loop, for any linearization of a least-squares problem and any solver for its steps."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ AnySystem = TypeVar("AnySystem", bound=System)
 
 @dataclass(frozen=True)
 class DampingRule:
-    """How the damping follows what steps bring.
+    """Update of the damping after a step.
 
     Args:
-        trusted: share of the promised decrease from which a step shows that the model holds.
-        down: factor after such a step.
-        doubtful: factor after one that brought less.
-        up: factor after one that raised the cost, or that could not be solved for.
+        trusted: share of the predicted decrease from which the quadratic model counts as valid.
+        down: factor after a step with such a decrease.
+        doubtful: factor after a step with a smaller decrease.
+        up: factor after a step that raised the cost, or whose system could not be solved.
         least: smallest damping, against rounding.
-        most: largest damping: beyond it no step moves anything.
+        most: largest damping, at which steps vanish.
     """
 
     trusted: float
@@ -48,12 +48,12 @@ class DampingRule:
 
 
 class Trial(NamedTuple, Generic[State]):
-    """A step that is not tested yet.
+    """A step before its cost is known.
 
     Args:
-        state: where it leads.
-        step: (..., D), or in any other shape.
-        promised: (...) by how much the cost would fall were it quadratic, ``-g^T s / 2``.
+        state: after the step.
+        step: (..., D), or of any shape.
+        promised: (...) decrease of the cost in the quadratic model, ``-g^T s / 2``.
         sound: (...) False where the damped system had no solution and the step is zero.
     """
 
@@ -64,15 +64,15 @@ class Trial(NamedTuple, Generic[State]):
 
 
 class Descent(NamedTuple, Generic[State, AnySystem]):
-    """Where the iteration stopped.
+    """Result of the iteration.
 
     Args:
         state: of the lowest cost.
-        system: the problem around it; after ``final_cost`` its cost alone is up to date.
+        system: the problem around it; after ``final_cost`` only its cost is up to date.
         damping: (...) to continue with.
-        last_step: the last step that was kept, zero if none was.
+        last_step: the last accepted step, zero if there was none.
         num_steps: steps tried.
-        done: (...) whether the problem settled.
+        done: (...) whether the problem has converged.
     """
 
     state: State
@@ -91,27 +91,28 @@ def damped_descent(
     *,
     rule: DampingRule,
     max_steps: int,
-    settled: Callable[[Trial[State], Tensor, Tensor], Tensor] | None = None,
+    converged: Callable[[Trial[State], Tensor, Tensor], Tensor] | None = None,
     done: Tensor | None = None,
     start: AnySystem | None = None,
     final_cost: Callable[[State], Tensor] | None = None,
 ) -> Descent[State, AnySystem]:
     """Return the state of lowest cost that damped steps find; problems of a batch proceed independently.
 
-    A step that raises the cost is undone and the damping raised; one that lowers it is kept, and the damping follows
-    what it brought, see `DampingRule`.
+    A step that raises the cost is rejected and the damping raised; one that lowers it is accepted, and the damping
+    updated by its decrease, see `DampingRule`.
 
     Args:
         linearize: the problem around a state.
         solve: (state, problem, damping (...)) to a step.
-        state: to start from.
-        damping: (...) to start with.
-        rule: how the damping changes.
-        max_steps: steps tried at most.
-        settled: (trial, cost before, cost after) to (...) whether a problem is done, and stays where it is; None never.
-        done: (...) problems that are done from the start.
-        start: the problem around the start, if it is known already.
-        final_cost: cost (...) of a state, where that is cheaper: the last trial needs no more.
+        state: initial state.
+        damping: (...) initial damping.
+        rule: update of the damping.
+        max_steps: largest number of steps tried.
+        converged: (trial, cost before, cost after) to (...) whether a problem has converged and keeps its state; None:
+            never.
+        done: (...) problems that have converged already.
+        start: the problem around the initial state, if known.
+        final_cost: cost (...) of a state, if that is cheaper: the last trial needs no more.
 
     Differentiable: no.
 
@@ -120,7 +121,7 @@ def damped_descent(
     current = linearize(state) if start is None else start
     done = torch.zeros_like(current.cost, dtype=torch.bool) if done is None else done
     last_step, num_steps = None, 0
-    while num_steps < max_steps and not (settled is not None and bool(done.all())):
+    while num_steps < max_steps and not (converged is not None and bool(done.all())):
         num_steps += 1
         trial = solve(state, current, damping)
         last = final_cost is not None and num_steps == max_steps
@@ -132,8 +133,8 @@ def damped_descent(
         damping = torch.where(lower, lowered, rule.up * damping).clamp(rule.least, rule.most)
         keep = lower & ~done
         last_step = _chosen(keep, trial.step, torch.zeros_like(trial.step) if last_step is None else last_step)
-        if settled is not None:
-            done = done | (settled(trial, current.cost, after.cost) & trial.sound)
+        if converged is not None:
+            done = done | (converged(trial, current.cost, after.cost) & trial.sound)
         state, current = _chosen(keep, trial.state, state), _chosen(keep, after, current)
     last_step = current.cost.new_zeros(()) if last_step is None else last_step
     return Descent(state, current, damping, last_step, num_steps, done)

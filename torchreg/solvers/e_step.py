@@ -1,4 +1,4 @@
-"""Who matches whom, softly: the E-step with an outlier class, in bounded memory."""
+"""The E-step: soft correspondences with an outlier class, in bounded memory."""
 
 from __future__ import annotations
 
@@ -9,29 +9,37 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchreg.geometry.budget import BUDGET
+
 # c of eq. 18 when the matched volume is negligible beside the working volume.
 OUTLIER_CONSTANT = 3 * math.sqrt(math.pi / 2)
-# The bracket of eq. 18 may turn negative while n v exceeds V; it is kept from there.
-_MIN_FREE_SHARE = 0.05
-# Entries of the kernel matrix held at a time: in cache on a CPU, and far below 2 GB anywhere.
-_CHUNK_ENTRIES = 2_000_000
-# Below this ratio of extent to sigma the expanded square |x|^2 - 2 xy + |y|^2 moves no exponent by more than 0.02.
-_MAX_EXPANDED_RATIO = {torch.float32: 128.0, torch.float64: 3e6}
-# The kernel is taken to base 2, whose power costs a quarter of exp() on a CPU.
-_LOG2_E = 1 / math.log(2)
-# A kernel of 1e-26 is nothing beside any outlier constant; from there it is zero.
-_MIN_EXPONENT = math.log2(1e-26)
-# Beyond this ratio squares may overflow; every sigma that small holds coincident points only.
-_MAX_RATIO = 1e15
+
+
+@dataclass(frozen=True)
+class _Kernel:
+    """Limits of the kernel's numbers."""
+
+    # Least value of the bracket of eq. 18, which may turn negative while n v exceeds V.
+    min_free_share: float = 0.05
+    # Ratio of extent to sigma up to which |x|^2 - 2 xy + |y|^2 changes no exponent by more than 0.02, per precision.
+    expanded_float32: float = 128.0
+    expanded_float64: float = 3e6
+    # Ratio of extent to sigma beyond which squares may overflow; a sigma that small holds coincident points only.
+    max_ratio: float = 1e15
+    # Kernel value that is negligible beside any outlier constant; smaller ones are zero.
+    least: float = 1e-26
+
+
+_KERNEL = _Kernel()
 
 
 @dataclass(frozen=True)
 class EStep:
-    """What the M-step needs of the posterior.
+    """Sufficient statistics of the posterior for the M-step.
 
     Args:
-        weights: (..., N) lambda_i, the data each model point holds.
-        targets: (..., N, 3) G_i, the mean of the data it holds; the model point itself where it holds none.
+        weights: (..., N) lambda_i, the total posterior of the data of each model point.
+        targets: (..., N, 3) G_i, the weighted mean of its data; the model point itself if it has none.
         inlier_posterior: (..., M) probability that a datum belongs to any model point.
         squared_error: (...) sum over i and j of alpha_ij |Y_j - X_i|^2.
     """
@@ -52,15 +60,12 @@ def outlier_constant(num_points: int, sigma: Tensor, volume: Tensor) -> Tensor:
         sigma: (...) metres.
         volume: (...) V, the working volume, cubic metres; see `working_volume`.
 
-    Returns:
-        (...).
-
     Differentiable: in ``sigma`` and ``volume``.
 
     References: Dewaele et al. 2006, eq. 18.
     """
     matched = num_points * 4 / 3 * math.pi * sigma**3
-    return OUTLIER_CONSTANT * (1 - matched / volume).clamp_min(_MIN_FREE_SHARE)
+    return OUTLIER_CONSTANT * (1 - matched / volume).clamp_min(_KERNEL.min_free_share)
 
 
 def expectation(
@@ -82,10 +87,10 @@ def expectation(
         data: (..., M, 3), metres, with batch dimensions that broadcast with the model's.
         sigma: (...) metres, positive.
         outlier: (...) c, positive.
-        mask: (..., M) False where a datum is padding, whose coordinates are never looked at.
+        mask: (..., M) False where a datum is padding, whose coordinates are ignored.
 
     Returns:
-        an `EStep`; a padded datum has posterior 0.
+        An `EStep`; a padded datum has posterior 0.
 
     Differentiable: no (see `EMLoss`).
 
@@ -102,27 +107,28 @@ def expectation(
         data = data.expand(*batch, num_data, 3).reshape(flat, num_data, 3)
         sigma, outlier = _flat(sigma, batch, model), _flat(outlier, batch, model)
         valid = None if mask is None else mask.expand(*batch, num_data).reshape(flat, num_data)
-        data, center = _centered(data, valid)
+        data, center = _centered_data(data, valid)
         offset = model - center
         extent = _extent(offset, data)
-        sigma = torch.maximum(sigma, extent / _MAX_RATIO)
-        expand = flat > 0 and float(extent) < _MAX_EXPANDED_RATIO[model.dtype] * float(sigma.min())
+        sigma = torch.maximum(sigma, extent / _KERNEL.max_ratio)
+        limit = _KERNEL.expanded_float32 if model.dtype == torch.float32 else _KERNEL.expanded_float64
+        expand = flat > 0 and float(extent) < limit * float(sigma.min())
         scale = (2**-0.5 / sigma)[:, None, None]
         scaled_model, scaled_data = offset * scale, _raised(data * scale)
         weights, moments, inlier = _accumulate(scaled_model, scaled_data, outlier, valid, expand)
-        # G_i - X_i, zero where a model point holds nothing.
+        # G_i - X_i, zero for a model point without data.
         mass = weights.unsqueeze(-1)
-        total_pull = torch.addcmul(moments, mass, scaled_model, value=-1)
-        pull = total_pull / mass.clamp_min(torch.finfo(model.dtype).tiny)
-        targets = torch.addcdiv(model, pull, scale)
-        # sum_j alpha |Y - X|^2 splits into the spread of the held data and their offset from the model point.
-        spread = (inlier * scaled_data[..., 4]).sum(-1) - (moments * (scaled_model + pull)).sum((-2, -1))
-        squares = (spread.clamp_min(0) + (total_pull * pull).sum((-2, -1))) / scale[:, 0, 0].square()
+        total_offset = torch.addcmul(moments, mass, scaled_model, value=-1)
+        mean_offset = total_offset / mass.clamp_min(torch.finfo(model.dtype).tiny)
+        targets = torch.addcdiv(model, mean_offset, scale)
+        # sum_j alpha |Y - X|^2 splits into the spread of the data and their mean offset from the model point.
+        spread = (inlier * scaled_data[..., 4]).sum(-1) - (moments * (scaled_model + mean_offset)).sum((-2, -1))
+        squares = (spread.clamp_min(0) + (total_offset * mean_offset).sum((-2, -1))) / scale[:, 0, 0].square()
     return EStep(
-        weights.reshape(*batch, num_model),
-        targets.reshape(*batch, num_model, 3),
-        inlier.reshape(*batch, num_data),
-        squares.reshape(batch),
+        weights=weights.reshape(*batch, num_model),
+        targets=targets.reshape(*batch, num_model, 3),
+        inlier_posterior=inlier.reshape(*batch, num_data),
+        squared_error=squares.reshape(batch),
     )
 
 
@@ -134,7 +140,7 @@ def posterior(
     *,
     mask: Tensor | None = None,
 ) -> Tensor:
-    """Return the full posterior alpha, for looking at or small problems.
+    """Return the full posterior alpha (..., N, M), for inspection or small problems.
 
     Args:
         model: (..., N, 3), metres.
@@ -144,7 +150,7 @@ def posterior(
         mask: (..., M) False where a datum is padding (its column is zero).
 
     Returns:
-        (..., N, M); columns sum to the probability that the datum is an inlier.
+        Posteriors (..., N, M); columns sum to the probability that the datum is an inlier.
 
     Differentiable: in ``model``, ``data`` and ``sigma``.
 
@@ -166,11 +172,11 @@ def responsibilities(exponent: Tensor, outlier: Tensor | float, *, dim: int) -> 
 
     Args:
         exponent: (...) log-likelihoods, up to a constant, of the candidates along ``dim``.
-        outlier: c, positive, one or with the dimensions of ``exponent``, that of ``dim`` being one.
-        dim: along which candidates lie.
+        outlier: c, positive, a number or of the shape of ``exponent`` with size one along ``dim``.
+        dim: dimension of the candidates.
 
     Returns:
-        (...); what is missing to one along ``dim`` is the probability of an outlier.
+        Probabilities (...); the rest to one along ``dim`` is the probability of an outlier.
 
     Differentiable: in both.
 
@@ -181,16 +187,13 @@ def responsibilities(exponent: Tensor, outlier: Tensor | float, *, dim: int) -> 
 
 
 def working_volume(model: Tensor, data: Tensor, sigma: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return V of eq. 18: the volume of the bounding box of data and posed model, grown by 3 sigma on each side.
+    """Return V of eq. 18 (...), the volume of the bounding box of data and posed model grown by 3 sigma, cubic metres.
 
     Args:
         model: (..., N, 3), metres.
         data: (..., M, 3), metres.
         sigma: (...) metres.
         mask: (..., M) False where a datum is padding.
-
-    Returns:
-        (...), cubic metres.
 
     Differentiable: in all but ``mask``.
     """
@@ -207,7 +210,7 @@ def _flat(value: Tensor | float, batch: torch.Size, like: Tensor) -> Tensor:
     return torch.as_tensor(value, dtype=like.dtype, device=like.device).expand(batch).reshape(like.shape[0])
 
 
-def _centered(data: Tensor, valid: Tensor | None) -> tuple[Tensor, Tensor]:
+def _centered_data(data: Tensor, valid: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return the data with the origin moved to their mean, padding at the origin, and the mean (B, 1, 3)."""
     if valid is None:
         center = data.sum(-2, keepdim=True) / max(data.shape[-2], 1)
@@ -220,7 +223,7 @@ def _centered(data: Tensor, valid: Tensor | None) -> tuple[Tensor, Tensor]:
 
 
 def _raised(data: Tensor) -> Tensor:
-    """Return (B, M, 5): the data, one, and their squared norms, which the kernel and the moments are products with."""
+    """Return (B, M, 5): the data, one, and their squared norms, the right factor of kernel and moments."""
     return torch.cat([data, torch.ones_like(data[..., :1]), (data * data).sum(-1, keepdim=True)], dim=-1)
 
 
@@ -231,7 +234,7 @@ def _accumulate(
     gathered, inlier = model.new_zeros(model.shape[0], 4, model.shape[1]), torch.zeros_like(data[..., 0])
     for rows, columns in chunks(model.shape[0], model.shape[1], data.shape[1]):
         part = data[rows, columns]
-        kernel = _expanded_kernel(model[rows], part) if expand else _exact_kernel(model[rows], part[..., :3])
+        kernel = _expanded_kernel(model[rows], part) if expand else gaussian_kernel(model[rows], part[..., :3])
         total = kernel.sum(-2)
         share = (total + outlier[rows, None]).reciprocal()
         if valid is not None:
@@ -246,50 +249,43 @@ def _accumulate(
 def chunks(batch: int, num_model: int, num_data: int) -> Iterator[tuple[slice, slice]]:
     """Yield slices over batch and data that keep the kernel matrix within the chunk size."""
     per_problem = num_model * num_data
-    rows = max(1, _CHUNK_ENTRIES // max(per_problem, 1))
-    columns = max(1, num_data if per_problem <= _CHUNK_ENTRIES else _CHUNK_ENTRIES // num_model)
+    rows = max(1, BUDGET.table_entries // max(per_problem, 1))
+    columns = max(1, num_data if per_problem <= BUDGET.table_entries else BUDGET.table_entries // num_model)
     for row in range(0, batch, rows):
         for column in range(0, num_data, columns):
             yield slice(row, row + rows), slice(column, column + columns)
 
 
-def gaussian_kernel(model: Tensor, data: Tensor, *, expand: bool) -> Tensor:
-    """Return ``exp(-|x - y|^2)`` of scaled points, zero up to 1e-26.
+def _expanded_kernel(model: Tensor, raised: Tensor) -> Tensor:
+    """Return the kernel by one matrix product, ``2 xy - |x|^2 - |y|^2``: faster, and accurate near the origin only."""
+    square = (model * model).sum(-1, keepdim=True)
+    factor = torch.cat([2 * model, -square, -torch.ones_like(square)], dim=-1) * math.log2(math.e)
+    return _power(factor @ raised.mT)
+
+
+def gaussian_kernel(model: Tensor, data: Tensor) -> Tensor:
+    """Return ``exp(-|x - y|^2)`` (B, N, M) of scaled points, zero up to 1e-26.
 
     Args:
         model: (B, N, 3), in units of sqrt(2) sigma.
         data: (B, M, 3), in the same units.
-        expand: take the exponent from one matrix product, ``2 xy - |x|^2 - |y|^2``: faster, and exact enough near the
-            origin only.
-
-    Returns:
-        (B, N, M).
 
     Differentiable: no; it works in place.
     """
-    return _expanded_kernel(model, _raised(data)) if expand else _exact_kernel(model, data)
-
-
-def _expanded_kernel(model: Tensor, raised: Tensor) -> Tensor:
-    square = (model * model).sum(-1, keepdim=True)
-    left = torch.cat([2 * model, -square, -torch.ones_like(square)], dim=-1) * _LOG2_E
-    return _power(left @ raised.mT)
-
-
-def _exact_kernel(model: Tensor, data: Tensor) -> Tensor:
     exponent = model[..., 0:1] - data[..., 0].unsqueeze(-2)
     exponent.mul_(exponent)
     for axis in (1, 2):
         difference = model[..., axis : axis + 1] - data[..., axis].unsqueeze(-2)
         exponent.add_(difference.mul_(difference))
-    return _power(exponent.mul_(-_LOG2_E))
+    return _power(exponent.mul_(-math.log2(math.e)))
 
 
 def _power(exponent: Tensor) -> Tensor:
-    # Where a power underflows it takes many times as long, and so does arithmetic on what it leaves.
-    return torch.threshold_(exponent, _MIN_EXPONENT, -math.inf).exp2_()
+    """Return powers of two, which cost a quarter of exp() on a CPU."""
+    # A power that underflows takes many times as long, and so does arithmetic on its result.
+    return torch.threshold_(exponent, math.log2(_KERNEL.least), -math.inf).exp2_()
 
 
 def _extent(model: Tensor, data: Tensor) -> Tensor:
-    both = [points.abs().amax() for points in (model, data) if points.numel() > 0]
-    return torch.stack(both).amax() if both else model.new_zeros(())
+    extents = [points.abs().amax() for points in (model, data) if points.numel() > 0]
+    return torch.stack(extents).amax() if extents else model.new_zeros(())

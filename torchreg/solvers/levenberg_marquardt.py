@@ -11,12 +11,24 @@ from torch import Tensor
 
 from torchreg.solvers.damped_descent import DampingRule, Trial, damped_descent
 
-# Steps that overshoot almost to the same height would else zigzag for long, each of them accepted: a quadratic falls by
-# at least half of slope times step, and less than half of that makes the model doubtful.
-_RULE = DampingRule(trusted=0.5, down=0.2, doubtful=2.0, up=6.0, least=1e-7)
-_FIRST_DAMPING = 1e-3
-# Rounding makes a singular Hessian of D variables indefinite by about D eps; a damping of a few times that covers it.
-_ROUNDING_COVER = 4.0
+
+@dataclass(frozen=True)
+class _Damping(DampingRule):
+    """Relative damping: its start, its update and its floor."""
+
+    initial: float = 1e-3
+    # Less than half of the predicted decrease is doubtful: steps that overshoot to almost the same cost would otherwise
+    # zigzag for long, each of them accepted.
+    trusted: float = 0.5
+    down: float = 0.2
+    doubtful: float = 2.0
+    up: float = 6.0
+    least: float = 1e-7
+    # Least damping in units of D eps, the rounding that makes a singular Hessian of D variables indefinite.
+    rounding_cover: float = 4.0
+
+
+_DAMPING = _Damping()
 
 
 class Linearization(NamedTuple):
@@ -35,14 +47,14 @@ class Linearization(NamedTuple):
 
 @dataclass(frozen=True)
 class LMResult:
-    """Where the iteration stopped.
+    """Result of the iteration.
 
     Args:
         state: (B, D).
         cost: (B,) at the state.
         damping: (B,) to continue with.
-        last_step: (B, D) the last accepted step, zero if none was.
-        num_steps: steps taken.
+        last_step: (B, D) the last accepted step, zero if there was none.
+        num_steps: steps tried.
     """
 
     state: Tensor
@@ -69,23 +81,23 @@ def levenberg_marquardt(
 
     Each step solves ``(H + damping diag(H)) s = -g``. Variables at a limit whose gradient pushes outwards are frozen
     for the step; the others are clamped at the limit. A step that raises the cost, or whose system has no Cholesky
-    factor, is undone and the damping raised; one that lowers it by much less than promised is kept and the damping
-    raised a little.
+    factor, is rejected and the damping raised; one that lowers it by much less than predicted is accepted and the
+    damping raised a little.
 
     Args:
         linearize: state (B, D) to `Linearization`.
-        state: (B, D) start; clamped to the limits first.
+        state: (B, D) initial state; clamped to the limits first.
         retract: (state, step) to state; addition by default.
         lower: (D,) or (B, D) limits of the state, or None.
         upper: (D,) or (B, D) limits of the state, none below ``lower``, or None.
-        damping: (B,) relative damping to start with; 1e-3 by default.
+        damping: (B,) initial relative damping; 1e-3 by default.
         max_steps: number of linearizations after the first.
         atol: stop when every problem's largest step component is at most this.
-        start: what ``linearize`` returns at ``state``, which must lie within the limits, if it is known already.
+        start: the linearization at ``state``, which must lie within the limits, if known.
         cost: state (B, D) to cost (B,) like ``linearize``'s, if that is cheaper; the last trial needs no more.
 
     Returns:
-        an `LMResult`; where the start has no finite cost, the start.
+        An `LMResult`; the initial state of problems without finite cost there.
 
     Differentiable: no.
 
@@ -95,7 +107,7 @@ def levenberg_marquardt(
     """
     low = state.new_full(state.shape[-1:], -torch.inf) if lower is None else lower
     high = state.new_full(state.shape[-1:], torch.inf) if upper is None else upper
-    rounding = _ROUNDING_COVER * state.shape[-1] * torch.finfo(state.dtype).eps
+    rounding = _DAMPING.rounding_cover * state.shape[-1] * torch.finfo(state.dtype).eps
 
     def within(state: Tensor) -> Tensor:
         return torch.minimum(torch.maximum(state, low), high)
@@ -106,17 +118,17 @@ def levenberg_marquardt(
         return Trial(within(retract(state, step)), step, promised, sound)
 
     def small(trial: Trial[Tensor], before: Tensor, after: Tensor) -> Tensor:
-        # Together: the steps of the others are as small as those of the last.
+        # All problems stop together, when the last one has converged.
         return ((trial.step.abs().amax(-1) <= atol) & trial.sound).all().expand(before.shape)
 
     found = damped_descent(
         linearize,
         solve,
         within(state),
-        state.new_full(state.shape[:1], _FIRST_DAMPING) if damping is None else damping,
-        rule=replace(_RULE, least=max(_RULE.least, rounding)),
+        state.new_full(state.shape[:1], _DAMPING.initial) if damping is None else damping,
+        rule=replace(_DAMPING, least=max(_DAMPING.least, rounding)),
         max_steps=max_steps,
-        settled=small if atol > 0 else None,
+        converged=small if atol > 0 else None,
         start=start,
         final_cost=cost,
     )
@@ -125,10 +137,10 @@ def levenberg_marquardt(
 
 
 def damped_step(problem: Linearization, damping: Tensor, *, frozen: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return the step ``-(H + damping diag(H))^-1 g``, zero in frozen variables and where nothing constrains one.
+    """Return the step ``-(H + damping diag(H))^-1 g``, zero in frozen and in unconstrained variables.
 
-    A variable counts as unconstrained when its curvature is below the rounding of the largest one's. A problem whose
-    damped system has no Cholesky factor gets a zero step.
+    A variable is unconstrained when its curvature is below the rounding of the largest one's. A problem whose damped
+    system has no Cholesky factor gets a zero step.
 
     Args:
         problem: the linearized problem.
@@ -136,13 +148,13 @@ def damped_step(problem: Linearization, damping: Tensor, *, frozen: Tensor | Non
         frozen: (B, D) True for variables to hold.
 
     Returns:
-        (B, D), and (B,) whether the system could be factored.
+        Steps (B, D), and a mask (B,) of the systems that could be factored.
 
     Differentiable: no.
     """
     hessian, gradient = problem.hessian, problem.gradient
     diagonal = hessian.diagonal(dim1=-2, dim2=-1)
-    # A variable without curvature keeps its place: unit diagonal, zero gradient. The floor bounds the repair.
+    # A variable without curvature keeps its value: unit diagonal, zero gradient. The floor bounds the repair.
     idle = diagonal <= diagonal.amax(-1, keepdim=True) * torch.finfo(hessian.dtype).eps
     idle = idle if frozen is None else idle | frozen
     # Scaling by the root of the diagonal makes metres and radians alike, and the factorization sound in float32.
@@ -157,5 +169,5 @@ def damped_step(problem: Linearization, damping: Tensor, *, frozen: Tensor | Non
 
 
 def held_at_limits(gradient: Tensor, state: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Return which variables (B, D) a descent must hold: pushed outwards at a limit, or without range."""
+    """Return a mask (B, D) of the variables that a descent must hold: pushed outwards at a limit, or without range."""
     return ((state <= lower) & (gradient > 0)) | ((state >= upper) & (gradient < 0)) | (lower == upper)

@@ -8,18 +8,25 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_count, check_finite, check_positive, check_shape
-from torchreg.errors import InputError
 
-_MAX_DOUBLINGS = 60
-# Lets the step length grow again where the curvature is less.
-_CURVATURE_DOWN = 0.9
-_PROBE = 1e-3
+@dataclass(frozen=True)
+class _StepLength:
+    """Numbers by which the step length follows the curvature."""
+
+    # Doublings of the curvature in a step, until the cost stays below its quadratic bound.
+    max_doublings: int = 60
+    # Factor on the curvature after a step, so that step lengths grow again where it is less.
+    curvature_down: float = 0.9
+    # Length of the probe of the first curvature, as a share of the largest variable.
+    probe: float = 1e-3
+
+
+_STEP = _StepLength()
 
 
 @dataclass(frozen=True)
 class DescentResult:
-    """Where projected gradients led.
+    """Result of projected gradient descent.
 
     Args:
         x: (..., n).
@@ -44,37 +51,24 @@ def projected_gradient(
 ) -> DescentResult:
     """Return x >= 0 of low cost by accelerated projected gradient steps; problems of a batch proceed independently.
 
-    Momentum is dropped where it runs against the step taken or raises the cost, so that the cost never rises. Step
-    lengths follow the curvature met, by doubling it until the cost stays below its quadratic bound.
+    Momentum is dropped where it opposes the step or raises the cost, so that the cost never rises. Step lengths follow
+    the curvature, which is doubled until the cost stays below its quadratic bound.
 
     Args:
         cost: x (..., n) to convex, differentiable costs (...).
-        start: (..., n); negative entries are set to zero first.
+        start: (..., n) finite and of finite cost; negative entries are set to zero first.
         scale: (..., n) positive step lengths of the variables relative to each other, best the inverse of the
             curvature's diagonal; ones by default.
-        max_steps: most steps.
-        tol: a problem is done when a step without momentum changes no variable by more than this share of the largest.
-
-    Returns:
-        a `DescentResult`.
-
-    Raises:
-        InputError: if ``start`` is not finite, ``scale`` not positive, or a cost at the start not finite.
+        max_steps: largest number of steps.
+        tol: largest change of a variable, as a share of the largest variable, in the last step without momentum.
 
     Differentiable: no; the gradients of ``cost`` come from autograd.
 
     References: Beck and Teboulle 2009; O'Donoghue and Candes 2015 for the restarts.
     """
-    check_count(max_steps, "max_steps", 1)
-    check_positive(tol, "tol")
-    check_shape(start, "start", ("n",), batch=True)
-    check_finite(start, "start")
     scale = torch.ones_like(start) if scale is None else scale
-    if not bool((scale > 0).all()):
-        raise InputError("scale must be positive everywhere; give variables without curvature any positive number")
     x = start.detach().clamp_min(0)
     value, gradient = _value_and_gradient(cost, x)
-    check_finite(value, "cost(start)")
     curvature = _probe(cost, x, gradient, scale)
     ahead, weight = x, torch.ones_like(value)
     done = torch.zeros_like(value, dtype=torch.bool)
@@ -82,22 +76,24 @@ def projected_gradient(
     while steps < max_steps and not bool(done.all()):
         steps += 1
         reference, gradient = _value_and_gradient(cost, ahead)
-        trial, lower, curvature = _bounded_step(cost, ahead, reference, gradient, scale, curvature, done)
+        trial, lower, curvature = _bounded_step(
+            cost, ahead, reference, gradient, scale=scale, curvature=curvature, done=done
+        )
         step = trial - ahead
-        plain = (ahead == x).all(-1)
+        without_momentum = (ahead == x).all(-1)
         small = step.abs().amax(-1) <= tol * trial.abs().amax(-1)
-        against = ((step * (trial - x) / scale).sum(-1) < 0) | (lower > value)
+        opposed = ((step * (trial - x) / scale).sum(-1) < 0) | (lower > value)
         keep = (lower <= value) & ~done
         grown = 0.5 * (1 + (1 + 4 * weight**2).sqrt())
-        momentum = torch.where(against, 0.0, (weight - 1) / grown).unsqueeze(-1)
-        weight = torch.where(against, 1.0, grown)
+        momentum = torch.where(opposed, 0.0, (weight - 1) / grown).unsqueeze(-1)
+        weight = torch.where(opposed, 1.0, grown)
         moved = torch.where(keep.unsqueeze(-1), trial, x)
         # A small step with momentum is tried again without before it counts.
-        momentum = momentum.masked_fill((small & ~plain).unsqueeze(-1), 0.0)
+        momentum = momentum.masked_fill((small & ~without_momentum).unsqueeze(-1), 0.0)
         ahead = moved + momentum * (moved - x)
-        done = done | (plain & (small | ~(lower < value)))
+        done = done | (without_momentum & (small | ~(lower < value)))
         x, value = moved, torch.where(keep, lower, value)
-        curvature = curvature * _CURVATURE_DOWN
+        curvature = curvature * _STEP.curvature_down
     return DescentResult(x, value, steps, done)
 
 
@@ -114,7 +110,8 @@ def _probe(cost: Callable[[Tensor], Tensor], x: Tensor, gradient: Tensor, scale:
     direction = scale * gradient
     longest = direction.abs().amax(-1, keepdim=True)
     reach = x.abs().amax(-1, keepdim=True)
-    direction = direction * (torch.where(reach > 0, reach, 1.0) * _PROBE / longest.clamp_min(torch.finfo(x.dtype).tiny))
+    length = torch.where(reach > 0, reach, 1.0) * _STEP.probe
+    direction = direction * (length / longest.clamp_min(torch.finfo(x.dtype).tiny))
     change = _value_and_gradient(cost, x + direction)[1] - gradient
     curvature = (change * direction).sum(-1) / (direction**2 / scale).sum(-1)
     return torch.where(curvature > 0, curvature, 1.0)
@@ -125,13 +122,14 @@ def _bounded_step(
     ahead: Tensor,
     value: Tensor,
     gradient: Tensor,
+    *,
     scale: Tensor,
     curvature: Tensor,
     done: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return a projected step's end, its cost, and the curvature whose quadratic bound holds there."""
+    """Return the point after a projected step, its cost, and the curvature whose quadratic bound holds there."""
     slack = 10 * torch.finfo(ahead.dtype).eps * value.abs()
-    for _ in range(_MAX_DOUBLINGS):
+    for _ in range(_STEP.max_doublings):
         trial = (ahead - scale * gradient / curvature.unsqueeze(-1)).clamp_min(0)
         step = trial - ahead
         with torch.no_grad():

@@ -1,41 +1,44 @@
-"""Rigid motions from matched points most of which are wrong, by random samples."""
+"""RANSAC: rigid motions from matches most of which are wrong."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_count, check_finite, check_points, check_positive, check_same_kind
-from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.budget import BUDGET
 from torchreg.geometry.rigid import fit_rigid, invert_rigid, rigid_matrix
 
-# Numbers held at once per table of trials times matches.
-_CHUNK = 2**21
-# Two right matches change their distance by at most twice what each may be off.
-_PAIR_SLACK = 2.0
-# The other way is faster and off by far more than a threshold in float32.
-_EXACT = "donot_use_mm_for_euclid_dist"
-# In thresholds: closer samples say little about a rotation.
-_MIN_BASELINE = 2.0
-_MIN_SINE = 0.1
-# Refined before distinct ones are picked, per hypothesis returned.
-_SPARE = 3
-# Widths of the inlier kernel, in thresholds, that a refinement goes through.
-_WIDTHS = (2.0, 1.5, 1.0, 1.0, 1.0)
+
+@dataclass(frozen=True)
+class _Sampling:
+    """Numbers of the samples and of their refinement."""
+
+    # Change of the distance between two right matches, in thresholds: each of the two may be off by one.
+    pair_slack: float = 2.0
+    # Least distance between samples, in thresholds: closer ones say little about a rotation.
+    min_baseline: float = 2.0
+    # Least sine of the angle between the two directions that make a frame.
+    min_sine: float = 0.1
+    # Motions refined before distinct ones are picked, per hypothesis returned.
+    spare: int = 3
+    # Widths of the inlier kernel in the steps of a refinement, in thresholds.
+    widths: tuple[float, ...] = (2.0, 1.5, 1.0, 1.0, 1.0)
+
+
+_SAMPLING = _Sampling()
 
 
 @dataclass(frozen=True)
 class RansacResult:
-    """Rigid motions that many matches agree with, best first. A batch of groups adds its dimensions in front.
+    """Rigid motions that many matches support, best first; a batch of groups adds its dimensions in front.
 
     Args:
-        transforms: (K, 4, 4), source to target; the identity where fewer than K distinct ones were found.
+        transforms: (K, 4, 4), source to target; the identity if fewer than K distinct ones were found.
         inliers: (K, N) True for matches within the threshold.
-        counts: (K,) int64 number of inliers; 0 where nothing was found.
-        scores: (K,) weighted sum of ``1 - r^2 / threshold^2`` over the inliers, which ranks the motions.
+        counts: (K,) int64 number of inliers; 0 for motions that were not found.
+        scores: (K,) weighted sum of ``1 - r^2 / threshold^2`` over the inliers, by which motions are ranked.
     """
 
     transforms: Tensor
@@ -62,21 +65,21 @@ def ransac_rigid(
 ) -> RansacResult:
     """Return several distinct rigid motions supported by matched points, however many matches are wrong.
 
-    The first match of a sample is drawn by weight, evenly over the samples; each further one among those that keep
-    their distances to the samples before it (and, with normals, their angles), far ones rather than near ones. Three
-    matches, or two with normals, give a motion. All motions of all groups are scored together; the best are refitted to
-    their inliers in turns, and then picked in the order of their scores, leaving out those that move the group's points
-    nearly like one picked before.
+    The first match of a sample is drawn by weight, stratified over the samples; each further one among those that
+    preserve the distances to the samples before it (and, with normals, the angles), with a probability that grows with
+    the distance. Three matches, or two with normals, determine a motion. All motions of all groups are scored together;
+    the best are refitted to their inliers repeatedly, and then picked in the order of their scores, without those that
+    move the group's points nearly like one picked before.
 
     Args:
         source: (..., N, 3), any unit; leading dimensions are groups with motions of their own.
         target: (..., N, 3) the matches, row by row; a point may occur in several rows.
         threshold: distance below which a match is an inlier, in the unit of the points.
-        source_normals: (..., N, 3) unit, oriented alike in source and target; None to do without.
+        source_normals: (..., N, 3) unit, consistently oriented in source and target; None to ignore normals.
         target_normals: (..., N, 3), given with ``source_normals``.
-        max_angle: between a turned normal and its match's in an inlier, radians.
+        max_angle: between a rotated normal and its match's in an inlier, radians.
         weights: (..., N) not negative, of the matches; ones by default. A row of weight zero is no inlier.
-        mask: (..., N) True for rows that count; rows that only fill up a group are False and may hold anything.
+        mask: (..., N) bool, False for padding, which may hold anything.
         num_trials: samples per group.
         num_hypotheses: K, motions returned per group.
         min_difference: root mean square distance, in thresholds, by which motions must move the points apart to be
@@ -84,11 +87,7 @@ def ransac_rigid(
         generator: draws the samples; a default one of seed 0 if none is given.
 
     Returns:
-        a `RansacResult`; the same for the same generator state, however the groups are batched up to rounding.
-
-    Raises:
-        InputError: if shapes differ, numbers are not finite, or only one of the normals is given.
-        InputTypeError: if dtypes or devices differ or ``mask`` is not Boolean.
+        A `RansacResult`; the same for the same generator state, however the groups are batched up to rounding.
 
     Differentiable: no.
 
@@ -96,33 +95,36 @@ def ransac_rigid(
 
     References: Fischler and Bolles 1981; Torr and Zisserman 2000 for the score.
     """
-    check_positive(threshold, "threshold")
-    check_positive(max_angle, "max_angle")
-    check_positive(min_difference, "min_difference", allow_zero=True)
-    check_count(num_trials, "num_trials", 1)
-    check_count(num_hypotheses, "num_hypotheses", 1)
-    matches = _matches(source, target, source_normals, target_normals, weights, mask, threshold, max_angle)
+    normals = None if source_normals is None or target_normals is None else (source_normals, target_normals)
+    matches = _Matches.from_rows(source, target, normals, weights, mask, threshold=threshold, max_angle=max_angle)
     groups, count = matches.weights.shape
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     # One draw for all groups alike keeps a group's samples the same whatever it is batched with.
     drawn = torch.rand(3, num_trials, generator=generator, device=generator.device, dtype=torch.float64)
-    # Every match, by its weight, gets its share of the samples that start with it.
+    # Stratified: every match gets its share of the samples by its weight.
     drawn[0] = (drawn[0] + torch.arange(num_trials, device=drawn.device)) / num_trials
     drawn = drawn.to(matches.source)
     trials = []
-    for part in drawn.split(max(1, _CHUNK // max(1, groups * count)), dim=1):
-        motions, sound = _sampled(matches, part)
+    for part in drawn.split(max(1, BUDGET.table_entries // max(1, groups * count)), dim=1):
+        motions, sound = _sampled_motions(matches, part)
         trials.append((motions, matches.score(motions, 1.0)[0].sum(-1).masked_fill_(~sound, 0.0)))
     transforms, scores = (torch.cat(column, dim=1) for column in zip(*trials, strict=True))
-    apart = min_difference * threshold
-    # Most good samples give the same motion, which must not crowd out the others before they are refined.
-    transforms, scores = _distinct(matches, transforms, scores, min(_SPARE * num_hypotheses, num_trials), apart)
+    distance = min_difference * threshold
+    # Most good samples give the same motion, which must not crowd out further ones before they are refined.
+    num_refined = min(_SAMPLING.spare * num_hypotheses, num_trials)
+    transforms, scores = _distinct(matches, transforms, scores, num_refined, distance)
     transforms, scores = _refined(matches, transforms, scores)
-    transforms, scores = _distinct(matches, transforms, scores, num_hypotheses, apart)
+    transforms, scores = _distinct(matches, transforms, scores, num_hypotheses, distance)
     found = scores > 0
     inliers = matches.score(transforms, 1.0)[1] & found.unsqueeze(-1)
-    fields = (matches.in_place(transforms, found), inliers, inliers.sum(-1), scores)
-    return RansacResult(*[field.reshape(*source.shape[:-2], *field.shape[1:]) for field in fields])
+    fields = {
+        "transforms": matches.between_given_points(transforms, found),
+        "inliers": inliers,
+        "counts": inliers.sum(-1),
+        "scores": scores,
+    }
+    batch = source.shape[:-2]
+    return RansacResult(**{name: value.reshape(*batch, *value.shape[1:]) for name, value in fields.items()})
 
 
 @dataclass(frozen=True)
@@ -131,8 +133,7 @@ class _Matches:
 
     source: Tensor
     target: Tensor
-    source_normals: Tensor | None
-    target_normals: Tensor | None
+    normals: tuple[Tensor, Tensor] | None
     weights: Tensor
     valid: Tensor
     source_center: Tensor
@@ -140,149 +141,145 @@ class _Matches:
     threshold: float
     max_angle: float
 
+    @classmethod
+    def from_rows(
+        cls,
+        source: Tensor,
+        target: Tensor,
+        normals: tuple[Tensor, Tensor] | None,
+        weights: Tensor | None,
+        mask: Tensor | None,
+        *,
+        threshold: float,
+        max_angle: float,
+    ) -> _Matches:
+        """Return masked and centered matches with one dimension of groups."""
+        valid = torch.ones_like(source[..., 0], dtype=torch.bool) if mask is None else mask
+        weights = (source.new_ones(valid.shape) if weights is None else weights.to(source)).masked_fill(~valid, 0.0)
+        keep = valid.reshape(-1, valid.shape[-1], 1)
+        total = keep.sum(-2, keepdim=True).clamp_min(1)
+
+        def flat(rows: Tensor) -> Tensor:
+            return rows.reshape(-1, *rows.shape[-2:]).masked_fill(~keep, 0.0)
+
+        def center(rows: Tensor) -> Tensor:
+            return flat(rows).sum(-2, keepdim=True) / total
+
+        return cls(
+            source=(flat(source) - center(source)) * keep,
+            target=(flat(target) - center(target)) * keep,
+            normals=None if normals is None else (flat(normals[0]), flat(normals[1])),
+            weights=weights.reshape(keep.shape[:-1]),
+            valid=keep.squeeze(-1) & (weights.reshape(keep.shape[:-1]) > 0),
+            source_center=center(source),
+            target_center=center(target),
+            threshold=threshold,
+            max_angle=max_angle,
+        )
+
     def score(self, transforms: Tensor, width: float) -> tuple[Tensor, Tensor]:
-        """Return weighted scores (G, C, N) of the matches under transforms (G, C, 4, 4), and which are within."""
+        """Return weighted scores (G, C, N) of the matches under transforms (G, C, 4, 4), and the mask of inliers."""
         rotation = transforms[..., :3, :3]
         moved = (rotation.flatten(1, 2) @ self.source.mT).unflatten(1, (-1, 3)).add_(transforms[..., :3, 3:])
         square = moved.sub_(self.target.mT.unsqueeze(1)).square_().sum(2)
         share = square.mul_(-1 / (width * self.threshold) ** 2).add_(1.0)
         within = (share > 0) & self.valid.unsqueeze(1)
-        if self.source_normals is not None and self.target_normals is not None:
-            turned = (rotation.flatten(1, 2) @ self.source_normals.mT).unflatten(1, (-1, 3))
-            cosine = turned.mul_(self.target_normals.mT.unsqueeze(1)).sum(2)
+        if self.normals is not None:
+            source_normals, target_normals = self.normals
+            rotated = (rotation.flatten(1, 2) @ source_normals.mT).unflatten(1, (-1, 3))
+            cosine = rotated.mul_(target_normals.mT.unsqueeze(1)).sum(2)
             within &= cosine > torch.cos(cosine.new_tensor(self.max_angle))
         return share.mul_(within).mul_(self.weights.unsqueeze(1)), within
 
-    def in_place(self, transforms: Tensor, found: Tensor) -> Tensor:
-        """Return transforms (G, C, 4, 4) between the points as given, the identity where nothing was found."""
+    def between_given_points(self, transforms: Tensor, found: Tensor) -> Tensor:
+        """Return transforms (G, C, 4, 4) of the points before centering, the identity where nothing was found."""
         eye = torch.eye(3, dtype=transforms.dtype, device=transforms.device)
-        there = rigid_matrix(eye.expand(len(transforms), 1, 3, 3), self.target_center)
-        here = rigid_matrix(eye.expand(len(transforms), 1, 3, 3), self.source_center)
-        placed = there @ transforms @ invert_rigid(here)
-        return torch.where(found[..., None, None], placed, torch.eye(4, dtype=placed.dtype, device=placed.device))
+        to_target = rigid_matrix(eye.expand(len(transforms), 1, 3, 3), self.target_center)
+        to_source = rigid_matrix(eye.expand(len(transforms), 1, 3, 3), self.source_center)
+        moved = to_target @ transforms @ invert_rigid(to_source)
+        return torch.where(found[..., None, None], moved, torch.eye(4, dtype=moved.dtype, device=moved.device))
 
 
-def _matches(
-    source: Any,
-    target: Any,
-    source_normals: Any,
-    target_normals: Any,
-    weights: Any,
-    mask: Any,
-    threshold: float,
-    max_angle: float,
-) -> _Matches:
-    """Return checked, masked and centered matches with one dimension of groups."""
-    source, target = as_float_tensor(source, "source"), as_float_tensor(target, "target")
-    check_same_kind(target, "target", source, "source")
-    valid = torch.ones(source.shape[:-1], dtype=torch.bool, device=source.device) if mask is None else mask
-    if not isinstance(valid, Tensor) or valid.dtype != torch.bool:
-        raise InputTypeError(f"mask must be a Boolean tensor, got {getattr(valid, 'dtype', type(valid).__name__)}")
-    weights = source.new_ones(valid.shape) if weights is None else as_float_tensor(weights, "weights", like=source)
-    if (source_normals is None) != (target_normals is None):
-        raise InputError("source_normals and target_normals must be given together, got one of them")
-    rows = {"target": target, "mask": valid.unsqueeze(-1), "weights": weights.unsqueeze(-1)}
-    normals = {"source_normals": source_normals, "target_normals": target_normals} if source_normals is not None else {}
-    normals = {name: as_float_tensor(value, name, like=source) for name, value in normals.items()}
-    for name, value in {**rows, **normals}.items():
-        if value.shape[:-1] != source.shape[:-1]:
-            raise InputError(
-                f"{name} must have one row per row of source {tuple(source.shape)}, got {tuple(value.shape)}"
-            )
-    keep = valid.unsqueeze(-1)
-    given = {"source": source, "target": target, **normals}
-    clean = {name: value.masked_fill(~keep, 0.0) for name, value in given.items()}
-    for name, value in clean.items():
-        check_points(value, name)
-    weights = weights.masked_fill(~valid, 0.0)
-    check_finite(weights, "weights")
-    if bool((weights < 0).any()):
-        raise InputError(f"weights must not be negative, got {float(weights.min())}")
-    flat = {name: value.reshape(-1, *value.shape[-2:]) for name, value in clean.items()}
-    keep = keep.reshape(-1, *keep.shape[-2:])
-    total = keep.sum(-2, keepdim=True).clamp_min(1)
-    centers = {name: flat[name].sum(-2, keepdim=True) / total for name in ("source", "target")}
-    return _Matches(
-        (flat["source"] - centers["source"]) * keep,
-        (flat["target"] - centers["target"]) * keep,
-        flat.get("source_normals"),
-        flat.get("target_normals"),
-        weights.reshape(keep.shape[:-1]),
-        keep.squeeze(-1) & (weights.reshape(keep.shape[:-1]) > 0),
-        centers["source"],
-        centers["target"],
-        threshold,
-        max_angle,
-    )
-
-
-def _sampled(matches: _Matches, drawn: Tensor) -> tuple[Tensor, Tensor]:
-    """Return motions (G, C, 4, 4) of samples drawn with numbers (3, C) from 0 to 1, and which are sound (G, C)."""
-    first = _draw(matches.weights.unsqueeze(1).expand(-1, drawn.shape[1], -1), drawn[0])
+def _sampled_motions(matches: _Matches, drawn: Tensor) -> tuple[Tensor, Tensor]:
+    """Return motions (G, C, 4, 4) of samples drawn with numbers (3, C) from 0 to 1, and a mask of sound ones."""
+    first = _drawn_rows(matches.weights.unsqueeze(1).expand(-1, drawn.shape[1], -1), drawn[0])
     from_first = _compatible(matches, first)
-    second = _draw(from_first, drawn[1])
-    origin, there = _rows(matches.source, first), _rows(matches.target, first)
-    across, across_there = _rows(matches.source, second) - origin, _rows(matches.target, second) - there
+    second = _drawn_rows(from_first, drawn[1])
+    origin, across = _edge(matches.source, first, second)
+    target_origin, target_across = _edge(matches.target, first, second)
     sound = from_first.gather(2, second.unsqueeze(-1)).squeeze(-1) > 0
-    if matches.source_normals is not None and matches.target_normals is not None:
-        side = _rows(matches.source_normals, first) + _rows(matches.source_normals, second)
-        side_there = _rows(matches.target_normals, first) + _rows(matches.target_normals, second)
+    if matches.normals is not None:
+        side, target_side = (_rows(normals, first) + _rows(normals, second) for normals in matches.normals)
     else:
-        # The height of the triangle over the first two samples weighs the third.
-        axis = torch.nn.functional.normalize(across, dim=-1)
-        offset = matches.source.unsqueeze(1) - origin.unsqueeze(2)
-        along = (offset @ axis.unsqueeze(-1)).squeeze(-1)
-        height = (offset.square_().sum(-1) - along.square_()).clamp_min_(0.0).sqrt_()
-        both = height * ((from_first > 0) & (_compatible(matches, second) > 0))
-        both = both.masked_fill_(height < _MIN_BASELINE * matches.threshold, 0.0)
-        third = _draw(both, drawn[2])
-        sound &= both.gather(2, third.unsqueeze(-1)).squeeze(-1) > 0
-        side, side_there = _rows(matches.source, third) - origin, _rows(matches.target, third) - there
-    frame, good = _frame(across, side)
-    frame_there, good_there = _frame(across_there, side_there)
-    rotation = frame_there @ frame.mT
-    middle, middle_there = origin + 0.5 * across, there + 0.5 * across_there
-    translation = middle_there - (rotation @ middle.unsqueeze(-1)).squeeze(-1)
-    return rigid_matrix(rotation, translation), sound & good & good_there
+        weights = _third_weights(matches, origin, across, from_first, second)
+        third = _drawn_rows(weights, drawn[2])
+        sound &= weights.gather(2, third.unsqueeze(-1)).squeeze(-1) > 0
+        side, target_side = _rows(matches.source, third) - origin, _rows(matches.target, third) - target_origin
+    frame, good = _orthonormal(across, side)
+    target_frame, target_good = _orthonormal(target_across, target_side)
+    rotation = target_frame @ frame.mT
+    center, target_center = origin + 0.5 * across, target_origin + 0.5 * target_across
+    translation = target_center - (rotation @ center.unsqueeze(-1)).squeeze(-1)
+    return rigid_matrix(rotation, translation), sound & good & target_good
+
+
+def _edge(points: Tensor, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """Return points (G, C, 3) at the first indices, and the vectors from these to those at the second."""
+    origin = _rows(points, first)
+    return origin, _rows(points, second) - origin
+
+
+def _third_weights(matches: _Matches, origin: Tensor, across: Tensor, from_first: Tensor, second: Tensor) -> Tensor:
+    """Return the weights (G, C, N) of a third match: the height of its triangle over the first two."""
+    axis = torch.nn.functional.normalize(across, dim=-1)
+    offset = matches.source.unsqueeze(1) - origin.unsqueeze(2)
+    along = (offset @ axis.unsqueeze(-1)).squeeze(-1)
+    height = (offset.square_().sum(-1) - along.square_()).clamp_min_(0.0).sqrt_()
+    weights = height * ((from_first > 0) & (_compatible(matches, second) > 0))
+    return weights.masked_fill_(height < _SAMPLING.min_baseline * matches.threshold, 0.0)
 
 
 def _compatible(matches: _Matches, index: Tensor) -> Tensor:
     """Return weights (G, C, N) of matches that can lie on one rigid body with match ``index`` (G, C), else zero."""
-    distance = torch.cdist(_rows(matches.source, index), matches.source, compute_mode=_EXACT)
-    distance_there = torch.cdist(_rows(matches.target, index), matches.target, compute_mode=_EXACT)
-    fits = (distance - distance_there).abs_() <= _PAIR_SLACK * matches.threshold
-    fits &= torch.minimum(distance, distance_there) >= _MIN_BASELINE * matches.threshold
-    if matches.source_normals is not None and matches.target_normals is not None:
-        here = _angles(matches.source, matches.source_normals, index, distance)
-        there = _angles(matches.target, matches.target_normals, index, distance_there)
+    source, target = _exact_distances(matches.source, index), _exact_distances(matches.target, index)
+    fits = (source - target).abs_() <= _SAMPLING.pair_slack * matches.threshold
+    fits &= torch.minimum(source, target) >= _SAMPLING.min_baseline * matches.threshold
+    if matches.normals is not None:
+        source_cosines = _cosines(matches.source, matches.normals[0], index, source)
+        target_cosines = _cosines(matches.target, matches.normals[1], index, target)
         # A cosine changes by no more than its angle.
-        for cosine, cosine_there in zip(here, there, strict=True):
-            fits &= (cosine - cosine_there).abs_() <= _PAIR_SLACK * matches.max_angle
-    return distance.mul_(fits).mul_(matches.weights.unsqueeze(1))
+        for source_cosine, target_cosine in zip(source_cosines, target_cosines, strict=True):
+            fits &= (source_cosine - target_cosine).abs_() <= _SAMPLING.pair_slack * matches.max_angle
+    return source.mul_(fits).mul_(matches.weights.unsqueeze(1))
 
 
-def _angles(points: Tensor, normals: Tensor, index: Tensor, distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return cosines (G, C, N) between both normals, and between each and the line that joins the points."""
-    own_point, own_normal = _rows(points, index), _rows(normals, index)
+def _exact_distances(points: Tensor, index: Tensor) -> Tensor:
+    # The matrix product of the default mode is off by far more than a threshold in float32.
+    return torch.cdist(_rows(points, index), points, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def _cosines(points: Tensor, normals: Tensor, index: Tensor, distance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return cosines (G, C, N) between the normals of two points, and between each and the line through the points."""
+    start, start_normal = _rows(points, index), _rows(normals, index)
     length = distance.clamp_min(torch.finfo(distance.dtype).tiny)
-    from_own = own_normal @ points.mT - (own_normal * own_point).sum(-1, keepdim=True)
-    from_other = (normals * points).sum(-1).unsqueeze(1) - own_point @ normals.mT
-    return own_normal @ normals.mT, from_own / length, from_other / length
+    along_start = start_normal @ points.mT - (start_normal * start).sum(-1, keepdim=True)
+    along_end = (normals * points).sum(-1).unsqueeze(1) - start @ normals.mT
+    return start_normal @ normals.mT, along_start / length, along_end / length
 
 
-def _frame(across: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
-    """Return orthonormal columns (..., 3, 3), the first along ``across``, the second near ``side``, and whether so."""
+def _orthonormal(across: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
+    """Return orthonormal columns (..., 3, 3), the first along ``across``, the second near ``side``, and their mask."""
     first = torch.nn.functional.normalize(across, dim=-1)
     rest = side - (side * first).sum(-1, keepdim=True) * first
-    good = rest.norm(dim=-1) > _MIN_SINE * side.norm(dim=-1)
+    good = rest.norm(dim=-1) > _SAMPLING.min_sine * side.norm(dim=-1)
     second = torch.nn.functional.normalize(rest, dim=-1)
     return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1), good
 
 
-def _draw(weights: Tensor, drawn: Tensor) -> Tensor:
-    """Return one index (G, C) per row of weights (G, C, N), drawn by weight with numbers (C,) from 0 to 1."""
+def _drawn_rows(weights: Tensor, drawn: Tensor) -> Tensor:
+    """Return an index (G, C) per row of weights (G, C, N), drawn by weight with numbers (C,) from 0 to 1."""
     cumulated = weights.cumsum(-1)
-    # Short of the end even after rounding, so that no row of weight zero is met there.
+    # Short of the end even after rounding, so that no row of weight zero is drawn there.
     goal = cumulated[..., -1:] * drawn[:, None] * (1 - 4 * torch.finfo(weights.dtype).eps)
     index = torch.searchsorted(cumulated, goal, right=True).squeeze(-1)
     return index.clamp_max_(weights.shape[-1] - 1)
@@ -296,11 +293,11 @@ def _rows(table: Tensor, index: Tensor) -> Tensor:
 def _refined(matches: _Matches, transforms: Tensor, scores: Tensor) -> tuple[Tensor, Tensor]:
     """Return transforms (G, C, 4, 4) fitted to their inliers where that raised their scores."""
     source, target = matches.source.unsqueeze(1), matches.target.unsqueeze(1)
-    for width in _WIDTHS:
+    for width in _SAMPLING.widths:
         weights, _ = matches.score(transforms, width)
         trial = fit_rigid(source, target, weights)
         trial_scores = matches.score(trial, 1.0)[0].sum(-1)
-        # What was never sound stays without a score.
+        # Unsound motions keep the score zero.
         better = (trial_scores > scores) & (scores > 0)
         transforms = torch.where(better[..., None, None], trial, transforms)
         scores = torch.where(better, trial_scores, scores)
@@ -318,8 +315,8 @@ def _distinct(
     for _ in range(count):
         best = alive.argmax(1)
         chosen.append((transforms[groups, best], alive[groups, best]))
-        apart = transforms[..., :3, :] - transforms[groups, best][:, None, :3, :]
-        square = ((apart @ moments.unsqueeze(1)) * apart).sum((-2, -1))
+        difference = transforms[..., :3, :] - transforms[groups, best][:, None, :3, :]
+        square = ((difference @ moments.unsqueeze(1)) * difference).sum((-2, -1))
         alive = alive.masked_fill(square < distance**2, 0.0)
         alive[groups, best] = 0.0
     return torch.stack([item[0] for item in chosen], 1), torch.stack([item[1] for item in chosen], 1)

@@ -1,4 +1,4 @@
-"""Which parts moved as one."""
+"""Rigid parts made of pieces that moved alike."""
 
 from __future__ import annotations
 
@@ -6,38 +6,38 @@ import torch
 from torch import Tensor
 
 
-def joined_alike(apart: Tensor, counts: Tensor, meet: Tensor, tolerance: float) -> Tensor:
-    """Return the part of each piece when the two that meet and moved most alike are joined again and again.
+def merge_alike(residuals: Tensor, counts: Tensor, adjacent: Tensor, tolerance: float) -> Tensor:
+    """Return the part of each piece after the two adjacent pieces of most similar motion are merged repeatedly.
 
-    What was joined moves as its larger piece then. So chains of pieces, each of which moves much like the next, do not
-    make one part of all. It ends when, of any two that meet, the motion of neither leaves the other's points within the
-    tolerance of where they went, in the mean.
+    A merged piece moves as its larger member, so that chains of pieces, each of which moves much like the next, do not
+    merge into one part. It ends when, of any two adjacent pieces, the motion of neither explains the points of the
+    other within the tolerance, on average.
 
     Args:
-        apart: (T, B, B) how far the motion of piece a takes the points of piece b from where they went, ``[t, a, b]``,
-            in all, in each of T frames.
-        counts: (B,) points of each piece; those without any are not joined.
-        meet: (B, B) bool, which pieces meet, symmetric.
-        tolerance: in the unit of ``apart``, in the mean over the points, in the worst frame.
+        residuals: (T, B, B) sum of the distances of the points of piece b from their observed positions under the
+            motion of piece a, ``[t, a, b]``, in each of T frames.
+        counts: (B,) points of each piece; pieces without points are not merged.
+        adjacent: (B, B) bool, symmetric.
+        tolerance: of the mean residual over the points in the worst frame, in the unit of ``residuals``.
 
     Returns:
-        (B,) int64, the number of one of the pieces of each part.
+        Parts (B,) int64, each the index of one of its pieces.
     """
-    apart, counts, meet = apart.clone(), counts.clone(), meet.clone().fill_diagonal_(False)
+    residuals, counts, adjacent = residuals.clone(), counts.clone(), adjacent.clone().fill_diagonal_(False)
     part = torch.arange(len(counts), device=counts.device)
-    meet &= (counts > 0) & (counts > 0).unsqueeze(1)
-    while bool(meet.any()):
-        mean = apart / counts.clamp_min(1)
-        gap = torch.minimum(mean, mean.mT).amax(0).masked_fill(~meet, torch.inf)
-        one, other = divmod(int(gap.argmin()), len(counts))
-        if float(gap[one, other]) > tolerance:
+    adjacent &= (counts > 0) & (counts > 0).unsqueeze(1)
+    while bool(adjacent.any()):
+        mean = residuals / counts.clamp_min(1)
+        difference = torch.minimum(mean, mean.mT).amax(0).masked_fill(~adjacent, torch.inf)
+        kept, merged = divmod(int(difference.argmin()), len(counts))
+        if float(difference[kept, merged]) > tolerance:
             break
-        if counts[other] > counts[one]:
-            one, other = other, one
-        apart[..., one] += apart[..., other]
-        counts[one] += counts[other]
-        meet[one] |= meet[other]
-        meet[:, one] |= meet[:, other]
-        meet[other], meet[:, other], meet[one, one] = False, False, False
-        part[part == other] = one
+        if counts[merged] > counts[kept]:
+            kept, merged = merged, kept
+        residuals[..., kept] += residuals[..., merged]
+        counts[kept] += counts[merged]
+        adjacent[kept] |= adjacent[merged]
+        adjacent[:, kept] |= adjacent[:, merged]
+        adjacent[merged], adjacent[:, merged], adjacent[kept, kept] = False, False, False
+        part[part == merged] = kept
     return part

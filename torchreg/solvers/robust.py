@@ -1,4 +1,4 @@
-"""Robust kernels: how much a residual counts that may be an outlier's.
+"""Robust kernels: losses and weights of residuals that may be outliers'.
 
 Each kernel is two functions of the squared ratio ``z = (r / s)^2`` of residual and scale, as in Ceres: a loss
 ``rho(z)`` with ``rho(0) = 0`` and ``rho'(0) = 1``, and the weight ``rho'(z)``, which falls from 1 to 0. The cost
@@ -53,7 +53,7 @@ def geman_mcclure_loss(squared_ratio: Tensor) -> Tensor:
 
 
 def cauchy_weight(squared_ratio: Tensor) -> Tensor:
-    """Return ``1 / (1 + z)``: 1/2 at the scale, 1/10 at three scales; the pull of a residual fades but slowly.
+    """Return ``1 / (1 + z)``: 1/2 at the scale, 1/10 at three scales; the influence of a residual decays slowly.
 
     References: Holland and Welsch 1977.
     """

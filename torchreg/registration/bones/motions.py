@@ -105,7 +105,7 @@ def fit_bones(
         level,
         rule=replace(_RULE, least=rounding_cover(problem)),
         max_steps=max_steps,
-        settled=settled,
+        converged=settled,
         done=2 * current.cost <= atol**2,
         start=current,
     )

@@ -107,7 +107,7 @@ def fit_bones_and_joints(
         transforms.new_tensor(FIRST_DAMPING),
         rule=replace(_RULE, least=rounding_cover(problem)),
         max_steps=max_steps,
-        settled=settled,
+        converged=settled,
     )
     energy = 2 * found.system.costs
     return JointFit(

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_finite, check_shape
-from torchreg._threads import both, one_thread
+from torchreg._threads import one_thread, run_both
 from torchreg.geometry.neighbors import k_nearest
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.registration.blend import blend_linear
@@ -228,7 +228,7 @@ def _both_told(
 ) -> tuple[_One, _Other]:
     """Return what two calls return, made side by side; the thread that called the library tells of their steps."""
     later: list[ScanAlignRecord] = []
-    found = both(partial(one, on_step), partial(other, later.append))
+    found = run_both(partial(one, on_step), partial(other, later.append))
     for record in later:
         on_step(record)
     return found
@@ -265,7 +265,7 @@ def _rearranged(
 
     Of each kind it is the option that one-to-one matches make the best, and none if that looks clearly worse.
     """
-    exchanged, covering = both(
+    exchanged, covering = run_both(
         partial(exchanged_limbs, problem, best.transforms),
         partial(covering_limbs, problem, best.transforms, config.choice),
     )

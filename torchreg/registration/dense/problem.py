@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg._threads import both
+from torchreg._threads import run_both
 from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.graphs import Graph
 from torchreg.geometry.neighbors import NeighborTree, sampling_distance
@@ -102,7 +102,7 @@ def describe(
     def curvature(pair: tuple[Tensor, Tensor]) -> Tensor:
         return curvature_features(*pair, *pair, config.curvature_radii, num_neighbors=_AROUND)
 
-    features = scaled_together(*both(lambda: curvature(places[0]), lambda: curvature(places[1])))
+    features = scaled_together(*run_both(lambda: curvature(places[0]), lambda: curvature(places[1])))
     one, other = (
         OrientedSamples(*pair, feature, scan.boundary[which].cpu())
         for pair, feature, scan, which in zip(places, features, (source, target), (here, there), strict=True)
@@ -161,7 +161,7 @@ def first_matches(problem: ScanAlignProblem, config: MatchConfig) -> GraphMatche
     here = problem.source.first(min(config.num_points, len(problem.samples)))
     there = problem.target.first(config.num_points)
     # Voters are within the radius; the targets of two points that vote may be farther apart.
-    (seen, ways), (other_seen, other_ways) = both(
+    (seen, ways), (other_seen, other_ways) = run_both(
         lambda: _described(here, problem.source, config, config.radius),
         lambda: _described(there, problem.target, config, 2 * config.radius),
     )

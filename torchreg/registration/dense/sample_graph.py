@@ -17,7 +17,7 @@ from torchreg._checks import (
 )
 from torchreg.errors import InputError
 from torchreg.geometry.graphs import Graph, component_links, connected_components
-from torchreg.geometry.neighbors import NeighborTree, distinct_places, k_nearest_others
+from torchreg.geometry.neighbors import NeighborTree, distinct_positions, k_nearest_others
 
 # A step leads across a valley where both normals lean over it by this much, in the mean: the sine of an angle.
 _VALLEY = 0.2
@@ -98,7 +98,7 @@ def _steps_of_faces(faces: Tensor) -> np.ndarray:
 
 
 def _steps_of_points(points: Tensor, num_neighbors: int) -> np.ndarray:
-    places, place = distinct_places(points)
+    places, place = distinct_positions(points)
     index, _ = k_nearest_others(places, num_neighbors)
     # One point of each place, and all others of it through that one.
     one = np.zeros(len(places), dtype=np.int64)

@@ -1,0 +1,270 @@
+"""Cameras: projection and its inverse, lenses, views, rigs by name, and stereo pairs."""
+
+import math
+
+import pytest
+import torch
+
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.camera import Camera, check_rigid_motion, lens_jacobian
+from torchreg.geometry.camera_rig import CameraRig, StereoPair
+from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.rigid import invert_rigid, rigid_matrix, se3_exp, transform_points
+from torchreg.geometry.rotation import so3_exp
+from torchreg.geometry.visibility import rasterize
+
+LENSES = {
+    "none": (),
+    "four": (-0.2, 0.05, 1e-3, -2e-3),
+    "five": (-0.2, 0.05, 1e-3, -2e-3, 0.01),
+    "eight": (0.1, -0.05, 1e-3, -2e-3, 0.01, 0.3, -0.1, 0.02),
+}
+
+
+def make(lens=(), dtype=torch.float64, **kwargs):
+    twist = torch.tensor([0.1, -0.2, 0.3, 0.2, -0.4, 0.1], dtype=torch.float64)
+    values = torch.tensor([610.0, 590.0, 322.0, 236.0], dtype=torch.float64)
+    return Camera(640, 480, values, se3_exp(twist), torch.tensor(lens, dtype=torch.float64), **kwargs).to(dtype)
+
+
+def points_before(camera, count=50, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    local = torch.rand(count, 3, generator=generator, dtype=torch.float64) * 2 - 1
+    local = local * torch.tensor([0.5, 0.4, 0.5]) + torch.tensor([0.0, 0.0, 1.5])
+    return transform_points(camera.camera_to_world.double(), local)
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_projection_agrees_with_opencv(lens):
+    cv2 = pytest.importorskip("cv2")
+    camera = make(lens)
+    points = points_before(camera)
+    rotation, _ = cv2.Rodrigues(camera.world_to_camera[:3, :3].numpy())
+    expected, _ = cv2.projectPoints(
+        points.numpy(),
+        rotation,
+        camera.world_to_camera[:3, 3].numpy(),
+        camera.matrix.numpy(),
+        camera.distortion.numpy(),
+    )
+    pixels, depth = camera.project(points)
+    assert (pixels - torch.from_numpy(expected[:, 0])).abs().max() < 1e-6
+    assert torch.allclose(depth, transform_points(camera.world_to_camera, points)[:, 2])
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_projection_agrees_with_kornia(lens):
+    from kornia.geometry.calibration import distort_points
+
+    camera = make(lens)
+    points = points_before(camera)
+    local = transform_points(camera.world_to_camera, points)
+    plain = local[:, :2] / local[:, 2:] * camera.intrinsics[:2] + camera.intrinsics[2:]
+    expected = distort_points(plain, camera.matrix, camera.distortion)
+    assert (camera.project(points)[0] - expected).abs().max() < 1e-6
+    cv2 = pytest.importorskip("cv2")
+    still = torch.zeros(3, dtype=torch.float64).numpy()
+    theirs, _ = cv2.projectPoints(local.numpy(), still, still, camera.matrix.numpy(), camera.distortion.numpy())
+    assert (expected - torch.from_numpy(theirs[:, 0])).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
+def test_unproject_takes_pixels_back(lens):
+    camera = make(lens)
+    points = points_before(camera).reshape(5, 10, 3)
+    pixels, depth = camera.project(points)
+    assert (camera.unproject(pixels, depth) - points).abs().max() < 1e-10
+    single = make(lens, torch.float32)
+    pixels, depth = single.project(points.float())
+    assert pixels.dtype == torch.float32
+    assert (single.unproject(pixels, depth) - points).abs().max() < 1e-4
+
+
+def test_points_behind_have_no_pixel_and_no_gradient():
+    camera = Camera(4, 4, (2.0, 2.0, 1.5, 1.5))
+    points = torch.tensor([[0.0, 0.0, -1.0], [0.1, 0.0, 0.0], [0.5, 0.0, 1.0]], dtype=torch.float64, requires_grad=True)
+    pixels, depth = camera.project(points)
+    assert pixels.isnan().all(-1).tolist() == [True, True, False]
+    assert depth.tolist() == [-1.0, 0.0, 1.0]
+    pixels[2].sum().backward()
+    assert points.grad.isfinite().all()
+    assert camera.contains(pixels).tolist() == [False, False, True]
+
+
+def test_gradients_of_points_lens_and_place():
+    camera = make(LENSES["eight"])
+    points = points_before(camera, 3).requires_grad_()
+    pixels, depth = (part.detach() for part in camera.project(points))
+    intrinsics, lens = camera.intrinsics.clone().requires_grad_(), camera.distortion.clone().requires_grad_()
+    twist = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+
+    def build(intrinsics, lens, twist):
+        return Camera(640, 480, intrinsics, se3_exp(twist) @ camera.world_to_camera, lens)
+
+    def forth(points, *parts):
+        return build(*parts).project(points)[0]
+
+    def back(pixels, depth, *parts):
+        return build(*parts).unproject(pixels, depth)
+
+    assert torch.autograd.gradcheck(forth, (points, intrinsics, lens, twist))
+    inputs = (pixels.requires_grad_(), depth.requires_grad_(), intrinsics, lens, twist)
+    assert torch.autograd.gradcheck(back, inputs)
+
+
+def test_lens_jacobian_is_the_derivative():
+    camera = make(LENSES["eight"])
+    plane = torch.tensor([[0.1, -0.2], [0.0, 0.0], [0.4, 0.3]], dtype=torch.float64)
+    expected = torch.func.vmap(torch.func.jacrev(camera.distorted))(plane)
+    assert torch.allclose(lens_jacobian(plane, camera.distortion), expected, atol=1e-12)
+
+
+def test_pixels_that_the_lens_never_reaches_are_nan():
+    # r (1 - 0.2 r^2) has its largest value, 0.86, at r = 1.29.
+    camera = Camera(100, 100, (10.0, 10.0, 0.0, 0.0), distortion=(-0.2, 0.0, 0.0, 0.0))
+    found = camera.undistorted(torch.tensor([[0.5, 0.0], [0.9, 0.0]], dtype=torch.float64))
+    assert found.isnan().all(-1).tolist() == [False, True]
+
+
+def test_looking_at_puts_the_target_in_the_middle():
+    camera = Camera.looking_at([1.0, 2.0, 3.0], [0.0, 0.5, 0.0], focal=500.0, width=64, height=48, name="a")
+    pixels, depth = camera.project(torch.tensor([[0.0, 0.5, 0.0]], dtype=torch.float64))
+    assert torch.allclose(pixels, pixels.new_tensor([[31.5, 23.5]]))
+    assert float(depth) == pytest.approx(math.sqrt(1 + 2.25 + 9))
+    assert torch.allclose(camera.position, pixels.new_tensor([1.0, 2.0, 3.0]))
+    assert camera.name == "a"
+
+
+def test_scaled_and_moved_cameras_see_the_same():
+    camera = make(LENSES["five"])
+    points = points_before(camera)
+    pixels, _ = camera.project(points)
+    half, _ = camera.scaled(0.5).project(points)
+    assert torch.allclose((half + 0.5) * 2 - 0.5, pixels)
+    motion = se3_exp(torch.tensor([0.3, 0.1, -0.2, 0.5, 0.2, 0.1], dtype=torch.float64))
+    assert torch.allclose(camera.moved(motion).project(transform_points(motion, points))[0], pixels)
+    with pytest.raises(InputError, match="must leave a pixel"):
+        camera.scaled(1e-4)
+
+
+def test_view_rasterizes_what_project_says():
+    camera = Camera(32, 24, (30.0, 30.0, 14.0, 11.0), make().world_to_camera)
+    local = torch.tensor([[-2.0, -2.0, 2.0], [2.0, -2.0, 3.0], [0.0, 3.0, 2.5]], dtype=torch.float64)
+    triangle = TriangleMesh(transform_points(invert_rigid(camera.world_to_camera), local), torch.tensor([[0, 1, 2]]))
+    raster = rasterize(triangle, camera.view())
+    seen = raster.face_index >= 0
+    points = (raster.barycentric[seen].unsqueeze(-1) * triangle.vertices).sum(-2)
+    pixels, depth = camera.project(points)
+    assert torch.allclose(pixels, camera.pixel_grid()[seen], atol=1e-9)
+    assert torch.allclose(depth, raster.depth[seen])
+    with pytest.raises(InputError, match="square pixels and no distortion"):
+        make(LENSES["four"]).view()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"width": 0}, "width must be at least 1"),
+        ({"width": 10_000, "height": 10_000}, "at most 64 megapixels"),
+        ({"intrinsics": (1.0, 1.0, 1.0)}, r"intrinsics must have shape \(4\)"),
+        ({"intrinsics": (1.0, -1.0, 1.0, 1.0)}, r"intrinsics \(fy\) must be positive"),
+        ({"intrinsics": (1.0, math.nan, 1.0, 1.0)}, "must be finite"),
+        ({"intrinsics": ("a", 1.0, 1.0, 1.0)}, "must hold numbers"),
+        ({"distortion": (0.1,)}, "0, 4, 5 or 8 numbers"),
+        ({"world_to_camera": 2 * torch.eye(4)}, "must be a rotation and a translation"),
+        ({"world_to_camera": torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0]))}, "must be a rotation and a translation"),
+        ({"world_to_camera": torch.eye(3)}, r"world_to_camera must have shape \(4, 4\)"),
+    ],
+)
+def test_what_is_no_camera_is_refused(change, message):
+    values = {"width": 4, "height": 4, "intrinsics": (2.0, 2.0, 1.5, 1.5)} | change
+    with pytest.raises(InputError, match=message):
+        Camera(**values)
+
+
+def test_rigid_motions_may_be_rounded():
+    check_rigid_motion(se3_exp(torch.ones(6)), "motion")
+    with pytest.raises(InputError, match="motion must be a rotation"):
+        check_rigid_motion(torch.eye(4) * 1.01, "motion")
+
+
+INTRINSICS = (600.0, 600.0, 319.5, 239.5)
+
+
+def camera_at(x, turn=(0.0, 0.0, 0.0), intrinsics=INTRINSICS, **kwargs):
+    rotation = so3_exp(torch.tensor(turn, dtype=torch.float64))
+    place = torch.tensor([x, 0.0, 0.0], dtype=torch.float64)
+    return Camera(640, 480, intrinsics, rigid_matrix(rotation, -rotation @ place), **kwargs)
+
+
+@pytest.fixture
+def pair():
+    motion = se3_exp(torch.tensor([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], dtype=torch.float64))
+    right = camera_at(0.06, intrinsics=(600.0, 600.0, 310.0, 239.5))
+    return StereoPair(camera_at(-0.06).moved(motion), right.moved(motion))
+
+
+def test_disparity_is_the_difference_of_columns(pair):
+    assert pair.baseline == pytest.approx(0.12)
+    assert pair.is_rectified
+    depth = torch.tensor([0.5, 0.8], dtype=torch.float64)
+    pixels = torch.tensor([[400.0, 100.0], [300.0, 200.0]], dtype=torch.float64)
+    other, _ = pair.right.project(pair.left.unproject(pixels, depth))
+    disparity = pixels[:, 0] - other[:, 0]
+    assert torch.allclose(pair.disparity(depth), disparity)
+    assert torch.allclose(pair.depth(disparity), depth)
+    assert torch.allclose(other[:, 1], pixels[:, 1])
+    assert pair.depth(torch.tensor([0.0])).isnan().all()
+
+
+def test_depth_deviation_is_the_derivative(pair):
+    depth = torch.tensor([0.6], dtype=torch.float64)
+    step = 1e-4
+    moved = pair.depth(pair.disparity(depth) - step) - depth
+    assert torch.allclose(moved / step, pair.depth_std(depth, 1.0), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "right",
+    [
+        camera_at(0.06, turn=(0.01, 0.0, 0.0)),
+        camera_at(0.06, turn=(0.0, 0.01, 0.0)),
+        camera_at(0.06, turn=(0.0, 0.0, 0.01)),
+        camera_at(0.06, intrinsics=(600.0, 600.0, 319.5, 250.0)),
+        camera_at(0.06, intrinsics=(620.0, 600.0, 319.5, 239.5)),
+        camera_at(0.06, distortion=(0.1, 0.0, 0.0, 0.0)),
+        camera_at(0.06).scaled(0.5),
+    ],
+)
+def test_other_pairs_are_not_rectified(right):
+    pair = StereoPair(camera_at(-0.06), right)
+    assert not pair.is_rectified
+    with pytest.raises(InputError, match="the pair is not rectified"):
+        pair.check_rectified()
+
+
+def test_swapped_and_senseless_pairs_are_refused():
+    with pytest.raises(InputError, match=r"swapped: the right camera stands 0\.12 to the left"):
+        StereoPair(camera_at(0.06), camera_at(-0.06))
+    with pytest.raises(InputError, match="different places"):
+        StereoPair(camera_at(0.0), camera_at(0.0))
+    with pytest.raises(InputError, match="look the same way"):
+        StereoPair(camera_at(0.0), camera_at(0.1, turn=(0.0, 2.0, 0.0)))
+
+
+def test_rig_finds_cameras_by_name_and_place():
+    rig = CameraRig((camera_at(0.0, name="left"), camera_at(0.1)))
+    assert rig.names == ("left", "camera1")
+    assert rig["left"] is rig[0]
+    assert len(rig) == len(list(rig)) == 2
+    assert rig.stereo().baseline == pytest.approx(0.1)
+    with pytest.raises(InputError, match="no camera 'top', it has left, camera1"):
+        rig["top"]
+    with pytest.raises(InputError, match="two cameras"):
+        CameraRig((rig[0],)).stereo()
+    with pytest.raises(InputError, match="left more than once"):
+        CameraRig((rig[0], rig[0]))
+    with pytest.raises(InputError, match="at least one"):
+        CameraRig(())
+    with pytest.raises(InputTypeError, match="Camera records"):
+        CameraRig((1,))

@@ -1,0 +1,153 @@
+"""Subsets that cover a cloud evenly: Poisson disks and farthest points."""
+
+import numpy as np
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from torchreg.geometry.poisson_disk import poisson_disk, poisson_disk_count
+from torchreg.geometry.sampling import even_order, farthest_points
+
+
+def cloud(count, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    points = torch.randn(count, 3, generator=generator)
+    return points / points.norm(dim=-1, keepdim=True)
+
+
+def nearest(points):
+    return cKDTree(points.numpy()).query(points.numpy(), 2)[0][:, 1]
+
+
+def test_the_rule_walked_point_by_point():
+    points, radius = cloud(150).double(), 0.25
+    order = torch.randperm(150, generator=torch.Generator().manual_seed(0))
+    kept = []
+    for index in order.tolist():
+        if all(float((points[index] - points[other]).norm()) > radius for other in kept):
+            kept.append(index)
+    assert poisson_disk(points, radius).tolist() == sorted(kept)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    count=st.integers(1, 300), radius=st.floats(1e-3, 3), seed=st.integers(0, 99), scale=st.sampled_from([1e-3, 1e3])
+)
+def test_no_two_are_within_the_radius_and_no_other_point_is_out_of_reach(count, radius, seed, scale):
+    points = cloud(count, seed).double()
+    few = poisson_disk(points, radius)
+    assert len(few.unique()) == len(few)
+    apart = torch.cdist(points[few], points[few]).fill_diagonal_(torch.inf)
+    assert float(apart.min()) > radius or len(few) == 1
+    # Each thinning before the last may leave a point out of reach of the last one by its own radius.
+    assert float(torch.cdist(points, points[few]).min(dim=1).values.max()) <= 1.5 * radius + 1e-12
+    assert torch.equal(poisson_disk(points * scale, radius * scale), few)
+
+
+@settings(max_examples=25, deadline=None)
+@given(size=st.integers(1, 300), count=st.integers(1, 300), seed=st.integers(0, 99), doubles=st.booleans())
+def test_as_many_as_asked_for(size, count, seed, doubles):
+    points = cloud(size, seed)
+    if doubles:
+        points = torch.cat((points, points[:1].expand(50, 3)))
+    few = poisson_disk_count(points, count)
+    assert len(few) == min(count, len(points))
+    assert torch.equal(few, few.unique())
+
+
+def test_a_count_is_spread_far_better_than_at_random():
+    points = cloud(5000)
+    few = poisson_disk_count(points, 400)
+    spread, random = nearest(points[few]), nearest(points[:400])
+    assert spread.min() > 0.6 * np.sqrt(4 * np.pi / 400)
+    assert spread.min() > 10 * random.min()
+    reach = cKDTree(points[few].numpy()).query(points.numpy())[0].max()
+    assert reach < 1.3 * np.sqrt(4 * np.pi / 400)
+
+
+def test_dense_and_sparse_regions_end_alike():
+    points = cloud(6000)
+    kept = (points[:, 0] > 0) | (torch.arange(6000) % 10 == 0)
+    points = points[kept]
+    few = points[poisson_disk_count(points, 150)]
+    assert 0.4 < float((few[:, 0] > 0).double().mean()) < 0.6
+
+
+def test_points_at_one_place():
+    points = torch.ones(9, 3)
+    assert len(poisson_disk(points, 0.1)) == 1
+    assert len(poisson_disk_count(points, 4)) == 4
+
+
+def test_more_copies_than_places():
+    points = torch.cat((cloud(60), torch.zeros(400, 3)))
+    few = poisson_disk_count(points, 61)
+    assert len(few) == 61
+    assert int((few < 60).sum()) == 60
+
+
+def test_the_generator_decides():
+    points = cloud(500)
+    assert torch.equal(poisson_disk(points, 0.3), poisson_disk(points, 0.3))
+    other = poisson_disk(points, 0.3, torch.Generator().manual_seed(5))
+    assert not torch.equal(poisson_disk(points, 0.3), other)
+    assert torch.equal(other, poisson_disk(points, 0.3, torch.Generator().manual_seed(5)))
+
+
+def sampled_cloud(count, seed=0):
+    return torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_each_point_is_the_farthest_from_those_before():
+    points = sampled_cloud(60)
+    chosen = farthest_points(points, 20, start=7)
+    assert chosen[0] == 7
+    for k in range(1, 20):
+        gaps = torch.cdist(points, points[chosen[:k]]).amin(-1)
+        assert gaps[chosen[k]] == gaps.max()
+
+
+def test_the_cover_is_within_twice_the_best():
+    # Four tight groups: four choices find one point in each.
+    centers = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=torch.float64)
+    points = (centers.unsqueeze(1) + 0.01 * sampled_cloud(40).reshape(4, 10, 3)).reshape(-1, 3)
+    groups = farthest_points(points, 4) // 10
+    assert sorted(groups.tolist()) == [0, 1, 2, 3]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 30), st.data())
+def test_indices_are_all_different_also_among_duplicates(size, data):
+    count = data.draw(st.integers(1, size))
+    points = sampled_cloud(size).mul(2).round()
+    chosen = farthest_points(points, count)
+    assert chosen.dtype == torch.int64
+    assert len(set(chosen.tolist())) == count
+    distinct = len(torch.unique(points, dim=0))
+    assert len(torch.unique(points[chosen], dim=0)) == min(count, distinct)
+
+
+def test_float32_and_a_shift_choose_alike():
+    points = sampled_cloud(50)
+    expected = farthest_points(points, 10)
+    assert torch.equal(farthest_points(points.float(), 10), expected)
+    assert torch.equal(farthest_points(points + 5, 10), expected)
+
+
+def test_the_even_order_chooses_the_farthest_each_time():
+    points = sampled_cloud(60)
+    order = even_order(points)
+    assert torch.equal(order.sort().values, torch.arange(60))
+    assert int(order[0]) == int((points - points.mean(0)).norm(dim=-1).argmax())
+    assert torch.equal(order, farthest_points(points, 60, int(order[0])))
+    shifted = even_order((points + 1000).float())
+    assert torch.equal(shifted.sort().values, torch.arange(60))
+
+
+def test_the_even_order_holds_duplicates_once():
+    points = sampled_cloud(5).repeat(4, 1)
+    order = even_order(points)
+    assert torch.equal(order.sort().values, torch.arange(20))
+    assert len((order[:5] % 5).unique()) == 5
+    assert even_order(sampled_cloud(1)).tolist() == [0]

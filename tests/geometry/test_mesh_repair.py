@@ -1,0 +1,124 @@
+import math
+
+import pytest
+import torch
+
+from torchreg.errors import InputError
+from torchreg.geometry.graphs import connected_components
+from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
+from torchreg.geometry.surface_graph import close_holes, coarsened, one_piece, unique_edges
+
+
+def ball(subdivisions=2, radius=1.0, at=(0.0, 0.0, 0.0)):
+    mesh = unit_sphere(subdivisions, dtype=torch.float64)
+    return TriangleMesh(radius * mesh.vertices + torch.tensor(at, dtype=torch.float64), mesh.faces)
+
+
+def euler_number(mesh):
+    return mesh.num_vertices - len(unique_edges(mesh.faces)[0]) + mesh.num_faces
+
+
+def test_edges_of_a_tetrahedron():
+    faces = torch.tensor([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])
+    edges, which = unique_edges(faces)
+    assert edges.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
+    assert edges[which[1]].tolist() == [[0, 3], [1, 3], [0, 1]]
+    assert unique_edges(torch.zeros(0, 3, dtype=torch.int64))[0].shape == (0, 2)
+
+
+def test_a_clean_surface_stays_as_it_is():
+    whole = one_piece(ball())
+    assert whole.notes == ()
+    assert torch.equal(whole.mesh.faces, ball().faces)
+    assert torch.equal(whole.vertex, torch.arange(162))
+    assert whole.bridges.shape == (0, 2)
+
+
+def test_separate_triangles_are_welded_and_repeated_ones_dropped():
+    mesh = ball()
+    soup = TriangleMesh(mesh.vertices[mesh.faces].reshape(-1, 3), torch.arange(3 * mesh.num_faces).reshape(-1, 3))
+    again = TriangleMesh(soup.vertices, torch.cat((soup.faces, soup.faces[:7].flip(1), soup.faces[:3, [0, 0, 1]])))
+    whole = one_piece(again)
+    assert (whole.mesh.num_vertices, whole.mesh.num_faces) == (162, 320)
+    assert torch.equal(whole.mesh.vertices, again.vertices[whole.vertex])
+
+
+def test_pieces_by_policy():
+    mesh = concatenate([ball(1, 0.5, (2.0, 0, 0)), ball(), ball(1, 0.25, (0, 0, 3.0))])
+    kept = one_piece(mesh)
+    assert kept.mesh.num_faces == 320
+    assert kept.vertex.tolist() == list(range(42, 204))
+    assert kept.notes == ("2 fragment(s) left out, 33.33% of the faces",)
+    bridged = one_piece(mesh, "bridge")
+    assert bridged.mesh.num_faces == mesh.num_faces
+    ends = mesh.vertices[bridged.vertex[bridged.bridges]]
+    apart = (ends[:, 0] - ends[:, 1]).norm(dim=-1).sort().values
+    table = torch.cdist(mesh.vertices[42:204], mesh.vertices)
+    assert apart.tolist() == pytest.approx([float(table[:, :42].min()), float(table[:, 204:].min())])
+    with pytest.raises(InputError, match="mesh must be one piece, got 3"):
+        one_piece(mesh, "error")
+
+
+def test_many_pieces_are_bridged_one_to_the_next():
+    places = torch.rand(60, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 20
+    places[:, 0] += 3 * torch.arange(60)
+    mesh = concatenate([ball(1, 0.3, place) for place in places.tolist()])
+    bridges = one_piece(mesh, "bridge").bridges
+    assert bridges.shape == (59, 2)
+    assert len(connected_components(torch.cat((bridges // 42, torch.zeros(0, 2, dtype=torch.int64))), 60).unique()) == 1
+    apart = torch.cdist(places, places).fill_diagonal_(torch.inf).amin(1)
+    assert (mesh.vertices[bridges].diff(dim=1).norm(dim=-1)).min() < apart.min()
+
+
+def test_dust_is_no_reason_for_an_error():
+    mesh = concatenate([ball(4), TriangleMesh(torch.eye(3, dtype=torch.float64) + 5, torch.tensor([[0, 1, 2]]))])
+    assert one_piece(mesh, "error").mesh.num_faces == 5120
+    assert one_piece(mesh, "bridge").bridges.shape == (0, 2)
+
+
+def test_holes_are_closed():
+    mesh = ball(3)
+    upper = mesh.vertices[mesh.faces].mean(1)[:, 2]
+    whole = one_piece(TriangleMesh(mesh.vertices, mesh.faces[upper.abs() < 0.7]))
+    assert whole.notes == ("2 hole(s) closed",)
+    assert euler_number(whole.mesh) == 2
+    middles = whole.mesh.vertices[whole.vertex < 0]
+    assert middles[:, :2].abs().max() < 0.05
+    assert sorted(middles[:, 2].sign().tolist()) == [-1, 1]
+    vertices, _, count = close_holes(mesh.vertices, mesh.faces)
+    assert count == 0
+    assert vertices is mesh.vertices
+
+
+def test_a_surface_without_triangles_is_refused():
+    with pytest.raises(InputError, match="three different corners"):
+        one_piece(TriangleMesh(torch.zeros(3, 3), torch.tensor([[0, 1, 2]])))
+    with pytest.raises(InputError, match="without area"):
+        one_piece(TriangleMesh(torch.arange(9.0).reshape(3, 3), torch.tensor([[0, 1, 2]])))
+
+
+def test_coarse_surfaces_keep_place_and_topology():
+    mesh = ball(5)
+    few = coarsened(mesh, 1000)
+    assert 500 < few.num_vertices <= 1200
+    assert few.vertices.norm(dim=1).min() > 0.99
+    assert abs(float(few.face_areas().sum()) / (4 * math.pi) - 1) < 0.03
+    assert euler_number(one_piece(few).mesh) == 2
+    assert coarsened(mesh, 20_000) is mesh
+
+
+def test_sheets_closer_than_a_cell_stay_apart_and_thin_tubes_stay_tubes():
+    turn = torch.linspace(0, 2 * math.pi, 9, dtype=torch.float64)[:8]
+    height = torch.linspace(0, 4, 400, dtype=torch.float64)
+    ring = 0.002 * torch.stack((turn.cos(), turn.sin()), dim=1)
+    tube = torch.cat((ring.repeat(400, 1), height.repeat_interleave(8)[:, None]), dim=1)
+    at = torch.arange(399).repeat_interleave(8) * 8
+    here, there = torch.arange(8).repeat(399), (torch.arange(8).repeat(399) + 1) % 8
+    faces = torch.stack((at + here, at + there, at + 8 + here), 1)
+    faces = torch.cat((faces, torch.stack((at + there, at + 8 + there, at + 8 + here), 1)))
+    outer, inner = ball(5), ball(5, 0.999)
+    mesh = concatenate([outer, inner, TriangleMesh(tube + 3, faces)])
+    few = coarsened(mesh, 3000)
+    labels = connected_components(torch.cat((few.faces[:, :2], few.faces[:, 1:])), few.num_vertices)
+    assert len(labels.unique()) == 3
+    assert few.vertices[:, 2].max() == pytest.approx(7.0, abs=0.06)

@@ -1,0 +1,288 @@
+"""Rotations at every angle: exponential, logarithm, composition, and representations for networks."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+from torch.autograd import gradcheck
+from torch.func import jacfwd, jacrev
+
+from torchreg.geometry.rotation import (
+    compose_rotation_vectors,
+    left_jacobian,
+    skew,
+    so3_exp,
+    so3_log,
+    wrap_rotation_vector,
+)
+from torchreg.geometry.rotation_representations import (
+    quaternion_from_rotation,
+    quaternion_from_rotation_vector,
+    rotation_from_6d,
+    rotation_from_quaternion,
+    rotation_to_6d,
+    rotation_vector_from_6d,
+    rotation_vector_from_quaternion,
+    rotation_vector_from_rotation,
+    rotation_vector_to_6d,
+)
+
+# torch's own forward mode compiles its decompositions with a deprecated call on first use.
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
+
+D = torch.float64
+AXIS = torch.tensor([1.0, 2.0, -3.0], dtype=D) / math.sqrt(14)
+# Zero, both sides of the switch to the series (0.01), a half turn, a whole turn and beyond.
+ANGLES = [0.0, 1e-9, 1e-5, 9.99e-3, 1.001e-2, 0.3, 2.0, math.pi - 1e-7, math.pi, 4.0, 2 * math.pi, 9.0]
+numbers = st.floats(-4.0, 4.0, allow_nan=False, width=64)
+vectors = st.tuples(numbers, numbers, numbers).map(lambda v: torch.tensor(v, dtype=D))
+
+
+def central_jacobian(function, at, step=1e-6):
+    columns = [(function(at + step * e) - function(at - step * e)) / (2 * step) for e in torch.eye(3, dtype=at.dtype)]
+    return torch.stack(columns, dim=-1)
+
+
+def random_vectors(count, seed=0):
+    return 2 * torch.randn(count, 3, generator=torch.Generator().manual_seed(seed), dtype=D)
+
+
+def test_skew_is_the_cross_product():
+    a, b = random_vectors(5), random_vectors(5, seed=1)
+    torch.testing.assert_close((skew(a) @ b.unsqueeze(-1)).squeeze(-1), torch.linalg.cross(a, b))
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_exp_agrees_with_scipy_and_the_matrix_exponential(angle):
+    vector = angle * AXIS
+    rotation = so3_exp(vector)
+    np.testing.assert_allclose(rotation, Rotation.from_rotvec(vector.numpy()).as_matrix(), atol=2e-15)
+    np.testing.assert_allclose(rotation, expm(skew(vector).numpy()), atol=1e-14)
+    torch.testing.assert_close(rotation, torch.matrix_exp(skew(vector)), atol=1e-12, rtol=0)
+    torch.testing.assert_close(so3_exp(vector.float()).double(), rotation, atol=3e-6, rtol=0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(vectors)
+def test_exp_gives_rotations_that_log_brings_back(vector):
+    rotation = so3_exp(vector)
+    torch.testing.assert_close(rotation @ rotation.mT, torch.eye(3, dtype=D), atol=1e-14, rtol=0)
+    assert torch.det(rotation) == pytest.approx(1.0, abs=1e-14)
+    back = so3_log(rotation)
+    assert back.norm() <= math.pi + 1e-12
+    torch.testing.assert_close(so3_exp(back), rotation, atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("angle", [a for a in ANGLES if a < math.pi])
+@pytest.mark.parametrize("dtype", [torch.float32, D])
+def test_log_inverts_exp_below_a_half_turn(angle, dtype):
+    vector = (angle * AXIS).to(dtype)
+    if float(vector.norm()) < math.pi - 1e-6:
+        tol = 1e-6 if dtype == torch.float32 else 1e-14
+        torch.testing.assert_close(so3_log(so3_exp(vector)), vector, atol=tol * max(angle, 1e-3), rtol=0)
+
+
+@pytest.mark.parametrize("axis", [*torch.eye(3, dtype=D), AXIS])
+def test_half_turns_keep_their_axis(axis):
+    back = so3_log(so3_exp(math.pi * axis))
+    assert back.norm() == pytest.approx(math.pi, abs=1e-12)
+    assert abs(float(back @ axis)) == pytest.approx(math.pi, abs=1e-7)
+
+
+@pytest.mark.parametrize("angle", [a for a in ANGLES if a != math.pi])
+def test_left_jacobian_is_the_derivative_of_exp(angle):
+    vector = angle * AXIS
+    expected = central_jacobian(
+        lambda w: torch.as_tensor(
+            (Rotation.from_rotvec(w.numpy()) * Rotation.from_rotvec(vector.numpy()).inv()).as_rotvec()
+        ),
+        vector,
+    )
+    torch.testing.assert_close(left_jacobian(vector), expected, atol=1e-8, rtol=0)
+
+
+@pytest.mark.parametrize("function", [so3_exp, left_jacobian, lambda w: so3_log(so3_exp(w)), wrap_rotation_vector])
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 5e-3, 1.0, 3.0])
+def test_derivatives_agree_in_every_mode_also_at_zero(function, angle):
+    vector = angle * AXIS
+    forward, reverse = jacfwd(function)(vector), jacrev(function)(vector)
+    torch.testing.assert_close(forward, reverse, atol=1e-12, rtol=0)
+    torch.testing.assert_close(forward, central_jacobian(function, vector), atol=1e-8, rtol=0)
+    assert torch.autograd.gradcheck(function, vector.clone().requires_grad_())
+
+
+def test_second_derivatives_of_exp_at_zero():
+    zero = torch.zeros(3, dtype=D, requires_grad=True)
+    assert torch.autograd.gradgradcheck(so3_exp, zero, atol=1e-6)
+    second = jacfwd(jacrev(so3_exp))(zero.detach())
+    # R = I + [w] + [w]^2 / 2: the second derivative is that of [w]^2 / 2.
+    expected = jacfwd(jacrev(lambda w: 0.5 * torch.outer(w, w) - 0.5 * (w @ w) * torch.eye(3, dtype=D)))(zero.detach())
+    torch.testing.assert_close(second, expected, atol=1e-14, rtol=0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(vectors, vectors)
+def test_composition_agrees_with_scipy(first, second):
+    composed = compose_rotation_vectors(first, second)
+    expected = Rotation.from_rotvec(first.numpy()) * Rotation.from_rotvec(second.numpy())
+    assert composed.norm() <= math.pi + 1e-12
+    difference = (Rotation.from_rotvec(composed.numpy()).inv() * expected).magnitude()
+    assert difference < 1e-12
+
+
+def test_composition_across_the_half_turn_wraps():
+    small = compose_rotation_vectors(0.2 * AXIS, (math.pi - 0.1) * AXIS)
+    torch.testing.assert_close(small, -(math.pi - 0.1) * AXIS, atol=1e-12, rtol=0)
+    torch.testing.assert_close(compose_rotation_vectors(AXIS, -AXIS), torch.zeros(3, dtype=D), atol=1e-15, rtol=0)
+
+
+def test_composition_with_nothing_has_the_jacobian_of_the_group():
+    vector = 1.3 * AXIS
+    zero = torch.zeros(3, dtype=D)
+    for mode in (jacfwd, jacrev):
+        torch.testing.assert_close(mode(lambda w: compose_rotation_vectors(w, zero))(zero), torch.eye(3, dtype=D))
+        jacobian = mode(lambda w: compose_rotation_vectors(w, vector))(zero)
+        torch.testing.assert_close(left_jacobian(vector) @ jacobian, torch.eye(3, dtype=D), atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_wrapping_keeps_the_rotation(angle):
+    wrapped = wrap_rotation_vector(angle * AXIS)
+    assert wrapped.norm() <= math.pi + 1e-12
+    torch.testing.assert_close(so3_exp(wrapped), so3_exp(angle * AXIS), atol=1e-13, rtol=0)
+    if angle < math.pi:
+        torch.testing.assert_close(wrapped, angle * AXIS, atol=1e-14, rtol=0)
+
+
+@pytest.mark.parametrize("function", [so3_exp, left_jacobian, wrap_rotation_vector, lambda w: so3_log(so3_exp(w))])
+def test_batches_of_any_shape_are_loops(function):
+    batch = random_vectors(6)
+    together = function(batch.reshape(2, 3, 3))
+    torch.testing.assert_close(together.flatten(0, 1), torch.stack([function(w) for w in batch]))
+    assert function(batch[:0]).shape[0] == 0
+
+
+def test_composition_broadcasts():
+    many, one = random_vectors(4), random_vectors(1, seed=3)[0]
+    expected = torch.stack([compose_rotation_vectors(w, one) for w in many])
+    torch.testing.assert_close(compose_rotation_vectors(many, one), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("angle", ANGLES)
+def test_without_derivatives_the_same_comes_out_sooner(angle, dtype):
+    vector, other = (angle * AXIS).to(dtype), random_vectors(1)[0].to(dtype)
+    functions = [so3_exp, wrap_rotation_vector, lambda w: compose_rotation_vectors(w, other)]
+    expected = [function(vector) for function in functions]
+    with torch.inference_mode():
+        found = [function(vector) for function in functions]
+    for one, known in zip(found, expected, strict=True):
+        # Half a turn to the left is half a turn to the right.
+        same = one if known.ndim == 2 or float(one @ known) >= 0 else -one
+        torch.testing.assert_close(same, known, atol=50 * torch.finfo(dtype).eps, rtol=0)
+
+
+UP_TO_HALF_TURNS = [0.0, 1e-9, 1e-3, 9.99e-3, 0.0101, 0.7, 2.5, math.pi - 1e-7, math.pi]
+VECTORS = [angle * AXIS for angle in UP_TO_HALF_TURNS] + [math.pi * axis for axis in torch.eye(3, dtype=D)]
+
+
+def randn(*size, seed=0, dtype=D):
+    return torch.randn(*size, generator=torch.Generator().manual_seed(seed), dtype=D).to(dtype)
+
+
+def test_six_numbers_of_any_length_give_the_rotation_of_gram_schmidt():
+    columns = randn(50, 6)
+    rotation = rotation_from_6d(columns)
+    q, r = np.linalg.qr(columns.reshape(50, 2, 3).mT.numpy())
+    first_two = q * np.sign(np.diagonal(r, axis1=1, axis2=2))[:, None]
+    np.testing.assert_allclose(rotation[..., :2], first_two, atol=1e-14)
+    torch.testing.assert_close(torch.det(rotation), torch.ones(50, dtype=D))
+    torch.testing.assert_close(rotation_from_6d(columns * 1e-9), rotation)
+    torch.testing.assert_close(rotation_from_6d(rotation_to_6d(rotation)), rotation)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, D])
+def test_columns_that_point_nowhere_still_give_rotations_and_finite_gradients(dtype):
+    zero, x = torch.zeros(3, dtype=D), AXIS
+    rows = [[zero, zero], [x, zero], [zero, x], [x, 2 * x], [x, -x], [x, x + 1e-7 * x.roll(1)], [1e-30 * x, x.roll(1)]]
+    columns = torch.stack([torch.cat(row) for row in rows]).to(dtype).requires_grad_()
+    rotation = rotation_from_6d(columns)
+    tolerance = 1e-6 if dtype == torch.float32 else 1e-13
+    torch.testing.assert_close(
+        rotation @ rotation.mT, torch.eye(3, dtype=dtype).expand(7, 3, 3), atol=tolerance, rtol=0
+    )
+    torch.testing.assert_close(torch.det(rotation), torch.ones(7, dtype=dtype), atol=tolerance, rtol=0)
+    (gradient,) = torch.autograd.grad((rotation_vector_from_6d(columns) * x.to(dtype)).sum(), columns)
+    assert gradient.isfinite().all()
+    torch.testing.assert_close(rotation[0], torch.eye(3, dtype=dtype))
+    torch.testing.assert_close(rotation[1, :, 0], x.to(dtype))
+    assert not gradient[0].any()
+
+
+@pytest.mark.parametrize("vector", VECTORS)
+def test_all_ways_there_and_back_agree_with_scipy(vector):
+    truth = torch.from_numpy(Rotation.from_rotvec(vector.numpy()).as_matrix())
+    quaternion = quaternion_from_rotation_vector(vector)
+    np.testing.assert_allclose(
+        quaternion.abs(), np.abs(Rotation.from_rotvec(vector).as_quat(scalar_first=True)), atol=1e-15
+    )
+    for length in (1.0, -0.01, 1e5):
+        torch.testing.assert_close(rotation_from_quaternion(length * quaternion), truth, atol=1e-14, rtol=0)
+        back = rotation_vector_from_quaternion(length * quaternion)
+        assert back.norm() <= math.pi + 1e-12
+        torch.testing.assert_close(so3_exp(back), truth, atol=1e-14, rtol=0)
+    torch.testing.assert_close(so3_exp(rotation_vector_from_rotation(truth)), truth, atol=1e-14, rtol=0)
+    torch.testing.assert_close(
+        so3_exp(rotation_vector_from_6d(rotation_vector_to_6d(vector))), truth, atol=1e-14, rtol=0
+    )
+    if vector.norm() < math.pi - 1e-6:
+        torch.testing.assert_close(back, vector, atol=1e-14, rtol=1e-12)
+
+
+@pytest.mark.parametrize("vector", VECTORS)
+def test_gradients_hold_at_every_angle_zero_and_half_turns_too(vector):
+    """Through the vector to the rotation it stands for: there no angle is special."""
+    quaternion = 1.7 * quaternion_from_rotation_vector(vector)
+    columns = rotation_vector_to_6d(vector) * torch.tensor([2.0, 2, 2, 0.5, 0.5, 0.5], dtype=D)
+    assert gradcheck(rotation_from_quaternion, quaternion.requires_grad_())
+    assert gradcheck(rotation_from_6d, columns.requires_grad_())
+    assert gradcheck(lambda q: so3_exp(rotation_vector_from_quaternion(q)), quaternion)
+    assert gradcheck(lambda c: so3_exp(rotation_vector_from_6d(c)), columns)
+
+
+@pytest.mark.parametrize("angle", [0.0, 9.99e-3, 0.7, 3.0])
+def test_vectors_have_right_gradients_of_their_own_below_half_turns(angle):
+    quaternion = (0.3 * quaternion_from_rotation_vector(angle * AXIS)).requires_grad_()
+    assert gradcheck(rotation_vector_from_quaternion, quaternion)
+    assert gradcheck(rotation_vector_from_6d, rotation_vector_to_6d(angle * AXIS).requires_grad_())
+    assert gradcheck(quaternion_from_rotation_vector, (angle * AXIS).clone().requires_grad_())
+
+
+def test_the_zero_quaternion_is_no_rotation_and_takes_no_gradient():
+    zero = torch.zeros(4, dtype=D, requires_grad=True)
+    torch.testing.assert_close(rotation_from_quaternion(zero).detach(), torch.eye(3, dtype=D))
+    vector = rotation_vector_from_quaternion(zero)
+    assert not vector.any()
+    assert not torch.autograd.grad(vector.sum() + rotation_from_quaternion(zero).sum(), zero)[0].any()
+
+
+def test_the_rotation_does_not_jump_where_the_vector_does():
+    turns = torch.linspace(-math.pi, 3 * math.pi, 400, dtype=D).unsqueeze(-1)
+    quaternions = torch.cat([(turns / 2).cos(), (turns / 2).sin() * AXIS], dim=-1)
+    rotation = so3_exp(rotation_vector_from_quaternion(quaternions))
+    assert rotation.diff(dim=0).abs().max() < 0.035
+    torch.testing.assert_close(rotation, rotation_from_quaternion(quaternions), atol=1e-13, rtol=0)
+
+
+def test_batches_of_any_shape_and_float32():
+    columns = randn(2, 3, 6)
+    batch = rotation_vector_from_6d(columns)
+    assert batch.shape == (2, 3, 3)
+    torch.testing.assert_close(batch[1, 2], rotation_vector_from_6d(columns[1, 2]))
+    torch.testing.assert_close(rotation_vector_from_6d(columns.float()).double(), batch, atol=1e-5, rtol=0)
+    assert quaternion_from_rotation(rotation_from_6d(columns)).shape == (2, 3, 4)

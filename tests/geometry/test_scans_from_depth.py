@@ -1,0 +1,113 @@
+"""Depth images: pinhole points, triangles on one surface, cuts where the depth jumps."""
+
+import pytest
+import torch
+
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.depth_image import unproject
+from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.range_scan import RangeScan
+
+PINHOLE = (100.0, 90.0, 20.0, 15.0)
+
+
+def rays(height=31, width=41):
+    row, column = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    ones = torch.ones(height, width, dtype=torch.float64)
+    return torch.stack(((column - 20.0) / 100, (row - 15.0) / 90, ones), dim=-1)
+
+
+def plane_depth(normal, offset):
+    """Depth of the plane normal . x = offset."""
+    return offset / (rays() @ torch.tensor(normal, dtype=torch.float64))
+
+
+def test_points_lie_where_their_rays_meet_the_plane():
+    normal = (0.3, -0.4, 1.0)
+    points, faces = unproject(plane_depth(normal, 2.0), PINHOLE, 3.0)
+    assert len(points) == 31 * 41
+    assert len(faces) == 2 * 30 * 40
+    torch.testing.assert_close(points @ torch.tensor(normal, dtype=torch.float64), torch.full((1271,), 2.0).double())
+    torch.testing.assert_close(points / points[:, 2:], rays().reshape(-1, 3))
+    facing = TriangleMesh(points, faces).face_normals()
+    assert float((facing * -points[faces[:, 0]]).sum(-1).min()) > 0
+    assert int(faces.reshape(-1).bincount().max()) <= 8
+
+
+@pytest.mark.parametrize("slope", [0.0, 2.0, -3.0])
+def test_slanted_planes_hold_together_and_steps_do_not(slope):
+    depth = plane_depth((slope, 0.0, 1.0), 10.0)
+    behind = depth.clone()
+    behind[:, 25:] += 1.0 + 0.6 * abs(slope)
+    points, faces = unproject(depth, PINHOLE, 3.0)
+    assert len(faces) == 2 * 30 * 40
+    points, faces = unproject(behind, PINHOLE, 3.0)
+    assert len(faces) == 2 * 30 * 39
+    columns = (points[:, 0] / points[:, 2] * 100 + 20).round()[faces]
+    assert not bool(((columns < 24.5).any(-1) & (columns > 24.5).any(-1)).any())
+
+
+def test_a_crease_is_no_jump():
+    depth = torch.maximum(plane_depth((2.0, 0.0, 1.0), 10.0), plane_depth((-2.0, 0.0, 1.0), 10.0))
+    assert len(unproject(depth, PINHOLE, 3.0)[1]) == 2 * 30 * 40
+
+
+def test_what_flies_between_two_surfaces_is_left_out():
+    depth = torch.full((20, 20), 1.0).double()
+    depth[:, 10:] = 3.0
+    depth[:, 10] = 2.0
+    points, faces = unproject(depth, (100, 100, 10, 10), 3.0)
+    assert set(points[:, 2].tolist()) == {1.0, 3.0}
+    assert len(faces) == 2 * 19 * (9 + 8)
+
+
+def test_noise_does_not_tear():
+    noise = torch.randn(31, 41, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    faces = unproject(plane_depth((0.0, 0.0, 1.0), 1.0) + 0.05 * noise, PINHOLE, 3.0)[1]
+    assert len(faces) > 0.99 * 2 * 30 * 40
+
+
+def test_holes_leave_out_their_pixels_and_corners_keep_their_triangle():
+    depth = torch.ones(4, 4)
+    for value in (0.0, -1.0, torch.nan, torch.inf):
+        depth[0, 0] = value
+        points, faces = unproject(depth, (10, 10, 2, 2), 3.0)
+        assert len(points) == 15
+        assert len(faces) == 17
+    depth[1, 1] = 0.0
+    assert len(unproject(depth, (10, 10, 2, 2), 3.0)[1]) == 5 * 2 + 3
+
+
+def test_the_flatter_of_two_splits():
+    depth = torch.tensor([[1.0, 1.1], [1.1, 1.4]])
+    _, faces = unproject(depth, (5, 5, 0, 0), 3.0)
+    assert sorted(map(sorted, faces.tolist())) == [[0, 1, 2], [1, 2, 3]]
+    _, faces = unproject(depth.flip(0), (5, 5, 0, 0), 3.0)
+    assert sorted(map(sorted, faces.tolist())) == [[0, 1, 3], [0, 2, 3]]
+
+
+def test_units_do_not_matter():
+    depth = plane_depth((1.0, 0.5, 1.0), 2.0)
+    depth[10:20, 10:20] -= 0.4
+    points, faces = unproject(depth, PINHOLE, 3.0)
+    for scale in (1e-3, 1e3):
+        scaled, same = unproject(depth * scale, PINHOLE, 3.0)
+        assert torch.equal(same, faces)
+        torch.testing.assert_close(scaled, points * scale)
+
+
+@pytest.mark.parametrize(
+    ("depth", "intrinsics", "error", "message"),
+    [
+        (torch.ones(3), PINHOLE, InputError, r"depth must have shape \(H, W\)"),
+        (torch.zeros(3, 3), PINHOLE, InputError, "0 of 9 pixels measured and none joined"),
+        (torch.ones(1, 9), PINHOLE, InputError, "9 of 9 pixels measured and none joined"),
+        (torch.ones(3, 3), (1, 1, 1), InputTypeError, "intrinsics must be the four numbers fx, fy, cx, cy"),
+        (torch.ones(3, 3), (0.0, 1, 1, 1), InputError, r"intrinsics\[0\] \(fx\) must be positive"),
+        (torch.ones(3, 3), (1, -1, 1, 1), InputError, r"intrinsics\[1\] \(fy\) must be positive"),
+        (torch.ones(3, 3), (1, 1, float("nan"), 1), InputError, "intrinsics must be finite"),
+    ],
+)
+def test_what_is_no_depth_image(depth, intrinsics, error, message):
+    with pytest.raises(error, match=message):
+        RangeScan.from_depth(depth, intrinsics)

@@ -1,0 +1,221 @@
+import math
+from itertools import pairwise
+
+import networkx
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.rigid import rigid_matrix, se3_exp
+from torchreg.geometry.skeleton import Skeleton, build_skeleton, nearest_rotation, resample_curve
+
+# Two junctions of degree three, four tips: nodes 2 and 4.
+EDGES = [(0, 1), (1, 2), (2, 3), (2, 4), (4, 5), (5, 6), (4, 7)]
+
+
+def random(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def figure(edges=EDGES, **more):
+    count = 1 + max(max(edge) for edge in edges)
+    return Skeleton(random(count, 3), edges, torch.ones(count), **more)
+
+
+def star(arms, length):
+    hub, edges = 0, []
+    for arm in range(arms):
+        chain = [hub, *range(1 + arm * length, 1 + (arm + 1) * length)]
+        edges += list(pairwise(chain))
+    return figure(edges)
+
+
+def contracted(edges):
+    graph = networkx.Graph(edges)
+    for node in [node for node in graph if graph.degree(node) == 2]:
+        graph.add_edge(*graph.neighbors(node))
+        graph.remove_node(node)
+    return graph
+
+
+def test_tips_junctions_and_limbs_of_a_tree_drawn_by_hand():
+    tree = figure()
+    assert len(tree) == 8
+    assert tree.tips.tolist() == [0, 3, 6, 7]
+    assert tree.junctions.tolist() == [2, 4]
+    assert tree.degrees[tree.junctions].tolist() == [3, 3]
+    assert [limb.tolist() for limb in tree.limbs] == [[0, 1, 2], [3, 2], [6, 5, 4], [7, 4], [2, 4]]
+    assert tree.limb_ends.tolist() == [[0, 2], [3, 2], [6, 4], [7, 4], [2, 4]]
+    assert repr(tree) == "Skeleton(8 nodes, 4 tips, 5 limbs, junctions of degree [3, 3])"
+    expected = [sum(math.dist(tree.nodes[a], tree.nodes[b]) for a, b in pair) for pair in [[(0, 1), (1, 2)], [(2, 3)]]]
+    assert tree.limb_lengths[:2].tolist() == pytest.approx(expected)
+    assert float(tree.length) == pytest.approx(sum(math.dist(tree.nodes[a], tree.nodes[b]) for a, b in EDGES))
+
+
+def test_a_tree_without_junctions_is_one_limb():
+    line = figure([(2, 0), (0, 1)])
+    assert [limb.tolist() for limb in line.limbs] == [[1, 0, 2]]
+    assert line.topology == "(())"
+
+
+def test_a_single_node_is_a_tip_without_a_limb():
+    point = Skeleton(torch.zeros(1, 3), [], torch.ones(1))
+    assert point.tips.tolist() == [0]
+    assert point.limbs == ()
+    assert point.topology == "()"
+    assert point.limb_lengths.shape == (0,)
+    assert point.limb_ends.shape == (0, 2)
+    with pytest.raises(InputError, match="single node"):
+        point.resample(3)
+
+
+def test_topology_of_stars_counts_arms_and_ignores_nodes_in_between():
+    assert star(5, 1).topology == star(5, 4).topology == "(()()()()())"
+    assert star(4, 2).topology != star(5, 2).topology
+    # Three junctions of degree three also have five tips.
+    split = figure([(0, 2), (1, 2), (2, 3), (3, 4), (3, 5), (5, 6), (5, 7)])
+    assert len(split.tips) == 5
+    assert split.topology != star(5, 1).topology
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.integers(0, 10**6), min_size=2, max_size=9), st.randoms(use_true_random=False))
+def test_topology_is_equal_exactly_for_isomorphic_trees(numbers, shuffler):
+    def tree(values):
+        return [(place + 1, value % (place + 1)) for place, value in enumerate(values)]
+
+    first, second = tree(numbers), tree(numbers[::-1])
+    same = networkx.is_isomorphic(contracted(first), contracted(second))
+    assert (figure(first).topology == figure(second).topology) == same
+    names = list(range(len(first) + 1))
+    shuffler.shuffle(names)
+    assert figure([(names[a], names[b]) for a, b in first]).topology == figure(first).topology
+
+
+def test_path_runs_along_the_tree():
+    tree = figure()
+    assert tree.path(0, 6).tolist() == [0, 1, 2, 4, 5, 6]
+    assert tree.path(3, 3).tolist() == [3]
+    with pytest.raises(InputError, match="end must be a node from 0 to 7, got 8"):
+        tree.path(0, 8)
+
+
+def test_resampled_curves_have_equal_steps_and_keep_their_ends():
+    corner = torch.tensor([[0.0, 0, 0], [3, 0, 0], [3, 1, 0]], dtype=torch.float64)
+    turn = se3_exp(torch.tensor([[0, 0, 0, 0, 0, angle] for angle in (0.0, 1.5, 1.5)], dtype=torch.float64))[:, :3, :3]
+    points, radii, frames = resample_curve(corner, torch.tensor([1.0, 4.0, 6.0], dtype=torch.float64), turn, 5)
+    assert torch.allclose(points, torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [3, 1, 0]]).double())
+    assert radii.tolist() == pytest.approx([1, 2, 3, 4, 6])
+    assert torch.allclose(frames @ frames.mT, torch.eye(3, dtype=torch.float64).expand(5, 3, 3))
+    assert torch.allclose(frames[[0, 3, 4]], turn)
+    curves, radii, frames = star(5, 3).resample(7)
+    assert curves.shape == (5, 7, 3)
+    assert radii.shape == (5, 7)
+    assert frames.shape == (5, 7, 3, 3)
+
+
+def test_resampling_is_differentiable_in_points_and_radii():
+    points, radii = random(4, 3, seed=1).requires_grad_(), random(4, seed=2).requires_grad_()
+    eye = torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
+    held = points.detach()
+
+    def moved(weights):
+        # The place along the polyline is held fixed, so only moves that keep the steps in proportion are exact.
+        return resample_curve(held * weights, radii, eye, 6)[0]
+
+    assert torch.autograd.gradcheck(moved, torch.ones((), dtype=torch.float64, requires_grad=True))
+    assert torch.autograd.gradcheck(lambda r: resample_curve(held, r, eye, 6)[1], radii)
+
+
+def test_a_polyline_that_stands_still_is_resampled_in_place():
+    points, _, _ = resample_curve(torch.ones(3, 3), torch.ones(3), torch.eye(3).expand(3, 3, 3), 4)
+    assert torch.equal(points, torch.ones(4, 3))
+
+
+def test_nearest_rotation_is_right_handed_also_from_a_mirror():
+    matrices = torch.cat((random(5, 3, 3), -torch.eye(3, dtype=torch.float64)[None]))
+    turned = nearest_rotation(matrices)
+    assert torch.allclose(turned @ turned.mT, torch.eye(3, dtype=torch.float64).expand(6, 3, 3))
+    assert torch.allclose(torch.linalg.det(turned), torch.ones(6, dtype=torch.float64))
+    others = se3_exp(random(200, 6, seed=3))[:, :3, :3]
+    gain = torch.einsum("bij,bij->b", turned, matrices)
+    assert bool((torch.einsum("nij,bij->bn", others, matrices) <= gain[:, None] + 1e-9).all())
+
+
+def test_a_motion_with_scale_moves_nodes_radii_and_frames():
+    tree = figure()
+    motion = se3_exp(random(6, seed=4))
+    motion = rigid_matrix(2 * motion[:3, :3], motion[:3, 3])
+    moved = tree.transformed(motion)
+    assert torch.allclose(moved.limb_lengths, 2 * tree.limb_lengths)
+    assert torch.allclose(moved.radii, 2 * tree.radii)
+    assert torch.allclose(moved.frames, motion[:3, :3] / 2 @ tree.frames)
+    assert moved.topology == tree.topology
+
+
+def test_limbs_that_share_end_numbers_are_joined():
+    eye = torch.eye(3).expand(3, 3, 3)
+    hub = torch.zeros(3)
+    limbs = [(torch.stack((random(3, seed=k).float(), random(3, seed=9 + k).float(), hub)), hub, eye) for k in range(5)]
+    built = build_skeleton(limbs, [(tip, 42) for tip in range(5)], ["a note"])
+    assert built.topology == "(()()()()())"
+    assert len(built) == 11
+    assert built.notes == ("a note",)
+    assert torch.equal(built.nodes[built.limbs[3]], limbs[3][0])
+    with pytest.raises(InputError, match="one tree"):
+        build_skeleton([*limbs[:1], limbs[0]], [(0, 1), (1, 0)])
+
+
+@pytest.mark.parametrize(
+    ("edges", "message"),
+    [
+        ([(0, 1), (1, 2), (2, 0)], "one tree"),
+        ([(0, 1)], "one tree"),
+        ([(0, 1), (1, 0)], "reach 2 of 3 nodes"),
+        ([(0, 1), (1, 3)], "must index the 3 nodes"),
+        ([(0, 1, 2)], "shape"),
+    ],
+)
+def test_edges_that_are_no_tree_are_refused(edges, message):
+    with pytest.raises(InputError, match=message):
+        Skeleton(torch.zeros(3, 3), edges, torch.ones(3))
+
+
+def test_wrong_values_are_refused():
+    edges = [(0, 1)]
+    with pytest.raises(InputTypeError, match="edges must hold integers"):
+        Skeleton(torch.zeros(2, 3), torch.zeros(1, 2), torch.ones(2))
+    with pytest.raises(InputError, match="nodes must be finite"):
+        Skeleton(torch.tensor([[0.0, 0, math.nan], [0, 0, 0]]), edges, torch.ones(2))
+    with pytest.raises(InputError, match="radii must have shape"):
+        Skeleton(torch.zeros(2, 3), edges, torch.ones(3))
+    with pytest.raises(InputError, match="frames must be rotations"):
+        Skeleton(torch.zeros(2, 3), edges, torch.ones(2), -torch.eye(3).expand(2, 3, 3))
+    with pytest.raises(InputError, match="confidence must have shape"):
+        Skeleton(torch.zeros(2, 3), edges, torch.ones(2), confidence=torch.ones(3))
+    with pytest.raises(InputError, match="count must be at least 2"):
+        figure().resample(1)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_everything_takes_the_dtype_of_the_nodes(dtype):
+    tree = Skeleton(random(8, 3).to(dtype), torch.tensor(EDGES, dtype=torch.int32), [1.0] * 8, confidence=[0.5] * 4)
+    assert tree.edges.dtype == torch.int64
+    assert {value.dtype for value in (tree.radii, tree.frames, tree.confidence, tree.length, *tree.resample(3))} == {
+        dtype
+    }
+
+
+def test_points_belong_to_the_limb_whose_surface_is_nearest():
+    # A cross: four arms of length 2 from a thick middle.
+    nodes = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [-1, 0, 0], [-2, 0, 0], [0, 1, 0], [0, 2, 0], [0, -1, 0]])
+    edges = torch.tensor([[0, 1], [1, 2], [0, 3], [3, 4], [0, 5], [5, 6], [0, 7]])
+    skeleton = Skeleton(nodes, edges, torch.tensor([0.5, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]))
+    found = skeleton.limb_of(torch.tensor([[1.9, 0.2, 0.0], [0.1, 1.4, 0.0], [-3.0, 0.0, 1.0], [0.0, -0.8, 0.0]]))
+    assert [int(skeleton.limbs[limb][0]) for limb in found] == [2, 6, 4, 7]
+    moved = skeleton.transformed(se3_exp(torch.tensor([1.0, 2.0, 3.0, 0.3, -1.0, 0.4])))
+    assert torch.equal(moved.limb_of(moved.nodes[1:]), skeleton.limb_of(nodes[1:]))
+    with pytest.raises(InputError, match="must have a limb"):
+        Skeleton(nodes[:1], torch.zeros(0, 2, dtype=torch.int64), torch.ones(1)).limb_of(nodes)

@@ -1,0 +1,208 @@
+"""Triangle meshes: validation, normals, sampling, spheres."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.mesh import TriangleMesh, concatenate, interpolate, sample_surface, unit_sphere
+
+
+def bumpy(seed: int = 0, dtype: torch.dtype = torch.float64) -> TriangleMesh:
+    sphere = unit_sphere(1, dtype=dtype)
+    generator = torch.Generator().manual_seed(seed)
+    return TriangleMesh(sphere.vertices + 0.1 * torch.randn(42, 3, generator=generator, dtype=dtype), sphere.faces)
+
+
+def to_trimesh(mesh: TriangleMesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_areas_and_normals_agree_with_trimesh(dtype):
+    mesh = bumpy(dtype=dtype)
+    oracle = to_trimesh(mesh)
+    tol = 1e-5 if dtype == torch.float32 else 1e-10
+    assert mesh.face_areas().dtype == dtype
+    np.testing.assert_allclose(mesh.face_areas(), oracle.area_faces, atol=tol)
+    np.testing.assert_allclose(mesh.face_normals(), oracle.face_normals, atol=tol)
+    by_angle = trimesh.geometry.weighted_vertex_normals(42, oracle.faces, oracle.face_normals, oracle.face_angles)
+    np.testing.assert_allclose(mesh.vertex_normals(), by_angle, atol=tol)
+    np.testing.assert_allclose(mesh.bounds(), oracle.bounds, atol=tol)
+
+
+def test_vertex_normals_of_a_cube_corner_do_not_depend_on_the_triangulation():
+    box = trimesh.creation.box()
+    mesh = TriangleMesh(torch.tensor(np.array(box.vertices)), torch.tensor(np.array(box.faces)))
+    expected = mesh.vertices / mesh.vertices.norm(dim=-1, keepdim=True)
+    torch.testing.assert_close(mesh.vertex_normals(), expected)
+    assert not torch.allclose(mesh.vertex_normals("area"), expected)
+
+
+def test_area_weighting_is_the_sum_of_cross_products():
+    mesh = bumpy()
+    total = torch.zeros(42, 3, dtype=torch.float64)
+    for face in mesh.faces:
+        a, b, c = mesh.vertices[face]
+        total[face] += torch.linalg.cross(b - a, c - a)
+    torch.testing.assert_close(mesh.vertex_normals("area"), total / total.norm(dim=-1, keepdim=True))
+
+
+def test_isolated_vertices_and_flat_faces_give_zero_and_finite_gradients():
+    vertices = torch.tensor(
+        [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 5], [2, 0, 0]], dtype=torch.float64, requires_grad=True
+    )
+    mesh = TriangleMesh(vertices, torch.tensor([[0, 1, 2], [0, 1, 4], [1, 1, 1]]))
+    assert mesh.face_normals()[1:].eq(0).all()
+    normals = mesh.vertex_normals()
+    torch.testing.assert_close(normals[:3], torch.tensor([[0.0, 0, 1]] * 3, dtype=torch.float64))
+    assert normals[3:].eq(0).all()
+    (normals.square().sum() + mesh.vertex_normals("area").sum() + mesh.face_areas().sum()).backward()
+    assert vertices.grad is not None
+    assert torch.isfinite(vertices.grad).all()
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_normals_do_not_depend_on_scale_in_float32(scale):
+    mesh = bumpy(dtype=torch.float32)
+    scaled = TriangleMesh(mesh.vertices * scale, mesh.faces)
+    torch.testing.assert_close(scaled.vertex_normals(), mesh.vertex_normals(), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(scaled.face_normals(), mesh.face_normals(), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("quantity", ["face_areas", "face_normals", "vertex_normals"])
+def test_gradients(quantity):
+    sphere = unit_sphere(0, dtype=torch.float64)
+    vertices = (sphere.vertices * torch.tensor([1.0, 1.3, 0.7], dtype=torch.float64)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda v: getattr(TriangleMesh(v, sphere.faces), quantity)(), (vertices,))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 1000))
+def test_normals_turn_with_the_mesh(seed):
+    generator = torch.Generator().manual_seed(seed)
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator, dtype=torch.float64)).Q
+    rotation = rotation * rotation.det()
+    mesh = bumpy(seed)
+    turned = TriangleMesh(mesh.vertices @ rotation.mT + 3.0, mesh.faces)
+    torch.testing.assert_close(turned.vertex_normals(), mesh.vertex_normals() @ rotation.mT)
+    torch.testing.assert_close(turned.face_areas(), mesh.face_areas())
+
+
+def test_mesh_moves_between_dtypes_and_takes_lists():
+    mesh = TriangleMesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+    assert mesh.vertices.dtype == torch.float32
+    assert mesh.faces.dtype == torch.int64
+    moved = mesh.to(torch.float64)
+    assert moved.vertices.dtype == torch.float64
+    assert moved.faces.dtype == torch.int64
+    assert (moved.num_vertices, moved.num_faces) == (3, 1)
+    assert TriangleMesh(torch.zeros(1, 3), torch.zeros(0, 3, dtype=torch.int32)).vertex_normals().eq(0).all()
+    assert TriangleMesh(torch.zeros(1, 3), []).num_faces == 0
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "error", "words"),
+    [
+        (torch.zeros(3, 2), [[0, 1, 2]], InputError, r"vertices must have shape \(V, 3\), got \(3, 2\)"),
+        (torch.full((3, 3), math.nan), [[0, 1, 2]], InputError, "vertices must be finite, got 9 non-finite of 9"),
+        (torch.zeros(3, 3), [[0, 1, 3]], InputError, r"index the 3 vertices \(0 to 2\), got indices from 0 to 3"),
+        (torch.zeros(3, 3), [[0, -1, 2]], InputError, "from -1 to 2"),
+        (torch.zeros(3, 3), [[0, 1]], InputError, r"faces must have shape \(F, 3\)"),
+        (torch.zeros(3, 3), [[0.0, 1.0, 2.0]], InputTypeError, "faces must hold integers"),
+        (torch.zeros(3, 3), "none", InputTypeError, "faces must be an"),
+    ],
+)
+def test_bad_meshes_are_refused(vertices, faces, error, words):
+    with pytest.raises(error, match=words):
+        TriangleMesh(vertices, faces)
+
+
+def test_wrong_choices_are_refused():
+    with pytest.raises(InputError, match="weighting must be one of angle, area"):
+        bumpy().vertex_normals("size")
+    with pytest.raises(InputError, match="at least 1 point"):
+        TriangleMesh(torch.zeros(0, 3), []).bounds()
+    for subdivisions in (-1, 9, 1.5, True):
+        with pytest.raises(InputError, match="subdivisions must be an integer from 0 to 8"):
+            unit_sphere(subdivisions)
+
+
+@pytest.mark.parametrize("subdivisions", [0, 1, 3])
+def test_sphere_is_closed_round_and_faces_outward(subdivisions):
+    mesh = unit_sphere(subdivisions, dtype=torch.float64)
+    oracle = to_trimesh(mesh)
+    assert mesh.num_vertices == 10 * 4**subdivisions + 2
+    assert oracle.is_watertight
+    assert oracle.is_winding_consistent
+    assert 0 < 4 * math.pi / 3 - oracle.volume < 2.0 / 3.5**subdivisions
+    torch.testing.assert_close(mesh.vertices.norm(dim=-1), torch.ones(mesh.num_vertices, dtype=torch.float64))
+    assert (torch.diff(mesh.face_areas().sort().values) >= 0).all()
+    torch.testing.assert_close(mesh.vertex_normals(), mesh.vertices, atol=0.02, rtol=0)
+
+
+def test_concatenate_keeps_the_order():
+    first, second = bumpy(0), bumpy(1)
+    both = concatenate([first, second])
+    torch.testing.assert_close(both.face_areas(), torch.cat((first.face_areas(), second.face_areas())))
+    assert both.num_vertices == 84
+
+
+def test_samples_lie_on_their_face_and_follow_the_area():
+    triangles = torch.tensor([[0.0, 0, 0], [3, 0, 0], [0, 2, 0], [0, 0, 0], [1, 0, 0], [0, 2, 0]], dtype=torch.float64)
+    mesh = TriangleMesh(triangles, torch.tensor([[0, 1, 2], [3, 4, 5], [0, 0, 0]]))
+    points, face, weights = sample_surface(mesh, 20_000, torch.Generator().manual_seed(1))
+    assert points.shape == (20_000, 3)
+    share = (face == 0).double().mean()
+    assert abs(float(share) - 0.75) < 4 * math.sqrt(0.75 * 0.25 / 20_000)
+    assert int(face.max()) == 1
+    torch.testing.assert_close(weights.sum(dim=-1), torch.ones(20_000, dtype=torch.float64))
+    # Uniform on a triangle: the mean is the centroid and E[x^2] = side^2 / 6.
+    on_first = points[face == 0]
+    torch.testing.assert_close(
+        on_first.mean(dim=0), torch.tensor([1.0, 2 / 3, 0], dtype=torch.float64), atol=0.03, rtol=0
+    )
+    assert abs(float(on_first[:, 0].square().mean()) - 9 / 6) < 0.05
+
+
+def test_sampling_is_reproducible_and_leaves_the_global_generator_alone():
+    mesh = bumpy(dtype=torch.float32)
+    state = torch.get_rng_state()
+    first, again = sample_surface(mesh, 50)[0], sample_surface(mesh, 50)[0]
+    assert torch.equal(first, again)
+    assert torch.equal(torch.get_rng_state(), state)
+    generator = torch.Generator().manual_seed(3)
+    assert not torch.equal(sample_surface(mesh, 50, generator)[0], sample_surface(mesh, 50, generator)[0])
+    assert sample_surface(mesh, 0)[0].shape == (0, 3)
+    assert first.dtype == torch.float32
+
+
+def test_sampling_is_differentiable_in_the_vertices():
+    sphere = unit_sphere(0, dtype=torch.float64)
+
+    def scaled(scale: torch.Tensor) -> torch.Tensor:
+        return sample_surface(TriangleMesh(sphere.vertices * scale, sphere.faces), 7)[0]
+
+    # A uniform scale leaves the drawn faces as they are, so finite differences see the same function.
+    assert torch.autograd.gradcheck(scaled, (torch.tensor(1.3, dtype=torch.float64, requires_grad=True),))
+
+
+def test_sampling_needs_a_surface():
+    for faces in ([], [[0, 1, 2]]):
+        with pytest.raises(InputError, match="mesh must have a surface to sample"):
+            sample_surface(TriangleMesh(torch.zeros(3, 3), faces), 5)
+
+
+def test_interpolation_reproduces_linear_fields():
+    mesh = bumpy()
+    points, face, weights = sample_surface(mesh, 30)
+    slope = torch.randn(3, 2, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    field = torch.einsum("vi,ijk->vjk", mesh.vertices, slope)
+    expected = torch.einsum("vi,ijk->vjk", points, slope)
+    torch.testing.assert_close(interpolate(field, mesh.faces, face, weights), expected)
+    torch.testing.assert_close(interpolate(mesh.vertices[:, 0], mesh.faces, face, weights), points[:, 0])

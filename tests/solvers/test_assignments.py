@@ -1,0 +1,138 @@
+"""Assignments and combinations of rows against trying them all."""
+
+from itertools import permutations, product
+
+import pytest
+import torch
+
+from torchreg.solvers.assignment import assign, assign_within
+from torchreg.solvers.cover import best_covers
+
+
+def random(*size, seed=0):
+    return torch.rand(*size, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize(("rows", "columns"), [(4, 4), (3, 5), (1, 1)])
+def test_no_assignment_is_cheaper(rows, columns):
+    costs = random(rows, columns, seed=rows)
+    found = assign(costs)
+    best = min(sum(float(costs[r, c]) for r, c in enumerate(way)) for way in permutations(range(columns), rows))
+    assert float(costs[torch.arange(rows), found].sum()) == pytest.approx(best)
+    assert len(set(found.tolist())) == rows
+
+
+def test_rows_stay_alone_where_columns_are_few_or_dear():
+    costs = torch.tensor([[0.1, 0.9], [0.2, 0.95], [0.3, 0.99]])
+    assert assign(costs).tolist().count(-1) == 1
+    assert assign(costs, 0.5).tolist() == [0, -1, -1]
+    assert assign(costs, torch.tensor([0.05, 2.0, 2.0])).tolist() == [-1, 0, 1]
+    assert assign(torch.zeros(2, 0)).tolist() == [-1, -1]
+    assert assign(torch.zeros(0, 3)).tolist() == []
+
+
+def test_permuting_rows_and_columns_permutes_the_answer():
+    costs, rows, columns = random(5, 6), torch.tensor([3, 1, 4, 0, 2]), torch.tensor([5, 2, 0, 1, 4, 3])
+    found, moved = assign(costs, 0.4), assign(costs[rows][:, columns], 0.4)
+    there = torch.where(moved >= 0, columns[moved], -1)
+    assert torch.equal(there, found[rows])
+
+
+def test_no_assignment_within_a_limit_is_cheaper():
+    costs = random(5, 4, seed=3)
+    found = assign_within(costs, 0.3)
+    paid = sum(float(costs[row, column]) if column >= 0 else 0.3 for row, column in enumerate(found.tolist()))
+    table = torch.cat((costs.clamp(max=0.3), torch.full((5, 1), 0.3, dtype=torch.float64)), dim=1)
+    best = min(sum(float(table[row, column]) for row, column in enumerate(way)) for way in permutations(range(5)))
+    assert paid == pytest.approx(best)
+    assert bool((costs[found >= 0, found[found >= 0]] < 0.3).all())
+
+
+def test_nothing_within_the_limit_or_no_rows_leave_no_pairs():
+    assert assign_within(random(3, 2), 1e-9).tolist() == [-1, -1, -1]
+    assert assign_within(torch.zeros(0, 2), 1.0).tolist() == []
+
+
+def problem(seed, rows=(4, 5, 3), columns=12, batch=2):
+    generator = torch.Generator().manual_seed(seed)
+    tables = [torch.rand(batch, count, columns, generator=generator, dtype=torch.float64) for count in rows]
+    costs = [torch.rand(batch, count, generator=generator, dtype=torch.float64) for count in rows]
+    return torch.rand(batch, columns, generator=generator, dtype=torch.float64), tables, costs
+
+
+def all_totals(uncovered, tables, costs, row):
+    """Return every choice with its cost, from the definition."""
+    found = {}
+    for choice in product(*[range(table.shape[1]) for table in tables]):
+        covered = [
+            min(
+                [float(uncovered[row, column])]
+                + [float(t[row, k, column]) for t, k in zip(tables, choice, strict=True)]
+            )
+            for column in range(uncovered.shape[1])
+        ]
+        found[choice] = sum(covered) + sum(float(c[row, k]) for c, k in zip(costs, choice, strict=True))
+    return found
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_wide_beam_finds_the_best_choices_in_order(seed):
+    uncovered, tables, costs = problem(seed)
+    index, total = best_covers(uncovered, tables, costs, count=6, beam=60, num_exchanged=0)
+    for row in range(2):
+        expected = all_totals(uncovered, tables, costs, row)
+        ranked = sorted(expected, key=expected.get)[:6]
+        assert [tuple(choice) for choice in index[row].tolist()] == ranked
+        torch.testing.assert_close(total[row], torch.tensor([expected[c] for c in ranked], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_exchanges_mend_what_a_beam_of_one_misses(seed):
+    uncovered, tables, costs = problem(seed, rows=(4, 4, 4))
+    greedy = best_covers(uncovered, tables, costs, count=1, beam=1, num_exchanged=0)[1]
+    index, total = best_covers(uncovered, tables, costs, count=1, beam=1, num_exchanged=1, sweeps=3)
+    assert (total <= greedy).all()
+    for row in range(2):
+        expected = all_totals(uncovered, tables, costs, row)
+        torch.testing.assert_close(float(total[row, 0]), expected[tuple(index[row, 0].tolist())])
+        # No exchange of two rows is left that would help.
+        best = tuple(index[row, 0].tolist())
+        near = [choice for choice in expected if sum(a != b for a, b in zip(choice, best, strict=True)) <= 2]
+        assert expected[best] <= min(expected[choice] for choice in near) + 1e-12
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_choice_is_returned_twice(seed):
+    uncovered, tables, costs = problem(seed, rows=(4, 4, 4))
+    index, total = best_covers(uncovered, tables, costs, count=10, beam=10, num_exchanged=8)
+    for row in index.tolist():
+        assert len({tuple(choice) for choice in row}) == 10
+    assert (total.diff(dim=1) >= 0).all()
+
+
+def test_two_rows_that_must_change_together_are_found():
+    # Each limb alone prefers the columns of the other.
+    uncovered = torch.ones(1, 4)
+    first = torch.tensor([[[0.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0]]])
+    second = torch.tensor([[[1.0, 1.0, 1.0, 0.0], [0.0, 1.0, 1.0, 1.0]]])
+    index, total = best_covers(uncovered, [first, second], [torch.zeros(1, 2)] * 2, count=1, beam=1)
+    assert float(total) == 0.0
+    assert index.tolist() in ([[[0, 0]]], [[[1, 1]]])
+
+
+def test_batches_equal_single_problems_and_columns_may_be_permuted():
+    uncovered, tables, costs = problem(7, batch=3)
+    index, total = best_covers(uncovered, tables, costs)
+    order = torch.randperm(uncovered.shape[1], generator=torch.Generator().manual_seed(0))
+    for row in range(3):
+        alone = best_covers(uncovered[row : row + 1][:, order], [t[row : row + 1][..., order] for t in tables],
+                            [c[row : row + 1] for c in costs])  # fmt: skip
+        torch.testing.assert_close(alone[1][0], total[row])
+        assert alone[0][0].tolist() == index[row].tolist()
+
+
+def test_a_single_table_and_fewer_choices_than_asked_for():
+    uncovered, tables, costs = problem(1, rows=(3,))
+    index, total = best_covers(uncovered, tables, costs, count=10)
+    assert index.shape == (2, 3, 1)
+    assert (total.diff(dim=1) >= 0).all()

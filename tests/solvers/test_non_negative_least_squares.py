@@ -1,0 +1,354 @@
+"""Least squares under x >= 0, by active sets and by projected gradients: against scipy and each other."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import lsq_linear, minimize
+from scipy.optimize import nnls as dense_nnls
+
+import torchreg.solvers.nnls as module
+from torchreg.solvers.nnls import nnls
+from torchreg.solvers.projected_gradient import projected_gradient
+
+SEEDS = st.integers(0, 10_000)
+
+
+def dense_problem(seed, rows=30, columns=12):
+    generator = np.random.default_rng(seed)
+    return generator.normal(size=(rows, columns)), generator.normal(size=rows)
+
+
+def solved(matrix, target, start=None, **options):
+    """Return the solution for arrays or tensors."""
+    matrix, target, start = (torch.from_numpy(a) if isinstance(a, np.ndarray) else a for a in (matrix, target, start))
+    return nnls(matrix, target, start=start, **options)
+
+
+def weight_problem(side=16, num_bones=6, rows=1200, seed=0):
+    """Return A, b and labels like the weights of a skin: data rows, smoothness, rows that sum to one, closeness."""
+    generator = np.random.default_rng(seed)
+    count = side * side
+    places = np.stack(np.meshgrid(np.arange(side), np.arange(side), indexing="ij"), -1).reshape(-1, 2)
+    labels = ((places[:, None] - generator.random((num_bones, 2)) * side) ** 2).sum(-1).argmin(1)
+    cell = generator.integers(0, count, rows)
+    residual = 2 * generator.normal(size=(rows, num_bones))
+    residual[np.arange(rows), labels[cell]] *= 0.02
+    columns = cell[:, None] * num_bones + np.arange(num_bones)
+    data = sp.csr_matrix(
+        (residual.ravel(), (np.repeat(np.arange(rows), num_bones), columns.ravel())), shape=(rows, count * num_bones)
+    )
+    index = np.arange(count).reshape(side, side)
+    pairs = np.concatenate(
+        [np.stack([a.ravel(), b.ravel()], 1) for a, b in [(index[1:], index[:-1]), (index[:, 1:], index[:, :-1])]]
+    )
+    number = np.arange(len(pairs))
+    ones = np.ones(len(pairs))
+    difference = sp.csr_matrix(
+        (np.r_[ones, -ones], (np.r_[number, number], np.r_[pairs[:, 0], pairs[:, 1]])), shape=(len(pairs), count)
+    )
+    bones = sp.eye(num_bones)
+    sums = sp.kron(sp.eye(count), np.ones((1, num_bones)))
+    near = np.sqrt(0.3) * sp.eye(count * num_bones)
+    start = np.eye(num_bones)[labels].ravel()
+    matrix = sp.vstack([data, np.sqrt(0.5) * sp.kron(difference, bones), sums, near]).tocsr()
+    target = np.r_[np.zeros(rows + len(pairs) * num_bones), np.ones(count), np.sqrt(0.3) * start]
+    return matrix, target, start
+
+
+@given(SEEDS, st.integers(1, 40), st.integers(1, 20))
+@settings(max_examples=60, deadline=None)
+def test_small_dense_problems_agree_with_scipy(seed, rows, columns):
+    matrix, target = dense_problem(seed, rows, columns)
+    result = solved(torch.from_numpy(matrix), torch.from_numpy(target))
+    expected = dense_nnls(matrix, target)[1] ** 2
+    assert result.converged
+    assert result.objective <= expected + 1e-6 * (target @ target)
+    assert result.objective == pytest.approx(((matrix @ result.x.numpy() - target) ** 2).sum(), rel=1e-9)
+    assert (result.x >= 0).all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_solution_itself_is_scipys_where_it_is_unique(seed):
+    matrix, target = dense_problem(seed, 60, 25)
+    expected = torch.from_numpy(dense_nnls(matrix, target)[0])
+    torch.testing.assert_close(solved(sp.csr_matrix(matrix), target).x, expected, atol=1e-6, rtol=1e-6)
+
+
+def test_a_problem_of_weights_agrees_with_two_other_methods():
+    matrix, target, start = weight_problem()
+    result = solved(matrix, torch.from_numpy(target), start=torch.from_numpy(start))
+    assert len(result.x) == 1536
+    assert result.converged
+    assert result.ridge == 0
+
+    def value_and_slope(x):
+        residual = matrix @ x - target
+        return residual @ residual, 2 * (matrix.T @ residual)
+
+    options = {"maxiter": 2000, "maxfun": 5000, "ftol": 1e-14, "gtol": 1e-8}
+    oracle = minimize(
+        value_and_slope, start, jac=True, method="L-BFGS-B", bounds=[(0, None)] * len(start), options=options
+    )
+    assert result.objective == pytest.approx(oracle.fun, rel=1e-6)
+    assert result.objective <= oracle.fun * (1 + 1e-9)
+    interior = lsq_linear(matrix, target, bounds=(0, np.inf), tol=1e-10, max_iter=60)
+    assert result.objective == pytest.approx(2 * interior.cost, rel=1e-6)
+
+
+def test_every_start_leads_to_the_same_solution():
+    matrix, target, start = weight_problem(side=10)
+    expected = solved(matrix, target, start=start)
+    for first in (None, np.zeros(len(start)), (start == 0).astype(float)):
+        result = solved(matrix, target, start=first)
+        assert result.converged
+        torch.testing.assert_close(result.x, expected.x, atol=1e-6, rtol=0)
+
+
+def test_the_solution_as_start_needs_no_round():
+    matrix, target, start = weight_problem(side=10)
+    cold = solved(matrix, target, start=start)
+    warm = solved(matrix, target, start=cold.x)
+    assert warm.num_steps == 0
+    assert warm.num_solves < cold.num_solves
+    torch.testing.assert_close(warm.x, cold.x, atol=1e-7, rtol=0)
+
+
+def test_sums_of_one_held_by_a_penalty_come_out_as_one():
+    matrix, target, start = weight_problem(side=8)
+    sums = sp.kron(sp.eye(64), np.ones((1, 6)))
+    tight = solved(sp.vstack([matrix, 1e3 * sums]), np.r_[target, 1e3 * np.ones(64)], start=start)
+    loose = solved(matrix, target, start=start)
+    totals = tight.x.reshape(64, 6).sum(1)
+    assert tight.converged
+    torch.testing.assert_close(totals, torch.ones_like(totals), atol=1e-5, rtol=0)
+    assert (loose.x.reshape(64, 6).sum(1) - 1).abs().max() > 0.05
+
+
+def test_every_form_of_matrix_gives_the_same():
+    matrix, target = dense_problem(3)
+    matrix[np.abs(matrix) < 0.7] = 0
+    dense, b = torch.from_numpy(matrix), torch.from_numpy(target)
+    forms = [dense, dense.to_sparse_coo(), sp.coo_matrix(matrix), matrix]
+    solutions = [solved(form, b).x for form in forms]
+    for solution in solutions[1:]:
+        assert torch.equal(solution, solutions[0])
+
+
+def test_the_solution_takes_the_dtype_of_the_target():
+    matrix, target = dense_problem(3)
+    result = solved(torch.from_numpy(matrix).float(), torch.from_numpy(target).float())
+    assert result.x.dtype == torch.float32
+    assert result.objective == pytest.approx(dense_nnls(matrix, target)[1] ** 2, rel=1e-5)
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1e8])
+def test_units_of_variables_and_of_the_target_change_nothing_but_units(scale):
+    matrix, target = dense_problem(5)
+    units = np.logspace(-6, 6, 12)
+    plain, other = solved(matrix, target), solved(matrix * units, target * scale)
+    torch.testing.assert_close(other.x * torch.from_numpy(units) / scale, plain.x, atol=1e-9, rtol=1e-7)
+    assert other.kkt_residual <= 1e-7
+
+
+def test_permuted_variables_give_the_permuted_solution():
+    matrix, target = dense_problem(6)
+    order = np.random.default_rng(0).permutation(12)
+    torch.testing.assert_close(solved(matrix[:, order], target).x, solved(matrix, target).x[order])
+
+
+def test_a_step_too_few_is_no_convergence_but_a_sound_point():
+    matrix, target = dense_problem(4, 60, 40)
+    result = solved(matrix, target, start=np.zeros(40), max_steps=1)
+    assert not result.converged
+    assert result.kkt_residual > 1e-7
+    assert result.objective < target @ target
+    assert (result.x >= 0).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_steps_that_cannot_cycle_find_the_same_solution(seed, monkeypatch):
+    matrix, target = dense_problem(seed, 40, 25)
+    expected = solved(matrix, target)
+    # An elimination that loses everything after the first one makes every round fall back.
+    eliminate, calls = module._eliminate, []
+
+    def useless(problem, free, start):
+        calls.append(1)
+        return eliminate(problem, free, start) if len(calls) == 1 else np.zeros_like(start)
+
+    monkeypatch.setattr(module, "_eliminate", useless)
+    result = solved(matrix, target, start=(np.arange(25) % 3 == 0).astype(float))
+    assert len(calls) > 1
+    assert result.converged
+    torch.testing.assert_close(result.x, expected.x, atol=1e-7, rtol=1e-7)
+
+
+def test_zero_columns_stay_zero():
+    matrix, target = dense_problem(2)
+    matrix[:, [0, 5]] = 0
+    result = solved(matrix, target, start=np.ones(12))
+    assert result.converged
+    assert result.ridge == 0
+    assert result.x[[0, 5]].tolist() == [0, 0]
+    assert result.objective == pytest.approx(dense_nnls(matrix, target)[1] ** 2)
+
+
+@pytest.mark.parametrize("repeats", [2, 60])
+def test_equal_columns_are_solved_with_a_visible_ridge_at_most(repeats):
+    matrix, target = dense_problem(8)
+    twice = np.tile(matrix, (1, repeats))
+    result = solved(twice, target)
+    assert 0 <= result.ridge <= 1e-8
+    assert result.objective == pytest.approx(dense_nnls(matrix, target)[1] ** 2, rel=1e-6)
+
+
+def test_fewer_rows_than_columns_leave_no_residual_and_a_recorded_ridge():
+    generator = np.random.default_rng(0)
+    matrix = generator.normal(size=(6, 20))
+    result = solved(matrix, matrix @ generator.random(20))
+    assert 0 < result.ridge <= 1e-8
+    assert result.objective < 1e-10
+
+
+def test_when_nothing_helps_the_solution_is_zero():
+    matrix = np.abs(dense_problem(1)[0])
+    result = solved(matrix, -np.ones(30))
+    assert result.x.tolist() == [0] * 12
+    assert result.objective == 30
+    assert result.converged
+    assert solved(matrix, np.zeros(30)).x.tolist() == [0] * 12
+    assert solved(sp.csr_matrix((3, 2)), np.ones(3)).x.tolist() == [0, 0]
+
+
+def test_a_long_chain_beyond_conjugate_gradients_is_factored():
+    size = 3000
+    first = sp.diags([1.0, -1.0], [0, 1], shape=(size - 1, size))
+    ends = sp.csr_matrix(([1.0, 1.0], ([0, 1], [0, size - 1])), shape=(2, size))
+    result = solved(sp.vstack([first, ends]), np.r_[np.zeros(size - 1), 1.0, 2.0])
+    low, high = 1 + 1 / (size + 1), 2 - 1 / (size + 1)
+    expected = torch.linspace(low, high, size, dtype=torch.float64)
+    torch.testing.assert_close(result.x, expected, atol=1e-5, rtol=0)
+    assert result.ridge == 0
+
+
+def problem(seed, rows=30, columns=12, batch=()):
+    generator = torch.Generator().manual_seed(seed)
+    matrix = torch.randn(*batch, rows, columns, generator=generator, dtype=torch.float64)
+    return matrix, torch.randn(*batch, rows, generator=generator, dtype=torch.float64)
+
+
+def squares(matrix, target):
+    return lambda x: ((matrix @ x.unsqueeze(-1)).squeeze(-1) - target).square().sum(-1)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_cost_is_scipys(seed):
+    matrix, target = problem(seed)
+    result = projected_gradient(squares(matrix, target), torch.zeros(12, dtype=torch.float64))
+    assert bool(result.converged)
+    assert float(result.cost) == pytest.approx(dense_nnls(matrix.numpy(), target.numpy())[1] ** 2, rel=1e-8)
+    assert (result.x >= 0).all()
+
+
+def test_sums_of_one_smoothness_and_data_come_within_a_percent_of_the_active_set():
+    generator = torch.Generator().manual_seed(0)
+    data = torch.randn(400, 40, 5, generator=generator, dtype=torch.float64).square()
+    data = data * (torch.rand(400, 40, 1, generator=generator, dtype=torch.float64) < 0.05)
+    step = torch.eye(40, dtype=torch.float64)[1:] - torch.eye(40, dtype=torch.float64)[:-1]
+    bones = torch.eye(5, dtype=torch.float64)
+    sums = torch.kron(torch.eye(40, dtype=torch.float64), torch.ones(1, 5, dtype=torch.float64))
+    matrix = torch.cat([data.flatten(1), 3 * torch.kron(step, bones), 3 * sums])
+    target = torch.cat([torch.zeros(400 + 39 * 5, dtype=torch.float64), torch.full((40,), 3.0, dtype=torch.float64)])
+    expected = nnls(matrix, target)
+    scale = 1 / matrix.square().sum(0)
+    result = projected_gradient(squares(matrix, target), torch.full((200,), 0.2, dtype=torch.float64), scale=scale)
+    assert expected.converged
+    assert expected.objective * (1 - 1e-9) <= float(result.cost) <= expected.objective * 1.01
+
+
+def test_a_batch_equals_a_loop():
+    matrix, target = problem(1, batch=(2, 3))
+    start = torch.rand(2, 3, 12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    batch = projected_gradient(squares(matrix, target), start)
+    for index in np.ndindex(2, 3):
+        alone = projected_gradient(squares(matrix[index], target[index]), start[index])
+        torch.testing.assert_close(batch.x[index], alone.x, atol=1e-8, rtol=1e-8)
+        torch.testing.assert_close(batch.cost[index], alone.cost)
+    assert batch.converged.all()
+
+
+def test_the_cost_never_rises_with_more_steps():
+    matrix, target = problem(2, 60, 50)
+    matrix = matrix * torch.logspace(-1, 1, 50, dtype=torch.float64)
+    start = torch.ones(50, dtype=torch.float64)
+    costs = [float(projected_gradient(squares(matrix, target), start, max_steps=steps).cost) for steps in range(1, 60)]
+    assert all(after <= before for before, after in pairwise(costs))
+
+
+def test_scaling_by_the_curvature_saves_steps_where_units_differ():
+    matrix, target = problem(3)
+    matrix = matrix * torch.logspace(-3, 3, 12, dtype=torch.float64)
+    start = torch.zeros(12, dtype=torch.float64)
+    scaled = projected_gradient(squares(matrix, target), start, scale=1 / matrix.square().sum(0))
+    plain = projected_gradient(squares(matrix, target), start, max_steps=scaled.num_steps)
+    assert float(scaled.cost) == pytest.approx(dense_nnls(matrix.numpy(), target.numpy())[1] ** 2, rel=1e-6)
+    assert plain.cost > scaled.cost * (1 + 1e-6)
+    assert not bool(plain.converged)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e6])
+def test_the_unit_of_the_target_changes_nothing_but_the_unit(size):
+    matrix, target = problem(4)
+    start = torch.zeros(12, dtype=torch.float64)
+    plain = projected_gradient(squares(matrix, target), start)
+    other = projected_gradient(squares(matrix, size * target), start)
+    torch.testing.assert_close(other.x / size, plain.x, atol=1e-6, rtol=1e-5)
+
+
+def test_float32_ends_at_its_own_rounding():
+    matrix, target = problem(5)
+    result = projected_gradient(squares(matrix.float(), target.float()), torch.zeros(12))
+    assert result.x.dtype == torch.float32
+    assert bool(result.converged)
+    assert result.num_steps < 500
+    assert float(result.cost) == pytest.approx(dense_nnls(matrix.numpy(), target.numpy())[1] ** 2, rel=1e-5)
+
+
+def test_convex_costs_that_are_no_squares_meet_their_conditions():
+    # Logarithmic loss with a barrier that makes too long a step infinite.
+    matrix, target = problem(6)
+    matrix = matrix.abs()
+
+    def cost(x):
+        return (matrix @ x - (target.exp() * (matrix @ x + 0.1).log())).sum(-1)
+
+    result = projected_gradient(cost, torch.ones(12, dtype=torch.float64), max_steps=3000, tol=1e-9)
+    x = result.x.requires_grad_()
+    (slope,) = torch.autograd.grad(cost(x), x)
+    assert bool(result.converged)
+    assert slope[x > 0].abs().max() < 1e-4
+    assert slope[x == 0].min() > -1e-4
+
+
+def test_gradients_stay_at_zero_when_nothing_helps():
+    matrix, _ = problem(7)
+    cost = squares(matrix.abs(), -torch.ones(30, dtype=torch.float64))
+    result = projected_gradient(cost, torch.ones(12, dtype=torch.float64))
+    assert result.x.tolist() == [0] * 12
+    assert bool(result.converged)
+    again = projected_gradient(cost, torch.zeros(12, dtype=torch.float64))
+    assert again.num_steps == 1
+
+
+def test_negative_starts_are_clamped_and_left_as_they_were():
+    matrix, target = problem(8)
+    start = -torch.ones(12, dtype=torch.float64)
+    result = projected_gradient(squares(matrix, target), start)
+    assert start.tolist() == [-1] * 12
+    assert bool(result.converged)
+    assert not result.x.requires_grad

@@ -1,0 +1,252 @@
+"""Parts on a kinematic tree in any pose: transforms, keypoints, twists, and steps between poses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torchreg._checks import as_float_tensor, check_choice, check_shape
+from torchreg.errors import ModelError
+from torchreg.geometry.kinematic_tree import KinematicTree
+from torchreg.geometry.rigid import rigid_matrix
+from torchreg.geometry.rotation import left_jacobian, so3_exp, wrap_rotation_vector
+from torchreg.shapes.kinematics import KinematicChain, neighbor_matrix, offset_owners, part_parents
+from torchreg.shapes.pose_algebra import BASE_DOF_NAMES, BASE_DOFS, difference, retract
+
+
+class PosedTree(nn.Module):
+    """Parts on a kinematic tree with a base that moves; see `ArticulatedShape` for conventions and arguments.
+
+    Attributes:
+        is_sliding: (num_dofs,) bool, degrees of freedom in metres: the base's translation and prismatic joints.
+    """
+
+    adjacency: Tensor
+    part_index: Tensor
+    rest: Tensor
+    lower: Tensor
+    upper: Tensor
+    is_sliding: Tensor
+    _owners: Tensor
+    _part_moves: Tensor
+    _row_moves: Tensor
+    _couplings: Tensor
+
+    def __init__(
+        self, tree: KinematicTree, part_frames: Sequence[str], part_names: Sequence[str] | None, free_base: bool
+    ) -> None:
+        super().__init__()
+        if len(set(part_frames)) != len(part_frames):
+            raise ModelError("two parts share a frame; give each part a frame of its own (a fixed joint will do)")
+        names = tuple(part_frames if part_names is None else part_names)
+        if len(names) != len(part_frames) or len(set(names)) != len(names):
+            raise ModelError(f"{len(part_frames)} parts need {len(part_frames)} different names, got {len(set(names))}")
+        self.chain = KinematicChain(tree)
+        self.part_names = names
+        frames = [tree.index(name) for name in part_frames]
+        self.part_parents = tuple(part_parents(tree, frames))
+        moves = nn.functional.pad(self.chain.moves[frames], (BASE_DOFS, 0), value=1.0)
+        slides = self.chain.couplings.abs().mT @ (1 - self.chain.is_revolute) > 0
+        limit = torch.full((BASE_DOFS,), math.inf if free_base else 0.0, dtype=torch.float64)
+        lower, upper = torch.cat([-limit, self.chain.lower]), torch.cat([limit, self.chain.upper])
+        buffers = {
+            "part_index": torch.tensor(frames),
+            "adjacency": neighbor_matrix(self.part_parents),
+            "_owners": torch.tensor(offset_owners(tree, frames)),
+            "_part_moves": moves,
+            "_row_moves": moves.repeat_interleave(4, 0).unsqueeze(-2),
+            "_couplings": torch.block_diag(torch.eye(BASE_DOFS, dtype=torch.float64), self.chain.couplings),
+            "is_sliding": torch.cat([torch.arange(BASE_DOFS) < 3, slides]),
+            "lower": lower,
+            "upper": upper,
+            "rest": torch.zeros(self.num_dofs, dtype=torch.float64).clamp(lower, upper),
+        }
+        for name, value in buffers.items():
+            self.register_buffer(name, value, persistent=False)
+        self.log_length_scales = nn.Parameter(torch.zeros(len(frames), dtype=torch.float64))
+
+    @property
+    def num_dofs(self) -> int:
+        """Number of degrees of freedom: 6 of the base, then the joints."""
+        return BASE_DOFS + self.chain.num_dofs
+
+    @property
+    def num_parts(self) -> int:
+        """Number of parts."""
+        return len(self.part_names)
+
+    @property
+    def dof_names(self) -> tuple[str, ...]:
+        """Names of the degrees of freedom, in the order of a pose."""
+        return BASE_DOF_NAMES + self.chain.dof_names
+
+    def rest_pose(self) -> Tensor:
+        """Return the pose (num_dofs,) with every joint at zero, or at the limit nearest to zero."""
+        return self.rest.clone()
+
+    def check_pose(self, pose: Tensor, name: str = "pose") -> Tensor:
+        """Return ``pose`` as a tensor of this module's dtype and device; raise InputError if its size is wrong."""
+        pose = as_float_tensor(pose, name, like=self.rest)
+        check_shape(pose, name, (self.num_dofs,), batch=True)
+        return pose
+
+    def clamp(self, pose: Tensor) -> Tensor:
+        """Return the pose with joints moved to their nearest limit and the base rotation wrapped to at most pi."""
+        pose = torch.cat([pose[..., :3], wrap_rotation_vector(pose[..., 3:6]), pose[..., 6:]], dim=-1)
+        return torch.minimum(torch.maximum(pose, self.lower), self.upper)
+
+    def retract(self, pose: Tensor, step: Tensor) -> Tensor:
+        """Return the pose moved by a tangent step; the base rotation is updated by composition, ``exp(step) exp(w)``.
+
+        Args:
+            pose: (..., num_dofs).
+            step: (..., num_dofs), in the coordinates of `part_twists` with ``chart="tangent"``.
+
+        Returns:
+            (..., num_dofs).
+
+        Differentiable: in both.
+        """
+        return retract(pose, step)
+
+    def difference(self, start: Tensor, end: Tensor) -> Tensor:
+        """Return the tangent step that `retract` takes from one pose to another.
+
+        Args:
+            start: (..., num_dofs).
+            end: (..., num_dofs), with batch dimensions that broadcast with the start's.
+
+        Returns:
+            (..., num_dofs); the base's rotation by an angle of at most pi.
+
+        Differentiable: in both, where that angle is below pi.
+        """
+        return difference(start, end)
+
+    def frame_transforms(self, pose: Tensor) -> Tensor:
+        """Return ``T_world_frame`` of every frame of the tree.
+
+        Args:
+            pose: (..., num_dofs).
+
+        Returns:
+            (..., F, 4, 4).
+
+        Raises:
+            InputError: if the pose has the wrong size.
+
+        Differentiable: in ``pose`` and `log_length_scales`.
+        """
+        check_shape(pose, "pose", (self.num_dofs,), batch=True)
+        base = rigid_matrix(so3_exp(pose[..., 3:6]), pose[..., :3])
+        return base.unsqueeze(-3) @ self.chain(pose[..., 6:], self._offset_scales())
+
+    def part_transforms(self, pose: Tensor) -> Tensor:
+        """Return ``T_world_part`` of every part, ``p_world = T_world_part @ p_part``.
+
+        Args:
+            pose: (..., num_dofs).
+
+        Returns:
+            (..., P, 4, 4).
+
+        Raises:
+            InputError: if the pose has the wrong size.
+
+        Differentiable: in ``pose`` and `log_length_scales`.
+        """
+        return self.frame_transforms(pose).index_select(-3, self.part_index)
+
+    def keypoints(self, pose: Tensor) -> Tensor:
+        """Return the keypoints of the shape: the origins of the parts.
+
+        Args:
+            pose: (..., num_dofs).
+
+        Returns:
+            (..., P, 3), metres.
+
+        Raises:
+            InputError: if the pose has the wrong size.
+
+        Differentiable: in ``pose`` and `log_length_scales`.
+        """
+        return self.placed_keypoints(self.part_transforms(pose))
+
+    def placed_keypoints(self, transforms: Tensor) -> Tensor:
+        """Return the keypoints for given part transforms.
+
+        Args:
+            transforms: (..., P, 4, 4) ``T_world_part``.
+
+        Returns:
+            (..., K, 3), metres, as `keypoints`.
+
+        Differentiable: in ``transforms`` and `log_length_scales`.
+        """
+        return transforms[..., :3, 3]
+
+    def part_twists(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
+        """Return the part transforms and the twist each degree of freedom gives to each part.
+
+        A point x of part p moves by ``twist[p, k, :3] + twist[p, k, 3:] x x`` per unit of degree of freedom k.
+
+        Args:
+            pose: (..., num_dofs).
+            chart: "pose" for derivatives with respect to the pose vector, "tangent" for steps taken with `retract`.
+
+        Returns:
+            transforms (..., P, 4, 4) and twists (..., P, num_dofs, 6) as (translation, rotation).
+
+        Differentiable: in ``pose``.
+        """
+        transforms, linear, angular = self._twists(pose, chart)
+        twists = torch.cat([linear, angular], dim=-1).unsqueeze(-3) * self._part_moves.unsqueeze(-1)
+        return transforms, self._couplings.mT @ twists if self.chain.has_mimics else twists
+
+    def _twists(self, pose: Tensor, chart: str) -> tuple[Tensor, Tensor, Tensor]:
+        """Return part transforms and the twists of base and moving joints: linear and angular (..., 6 + J, 3)."""
+        frames = self.frame_transforms(pose)
+        joints = self.chain.joint_twists(frames)[0]
+        linear, angular = _base_twists(pose, chart)
+        linear = torch.cat([linear, joints[..., :3]], dim=-2)
+        return frames.index_select(-3, self.part_index), linear, torch.cat([angular, joints[..., 3:]], dim=-2)
+
+    def transform_jacobian(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
+        """Return the stacked part transforms, in whose rows skins are linear, and their analytic derivatives.
+
+        Args:
+            pose: (..., num_dofs).
+            chart: see `part_twists`.
+
+        Returns:
+            Rows (..., 4 P, 3), for each part the transposed ``[R | t]``, and derivatives (..., 4 P, 3, num_dofs).
+
+        Differentiable: in ``pose``.
+        """
+        transforms, linear, angular = self._twists(pose, chart)
+        rows = transforms.mT
+        # An axis e turns by ``angular x e``; the row of a translation, whose fourth entry is one, also moves.
+        identity = torch.eye(3, dtype=pose.dtype, device=pose.device).unsqueeze(-2)
+        angular = angular.unsqueeze(-3)
+        turns = torch.linalg.cross(angular, identity.expand(*angular.shape[:-3], 3, 1, 3))
+        motions = torch.cat([turns, linear.unsqueeze(-3)], dim=-3).mT.flatten(-2)
+        derivative = (rows.flatten(-3, -2) @ motions).unflatten(-1, (3, -1)) * self._row_moves
+        derivative = derivative @ self._couplings if self.chain.has_mimics else derivative
+        return rows[..., :3].flatten(-3, -2), derivative
+
+    def _offset_scales(self) -> Tensor:
+        """Return the factors (F,) on the length of each frame's offset from its parent."""
+        return nn.functional.pad(self.log_length_scales, (1, 0)).index_select(0, self._owners).exp()
+
+
+def _base_twists(pose: Tensor, chart: str) -> tuple[Tensor, Tensor]:
+    """Return the twists of the base's degrees of freedom: linear and angular (..., 6, 3)."""
+    check_choice(chart, "chart", ("pose", "tangent"))
+    identity = torch.eye(3, dtype=pose.dtype, device=pose.device).expand(*pose.shape[:-1], 3, 3)
+    angular = identity if chart == "tangent" else left_jacobian(pose[..., 3:6]).mT
+    linear = torch.linalg.cross(pose[..., None, :3].expand_as(angular), angular)
+    return torch.cat([identity, linear], dim=-2), torch.cat([torch.zeros_like(identity), angular], dim=-2)
