@@ -16,7 +16,7 @@ from torchreg.registration.bones.alternation import ReducedFit
 from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.align_scans import align_scans
 from torchreg.registration.dense.config import ScanAlignConfig
-from torchreg.registration.normalization import ScanUnit
+from torchreg.registration.normalization import Normalization
 from torchreg.registration.register import source_samples
 from torchreg.registration.register_sequence import register_sequence
 
@@ -133,8 +133,8 @@ def test_all_frames_are_fitted_to_the_dense_alignments_and_bones_hold_each_other
     assert {name: getattr(fits[0].config, name) for name in held} == held
     assert fits[0].data.linked
     index = source_samples(toy[0], config, None)
-    unit = ScanUnit.of(toy[0].points[index])
-    expected = torch.stack([unit.of_points(points)[index] for points in (toy[0].points, *(r.points for r in reached))])
+    unit = Normalization.from_points(toy[0].points[index])
+    expected = torch.stack([unit.normalize(points)[index] for points in (toy[0].points, *(r.points for r in reached))])
     torch.testing.assert_close(fits[0].samples.moved, expected)
 
 

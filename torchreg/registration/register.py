@@ -20,7 +20,7 @@ from torchreg.registration.bones.labels import CellData, labels_of_parts
 from torchreg.registration.bones.sparse_grid import MAX_RESOLUTION, SparseGrid
 from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.align_scans import align_scans
-from torchreg.registration.normalization import ScanUnit
+from torchreg.registration.normalization import Normalization
 from torchreg.registration.results import RegisterRecord, ScanRegistration
 from torchreg.result import Status
 
@@ -85,8 +85,8 @@ def register(
     parts = None if parts is None else checked_parts(source, parts, num_bones)
     clock = Clock()
     index = source_samples(source, config, generator)
-    unit = ScanUnit.of(source.points[index])
-    scan, other = unit.of_scan(source), unit.of_scan(target)
+    normalization = Normalization.from_points(source.points[index])
+    scan, other = normalization.normalize_scan(source), normalization.normalize_scan(target)
     # Line 1 of the algorithm: the grid.
     grid = SparseGrid.from_points(scan.points, grid_resolution)
     data = CellData(grid, scan.points[index], config.num_patches)
@@ -95,7 +95,7 @@ def register(
     if start is None:
         aligned = align_scans(source, target, config.align, generator=generator, on_step=initial_records(on_step))
         start, confidence = aligned.points, aligned.confidence
-    moved = unit.of_points(start)
+    moved = normalization.normalize(start)
     trust = torch.ones_like(moved[:, 0]) if confidence is None else confidence.detach().cpu().double()
     samples = Samples(
         scan.points[index], scan.normals[index], moved[None, index], trust[None, index].clamp(min=LEAST_CONFIDENCE)
@@ -109,14 +109,14 @@ def register(
     # Line 9: continuous weights.
     settled = fit.refine() and settled
     clock.lap()
-    return _result(source, scan, other, unit, fit, settled, clock.seconds)
+    return _result(source, scan, other, normalization, fit, settled, clock.seconds)
 
 
 def _result(
     source: RangeScan,
     scan: RangeScan,
     other: RangeScan,
-    unit: ScanUnit,
+    normalization: Normalization,
     fit: ReducedFit,
     settled: bool,
     seconds: Tensor,
@@ -133,16 +133,16 @@ def _result(
     )
     like = source.points
     fit.model.set_transforms_(fit.model.transforms.detach()[0])
-    model = fit.model.rescaled(unit.size, unit.middle).to(dtype=like.dtype, device=like.device)
+    model = fit.model.rescaled(normalization.scale, normalization.center).to(dtype=like.dtype, device=like.device)
     return ScanRegistration(
         model,
         like.detach(),
         source.faces,
-        unit.points_back(moved, like),
+        normalization.denormalize(moved, like),
         weights.argmax(-1).to(like.device),
         model.transforms.detach(),
         weights.to(like),
-        (unit.size * nearest_neighbor(moved, other.points)[1]).to(like),
+        (normalization.scale * nearest_neighbor(moved, other.points)[1]).to(like),
         found.kept.to(like.device),
         fit_status(found.counts.kept / len(points), settled, config),
         seconds,

@@ -19,7 +19,7 @@ from torchreg.registration.bones.labels import CellData
 from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.align_scans import align_scans
-from torchreg.registration.normalization import ScanUnit
+from torchreg.registration.normalization import Normalization
 from torchreg.registration.register import (
     LEAST_CONFIDENCE,
     check_inputs,
@@ -96,19 +96,19 @@ def register_sequence(
         raise InputError(f"reference must be below the number of scans {len(scans)}, got {reference}")
     source = scans[reference]
     index = source_samples(source, config, generator)
-    unit = ScanUnit.of(source.points[index])
+    normalization = Normalization.from_points(source.points[index])
     reached, confidence = _chain(scans, reference, num_bones, grid_resolution, _carrying(config), generator, on_step)
-    scan = unit.of_scan(source)
+    scan = normalization.normalize_scan(source)
     held = _held(config)
     grid = SparseGrid.from_points(scan.points, grid_resolution)
     data = CellData(grid, scan.points[index], held.num_patches, linked=True)
-    places = unit.of_points(reached)[:, index]
+    places = normalization.normalize(reached)[:, index]
     trust = confidence[:, index].double().clamp(min=LEAST_CONFIDENCE)
     samples = Samples(scan.points[index], scan.normals[index], places, trust)
-    fit = ReducedFit(data, samples, [unit.of_scan(other) for other in scans], num_bones, held, on_step)
+    fit = ReducedFit(data, samples, [normalization.normalize_scan(other) for other in scans], num_bones, held, on_step)
     settled = fit.fit_labels()
     settled = fit.refine() and settled
-    return _result(scans, reference, unit, fit, settled)
+    return _result(scans, reference, normalization, fit, settled)
 
 
 def _carrying(config: RegisterConfig) -> RegisterConfig:
@@ -184,25 +184,25 @@ def _expected(places: dict[int, Tensor], frame: int, step: int) -> Tensor | None
 
 
 def _result(
-    scans: tuple[RangeScan, ...], reference: int, unit: ScanUnit, fit: ReducedFit, settled: bool
+    scans: tuple[RangeScan, ...], reference: int, normalization: Normalization, fit: ReducedFit, settled: bool
 ) -> SequenceRegistration:
     """Return what was found, in the unit and frame of the scans."""
     source = scans[reference]
-    like, points = source.points, unit.of_points(source.points)
+    like, points = source.points, normalization.normalize(source.points)
     weights = fit.model.weights_at(points)
     moved = fit.model.move(points, weights)
-    fused, normals, frames = _fused(scans, unit, moved, weights, fit.model.transforms.detach())
+    fused, normals, frames = _fused(scans, normalization, moved, weights, fit.model.transforms.detach())
     shares = fit.history[-1].kept / (len(scans) * len(fit.samples.points))
-    model = fit.model.rescaled(unit.size, unit.middle).to(dtype=like.dtype, device=like.device)
+    model = fit.model.rescaled(normalization.scale, normalization.center).to(dtype=like.dtype, device=like.device)
     return SequenceRegistration(
         model,
         like.detach(),
         source.faces,
-        unit.points_back(moved, like),
+        normalization.denormalize(moved, like),
         weights.argmax(-1).to(like.device),
         model.transforms.detach(),
         weights.to(like),
-        unit.points_back(fused, like),
+        normalization.denormalize(fused, like),
         normals.to(like),
         frames.to(like.device),
         reference,
@@ -212,7 +212,7 @@ def _result(
 
 
 def _fused(
-    scans: tuple[RangeScan, ...], unit: ScanUnit, moved: Tensor, weights: Tensor, transforms: Tensor
+    scans: tuple[RangeScan, ...], normalization: Normalization, moved: Tensor, weights: Tensor, transforms: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return all points (K, 3) of all scans in the pose of the reference, their normals and the frames they are from.
 
@@ -220,7 +220,7 @@ def _fused(
     """
     places, sides, frames = [], [], []
     for frame, scan in enumerate(scans):
-        local = unit.of_scan(scan)
+        local = normalization.normalize_scan(scan)
         near, _ = nearest_neighbor(local.points, moved[frame])
         blended = torch.einsum("nb,bij->nij", weights[near], transforms[frame])
         shift = (local.points - blended[:, :3, 3]).unsqueeze(-1)
