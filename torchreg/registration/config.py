@@ -1,4 +1,4 @@
-"""How scans are registered: settings of the dense alignment and of the bones fitted to it."""
+"""Settings of scan registration: of the dense alignment and of the bones fitted to it."""
 
 from __future__ import annotations
 

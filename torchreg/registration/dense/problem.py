@@ -120,17 +120,9 @@ def describe(
     regions = _wide_regions(graph, ways, nodes.nodes, config)
     far = _far_apart(ways, config)
     return ScanAlignProblem(
-        graph=graph,
-        source=one,
-        target=other,
-        regions=regions,
-        far=far,
-        free=free,
-        samples=samples,
-        nodes=samples[nodes.nodes],
-        unit=unit,
-        expected=ahead,
-    )
+        graph=graph, source=one, target=other, regions=regions, far=far, free=free,
+        samples=samples, nodes=samples[nodes.nodes], unit=unit, expected=ahead,
+    )  # fmt: skip
 
 
 def _far_apart(ways: Graph, config: ScanAlignConfig) -> Tensor:
