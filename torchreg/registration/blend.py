@@ -9,6 +9,7 @@ from torchreg._checks import check_finite
 from torchreg.errors import InputError
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import skew, so3_exp
+from torchreg.geometry.rotation_representations import quaternion_from_rotation
 
 
 def turn_about(transforms: Tensor, twists: Tensor, centers: Tensor) -> Tensor:
@@ -121,29 +122,9 @@ def blend_dual_quaternion_jacobian(points: Tensor, weights: Tensor, transforms: 
     return product * share.unsqueeze(-3)
 
 
-def rotation_to_quaternion(rotation: Tensor) -> Tensor:
-    """Return unit quaternions (..., 4), scalar first, of rotation matrices (..., 3, 3).
-
-    The symmetric matrix 4 q q^T is filled in and its row with the largest diagonal normalized, so that no angle loses
-    digits.
-
-    Differentiable: in ``rotation``, at every angle.
-    """
-    r = rotation
-    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    wx, wy, wz = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
-    xy, xz, yz = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
-    squares = torch.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], dim=-1)
-    ww, xx, yy, zz = squares.unbind(-1)
-    entries = [ww, wx, wy, wz, wx, xx, xy, xz, wy, xy, yy, yz, wz, xz, yz, zz]
-    rows = torch.stack(entries, dim=-1).unflatten(-1, (4, 4))
-    best = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
-    return torch.nn.functional.normalize(rows.gather(-2, best).squeeze(-2), dim=-1)
-
-
 def _signed_quaternions(weights: Tensor, transforms: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return real and dual parts (..., B, 4) of the bones, and the sign (..., N, B) that each takes at each point."""
-    real = rotation_to_quaternion(transforms[..., :3, :3])
+    real = quaternion_from_rotation(transforms[..., :3, :3])
     scalar, vector = real[..., :1], real[..., 1:]
     shift = transforms[..., :3, 3]
     dual = 0.5 * torch.cat(
