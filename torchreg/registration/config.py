@@ -10,7 +10,7 @@ from torchreg.registration.dense.config import ScanAlignConfig
 
 @dataclass(frozen=True)
 class RegisterConfig(BoneConfig):
-    """How a reduced deformable model is fitted to two scans or more.
+    """Settings by which a reduced deformable model is fitted to two scans or more.
 
     Args:
         align: the dense alignment from which parts are found; all others as in `BoneConfig`.

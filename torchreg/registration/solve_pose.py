@@ -35,7 +35,7 @@ HELD_JOINTS = ("tree", "all")
 
 @dataclass(frozen=True)
 class SolvePoseConfig:
-    """How a pose is solved.
+    """Settings by which a pose is solved.
 
     Args:
         hold: weight of the joints against the handles; where a target is out of reach, joints open by about its inverse

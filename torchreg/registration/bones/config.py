@@ -23,7 +23,7 @@ def _refinement() -> WeightsConfig:
 
 @dataclass(frozen=True)
 class BoneConfig:
-    """How bones, labels and weights are fitted to an alignment of a source with one scan or more.
+    """Settings by which bones, labels and weights are fitted to an alignment of a source with one scan or more.
 
     Pairs of numbers are a first and a last value, between which a setting runs in even ratios.
 

@@ -1,4 +1,4 @@
-"""How firmly the joints of a registration hold: robust weights, and stiffness against turns that scans do not show."""
+"""Robust weights of the joints of a registration, and their stiffness against turns that scans do not show."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ class CellData:
         points: (n, 3) samples before they are moved.
         num_patches: of the cells, about, from which parts are merged.
         linked: whether labels of separate regions should agree with those of the cells nearest to them.
-        gap: empty cells between regions that belong together all the same: holes of scans cut limbs in two.
+        gap: most empty cells between regions that count as connected: holes of scans cut limbs in two.
     """
 
     grid: SparseGrid
@@ -57,7 +57,7 @@ class CellData:
 
     @cached_property
     def patch_count(self) -> int:
-        """How many patches there are."""
+        """Number of patches."""
         return int(self.patches.max()) + 1
 
     def per_cell(self, weights: Tensor) -> float:
@@ -112,7 +112,7 @@ def first_labels(data: CellData, moved: Tensor, weights: Tensor, num_bones: int,
     moments, patches = data.moments(moved, weights), data.patches
     part = merge_rigid(moments, patches[data.bridged], num_bones, tolerance=costs.label / data.per_cell(weights))
     if int(part.max()) >= num_bones:
-        # Regions that touch nothing: what moves most alike is one part all the same.
+        # Of regions that touch nothing, those that move most alike become one part.
         joined = moments.joined(part, int(part.max()) + 1)
         pairs = torch.combinations(torch.arange(joined.num_groups, device=part.device))
         part = merge_rigid(joined, pairs, num_bones)[part]

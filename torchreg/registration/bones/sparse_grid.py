@@ -248,7 +248,7 @@ class SparseGrid:
         return torch.stack([number // self.num_cells, number % self.num_cells], dim=-1)
 
     def regions(self, gap: float = 0.0) -> Tensor:
-        """Return which connected region (C,) int64 each cell belongs to; see `neighbors` for ``gap``."""
+        """Return the connected region (C,) int64 of each cell; see `neighbors` for ``gap``."""
         return connected_components(self.neighbors(gap), self.num_cells)
 
     def links(self) -> Tensor:
