@@ -43,8 +43,8 @@ class BoneConfig:
         truncation: largest distance of a sample in the W-step, in cells.
         reuse: whether labels that lost all their cells are given to the regions with the largest residuals.
         joint_weight: beta, the weight of the joints against the mean squared distance, over the rounds of labels; zeros
-            leave joints out, and with them the costs of turns. The paper has (1, 0.05), to hold bones together where
-            matches do not; here the dense alignment does, and joints that are no points, or wrong, should not resist.
+            leave out joints and the costs of turns, and the paper's (1, 0.05) holds bones together where matches do
+            not, which here the dense alignment does, so that joints that are wrong need not resist.
         joint_scale: robust scale of the gaps that motions tear open at joints, since not all that meets is joined; it
             starts wide, as labels are coarse at first and tear joints.
         turn_weight: cost per squared radian by which bones that share weight turn against each other, so that the twist
