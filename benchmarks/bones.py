@@ -28,11 +28,12 @@ from torch import Tensor
 
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
+from torchreg.registration.bones.correspondences import Correspondences
 from torchreg.registration.bones.grid_lbs import GridLBS
-from torchreg.registration.bones.motion_problem import BoneProblem, bind
+from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
 from torchreg.registration.bones.motions import fit_bones
 from torchreg.registration.bones.sparse_grid import SparseGrid
-from torchreg.registration.bones.weights import RefineConfig, refine_weights
+from torchreg.registration.bones.weights import WeightsConfig, refine_weights
 from torchreg.registration.solve_pose import PoseSolver
 
 
@@ -97,8 +98,10 @@ def measure(bones: int, dtype: torch.dtype, scale: float, repeats: int) -> list[
         weights, moments = model.weights_at(points[few]), model.joint_moments()
         targets = model(points[few], bent) + 0.01 * torch.randn(len(few), 3, generator=generator).to(points)
         binary = torch.nn.functional.one_hot(weights.argmax(-1), bones).to(points)
-        for name, some in (("binary", binary), ("blended", weights)):
-            problem = BoneProblem(points[few], bind(some), targets, tube.normals[few], moments=moments)
+        pairs = Correspondences(targets, tube.normals[few], torch.ones_like(targets[:, 0]), 0.0)
+        for name, shares in (("binary", binary), ("blended", weights)):
+            bodies = BoneBodies.from_weights(points[few], shares)
+            problem = BoneProblem(points[few], Binding.from_weights(shares), pairs, bodies, moments)
             rows.append((f"T-step, {name}", milliseconds(lambda p=problem: fit_bones(p, bent, max_steps=1), repeats)))
     rows += refinement_rows(tube, few[: int(1500 * scale)], max(1, repeats // 10))
     return rows + pose_rows(tube, repeats)
@@ -112,12 +115,13 @@ def refinement_rows(tube: Tube, few: Tensor, repeats: int) -> list[tuple[str, st
     smooth = smooth - torch.cat([share, torch.zeros_like(share[:, :1])], dim=-1)
     moved = points @ model.transforms[:, :3, :3].mT + model.transforms[:, None, :3, 3]
     targets = (smooth.mT.unsqueeze(-1) * moved).sum(0).detach()
+    pairs = Correspondences(targets, tube.normals[few], torch.ones_like(targets[:, 0]), 0.0)
     rows, objectives = [], []
     for method in ("active_set", "gradient"):
-        config = RefineConfig(method=method)
+        config = WeightsConfig(method=method)
 
-        def run(config: RefineConfig = config) -> float:
-            return refine_weights(model, points, targets, tube.normals[few], config=config).objective
+        def run(config: WeightsConfig = config) -> float:
+            return refine_weights(model, points, pairs, config).objective
 
         rows.append((f"refine, {method}", milliseconds(run, repeats)))
         objectives.append(run())
@@ -136,7 +140,7 @@ def pose_rows(tube: Tube, repeats: int) -> list[tuple[str, str]]:
         targets = model(handles, tube.pose(0.2 + angle / max(1, length - 1))).detach()
         solution = solver.solve(handles, targets)
         figure = milliseconds(lambda t=targets: solver.solve(handles, t), repeats)
-        miss = float(solution.misses.max()) / length
+        miss = float(solution.residuals.max()) / length
         rows.append((f"pose, {name}", f"{figure}, {solution.num_steps} steps, off by {100 * miss:.2f} % of the length"))
     return rows
 

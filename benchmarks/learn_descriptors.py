@@ -55,7 +55,7 @@ def moments(pair: ScanPair, config: ScanAlignConfig, generator: torch.Generator)
     problem = describe(pair.source, pair.target, config, generator)
     source = problem.source.first(min(config.match.num_points, len(problem.samples)))
     target = problem.target.first(SCENE)
-    truth = problem.unit.of_points(pair.truth.double())[problem.samples[: len(source)]]
+    truth = problem.unit.normalize(pair.truth.double())[problem.samples[: len(source)]]
     same, apart = nearest_neighbor(truth, target.points)
     seen = (apart < SAME).nonzero()[:, 0]
     here, there = (_described(samples, scan) for samples, scan in ((source, problem.source), (target, problem.target)))

@@ -40,7 +40,7 @@ from torchreg.registration.dense.isometry import consistent_matches
 from torchreg.registration.dense.learned_descriptors import CURVATURE_RADII, learned_descriptors
 from torchreg.registration.dense.oriented_samples import OrientedSamples, scaled_together
 from torchreg.registration.dense.spin_images import spin_images
-from torchreg.registration.normalization import ScanUnit
+from torchreg.registration.normalization import Normalization
 from torchreg.solvers.ransac import ransac_rigid
 
 RIGHT = 0.05
@@ -155,11 +155,11 @@ def images(pair: Pair, here: Tensor, there: Tensor, divisions: float) -> tuple[T
 
 def learned(pair: Pair, here: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
     """Return learned descriptors (Q, 32) of source and target points."""
-    unit = ScanUnit.of(pair.source.points[pair.source.uniform_subsample(NUM_SCENE)])
+    unit = Normalization.from_points(pair.source.points[pair.source.uniform_subsample(NUM_SCENE)])
     few, scenes = [], []
     for scan, which in ((pair.source, here), (pair.target, there)):
         for samples, rows in ((few, which), (scenes, scan.uniform_subsample(NUM_SCENE))):
-            samples.append((unit.of_points(scan.points[rows]), scan.normals[rows].double()))
+            samples.append((unit.normalize(scan.points[rows]), scan.normals[rows].double()))
     curvature = [curvature_features(*one, *scene, CURVATURE_RADII) for one, scene in zip(few, scenes, strict=True)]
     features = scaled_together(*curvature)
     first, second = (

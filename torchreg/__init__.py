@@ -37,7 +37,7 @@ _NAMES = {
     "registration.register": "register",
     "registration.register_sequence": "register_sequence",
     "registration.results": "PoseSolution ScanRegistration SequenceRegistration",
-    "registration.solve_pose": "solve_pose",
+    "registration.solve_pose": "SolvePoseConfig solve_pose",
     "result": "Status",
     "shapes.articulated": "ArticulatedShape",
     "shapes.hand": "Hand",

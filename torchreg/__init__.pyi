@@ -39,6 +39,7 @@ from torchreg.registration.register_sequence import register_sequence as registe
 from torchreg.registration.results import PoseSolution as PoseSolution
 from torchreg.registration.results import ScanRegistration as ScanRegistration
 from torchreg.registration.results import SequenceRegistration as SequenceRegistration
+from torchreg.registration.solve_pose import SolvePoseConfig as SolvePoseConfig
 from torchreg.registration.solve_pose import solve_pose as solve_pose
 from torchreg.result import Status as Status
 from torchreg.shapes.articulated import ArticulatedShape as ArticulatedShape
@@ -97,6 +98,7 @@ __all__ = [
     "SilhouetteFrames",
     "Skeleton",
     "SkeletonizeConfig",
+    "SolvePoseConfig",
     "Spine",
     "SpineConfig",
     "SpineSequence",

@@ -8,8 +8,9 @@ import torch
 
 from torchreg.geometry.rigid import rigid_matrix, se3_exp
 from torchreg.geometry.rotation import so3_exp
+from torchreg.registration.bones.correspondences import Correspondences
 from torchreg.registration.bones.grid_lbs import GridLBS
-from torchreg.registration.bones.motion_problem import BoneProblem, bind
+from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
 from torchreg.registration.bones.sparse_grid import SparseGrid
 
 BONES = 3
@@ -44,6 +45,19 @@ def bent(angle=0.6):
     return se3_exp(torch.tensor([0.1, -0.2, 0.1, 0.2, 0.1, 0], dtype=torch.float64)) @ torch.stack(motions)
 
 
+def problem_of(points, weights, targets, normals=None, match_weights=None, point_to_point=0.0, **terms):
+    """The energy of bones with weights at points, matched with targets."""
+    weights = weights.detach()
+    match_weights = torch.ones_like(targets[..., 0]) if match_weights is None else match_weights
+    return BoneProblem(
+        points=points,
+        binding=Binding.from_weights(weights),
+        correspondences=Correspondences(targets, normals, match_weights, point_to_point),
+        bodies=BoneBodies.from_weights(points, weights),
+        **terms,
+    )
+
+
 def noisy_problem(blend="linear", share=0.0, batch=(2,)):
     points, _ = limb(60)
     model = model_of(points, blend, 8)
@@ -53,13 +67,13 @@ def noisy_problem(blend="linear", share=0.0, batch=(2,)):
     normals = torch.nn.functional.normalize(draw(*batch, 60, 3, seed=1), dim=-1)
     match_weights = draw(*batch, 60, seed=2).clamp_min(0)
     targets = points + 0.1 * draw(*batch, 60, 3, seed=3)
-    problem = BoneProblem(
+    problem = problem_of(
         points,
-        bind(weights),
+        weights,
         targets,
         normals,
         match_weights,
-        point_to_point=share,
+        share,
         moments=moments,
         joint_weight=0.7,
         pair_weights=torch.linspace(0.5, 1.5, len(moments.pairs)).double(),
@@ -73,7 +87,7 @@ def noisy_problem(blend="linear", share=0.0, batch=(2,)):
 @pytest.fixture(scope="session")
 def bones():
     """A limb of three bones: how to make it, its model, poses and noisy matches."""
-    makers = (draw, limb, model_of, bent, noisy_problem)
+    makers = (draw, limb, model_of, bent, problem_of, noisy_problem)
     return SimpleNamespace(COUNT=BONES, **{maker.__name__: maker for maker in makers})
 
 

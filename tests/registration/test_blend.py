@@ -13,7 +13,6 @@ from torchreg.registration.blend import (
     blend_dual_quaternion_jacobian,
     blend_linear,
     blend_linear_jacobian,
-    rotation_to_quaternion,
     turn_about,
 )
 
@@ -138,18 +137,3 @@ def test_turning_about_a_point_keeps_it_and_shifts_it():
     zero = torch.zeros(4, 6, dtype=torch.float64, requires_grad=True)
     torch.testing.assert_close(turn_about(transforms, zero, centers), transforms)
     assert torch.autograd.gradcheck(lambda z: turn_about(transforms, z, centers), (zero,))
-
-
-def test_quaternions_at_every_angle():
-    generator = np.random.default_rng(0)
-    axes = generator.normal(size=(60, 3))
-    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
-    angles = np.concatenate([np.zeros(20), np.full(20, np.pi), generator.uniform(0, np.pi, 20)])
-    axes[20:29] = np.eye(3)[[0, 1, 2] * 3]
-    matrices = torch.from_numpy(Rotation.from_rotvec(axes * angles[:, None]).as_matrix())
-    found = rotation_to_quaternion(matrices)
-    torch.testing.assert_close(found.norm(dim=-1), torch.ones(60, dtype=torch.float64))
-    again = Rotation.from_quat(found.numpy()[:, [1, 2, 3, 0]]).as_matrix()
-    np.testing.assert_allclose(again, matrices.numpy(), atol=1e-12)
-    some = matrices[[0, 20, 25, 50]].clone().requires_grad_()
-    assert torch.autograd.gradcheck(rotation_to_quaternion, (some,))

@@ -1,10 +1,11 @@
-"""Settings of scan registration: what is out of range is refused by name."""
+"""Settings of scan registration: values out of range are refused by name, pairs run in even ratios."""
 
 import math
 
 import pytest
 
 from torchreg.errors import InputError, InputTypeError
+from torchreg.registration.annealing import geometric_at
 from torchreg.registration.config import RegisterConfig
 
 
@@ -40,3 +41,8 @@ def test_the_weight_of_joints_falls_in_even_ratios():
     expected = [math.exp(k * math.log(0.05) / 5) for k in range(6)] + [0.05, 0.05]
     assert weights == pytest.approx(expected)
     assert RegisterConfig(joint_weight=(0.0, 0.0)).joint_weight_at(0.5) == 0
+
+
+def test_values_between_first_and_last_are_in_even_ratios():
+    values = [geometric_at((8.0, 0.5), progress) for progress in (0, 0.5, 1, 2)]
+    assert values == pytest.approx([8, 2, 0.5, 0.5])

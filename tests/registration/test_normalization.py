@@ -2,7 +2,7 @@ import torch
 
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import transform_points
-from torchreg.registration.normalization import ScanUnit
+from torchreg.registration.normalization import Normalization
 
 F64 = torch.float64
 
@@ -21,23 +21,23 @@ def motions(count):
 
 def test_size_follows_the_unit_and_not_the_turn():
     points, motion = cloud(), motions(1)[0]
-    unit = ScanUnit.of(points)
-    turned = ScanUnit.of(7 * transform_points(motion, points))
-    assert abs(turned.size - 7 * unit.size) < 1e-12 * turned.size
-    torch.testing.assert_close(turned.middle, 7 * transform_points(motion, unit.middle[None])[0])
-    assert bool(unit.of_points(points).mean(0).abs().max() < 1e-12)
+    normalization = Normalization.from_points(points)
+    turned = Normalization.from_points(7 * transform_points(motion, points))
+    assert abs(turned.scale - 7 * normalization.scale) < 1e-12 * turned.scale
+    torch.testing.assert_close(turned.center, 7 * transform_points(motion, normalization.center[None])[0])
+    assert bool(normalization.normalize(points).mean(0).abs().max() < 1e-12)
 
 
 def test_points_and_scans_come_back():
     points = cloud().float()
-    unit = ScanUnit.of(points)
-    torch.testing.assert_close(unit.points_back(unit.of_points(points), points), points)
+    normalization = Normalization.from_points(points)
+    torch.testing.assert_close(normalization.denormalize(normalization.normalize(points), points), points)
     scan = RangeScan(points, normals=torch.nn.functional.normalize(points, dim=-1))
-    torch.testing.assert_close(unit.of_scan(scan).points, unit.of_points(points))
+    torch.testing.assert_close(normalization.normalize_scan(scan).points, normalization.normalize(points))
 
 
 def test_motions_mean_the_same_in_both_coordinates():
     points, transforms = cloud(), motions(4)
-    unit = ScanUnit.of(points)
-    there = unit.points_back(transform_points(transforms, unit.of_points(points)), points)
-    torch.testing.assert_close(transform_points(unit.transforms_back(transforms), points), there)
+    normalization = Normalization.from_points(points)
+    there = normalization.denormalize(transform_points(transforms, normalization.normalize(points)), points)
+    torch.testing.assert_close(transform_points(normalization.denormalize_motions(transforms), points), there)

@@ -1,7 +1,6 @@
 """Many scans together: every frame reached, one set of weights, all points in one pose, bad input."""
 
 import math
-import sys
 from dataclasses import replace
 
 import pytest
@@ -12,13 +11,9 @@ from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.neighbors import nearest_neighbor
-from torchreg.registration.bones.alternation import ReducedFit
 from torchreg.registration.config import RegisterConfig
-from torchreg.registration.dense.align_scans import align_scans
 from torchreg.registration.dense.config import ScanAlignConfig
-from torchreg.registration.normalization import ScanUnit
-from torchreg.registration.register import source_samples
-from torchreg.registration.register_sequence import register_sequence
+from torchreg.registration.register_sequence import ALL_FRAMES, FRAME_TO_FRAME, register_sequence
 
 QUICK = RegisterConfig(align=ScanAlignConfig(num_samples=300, num_target_samples=400), num_samples=500)
 
@@ -64,48 +59,30 @@ def test_results_are_the_same_on_disk(found, tmp_path):
     assert back.history == found.history
 
 
-def test_points_are_expected_to_go_on_as_they_went(toy, monkeypatch):
-    calls = []
-
-    def watched(source, target, config, **options):
-        aligned = align_scans(source, target, config, **options)
-        calls.append((source.points, options["expected"]))
-        return aligned
-
-    # The package has a function of the module's name.
-    monkeypatch.setattr(sys.modules[register_sequence.__module__], "align_scans", watched)
-    register_sequence([toy[frame] for frame in (0, 1, 2, 1)], 8, 30, QUICK, reference=1)
-    (first, nothing), (second, ahead), (third, back) = calls
-    assert nothing is None
-    assert torch.equal(first, toy[1].points)
-    torch.testing.assert_close(ahead, second + 0.5 * (second - first))
+def test_points_are_predicted_by_half_their_last_step():
+    first, second = torch.zeros(5, 3), torch.ones(5, 3)
+    assert FRAME_TO_FRAME.predict({2: first}, 3, 1) is None
+    assert torch.equal(FRAME_TO_FRAME.predict({2: first, 3: second}, 4, 1), 1.5 * second)
     # Towards earlier frames, against the way that later ones were reached.
-    assert torch.equal(third, first)
-    torch.testing.assert_close(back, first - 0.5 * (second - first))
+    assert torch.equal(FRAME_TO_FRAME.predict({2: first, 3: second}, 1, -1), -0.5 * second)
 
 
 @pytest.mark.parametrize(
-    ("given", "carried"),
+    ("given", "expected"),
     [
         ({"point_to_point": 0.01, "joint_weight": (0.001, 0.001)}, (0.1, (1e-4, 1e-4))),
         ({"point_to_point": 0.5, "joint_weight": (1e-5, 1e-6)}, (0.5, (1e-5, 1e-6))),
         ({"joint_weight": (0.0, 0.0)}, (0.1, (0.0, 0.0))),
     ],
 )
-def test_what_is_carried_is_held_along_the_surface_and_not_by_joints(toy, monkeypatch, given, carried):
-    settings = []
-
-    def watched(source, target, num_bones, grid_resolution, config, generator, **start):
-        settings.append((config.point_to_point, config.joint_weight))
-        return tr.register(source, target, num_bones, grid_resolution, config, generator, **start)
-
-    monkeypatch.setattr(sys.modules[register_sequence.__module__], "register", watched)
-    register_sequence([toy[0], toy[1], toy[2]], 8, 30, replace(QUICK, **given))
-    assert settings == [carried]
+def test_from_frame_to_frame_bones_are_held_along_the_surface_and_not_by_joints(given, expected):
+    config = FRAME_TO_FRAME.apply(RegisterConfig(**given))
+    assert (config.point_to_point, config.joint_weight) == expected
+    assert config.settle_steps == 0
 
 
 @pytest.mark.parametrize(
-    ("given", "held"),
+    ("given", "expected"),
     [
         ({}, {"turn_scale": 0.5, "joint_weight": (0.01, 0.01), "point_to_point": 0.001, "seam_cap": 1.0}),
         ({"turn_scale": 2.0, "joint_weight": (1.0, 0.05)}, {"turn_scale": 2.0, "joint_weight": (1.0, 0.05)}),
@@ -114,28 +91,21 @@ def test_what_is_carried_is_held_along_the_surface_and_not_by_joints(toy, monkey
         ({"match_steps": 6, "refine_steps": 0, "rtol": 0.0}, {"match_steps": 6, "refine_steps": 0, "rtol": 0.0}),
     ],
 )
-def test_all_frames_are_fitted_to_the_dense_alignments_and_bones_hold_each_other(toy, monkeypatch, given, held):
-    module, reached, fits = sys.modules[register_sequence.__module__], [], []
+def test_all_frames_together_are_fitted_more_thoroughly_and_bones_hold_each_other(given, expected):
+    config = ALL_FRAMES.apply(RegisterConfig(**given))
+    assert {name: getattr(config, name) for name in expected} == expected
 
-    def aligned(*arguments, **options):
-        reached.append(align_scans(*arguments, **options))
-        return reached[-1]
 
-    class Watched(ReducedFit):
-        def __init__(self, *arguments):
-            super().__init__(*arguments)
-            fits.append(self)
-
-    monkeypatch.setattr(module, "align_scans", aligned)
-    monkeypatch.setattr(module, "ReducedFit", Watched)
-    config = replace(QUICK, **given)
-    register_sequence([toy[0], toy[1], toy[2]], 8, 30, config)
-    assert {name: getattr(fits[0].config, name) for name in held} == held
-    assert fits[0].data.linked
-    index = source_samples(toy[0], config, None)
-    unit = ScanUnit.of(toy[0].points[index])
-    expected = torch.stack([unit.of_points(points)[index] for points in (toy[0].points, *(r.points for r in reached))])
-    torch.testing.assert_close(fits[0].samples.moved, expected)
+def test_far_frames_are_reached_step_by_step_as_the_config_says(toy):
+    records = []
+    config = replace(QUICK, refine_steps=0, joint_weight=(0.0, 0.0), settle_steps=5)
+    found = register_sequence([toy[frame] for frame in range(3)], 8, 30, config, on_step=records.append)
+    errors = (found.deformed[2] - toy.truth(0, 2)).norm(dim=-1) / toy[0].diagonal
+    assert float((errors < 0.025).float().mean()) > 0.8
+    assert records[-len(found.history) :] == list(found.history)
+    assert {record.stage for record in records} == {"initialize", "align", "refine"}
+    assert [record.num_steps for record in found.history if record.stage == "refine"] == [5] * 5
+    assert all(record.joint == 0 for record in found.history)
 
 
 def test_bad_arguments_are_refused_by_name(toy):

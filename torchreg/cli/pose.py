@@ -98,7 +98,7 @@ def _pose_once(editor: PoseEditor, handle: list[str], to: list[str], path: Path,
     editor.model.set_transforms_(solution.transforms)
     save_weight_ply(path, editor.model, editor.points, editor.faces, moved=True)
     if not quiet:
-        typer.echo(f"handles miss their targets by at most {float(solution.misses.max()):.3g} -> {path}")
+        typer.echo(f"handles miss their targets by at most {float(solution.residuals.max()):.3g} -> {path}")
 
 
 def _place(text: str) -> list[float]:

@@ -7,7 +7,7 @@ from torchreg.errors import InputError, InputTypeError
 
 
 def geometric_at(ends: tuple[float, float], progress: float) -> float:
-    """Return the value at a share of the way from the first to the last; the last one after it."""
+    """Return the value at a progress from 0 to 1 between the first and the last, and the last one after."""
     first, last = ends
     return float(first * (last / first) ** min(progress, 1.0))
 

@@ -1,19 +1,22 @@
-"""Blends of rigid motions: points that follow several bones, each by a share."""
+"""Rigid motions of bones, and their blends, which points follow by the weights of several bones."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from torchreg._checks import check_finite
+from torchreg.errors import InputError
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import skew, so3_exp
+from torchreg.geometry.rotation_representations import quaternion_from_rotation
 
 
 def turn_about(transforms: Tensor, twists: Tensor, centers: Tensor) -> Tensor:
-    """Return rigid motions moved on: turned about points of their own, then shifted.
+    """Return rigid motions updated by twists: turned about centers, then shifted.
 
     ``R <- exp(w) R``, ``t <- c + exp(w) (t - c) + v``: the point that the motion takes to c ends at c + v. Turning
-    about a point near what a bone carries keeps turns and shifts apart, which solvers and optimizers need.
+    about a point near the bone decouples rotation and translation, which solvers and optimizers need.
 
     Convention: twists are (translation, rotation).
 
@@ -55,8 +58,8 @@ def blend_linear(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
 def blend_dual_quaternion(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
     """Return the points moved by the normalized weighted sum of the bones' unit dual quaternions.
 
-    What moves a point is rigid for any weights: a twisted limb keeps its girth where the linear blend wrings it.
-    Quaternions are taken on the side of the bone with the largest weight, so that no blend goes the long way round.
+    The blend is rigid for any weights: a twisted limb keeps its girth, which the linear blend shrinks. Quaternions take
+    the sign nearest to that of the bone with the largest weight, so that no blend turns by more than half a turn.
 
     Args:
         points: (..., N, 3).
@@ -70,8 +73,9 @@ def blend_dual_quaternion(points: Tensor, weights: Tensor, transforms: Tensor) -
 
     References: Kavan et al. 2007, eqs. 16-17.
     """
-    signed, dual = _signed_sums(weights, transforms)
-    return _move(points, signed, dual)
+    real, dual, sign = _signed_quaternions(weights, transforms)
+    signed = weights * sign
+    return _move(points, signed @ real, signed @ dual)
 
 
 def blend_linear_jacobian(points: Tensor, weights: Tensor, transforms: Tensor, centers: Tensor) -> Tensor:
@@ -118,29 +122,9 @@ def blend_dual_quaternion_jacobian(points: Tensor, weights: Tensor, transforms: 
     return product * share.unsqueeze(-3)
 
 
-def rotation_to_quaternion(rotation: Tensor) -> Tensor:
-    """Return unit quaternions (..., 4), scalar first, of rotation matrices (..., 3, 3).
-
-    The symmetric matrix 4 q q^T is filled in and its row with the largest diagonal normalized, so that no angle loses
-    digits.
-
-    Differentiable: in ``rotation``, at every angle.
-    """
-    r = rotation
-    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    wx, wy, wz = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
-    xy, xz, yz = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
-    squares = torch.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], dim=-1)
-    ww, xx, yy, zz = squares.unbind(-1)
-    entries = [ww, wx, wy, wz, wx, xx, xy, xz, wy, xy, yy, yz, wz, xz, yz, zz]
-    rows = torch.stack(entries, dim=-1).unflatten(-1, (4, 4))
-    best = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
-    return torch.nn.functional.normalize(rows.gather(-2, best).squeeze(-2), dim=-1)
-
-
 def _signed_quaternions(weights: Tensor, transforms: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return real and dual parts (..., B, 4) of the bones, and the sign (..., N, B) each takes at each point."""
-    real = rotation_to_quaternion(transforms[..., :3, :3])
+    """Return real and dual parts (..., B, 4) of the bones, and the sign (..., N, B) that each takes at each point."""
+    real = quaternion_from_rotation(transforms[..., :3, :3])
     scalar, vector = real[..., :1], real[..., 1:]
     shift = transforms[..., :3, 3]
     dual = 0.5 * torch.cat(
@@ -151,12 +135,6 @@ def _signed_quaternions(weights: Tensor, transforms: Tensor) -> tuple[Tensor, Te
         pivot = torch.nn.functional.one_hot(weights.argmax(-1), weights.shape[-1]).to(real.dtype)
         sign = pivot @ side
     return real, dual, sign
-
-
-def _signed_sums(weights: Tensor, transforms: Tensor) -> tuple[Tensor, Tensor]:
-    real, dual, sign = _signed_quaternions(weights, transforms)
-    share = weights * sign
-    return share @ real, share @ dual
 
 
 def _move(points: Tensor, real: Tensor, dual: Tensor) -> Tensor:
@@ -191,3 +169,18 @@ def _left_products(quaternion: Tensor) -> Tensor:
     scalar, vector = quaternion[..., :1], quaternion[..., 1:]
     identity = torch.eye(3, dtype=quaternion.dtype, device=quaternion.device)
     return torch.cat([-vector.unsqueeze(-2), scalar.unsqueeze(-1) * identity - skew(vector)], dim=-2)
+
+
+def check_rigid_motions(transforms: Tensor, name: str) -> None:
+    """Raise InputError unless all of ``transforms`` (..., 4, 4) are rigid motions to single precision."""
+    check_finite(transforms, name)
+    rotation = transforms[..., :3, :3].detach().double()
+    deviation = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs()
+    bottom = (transforms[..., 3, :].detach() - transforms.new_tensor([0.0, 0.0, 0.0, 1.0])).abs()
+    if transforms.numel() and (
+        float(deviation.max()) > 1e-3 or float(bottom.max()) > 1e-6 or bool((torch.linalg.det(rotation) < 0).any())
+    ):
+        raise InputError(
+            f"{name} must hold rigid motions, got one with scale, shear, mirror or a last row other than 0 0 0 1 "
+            f"(off by {max(float(deviation.max()), float(bottom.max())):.2g})"
+        )

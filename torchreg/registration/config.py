@@ -1,4 +1,4 @@
-"""How scans are registered: settings of the dense alignment and of the bones fitted to it."""
+"""Settings of scan registration: of the dense alignment and of the bones fitted to it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torchreg.registration.dense.config import ScanAlignConfig
 
 @dataclass(frozen=True)
 class RegisterConfig(BoneConfig):
-    """How a reduced deformable model is fitted to two scans or more.
+    """Settings by which a reduced deformable model is fitted to two scans or more.
 
     Args:
         align: the dense alignment from which parts are found; all others as in `BoneConfig`.

@@ -1,8 +1,9 @@
-"""Coordinates in which scans of any size, place and turn are alike."""
+"""Coordinates in which scans of any size, position and orientation are alike."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -10,44 +11,44 @@ from torch import Tensor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import rescale_motions
 
-# Root mean squared distance from the middle, over the diagonal of the bounding box, of people and animals; unlike the
-# box it does not change with the frame.
-_SPREAD = 0.23
-
 
 @dataclass(frozen=True, eq=False)
-class ScanUnit:
-    """Coordinates about the middle of a scan, in units of about its diagonal, double precision on the CPU.
+class Normalization:
+    """Normalized coordinates ``(x - center) / scale``: about one diagonal long, double precision on the CPU.
 
     Args:
-        middle: (3,) of the scan.
-        size: of the scan.
+        center: (3,) mean of the points, in the user's coordinates.
+        scale: root mean squared distance from it over that of a scan whose bounding box has a diagonal of one.
     """
 
-    middle: Tensor
-    size: float
+    # Root mean squared distance from the center over the bounding box's diagonal, for people and animals. Unlike the
+    # box, that distance does not change when the points turn.
+    SPREAD: ClassVar[float] = 0.23
+
+    center: Tensor
+    scale: float
 
     @classmethod
-    def of(cls, samples: Tensor) -> ScanUnit:
-        """Return the unit of evenly spread points (N, 3) of a scan, the same however the scan is turned."""
-        places = samples.detach().cpu().double()
-        middle = places.mean(0)
-        return cls(middle, float((places - middle).square().sum(-1).mean().sqrt()) / _SPREAD)
+    def from_points(cls, points: Tensor) -> Normalization:
+        """Return the normalization of evenly spread points (N, 3), the same however they are turned."""
+        points = points.detach().cpu().double()
+        center = points.mean(0)
+        return cls(center, float((points - center).square().sum(-1).mean().sqrt()) / cls.SPREAD)
 
-    def of_points(self, points: Tensor) -> Tensor:
-        """Return points (..., 3) of the user in these coordinates."""
-        return (points.detach().cpu().double() - self.middle) / self.size
+    def normalize(self, points: Tensor) -> Tensor:
+        """Return the user's points (..., 3) in normalized coordinates."""
+        return (points.detach().cpu().double() - self.center) / self.scale
 
-    def of_scan(self, scan: RangeScan) -> RangeScan:
-        """Return a scan of the user in these coordinates."""
-        motion = torch.eye(4, dtype=torch.float64) / self.size
-        motion[:3, 3], motion[3, 3] = -self.middle / self.size, 1.0
+    def normalize_scan(self, scan: RangeScan) -> RangeScan:
+        """Return the user's scan in normalized coordinates."""
+        motion = torch.eye(4, dtype=torch.float64) / self.scale
+        motion[:3, 3], motion[3, 3] = -self.center / self.scale, 1.0
         return scan.to(dtype=torch.float64, device="cpu").transformed(motion)
 
-    def points_back(self, points: Tensor, like: Tensor) -> Tensor:
-        """Return points in the coordinates of the user, in the dtype and on the device of ``like``."""
-        return (self.middle + self.size * points).to(like)
+    def denormalize(self, points: Tensor, like: Tensor) -> Tensor:
+        """Return normalized points (..., 3) in the user's coordinates, with the dtype and device of ``like``."""
+        return (self.center + self.scale * points).to(like)
 
-    def transforms_back(self, transforms: Tensor) -> Tensor:
-        """Return motions (..., 4, 4) in the coordinates of the user."""
-        return rescale_motions(transforms, self.size, self.middle)
+    def denormalize_motions(self, transforms: Tensor) -> Tensor:
+        """Return motions (..., 4, 4) of normalized points as motions of the user's points."""
+        return rescale_motions(transforms, self.scale, self.center)

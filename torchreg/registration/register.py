@@ -20,12 +20,9 @@ from torchreg.registration.bones.labels import CellData, labels_of_parts
 from torchreg.registration.bones.sparse_grid import MAX_RESOLUTION, SparseGrid
 from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.align_scans import align_scans
-from torchreg.registration.normalization import ScanUnit
+from torchreg.registration.normalization import Normalization
 from torchreg.registration.results import RegisterRecord, ScanRegistration
 from torchreg.result import Status
-
-# Points that the dense alignment is unsure of count this much at least: they follow what is around them.
-LEAST_CONFIDENCE = 0.1
 
 
 @torch.no_grad()
@@ -47,11 +44,11 @@ def register(
 
     ``D(x) = sum_j w_j(x) (R_j x + t_j)``, the weights interpolated on a sparse grid around the source. Unlike the
     paper, which starts from a random segmentation and spin images, a dense alignment by a deformation graph comes
-    first: see `align_scans`. What moves rigidly in it becomes the first bones; then motions, correspondences and
+    first: see `align_scans`. Parts that move rigidly in it become the first bones; then motions, correspondences and
     labels are solved in turn, and last continuous weights with the motions.
 
     Units change nothing, and turns and shifts of both scans nothing beyond rounding. Computed in double precision on
-    the CPU; what is returned has the dtype and device of the source.
+    the CPU; the result has the dtype and device of the source.
 
     Args:
         source: the scan to be moved, N points.
@@ -61,8 +58,8 @@ def register(
         config: see `RegisterConfig`.
         generator: source of randomness; None draws the same numbers at every call.
         on_step: called with a `RegisterRecord` after each step.
-        start: (N, 3) where the source's points are known to be near in the target's pose, instead of an alignment.
-        confidence: (N,) from 0 to 1, how far each of ``start`` can be trusted; ones by default.
+        start: (N, 3) known positions of the source's points in the target's pose, about, instead of an alignment.
+        confidence: (N,) from 0 to 1, of ``start``; ones by default.
         parts: (N,) integers from zero, less than ``num_bones``, the parts from which bones start, such as the limbs of
             a spine, ``skeletonize(mesh).limb_of(source.points)``; by default patches that move as one.
 
@@ -81,85 +78,78 @@ def register(
     """
     config = RegisterConfig() if config is None else config
     check_inputs((source, target), num_bones, grid_resolution)
-    check_start(source, start, confidence)
-    parts = None if parts is None else checked_parts(source, parts, num_bones)
-    clock = Clock()
+    _check_start(source, start, confidence)
+    parts = None if parts is None else _checked_parts(source, parts, num_bones)
+    clock = _Clock()
     index = source_samples(source, config, generator)
-    unit = ScanUnit.of(source.points[index])
-    scan, other = unit.of_scan(source), unit.of_scan(target)
+    normalization = Normalization.from_points(source.points[index])
+    normalized_source = normalization.normalize_scan(source)
     # Line 1 of the algorithm: the grid.
-    grid = SparseGrid.from_points(scan.points, grid_resolution)
-    data = CellData(grid, scan.points[index], config.num_patches)
+    grid = SparseGrid.from_points(normalized_source.points, grid_resolution)
+    data = CellData(grid, normalized_source.points[index], config.num_patches)
     clock.lap()
-    # Line 2: where everything goes, roughly.
+    # Line 2: a first alignment of all points.
     if start is None:
         aligned = align_scans(source, target, config.align, generator=generator, on_step=initial_records(on_step))
         start, confidence = aligned.points, aligned.confidence
-    moved = unit.of_points(start)
-    trust = torch.ones_like(moved[:, 0]) if confidence is None else confidence.detach().cpu().double()
-    samples = Samples(
-        scan.points[index], scan.normals[index], moved[None, index], trust[None, index].clamp(min=LEAST_CONFIDENCE)
-    )
+    start = normalization.normalize(start)
+    confidence = torch.ones_like(start[:, 0]) if confidence is None else confidence.detach().cpu()
+    samples = Samples.from_alignment(normalized_source, index, start[None], confidence[None])
     clock.lap()
     # Lines 3 to 8: motions, correspondences and labels in turn.
-    labels = None if parts is None else labels_of_parts(data, scan.points, parts)
-    fit = ReducedFit(data, samples, (other,), num_bones, config, on_step, labels)
-    settled = fit.fit_labels()
+    labels = None if parts is None else labels_of_parts(data, normalized_source.points, parts)
+    targets = (normalization.normalize_scan(target),)
+    fit = ReducedFit(data, samples, targets, config, num_bones=num_bones, labels=labels, on_step=on_step)
+    converged = fit.fit_labels()
     clock.lap()
     # Line 9: continuous weights.
-    settled = fit.refine() and settled
+    converged = fit.refine() and converged
     clock.lap()
-    return _result(source, scan, other, unit, fit, settled, clock.seconds)
+    return _scan_registration(source, normalized_source, normalization, fit, converged, clock.seconds)
 
 
-def _result(
+def _scan_registration(
     source: RangeScan,
-    scan: RangeScan,
-    other: RangeScan,
-    unit: ScanUnit,
+    normalized_source: RangeScan,
+    normalization: Normalization,
     fit: ReducedFit,
-    settled: bool,
+    converged: bool,
     seconds: Tensor,
 ) -> ScanRegistration:
-    """Return what was found, in the unit and frame of the source."""
-    config, points = fit.config, scan.points
-    weights = fit.model.weights_at(points)
-    (moved,), (normals,) = fit.moved(points, scan.normals)
-    found = fit.matchers[0].match(
-        moved,
-        normals,
-        max_distance=max(config.max_distance[1], 2 * other.spacing),
-        max_angle=config.max_angle[1],
-    )
-    like = source.points
+    """Return the registration in the unit and frame of the source, from that of the normalized scans."""
+    config, like = fit.config, source.points
+    weights = fit.model.weights_at(normalized_source.points)
+    (moved,), (normals,) = fit.moved(normalized_source.points, normalized_source.normals)
+    (matcher,) = fit.matchers
+    matches = matcher.match(moved, normals, max_distance=config.max_distance[1], max_angle=config.max_angle[1])
     fit.model.set_transforms_(fit.model.transforms.detach()[0])
-    model = fit.model.rescaled(unit.size, unit.middle).to(dtype=like.dtype, device=like.device)
+    model = fit.model.rescaled(normalization.scale, normalization.center).to(dtype=like.dtype, device=like.device)
     return ScanRegistration(
-        model,
-        like.detach(),
-        source.faces,
-        unit.points_back(moved, like),
-        weights.argmax(-1).to(like.device),
-        model.transforms.detach(),
-        weights.to(like),
-        (unit.size * nearest_neighbor(moved, other.points)[1]).to(like),
-        found.kept.to(like.device),
-        fit_status(found.counts.kept / len(points), settled, config),
-        seconds,
-        tuple(fit.history),
+        model=model,
+        points=like.detach(),
+        faces=source.faces,
+        deformed=normalization.denormalize(moved, like),
+        labels=weights.argmax(-1).to(like.device),
+        transforms=model.transforms.detach(),
+        weights=weights.to(like),
+        distances=(normalization.scale * nearest_neighbor(moved, matcher.target.points)[1]).to(like),
+        matched=matches.kept.to(like.device),
+        status=fit_status(int(matches.kept.sum()) / len(moved), converged, config),
+        seconds=seconds,
+        history=tuple(fit.history),
     )
 
 
-def fit_status(matched: float, settled: bool, config: BoneConfig) -> Status:
-    """Return how a fit went that matched a share of the points."""
+def fit_status(matched: float, converged: bool, config: BoneConfig) -> Status:
+    """Return the status of a fit that matched a share of the points."""
     if matched == 0:
         return Status.NO_DATA
     if matched < config.min_matched:
         return Status.FEW_INLIERS
-    return Status.CONVERGED if settled else Status.MAX_STEPS
+    return Status.CONVERGED if converged else Status.MAX_STEPS
 
 
-class Clock:
+class _Clock:
     """Seconds between laps: setup, initialization, alignment and refinement, as in the paper's table 1."""
 
     def __init__(self) -> None:
@@ -181,11 +171,17 @@ def source_samples(scan: RangeScan, config: RegisterConfig, generator: torch.Gen
 
 
 def initial_records(on_step: OnRegisterStep | None) -> Callable[[Any], None] | None:
-    """Return what tells of the steps of the dense alignment, as steps of the initialization."""
+    """Return the callback that hands on records of the dense alignment as those of the initialization."""
     if on_step is None:
         return None
     return lambda record: on_step(
-        RegisterRecord("initialize", record.step, record.num_steps, record.misses, record.gaps, 0, 0, 0, 0, 0, 0)
+        RegisterRecord(
+            stage="initialize",
+            step=record.step,
+            num_steps=record.num_steps,
+            distance=record.misses,
+            joint=record.gaps,
+        )
     )
 
 
@@ -204,7 +200,7 @@ def check_inputs(scans: tuple[Any, ...], num_bones: int, grid_resolution: int) -
         raise InputError(f"grid_resolution must be at most {MAX_RESOLUTION}, got {grid_resolution}")
 
 
-def checked_parts(source: RangeScan, parts: Any, num_bones: int) -> Tensor:
+def _checked_parts(source: RangeScan, parts: Any, num_bones: int) -> Tensor:
     """Return known parts (N,) as int64 on the CPU; raise unless they fit the source and the number of bones."""
     parts = as_tensor(parts, "parts", "integers")
     if parts.is_floating_point() or parts.dtype == torch.bool:
@@ -217,7 +213,7 @@ def checked_parts(source: RangeScan, parts: Any, num_bones: int) -> Tensor:
     return parts.detach().cpu().long()
 
 
-def check_start(source: RangeScan, start: Any, confidence: Any) -> None:
+def _check_start(source: RangeScan, start: Any, confidence: Any) -> None:
     """Raise unless a known start fits the source."""
     if start is None:
         if confidence is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -19,29 +19,98 @@ from torchreg.registration.bones.labels import CellData
 from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.align_scans import align_scans
-from torchreg.registration.normalization import ScanUnit
-from torchreg.registration.register import (
-    LEAST_CONFIDENCE,
-    check_inputs,
-    fit_status,
-    initial_records,
-    register,
-    source_samples,
-)
+from torchreg.registration.normalization import Normalization
+from torchreg.registration.register import check_inputs, fit_status, initial_records, register, source_samples
 from torchreg.registration.results import SequenceRegistration
 
-# From frame to frame few large bones carry the reference: what many small ones take over from noise adds up, and so
-# does what slides along the surface. They have no room for all joints, so that none of them may be firm.
-_CARRIED_LABEL_COST, _CARRIED_SMOOTHNESS, _CARRIED_POINT_TO_POINT, _CARRIED_JOINTS = 0.002, 0.2, 0.1, 1e-4
-# Together, frames tell more of joints, so that these may be firm; what no frame tells is lost again in each of them, so
-# that bones hold each other in wide turns too, radians; and places along the surface, which drift, count less.
-_HELD_JOINTS, _HELD_TURNS, _HELD_POINT_TO_POINT = 0.01, 0.5, 0.001
-# Parts may start from smaller patches, and wide motions tear more where parts meet, cells.
-_HELD_PATCHES, _HELD_SEAM_CAP = 200, 1.0
-# What moves along the surface settles slowly, and borders between parts are where settled motions agree.
-_HELD_MATCH_STEPS, _HELD_REFINE_STEPS, _HELD_SETTLE_STEPS, _HELD_RTOL = 4, 3, 4, 0.02
-# Share of its last step by which a point is expected to move on: hidden limbs would run away with the whole.
-_GOES_ON = 0.5
+
+@dataclass(frozen=True)
+class FrameToFrame:
+    """Bounds on the settings by which the reference is transferred from frame to frame, by few large bones.
+
+    Small bones would follow noise, which adds up, as does drift along the surface. A few large bones cannot bend in all
+    joints, so that none of them may be firm.
+
+    Args:
+        label_cost: lower bound.
+        smoothness: lower bound.
+        point_to_point: lower bound.
+        joint_weight: upper bound.
+        momentum: share of its last step by which a point is predicted to move on; with all of it, hidden limbs would
+            run away.
+    """
+
+    label_cost: float = 0.002
+    smoothness: float = 0.2
+    point_to_point: float = 0.1
+    joint_weight: float = 1e-4
+    momentum: float = 0.5
+
+    def apply(self, config: RegisterConfig) -> RegisterConfig:
+        """Return the settings within the bounds; motions need not converge."""
+        first, last = config.joint_weight
+        return replace(
+            config,
+            label_cost=max(config.label_cost, self.label_cost),
+            smoothness=max(config.smoothness, self.smoothness),
+            point_to_point=max(config.point_to_point, self.point_to_point),
+            joint_weight=(min(first, self.joint_weight), min(last, self.joint_weight)),
+            settle_steps=0,
+        )
+
+    def predict(self, positions: dict[int, Tensor], frame: int, step: int) -> Tensor | None:
+        """Return the points (N, 3) predicted in a frame by their last step, if that is known."""
+        last, before = positions[frame - step], positions.get(frame - 2 * step)
+        return None if before is None else last + self.momentum * (last - before)
+
+
+@dataclass(frozen=True)
+class AllFrames:
+    """Bounds on the settings by which all frames are fitted together.
+
+    Args:
+        num_patches: lower bound; parts may start from smaller patches.
+        match_steps: lower bound; borders between parts are drawn by motions, which should have converged.
+        refine_steps: lower bound, unless there are none.
+        settle_steps: lower bound; displacements along the surface converge slowly.
+        rtol: upper bound, for the same reason.
+        joint_weight: lower bound, unless joints are left out; many frames determine joints well, so that these may be
+            firm.
+        turn_scale: lower bound, radians; bones hold each other in wide turns too, since twists that scans do not show
+            would be lost in every frame anew.
+        point_to_point: upper bound; positions along the surface drift.
+        seam_cap: lower bound, cells; wide motions tear more where parts meet.
+    """
+
+    num_patches: int = 200
+    match_steps: int = 4
+    refine_steps: int = 3
+    settle_steps: int = 4
+    rtol: float = 0.02
+    joint_weight: float = 0.01
+    turn_scale: float = 0.5
+    point_to_point: float = 0.001
+    seam_cap: float = 1.0
+
+    def apply(self, config: RegisterConfig) -> RegisterConfig:
+        """Return the settings within the bounds."""
+        first, last = (max(weight, self.joint_weight) if weight > 0 else weight for weight in config.joint_weight)
+        return replace(
+            config,
+            num_patches=max(config.num_patches, self.num_patches),
+            match_steps=max(config.match_steps, self.match_steps),
+            refine_steps=max(config.refine_steps, self.refine_steps) if config.refine_steps > 0 else 0,
+            settle_steps=max(config.settle_steps, self.settle_steps),
+            rtol=min(config.rtol, self.rtol),
+            joint_weight=(first, last),
+            turn_scale=max(config.turn_scale, self.turn_scale),
+            point_to_point=min(config.point_to_point, self.point_to_point),
+            seam_cap=max(config.seam_cap, self.seam_cap),
+        )
+
+
+FRAME_TO_FRAME = FrameToFrame()
+ALL_FRAMES = AllFrames()
 
 
 @torch.no_grad()
@@ -58,10 +127,10 @@ def register_sequence(
 ) -> SequenceRegistration:
     """Return one set of bones and weights that takes a reference scan onto all scans, and what all of them show.
 
-    Going from the reference outward, the reference as moved for one frame is aligned with the next, its points expected
-    to go on somewhat as they went, and a few bones are fitted to that: every frame is reached by bending the reference
-    itself, not what earlier frames made of it, so that errors do not pile up. Then labels, weights and the motions of
-    all frames are solved together, from the alignments; bones that meet had better turn about one axis in all frames.
+    From the reference outward, the reference as moved to one frame is aligned with the next, its points predicted from
+    their last step, and a few bones are fitted to that alignment: every frame is reached by deforming the reference
+    itself, so that errors do not pile up. Then labels, weights and the motions of all frames are solved together, from
+    the alignments; bones that share weight pay for turning about more than one axis over the frames.
 
     Args:
         scans: T scans of one thing, two at least, in one unit and frame; motions between neighbors as in `register`.
@@ -96,136 +165,108 @@ def register_sequence(
         raise InputError(f"reference must be below the number of scans {len(scans)}, got {reference}")
     source = scans[reference]
     index = source_samples(source, config, generator)
-    unit = ScanUnit.of(source.points[index])
-    reached, confidence = _chain(scans, reference, num_bones, grid_resolution, _carrying(config), generator, on_step)
-    scan = unit.of_scan(source)
-    held = _held(config)
-    grid = SparseGrid.from_points(scan.points, grid_resolution)
-    data = CellData(grid, scan.points[index], held.num_patches, linked=True)
-    places = unit.of_points(reached)[:, index]
-    trust = confidence[:, index].double().clamp(min=LEAST_CONFIDENCE)
-    samples = Samples(scan.points[index], scan.normals[index], places, trust)
-    fit = ReducedFit(data, samples, [unit.of_scan(other) for other in scans], num_bones, held, on_step)
-    settled = fit.fit_labels()
-    settled = fit.refine() and settled
-    return _result(scans, reference, unit, fit, settled)
-
-
-def _carrying(config: RegisterConfig) -> RegisterConfig:
-    """Return settings for the few bones that carry the reference from frame to frame."""
-    first, last = config.joint_weight
-    return replace(
-        config,
-        label_cost=max(config.label_cost, _CARRIED_LABEL_COST),
-        smoothness=max(config.smoothness, _CARRIED_SMOOTHNESS),
-        point_to_point=max(config.point_to_point, _CARRIED_POINT_TO_POINT),
-        joint_weight=(min(first, _CARRIED_JOINTS), min(last, _CARRIED_JOINTS)),
-        settle_steps=0,
+    normalization = Normalization.from_points(source.points[index])
+    moved, confidence = _aligned_frames(
+        scans, reference, num_bones, grid_resolution, config, generator=generator, on_step=on_step
     )
+    normalized = [normalization.normalize_scan(scan) for scan in scans]
+    normalized_source, config = normalized[reference], ALL_FRAMES.apply(config)
+    grid = SparseGrid.from_points(normalized_source.points, grid_resolution)
+    data = CellData(grid, normalized_source.points[index], config.num_patches, linked=True)
+    samples = Samples.from_alignment(normalized_source, index, normalization.normalize(moved), confidence)
+    fit = ReducedFit(data, samples, normalized, config, num_bones=num_bones, on_step=on_step)
+    converged = fit.fit_labels()
+    converged = fit.refine() and converged
+    return _sequence_registration(source, reference, normalized, normalization, fit, converged)
 
 
-def _held(config: RegisterConfig) -> RegisterConfig:
-    """Return settings for all frames together."""
-    first, last = (max(weight, _HELD_JOINTS) if weight > 0 else weight for weight in config.joint_weight)
-    return replace(
-        config,
-        num_patches=max(config.num_patches, _HELD_PATCHES),
-        match_steps=max(config.match_steps, _HELD_MATCH_STEPS),
-        refine_steps=max(config.refine_steps, _HELD_REFINE_STEPS) if config.refine_steps > 0 else 0,
-        settle_steps=max(config.settle_steps, _HELD_SETTLE_STEPS),
-        rtol=min(config.rtol, _HELD_RTOL),
-        joint_weight=(first, last),
-        turn_scale=max(config.turn_scale, _HELD_TURNS),
-        point_to_point=min(config.point_to_point, _HELD_POINT_TO_POINT),
-        seam_cap=max(config.seam_cap, _HELD_SEAM_CAP),
-    )
-
-
-def _chain(
+def _aligned_frames(
     scans: tuple[RangeScan, ...],
     reference: int,
     num_bones: int,
     grid_resolution: int,
     config: RegisterConfig,
+    *,
     generator: torch.Generator | None,
     on_step: OnRegisterStep | None,
 ) -> tuple[Tensor, Tensor]:
-    """Return where the reference's points are in every frame, (T, N, 3), and how far that can be trusted, (T, N).
+    """Return the reference's points aligned with every frame, (T, N, 3), and their confidence, (T, N).
 
-    The dense alignments tell, in which small parts move that the few bones carried on have no room for.
+    Those of the dense alignments: small parts move in them for which the few bones have no room that move the reference
+    on from frame to frame.
     """
-    source, ones = scans[reference], torch.ones(len(scans[reference]))
-    carried, reached, trust = {reference: source.points}, {reference: source.points}, {reference: ones}
+    source, few_bones = scans[reference], FRAME_TO_FRAME.apply(config)
+    aligned, confidence = {reference: source.points}, {reference: torch.ones(len(source))}
+    deformed = {reference: source.points}
     for step, end in ((1, len(scans)), (-1, -1)):
         current = source
         for frame in range(reference + step, end, step):
-            aligned = align_scans(
+            found = align_scans(
                 current, scans[frame], config.align,
-                generator=generator, on_step=initial_records(on_step), expected=_expected(carried, frame, step),
+                generator=generator, on_step=initial_records(on_step),
+                expected=FRAME_TO_FRAME.predict(deformed, frame, step),
             )  # fmt: skip
-            reached[frame], trust[frame] = aligned.points, aligned.confidence
+            aligned[frame], confidence[frame] = found.points, found.confidence
             if frame + step == end:
                 break
-            found = register(
-                source, scans[frame], num_bones, grid_resolution, config, generator,
-                start=aligned.points, confidence=aligned.confidence,
+            bent = register(
+                source, scans[frame], num_bones, grid_resolution, few_bones, generator,
+                start=found.points, confidence=found.confidence,
             )  # fmt: skip
-            carried[frame] = found.deformed
-            normals = turned_normals(source.normals, found.weights, found.transforms)
-            current = RangeScan(found.deformed, source.faces, normals)
+            deformed[frame] = bent.deformed
+            normals = turned_normals(source.normals, bent.weights, bent.transforms)
+            current = RangeScan(bent.deformed, source.faces, normals)
     frames = range(len(scans))
-    return torch.stack([reached[frame] for frame in frames]), torch.stack([trust[frame].cpu() for frame in frames])
+    return torch.stack([aligned[frame] for frame in frames]), torch.stack([confidence[frame].cpu() for frame in frames])
 
 
-def _expected(places: dict[int, Tensor], frame: int, step: int) -> Tensor | None:
-    """Return where points (N, 3) are expected in a frame by their last step, if that is known."""
-    last, before = places[frame - step], places.get(frame - 2 * step)
-    return None if before is None else last + _GOES_ON * (last - before)
-
-
-def _result(
-    scans: tuple[RangeScan, ...], reference: int, unit: ScanUnit, fit: ReducedFit, settled: bool
+def _sequence_registration(
+    source: RangeScan,
+    reference: int,
+    scans: Sequence[RangeScan],
+    normalization: Normalization,
+    fit: ReducedFit,
+    converged: bool,
 ) -> SequenceRegistration:
-    """Return what was found, in the unit and frame of the scans."""
-    source = scans[reference]
-    like, points = source.points, unit.of_points(source.points)
+    """Return the registration in the unit and frame of the source, from that of the normalized scans."""
+    like, points = source.points, scans[reference].points
     weights = fit.model.weights_at(points)
     moved = fit.model.move(points, weights)
-    fused, normals, frames = _fused(scans, unit, moved, weights, fit.model.transforms.detach())
-    shares = fit.history[-1].kept / (len(scans) * len(fit.samples.points))
-    model = fit.model.rescaled(unit.size, unit.middle).to(dtype=like.dtype, device=like.device)
+    fused, normals, frames = _back_to_reference(scans, moved, weights, fit.model.transforms.detach())
+    matched = fit.history[-1].kept / (len(scans) * len(fit.samples.points))
+    model = fit.model.rescaled(normalization.scale, normalization.center).to(dtype=like.dtype, device=like.device)
     return SequenceRegistration(
-        model,
-        like.detach(),
-        source.faces,
-        unit.points_back(moved, like),
-        weights.argmax(-1).to(like.device),
-        model.transforms.detach(),
-        weights.to(like),
-        unit.points_back(fused, like),
-        normals.to(like),
-        frames.to(like.device),
-        reference,
-        fit_status(shares, settled, fit.config),
-        tuple(fit.history),
+        model=model,
+        points=like.detach(),
+        faces=source.faces,
+        deformed=normalization.denormalize(moved, like),
+        labels=weights.argmax(-1).to(like.device),
+        transforms=model.transforms.detach(),
+        weights=weights.to(like),
+        fused=normalization.denormalize(fused, like),
+        fused_normals=normals.to(like),
+        fused_frames=frames.to(like.device),
+        reference=reference,
+        status=fit_status(matched, converged, fit.config),
+        history=tuple(fit.history),
     )
 
 
-def _fused(
-    scans: tuple[RangeScan, ...], unit: ScanUnit, moved: Tensor, weights: Tensor, transforms: Tensor
+def _back_to_reference(
+    scans: Sequence[RangeScan], moved: Tensor, weights: Tensor, transforms: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return all points (K, 3) of all scans in the pose of the reference, their normals and the frames they are from.
+    """Return all points (K, 3) of all scans in the pose of the reference, their normals and their frames (K,).
 
-    Every point moves back as the nearest point of the moved reference came.
+    Every point moves by the inverse of the motion of the nearest point of the moved reference (T, N, 3), which has
+    weights (N, B).
     """
-    places, sides, frames = [], [], []
+    points, normals, frames = [], [], []
     for frame, scan in enumerate(scans):
-        local = unit.of_scan(scan)
-        near, _ = nearest_neighbor(local.points, moved[frame])
-        blended = torch.einsum("nb,bij->nij", weights[near], transforms[frame])
-        shift = (local.points - blended[:, :3, 3]).unsqueeze(-1)
-        places.append(torch.linalg.solve(blended[:, :3, :3], shift).squeeze(-1))
-        back = torch.linalg.solve(blended[:, :3, :3], local.normals.unsqueeze(-1)).squeeze(-1)
-        sides.append(torch.nn.functional.normalize(back, dim=-1))
+        nearest, _ = nearest_neighbor(scan.points, moved[frame])
+        motions = torch.einsum("nb,bij->nij", weights[nearest], transforms[frame])
+        offsets = (scan.points - motions[:, :3, 3]).unsqueeze(-1)
+        points.append(torch.linalg.solve(motions[:, :3, :3], offsets).squeeze(-1))
+        turned = torch.linalg.solve(motions[:, :3, :3], scan.normals.unsqueeze(-1)).squeeze(-1)
+        normals.append(torch.nn.functional.normalize(turned, dim=-1))
         frames.append(torch.full((len(scan),), frame))
-    return torch.cat(places), torch.cat(sides), torch.cat(frames)
+    return torch.cat(points), torch.cat(normals), torch.cat(frames)

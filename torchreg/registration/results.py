@@ -1,4 +1,4 @@
-"""What registering and posing scans returns."""
+"""Results of registering and posing scans."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import torch
 from torch import Tensor, nn
 
 from torchreg.registration.bones.grid_lbs import GridLBS
-from torchreg.result import Result, Status, stored_as
+from torchreg.result import Result, Status, formerly, stored_as
 from torchreg.solvers.rigid_groups import merge_alike
 
-# Shared weight, as a share of all points, from which two bones meet.
-_MEETING = 1e-3
+# Weight that two bones share, as a share of all points, from which they are neighbors.
+_LEAST_SHARED = 1e-3
 
 
 @dataclass(frozen=True)
@@ -20,14 +20,14 @@ class RegisterRecord:
     """One step of a scan registration, as given to ``on_step``. Counts of matches are sums over the frames.
 
     Args:
-        stage: "initialize", of which only the first five fields tell; "align", labels and motions in turn; or "refine",
-            weights and motions in turn.
+        stage: "initialize", which leaves the fields after ``joint`` at zero; "align", labels and motions in turn; or
+            "refine", weights and motions in turn.
         step: number of the step in its stage.
         num_steps: steps planned in the stage.
-        distance: weighted mean squared distance of the matches, squared shares of the source's diagonal.
+        distance: weighted mean squared residual of the matches, squared shares of the source's diagonal.
         joint: sum of the squared gaps of the joints that are held, squared shares of the diagonal.
         smoothness: pairs of neighboring cells with different labels.
-        num_labels: bones alive.
+        num_labels: bones with a cell.
         kept: matches that hold.
         boundary: matches dropped because the target is on a boundary.
         far: matches dropped because of their distance.
@@ -39,12 +39,12 @@ class RegisterRecord:
     num_steps: int
     distance: float
     joint: float
-    smoothness: int
-    num_labels: int
-    kept: int
-    boundary: int
-    far: int
-    turned: int
+    smoothness: int = 0
+    num_labels: int = 0
+    kept: int = 0
+    boundary: int = 0
+    far: int = 0
+    turned: int = 0
 
 
 @dataclass(frozen=True)
@@ -80,11 +80,11 @@ class ScanRegistration(Result):
     history: tuple[RegisterRecord, ...] = ()
 
     def parts(self, tolerance: float = 0.01) -> Tensor:
-        """Return labels (N,) int64 in which bones that meet and moved as one are one part, numbered from 0.
+        """Return labels (N,) int64 in which neighboring bones that moved as one are one part, numbered from 0.
 
         Bones outnumber parts where a surface stretches, or where two scans do not tell parts apart. The two that moved
-        most alike are joined again and again and move as the larger one then, as long as the motion of one leaves the
-        other's points within ``tolerance`` of where they went, in the mean.
+        most alike are joined again and again and move as the larger one then, as long as the motion of each leaves the
+        other's points at a mean distance of up to ``tolerance`` from where they moved.
 
         Args:
             tolerance: share of the diagonal of the moved points.
@@ -92,27 +92,30 @@ class ScanRegistration(Result):
         return _parts(self.deformed.unsqueeze(0), self.transforms.unsqueeze(0), self.labels, self.weights, tolerance)
 
 
-def _parts(moved: Tensor, transforms: Tensor, labels: Tensor, weights: Tensor, tolerance: float) -> Tensor:
+def _parts(deformed: Tensor, transforms: Tensor, labels: Tensor, weights: Tensor, tolerance: float) -> Tensor:
     """Return the parts (N,) of points moved to (T, N, 3) by transforms (T, B, 4, 4), alike in all T frames."""
-    blends, own = weights.double(), nn.functional.one_hot(labels, weights.shape[1]).double()
-    # Frame by frame: all at once would need T B N places.
-    apart = torch.stack(
-        [_misses(*frame, labels, own) for frame in zip(moved.double(), transforms.double(), strict=True)]
+    weights, members = weights.double(), nn.functional.one_hot(labels, weights.shape[1]).double()
+    # Frame by frame: all at once would need T B N positions.
+    residuals = torch.stack(
+        [
+            _residual_sums(points, motions, labels, members)
+            for points, motions in zip(deformed.double(), transforms.double(), strict=True)
+        ]
     )
-    meet = blends.mT @ blends > _MEETING * len(labels)
-    part = merge_alike(apart, own.sum(0), meet, tolerance)
+    neighbors = weights.mT @ weights > _LEAST_SHARED * len(labels)
+    part = merge_alike(residuals, members.sum(0), neighbors, tolerance)
     return part[labels].unique(return_inverse=True)[1]
 
 
-def _misses(points: Tensor, motions: Tensor, labels: Tensor, own: Tensor) -> Tensor:
-    """Return how far the motion of every bone takes every bone's points (B, B) from where they went, in all.
+def _residual_sums(points: Tensor, motions: Tensor, labels: Tensor, members: Tensor) -> Tensor:
+    """Return (B, B): summed distances of each bone's moved points (N, 3) from where every bone would move them.
 
-    In diagonals of the moved points (N, 3); ``own`` (N, B) tells whose each of them is.
+    In diagonals of the moved points; ``members`` (N, B) are the bones' points.
     """
     size = (points.amax(0) - points.amin(0)).norm()
     rest = (torch.linalg.inv(motions)[labels] @ nn.functional.pad(points, (0, 1), value=1.0).unsqueeze(-1))[:, :3, 0]
-    places = rest @ motions[:, :3, :3].mT + motions[:, None, :3, 3]
-    return (places - points).norm(dim=-1) @ own / size
+    positions = rest @ motions[:, :3, :3].mT + motions[:, None, :3, 3]
+    return (positions - points).norm(dim=-1) @ members / size
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ class SequenceRegistration(Result):
         transforms: (T, B, 4, 4) of the bones.
         weights: (N, B) of the bones at the points, rows sum to one.
         fused: (K, 3) the points of all scans in the pose of the reference: a more complete model than any of them.
-        fused_normals: (K, 3) unit normals there.
+        fused_normals: (K, 3) unit normals of these points.
         fused_frames: (K,) int64, the scan that each is from.
         reference: number of the scan that is moved.
         status: how the registration ended.
@@ -164,16 +167,21 @@ class PoseSolution(Result):
 
     Args:
         transforms: (B, 4, 4) of the bones.
-        placed: (H, 3) where the handles are.
-        misses: (H,) their distances from the targets.
-        gaps: (J,) how far apart the bones of each joint take its center.
+        placed: (H, 3) the handles in this pose.
+        residuals: (H,) their distances from the targets.
+        gaps: (J,) distances between the images of each joint's center under its two bones.
         num_steps: linear systems solved.
         status: CONVERGED or MAX_STEPS; a tuple with one entry per problem for a batch.
     """
 
     transforms: Tensor
     placed: Tensor
-    misses: Tensor
+    residuals: Tensor = field(metadata=formerly("misses"))
     gaps: Tensor
     num_steps: int
     status: Status | tuple[Status, ...]
+
+    @property
+    def misses(self) -> Tensor:
+        """The residuals (H,), by their earlier name."""
+        return self.residuals

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -20,33 +20,33 @@ from torchreg._checks import (
 from torchreg._threads import one_thread
 from torchreg.errors import InputError
 from torchreg.geometry.rigid import transform_points
-from torchreg.registration.blend import turn_about
-from torchreg.registration.bones.grid_lbs import GridLBS, check_rigid
-from torchreg.registration.bones.joint_moments import JointMoments
+from torchreg.registration.blend import check_rigid_motions, turn_about
+from torchreg.registration.bones.correspondences import Correspondences
+from torchreg.registration.bones.grid_lbs import GridLBS
+from torchreg.registration.bones.joint_moments import gaps_at, motion_differences
 from torchreg.registration.bones.joints import BoneTree, bone_tree
-from torchreg.registration.bones.motion_problem import BoneProblem, bind, bone_bodies
+from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
 from torchreg.registration.bones.motions import BoneFit, fit_bones
 from torchreg.registration.results import PoseSolution
 from torchreg.result import Status
 
 HELD_JOINTS = ("tree", "all")
-# Where handles are this share of the model's size off, steps pay at first about as much as handles pull; less, nearer.
-_FAR = 0.2
 
 
 @dataclass(frozen=True)
-class PoseConfig:
-    """How a pose is solved.
+class SolvePoseConfig:
+    """Settings by which a pose is solved.
 
     Args:
-        hold: how much the joints count against the handles: where a target is out of reach, joints open by a share of
-            the miss that is about the inverse.
-        bend: how much joints pull bones back to the unmoved pose, as a share of ``hold``; the energy of eq. 4 has 1.
-        stay: how much the mean squared shift of what the bones carry counts against that of the handles.
-        joints: "tree", those of the skeleton; "all", wherever two bones share weight, touching parts too.
+        hold: weight of the joints against the handles; where a target is out of reach, joints open by about its inverse
+            as a share of the residual.
+        bend: weight of turns at the joints, which draw bones back to the unmoved pose, as a share of ``hold``; the
+            joint energy of eq. 4 has 1.
+        stay: weight of the bones' mean squared displacement from the start against that of the handles.
+        joints: "tree" holds those of the skeleton, "all" wherever two bones share weight, so that touching parts hold.
         max_steps: most linear systems.
-        rtol: the pose is found when a step changes the energy by less than this share,
-        atol: or when it is below the square of this share of the model's size (root mean square).
+        rtol: relative change of the energy by a step below which the pose is found.
+        atol: root of the energy, as a share of the model's size (root mean square), below which the pose is found.
 
     Raises:
         InputError: if a value is out of range.
@@ -70,6 +70,25 @@ class PoseConfig:
         check_positive(self.atol, "atol", allow_zero=True)
 
 
+@dataclass(frozen=True)
+class _FirstDamping:
+    """Damping of the first step, which grows with the squared distance of the handles from their targets.
+
+    Args:
+        far: root mean squared distance, as a share of the model's size, at which displacements cost as much as
+            residuals.
+        least: smallest damping.
+        most: largest damping.
+    """
+
+    far: float = 0.2
+    least: float = 1e-3
+    most: float = 1.0
+
+
+_DAMPING = _FirstDamping()
+
+
 def solve_pose(
     model: GridLBS,
     handles: Tensor,
@@ -78,24 +97,24 @@ def solve_pose(
     start: Tensor | None = None,
     handle_weights: Tensor | None = None,
     fixed: Tensor | None = None,
-    config: PoseConfig | None = None,
+    config: SolvePoseConfig | None = None,
 ) -> PoseSolution:
-    """Return the pose in which points of the space come to lie at targets, joints hold, and the rest moves little.
+    """Return the pose in which handles lie at targets, joints hold, and the rest moves little.
 
     ``argmin_T mean_h |D(x_h; T) - y_h|^2 + hold sum_joints |T_i c - T_j c|^2 + ...``, a joint being the point c that
     the model's own motions move alike. Pieces of a scan that hidden joints cut apart hold together as well, see
     `GridLBS.joints`.
 
-    Whoever drags handles solves many poses of one model: a `PoseSolver` finds the joints once.
+    To solve many poses of one model, as when dragging, use a `PoseSolver`, which finds the joints once.
 
     Args:
-        model: what to pose; it is not changed.
+        model: the model to pose, which is not changed.
         handles: (H, 3) points of the space before it is moved, such as points of the source scan.
-        targets: (..., H, 3) where they should go; a batch solves several poses at once.
+        targets: (..., H, 3) of the handles; a batch solves several poses at once.
         start: (..., B, 4, 4) to start from and to stay near, the last solution when dragging; the model's by default.
-        handle_weights: (..., H) how much each handle counts; ones by default.
+        handle_weights: (..., H) not negative; ones by default.
         fixed: (B,) bool, bones to hold at the start.
-        config: see `PoseConfig`.
+        config: see `SolvePoseConfig`.
 
     Returns:
         a `PoseSolution`.
@@ -119,26 +138,24 @@ class PoseSolver:
     """Poses of one model, its joints found once.
 
     Args:
-        model: what to pose; later changes of it go unnoticed.
-        config: see `PoseConfig`.
+        model: the model to pose; later changes of it go unnoticed.
+        config: see `SolvePoseConfig`.
     """
 
     @torch.no_grad()
-    def __init__(self, model: GridLBS, *, config: PoseConfig | None = None) -> None:
+    def __init__(self, model: GridLBS, *, config: SolvePoseConfig | None = None) -> None:
         self.model = model
-        self.config = PoseConfig() if config is None else config
-        grid = model.grid
-        weights = model.corner_weights()
-        self._bodies = bone_bodies(grid.corner_points().double(), weights.double())
-        corners = grid.corner_points()
+        self.config = SolvePoseConfig() if config is None else config
+        corners, weights = model.grid.corner_points(), model.corner_weights()
+        self._bodies = BoneBodies.from_weights(corners.double(), weights.double())
         self._size = float((corners - corners.mean(0)).square().sum(-1).mean().sqrt())
         moments = model.bridged_moments()
         joints = model.joints_of(moments)
-        tree = bone_tree(joints, model.middles, weights.sum(0))
-        self._chains = _Chains(tree, self._bodies.middle)
-        kept = self._chains.uses(joints.pairs) if self.config.joints == "tree" else slice(None)
-        spread = self.config.bend * moments.spread[kept]
-        self._held = JointMoments(joints.pairs[kept], joints.mass[kept], joints.centers[kept], spread).to(torch.float64)
+        self._tree = _JointTree(bone_tree(joints, model.middles, weights.sum(0)), self._bodies.center)
+        moments = replace(moments, center=joints.centers, spread=self.config.bend * moments.spread)
+        if self.config.joints == "tree":
+            moments = moments.select(self._tree.holds(moments.pairs))
+        self._held = moments.to(torch.float64)
 
     @torch.no_grad()
     @one_thread()
@@ -151,29 +168,24 @@ class PoseSolver:
         handle_weights: Tensor | None = None,
         fixed: Tensor | None = None,
     ) -> PoseSolution:
-        """Return the pose for some handles; see `solve_pose`."""
+        """Return the pose of some handles; see `solve_pose`."""
         model, config = self.model, self.config
         handles = as_float_tensor(handles, "handles", like=model.weights)
         check_points(handles, "handles", batch=False)
         targets = as_float_tensor(targets, "targets", like=model.weights)
         check_shape(targets, "targets", (len(handles), 3), batch=True)
         check_finite(targets, "targets")
-        start = self._start(start)
-        if handle_weights is not None:
-            handle_weights = as_float_tensor(handle_weights, "handle_weights", like=start)
-            check_shape(handle_weights, "handle_weights", (len(handles),), batch=True)
-            check_finite(handle_weights, "handle_weights")
-            if bool((handle_weights < 0).any()):
-                raise InputError(f"handle_weights must not be negative, got {float(handle_weights.min()):g}")
+        start = self._checked_start(start)
+        if fixed is not None:
+            check_shape(fixed, "fixed", (model.num_bones,))
+        weights = torch.ones_like(targets[..., 0]) if handle_weights is None else handle_weights
         problem = BoneProblem(
-            handles.double(),
-            bind(model.weights_at(handles).double()),
-            targets.double(),
-            match_weights=handle_weights,
-            point_to_point=1.0,
+            points=handles.double(),
+            binding=Binding.from_weights(model.weights_at(handles).double()),
+            correspondences=Correspondences(targets.double(), None, _checked_weights(weights, start, len(handles))),
+            bodies=self._bodies,
             moments=self._held,
             joint_weight=config.hold,
-            bodies=self._bodies,
             anchors=start,
             anchor_weights=config.stay / model.num_bones,
             blend=model.blend,
@@ -186,17 +198,17 @@ class PoseSolver:
             rtol=config.rtol,
             atol=config.atol * self._size,
             damping=self._damping(problem, start),
-            retract=partial(self._chains.move, fixed=fixed),
+            retract=partial(self._tree.retract, fixed=fixed),
         )
         return self._solution(problem, targets, fit)
 
     def _damping(self, problem: BoneProblem, start: Tensor) -> Tensor:
         """Return the damping (...) of the first step."""
         moved = self.model.move(problem.points, problem.binding.weights, start)
-        square = (moved - problem.targets).square().sum(-1).mean(-1)
-        return (square / (_FAR * self._size) ** 2).clamp(1e-3, 1.0)
+        square = (moved - problem.correspondences.targets).square().sum(-1).mean(-1)
+        return (square / (_DAMPING.far * self._size) ** 2).clamp(_DAMPING.least, _DAMPING.most)
 
-    def _start(self, start: Tensor | None) -> Tensor:
+    def _checked_start(self, start: Tensor | None) -> Tensor:
         model = self.model
         if start is None:
             start = model.transforms
@@ -204,68 +216,79 @@ class PoseSolver:
                 raise InputError(f"start must be given for a model with {tuple(start.shape[:-3])} poses; choose one")
         start = as_float_tensor(start, "start", like=model.weights).detach()
         check_shape(start, "start", (model.num_bones, 4, 4), batch=True)
-        check_rigid(start, "start")
+        check_rigid_motions(start, "start")
         return start.double()
 
     def _solution(self, problem: BoneProblem, targets: Tensor, fit: BoneFit) -> PoseSolution:
         placed = self.model.move(problem.points, problem.binding.weights, fit.transforms).to(targets)
-        one, two = (fit.transforms[..., bones, :, :] for bones in self._held.pairs.unbind(-1))
-        apart = ((one - two)[..., :3, :3] @ self._held.center.unsqueeze(-1)).squeeze(-1) + (one - two)[..., :3, 3]
-        done = [Status.CONVERGED if ok else Status.MAX_STEPS for ok in fit.converged.reshape(-1).tolist()]
+        gaps = gaps_at(motion_differences(fit.transforms, self._held.pairs), self._held.center)
+        status = [Status.CONVERGED if done else Status.MAX_STEPS for done in fit.converged.reshape(-1).tolist()]
         return PoseSolution(
-            fit.transforms.to(targets),
-            placed,
-            torch.linalg.vector_norm(placed - targets, dim=-1),
-            torch.linalg.vector_norm(apart, dim=-1).to(targets),
-            fit.num_steps,
-            done[0] if fit.converged.ndim == 0 else tuple(done),
+            transforms=fit.transforms.to(targets),
+            placed=placed,
+            residuals=torch.linalg.vector_norm(placed - targets, dim=-1),
+            gaps=torch.linalg.vector_norm(gaps, dim=-1).to(targets),
+            num_steps=fit.num_steps,
+            status=status[0] if fit.converged.ndim == 0 else tuple(status),
         )
 
 
-class _Chains:
-    """Bones that hang on each other at joints."""
+def _checked_weights(weights: Tensor, like: Tensor, count: int) -> Tensor:
+    weights = as_float_tensor(weights, "handle_weights", like=like)
+    check_shape(weights, "handle_weights", (count,), batch=True)
+    check_finite(weights, "handle_weights")
+    if bool((weights < 0).any()):
+        raise InputError(f"handle_weights must not be negative, got {float(weights.min()):g}")
+    return weights
 
-    def __init__(self, tree: BoneTree, middles: Tensor) -> None:
-        parents = torch.tensor(tree.parents, device=middles.device)
-        self.parents, self.middles = parents, middles
-        self.child = (parents >= 0).nonzero()[:, 0]
-        self.parent = parents[self.child]
-        self.joint = tree.origins[self.child].double().unsqueeze(-1)
-        # Which joints lie between a bone and its root.
-        above = torch.zeros(len(parents), len(parents), dtype=middles.dtype, device=middles.device)
-        for bone in range(len(parents)):
-            at = bone
-            while at >= 0:
-                above[bone, at] = 1.0
-                at = tree.parents[at]
-        self.above = above[:, self.child]
 
-    def uses(self, pairs: Tensor) -> Tensor:
-        """Return which pairs of bones (P,) bool hang on each other."""
+class _JointTree:
+    """The tree of B bones and the J joints between bones and their parents.
+
+    Args:
+        tree: the skeleton.
+        centers: (B, 3) of the bones' bodies, about which twists turn them.
+    """
+
+    def __init__(self, tree: BoneTree, centers: Tensor) -> None:
+        self._centers, self._parents = centers, torch.tensor(tree.parents, device=centers.device)
+        self._child = (self._parents >= 0).nonzero()[:, 0]
+        self._parent = self._parents[self._child]
+        self._joint = tree.origins[self._child].double().unsqueeze(-1)
+        # Which joints (B, J) lie between a bone and its root.
+        above = torch.zeros(len(centers), len(centers), dtype=centers.dtype, device=centers.device)
+        for bone in range(len(centers)):
+            ancestor = bone
+            while ancestor >= 0:
+                above[bone, ancestor] = 1.0
+                ancestor = tree.parents[ancestor]
+        self._above = above[:, self._child]
+
+    def holds(self, pairs: Tensor) -> Tensor:
+        """Return a mask (P,) of the pairs of bones that are parent and child."""
         first, second = pairs.unbind(-1)
-        return (self.parents[first] == second) | (self.parents[second] == first)
+        return (self._parents[first] == second) | (self._parents[second] == first)
 
-    def move(self, transforms: Tensor, twists: Tensor, fixed: Tensor | None = None) -> Tensor:
-        """Return motions moved on by twists about the bones' middles, shifted so that joints open as to first order.
+    def retract(self, transforms: Tensor, twists: Tensor, fixed: Tensor | None = None) -> Tensor:
+        """Return motions updated by twists about the bones' centers, shifted so that joints open as to first order.
 
         Bones that turn far leave their joints along tangents: without the shift, stiff joints allow small turns alone.
         """
-        centers = transform_points(transforms, self.middles.unsqueeze(-2)).squeeze(-2)
+        centers = transform_points(transforms, self._centers.unsqueeze(-2)).squeeze(-2)
         moved = turn_about(transforms, twists, centers)
-        # Of both ends of every joint: where it ends, less where its first-order motion takes it.
-        ends = torch.cat([self.child, self.parent])
-        place = self._places(transforms, ends)
-        arms = place - centers.index_select(-2, ends)
-        twist = twists.index_select(-2, ends)
-        slide = place + twist[..., :3] + torch.linalg.cross(twist[..., 3:], arms)
-        child, parent = (self._places(moved, ends) - slide).chunk(2, dim=-2)
-        shift = self.above @ (parent - child)
+        # The end of every joint on each of its bones, and how far the update takes it from its first-order motion.
+        ends = torch.cat([self._child, self._parent])
+        before = self._joint_positions(transforms, ends)
+        twist, arms = twists.index_select(-2, ends), before - centers.index_select(-2, ends)
+        linear = before + twist[..., :3] + torch.linalg.cross(twist[..., 3:], arms)
+        child, parent = (self._joint_positions(moved, ends) - linear).chunk(2, dim=-2)
+        shift = self._above @ (parent - child)
         if fixed is not None and bool(fixed.any()):
             # What hangs on a held bone comes to it, not the other way round.
             shift = (shift - shift[..., fixed, :].mean(-2, keepdim=True)).masked_fill(fixed.unsqueeze(-1), 0.0)
         return torch.cat([moved[..., :3], moved[..., 3:] + nn.functional.pad(shift, (0, 1)).unsqueeze(-1)], dim=-1)
 
-    def _places(self, transforms: Tensor, bones: Tensor) -> Tensor:
-        """Return where the joints (..., 2 J, 3) are, as the bones at their ends see it."""
+    def _joint_positions(self, transforms: Tensor, bones: Tensor) -> Tensor:
+        """Return the images (..., 2 J, 3) of the joints under the motions of the bones at their ends."""
         rows = transforms[..., :3, :].index_select(-3, bones)
-        return (rows[..., :3] @ torch.cat([self.joint, self.joint])).squeeze(-1) + rows[..., 3]
+        return (rows[..., :3] @ torch.cat([self._joint, self._joint])).squeeze(-1) + rows[..., 3]

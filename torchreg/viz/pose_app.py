@@ -268,7 +268,7 @@ class PoseApp:
         self._name.content = f"handle {self._selected + 1} of {len(state.vertices)}" if chosen else "none yet"
         self._pinned.value = chosen and state.pinned[self._selected]  # type: ignore[misc]
         if state.solution is not None:
-            miss = float(state.solution.misses.max()) / self.editor.diagonal
+            miss = float(state.solution.residuals.max()) / self.editor.diagonal
             milliseconds = 1000 * self.worker.median_seconds
             self._status.content = f"handles miss by {miss:.2%} of the size; {milliseconds:.0f} ms per pose"
 

@@ -16,7 +16,7 @@ from torchreg.errors import InputError
 from torchreg.io.gltf_morph import save_vertex_animation
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.results import PoseSolution, ScanRegistration, SequenceRegistration
-from torchreg.registration.solve_pose import PoseConfig, PoseSolver
+from torchreg.registration.solve_pose import PoseSolver, SolvePoseConfig
 from torchreg.viz.bone_colors import weight_colors
 from torchreg.viz.key_poses import between_poses
 from torchreg.viz.scan_gltf import save_grid_animation
@@ -65,7 +65,7 @@ class PoseEditor:
         *,
         frame: int = 0,
         start: Tensor | None = None,
-        config: PoseConfig | None = None,
+        config: SolvePoseConfig | None = None,
     ) -> None:
         own = registration.transforms.detach()
         if own.ndim == 4 and not 0 <= frame < len(own):

@@ -14,8 +14,8 @@ from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.io.gltf_write import save_animated_skin
-from torchreg.registration.blend import blend_linear
-from torchreg.registration.bones.grid_lbs import GridLBS, check_rigid
+from torchreg.registration.blend import blend_linear, check_rigid_motions
+from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.viz.bone_colors import weight_colors
 
 _WEIGHTS = (4, 8)
@@ -125,7 +125,7 @@ def _poses(model: GridLBS, poses: Tensor | None) -> Tensor:
         return torch.cat([rest, own])
     poses = as_float_tensor(poses, "poses", like=model.weights)
     check_shape(poses, "poses", ("T", model.num_bones, 4, 4))
-    check_rigid(poses, "poses")
+    check_rigid_motions(poses, "poses")
     if len(poses) == 0:
         raise InputError("poses must hold at least one, got none")
     return poses

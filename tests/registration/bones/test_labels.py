@@ -1,4 +1,4 @@
-"""Labels of cells: parts of a bent bar, the W-step's energy, label costs, lost labels born again where it helps."""
+"""Labels of cells: parts of a bent bar, the W-step's energy, label costs, lost labels used again where it helps."""
 
 import pytest
 import torch
@@ -6,7 +6,8 @@ import torch
 from torchreg.geometry.rigid import rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.metrics import adjusted_rand
-from torchreg.registration.bones.labels import CellData, LabelCosts, Pull, first_labels, relabel, reuse_labels
+from torchreg.registration.bones.correspondences import Correspondences
+from torchreg.registration.bones.labels import CellData, LabelCosts, first_labels, reinitialize_labels, relabel
 from torchreg.registration.bones.sparse_grid import SparseGrid
 
 COSTS = LabelCosts(smoothness=0.2, label=4.0, truncation=4.0)
@@ -54,21 +55,21 @@ def test_what_is_cut_off_follows_what_it_hangs_on_where_hardly_anything_is_told(
     trust = torch.where(island, 1e-6, 1.0).expand(1, -1)
     seen = CellData(SparseGrid.from_points(points, 40), points, 150, linked=linked)
     start = torch.zeros(seen.grid.num_cells, dtype=torch.int64)
-    labels, _ = relabel(seen, Pull(there[None], None, trust), motions[None], start, COSTS)
+    labels, _ = relabel(seen, Correspondences(there[None], None, trust), motions[None], start, COSTS)
     assert labels[seen.cell[island]].unique().tolist() == [label]
 
 
 def test_the_w_step_finds_borders_and_its_energy_is_as_defined(bar):
     data, moved, weights, part, motions = bar
-    pull = Pull(moved, None, weights)
+    pairs = Correspondences(moved, None, weights)
     start = torch.zeros(data.grid.num_cells, dtype=torch.int64)
-    labels, energy = relabel(data, pull, motions[None], start, COSTS)
+    labels, energy = relabel(data, pairs, motions[None], start, COSTS)
     assert float(adjusted_rand(labels[data.cell], part)) > 0.95
     own = transform_points(motions[labels[data.cell]], data.points[:, None])[:, 0]
     squares = (own - moved[0]).square().sum(-1).clamp(max=(4 * data.grid.spacing) ** 2) / data.grid.spacing**2
     distance = data.grid.num_cells * squares.mean()
-    pairs = data.grid.neighbors()
-    borders = (labels[pairs[:, 0]] != labels[pairs[:, 1]]).sum()
+    first, second = data.grid.neighbors().unbind(-1)
+    borders = (labels[first] != labels[second]).sum()
     assert energy == pytest.approx(float(distance + 0.2 * borders + 4.0 * 3), rel=1e-6)
 
 
@@ -76,13 +77,13 @@ def test_seams_cost_what_two_bones_tear_apart_up_to_a_cap(bar):
     data, moved, weights, _, motions = bar
     frames = torch.cat([data.points[None], moved])
     both = torch.stack([torch.eye(4, dtype=torch.float64).expand(3, 4, 4), motions])
-    pull = Pull(frames, None, weights.expand(2, -1))
+    pairs = Correspondences(frames, None, weights.expand(2, -1))
     start = (data.grid.cell_centers()[:, 0] > 3).long()
-    spacing, pairs = data.grid.spacing, data.grid.neighbors()
+    spacing, cells = data.grid.spacing, data.grid.neighbors()
     plain, seamed = (LabelCosts(0.2, 4.0, 4.0, seam=seam, seam_cap=0.5) for seam in (0.0, 0.3))
-    labels, energy = relabel(data, pull, both, start, seamed)
+    labels, energy = relabel(data, pairs, both, start, seamed)
     centers, seams = data.grid.cell_centers(), 0.0
-    for one, other in pairs[labels[pairs[:, 0]] != labels[pairs[:, 1]]].tolist():
+    for one, other in cells[labels[cells[:, 0]] != labels[cells[:, 1]]].tolist():
         middle = torch.cat([0.5 * (centers[one] + centers[other]), torch.ones(1, dtype=torch.float64)])
         gaps = [(motion[labels[one], :3] - motion[labels[other], :3]) @ middle for motion in both]
         apart = torch.stack(gaps).square().sum(-1).mean().sqrt() / spacing
@@ -90,11 +91,11 @@ def test_seams_cost_what_two_bones_tear_apart_up_to_a_cap(bar):
     own = both[:, labels[data.cell], :3, :3] @ data.points[..., None]
     squares = (own[..., 0] + both[:, labels[data.cell], :3, 3] - frames).square().sum(-1)
     distance = data.grid.num_cells * squares.clamp(max=(4 * spacing) ** 2).mean() / spacing**2
-    borders = (labels[pairs[:, 0]] != labels[pairs[:, 1]]).sum()
+    borders = (labels[cells[:, 0]] != labels[cells[:, 1]]).sum()
     expected = float(distance) + 0.2 * float(borders) + 4.0 * len(labels.unique()) + seams
     assert energy == pytest.approx(expected, rel=1e-6)
     assert seams > 0
-    assert relabel(data, pull, both, start, plain)[1] < energy
+    assert relabel(data, pairs, both, start, plain)[1] < energy
 
 
 def test_seams_draw_borders_to_the_joints(bar):
@@ -103,9 +104,11 @@ def test_seams_draw_borders_to_the_joints(bar):
     start = torch.zeros(data.grid.num_cells, dtype=torch.int64)
     wrong = {0.0: 0.0, 0.5: 0.0}
     for _ in range(3):
-        pull = Pull(moved + 0.1 * torch.randn(moved.shape, generator=generator, dtype=torch.float64), None, weights)
+        pairs = Correspondences(
+            moved + 0.1 * torch.randn(moved.shape, generator=generator, dtype=torch.float64), None, weights
+        )
         for seam in wrong:
-            labels, _ = relabel(data, pull, motions[None], start, LabelCosts(0.02, 4.0, 4.0, seam=seam))
+            labels, _ = relabel(data, pairs, motions[None], start, LabelCosts(0.02, 4.0, 4.0, seam=seam))
             wrong[seam] += float((labels[data.cell] != part).double().mean())
     assert wrong[0.5] < 0.75 * wrong[0.0]
 
@@ -121,41 +124,33 @@ def test_what_merely_touches_can_part():
     weights = torch.ones(1, len(points), dtype=torch.float64)
     start = torch.zeros(data.grid.num_cells, dtype=torch.int64)
     labels, _ = relabel(
-        data, Pull(moved[None], None, weights), motions[None], start, LabelCosts(0.02, 4.0, 4.0, seam=0.2)
+        data, Correspondences(moved[None], None, weights), motions[None], start, LabelCosts(0.02, 4.0, 4.0, seam=0.2)
     )
     assert float(adjusted_rand(labels[data.cell], lower)) > 0.8
     stuck = LabelCosts(0.02, 4.0, 4.0, seam=50.0, seam_cap=20.0)
-    assert len(relabel(data, Pull(moved[None], None, weights), motions[None], start, stuck)[0].unique()) == 1
+    assert len(relabel(data, Correspondences(moved[None], None, weights), motions[None], start, stuck)[0].unique()) == 1
 
 
 def test_labels_that_cost_too_much_are_not_used(bar):
     data, moved, weights, _, motions = bar
     start = torch.zeros(data.grid.num_cells, dtype=torch.int64)
-    labels, _ = relabel(data, Pull(moved, None, weights), motions[None], start, LabelCosts(0.2, 1e6, 4.0))
+    labels, _ = relabel(data, Correspondences(moved, None, weights), motions[None], start, LabelCosts(0.2, 1e6, 4.0))
     assert len(labels.unique()) == 1
 
 
-def test_point_to_plane_lets_points_slide(bar):
-    data, moved, weights, _, motions = bar
-    up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand(moved.shape)
-    pull = Pull(moved + torch.tensor([1.0, 0.0, 0.5]), up, weights, 0.2)
-    torch.testing.assert_close(pull.squares(moved), torch.full_like(weights, 0.8 * 0.25 + 0.2 * 1.25))
-    assert pull.squares(transform_points(motions[None], data.points)).shape == (1, 3, len(data.points))
-
-
-def test_lost_labels_are_born_again_where_two_motions_fit_better(bar):
+def test_lost_labels_are_used_again_where_two_motions_fit_better(bar):
     data, moved, weights, part, _ = bar
-    pull = Pull(moved, None, weights)
+    pairs = Correspondences(moved, None, weights)
     merged = (data.grid.cell_centers()[:, 0] > 4).long()
-    labels = reuse_labels(data, pull, merged, 3, COSTS)
+    labels = reinitialize_labels(data, pairs, merged, 3, COSTS)
     assert labels.unique().tolist() == [0, 1, 2]
     assert float(adjusted_rand(labels[data.cell], part)) > 0.9
-    assert torch.equal(reuse_labels(data, pull, merged, 2, COSTS), merged)
+    assert torch.equal(reinitialize_labels(data, pairs, merged, 2, COSTS), merged)
     # Nothing is split that moves as one already.
-    assert torch.equal(reuse_labels(data, pull, labels, 9, LabelCosts(0.2, 50.0, 4.0)), labels)
+    assert torch.equal(reinitialize_labels(data, pairs, labels, 9, LabelCosts(0.2, 50.0, 4.0)), labels)
     tiny = torch.zeros(data.grid.num_cells, dtype=torch.int64)
     tiny[0] = 1
-    assert reuse_labels(data, pull, tiny, 2, COSTS).unique().tolist() == [0, 1]
+    assert reinitialize_labels(data, pairs, tiny, 2, COSTS).unique().tolist() == [0, 1]
 
 
 def test_frames_decide_together(bar):
@@ -165,5 +160,5 @@ def test_frames_decide_together(bar):
     labels = first_labels(data, frames, weights.expand(2, -1), 3, COSTS)
     assert float(adjusted_rand(labels[data.cell], part)) > 0.9
     both = torch.stack([torch.eye(4, dtype=torch.float64).expand(3, 4, 4), motions])
-    found, _ = relabel(data, Pull(frames, None, weights.expand(2, -1)), both, labels, COSTS)
+    found, _ = relabel(data, Correspondences(frames, None, weights.expand(2, -1)), both, labels, COSTS)
     assert float(adjusted_rand(found[data.cell], part)) > 0.95

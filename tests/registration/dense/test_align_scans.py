@@ -13,7 +13,7 @@ from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.registration.blend import blend_linear
 from torchreg.registration.dense import align_scans as scan_alignment
 from torchreg.registration.dense.align_scans import align_scans
-from torchreg.registration.dense.config import Hypothesis, RefineConfig, ScanAlignConfig
+from torchreg.registration.dense.config import EMConfig, Hypothesis, ScanAlignConfig
 from torchreg.registration.dense.problem import describe
 from torchreg.registration.dense.stages import judge, refine
 
@@ -23,7 +23,7 @@ QUICK = replace(
     QUICK,
     match=replace(QUICK.match, num_points=400),
     assign=replace(QUICK.assign, num_points=250, num_steps=6),
-    refine=RefineConfig(num_steps=5, final_steps=1),
+    refine=EMConfig(num_steps=5, final_steps=1),
 )
 
 
@@ -40,7 +40,7 @@ def aligned(pair):
 def judged_end(pair, config, result):
     """Return how good an alignment is, by its motions alone."""
     problem = describe(pair.source, pair.target, config)
-    middle, size = problem.unit.middle, problem.unit.size
+    middle, size = problem.unit.center, problem.unit.scale
     outwards = torch.eye(4, dtype=torch.float64) * torch.tensor([size, size, size, 1.0])
     outwards[:3, 3] = middle
     motions = torch.linalg.inv(outwards) @ result.transforms.double() @ outwards

@@ -4,8 +4,8 @@ from torchreg.errors import InputError
 from torchreg.registration.dense.config import (
     AssignConfig,
     ChoiceConfig,
+    EMConfig,
     MatchConfig,
-    RefineConfig,
     ScanAlignConfig,
     ScanAlignRecord,
 )
@@ -28,10 +28,10 @@ from torchreg.registration.dense.e_step import ScanEMConfig
         (AssignConfig, {"reach": (0.1, 0.0)}, "reach must be positive"),
         (AssignConfig, {"stiffness": (0.1,)}, "stiffness must be two numbers"),
         (AssignConfig, {"feature_weight": -0.1}, "feature_weight must be"),
-        (RefineConfig, {"final_steps": -1}, "final_steps must be at least 0"),
-        (RefineConfig, {"slow_steps": -1}, "slow_steps must be at least 0"),
-        (RefineConfig, {"slide": (1.0, 0.0)}, "slide must be positive"),
-        (RefineConfig, {"density": -1.0}, "density must be"),
+        (EMConfig, {"final_steps": -1}, "final_steps must be at least 0"),
+        (EMConfig, {"slow_steps": -1}, "slow_steps must be at least 0"),
+        (EMConfig, {"slide": (1.0, 0.0)}, "slide must be positive"),
+        (EMConfig, {"density": -1.0}, "density must be"),
         (ChoiceConfig, {"cap": 0.0}, "cap must be positive"),
         (ChoiceConfig, {"bend": -1.0}, "bend must be"),
         (ChoiceConfig, {"seen": -1.0}, "seen must be"),
@@ -39,14 +39,14 @@ from torchreg.registration.dense.e_step import ScanEMConfig
         (ScanAlignConfig, {"num_nodes": 0}, "num_nodes must be at least 1"),
         (ScanAlignConfig, {"curvature_radii": ()}, "curvature_radii must hold"),
         (ScanAlignConfig, {"curvature_radii": (-0.1,)}, "curvature_radii must be positive"),
-        (RefineConfig, {"near_sigma": 0.0}, "near_sigma must be positive"),
+        (EMConfig, {"near_sigma": 0.0}, "near_sigma must be positive"),
         (MatchConfig, {"stiffer": ()}, "stiffer must hold"),
-        (RefineConfig, {"expected": -1.0}, "expected must be"),
-        (RefineConfig, {"expected_scale": 0.0}, "expected_scale must be positive"),
-        (RefineConfig, {"regions": -0.1}, "regions must be"),
-        (RefineConfig, {"unlike": (0.5,)}, "unlike must be two numbers"),
-        (RefineConfig, {"unlike": (0.8, 0.8)}, "unlike must grow, got 0.8 and 0.8"),
-        (RefineConfig, {"surrounding": 0}, "surrounding must be at least 1"),
+        (EMConfig, {"expected": -1.0}, "expected must be"),
+        (EMConfig, {"expected_scale": 0.0}, "expected_scale must be positive"),
+        (EMConfig, {"regions": -0.1}, "regions must be"),
+        (EMConfig, {"unlike": (0.5,)}, "unlike must be two numbers"),
+        (EMConfig, {"unlike": (0.8, 0.8)}, "unlike must grow, got 0.8 and 0.8"),
+        (EMConfig, {"surrounding": 0}, "surrounding must be at least 1"),
         (ChoiceConfig, {"strain": -1.0}, "strain must be"),
         (ScanAlignConfig, {"region_samples": 0}, "region_samples must be at least 1"),
         (ScanAlignConfig, {"region_reach": 0.0}, "region_reach must be positive"),
@@ -65,12 +65,12 @@ def test_values_out_of_range_are_named(kind, arguments, message):
 
 
 def test_defaults_are_shared_by_nobody():
-    assert ScanAlignConfig().refine == ScanAlignConfig().refine == RefineConfig()
-    assert RefineConfig().compatible == ScanEMConfig()
+    assert ScanAlignConfig().refine == ScanAlignConfig().refine == EMConfig()
+    assert EMConfig().compatible == ScanEMConfig()
 
 
 def test_slowly_matches_slide_from_the_beginning():
-    config = RefineConfig(slow_steps=9, slide=(0.5, 0.1), sigma=(0.02, 0.004))
+    config = EMConfig(slow_steps=9, slide=(0.5, 0.1), sigma=(0.02, 0.004))
     slow = config.slower()
     assert (slow.num_steps, slow.slide, slow.sigma) == (9, (0.1, 0.1), (0.02, 0.004))
 

@@ -27,7 +27,7 @@ def problem():
 def halves(problem):
     """The true motion, and two motions that are true in one half each and off in the other."""
     scans, pair = problem
-    truth = scans.unit.of_points(pair.truth[scans.samples])
+    truth = scans.unit.normalize(pair.truth[scans.samples])
     matches = GraphMatches.of_places(truth)
     right = fit_graph(scans.graph, scans.graph.rest(), matches, 0.01, num_steps=8).transforms
     off = se3_exp(torch.tensor([0.0, 0.0, 0.1, 0.0, 0.0, 0.0], dtype=torch.float64)) @ right

@@ -47,7 +47,7 @@ def test_what_turned_is_turned_back(pair, degrees):
     scans = describe(source, target, CONFIG)
     found = turned_motions(scans, CHOICE, 2)
     assert min(_degrees(each, motion) for each in found) <= 10.5
-    best = scans.unit.points_back(transform_points(found[0], scans.graph.points), source.points)
+    best = scans.unit.denormalize(transform_points(found[0], scans.graph.points), source.points)
     truth = transform_points(motion, source.points[scans.samples])
     assert float((best - truth).norm(dim=-1).mean()) < 0.05 * source.diagonal
 
@@ -104,7 +104,7 @@ def test_frames_and_units_change_nothing(pair):
     plain[1], _ = turned(plain[1], 50)
     scans, others = describe(*plain, CONFIG), describe(*(scan.transformed(larger) for scan in plain), CONFIG)
     one, other = (
-        each.unit.points_back(transform_points(turned_motions(each, CHOICE, 1)[0], each.graph.points), plain[0].points)
+        each.unit.denormalize(transform_points(turned_motions(each, CHOICE, 1)[0], each.graph.points), plain[0].points)
         for each in (scans, others)
     )
     torch.testing.assert_close(other, transform_points(larger, one), rtol=0, atol=1e-3 * 100 * plain[0].diagonal)

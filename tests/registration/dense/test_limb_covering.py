@@ -34,7 +34,7 @@ def legs_together(problem, left, right):
 def test_a_leg_laid_on_the_other_returns_to_its_own(problem, pair, lower_legs):
     left, right = lower_legs(problem, pair)
     wrong = legs_together(problem, left, right)
-    places, truth = problem.graph(wrong), problem.unit.of_points(pair.truth)[problem.samples]
+    places, truth = problem.graph(wrong), problem.unit.normalize(pair.truth)[problem.samples]
     astray = (places - truth)[left].mean(0).norm()
     assert float((places - truth)[right].mean(0).norm()) < 0.2 * float(astray)
     options = [problem.graph(motion) for motion in covering_limbs(problem, wrong, CONFIG.choice)]

@@ -25,12 +25,12 @@ def problem(pair):
 
 
 def test_samples_are_normalized_and_belong_to_the_scans(pair, problem):
-    assert problem.unit.size == pytest.approx(pair.source.diagonal, rel=0.3)
+    assert problem.unit.scale == pytest.approx(pair.source.diagonal, rel=0.3)
     assert float(problem.source.points.mean(0).norm()) < 1e-6
-    torch.testing.assert_close(problem.unit.of_points(pair.source.points[problem.samples]), problem.graph.points)
+    torch.testing.assert_close(problem.unit.normalize(pair.source.points[problem.samples]), problem.graph.points)
     torch.testing.assert_close(problem.graph.points[0], problem.source.points[0])
     assert len(problem.nodes) == problem.graph.num_nodes == 30
-    torch.testing.assert_close(problem.unit.of_points(pair.source.points[problem.nodes]), problem.graph.centers)
+    torch.testing.assert_close(problem.unit.normalize(pair.source.points[problem.nodes]), problem.graph.centers)
     assert len(problem.target) == 800
 
 
@@ -39,7 +39,7 @@ def test_frames_and_units_change_nothing(pair, problem):
     motion[:3] = 7 * motion[:3]
     source, target = (scan.to(torch.float64).transformed(motion) for scan in (pair.source, pair.target))
     moved = describe(source, target, CONFIG)
-    assert moved.unit.size == pytest.approx(7 * problem.unit.size, rel=1e-5)
+    assert moved.unit.scale == pytest.approx(7 * problem.unit.scale, rel=1e-5)
     assert torch.equal(moved.samples, problem.samples)
     assert torch.equal(moved.nodes, problem.nodes)
     torch.testing.assert_close(moved.target.features, problem.target.features, rtol=0, atol=1e-3)
@@ -51,7 +51,7 @@ def test_samples_beside_what_hides_the_rest_are_cut_off(pair, problem):
     cut = problem.target.cut_off
     assert 0.02 < float(cut.double().mean()) < 0.3
     # An arm before the body leaves a shadow on it; where the body turns away, nothing is cut off.
-    near = k_nearest(problem.target.points[cut], problem.unit.of_points(target.points[target.boundary]), 1)[1]
+    near = k_nearest(problem.target.points[cut], problem.unit.normalize(target.points[target.boundary]), 1)[1]
     assert float(near.max()) < 0.1
     unknown = RangeScan(target.points, target.faces, target.normals)
     guessed = describe(pair.source, unknown, CONFIG).target.cut_off
@@ -78,7 +78,7 @@ def test_moved_samples_are_those_of_the_graph(problem):
 @pytest.mark.parametrize("descriptor", ["learned", "spin_image"])
 def test_most_first_matches_are_right(pair, problem, descriptor):
     matches = first_matches(problem, MatchConfig(num_points=400, descriptor=descriptor))
-    truth = problem.unit.of_points(pair.truth[problem.samples])[matches.which]
+    truth = problem.unit.normalize(pair.truth[problem.samples])[matches.which]
     near = (matches.targets - truth).norm(dim=-1) < 0.05
     assert len(near) > 50
     assert float(near.double().mean()) > 0.9

@@ -11,8 +11,8 @@ from torchreg.geometry.rigid import se3_exp
 from torchreg.registration.dense.config import (
     AssignConfig,
     ChoiceConfig,
+    EMConfig,
     MatchConfig,
-    RefineConfig,
     ScanAlignConfig,
 )
 from torchreg.registration.dense.graph_fit import GraphMatches
@@ -54,12 +54,12 @@ def reporter():
 
 
 def misses(pair, problem, transforms):
-    truth = problem.unit.of_points(pair.truth[problem.samples])
+    truth = problem.unit.normalize(pair.truth[problem.samples])
     return (problem.graph(transforms) - truth).norm(dim=-1)
 
 
 def test_wrong_ones_among_the_first_matches_are_ignored(pair, problem, reporter):
-    truth = problem.unit.of_points(pair.truth[problem.samples])
+    truth = problem.unit.normalize(pair.truth[problem.samples])
     targets = truth[:200].clone()
     targets[::10] += 0.3
     matches = GraphMatches(torch.arange(200), targets, torch.ones(200, dtype=torch.float64))
@@ -77,7 +77,7 @@ def test_stages_come_nearer_and_report(pair, problem, reporter, stage):
     if stage == "assign":
         moved = pull_one_to_one(problem, rest, AssignConfig(num_steps=4, num_points=200), reporter[0])
     else:
-        moved = refine(problem, rest, RefineConfig(num_steps=3, final_steps=1), reporter[0])
+        moved = refine(problem, rest, EMConfig(num_steps=3, final_steps=1), reporter[0])
     assert float(misses(pair, problem, moved).mean()) < float(misses(pair, problem, rest).mean())
     assert len(reporter[1]) == 4
     widths = [record.width for record in reporter[1]]
@@ -88,19 +88,19 @@ def test_stages_come_nearer_and_report(pair, problem, reporter, stage):
 
 
 def test_small_sigmas_use_more_samples(problem):
-    config = RefineConfig(density=0.1, least_samples=50)
+    config = EMConfig(density=0.1, least_samples=50)
     assert len(used_samples(problem, problem.graph.rest(), 0.1, config)) == 50
     assert len(used_samples(problem, problem.graph.rest(), 0.02, config)) == 250
     assert len(used_samples(problem, problem.graph.rest(), 0.001, config)) == 400
 
 
 def test_a_near_start_begins_with_a_smaller_sigma(problem, reporter):
-    refine(problem, problem.graph.rest(), RefineConfig(num_steps=2, final_steps=1), reporter[0], 0.01)
+    refine(problem, problem.graph.rest(), EMConfig(num_steps=2, final_steps=1), reporter[0], 0.01)
     assert [record.width for record in reporter[1]] == pytest.approx([0.02, 0.012, 0.012])
 
 
 def test_refinement_can_be_taken_in_parts(problem, reporter):
-    config, rest = RefineConfig(num_steps=4, final_steps=1), problem.graph.rest()
+    config, rest = EMConfig(num_steps=4, final_steps=1), problem.graph.rest()
     whole = refine(problem, rest, config, reporter[0], 0.02)
     records = reporter[1].copy()
     begun = refine(problem, rest, config, reporter[0], 0.02, slice(2))
@@ -113,18 +113,18 @@ def test_samples_without_a_match_stay_about_where_they_are_expected(problem, rep
     shift = torch.tensor([0.02, -0.01, 0.03], dtype=torch.float64)
     waiting = replace(problem, expected=problem.graph(rest) + shift)
     # Nothing is matched by a sigma so small; when all is matched, next to nothing holds it.
-    alone = RefineConfig(num_steps=4, final_steps=0, sigma=(1e-4, 1e-4), beyond=0)
+    alone = EMConfig(num_steps=4, final_steps=0, sigma=(1e-4, 1e-4), beyond=0)
     held = refine(waiting, rest, alone, reporter[0])
     torch.testing.assert_close(problem.graph(held), waiting.expected, rtol=0, atol=1e-3)
     free = problem.graph(refine(waiting, rest, replace(alone, expected=0.0), reporter[0]))
     assert float((free - problem.graph(rest)).norm(dim=-1).median()) < 0.1 * float(shift.norm())
-    matched = RefineConfig(num_steps=3, final_steps=1)
+    matched = EMConfig(num_steps=3, final_steps=1)
     plain, aware = (problem.graph(refine(each, rest, matched, reporter[0])) for each in (problem, waiting))
     assert float((plain - aware).norm(dim=-1).median()) < 0.1 * float(shift.norm())
 
 
 def test_wide_regions_are_strained_less_where_samples_follow(problem, reporter):
-    rest, config = problem.graph.rest(), RefineConfig(num_steps=4, final_steps=0)
+    rest, config = problem.graph.rest(), EMConfig(num_steps=4, final_steps=0)
     half = torch.full_like(problem.graph.points[:, 0], 0.5)
     strains = [
         problem.regions.strain(
@@ -134,7 +134,7 @@ def test_wide_regions_are_strained_less_where_samples_follow(problem, reporter):
     ]
     assert strains[0] > 1.1 * strains[1] > 1.1**2 * strains[2]
     # At the last sigma they count no more.
-    last = RefineConfig(num_steps=1, final_steps=3)
+    last = EMConfig(num_steps=1, final_steps=3)
     begun = refine(problem, rest, last, reporter[0], steps=slice(1), follow=half)
     ends = [
         refine(problem, begun, replace(last, regions=each), reporter[0], steps=slice(1, None), follow=half)
@@ -144,7 +144,7 @@ def test_wide_regions_are_strained_less_where_samples_follow(problem, reporter):
 
 
 def test_who_follows_nothing_is_refined_as_ever(problem, reporter):
-    rest, config = problem.graph.rest(), RefineConfig(num_steps=2, final_steps=1)
+    rest, config = problem.graph.rest(), EMConfig(num_steps=2, final_steps=1)
     nobody = torch.zeros_like(problem.graph.points[:, 0])
     plain, following = (refine(problem, rest, config, reporter[0], follow=each) for each in (None, nobody))
     torch.testing.assert_close(problem.graph(following), problem.graph(plain))
@@ -160,7 +160,7 @@ def test_followers_are_not_drawn_along_the_surface(reporter):
     features = torch.randn(len(problem.source), 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     source, shift = replace(problem.source, features=features), torch.tensor([0.01, 0.0, -0.01], dtype=torch.float64)
     gone = replace(problem, source=source, target=replace(source, points=source.points + shift), free=None)
-    rest, config = problem.graph.rest(), RefineConfig(num_steps=6, final_steps=0, regions=0.0, slide=(1.0, 1.0))
+    rest, config = problem.graph.rest(), EMConfig(num_steps=6, final_steps=0, regions=0.0, slide=(1.0, 1.0))
     for follow, expected in ((0.0, shift), (1.0, shift * torch.tensor([0.0, 0.0, 1.0]))):
         everyone = torch.full_like(problem.graph.points[:, 0], follow)
         moved = problem.graph(refine(gone, rest, config, reporter[0], follow=everyone))
@@ -178,27 +178,27 @@ def test_cloth_does_not_follow_its_folds(reporter):
     problem = describe(scan, scan, CONFIG)
 
     def pattern(places, turned):
-        x, y, z = problem.unit.points_back(places, points).unbind(-1)
+        x, y, z = problem.unit.denormalize(places, points).unbind(-1)
         phase = 3 * (torch.atan2(y, x) - turned * (z < 0.5))
         return torch.stack((phase.cos(), phase.sin()), dim=1)
 
     source = replace(problem.source, features=pattern(problem.source.points, 0.0))
     target = replace(problem.target, features=pattern(problem.target.points, 0.4))
     worn = replace(problem, source=source, target=target, free=None)
-    rest, config = problem.graph.rest(), RefineConfig(near_sigma=0.04).slower()
+    rest, config = problem.graph.rest(), EMConfig(near_sigma=0.04).slower()
     follow = follow_regions(worn, rest, config, ChoiceConfig())
     drawn, held = (
         (worn.graph(refine(worn, rest, config, reporter[0], 0.04, follow=each)) - worn.graph(rest)).norm(dim=-1)
         for each in (None, follow)
     )
-    below = problem.unit.points_back(worn.graph.points, points)[:, 2] < 0.4
+    below = problem.unit.denormalize(worn.graph.points, points)[:, 2] < 0.4
     assert float(follow[below].mean()) > 0.9
     assert float(drawn[below].median()) > 0.02
     assert float(held[below].median()) < 0.002
 
 
 def test_samples_follow_where_all_around_is_unlike(problem):
-    rest, choice, config = problem.graph.rest(), ChoiceConfig(), RefineConfig(surrounding=10, unlike=(0.5, 1.5))
+    rest, choice, config = problem.graph.rest(), ChoiceConfig(), EMConfig(surrounding=10, unlike=(0.5, 1.5))
     moved, target = problem.moved(rest), problem.target
     # By one nearest neighbor at a time.
     away = torch.cdist(embedded(moved, choice), embedded(target, choice))
@@ -255,7 +255,7 @@ def plates():
 
 def laid(problem, second, height=0.0, turn=0.0):
     """Return motions that lay the second plate on the first, above it, turned about an edge of its own."""
-    motions, size = problem.graph.rest(), problem.unit.size
+    motions, size = problem.graph.rest(), problem.unit.scale
     there = torch.tensor([-0.6 / size, 0.0, height], dtype=torch.float64)
     middle = problem.graph.centers[second].mean(0)
     turned = se3_exp(torch.tensor([0.0, 0, 0, turn, 0, 0], dtype=torch.float64))
@@ -299,7 +299,7 @@ def test_overlaps_cost_as_much_as_they_weigh_and_lose_a_limb(plates):
 
 def test_better_hypotheses_are_judged_better(problem, reporter):
     rest = problem.graph.rest()
-    moved = refine(problem, rest, RefineConfig(num_steps=3, final_steps=1), reporter[0])
+    moved = refine(problem, rest, EMConfig(num_steps=3, final_steps=1), reporter[0])
     config = ChoiceConfig()
     still, better = judge(problem, "still", rest, config), judge(problem, "better", moved, config)
     assert better.energy < still.energy
@@ -392,7 +392,7 @@ def test_samples_are_taken_back_from_where_the_camera_saw_nothing(problem, repor
 
     def refined(beyond):
         # A sigma so small that next to nothing is matched.
-        config = RefineConfig(num_steps=4, final_steps=0, sigma=(1e-4, 1e-4), beyond=beyond)
+        config = EMConfig(num_steps=4, final_steps=0, sigma=(1e-4, 1e-4), beyond=beyond)
         return refine(problem, start, config, reporter[0])
 
     assert apart(start) > 0.003

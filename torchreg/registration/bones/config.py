@@ -1,4 +1,4 @@
-"""What decides how scans are registered. Lengths are shares of the source's diagonal, unless said otherwise."""
+"""Settings of the bones fitted to scans. Lengths are shares of the source's diagonal, unless said otherwise."""
 
 from __future__ import annotations
 
@@ -8,59 +8,61 @@ from dataclasses import dataclass, field
 from torchreg._checks import check_choice, check_count, check_positive
 from torchreg.errors import InputError
 from torchreg.registration.annealing import check_ends, geometric_at
-from torchreg.registration.bones.distance_loss import check_share
+from torchreg.registration.bones.correspondences import check_share
 from torchreg.registration.bones.grid_lbs import BLENDS
-from torchreg.registration.bones.weights import RefineConfig
+from torchreg.registration.bones.weights import WeightsConfig
 from torchreg.registration.results import RegisterRecord
 
 OnRegisterStep = Callable[[RegisterRecord], None]
 
 
-def _refinement() -> RefineConfig:
+def _refinement() -> WeightsConfig:
     """Return the refinement of weights: where limbs bend, the surface stretches over several cells."""
-    return RefineConfig(smoothness=0.05, closeness=0.02, reach=4)
+    return WeightsConfig(smoothness=0.05, closeness=0.02, reach=4)
 
 
 @dataclass(frozen=True)
 class BoneConfig:
-    """How bones, labels and weights are fitted to where points of a source go in one scan or more.
+    """Settings by which bones, labels and weights are fitted to an alignment of a source with one scan or more.
+
+    Pairs of numbers are a first and a last value, between which a setting runs in even ratios.
 
     Args:
         num_samples: source points that are matched, evenly spread.
-        num_patches: of the grid, from which parts are merged.
+        num_patches: patches of the grid, from which parts are merged.
         label_steps: most rounds of T-steps, correspondences and W-step.
         match_steps: T-steps, each followed by new correspondences, before a W-step.
         refine_steps: rounds of refining weights, T-step and correspondences.
-        settle_steps: rounds of T-step and correspondences after it.
+        settle_steps: rounds of T-step and correspondences after those.
         motion_steps: most linear systems of a T-step.
-        smoothness: mu of the W-step: of neighboring cells with different labels, in squared cells.
-        seam: what it costs there that these labels take the side between the cells apart, per cell,
-        seam_cap: up to this many cells: parts meet in joints, but what merely touches must be able to part.
-        label_cost: of each label in use: its square is what it must take from the mean squared distance. ``num_bones``
-            is a cap. Many small bones miss fewer joints; see `ScanRegistration.parts` for what moved as one.
-        truncation: samples are never farther off in the W-step, in cells.
-        reuse: give labels that lost all their cells to the regions that fit worst.
-        joint_weight: beta, of the joints against the mean squared distance, in the first and the last round of labels
-            and after it, in even ratios between; (1, 0.05) in the paper. It holds bones together where matches do not;
-            the dense alignment does so already, and joints that are no points, or wrong, resist more of it. Zeros leave
-            it out, and what turns cost.
-        joint_scale: bones whose motions take their joint apart by more than this hold each other ever less: not all
-            that meets is joined. First and last like ``joint_weight``: labels are coarse first, and tear joints.
-        turn_weight: what it costs that bones that meet turn against each other, per squared radian: what scans do not
-            tell, such as the twist of a round limb, stays as it was.
-        turn_scale: bones that turned against each other by more than this many radians hold each other ever less.
-        hinge_weight: what it costs, where three frames or more tell the axis, that bones that meet turn against each
-            other about another axis than they mostly do, per squared radian: most joints are hinges.
-        hinge_scale: bones that turn about other axes by more than this many radians hold each other ever less.
-        max_distance: of a match, first and last; never below two sampling distances of the target.
-        max_angle: between normals of a match, first and last, radians.
+        smoothness: mu of the W-step, the cost of neighboring cells with different labels, in squared cells.
+        seam: cost of neighboring cells with different labels per cell of the gap that these tear open between them.
+        seam_cap: gap in cells beyond which it costs no more, so that what merely touches can part.
+        label_cost: root of the mean squared distance that a label must save to be used; ``num_bones`` is a cap, and
+            `ScanRegistration.parts` joins bones that moved as one.
+        truncation: largest distance of a sample in the W-step, in cells.
+        reuse: whether labels that lost all their cells are given to the regions with the largest residuals.
+        joint_weight: beta, the weight of the joints against the mean squared distance, over the rounds of labels; zeros
+            leave out joints and the costs of turns, and the paper's (1, 0.05) holds bones together where matches do
+            not, which here the dense alignment does, so that joints that are wrong need not resist.
+        joint_scale: robust scale of the gaps that motions tear open at joints, since not all that meets is joined; it
+            starts wide, as labels are coarse at first and tear joints.
+        turn_weight: cost per squared radian by which bones that share weight turn against each other, so that the twist
+            of a round limb, which scans do not tell, stays as it was.
+        turn_scale: robust scale of those turns, radians.
+        hinge_weight: cost per squared radian of turns about other axes than the one about which two bones mostly turn,
+            where three frames or more tell it, since most joints are hinges.
+        hinge_scale: robust scale of the turns about other axes, radians.
+        max_distance: largest distance of a match, never below two sampling distances of the target.
+        max_angle: largest angle between the normals of a match, radians.
         normal_scale: distance that counts as much as normals 60 degrees apart.
-        point_to_point: share of the distance to where the dense alignment takes a sample, in that along the normal.
-        unmatched: how much samples without a match count, which stay with the dense alignment.
-        min_matched: with a smaller share of matches the scans count as not registered.
-        rtol: steps end when a round lowers the energy by less than this share.
-        refine: the weights' refinement; its point-to-point share is this one's.
-        blend: of the bones, see `GridLBS`. Weights are refined as if it were linear.
+        point_to_point: weight of the distance to where the dense alignment moves a sample, against that along the
+            normal.
+        unmatched: weight of samples without a match, which stay where the dense alignment moves them.
+        min_matched: share of samples with a match below which the scans count as not registered.
+        rtol: relative change of the energy over a round below which rounds end.
+        refine: refinement of the weights.
+        blend: of the bones, see `GridLBS`; weights are refined as if it were linear.
 
     Raises:
         InputError: if a value is out of range.
@@ -94,7 +96,7 @@ class BoneConfig:
     unmatched: float = 0.3
     min_matched: float = 0.1
     rtol: float = 0.2
-    refine: RefineConfig = field(default_factory=_refinement)
+    refine: WeightsConfig = field(default_factory=_refinement)
     blend: str = "linear"
 
     def __post_init__(self) -> None:
@@ -120,5 +122,5 @@ class BoneConfig:
         check_choice(self.blend, "blend", BLENDS)
 
     def joint_weight_at(self, progress: float) -> float:
-        """Return beta a share of the way through the rounds of labels."""
+        """Return beta at a progress from 0 to 1 through the rounds of labels, and its last value after."""
         return geometric_at(self.joint_weight, progress) if self.joint_weight[0] > 0 else 0.0

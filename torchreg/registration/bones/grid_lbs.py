@@ -7,7 +7,15 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from torchreg._checks import as_float_tensor, as_tensor, check_choice, check_count, check_finite, check_shape
+from torchreg._checks import (
+    as_float_tensor,
+    as_tensor,
+    check_choice,
+    check_count,
+    check_finite,
+    check_positive,
+    check_shape,
+)
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.rigid import rescale_motions, transform_points
 from torchreg.registration.blend import (
@@ -15,15 +23,19 @@ from torchreg.registration.blend import (
     blend_dual_quaternion_jacobian,
     blend_linear,
     blend_linear_jacobian,
+    check_rigid_motions,
     turn_about,
 )
-from torchreg.registration.bones.joint_moments import JointMoments, joint_moments
-from torchreg.registration.bones.joints import BoneTree, Joints, bone_tree, bridged, find_joints
-from torchreg.registration.bones.sparse_grid import SparseGrid, locate
+from torchreg.registration.bones.joint_moments import NEGLIGIBLE, JointMoments, joint_moments
+from torchreg.registration.bones.joints import REGULARIZATION, BoneTree, Joints, bone_tree, bridged, find_joints
+from torchreg.registration.bones.sparse_grid import SparseGrid, locate_in_cells
 
-BLENDS = ("linear", "dual_quaternion")
-_BLEND = {"linear": blend_linear, "dual_quaternion": blend_dual_quaternion}
-_JACOBIAN = {"linear": blend_linear_jacobian, "dual_quaternion": blend_dual_quaternion_jacobian}
+# The blends by name, and their derivatives by the bones' twists.
+_BLENDS = {
+    "linear": (blend_linear, blend_linear_jacobian),
+    "dual_quaternion": (blend_dual_quaternion, blend_dual_quaternion_jacobian),
+}
+BLENDS = tuple(_BLENDS)
 
 
 @dataclass(frozen=True)
@@ -31,12 +43,12 @@ class GridLBSRecord:
     """A `GridLBS` as plain data.
 
     Args:
-        cells: of the grid, and so on: see `SparseGrid`.
+        cells: of the grid, see `SparseGrid`.
         shape: of the grid.
         origin: of the grid.
         axes: of the grid.
         spacing: of the grid.
-        weights: (K, B) as they are, not normalized.
+        weights: (K, B) before rows are divided by their sums.
         transforms: (..., B, 4, 4).
         blend: see `GridLBS`.
     """
@@ -57,11 +69,11 @@ class GridLBS(nn.Module):
     Space without a cell has the weights of the nearest one, so that any point can be moved. Weights may take any
     values that are not negative: every row is divided by its sum where it is used.
 
-    The bones' motions are held as rigid matrices times twists about the bones' own middles. The twists are what an
+    The bones' motions are stored as rigid matrices times twists about the bones' own middles. The twists are what an
     optimizer moves; they are zero after `set_transforms_`, so that no rotation is special.
 
     Args:
-        grid: where the weights live.
+        grid: of the weights.
         weights: (K, B) at the corners of the grid, not negative, no row all zero; becomes a parameter.
         transforms: (..., B, 4, 4) rigid; a batch holds several poses; identities by default.
         blend: "linear", eq. 1; "dual_quaternion" moves every point rigidly, which keeps twisted limbs from collapsing.
@@ -128,7 +140,7 @@ class GridLBS(nn.Module):
         """Return the model in which every cell follows one bone; corners between cells of different bones share them.
 
         Args:
-            grid: where the weights live.
+            grid: of the weights.
             labels: (C,) integers, the bone of each cell.
             num_bones: B.
             transforms: see `GridLBS`.
@@ -159,29 +171,37 @@ class GridLBS(nn.Module):
         Raises:
             InputError: if it describes none.
         """
-        grid = SparseGrid(record.cells, record.shape, record.origin, record.axes, record.spacing)
+        grid = SparseGrid.from_cells(record.cells, record.shape, record.origin, record.axes, record.spacing)
         return cls(grid, record.weights, record.transforms, blend=record.blend)
 
     def record(self) -> GridLBSRecord:
-        """Return what the model consists of; its tensors are detached, on the CPU and not shared with it."""
+        """Return the model as plain data; its tensors are detached, on the CPU and not shared with the model."""
 
         def plain(value: Tensor) -> Tensor:
             return value.detach().cpu().clone()
 
-        grid, moved = self.grid, plain(self.transforms)
-        tables = plain(grid.cells), grid.shape, plain(grid.origin), plain(grid.axes), grid.spacing
-        return GridLBSRecord(*tables, plain(self.weights), moved, self.blend)
+        grid = self.grid
+        return GridLBSRecord(
+            cells=plain(grid.cells),
+            shape=grid.shape,
+            origin=plain(grid.origin),
+            axes=plain(grid.axes),
+            spacing=grid.spacing,
+            weights=plain(self.weights),
+            transforms=plain(self.transforms),
+            blend=self.blend,
+        )
 
     def rescaled(self, scale: float, origin: Tensor) -> GridLBS:
         """Return the same model, without gradients, in the coordinates ``x' = origin + scale x``.
 
         Args:
-            scale: of the new coordinates, positive.
-            origin: (3,) where the old origin is in the new coordinates.
+            scale: positive.
+            origin: (3,) of the old coordinates, in the new ones.
         """
         grid, transforms = self.grid, rescale_motions(self.transforms.detach(), scale, origin)
-        grown = SparseGrid(grid.cells, grid.shape, origin + scale * grid.origin, grid.axes, scale * grid.spacing)
-        return GridLBS(grown, self.weights.detach(), transforms, blend=self.blend)
+        scaled = SparseGrid(grid.cells, grid.shape, origin + scale * grid.origin, grid.axes, scale * grid.spacing)
+        return GridLBS(scaled, self.weights.detach(), transforms, blend=self.blend)
 
     def extra_repr(self) -> str:
         """Return the settings for the module's printed form."""
@@ -213,7 +233,7 @@ class GridLBS(nn.Module):
         """
         transforms = as_float_tensor(transforms, "transforms", like=self.weights).detach()
         check_shape(transforms, "transforms", (self.num_bones, 4, 4), batch=True)
-        check_rigid(transforms, "transforms")
+        check_rigid_motions(transforms, "transforms")
         if transforms.shape != self.base_transforms.shape:
             self.twists = nn.Parameter(transforms.new_zeros(*transforms.shape[:-2], 6), self.twists.requires_grad)
         self.base_transforms = transforms.clone()
@@ -221,15 +241,12 @@ class GridLBS(nn.Module):
         return self
 
     def forward(self, points: Tensor, transforms: Tensor | None = None) -> Tensor:
-        """Return points of the space moved by the bones.
+        """Return points (..., N, 3) of the space moved by the bones.
 
         Args:
             points: (..., N, 3) in the dtype of the model.
             transforms: (..., B, 4, 4) a pose to use instead of the model's own; batch dimensions broadcast with those
                 of the points.
-
-        Returns:
-            (..., N, 3).
 
         Differentiable: in ``points`` within cells, ``transforms``, ``twists`` and ``weights``.
 
@@ -240,11 +257,12 @@ class GridLBS(nn.Module):
         return self.move(points, self.weights_at(points), transforms)
 
     def move(self, points: Tensor, weights: Tensor, transforms: Tensor | None = None) -> Tensor:
-        """Return what `forward` does, of points (..., N, 3) whose weights (..., N, B) are known already.
+        """Return points (..., N, 3) of weights (..., N, B) moved by the bones; arguments else as of `forward`.
 
         Differentiable: in all, and ``twists``.
         """
-        return _BLEND[self.blend](points, weights, self.transforms if transforms is None else transforms)
+        blend, _ = _BLENDS[self.blend]
+        return blend(points, weights, self.transforms if transforms is None else transforms)
 
     def weights_at(self, points: Tensor) -> Tensor:
         """Return the bones' weights (..., N, B) at points (..., N, 3); rows sum to one.
@@ -252,11 +270,11 @@ class GridLBS(nn.Module):
         Differentiable: in ``points`` within cells, and ``weights``.
         """
         coordinates = ((points - self._origin) @ self._axes) / self._spacing
-        place = locate(coordinates, self._shape, self._cells, self._nearest)
-        index = self._cell_corners[place.cell]
+        location = locate_in_cells(coordinates, self._shape, self._cells, self._nearest)
+        index = self._cell_corners[location.cell]
         # Three times as fast as indexing.
         corner = self.corner_weights().index_select(0, index.flatten()).unflatten(0, index.shape)
-        return (place.coefficients.unsqueeze(-2) @ corner).squeeze(-2)
+        return (location.coefficients.unsqueeze(-2) @ corner).squeeze(-2)
 
     def corner_weights(self) -> Tensor:
         """Return the weights (K, B) at the corners, rows divided by their sums. Differentiable: in ``weights``."""
@@ -265,14 +283,11 @@ class GridLBS(nn.Module):
 
     @torch.no_grad()
     def vertex_weights(self, points: Tensor, *, most: int | None = None) -> Tensor:
-        """Return skinning weights (..., N, B) of points (..., N, 3), for other programs.
+        """Return skinning weights (..., N, B) of points (..., N, 3), for other programs; rows sum to one.
 
         Args:
             points: (..., N, 3).
             most: keep that many of the largest weights of each point, four in many file formats; all by default.
-
-        Returns:
-            (..., N, B), rows sum to one.
 
         Raises:
             InputError: if ``most`` is below one.
@@ -288,8 +303,8 @@ class GridLBS(nn.Module):
     def jacobian(self, points: Tensor, transforms: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return moved points (..., N, 3) and their derivatives (..., N, 3, B, 6) by twists of the bones.
 
-        Convention: a twist (translation, rotation) of bone j is applied on top of its motion, about the place that the
-        motion takes ``middles[j]`` to, see `turn_about`.
+        Convention: a twist (translation, rotation) of bone j is applied on top of its motion, about the image of
+        ``middles[j]``, see `turn_about`.
 
         Args:
             points: see `forward`.
@@ -299,28 +314,32 @@ class GridLBS(nn.Module):
         """
         transforms = self.transforms if transforms is None else transforms
         weights = self.weights_at(points)
-        jacobian = _JACOBIAN[self.blend](points, weights, transforms, self._centers(transforms))
-        return _BLEND[self.blend](points, weights, transforms), jacobian
+        blend, jacobian = _BLENDS[self.blend]
+        return blend(points, weights, transforms), jacobian(points, weights, transforms, self._centers(transforms))
 
-    def joint_moments(self, *, min_mass: float = 1e-6, pairs: Tensor | None = None) -> JointMoments:
-        """Return what bones share, over the whole grid; see `joint_moments.joint_moments`."""
+    def joint_moments(self, *, min_mass: float = NEGLIGIBLE.mass, pairs: Tensor | None = None) -> JointMoments:
+        """Return the moments of what bones share, over the whole grid; see `joint_moments.joint_moments`."""
+        check_positive(min_mass, "min_mass")
         return joint_moments(self.grid, self.corner_weights(), min_mass=min_mass, pairs=pairs)
 
     def joints(
-        self, transforms: Tensor | None = None, *, min_mass: float = 1e-6, regularization: float = 0.01
+        self,
+        transforms: Tensor | None = None,
+        *,
+        min_mass: float = NEGLIGIBLE.mass,
+        regularization: float = REGULARIZATION.found,
     ) -> Joints:
-        """Return where bones meet, in the space of the points before they are moved.
+        """Return the joints of the bones, in the space of the points before they are moved.
 
-        Bones that share weight meet; where hidden joints cut the points in pieces, so do bones that come near each
-        other and move alike there, see `bridged`.
+        Of bones that share weight, and where hidden joints cut the points in pieces, of those that `bridged` finds.
 
         Args:
             transforms: (..., B, 4, 4) poses to estimate the joints from, all together; the model's own by default.
             min_mass: pairs that share less than this share of a cell are left out.
             regularization: see `find_joints`.
 
-        Returns:
-            `Joints`.
+        Raises:
+            InputError: if a number is not positive or a shape does not fit.
 
         Differentiable: in ``transforms`` and ``twists``.
         """
@@ -329,27 +348,31 @@ class GridLBS(nn.Module):
 
     @torch.no_grad()
     def bridged_moments(
-        self, transforms: Tensor | None = None, *, min_mass: float = 1e-6, regularization: float = 0.01
+        self,
+        transforms: Tensor | None = None,
+        *,
+        min_mass: float = NEGLIGIBLE.mass,
+        regularization: float = REGULARIZATION.found,
     ) -> JointMoments:
-        """Return what bones share, and pairs that hold pieces together which share nothing; arguments as in `joints`.
+        """Return the moments of what bones share, and of pairs that join separate pieces; arguments as of `joints`.
 
         Differentiable: no.
         """
-        transforms = self.transforms if transforms is None else transforms
+        transforms = self._pose(transforms)
+        check_positive(regularization, "regularization")
         moments, corners = self.joint_moments(min_mass=min_mass), self.grid.corner_points()
         return bridged(moments, corners, self.corner_weights(), transforms, regularization=regularization)
 
     def joints_of(
-        self, moments: JointMoments, transforms: Tensor | None = None, *, regularization: float = 0.01
+        self, moments: JointMoments, transforms: Tensor | None = None, *, regularization: float = REGULARIZATION.found
     ) -> Joints:
-        """Return what `joints` does, of moments that are known already."""
-        return find_joints(
-            moments, self.transforms if transforms is None else transforms, regularization=regularization
-        )
+        """Return the joints of moments that are known already; arguments else as of `joints`."""
+        check_positive(regularization, "regularization")
+        return find_joints(moments, self._pose(transforms), regularization=regularization)
 
     @torch.no_grad()
-    def skeleton(self, transforms: Tensor | None = None, *, min_mass: float = 1e-6) -> BoneTree:
-        """Return the tree of the strongest joints; the heaviest bone is its root, and each without weight alone.
+    def skeleton(self, transforms: Tensor | None = None, *, min_mass: float = NEGLIGIBLE.mass) -> BoneTree:
+        """Return the tree of the strongest joints; its root is the heaviest bone; a bone without weight is one alone.
 
         Args:
             transforms: see `joints`.
@@ -358,9 +381,16 @@ class GridLBS(nn.Module):
         joints = self.joints(transforms, min_mass=min_mass)
         return bone_tree(joints, self._weighted_middles(self.grid), self.corner_weights().sum(0))
 
+    def _pose(self, transforms: Tensor | None) -> Tensor:
+        """Return given motions (..., B, 4, 4), or the model's own."""
+        if transforms is None:
+            return self.transforms
+        check_shape(transforms, "transforms", (self.num_bones, 4, 4), batch=True)
+        return transforms
+
     @torch.no_grad()
     def _weighted_middles(self, grid: SparseGrid) -> Tensor:
-        """Return the mean places (B, 3) of the bones' weights; of a bone without any, that of the grid."""
+        """Return the mean positions (B, 3) of the bones' weights; of a bone without any, that of the grid."""
         corners, share = grid.corner_points(), self.corner_weights()
         total = share.sum(0).unsqueeze(-1)
         origin = corners.mean(0)
@@ -368,18 +398,3 @@ class GridLBS(nn.Module):
 
     def _centers(self, transforms: Tensor) -> Tensor:
         return transform_points(transforms, self.middles.unsqueeze(-2)).squeeze(-2)
-
-
-def check_rigid(transforms: Tensor, name: str) -> None:
-    """Raise InputError unless all of ``transforms`` (..., 4, 4) are rigid motions to single precision."""
-    check_finite(transforms, name)
-    rotation = transforms[..., :3, :3].detach().double()
-    off = (rotation @ rotation.mT - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs()
-    bottom = (transforms[..., 3, :].detach() - transforms.new_tensor([0.0, 0.0, 0.0, 1.0])).abs()
-    if transforms.numel() and (
-        float(off.max()) > 1e-3 or float(bottom.max()) > 1e-6 or bool((torch.linalg.det(rotation) < 0).any())
-    ):
-        raise InputError(
-            f"{name} must hold rigid motions, got one with scale, shear, mirror or a last row other than 0 0 0 1 "
-            f"(off by {max(float(off.max()), float(bottom.max())):.2g})"
-        )

@@ -8,21 +8,37 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_positive, check_shape
 from torchreg.geometry.graphs import connected_components, minimum_spanning_forest, rooted
 from torchreg.geometry.neighbors import NeighborTree
-from torchreg.registration.bones.joint_moments import JointMoments
+from torchreg.registration.bones.joint_moments import JointMoments, gaps_at, motion_differences
+
+
+@dataclass(frozen=True)
+class Regularization:
+    """Lambda of `find_joints`, squared radians.
+
+    Args:
+        found: of joints found from motions that are given.
+        fitted: of joints fitted together with the motions: bones share weight at the surface that was scanned, joints
+            lie inside, and a firmer lambda draws them out, by up to a limb's radius.
+    """
+
+    found: float = 0.01
+    fitted: float = 0.001
+
+
+REGULARIZATION = Regularization()
 
 
 @dataclass(frozen=True)
 class Joints:
-    """Where pairs of bones meet.
+    """Joints of pairs of bones.
 
     Args:
         pairs: (P, 2) int64 bones, the lower first.
         centers: (P, 3) the points that both bones of a pair move alike, in the space that the motions start from.
-        mass: (P,) how much the bones of a pair share, see `JointMoments`; zero for those that only come near.
-        gaps: (..., P) how far apart the two motions take each center.
+        mass: (P,) of what the bones of a pair share, see `JointMoments`; zero for those that only come near.
+        gaps: (..., P) distances between the images of each center under the two motions.
     """
 
     pairs: Tensor
@@ -44,7 +60,7 @@ class BoneTree:
     origins: Tensor
 
 
-def find_joints(moments: JointMoments, transforms: Tensor, *, regularization: float = 0.01) -> Joints:
+def find_joints(moments: JointMoments, transforms: Tensor, *, regularization: float = REGULARIZATION.found) -> Joints:
     """Return the points that pairs of bones move alike, as nearly as there is one.
 
     ``argmin_c mean |(R_i - R_j) c + t_i - t_j|^2 + lambda |c - m|^2`` with m the center of what the two bones share: it
@@ -52,52 +68,47 @@ def find_joints(moments: JointMoments, transforms: Tensor, *, regularization: fl
     lambda is the angle between the bones, in radians, at which either counts the same.
 
     Args:
-        moments: of the bones that meet.
+        moments: of the bones that share weight.
         transforms: (..., B, 4, 4); all poses of a batch count alike.
         regularization: lambda.
 
     Returns:
         `Joints`.
 
-    Raises:
-        InputError: if ``regularization`` is not positive or a shape does not fit.
-
     Differentiable: in ``transforms`` and the moments.
 
     References: Schaefer and Yuksel 2007, section 5, for the regularized least squares.
     """
-    check_positive(regularization, "regularization")
-    check_shape(transforms, "transforms", ("B", 4, 4), batch=True)
-    first, second = moments.pairs.unbind(-1)
-    difference = transforms[..., first, :3, :] - transforms[..., second, :3, :]
-    turn = difference[..., :3]
-    apart = (turn @ moments.center.unsqueeze(-1)).squeeze(-1) + difference[..., 3]
-    normal, right = turn.mT @ turn, (turn.mT @ apart.unsqueeze(-1)).squeeze(-1)
-    normal, right = (
-        normal.flatten(0, -4).mean(0) if normal.ndim > 3 else normal,
-        (right.flatten(0, -3).mean(0) if right.ndim > 2 else right),
-    )
+    differences = motion_differences(transforms, moments.pairs)
+    turn, gaps = differences[..., :3], gaps_at(differences, moments.center)
+    normal, right = turn.mT @ turn, (turn.mT @ gaps.unsqueeze(-1)).squeeze(-1)
+    if normal.ndim > 3:
+        normal, right = normal.flatten(0, -4).mean(0), right.flatten(0, -3).mean(0)
     identity = torch.eye(3, dtype=normal.dtype, device=normal.device)
     centers = moments.center - torch.linalg.solve(normal + regularization * identity, right)
-    gaps = torch.linalg.vector_norm((turn @ centers.unsqueeze(-1)).squeeze(-1) + difference[..., 3], dim=-1)
-    return Joints(moments.pairs, centers, moments.mass, gaps)
+    return Joints(moments.pairs, centers, moments.mass, torch.linalg.vector_norm(gaps_at(differences, centers), dim=-1))
 
 
 @torch.no_grad()
 def bridged(
-    moments: JointMoments, corners: Tensor, weights: Tensor, transforms: Tensor, *, regularization: float = 0.01
+    moments: JointMoments,
+    corners: Tensor,
+    weights: Tensor,
+    transforms: Tensor,
+    *,
+    regularization: float = REGULARIZATION.found,
 ) -> JointMoments:
-    """Return moments with those of pairs added that hold groups of bones together which share nothing.
+    """Return moments with those of pairs added that join groups of bones which share no weight.
 
-    A scan falls apart where something nearer hides a joint. Between two groups, a pair of bones is a joint if little is
-    left unexplained: the sum of how far apart their nearest corners are, how far from the middle of these the point is
-    that both move alike, and how far apart they move it. The shortest pairs that make one group of all are added, with
-    no mass and no spread, their centers in the middles.
+    A scan falls apart where something nearer hides a joint. Between two groups, the joint is the pair of bones with the
+    least sum of three lengths: the distance of their nearest corners, the distance from the middle of these to the
+    point that both bones move alike, and the gap that their motions leave there. The shortest pairs that make one group
+    of all are added, with no mass and no spread, their centers in the middles.
 
     Args:
-        moments: of the bones that meet.
+        moments: of the bones that share weight.
         corners: (K, 3) of the grid.
-        weights: (K, B) there.
+        weights: (K, B) at the corners.
         transforms: (..., B, 4, 4); all poses of a batch count alike.
         regularization: see `find_joints`.
 
@@ -108,49 +119,46 @@ def bridged(
 
     Cost: O(K log K) per group; 9 ms for 5,000 corners in three groups.
     """
-    group, owner = connected_components(moments.pairs, weights.shape[1]), weights.argmax(1)
-    if len(group[owner].unique()) < 2:
+    group, bone = connected_components(moments.pairs, weights.shape[1]), weights.argmax(1)
+    if len(group[bone].unique()) < 2:
         return moments
-    pairs, center, apart = _nearest_pairs(corners, owner, group)
+    pairs, center, length = _nearest_pairs(corners, bone, group)
     added = JointMoments(pairs, center.new_zeros(len(pairs)), center, center.new_zeros(len(pairs), 3, 3))
     found = find_joints(added, transforms, regularization=regularization)
     gaps = found.gaps.reshape(-1, len(pairs)).mean(0)
-    added = added.select(_joining(group[pairs], apart + (found.centers - center).norm(dim=-1) + gaps))
-    both = [torch.cat(parts) for parts in zip(_fields(moments), _fields(added), strict=True)]
-    order = (both[0][:, 0] * weights.shape[1] + both[0][:, 1]).argsort()
-    return JointMoments(*(values[order] for values in both))
+    length = length + (found.centers - center).norm(dim=-1) + gaps
+    added = added.select(minimum_spanning_forest(group[pairs], length, len(group)).chosen())
+    pairs = torch.cat([moments.pairs, added.pairs])
+    order = (pairs[:, 0] * weights.shape[1] + pairs[:, 1]).argsort()
+    return JointMoments(
+        pairs=pairs[order],
+        mass=torch.cat([moments.mass, added.mass])[order],
+        center=torch.cat([moments.center, added.center])[order],
+        spread=torch.cat([moments.spread, added.spread])[order],
+    )
 
 
-def _fields(moments: JointMoments) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return moments.pairs, moments.mass, moments.center, moments.spread
+def _nearest_pairs(corners: Tensor, bone: Tensor, group: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return pairs (P, 2) of each bone and the nearest bone of each later group, with middles and lengths between.
 
-
-def _nearest_pairs(corners: Tensor, owner: Tensor, group: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return pairs (P, 2) of each bone and the nearest one of each later group, and the middles and lengths between."""
+    Args:
+        corners: (K, 3).
+        bone: (K,) with the largest weight at each corner.
+        group: (B,) of the bones.
+    """
     pairs, middles, lengths = [], [], []
-    there = group[owner]
-    for number in there.unique()[1:].tolist():
-        inside, others = (there == number).nonzero()[:, 0], (there < number).nonzero()[:, 0]
-        index, apart = NeighborTree(corners[inside]).nearest(corners[others])
-        for bone in owner[others].unique():
-            own = (owner[others] == bone).nonzero()[:, 0]
-            best = own[apart[own].argmin()]
-            ends = torch.stack((others[best], inside[index[best]]))
-            pairs.append(owner[ends].sort().values)
+    corner_group = group[bone]
+    for number in corner_group.unique()[1:].tolist():
+        inside, before = (corner_group == number).nonzero()[:, 0], (corner_group < number).nonzero()[:, 0]
+        index, distance = NeighborTree(corners[inside]).nearest(corners[before])
+        for earlier in bone[before].unique():
+            candidates = (bone[before] == earlier).nonzero()[:, 0]
+            best = candidates[distance[candidates].argmin()]
+            ends = torch.stack((before[best], inside[index[best]]))
+            pairs.append(bone[ends].sort().values)
             middles.append(corners[ends].mean(0))
-            lengths.append(apart[best].to(corners))
+            lengths.append(distance[best].to(corners))
     return torch.stack(pairs), torch.stack(middles), torch.stack(lengths)
-
-
-def _joining(groups: Tensor, lengths: Tensor) -> Tensor:
-    """Return the shortest of links (P,) between groups (P, 2) that make one group of all."""
-    kept, groups = [], groups.clone()
-    for link in lengths.argsort(stable=True).tolist():
-        one, other = groups[link].tolist()
-        if one != other:
-            kept.append(link)
-            groups[groups == other] = one
-    return torch.tensor(kept, device=groups.device)
 
 
 def bone_tree(joints: Joints, middles: Tensor, sizes: Sequence[float] | Tensor) -> BoneTree:

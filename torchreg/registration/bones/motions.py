@@ -1,4 +1,4 @@
-"""Fitting the motions of all bones at once to matched points while joints hold: the T-step of scan registration."""
+"""Fitting the motions of all bones at once to correspondences while joints hold: the T-step of scan registration."""
 
 from __future__ import annotations
 
@@ -8,34 +8,46 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_count, check_positive, check_shape
 from torchreg.registration.blend import turn_about
 from torchreg.registration.bones.motion_problem import BoneProblem
 from torchreg.solvers.damped_descent import DampingRule, Trial, damped_descent
 from torchreg.solvers.levenberg_marquardt import Linearization, damped_step
 
-# Nothing beside the pull of matches, of which a bone gets one part in B, but enough against rounding where none pulls.
-FIRST_DAMPING = 1e-4
 _RULE = DampingRule(trusted=0.5, down=0.25, doubtful=1.0, up=4.0, least=0.0)
-# A change of the cost by this many units in the last place of what bones carry, squared, is rounding.
-_ROUNDING = 10.0
+
+
+@dataclass(frozen=True)
+class TStep:
+    """The numbers of a T-step.
+
+    Args:
+        damping: first weight of the mean squared displacement of the bodies: nothing beside the residuals, of which a
+            bone gets one part in B, but enough against rounding where a bone has none.
+        rtol: relative change of the energy below which a step is the last.
+        rounding: units in the last place of the squared size of the bodies by which rounding alone changes the cost.
+    """
+
+    damping: float = 1e-4
+    rtol: float = 1e-3
+    rounding: float = 10.0
+
+
+T_STEP = TStep()
 
 
 @dataclass(frozen=True)
 class BoneFit:
-    """Motions that fit matches.
+    """Motions that fit correspondences.
 
     Args:
         transforms: (..., B, 4, 4).
         energy: (...) at them.
-        damping: (...) to continue with.
         num_steps: linear systems solved.
         converged: (...) whether the last step was within the tolerance.
     """
 
     transforms: Tensor
     energy: Tensor
-    damping: Tensor
     num_steps: int
     converged: Tensor
 
@@ -47,45 +59,37 @@ def fit_bones(
     *,
     fixed: Tensor | None = None,
     max_steps: int = 5,
-    rtol: float = 1e-4,
+    rtol: float = T_STEP.rtol,
     atol: float = 0.0,
-    damping: float | Tensor = FIRST_DAMPING,
+    damping: float | Tensor = T_STEP.damping,
     retract: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> BoneFit:
     """Return the motions of least energy that damped Gauss-Newton steps find, each problem of a batch by itself.
 
-    A step pays for the mean squared shift of what the bones carry, damping times: chains of bones move together as
-    freely as one bone, which a damping of the diagonal would prevent where joints are stiff.
+    The damping weighs the mean squared displacement of the bones' bodies: chains of bones move together as freely as
+    one bone, which a damping of the diagonal would prevent where joints are stiff.
 
     Args:
-        problem: the problem.
+        problem: the energy.
         transforms: (..., B, 4, 4) to start from.
         fixed: (B,) bool, bones to hold.
         max_steps: most linear systems.
-        rtol: a problem is done when a step changes its energy by less than this share.
+        rtol: relative change of a problem's energy below which a step is its last.
         atol: a problem is done when its energy is below the square of this length.
-        damping: (...) to start with, as an earlier fit of the same kind returned; 1 for starts far off.
-        retract: motions and twists (..., B, 6) about the bones' middles to motions; `turn_about` by default.
+        damping: (...) to start with; 1 for starts far off.
+        retract: motions and twists (..., B, 6) about the bodies' centers to motions; `turn_about` by default.
 
     Returns:
         a `BoneFit`.
-
-    Raises:
-        InputError: if a shape does not fit, or a tolerance is negative.
 
     Differentiable: no.
 
     References: Chang and Zwicker 2009, eq. 5; Marquardt 1963.
     """
-    check_count(max_steps, "max_steps", 1)
-    check_positive(rtol, "rtol", allow_zero=True)
-    check_positive(atol, "atol", allow_zero=True)
-    if fixed is not None:
-        check_shape(fixed, "fixed", (problem.binding.num_bones,))
     transforms = problem.batched(transforms)
     current = problem.linearize(transforms)
     level = torch.as_tensor(damping, dtype=transforms.dtype, device=transforms.device).expand(current.cost.shape)
-    floor = _rounding_floor(problem)
+    floor = _rounding_of_cost(problem)
 
     def solve(transforms: Tensor, current: Linearization, level: Tensor) -> Trial[Tensor]:
         twists, sound = _damped_twists(problem, transforms, current, level, fixed)
@@ -103,54 +107,53 @@ def fit_bones(
         solve,
         transforms,
         level,
-        rule=replace(_RULE, least=rounding_cover(problem)),
+        rule=replace(_RULE, least=least_damping(problem)),
         max_steps=max_steps,
         converged=settled,
         done=2 * current.cost <= atol**2,
         start=current,
     )
-    energy = 2 * found.system.cost
-    return BoneFit(straightened(found.state), energy, found.damping, found.num_steps, found.done)
+    return BoneFit(nearest_rigid(found.state), 2 * found.system.cost, found.num_steps, found.done)
 
 
-def rounding_cover(problem: BoneProblem) -> float:
+def least_damping(problem: BoneProblem) -> float:
     """Return the damping that makes up for rounding in the Hessian of a problem's 6 B twists."""
     return 24 * problem.binding.num_bones * torch.finfo(problem.points.dtype).eps
 
 
-def _rounding_floor(problem: BoneProblem) -> float:
+def _rounding_of_cost(problem: BoneProblem) -> float:
     """Return a change of the cost that is nothing but rounding."""
     size = problem.bodies.spread.diagonal(dim1=-2, dim2=-1).sum(-1).mean()
-    return (_ROUNDING * torch.finfo(size.dtype).eps) ** 2 * float(size)
+    return (T_STEP.rounding * torch.finfo(size.dtype).eps) ** 2 * float(size)
 
 
-def add_inertia(problem: BoneProblem, transforms: Tensor, hessian: Tensor, level: Tensor) -> Tensor:
-    """Return Hessians (..., 6 B, 6 B) damped by the mean squared shift of what the bones carry, level (...) times."""
+def add_inertia(problem: BoneProblem, transforms: Tensor, hessian: Tensor, damping: Tensor) -> Tensor:
+    """Return Hessians (..., 6 B, 6 B) plus damping (...) times those of the bodies' mean squared displacement."""
     size = problem.binding.num_bones
     damped = hessian.clone()
     blocks = damped.unflatten(-1, (size, 6)).unflatten(-3, (size, 6)).diagonal(dim1=-4, dim2=-2)
-    blocks += (level / size)[..., None, None, None] * problem.inertia(transforms).movedim(-3, -1)
+    blocks += (damping / size)[..., None, None, None] * problem.inertia(transforms).movedim(-3, -1)
     return damped
 
 
 def _damped_twists(
-    problem: BoneProblem, transforms: Tensor, current: Linearization, level: Tensor, fixed: Tensor | None
+    problem: BoneProblem, transforms: Tensor, current: Linearization, damping: Tensor, fixed: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Return the twists (..., B, 6) of a damped Gauss-Newton step, and whether its system could be solved (...)."""
     size = problem.binding.num_bones
-    hessian = add_inertia(problem, transforms, current.hessian, level)
+    hessian = add_inertia(problem, transforms, current.hessian, damping)
     frozen = None
     if fixed is not None:
-        frozen = fixed.to(hessian.device).repeat_interleave(6).expand(level.numel(), -1)
+        frozen = fixed.to(hessian.device).repeat_interleave(6).expand(damping.numel(), -1)
     flat = Linearization(
         current.cost.reshape(-1), current.gradient.reshape(-1, 6 * size), hessian.reshape(-1, 6 * size, 6 * size)
     )
-    # What is left of the diagonal's damping repairs rounding alone.
-    twists, sound = damped_step(flat, torch.full_like(flat.cost, rounding_cover(problem)), frozen=frozen)
+    # Beside the inertia, a damping of the diagonal repairs rounding alone.
+    twists, sound = damped_step(flat, torch.full_like(flat.cost, least_damping(problem)), frozen=frozen)
     return twists.reshape(*transforms.shape[:-2], 6), sound.reshape(current.cost.shape)
 
 
-def straightened(transforms: Tensor) -> Tensor:
+def nearest_rigid(transforms: Tensor) -> Tensor:
     """Return motions with the nearest rotations, by one Newton step: products of many drift by rounding."""
     rotation = transforms[..., :3, :3]
     transforms = transforms.clone()

@@ -1,33 +1,56 @@
-"""Parts that move rigidly, by merging patches of a surface two by two."""
+"""Patches of a grid, and parts that move rigidly, by merging patches two by two."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_count, check_positive, check_shape
+from torchreg.geometry.graphs import Graph
 from torchreg.geometry.rigid_moments import RigidMoments, least_cost
+from torchreg.geometry.sampling import farthest_points
+from torchreg.registration.bones.sparse_grid import SparseGrid
+
+
+def grid_patches(grid: SparseGrid, count: int, gap: float = 0.0) -> Tensor:
+    """Return the patch (C,) int64 of each cell: that of the seed nearest along the cells.
+
+    Seeds are spread evenly, and every connected region has one at least.
+
+    Args:
+        grid: the grid.
+        count: patches wanted; fewer if there are fewer cells, more if there are more regions.
+        gap: see `SparseGrid.neighbors`.
+
+    Differentiable: no.
+
+    Cost: 5 ms for 1,000 cells and 100 patches.
+
+    References: Chang and Zwicker 2009, section 4.3, but along the surface: patches do not span limbs that come near.
+    """
+    pairs = grid.neighbors(gap).cpu()
+    cells = grid.cells.cpu().double()
+    size = len(cells)
+    length = (cells[pairs[:, 0]] - cells[pairs[:, 1]]).norm(dim=-1)
+    seeds = farthest_points(cells, min(count, size))
+    region = grid.regions(gap).cpu()
+    # A region that is small and near another may have been passed over.
+    first = torch.full((int(region.max()) + 1,), size).scatter_reduce(0, region, torch.arange(size), "amin")
+    seeds = torch.cat([seeds, first[~torch.isin(torch.arange(len(first)), region[seeds])]])
+    return Graph.from_edges(pairs, length, size).nearest(seeds)[1].to(grid.cells.device)
 
 
 @torch.no_grad()
 def merge_rigid(moments: RigidMoments, edges: Tensor, num_parts: int, *, tolerance: float = 0.0) -> Tensor:
-    """Return which part (G,) each patch belongs to, when the two cheapest neighbors are merged again and again.
+    """Return the part (G,) int64 of each patch after the cheapest neighbors are merged again and again.
 
     A merger costs by how much the squared error of one rigid motion for both exceeds that of a motion each, summed over
-    the poses of a batch.
+    the poses of a batch. Parts are numbered from 0 by their first patches.
 
     Args:
         moments: of G patches.
-        edges: (E, 2) pairs of patches that touch; parts that nothing joins never merge, however many are left.
-        num_parts: merging stops when so many are left and
-        tolerance: no merger is left that costs at most this, in the unit of `RigidMoments.cost`: fewer parts are left
-            where more say little.
-
-    Returns:
-        (G,) int64 parts from 0, numbered by their first patches.
-
-    Raises:
-        InputError: if an argument is out of range.
+        edges: (E, 2) pairs of patches that touch; parts that no edge joins never merge, however many there are.
+        num_parts: merging goes on at any cost until so many parts are left.
+        tolerance: it goes on then while a merger costs at most this, in the unit of `RigidMoments.cost`.
 
     Differentiable: no.
 
@@ -35,39 +58,34 @@ def merge_rigid(moments: RigidMoments, edges: Tensor, num_parts: int, *, toleran
 
     References: Ward 1963, for merging by the growth of the squared error.
     """
-    check_count(num_parts, "num_parts", 1)
-    check_positive(tolerance, "tolerance", allow_zero=True)
-    check_shape(edges, "edges", ("E", 2))
     size = moments.num_groups
     sums = moments.sums.reshape(-1, size, moments.sums.shape[-1]).clone()
     part = torch.arange(size, device=edges.device)
     touching = torch.zeros(size, size, dtype=torch.bool, device=edges.device)
     touching[edges[:, 0], edges[:, 1]] = True
     touching = (touching | touching.mT).fill_diagonal_(False)
-    own = _cost(sums)
+    cost = _cost(sums)
     price = torch.full((size, size), torch.inf, dtype=sums.dtype, device=sums.device)
-    one, two = touching.triu().nonzero().unbind(-1)
-    price[one, two] = _cost(sums[:, one] + sums[:, two]) - own[one] - own[two]
-    left = size
-    while left > 1:
+    low, high = touching.triu().nonzero().unbind(-1)
+    price[low, high] = _cost(sums[:, low] + sums[:, high]) - cost[low] - cost[high]
+    for num_left in range(size - 1, 0, -1):
         first, second = divmod(int(price.argmin()), size)
-        cost = float(price[first, second])
-        if cost == float("inf") or (left <= num_parts and cost > tolerance):
+        cheapest = float(price[first, second])
+        if cheapest == float("inf") or (num_left < num_parts and cheapest > tolerance):
             break
-        left -= 1
         sums[:, first] += sums[:, second]
         part[part == second] = first
         touching[first] |= touching[second]
         touching[:, first] |= touching[second]
         touching[first, first] = False
         touching[second], touching[:, second] = False, False
-        for gone in (first, second):
-            price[gone], price[:, gone] = torch.inf, torch.inf
-        others = touching[first].nonzero()[:, 0]
-        costs = _cost(sums[:, [first]] + torch.cat((torch.zeros_like(sums[:, :1]), sums[:, others]), dim=1))
-        own[first] = costs[0]
-        low, high = others.clamp(max=first), others.clamp(min=first)
-        price[low, high] = costs[1:] - own[first] - own[others]
+        for merged in (first, second):
+            price[merged], price[:, merged] = torch.inf, torch.inf
+        neighbors = touching[first].nonzero()[:, 0]
+        costs = _cost(sums[:, [first]] + torch.cat((torch.zeros_like(sums[:, :1]), sums[:, neighbors]), dim=1))
+        cost[first] = costs[0]
+        low, high = neighbors.clamp(max=first), neighbors.clamp(min=first)
+        price[low, high] = costs[1:] - cost[first] - cost[neighbors]
     return part.unique(return_inverse=True)[1]
 
 

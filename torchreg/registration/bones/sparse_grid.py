@@ -1,4 +1,4 @@
-"""Sparse grids: the cubic cells around a surface, with shared corners that carry whatever varies over space."""
+"""Sparse grids: the cubic cells around a surface, with shared corners that carry values to interpolate."""
 
 from __future__ import annotations
 
@@ -27,17 +27,18 @@ from torchreg.geometry.distance_transform import nearest_inside
 from torchreg.geometry.graphs import component_links, connected_components
 from torchreg.geometry.neighbors import pairs_within
 
+# Cells along the longest side: a table over the whole box still takes 128 MiB.
 MAX_RESOLUTION = 256
 # The eight corners of a unit cell; corner 4 i + 2 j + k lies at (i, j, k).
 _CUBE = tuple((i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1))
 _CUBE_EDGES = tuple((a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1)
 
 
-class GridPlace(NamedTuple):
-    """Where points lie in a grid.
+class GridLocation(NamedTuple):
+    """Cells of points, and trilinear coefficients in them.
 
     Args:
-        cell: (..., N) int64, the cell that holds each point, or the occupied one nearest to its place.
+        cell: (..., N) int64, the cell that holds each point, or the occupied one nearest to it in the grid.
         coefficients: (..., N, 8) trilinear, of the cell's corners; not negative, rows sum to one.
     """
 
@@ -58,10 +59,6 @@ class SparseGrid:
         axes: (3, 3) directions of the grid as columns, a rotation.
         spacing: edge length h of a cell, in the unit of the points.
 
-    Raises:
-        InputError: if a shape is wrong, a cell lies outside the box or is there twice, or the axes are no rotation.
-        InputTypeError: if the cells are not integers.
-
     References: Chang and Zwicker 2009, section 3.
     """
 
@@ -71,19 +68,25 @@ class SparseGrid:
     axes: Tensor
     spacing: float
 
-    def __post_init__(self) -> None:
-        cells = _checked_cells(self.cells, self.shape)
-        origin = as_float_tensor(self.origin, "origin")
-        axes = as_float_tensor(self.axes, "axes", like=origin)
+    @classmethod
+    def from_cells(cls, cells: Any, shape: Any, origin: Any, axes: Any, spacing: float) -> SparseGrid:
+        """Return the grid of given cells; arguments as of the class.
+
+        Raises:
+            InputError: if a shape is wrong, a cell lies outside the box or is there twice, or the axes are no rotation.
+            InputTypeError: if the cells are not integers.
+        """
+        cells = _checked_cells(cells, shape)
+        origin = as_float_tensor(origin, "origin")
+        axes = as_float_tensor(axes, "axes", like=origin)
         check_shape(origin, "origin", (3,))
         check_shape(axes, "axes", (3, 3))
         check_finite(origin, "origin")
-        check_positive(self.spacing, "spacing")
-        off = (axes.mT @ axes - torch.eye(3, dtype=axes.dtype, device=axes.device)).abs().max()
-        if not float(off) < 1e-4 or float(torch.linalg.det(axes)) < 0:
+        check_positive(spacing, "spacing")
+        deviation = (axes.mT @ axes - torch.eye(3, dtype=axes.dtype, device=axes.device)).abs().max()
+        if not float(deviation) < 1e-4 or float(torch.linalg.det(axes)) < 0:
             raise InputError(f"axes must be a rotation, got {axes.tolist()}")
-        for name, value in (("cells", cells.to(origin.device)), ("origin", origin), ("axes", axes)):
-            object.__setattr__(self, name, value)
+        return cls(cells.to(origin.device), shape, origin, axes, spacing)
 
     @classmethod
     def from_points(cls, points: Any, resolution: int = 50, *, frame: str = "principal") -> SparseGrid:
@@ -91,7 +94,7 @@ class SparseGrid:
 
         Args:
             points: (N, 3), at two different places or more, in any unit.
-            resolution: cells along the longest side, 1 to 256.
+            resolution: cells along the longest side, 1 to `MAX_RESOLUTION`.
             frame: "principal": the sides follow the principal axes of the points, so that turning the points turns the
                 grid and changes nothing else; "world": the coordinate axes.
 
@@ -125,15 +128,16 @@ class SparseGrid:
         counts = ((high - low) / spacing - 1e-9).ceil().clamp(min=1)
         corner = (low + high - counts * spacing) / 2
         shape = tuple(int(n) for n in counts)
-        place = ((local - corner) / spacing).floor().clamp(min=torch.zeros_like(counts), max=counts - 1).long()
-        cells = _place(_number(place, shape).unique(), shape)
+        coordinates = ((local - corner) / spacing).floor().clamp(min=torch.zeros_like(counts), max=counts - 1).long()
+        cells = _cells_of(_cell_numbers(coordinates, shape).unique(), shape)
         return cls(cells, shape, (axes @ corner).to(points), axes.to(points), spacing)  # type: ignore[arg-type]
 
     @cached_property
     def _corner_table(self) -> tuple[Tensor, Tensor]:
         size = tuple(n + 1 for n in self.shape)
-        numbers, which = _number(self.cells[:, None] + self.cells.new_tensor(_CUBE), size).unique(return_inverse=True)
-        return _place(numbers, size), which
+        corners = _cell_numbers(self.cells[:, None] + self.cells.new_tensor(_CUBE), size)
+        numbers, cell_corners = corners.unique(return_inverse=True)
+        return _cells_of(numbers, size), cell_corners
 
     @property
     def corners(self) -> Tensor:
@@ -147,7 +151,7 @@ class SparseGrid:
 
     @cached_property
     def nearest(self) -> Tensor:
-        """The occupied cell (prod(shape),) int64 nearest to each place of the box."""
+        """The occupied cell (prod(shape),) int64 nearest to each cell of the box."""
         return _nearest_cells(self.cells, self.shape)
 
     def __repr__(self) -> str:
@@ -175,28 +179,28 @@ class SparseGrid:
         return self.origin + (self.spacing * coordinates) @ self.axes.mT
 
     def coordinates(self, points: Tensor) -> Tensor:
-        """Return grid coordinates (..., N, 3) of points (..., N, 3): how many cells from the origin.
+        """Return grid coordinates (..., N, 3) of points (..., N, 3), in cells from the origin.
 
         Differentiable: in ``points``.
         """
         return ((points - self.origin) @ self.axes) / self.spacing
 
-    def locate(self, points: Tensor) -> GridPlace:
+    def locate(self, points: Tensor) -> GridLocation:
         """Return the cell of every point, and the trilinear coefficients of its corners.
 
-        Points that no cell holds belong to the occupied cell nearest to their place in the grid (a place outside the
-        box is moved to its side first), and take the values of the nearest point of that cell: nothing is
-        extrapolated.
+        A point that no occupied cell holds belongs to the occupied one nearest to its own cell of the box, or for a
+        point outside the box to the nearest cell of its side, and takes the values of the nearest point there: nothing
+        is extrapolated.
 
         Args:
             points: (..., N, 3) in the dtype of the grid.
 
         Returns:
-            a `GridPlace`.
+            a `GridLocation`.
 
         Differentiable: the coefficients, in ``points``, within cells.
         """
-        return locate(self.coordinates(points), self.shape, self.cells, self.nearest)
+        return locate_in_cells(self.coordinates(points), self.shape, self.cells, self.nearest)
 
     def interpolate(self, values: Tensor, points: Tensor) -> Tensor:
         """Return values (..., N, B) at points, of values (K, B) at the corners.
@@ -207,8 +211,8 @@ class SparseGrid:
 
         Differentiable: in both.
         """
-        place = self.locate(points)
-        return (place.coefficients.unsqueeze(-2) @ values[self.cell_corners[place.cell]]).squeeze(-2)
+        location = self.locate(points)
+        return (location.coefficients.unsqueeze(-2) @ values[self.cell_corners[location.cell]]).squeeze(-2)
 
     def spread_to_corners(self, values: Tensor) -> Tensor:
         """Return values (K, B) at the corners, each the mean over the cells around it, of values (C, B) of the cells.
@@ -236,52 +240,47 @@ class SparseGrid:
             gap: regions that no chain of sides joins are joined where they come near each other, by the pairs of cells
                 within ``gap`` empty cells that are nearest to each other. Zero joins regions that touch at edges and
                 corners of cells; negative nothing.
-
-        Raises:
-            InputError: if ``gap`` is not finite.
         """
-        if not math.isfinite(gap):
-            raise InputError(f"gap must be finite, got {gap}")
-        pairs = torch.cat([self._beside(axis) for axis in range(3)])
+        pairs = torch.cat([self._side_by_side(axis) for axis in range(3)])
         if gap >= 0:
             pairs = torch.cat([pairs, self._bridges(pairs, gap)])
         number = (pairs[:, 0] * self.num_cells + pairs[:, 1]).unique()
         return torch.stack([number // self.num_cells, number % self.num_cells], dim=-1)
 
     def regions(self, gap: float = 0.0) -> Tensor:
-        """Return which connected region (C,) int64 each cell belongs to; see `neighbors` for ``gap``."""
+        """Return the connected region (C,) int64 of each cell; see `neighbors` for ``gap``."""
         return connected_components(self.neighbors(gap), self.num_cells)
 
     def links(self) -> Tensor:
         """Return pairs of cells (L, 2), the lower number first, that link all regions, however far apart they are."""
         return component_links(self.cells, self.regions())[0]
 
-    def _beside(self, axis: int) -> Tensor:
-        """Return pairs (A, 2) of cells with the one before it along an axis."""
-        inside = (self.cells[:, axis] > 0).nonzero()[:, 0]
-        before = self.cells[inside].clone()
+    def _side_by_side(self, axis: int) -> Tensor:
+        """Return pairs (A, 2) of cells that follow each other along an axis."""
+        later = (self.cells[:, axis] > 0).nonzero()[:, 0]
+        before = self.cells[later].clone()
         before[:, axis] -= 1
-        other = self.nearest[_number(before, self.shape)]
-        there = (self.cells[other] == before).all(-1)
-        return torch.stack([other[there], inside[there]], dim=-1)
+        earlier = self.nearest[_cell_numbers(before, self.shape)]
+        occupied = (self.cells[earlier] == before).all(-1)
+        return torch.stack([earlier[occupied], later[occupied]], dim=-1)
 
     def _bridges(self, pairs: Tensor, gap: float) -> Tensor:
-        """Return pairs (A, 2) of cells of two regions, in reach and nearest to each other."""
+        """Return pairs (A, 2) of cells of two regions, within the gap and nearest to each other."""
         region = connected_components(pairs, self.num_cells).cpu().numpy()
         if region.max(initial=0) == 0:
             return pairs[:0]
-        places = self.cells.cpu().numpy()
+        cells = self.cells.cpu().numpy()
         # A gap of no cell is a step of up to sqrt(3) across a corner.
         reach = max(gap + 1, math.sqrt(3)) + 1e-6
         near = pairs_within(self.cells, reach).cpu().numpy()
         near = near[region[near[:, 0]] != region[near[:, 1]]]
-        both = np.concatenate([near, near[:, ::-1]])
-        length = np.linalg.norm(places[both[:, 0]] - places[both[:, 1]], axis=1)
-        # The nearest cell of each region to each cell, then the pairs that are so from both sides.
-        order = np.lexsort((both[:, 1], length, region[both[:, 1]], both[:, 0]))
-        both = both[order]
-        first = np.unique(both[:, 0] * (region.max() + 1) + region[both[:, 1]], return_index=True)[1]
-        bridges, uses = np.unique(np.sort(both[first], axis=1), axis=0, return_counts=True)
+        directed = np.concatenate([near, near[:, ::-1]])
+        length = np.linalg.norm(cells[directed[:, 0]] - cells[directed[:, 1]], axis=1)
+        # The nearest cell of each region to each cell, then the pairs that are so from either side.
+        order = np.lexsort((directed[:, 1], length, region[directed[:, 1]], directed[:, 0]))
+        directed = directed[order]
+        first = np.unique(directed[:, 0] * (region.max() + 1) + region[directed[:, 1]], return_index=True)[1]
+        bridges, uses = np.unique(np.sort(directed[first], axis=1), axis=0, return_counts=True)
         return torch.from_numpy(bridges[uses == 2].astype(np.int64)).to(pairs.device)
 
     def to(self, *args: Any, **kwargs: Any) -> SparseGrid:
@@ -290,8 +289,8 @@ class SparseGrid:
         return SparseGrid(self.cells.to(origin.device), self.shape, origin, self.axes.to(origin), self.spacing)
 
 
-def locate(coordinates: Tensor, shape: Sequence[int], cells: Tensor, nearest: Tensor) -> GridPlace:
-    """Return what `SparseGrid.locate` does, from the tables of a grid; for compiled and exported code.
+def locate_in_cells(coordinates: Tensor, shape: Sequence[int], cells: Tensor, nearest: Tensor) -> GridLocation:
+    """Return cells and coefficients of points, as `SparseGrid.locate` does, from tables that can be compiled.
 
     Args:
         coordinates: (..., N, 3) grid coordinates of the points.
@@ -302,12 +301,12 @@ def locate(coordinates: Tensor, shape: Sequence[int], cells: Tensor, nearest: Te
     Differentiable: the coefficients, in ``coordinates``, within cells.
     """
     last = torch.tensor([n - 1 for n in shape], dtype=coordinates.dtype, device=coordinates.device)
-    place = torch.minimum(coordinates.detach().floor().clamp(min=0), last).long()
-    cell = nearest[_number(place, shape)]
+    inside = torch.minimum(coordinates.detach().floor().clamp(min=0), last).long()
+    cell = nearest[_cell_numbers(inside, shape)]
     local = (coordinates - cells[cell].to(coordinates)).clamp(0, 1)
     x, y, z = torch.stack([1 - local, local], dim=-1).unbind(-2)
     coefficients = x[..., :, None, None] * y[..., None, :, None] * z[..., None, None, :]
-    return GridPlace(cell, coefficients.flatten(-3))
+    return GridLocation(cell, coefficients.flatten(-3))
 
 
 def _principal_axes(points: Tensor) -> Tensor:
@@ -321,22 +320,23 @@ def _principal_axes(points: Tensor) -> Tensor:
     return torch.cat([axes[:, :2], torch.linalg.cross(axes[:, 0], axes[:, 1])[:, None]], dim=1)
 
 
-def _number(places: Tensor, shape: Sequence[int]) -> Tensor:
-    """Return the running numbers (...) of places (..., 3) in a box."""
-    return (places[..., 0] * shape[1] + places[..., 1]) * shape[2] + places[..., 2]
+def _cell_numbers(cells: Tensor, shape: Sequence[int]) -> Tensor:
+    """Return the running numbers (...) of cells (..., 3) in a box."""
+    return (cells[..., 0] * shape[1] + cells[..., 1]) * shape[2] + cells[..., 2]
 
 
-def _place(numbers: Tensor, shape: Sequence[int]) -> Tensor:
+def _cells_of(numbers: Tensor, shape: Sequence[int]) -> Tensor:
+    """Return the cells (..., 3) of running numbers (...)."""
     rows, last = numbers // shape[2], numbers % shape[2]
     return torch.stack([rows // shape[1], rows % shape[1], last], dim=-1)
 
 
 def _nearest_cells(cells: Tensor, shape: tuple[int, int, int]) -> Tensor:
-    """Return, for every place of the box, the number of the cell nearest to it."""
-    place = _number(cells, shape)
-    number = cells.new_zeros(math.prod(shape)).index_copy(0, place, torch.arange(len(cells), device=cells.device))
-    occupied = torch.zeros_like(number, dtype=torch.bool).index_fill(0, place, True)
-    return number[nearest_inside(occupied.view(shape)).flatten()]
+    """Return, for every cell of the box, the position in ``cells`` of the one nearest to it."""
+    number = _cell_numbers(cells, shape)
+    position = cells.new_zeros(math.prod(shape)).index_copy(0, number, torch.arange(len(cells), device=cells.device))
+    occupied = torch.zeros_like(position, dtype=torch.bool).index_fill(0, number, True)
+    return position[nearest_inside(occupied.view(shape)).flatten()]
 
 
 def _checked_cells(cells: Any, shape: Any) -> Tensor:
@@ -353,7 +353,7 @@ def _checked_cells(cells: Any, shape: Any) -> Tensor:
         raise InputError(
             f"cells must lie in the box of {tuple(shape)}, got {cells.amin(0).tolist()} to {cells.amax(0).tolist()}"
         )
-    number = _number(cells, shape)
+    number = _cell_numbers(cells, shape)
     if bool((number[1:] <= number[:-1]).any()):
         raise InputError("cells must be different and in the order of their coordinates")
     return cells

@@ -2,37 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_choice, check_count, check_finite, check_positive, check_same_kind, check_shape
-from torchreg.errors import InputError
+from torchreg._checks import check_choice, check_count, check_positive
 from torchreg.geometry.rigid import transform_points
-from torchreg.registration.bones.distance_loss import check_share
+from torchreg.registration.bones.correspondences import Correspondences
 from torchreg.registration.bones.grid_lbs import GridLBS
-from torchreg.registration.bones.grid_losses import WeightCloseness, WeightNormalization, WeightSmoothness
-from torchreg.registration.bones.sparse_grid import SparseGrid
+from torchreg.registration.bones.grid_losses import closeness_energy, normalization_energy, smoothness_energy
 from torchreg.solvers.nnls import nnls
 from torchreg.solvers.projected_gradient import projected_gradient
 
-METHODS = ("active_set", "gradient")
-
 
 @dataclass(frozen=True)
-class RefineConfig:
-    """How much each term of the refinement counts.
+class WeightsConfig:
+    """Weights of the terms of the refinement, and how it is solved.
 
     Args:
-        distance: of the mean squared distance of matches, in cells and per cell of the grid.
-        smoothness: mu, of the differences between neighboring corners.
-        normalization: nu, of the sums that differ from one.
-        closeness: of the differences from the labels.
+        distance: of the mean squared residual, in cells and per cell of the grid.
+        smoothness: mu, of the squared differences between neighboring corners.
+        normalization: nu, of the squared deviations of the sums from one.
+        closeness: of the squared differences from the labels.
         reach: a bone may get weight at corners up to that many edges from where it has a label.
-        point_to_point: share of the point-to-point distance, see `ScanDistance`.
-        method: "active_set", see `nnls`, or "gradient", see `projected_gradient`: both lead to the same weights.
+        method: "active_set", see `nnls`, or "gradient", see `projected_gradient`; both lead to the same weights.
         max_steps: of the method; 50 rounds or 2,000 gradient steps by default.
+
+    Raises:
+        InputError: if a value is out of range.
 
     References: Chang and Zwicker 2009, section 5, for the values in cells: mu 0.5 to 1, nu 1, closeness 0.1 to 0.5.
     """
@@ -42,7 +42,6 @@ class RefineConfig:
     normalization: float = 1.0
     closeness: float = 0.2
     reach: int = 3
-    point_to_point: float = 0.0
     method: str = "active_set"
     max_steps: int | None = None
 
@@ -53,8 +52,7 @@ class RefineConfig:
         check_positive(self.normalization, "normalization")
         check_positive(self.closeness, "closeness")
         check_count(self.reach, "reach", 0)
-        check_share(self.point_to_point, "point_to_point")
-        check_choice(self.method, "method", METHODS)
+        check_choice(self.method, "method", tuple(_METHODS))
         if self.max_steps is not None:
             check_count(self.max_steps, "max_steps", 1)
 
@@ -66,49 +64,35 @@ class RefinedWeights:
     Args:
         weights: (K, B) rows divided by their sums.
         objective: least value found, before that division.
-        start_objective: at the labels' weights.
-        num_steps: of the method.
         converged: whether the method met its tolerance.
     """
 
     weights: Tensor
     objective: float
-    start_objective: float
-    num_steps: int
     converged: bool
 
 
 @torch.no_grad()
 def refine_weights(
-    model: GridLBS,
-    points: Tensor,
-    targets: Tensor,
-    normals: Tensor | None = None,
-    match_weights: Tensor | None = None,
-    *,
-    config: RefineConfig | None = None,
+    model: GridLBS, points: Tensor, correspondences: Correspondences, config: WeightsConfig | None = None
 ) -> RefinedWeights:
-    """Return weights that fit matches, vary smoothly, add up to one and stay near the labels.
+    """Return weights that fit correspondences, vary smoothly, add up to one and stay near the labels.
 
     ``argmin_{v >= 0} a E_dist + mu E_smooth + nu E_norm + lambda E_disc`` over the corners times the bones in reach,
-    the motions fixed. The distance of a match is that of ``sum_j w_j (T_j x - y)``: the same as of the moved point
-    where weights add up to one, and where they do not, independent of the origin.
+    the motions fixed. The residual of a correspondence is that of ``sum_j w_j (T_j x - y)``: the same as of the moved
+    point where weights add up to one, and where they do not, independent of the origin.
 
     Args:
         model: the bones' motions, and the labels' weights, see `GridLBS.from_labels`; it is not changed. A batch of
             poses counts together.
         points: (N, 3) before they are moved.
-        targets: (..., N, 3) what each is matched with, in every pose.
-        normals: (..., N, 3) unit normals at the targets; not needed where only point to point counts.
-        match_weights: (..., N) not negative, zero for dropped matches; ones by default.
-        config: see `RefineConfig`.
+        correspondences: (..., N) of the moved points, in every pose.
+        config: see `WeightsConfig`.
 
     Returns:
         `RefinedWeights`.
 
     Raises:
-        InputError: if a shape does not fit or normals are missing.
-        InputTypeError: if dtypes or devices differ.
         SolverError: if the system cannot be solved.
 
     Differentiable: no.
@@ -117,131 +101,126 @@ def refine_weights(
 
     References: Chang and Zwicker 2009, eqs. 8 and 13.
     """
-    config = RefineConfig() if config is None else config
-    problem = _Problem(model, points, targets, normals, match_weights, config)
-    if config.method == "active_set":
-        solved = nnls(*problem.least_squares(), start=problem.start, max_steps=config.max_steps or 50, tol=1e-6)
-        x, steps, converged = solved.x, solved.num_steps, solved.converged
-    else:
-        matrix = problem.least_squares()[0]
-        curvature = torch.sparse.sum(matrix * matrix, dim=0).to_dense()
-        found = projected_gradient(
-            problem.cost, problem.start, scale=1 / curvature, max_steps=config.max_steps or 2000, tol=1e-5
-        )
-        x, steps, converged = found.x, found.num_steps, bool(found.converged)
-    weights, labels = problem.spread(x), problem.labels
+    config = WeightsConfig() if config is None else config
+    problem = _WeightsProblem(model, points, correspondences, config)
+    method = _METHODS[config.method]
+    x, converged = method.solve(problem, config.max_steps or method.max_steps, method.tol)
+    weights = problem.corner_weights(x)
     total = weights.sum(-1, keepdim=True)
-    weights = torch.where(total > 0, weights / total.clamp_min(1e-30), labels)
-    return RefinedWeights(
-        weights.to(model.weights), float(problem.cost(x)), float(problem.cost(problem.start)), steps, converged
-    )
+    weights = torch.where(total > 0, weights / total.clamp_min(1e-30), problem.labels)
+    return RefinedWeights(weights.to(model.weights), float(problem.cost(x)), converged)
 
 
-class _Problem:
-    """The refinement as a function of the weights in reach, in cells of the grid and double precision."""
+class _Rows(NamedTuple):
+    """Entries of some rows of a sparse least-squares problem, and the right sides of the rows."""
 
-    def __init__(
-        self,
-        model: GridLBS,
-        points: Tensor,
-        targets: Tensor,
-        normals: Tensor | None,
-        match_weights: Tensor | None,
-        config: RefineConfig,
-    ) -> None:
-        _check(model, points, targets, normals, match_weights, config)
+    row: Tensor
+    column: Tensor
+    value: Tensor
+    right: Tensor
+
+
+class _WeightsProblem:
+    """The refinement as a function of the weights in reach, in cells of the grid and double precision.
+
+    Attributes:
+        labels: (K, B) weights of the labels.
+        start: (V,) weights of the labels at the variables.
+    """
+
+    def __init__(self, model: GridLBS, points: Tensor, correspondences: Correspondences, config: WeightsConfig) -> None:
         grid = model.grid
-        self.config, self.edges = config, grid.edges()
+        self._config, self._edges = config, grid.edges()
         self.labels = model.corner_weights().double()
-        self.corner, self.bone = _in_reach(self.labels > 0, self.edges, config.reach).nonzero().unbind(-1)
-        self.start = self.labels[self.corner, self.bone]
-        self._number = torch.full(self.labels.shape, -1, device=points.device)
-        self._number[self.corner, self.bone] = torch.arange(len(self.corner), device=points.device)
-        place = grid.locate(points)
-        self._place = grid.cell_corners[place.cell], place.coefficients.double()
+        self._corner, self._bone = _in_reach(self.labels > 0, self._edges, config.reach).nonzero().unbind(-1)
+        self.start = self.labels[self._corner, self._bone]
+        self._variables = torch.arange(len(self._corner), device=points.device)
+        # Of corners and bones (K, B), -1 out of reach.
+        self._variable = torch.full(self.labels.shape, -1, device=points.device)
+        self._variable[self._corner, self._bone] = self._variables
+        location = grid.locate(points)
+        self._corners, self._coefficients = grid.cell_corners[location.cell], location.coefficients.double()
         moved = transform_points(model.transforms.detach(), points.unsqueeze(-3)).double().transpose(-2, -3)
-        off = (moved - targets.unsqueeze(-2)) / grid.spacing
-        measured = self._measured(off, normals, match_weights, grid)
-        self._off = measured.reshape(-1, *measured.shape[-3:])
+        offsets = (moved - correspondences.targets.unsqueeze(-2)) / grid.spacing
+        residuals = _weighted_residuals(offsets, correspondences, config.distance * grid.num_cells)
+        self._residuals = residuals.reshape(-1, *residuals.shape[-3:])
 
-    def _measured(self, off: Tensor, normals: Tensor | None, match_weights: Tensor | None, grid: SparseGrid) -> Tensor:
-        """Return offsets (..., N, B, m), of which the squared sums are each bone's share of the distance term."""
-        share = self.config.point_to_point
-        weights = torch.ones_like(off[..., 0, 0]) if match_weights is None else match_weights.double()
-        weights = weights.expand(off.shape[:-2])
-        root = (self.config.distance * grid.num_cells * weights / weights.sum().clamp_min(1e-300)).sqrt()[
-            ..., None, None
-        ]
-        off = torch.where(root > 0, off, 0.0)
-        parts = [] if share == 0 else [share**0.5 * off]
-        if normals is not None and share < 1:
-            along = (off * torch.where(root > 0, normals.double().unsqueeze(-2), 0.0)).sum(-1, keepdim=True)
-            parts.append((1 - share) ** 0.5 * along)
-        return root * torch.cat(parts, dim=-1)
-
-    def spread(self, x: Tensor) -> Tensor:
-        """Return weights (K, B) of the values in reach."""
-        return torch.zeros_like(self.labels).index_put((self.corner, self.bone), x)
+    def corner_weights(self, x: Tensor) -> Tensor:
+        """Return weights (K, B) of the variables (V,)."""
+        return torch.zeros_like(self.labels).index_put((self._corner, self._bone), x)
 
     def cost(self, x: Tensor) -> Tensor:
         """Return the objective, from the losses."""
-        weights, config = self.spread(x), self.config
-        corners, coefficients = self._place
-        at_points = (coefficients.unsqueeze(-1) * weights[corners]).sum(-2)
-        distance = (at_points.unsqueeze(-1) * self._off).sum(-2).square().sum()
-        smooth = config.smoothness * WeightSmoothness()(weights, self.edges)
-        normal = config.normalization * WeightNormalization()(weights)
-        return distance + smooth + normal + config.closeness * WeightCloseness()(weights, self.labels)
+        weights, config = self.corner_weights(x), self._config
+        at_points = (self._coefficients.unsqueeze(-1) * weights[self._corners]).sum(-2)
+        distance = (at_points.unsqueeze(-1) * self._residuals).sum(-2).square().sum()
+        smooth = config.smoothness * smoothness_energy(weights, self._edges)
+        normal = config.normalization * normalization_energy(weights)
+        return distance + smooth + normal + config.closeness * closeness_energy(weights, self.labels)
 
     def least_squares(self) -> tuple[Tensor, Tensor]:
         """Return sparse A and b with the objective ``|A x - b|^2``."""
-        count = len(self.corner)
-        variables = torch.arange(count, device=self.corner.device)
-        config = self.config
-        blocks = [
-            (*self._distance_rows(), None),
-            (*self._smoothness_rows(), None),
-            (self.corner, variables, torch.full_like(self.start, config.normalization**0.5), "sums"),
-            (variables, variables, torch.full_like(self.start, config.closeness**0.5), "labels"),
-        ]
-        right = {
-            "sums": torch.full_like(self.labels[:, 0], config.normalization**0.5),
-            "labels": config.closeness**0.5 * self.start,
-        }
-        indices, values, targets, rows = [], [], [], 0
-        for row, column, value, name in blocks:
-            target = value.new_zeros(int(row.max()) + 1 if len(row) else 0) if name is None else right[name]
-            indices.append(torch.stack([row + rows, column]))
-            values.append(value)
-            targets.append(target)
-            rows += len(target)
-        matrix = torch.sparse_coo_tensor(
-            torch.cat(indices, dim=1), torch.cat(values), (rows, count), check_invariants=False
-        )
-        return matrix.coalesce(), torch.cat(targets)
+        terms = (self._distance(), self._smoothness(), self._normalization(), self._closeness())
+        indices, num_rows = [], 0
+        for term in terms:
+            indices.append(torch.stack([term.row + num_rows, term.column]))
+            num_rows += len(term.right)
+        values, size = torch.cat([term.value for term in terms]), (num_rows, len(self.start))
+        matrix = torch.sparse_coo_tensor(torch.cat(indices, dim=1), values, size, check_invariants=False)
+        return matrix.coalesce(), torch.cat([term.right for term in terms])
 
-    def _distance_rows(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return row, variable and value of the entries of the distance term."""
-        corners, coefficients = self._place
-        number = self._number[corners]
-        point, slot, bone = (number >= 0).nonzero().unbind(-1)
-        poses, points, _, parts = self._off.shape
-        value = coefficients[point, slot].unsqueeze(-1) * self._off[:, point, bone]
+    def _distance(self) -> _Rows:
+        variable = self._variable[self._corners]
+        point, slot, bone = (variable >= 0).nonzero().unbind(-1)
+        poses, points, _, parts = self._residuals.shape
+        value = self._coefficients[point, slot].unsqueeze(-1) * self._residuals[:, point, bone]
         pose = torch.arange(poses, device=point.device).view(-1, 1, 1)
         row = (pose * points + point.unsqueeze(-1)) * parts + torch.arange(parts, device=point.device)
-        variable = number[point, slot, bone].view(1, -1, 1).expand(row.shape)
-        some = value != 0
-        return row[some], variable[some], value[some]
+        column = variable[point, slot, bone].view(1, -1, 1).expand(row.shape)
+        return _homogeneous(row, column, value, value != 0)
 
-    def _smoothness_rows(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Return row, variable and value of the differences along edges, of all bones in reach of either end."""
-        ends = self._number[self.edges]
+    def _smoothness(self) -> _Rows:
+        """Differences along edges, of all bones in reach of either end."""
+        ends = self._variable[self._edges]
         edge, bone = (ends >= 0).any(1).nonzero().unbind(-1)
-        variable = ends[edge, :, bone]
-        row = torch.arange(len(edge), device=edge.device).unsqueeze(-1).expand(variable.shape)
-        sign = torch.tensor([1.0, -1.0], dtype=torch.float64, device=edge.device).expand(variable.shape)
-        some = variable >= 0
-        return row[some], variable[some], self.config.smoothness**0.5 * sign[some]
+        column = ends[edge, :, bone]
+        row = torch.arange(len(edge), device=edge.device).unsqueeze(-1).expand(column.shape)
+        sign = torch.tensor([1.0, -1.0], dtype=torch.float64, device=edge.device).expand(column.shape)
+        return _homogeneous(row, column, self._config.smoothness**0.5 * sign, column >= 0)
+
+    def _normalization(self) -> _Rows:
+        root = self._config.normalization**0.5
+        right = torch.full_like(self.labels[:, 0], root)
+        return _Rows(self._corner, self._variables, torch.full_like(self.start, root), right)
+
+    def _closeness(self) -> _Rows:
+        root = self._config.closeness**0.5
+        return _Rows(self._variables, self._variables, torch.full_like(self.start, root), root * self.start)
+
+
+def _homogeneous(row: Tensor, column: Tensor, value: Tensor, kept: Tensor) -> _Rows:
+    """Return the entries that a mask keeps, of rows whose right sides are zero."""
+    row, column, value = row[kept], column[kept], value[kept]
+    return _Rows(row, column, value, value.new_zeros(int(row.max()) + 1 if len(row) else 0))
+
+
+def _weighted_residuals(offsets: Tensor, correspondences: Correspondences, scale: float) -> Tensor:
+    """Return residuals (..., N, B, m) of which the squared sums are `squared_residuals`, weighted.
+
+    Args:
+        offsets: (..., N, B, 3) of the points, moved by each bone, from their targets.
+        correspondences: (..., N).
+        scale: of the mean squared residual.
+    """
+    share, normals = correspondences.point_to_point, correspondences.normals
+    weights = correspondences.weights.double().expand(offsets.shape[:-2])
+    root = (scale * weights / weights.sum().clamp_min(1e-300)).sqrt()[..., None, None]
+    offsets = torch.where(root > 0, offsets, 0.0)
+    parts = [] if share == 0 else [share**0.5 * offsets]
+    if normals is not None and share < 1:
+        along = (offsets * torch.where(root > 0, normals.double().unsqueeze(-2), 0.0)).sum(-1, keepdim=True)
+        parts.append((1 - share) ** 0.5 * along)
+    return root * torch.cat(parts, dim=-1)
 
 
 def _in_reach(present: Tensor, edges: Tensor, steps: int) -> Tensor:
@@ -253,23 +232,33 @@ def _in_reach(present: Tensor, edges: Tensor, steps: int) -> Tensor:
     return present
 
 
-def _check(
-    model: GridLBS,
-    points: Tensor,
-    targets: Tensor,
-    normals: Tensor | None,
-    match_weights: Tensor | None,
-    config: RefineConfig,
-) -> None:
-    check_shape(points, "points", ("N", 3))
-    check_same_kind(points, "points", model.weights, "the model")
-    check_finite(points, "points")
-    shape = (*model.base_transforms.shape[:-3], len(points), 3)
-    check_shape(targets, "targets", shape)
-    check_same_kind(targets, "targets", points, "points")
-    if normals is not None:
-        check_shape(normals, "normals", shape)
-    elif config.point_to_point < 1:
-        raise InputError("normals are needed for point to plane; pass them, or set point_to_point=1 in the config")
-    if match_weights is not None:
-        check_shape(match_weights, "match_weights", shape[:-1])
+def _by_active_set(problem: _WeightsProblem, max_steps: int, tol: float) -> tuple[Tensor, bool]:
+    solved = nnls(*problem.least_squares(), start=problem.start, max_steps=max_steps, tol=tol)
+    return solved.x, solved.converged
+
+
+def _by_gradient(problem: _WeightsProblem, max_steps: int, tol: float) -> tuple[Tensor, bool]:
+    matrix, _ = problem.least_squares()
+    curvature = torch.sparse.sum(matrix * matrix, dim=0).to_dense()
+    found = projected_gradient(problem.cost, problem.start, scale=1 / curvature, max_steps=max_steps, tol=tol)
+    return found.x, bool(found.converged)
+
+
+class _Method(NamedTuple):
+    """One way to solve the refinement.
+
+    Args:
+        solve: problem, most steps and tolerance to the variables (V,), and whether they converged.
+        max_steps: by default.
+        tol: of the method.
+    """
+
+    solve: Callable[[_WeightsProblem, int, float], tuple[Tensor, bool]]
+    max_steps: int
+    tol: float
+
+
+_METHODS = {
+    "active_set": _Method(_by_active_set, max_steps=50, tol=1e-6),
+    "gradient": _Method(_by_gradient, max_steps=2000, tol=1e-5),
+}

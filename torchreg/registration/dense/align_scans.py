@@ -129,24 +129,24 @@ def align_scans(
     chosen = found[0].hypothesis
     transforms = _finished(problem, found[0], config, unsure, report)
     weights = spread_weights(
-        problem.unit.of_points(source.points),
+        problem.unit.normalize(source.points),
         source.normals.detach().cpu().double(),
         problem.graph.points,
         problem.graph.normals,
         problem.graph.dense_weights,
         NORMAL_SCALE,
     )
-    moved = blend_linear(problem.unit.of_points(source.points), weights, transforms)
+    moved = blend_linear(problem.unit.normalize(source.points), weights, transforms)
     return ScanAlignment(
-        problem.unit.points_back(moved, source.points),
-        _confidence(problem, transforms, config, source.points).to(source.points),
-        problem.samples,
-        problem.nodes,
-        weights.to(source.points),
-        problem.unit.transforms_back(transforms).to(source.points),
-        chosen,
-        tuple(candidate.hypothesis for candidate in found),
-        tuple(history),
+        points=problem.unit.denormalize(moved, source.points),
+        confidence=_confidence(problem, transforms, config, source.points).to(source.points),
+        samples=problem.samples,
+        nodes=problem.nodes,
+        weights=weights.to(source.points),
+        transforms=problem.unit.denormalize_motions(transforms).to(source.points),
+        chosen=chosen,
+        hypotheses=tuple(candidate.hypothesis for candidate in found),
+        history=tuple(history),
     )
 
 
@@ -186,11 +186,11 @@ def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnS
 def _near(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
     """Return the candidates from rest and, if that is known, from where points are expected."""
     sigma, rest = config.refine.near_sigma, problem.graph.rest()
-    found = [_compared(problem, rest, sigma, config, Reporter("rest", problem.unit.size, on_step))]
+    found = [_compared(problem, rest, sigma, config, Reporter("rest", problem.unit.scale, on_step))]
     if problem.expected is not None:
         there = GraphMatches.of_places(problem.expected)
         ahead = fit_graph(problem.graph, rest, there, _EXPECTED_STIFFNESS, _EXPECTED_FITS).transforms
-        found.append(_compared(problem, ahead, sigma, config, Reporter("expected", problem.unit.size, on_step)))
+        found.append(_compared(problem, ahead, sigma, config, Reporter("expected", problem.unit.scale, on_step)))
     return found
 
 
@@ -201,7 +201,7 @@ def _by_stiff_matches(
     matches = first_matches(problem, config.match)
     if len(matches.weights) < config.match.min_matches:
         return matches, None
-    reporter = Reporter("stiff matches", problem.unit.size, on_step)
+    reporter = Reporter("stiff matches", problem.unit.scale, on_step)
     fitted = fit_first_matches(problem, matches, config.match.stiffer, config.match, reporter)
     return matches, _compared(problem, fitted, config.refine.near_sigma, config, reporter)
 
@@ -210,7 +210,7 @@ def _by_matches(
     problem: ScanAlignProblem, config: ScanAlignConfig, matches: GraphMatches, on_step: OnStep
 ) -> _Candidate:
     """Return the candidate from the first matches, pulled one to one."""
-    reporter = Reporter("matches", problem.unit.size, on_step)
+    reporter = Reporter("matches", problem.unit.scale, on_step)
     fitted = fit_first_matches(problem, matches, config.match.stiffness, config.match, reporter)
     pulled = pull_one_to_one(problem, fitted, config.reassign, reporter)
     return replace(_compared(problem, pulled, config.refine.sigma[0], config, reporter), pulled=True)
@@ -218,7 +218,7 @@ def _by_matches(
 
 def _one_to_one(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> _Candidate:
     """Return the candidate pulled from rest by one-to-one matches alone."""
-    reporter = Reporter("one to one", problem.unit.size, on_step)
+    reporter = Reporter("one to one", problem.unit.scale, on_step)
     pulled = pull_one_to_one(problem, problem.graph.rest(), config.assign, reporter)
     return replace(_compared(problem, pulled, config.refine.sigma[0], config, reporter), pulled=True)
 
@@ -254,7 +254,7 @@ def _fused(
 ) -> _Candidate:
     """Return the candidate that takes the best of several."""
     begin = fuse_motions(problem, torch.stack([candidate.transforms for candidate in found]), config.choice)
-    reporter = Reporter("fused", problem.unit.size, on_step)
+    reporter = Reporter("fused", problem.unit.scale, on_step)
     return _compared(problem, begin, config.refine.fused_sigma, config, reporter)
 
 
@@ -288,7 +288,7 @@ def _pulled(
     """Return named options as one-to-one matches pull them."""
     found = []
     for name, option in options:
-        reporter = Reporter(name, problem.unit.size, on_step)
+        reporter = Reporter(name, problem.unit.scale, on_step)
         transforms = pull_one_to_one(problem, option, config.reassign, reporter)
         found.append(_Candidate(judge(problem, name, transforms, config.choice), transforms, config.refine.near_sigma))
     return found
@@ -304,7 +304,7 @@ def _side_by_side(
     """Return the candidates from two named motions (J, 4, 4) at most, followed at once."""
 
     def followed(name: str, transforms: Tensor, told: OnStep) -> _Candidate:
-        return _compared(problem, transforms, sigma, config, Reporter(name, problem.unit.size, told))
+        return _compared(problem, transforms, sigma, config, Reporter(name, problem.unit.scale, told))
 
     if len(starts) < 2:
         return [followed(*start, on_step) for start in starts]
@@ -327,11 +327,11 @@ def _finished(
     name, refining = candidate.hypothesis.name, config.refine
 
     def to_the_end(told: OnStep) -> Tensor:
-        steps, reporter = slice(refining.compared_after, None), Reporter(name, problem.unit.size, told)
+        steps, reporter = slice(refining.compared_after, None), Reporter(name, problem.unit.scale, told)
         return refine(problem, candidate.transforms, refining, reporter, candidate.sigma, steps)
 
     def slowly(told: OnStep) -> Tensor:
-        slow, reporter = refining.slower(), Reporter(name, problem.unit.size, told)
+        slow, reporter = refining.slower(), Reporter(name, problem.unit.scale, told)
         follow = None
         if refining.regions > 0:
             follow = follow_regions(problem, candidate.transforms, refining, config.choice)
@@ -372,5 +372,5 @@ def _confidence(problem: ScanAlignProblem, transforms: Tensor, config: ScanAlign
     sigma = config.refine.sigma[1]
     moved = used_samples(problem, transforms, sigma, config.refine)
     own = soft_matches(problem, moved, sigma, config.refine).posterior
-    index, _ = k_nearest(problem.unit.of_points(points), problem.graph.points[: len(own)], min(3, len(own)))
+    index, _ = k_nearest(problem.unit.normalize(points), problem.graph.points[: len(own)], min(3, len(own)))
     return own[index].mean(1)

@@ -91,7 +91,7 @@ class AssignConfig:
 
 
 @dataclass(frozen=True)
-class RefineConfig:
+class EMConfig:
     """How a graph is pulled by soft matches, annealed.
 
     Args:
@@ -170,7 +170,7 @@ class RefineConfig:
         for name in (*weights, *limits, "beyond_below", "beyond_margin", "density"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
-    def slower(self) -> RefineConfig:
+    def slower(self) -> EMConfig:
         """Return the settings of a second, slower EM: matches slide along the surface from its beginning.
 
         Held along the surface, samples go where the first matches were; cloth and round limbs have farther to go.
@@ -272,7 +272,7 @@ class ScanAlignConfig:
     reassign: AssignConfig = field(
         default_factory=lambda: AssignConfig(num_steps=6, reach=(0.15, 0.08), stiffness=(0.6, 0.2))
     )
-    refine: RefineConfig = field(default_factory=RefineConfig)
+    refine: EMConfig = field(default_factory=EMConfig)
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
 
     def __post_init__(self) -> None:

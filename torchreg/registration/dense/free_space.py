@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchreg._checks import check_positive, check_same_kind, check_shape
 from torchreg.geometry.neighbors import NeighborTree, k_nearest
-from torchreg.registration.dense.occlusion import Picture
+from torchreg.registration.dense.occlusion import PinholeView
 
 # Neighbors in the picture that a normal is averaged over, and that tell how it changes towards the outline.
 _FEW, _MANY = 6, 16
@@ -35,7 +35,7 @@ class FreeSpace:
         trust: (S,) in [0, 1], whether beside a sample the surface ended by turning away from the camera.
     """
 
-    picture: Picture
+    picture: PinholeView
     flat: Tensor
     depth: Tensor
     spacing: float
@@ -67,7 +67,7 @@ class FreeSpace:
         check_same_kind(normals, "normals", points, "points")
         check_same_kind(viewpoint, "viewpoint", points, "points")
         check_positive(most_cut, "most_cut")
-        picture = Picture.of(points, viewpoint)
+        picture = PinholeView.of(points, viewpoint)
         flat, depth = picture.project(points)
         trust = torch.zeros_like(depth)
         if len(points) <= _MANY:

@@ -24,7 +24,7 @@ _LEAST_DEPTH = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class PinholeView:
     """What a camera sees, as places in the plane through the middle of what it looks at.
 
     Args:
@@ -38,7 +38,7 @@ class Picture:
     distance: Tensor
 
     @classmethod
-    def of(cls, points: Tensor, viewpoint: Tensor) -> Picture:
+    def of(cls, points: Tensor, viewpoint: Tensor) -> PinholeView:
         """Return what a camera sees that looks at the middle of points (S, 3); along z if it is there."""
         middle = points.mean(0)
         distance = (middle - viewpoint).norm()
@@ -108,7 +108,7 @@ def occlusion_edges(edges: Tensor, surface: Tensor, viewpoint: Tensor, depth: fl
     check_positive(depth, "depth")
     if len(edges) == 0 or len(surface) < 2:
         return torch.zeros(len(edges), dtype=torch.bool, device=edges.device)
-    picture = Picture.of(surface, viewpoint)
+    picture = PinholeView.of(surface, viewpoint)
     (flat, far), (flat_edges, far_edges) = picture.project(surface), picture.project(edges)
     index, apart = k_nearest(flat_edges, flat, min(_NEIGHBORS, len(flat)))
     return ((apart < _BESIDE * sampling_distance(flat)) & (far[index] < far_edges.unsqueeze(1) - depth)).any(1)

@@ -27,7 +27,7 @@ from torchreg.registration.dense.oriented_samples import OrientedSamples, scaled
 from torchreg.registration.dense.rigid_regions import WideRegions
 from torchreg.registration.dense.sample_graph import sample_graph
 from torchreg.registration.dense.spin_images import spin_images
-from torchreg.registration.normalization import ScanUnit
+from torchreg.registration.normalization import Normalization
 
 # What opposite normals count as where a point takes over from the samples around it, length.
 NORMAL_SCALE = 0.03
@@ -62,7 +62,7 @@ class ScanAlignProblem:
     free: FreeSpace | None
     samples: Tensor
     nodes: Tensor
-    unit: ScanUnit
+    unit: Normalization
     expected: Tensor | None = None
 
     def moved(self, transforms: Tensor, count: int | None = None) -> OrientedSamples:
@@ -93,9 +93,9 @@ def describe(
     here = source.uniform_subsample(count, generator=generator)
     there = target.uniform_subsample(config.num_target_samples, generator=generator)
     here, there = here[even_order(source.points[here])], there[even_order(target.points[there])]
-    unit = ScanUnit.of(source.points[here])
+    unit = Normalization.from_points(source.points[here])
     places = [
-        (unit.of_points(scan.points[which]), scan.normals[which].detach().cpu().double())
+        (unit.normalize(scan.points[which]), scan.normals[which].detach().cpu().double())
         for scan, which in ((source, here), (target, there))
     ]
 
@@ -109,17 +109,20 @@ def describe(
     )
     eye = _viewpoint(target, unit, other)
     free = None if eye is None else FreeSpace.of(other.points, other.normals, eye, config.most_cut)
-    other = replace(other, cut_off=_cut_off(unit.of_points(target.points[target.boundary]), other.points, eye, config))
+    other = replace(other, cut_off=_cut_off(unit.normalize(target.points[target.boundary]), other.points, eye, config))
     samples = here[: config.num_samples].cpu()
     faces = None if source.faces is None else source.faces.cpu()
     normals = source.normals.detach().cpu().double()
-    ways = sample_graph(unit.of_points(source.points), samples, faces, normals=normals, normal_scale=NORMAL_SCALE)
+    ways = sample_graph(unit.normalize(source.points), samples, faces, normals=normals, normal_scale=NORMAL_SCALE)
     nodes = build_node_graph(ways, 0, config.num_nodes, config.num_nearest)
     graph = DeformationGraph(one.points[: len(samples)], one.normals[: len(samples)], nodes)
-    ahead = None if expected is None else unit.of_points(expected)[samples]
+    ahead = None if expected is None else unit.normalize(expected)[samples]
     regions = _wide_regions(graph, ways, nodes.nodes, config)
     far = _far_apart(ways, config)
-    return ScanAlignProblem(graph, one, other, regions, far, free, samples, samples[nodes.nodes], unit, ahead)
+    return ScanAlignProblem(
+        graph=graph, source=one, target=other, regions=regions, far=far, free=free,
+        samples=samples, nodes=samples[nodes.nodes], unit=unit, expected=ahead,
+    )  # fmt: skip
 
 
 def _far_apart(ways: Graph, config: ScanAlignConfig) -> Tensor:
@@ -135,11 +138,11 @@ def _wide_regions(graph: DeformationGraph, ways: Graph, nodes: Tensor, config: S
     return WideRegions.of(few, apart, config.region_reach, config.region_give)
 
 
-def _viewpoint(scan: RangeScan, unit: ScanUnit, samples: OrientedSamples) -> Tensor | None:
+def _viewpoint(scan: RangeScan, unit: Normalization, samples: OrientedSamples) -> Tensor | None:
     """Return where the camera (3,) was, if that is known or clear."""
     if scan.viewpoint is None:
         return likely_viewpoint(samples.points, samples.normals)
-    return unit.of_points(scan.viewpoint.unsqueeze(0))[0]
+    return unit.normalize(scan.viewpoint.unsqueeze(0))[0]
 
 
 def _cut_off(edges: Tensor, points: Tensor, eye: Tensor | None, config: ScanAlignConfig) -> Tensor:

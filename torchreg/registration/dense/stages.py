@@ -12,10 +12,10 @@ from torchreg.registration.annealing import geometric_at
 from torchreg.registration.dense.config import (
     AssignConfig,
     ChoiceConfig,
+    EMConfig,
     Hypothesis,
     MatchConfig,
     OnStep,
-    RefineConfig,
     ScanAlignRecord,
 )
 from torchreg.registration.dense.e_step import SoftMatches, match_softly
@@ -53,7 +53,15 @@ class Reporter:
         """Hand on one record."""
         self.on_step(
             ScanAlignRecord(
-                self.name, stage, step, num_steps, width * self.size, fit.misses, fit.gaps, stiffness, matched
+                hypothesis=self.name,
+                stage=stage,
+                step=step,
+                num_steps=num_steps,
+                width=width * self.size,
+                misses=fit.misses,
+                gaps=fit.gaps,
+                stiffness=stiffness,
+                matched=matched,
             )
         )
 
@@ -104,7 +112,7 @@ def pull_one_to_one(problem: ScanAlignProblem, transforms: Tensor, config: Assig
 def refine(
     problem: ScanAlignProblem,
     transforms: Tensor,
-    config: RefineConfig,
+    config: EMConfig,
     reporter: Reporter,
     first_sigma: float | None = None,
     steps: slice = slice(None),
@@ -116,7 +124,7 @@ def refine(
     Args:
         problem: the scans.
         transforms: (J, 4, 4) to start from.
-        config: see `RefineConfig`.
+        config: see `EMConfig`.
         reporter: takes a record of each step.
         first_sigma: instead of that of the configuration.
         steps: which of them to take.
@@ -142,17 +150,17 @@ def refine(
     return transforms
 
 
-def used_samples(problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: RefineConfig) -> OrientedSamples:
+def used_samples(problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: EMConfig) -> OrientedSamples:
     """Return as many moved samples as the sigma asks for."""
     return problem.moved(transforms, _num_used(sigma, config))
 
 
-def _num_used(sigma: float, config: RefineConfig) -> int:
+def _num_used(sigma: float, config: EMConfig) -> int:
     return max(round(config.density / sigma**2), config.least_samples)
 
 
 def soft_matches(
-    problem: ScanAlignProblem, moved: OrientedSamples, sigma: float, config: RefineConfig, share: float = 1.0
+    problem: ScanAlignProblem, moved: OrientedSamples, sigma: float, config: EMConfig, share: float = 1.0
 ) -> SoftMatches:
     """Return the matches of an E-step, a share of the way through, of moved samples."""
     first, last = config.feature_weight
@@ -176,7 +184,7 @@ def _along_surface(found: SoftMatches, slide: float, beside_edges: bool, follow:
 
 
 def _out_of_empty_space(
-    problem: ScanAlignProblem, moved: OrientedSamples, sigma: float, config: RefineConfig
+    problem: ScanAlignProblem, moved: OrientedSamples, sigma: float, config: EMConfig
 ) -> tuple[GraphMatches, ...]:
     """Return what takes samples back that are where the target's camera saw nothing, along the picture alone."""
     idle = config.beyond == 0 or sigma >= config.beyond_below
@@ -190,7 +198,7 @@ def _out_of_empty_space(
 
 
 def _as_expected(
-    problem: ScanAlignProblem, moved: OrientedSamples, found: SoftMatches, config: RefineConfig
+    problem: ScanAlignProblem, moved: OrientedSamples, found: SoftMatches, config: EMConfig
 ) -> tuple[GraphMatches, ...]:
     """Return what holds samples without a match near where they are expected."""
     if problem.expected is None or config.expected == 0:
@@ -202,7 +210,7 @@ def _as_expected(
     return (GraphMatches(slice(0, count), expected, weights),)
 
 
-def follow_regions(problem: ScanAlignProblem, transforms: Tensor, config: RefineConfig, choice: ChoiceConfig) -> Tensor:
+def follow_regions(problem: ScanAlignProblem, transforms: Tensor, config: EMConfig, choice: ChoiceConfig) -> Tensor:
     """Return how far samples (S,) had better follow wide regions than their own matches, from 0 to 1.
 
     Where a surface is unlike all around, it has folded anew, or matches are wrong: features tell nothing there.

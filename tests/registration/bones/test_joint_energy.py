@@ -1,13 +1,19 @@
-"""Moments of shared regions: against Monte Carlo and brute quadrature, and what motions of the grid do to them."""
+"""The joint energy and its moments: against Monte Carlo and brute quadrature, motions of grid and bones, gradients."""
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from torchreg.errors import InputError
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.rigid import se3_exp, transform_points
+from torchreg.registration.bones.grid_losses import JointEnergy
 from torchreg.registration.bones.joint_moments import joint_moments
 from torchreg.registration.bones.sparse_grid import SparseGrid
+
+
+def draw(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 def grid_and_weights(num_bones=4, resolution=6, seed=0, sparse=True):
@@ -19,6 +25,13 @@ def grid_and_weights(num_bones=4, resolution=6, seed=0, sparse=True):
         far = torch.cdist(grid.corner_points(), points[:num_bones])
         weights = weights * (far < far.amin(-1, keepdim=True) + 0.4)
     return grid, weights / weights.sum(-1, keepdim=True)
+
+
+def matrices(moments):
+    """The moments (P, 4, 4) of eq. 4 in homogeneous coordinates."""
+    column = torch.cat([moments.center, torch.ones(len(moments.center), 1).double()], dim=-1)
+    central = torch.nn.functional.pad(moments.spread, (0, 1, 0, 1))
+    return moments.mass[:, None, None] * (central + column.unsqueeze(-1) * column.unsqueeze(-2))
 
 
 def quadrature(grid, weights, i, j, order=6):
@@ -45,7 +58,7 @@ def test_moments_equal_quadrature():
     grid, weights = grid_and_weights(3, 3)
     moments = joint_moments(grid, weights)
     assert moments.pairs.tolist() == [[0, 1], [0, 2], [1, 2]]
-    for (i, j), matrix in zip(moments.pairs.tolist(), moments.matrix, strict=True):
+    for (i, j), matrix in zip(moments.pairs.tolist(), matrices(moments), strict=True):
         torch.testing.assert_close(matrix, quadrature(grid, weights, i, j), rtol=1e-10, atol=1e-14)
 
 
@@ -79,7 +92,7 @@ def test_only_pairs_that_meet_are_returned():
     alone[:, 0] = 1
     nothing = joint_moments(grid, alone)
     assert nothing.pairs.shape == (0, 2)
-    assert nothing.matrix.shape == (0, 4, 4)
+    assert nothing.spread.shape == (0, 3, 3)
 
 
 def test_tiny_pairs_are_skipped():
@@ -130,11 +143,89 @@ def test_gradients_in_the_weights():
     assert torch.autograd.gradcheck(values, (weights.clone().requires_grad_(),))
 
 
-def test_conversion_and_bad_input():
-    grid, weights = grid_and_weights()
-    moments = joint_moments(grid, weights).to(torch.float32)
-    assert moments.mass.dtype == moments.center.dtype == moments.spread.dtype == torch.float32
-    with pytest.raises(InputError, match="weights must have shape"):
-        joint_moments(grid, weights[1:])
-    with pytest.raises(InputError, match="min_mass must be positive"):
-        joint_moments(grid, weights, min_mass=0.0)
+def monte_carlo(grid, weights, transforms, count=300_000):
+    """Equation 4 by random points of the grid's volume, each pair once."""
+    generator = torch.Generator().manual_seed(5)
+    cell = torch.randint(grid.num_cells, (count,), generator=generator)
+    local = grid.cells[cell] + torch.rand(count, 3, generator=generator, dtype=torch.float64)
+    points = grid.origin + (grid.spacing * local) @ grid.axes.mT
+    shares = grid.interpolate(weights, points)
+    total = 0.0
+    for i in range(len(transforms)):
+        for j in range(i + 1, len(transforms)):
+            product = shares[:, i] * shares[:, j]
+            apart = transform_points(transforms[i], points) - transform_points(transforms[j], points)
+            total += float((product * apart.square().sum(-1)).sum() / product.sum())
+    return total
+
+
+def test_the_joint_energy_is_the_integral():
+    grid, weights = grid_and_weights(3, 4, sparse=False)
+    transforms = se3_exp(0.5 * draw(3, 6))
+    found = float(JointEnergy()(transforms, joint_moments(grid, weights)))
+    assert found == pytest.approx(monte_carlo(grid, weights, transforms), rel=0.01)
+
+
+def test_the_joint_energy_is_the_trace():
+    grid, weights = grid_and_weights(3, 4, sparse=False)
+    moments, transforms = joint_moments(grid, weights), se3_exp(draw(3, 6))
+    first, second = moments.pairs.unbind(-1)
+    difference = (transforms[first] - transforms[second])[:, :3]
+    expected = torch.einsum("pab,pbc,pac->p", difference, matrices(moments), difference) / moments.mass
+    torch.testing.assert_close(JointEnergy.per_pair(transforms, moments), expected)
+    counts = torch.tensor([0.0, 1.0, 2.0], dtype=torch.float64)
+    torch.testing.assert_close(JointEnergy()(transforms, moments, counts), (counts * expected).sum())
+
+
+def test_it_vanishes_when_all_bones_move_alike():
+    grid, weights = grid_and_weights(3, 4, sparse=False)
+    moments = joint_moments(grid, weights)
+    together = se3_exp(draw(1, 6)).expand(3, 4, 4)
+    assert float(JointEnergy()(together, moments)) == 0
+    hinge = torch.stack([together[0], together[0], se3_exp(draw(6, seed=7))])
+    assert float(JointEnergy()(hinge, moments)) > 0
+
+
+def test_it_ignores_what_moves_everything_and_scales_with_the_square():
+    grid, weights = grid_and_weights(3, 4, sparse=False)
+    moments, transforms = joint_moments(grid, weights), se3_exp(draw(3, 6))
+    expected = JointEnergy()(transforms, moments)
+    after = se3_exp(draw(6, seed=3)) @ transforms
+    torch.testing.assert_close(JointEnergy()(after, moments), expected)
+    wide = SparseGrid(grid.cells, grid.shape, 10 * grid.origin, grid.axes, 10 * grid.spacing)
+    scaled = transforms.clone()
+    scaled[:, :3, 3] *= 10
+    torch.testing.assert_close(JointEnergy()(scaled, joint_moments(wide, weights)), 100 * expected)
+    order = torch.tensor([2, 0, 1])
+    torch.testing.assert_close(JointEnergy()(transforms[order], joint_moments(grid, weights[:, order])), expected)
+
+
+def test_joint_batches_equal_loops():
+    grid, weights = grid_and_weights(3, 4, sparse=False)
+    moments, transforms = joint_moments(grid, weights), se3_exp(draw(2, 4, 3, 6))
+    found = JointEnergy()(transforms, moments)
+    assert found.shape == (2, 4)
+    torch.testing.assert_close(found[1, 2], JointEnergy()(transforms[1, 2], moments))
+
+
+def test_joint_gradients_in_motions_and_weights():
+    grid, weights = grid_and_weights(3, 2, sparse=False)
+    pairs = joint_moments(grid, weights).pairs
+
+    def energy(transforms, weights):
+        return JointEnergy()(transforms, joint_moments(grid, weights, pairs=pairs))
+
+    alike = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    for transforms in (se3_exp(draw(3, 6)), alike):
+        assert torch.autograd.gradcheck(energy, (transforms.clone().requires_grad_(), weights.clone().requires_grad_()))
+
+
+def test_bad_input_is_named():
+    grid, weights = grid_and_weights(3, 4, sparse=False)
+    moments, transforms = joint_moments(grid, weights), se3_exp(draw(3, 6))
+    with pytest.raises(InputError, match="transforms must have shape"):
+        JointEnergy()(transforms[:, :3], moments)
+    with pytest.raises(InputTypeError, match="moments is"):
+        JointEnergy()(transforms.float(), moments)
+    with pytest.raises(InputError, match="pair_weights must have shape"):
+        JointEnergy()(transforms, moments, torch.ones(2))

@@ -10,7 +10,7 @@ from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.rigid import rigid_matrix, se3_exp, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.registration.blend import turn_about
-from torchreg.registration.bones.grid_lbs import GridLBS, check_rigid
+from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.bones.sparse_grid import SparseGrid
 
 # torch builds its forward-mode rules with torch.jit.script, and warns about it.
@@ -277,11 +277,17 @@ def test_bad_input_is_named(change, message):
         GridLBS(grid, weights, **change)
 
 
-def test_rigidity_is_checked_to_single_precision():
-    check_rigid(se3_exp(torch.randn(5, 6)), "motions")
-    check_rigid(torch.zeros(0, 4, 4), "motions")
-    with pytest.raises(InputError, match="motions must hold rigid motions"):
-        check_rigid(torch.ones(4, 4)[None], "motions")
+def test_poses_and_settings_of_joints_are_checked():
+    model, _ = elbow()
+    for method in (model.joints, model.skeleton):
+        with pytest.raises(InputError, match="transforms must have shape"):
+            method(torch.eye(4).double())
+        with pytest.raises(InputError, match="min_mass must be positive"):
+            method(min_mass=0.0)
+    with pytest.raises(InputError, match="regularization must be positive"):
+        model.joints(regularization=-math.pi)
+    with pytest.raises(InputError, match="transforms must hold rigid motions"):
+        model.set_transforms_(torch.ones(2, 4, 4))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

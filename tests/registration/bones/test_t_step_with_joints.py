@@ -1,22 +1,20 @@
-"""The T-step with free joints: what it finds, that nothing is lower, invariances and guards."""
+"""The T-step with free joints: what it finds, that nothing is lower, invariances."""
 
 from dataclasses import replace
 
-import pytest
 import torch
 
-from torchreg.errors import InputError
 from torchreg.geometry.rigid import rigid_matrix, se3_exp, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.registration.blend import turn_about
-from torchreg.registration.bones.distance_loss import ScanDistance
+from torchreg.registration.bones.correspondences import ScanDistance
 from torchreg.registration.bones.joint_moments import JointMoments
 from torchreg.registration.bones.joints import find_joints
-from torchreg.registration.bones.motion_problem import BoneProblem, bind
 from torchreg.registration.bones.motions import fit_bones
 from torchreg.registration.bones.motions_and_joints import fit_bones_and_joints
 
 PIVOTS = torch.tensor([[1.0, 0.05, 0.0], [2.0, 0.1, 0.0]], dtype=torch.float64)
+SURFACE = PIVOTS + torch.tensor([0.05, 0.1, 0.1], dtype=torch.float64)
 FRAMES = 4
 
 
@@ -39,21 +37,21 @@ def problem_of(bones, noise=0.0, share=1.0, joint_weight=1.0):
     targets = targets + noise * bones.draw(*targets.shape, seed=9)
     turned = torch.einsum("nb,fbij,nj->fni", weights, truth[..., :3, :3], normals)
     pairs = torch.tensor([[0, 1], [1, 2]])
-    centers = PIVOTS + torch.tensor([0.05, 0.1, 0.1], dtype=torch.float64)
-    moments = JointMoments(pairs, torch.ones(2).double(), centers, torch.zeros(2, 3, 3).double())
-    return BoneProblem(
-        points, bind(weights), targets, torch.nn.functional.normalize(turned, dim=-1), point_to_point=share,
+    moments = JointMoments(pairs, torch.ones(2).double(), SURFACE, torch.zeros(2, 3, 3).double())
+    return bones.problem_of(
+        points, weights, targets, torch.nn.functional.normalize(turned, dim=-1), point_to_point=share,
         moments=moments, joint_weight=joint_weight,
     )  # fmt: skip
 
 
 def start(bones):
-    return torch.eye(4, dtype=torch.float64).repeat(FRAMES, bones.COUNT, 1, 1)
+    """Motions (F, 3, 4, 4) of the limb at rest, and its joints at the surface."""
+    return torch.eye(4, dtype=torch.float64).repeat(FRAMES, bones.COUNT, 1, 1), SURFACE
 
 
 def test_joints_behind_motions_are_found(bones):
     problem = problem_of(bones)
-    fit = fit_bones_and_joints(problem, start(bones), regularization=1e-9, max_steps=40, rtol=1e-9)
+    fit = fit_bones_and_joints(problem, *start(bones), regularization=1e-9, max_steps=40, rtol=1e-9)
     torch.testing.assert_close(fit.centers, PIVOTS, atol=1e-3, rtol=0)
     torch.testing.assert_close(fit.transforms, poses(bones), atol=1e-3, rtol=0)
     assert bool((fit.energy < 1e-6).all())
@@ -61,13 +59,14 @@ def test_joints_behind_motions_are_found(bones):
 
 def test_nothing_near_has_less_energy(bones):
     problem = replace(problem_of(bones, 0.02, 0.3), pair_weights=torch.tensor([0.5, 2.0]).double(), joint_weight=0.1)
-    fit = fit_bones_and_joints(problem, start(bones), regularization=0.05, max_steps=60, rtol=0.0)
+    fit = fit_bones_and_joints(problem, *start(bones), regularization=0.05, max_steps=60, rtol=0.0)
     middles = problem.centers(fit.transforms)
 
     def energy(twists, centers):
         motions = turn_about(fit.transforms, twists, middles)
         moved = torch.einsum("nb,fnbi->fni", problem.binding.weights, images(motions, problem.points))
-        total = ScanDistance(problem.point_to_point)(moved, problem.targets, problem.normals, None).sum()
+        pairs = problem.correspondences
+        total = ScanDistance(pairs.point_to_point)(moved, pairs.targets, pairs.normals).sum()
         gaps = [transform_points(motions[:, bones], centers.unsqueeze(-2)) for bones in problem.moments.pairs.mT]
         total = (
             total
@@ -91,26 +90,24 @@ def images(motions, points):
 
 
 def test_taking_turns_is_slower_where_joints_are_stiff(bones):
-    problem, first = problem_of(bones, noise=0.01, joint_weight=1.0), start(bones)
-    best = fit_bones_and_joints(problem, first, max_steps=60, rtol=0.0)
-    together = fit_bones_and_joints(problem, first, max_steps=8, rtol=0.0)
+    problem, (first, centers) = problem_of(bones, noise=0.01, joint_weight=1.0), start(bones)
+    best = fit_bones_and_joints(problem, first, centers, max_steps=60, rtol=0.0)
+    together = fit_bones_and_joints(problem, first, centers, max_steps=8, rtol=0.0)
     transforms, moments = first, problem.moments
     for _ in range(8):
         transforms = fit_bones(replace(problem, moments=moments), transforms, max_steps=1).transforms
         moments = replace(moments, center=find_joints(problem.moments, transforms, regularization=1e-3).centers)
-    misses = [(centers - best.centers).norm(dim=-1).max() for centers in (together.centers, moments.center)]
-    assert misses[0] < 1e-3 * misses[1]
+    errors = [(found - best.centers).norm(dim=-1).max() for found in (together.centers, moments.center)]
+    assert errors[0] < 1e-3 * errors[1]
 
 
 def test_a_motion_of_everything_changes_nothing(bones):
     problem, motion = problem_of(bones, 0.02, 0.2), se3_exp(bones.draw(6, seed=10))
-    alone = fit_bones_and_joints(problem, start(bones))
-    turned = replace(
-        problem,
-        targets=transform_points(motion, problem.targets),
-        normals=problem.normals @ motion[:3, :3].mT,
-    )
-    moved = fit_bones_and_joints(turned, motion @ start(bones))
+    (rest, centers), pairs = start(bones), problem.correspondences
+    alone = fit_bones_and_joints(problem, rest, centers)
+    targets, normals = transform_points(motion, pairs.targets), pairs.normals @ motion[:3, :3].mT
+    turned = replace(problem, correspondences=replace(pairs, targets=targets, normals=normals))
+    moved = fit_bones_and_joints(turned, motion @ rest, centers)
     torch.testing.assert_close(moved.centers, alone.centers)
     torch.testing.assert_close(moved.transforms, motion @ alone.transforms)
 
@@ -121,32 +118,13 @@ def test_energy_falls_from_any_start_and_few_steps_are_enough(bones):
     energies = [fit_bones_and_joints(problem, first, PIVOTS, max_steps=steps, rtol=0.0).energy for steps in (1, 3, 9)]
     assert energies[0].sum() > energies[1].sum() > energies[2].sum()
     done = fit_bones_and_joints(problem, first, PIVOTS, max_steps=100)
-    assert done.converged
-    assert done.num_steps < 100
+    torch.testing.assert_close(done.energy.sum(), energies[2].sum(), rtol=0.01, atol=0)
 
 
 def test_bones_without_matches_follow_their_joints(bones):
     problem = problem_of(bones)
     seen = (problem.points[:, 0] < 1.8).double().expand(FRAMES, -1)
-    fit = fit_bones_and_joints(replace(problem, match_weights=seen), start(bones), PIVOTS, max_steps=40, rtol=1e-9)
+    seen = replace(problem, correspondences=replace(problem.correspondences, weights=seen))
+    fit = fit_bones_and_joints(seen, start(bones)[0], PIVOTS, max_steps=40, rtol=1e-9)
     ends = [transform_points(fit.transforms[:, bone], fit.centers[1:]) for bone in (1, 2)]
     torch.testing.assert_close(*ends, atol=1e-3, rtol=0)
-
-
-def test_bad_input_is_named(bones):
-    problem = problem_of(bones)
-    for without in ({"moments": None}, {"joint_weight": 0.0}):
-        with pytest.raises(InputError, match="must have joints that count"):
-            fit_bones_and_joints(replace(problem, **without), start(bones))
-    with pytest.raises(InputError, match="centers must have shape"):
-        fit_bones_and_joints(problem, start(bones), PIVOTS[:1])
-    with pytest.raises(InputError, match="transforms must have shape"):
-        fit_bones_and_joints(problem, start(bones)[0])
-    with pytest.raises(InputError, match="targets must have shape"):
-        fit_bones_and_joints(bones.noisy_problem(batch=(2, 3))[0], start(bones))
-    with pytest.raises(InputError, match="regularization must be positive"):
-        fit_bones_and_joints(problem, start(bones), regularization=0.0)
-    with pytest.raises(InputError, match="max_steps must be at least 1"):
-        fit_bones_and_joints(problem, start(bones), max_steps=0)
-    with pytest.raises(InputError, match="rtol must"):
-        fit_bones_and_joints(problem, start(bones), rtol=-1.0)

@@ -1,0 +1,73 @@
+"""Robust weights of the joints of a registration, and their stiffness against turns that scans do not show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchreg.registration.bones.config import BoneConfig
+from torchreg.registration.bones.joint_moments import JointMoments
+from torchreg.solvers.robust import cauchy_weight, geman_mcclure_weight
+
+
+@dataclass(frozen=True)
+class _Hinges:
+    """Evidence that the axis of a hinge needs.
+
+    Args:
+        least_frames: between two frames every motion turns about one axis.
+        clear_turn: angle between bones, radians, at which an axis counts half.
+    """
+
+    least_frames: int = 3
+    clear_turn: float = 0.03
+
+
+_HINGES = _Hinges()
+
+
+def joint_weights(gaps: Tensor, scale: float) -> Tensor:
+    """Return weights (P,) of joints with gaps (..., P): less, the farther apart motions take their bones.
+
+    References: Geman and McClure 1987.
+    """
+    square = gaps.square().reshape(-1, gaps.shape[-1]).mean(0)
+    return geman_mcclure_weight(square / scale**2)
+
+
+def with_stiffness(moments: JointMoments, rotations: Tensor, config: BoneConfig, joint_weight: float) -> JointMoments:
+    """Return joints as points, with a spread by which the joint energy penalizes turns of bones against each other.
+
+    ``|R_i - R_j|^2`` is about twice the squared angle between two bones, and a spread ``s I`` costs s times as much.
+    Robust weights: the wider bones turn against each other, the less they resist.
+
+    Args:
+        moments: of P pairs of bones.
+        rotations: (F, B, 3, 3) of the bones in all frames.
+        config: see `BoneConfig`.
+        joint_weight: beta, by which the energy multiplies the spread.
+    """
+    first, second = rotations[..., moments.pairs.mT, :, :].unbind(-4)
+    differences = first - second
+    squares = (differences.mT @ differences).mean(0)
+    angles = 0.5 * squares.diagonal(dim1=-2, dim2=-1).sum(-1)
+    weight = 0.5 * config.turn_weight * cauchy_weight(angles / config.turn_scale**2)
+    spread = weight[:, None, None] * torch.eye(3, dtype=weight.dtype, device=weight.device)
+    if len(rotations) >= _HINGES.least_frames:
+        spread = spread + _hinge_spread(squares, config)
+    return replace(moments, spread=spread / joint_weight)
+
+
+def _hinge_spread(squares: Tensor, config: BoneConfig) -> Tensor:
+    """Return spreads (P, 3, 3) along hinge axes, of means (P, 3, 3) of ``(R_i - R_j)^T (R_i - R_j)``.
+
+    A hinge is a pin along its axis, which both bones must keep to. It holds less, the more the bones turn about other
+    axes, and the less their motions tell the axis.
+    """
+    chords, axes = torch.linalg.eigh(squares)
+    axis, (least, second, _) = axes[..., 0], chords.clamp(min=0).unbind(-1)
+    clarity = (second - least) / (second + _HINGES.clear_turn**2)
+    weight = config.hinge_weight * (clarity * geman_mcclure_weight(least / config.hinge_scale**2))
+    return weight[:, None, None] * axis.unsqueeze(-1) * axis.unsqueeze(-2)
