@@ -1,4 +1,4 @@
-"""COLMAP's text models: cameras.txt with the lenses and images.txt with the places."""
+"""COLMAP's text models: cameras.txt with the lenses and images.txt with the poses."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchreg.geometry.rigid import rigid_matrix
 from torchreg.io.atomic import write_atomic
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 
-# Per model which of its parameters are fx, fy, cx, cy, and then k1, k2, p1, p2, k3, k4, k5, k6; None is zero.
+# Per model the indices of fx, fy, cx, cy, and then k1, k2, p1, p2, k3, k4, k5, k6 among its parameters; None is zero.
 _MODELS: dict[str, tuple[int | None, ...]] = {
     "SIMPLE_PINHOLE": (0, 0, 1, 2),
     "PINHOLE": (0, 1, 2, 3),
@@ -25,7 +25,7 @@ _MODELS: dict[str, tuple[int | None, ...]] = {
     "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
     "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
 }
-# COLMAP counts pixels from the corner of the picture, we from the middle of the first.
+# COLMAP's pixel coordinates start at the corner of the picture, ours at the middle of the first pixel.
 _CORNER = 0.5
 
 
@@ -39,7 +39,7 @@ def load_colmap(folder: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_
         limits: ``max_bytes`` applies to each.
 
     Returns:
-        float64 cameras.
+        The cameras, float64.
 
     Raises:
         FormatError: if a line is cut off or not understood, a lens is of another kind, or an image names no camera.
@@ -48,7 +48,7 @@ def load_colmap(folder: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_
     place = local_path(folder)
     lenses = _lenses(place / "cameras.txt", limits)
     path = place / "images.txt"
-    # Every image has a second line, of its points; it is empty where there are none.
+    # Every image has a second line, of its points; it may be empty.
     lines = [(number, line) for number, line in _lines(path, limits) if not line.startswith("#")]
     while lines and not lines[0][1]:
         lines.pop(0)
@@ -114,11 +114,11 @@ def _lenses(path: Path, limits: FileLimits) -> dict[str, tuple[int, int, list[fl
         if model not in _MODELS:
             raise FormatError(f"{where}: lenses must be one of {', '.join(_MODELS)}; got {model}")
         which = _MODELS[model]
-        needed = 1 + max(place for place in which if place is not None)
+        needed = 1 + max(number for number in which if number is not None)
         if len(values) != needed:
             raise FormatError(f"{where}: {model} has {needed} parameters, got {len(values)}: it is cut off or damaged")
         if words[0] in found:
-            raise FormatError(f"{where}: camera {words[0]} is there twice")
+            raise FormatError(f"{where}: camera {words[0]} is listed twice")
         found[words[0]] = int(words[2]), int(words[3]), [0.0 if k is None else values[k] for k in which]
     return found
 
@@ -164,14 +164,14 @@ def _rotation(quaternion: list[float]) -> Tensor:
 
 
 def _quaternion(rotation: Tensor) -> list[float]:
-    """Return the unit quaternion w, x, y, z with w >= 0, by that of four ways which divides by most."""
+    """Return the unit quaternion w, x, y, z with w >= 0, by the best conditioned of four formulas."""
     (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    ways = [
+    rows = [
         [1 + a + e + i, h - f, c - g, d - b],
         [h - f, 1 + a - e - i, b + d, c + g],
         [c - g, b + d, 1 - a + e - i, f + h],
         [d - b, c + g, f + h, 1 - a - e + i],
     ]
-    best = max(range(4), key=lambda k: ways[k][k])
-    length = math.copysign(math.hypot(*ways[best]), ways[best][0])
-    return [value / length for value in ways[best]]
+    best = max(range(4), key=lambda k: rows[k][k])
+    length = math.copysign(math.hypot(*rows[best]), rows[best][0])
+    return [value / length for value in rows[best]]

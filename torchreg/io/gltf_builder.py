@@ -24,7 +24,7 @@ _COMPONENTS = {
     np.dtype(np.uint32): pygltflib.UNSIGNED_INT,
     np.dtype(np.float32): pygltflib.FLOAT,
 }
-_LARGEST_UINT16 = 65535
+# Matte skin: red, green, blue, opacity.
 DEFAULT_COLOR = (0.8, 0.62, 0.52, 1.0)
 
 Array = NDArray[Any]
@@ -74,9 +74,9 @@ class GltfBuilder:
     def add_mesh(
         self, name: str, attributes: pygltflib.Attributes, triangles: Array, color: Sequence[float] | None
     ) -> int:
-        """Return the index of a new mesh with a matte material of its own."""
+        """Return the index of a new mesh with a new matte material."""
         # The largest index of each type means "restart" in glTF and must not occur.
-        small = int(triangles.max()) < _LARGEST_UINT16
+        small = int(triangles.max()) < np.iinfo(np.uint16).max
         indices = self.add(
             triangles.reshape(-1).astype(np.uint16 if small else np.uint32), target=pygltflib.ELEMENT_ARRAY_BUFFER
         )
@@ -201,7 +201,7 @@ def unit_rows(vectors: Array) -> Array:
 
 
 def _quaternions(rotations: Array) -> Array:
-    """Return (T, 4) unit quaternions (x, y, z, w) of (T, 3, 3) rotations.
+    """Return unit quaternions (T, 4) as (x, y, z, w) of rotations (T, 3, 3).
 
     The symmetric matrix K = 4 q q^T of each rotation is filled in and its row with the largest diagonal normalized, so
     that no angle loses digits.
@@ -221,7 +221,7 @@ def _quaternions(rotations: Array) -> Array:
 
 
 def _continuous(quaternions: Array) -> Array:
-    """Return the same rotations with neighbors in time on the same side, so that viewers turn the short way."""
+    """Return the same rotations with neighbors in time on the same side, so that viewers take the shorter arc."""
     dots = np.einsum("ti,ti->t", quaternions[1:], quaternions[:-1])
     signs = np.concatenate([[1.0], np.cumprod(np.where(dots < 0, -1.0, 1.0))])
     return quaternions * signs[:, None]

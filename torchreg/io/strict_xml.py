@@ -6,11 +6,12 @@ import xml.etree.ElementTree as ET
 
 from torchreg.errors import FormatError
 
+# Elements within each other in any honest robot description are far fewer.
 _MAX_DEPTH = 64
 
 
 class _StrictBuilder(ET.TreeBuilder):
-    """Builds the element tree, but refuses document types (which bring entities) and absurd nesting."""
+    """A builder of the element tree that refuses document types (which bring entities) and absurd nesting."""
 
     depth = 0
 
