@@ -143,7 +143,8 @@ def _artifacts(sequence: Sequence, spine: tr.SpineSequence, bench: Bench) -> dic
     frame = spine.reference
     view = spine_view([sequence.meshes[frame]], size=PICTURE_PIXELS)
     figure, (ax,) = new_figure(*PICTURE_PIXELS)
-    draw_spine_frame(ax, sequence.meshes[frame], spine.curves[frame], spine.num_tips, view=view, own=spine.own[frame])
+    curves, transferred = spine.curves[frame], ~spine.own[frame]
+    draw_spine_frame(ax, sequence.meshes[frame], curves, spine.num_tips, view=view, transferred=transferred)
     save_picture(figure, bench.file("spine.png"))
     save_spine_animation(bench.file("spine.glb"), spine.model)
     return {"spine": "spine.png", "spine, moving": "spine.glb"}
