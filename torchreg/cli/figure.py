@@ -1,4 +1,4 @@
-"""``torchreg figure``: the pictures of the paper and of the README."""
+"""``torchreg figure``: pictures of the paper and of the README."""
 
 from __future__ import annotations
 
