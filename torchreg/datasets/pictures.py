@@ -9,14 +9,11 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_count, check_positive, check_shape
-from torchreg.datasets.hand import faces_of, surface_skin
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.camera_rig import CameraRig, StereoPair
 from torchreg.geometry.mesh import TriangleMesh, interpolate
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.visibility import rasterize
-from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.skin import LinearBlendSkin
 
 # Smooth noise of several scales: pairs of a wavelength, metres, and its share of the brightness.
 _Waves = tuple[tuple[float, float], ...]
@@ -293,34 +290,3 @@ def camera_ring(
 def cameras_of(cameras: CameraRig | StereoPair) -> tuple[Camera, ...]:
     """Return the cameras of a rig, or the left and the right one of a pair."""
     return (cameras.left, cameras.right) if isinstance(cameras, StereoPair) else tuple(cameras)
-
-
-def hand_pictures(
-    shape: ArticulatedShape,
-    pose: Tensor,
-    cameras: CameraRig | StereoPair,
-    *,
-    skin: LinearBlendSkin | None = None,
-    style: PictureStyle | None = None,
-    seed: int = 0,
-) -> list[Picture]:
-    """Return the pictures of a textured shape in one pose, one per camera, with the exact truth.
-
-    Args:
-        shape: such as a hand.
-        pose: (num_dofs,) in the world of the cameras, see `placed`.
-        cameras: a pair or a rig.
-        skin: of the surface, with faces; by default `surface_skin`.
-        style: light, background and noise; for stereo set its wall behind the shape.
-        seed: of texture and noise.
-
-    Raises:
-        InputError: if the skin has no faces, and as `render`.
-    """
-    pose = shape.check_pose(pose, "pose").detach()
-    check_shape(pose, "pose", (shape.num_dofs,))
-    skin = surface_skin(shape) if skin is None else skin
-    faces, generator = faces_of(skin), torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        mesh, rest = TriangleMesh(skin(pose), faces), skin(shape.rest_pose())
-    return [render(mesh, camera, rest, style=style, seed=seed, generator=generator) for camera in cameras_of(cameras)]

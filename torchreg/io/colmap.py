@@ -7,12 +7,12 @@ import os
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from torchreg.errors import FormatError, InputError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.rigid import rigid_matrix
+from torchreg.geometry.rotation_representations import quaternion_from_rotation, rotation_from_quaternion
 from torchreg.io.atomic import write_atomic
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 
@@ -81,7 +81,7 @@ def save_colmap(folder: str | os.PathLike[str], cameras: CameraRig) -> None:
         model = "FULL_OPENCV" if any(lens[4:]) else "OPENCV" if any(lens) else "PINHOLE"
         values = [fx, fy, cx + _CORNER, cy + _CORNER, *lens][: {"PINHOLE": 4, "OPENCV": 8}.get(model, 12)]
         motion = camera.world_to_camera.detach().double().cpu()
-        pose = [*_quaternion(motion[:3, :3]), *motion[:3, 3].tolist()]
+        pose = torch.cat((quaternion_from_rotation(motion[:3, :3]), motion[:3, 3])).tolist()
         lenses.append(f"{number} {model} {camera.width} {camera.height} {_joined(values)}")
         images += [f"{number} {_joined(pose)} {number} {camera.name}", ""]
     write_atomic(place / "cameras.txt", ("\n".join(lenses) + "\n").encode())
@@ -133,7 +133,8 @@ def _placed(line: str, lenses: dict[str, tuple[int, int, list[float]]], where: s
     width, height, values = lenses[words[8]]
     if not abs(math.hypot(*pose[:4]) - 1) < 1e-2:
         raise FormatError(f"{where}: QW QX QY QZ must be a unit quaternion, got length {math.hypot(*pose[:4]):.3g}")
-    motion = rigid_matrix(_rotation(pose[:4]), torch.tensor(pose[4:], dtype=torch.float64))
+    quaternion, position = torch.tensor(pose, dtype=torch.float64).split((4, 3))
+    motion = rigid_matrix(rotation_from_quaternion(quaternion), position)
     numbers = torch.tensor(values, dtype=torch.float64)
     numbers[2:4] -= _CORNER
     try:
@@ -150,28 +151,3 @@ def _values(words: list[str], where: str) -> list[float]:
     if not all(math.isfinite(value) for value in values):
         raise FormatError(f"{where}: numbers must be finite, got {' '.join(words)[:80]}")
     return values
-
-
-def _rotation(quaternion: list[float]) -> Tensor:
-    """Return the rotation (3, 3) of a quaternion w, x, y, z of any length."""
-    w, x, y, z = (torch.tensor(quaternion, dtype=torch.float64) / math.hypot(*quaternion)).tolist()
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.tensor(rows, dtype=torch.float64)
-
-
-def _quaternion(rotation: Tensor) -> list[float]:
-    """Return the unit quaternion w, x, y, z with w >= 0, by the best conditioned of four formulas."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    rows = [
-        [1 + a + e + i, h - f, c - g, d - b],
-        [h - f, 1 + a - e - i, b + d, c + g],
-        [c - g, b + d, 1 - a + e - i, f + h],
-        [d - b, c + g, f + h, 1 - a - e + i],
-    ]
-    best = max(range(4), key=lambda k: rows[k][k])
-    length = math.copysign(math.hypot(*rows[best]), rows[best][0])
-    return [value / length for value in rows[best]]

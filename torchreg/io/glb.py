@@ -18,9 +18,6 @@ def read_gltf(content: bytes, path: Path, limits: FileLimits) -> RawCloud:
 
     Meshes appear in the order of the node tree, vertices in the order of the file. Skinned meshes come in their bind
     pose, without their node's transform, as the standard says. Lines, morph targets and materials are ignored.
-
-    Raises:
-        FormatError: if the file is damaged, cyclic, too large, compressed or refers to remote data.
     """
     document = GltfDocument(content, path, limits)
     if not str(document.entry(document.json, "asset", dict).get("version")).startswith("2"):

@@ -43,9 +43,6 @@ class GltfDocument:
         content: bytes of the .glb or .gltf file.
         path: where they came from; buffers in files of their own must lie in its folder or below.
         limits: ``max_bytes`` applies to each buffer and each accessor.
-
-    Raises:
-        FormatError: if the container or its JSON is damaged, or the geometry is compressed.
     """
 
     def __init__(self, content: bytes, path: Path, limits: FileLimits) -> None:
@@ -66,11 +63,7 @@ class GltfDocument:
 
     @staticmethod
     def entry(owner: dict[str, Any], key: str, kind: type, default: Any = None) -> Any:
-        """Return ``owner[key]``, an instance of ``kind``; ``default`` (or an empty ``kind``) if it is missing or null.
-
-        Raises:
-            FormatError: if it is of another type.
-        """
+        """Return ``owner[key]`` of type ``kind``; ``default`` (or an empty ``kind``) if it is missing or null."""
         value = owner.get(key)
         if value is None:
             return kind() if default is None else default
@@ -121,9 +114,6 @@ class GltfDocument:
             index: of the accessor.
             what: the accessor holds, for messages.
             types: names such as "VEC3", of which its type must be one.
-
-        Raises:
-            FormatError: if its type is another or unknown, or its data are missing, beyond its buffer or too large.
         """
         count = self.accessor_count(index, what)
         item = self.item("accessors", index)
@@ -235,12 +225,7 @@ class GltfDocument:
         return repr(name) if name else str(index)
 
     def node_parents(self) -> list[int]:
-        """Return the parent of each node, -1 for roots.
-
-        Raises:
-            FormatError: if a child is no node.
-            ModelError: if a node has two parents.
-        """
+        """Return the parent of each node, -1 for roots."""
         nodes = self.items("nodes")
         parents = [-1] * len(nodes)
         for number, node in enumerate(nodes):
@@ -252,12 +237,7 @@ class GltfDocument:
         return parents
 
     def node_transform(self, index: int) -> Array:
-        """Return the (4, 4) transform of a node in its parent.
-
-        Raises:
-            FormatError: if it is not made of numbers, as many as needed.
-            ModelError: if they are not finite, or a rotation is zero.
-        """
+        """Return the (4, 4) transform of a node in its parent."""
         node, what = self.item("nodes", index), f"of node {self.node_label(index)}"
         if node.get("matrix") is not None:
             return self._numbers(node, "matrix", [0.0] * 16, what).reshape(4, 4).T
@@ -274,12 +254,7 @@ class GltfDocument:
         return transform
 
     def node_globals(self, parents: Sequence[int]) -> Array:
-        """Return the (nodes, 4, 4) transforms of all nodes in the scene, infinite where they overflow.
-
-        Raises:
-            FormatError: as `node_transform`.
-            ModelError: as `node_transform`, and if ``parents`` are cyclic.
-        """
+        """Return the (nodes, 4, 4) transforms of all nodes in the scene, infinite where they overflow."""
         order = parents_first(parents)
         if len(order) < len(parents):
             stuck = sorted(set(range(len(parents))) - set(order))
@@ -342,9 +317,6 @@ def triangles(mode: int, corners: Array, what: str) -> Array:
         mode: a `Mode` or another number of glTF.
         corners: (C,) int64 vertices in the order of the file.
         what: they are of, for messages.
-
-    Raises:
-        FormatError: if the corners of separate triangles are not a multiple of three.
     """
     if mode == Mode.TRIANGLES:
         if len(corners) % 3:

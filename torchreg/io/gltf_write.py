@@ -22,6 +22,7 @@ from torchreg.io.gltf_builder import (
     checked_times,
     checked_triangles,
 )
+from torchreg.io.gltf_document import parents_first
 
 
 @dataclass(frozen=True)
@@ -181,14 +182,10 @@ def _checked_parents(parents: Sequence[int], count: int, names: Sequence[str]) -
     """Return the joint indices with every parent before its children."""
     if len(parents) != count:
         raise InputError(f"parents must hold one index per joint ({count}), got {len(parents)}")
-    children: dict[int, list[int]] = {}
     for index, parent in enumerate(parents):
         if not -1 <= parent < count:
             raise InputError(f"parents of joint {names[index]!r} must be -1 to {count - 1}, got {parent}")
-        children.setdefault(int(parent), []).append(index)
-    order = list(children.get(-1, []))
-    for index in order:
-        order.extend(children.get(index, []))
+    order = parents_first(parents)
     if len(order) < count:
         stuck = [names[index] for index in range(count) if index not in set(order)]
         raise InputError(f"parents must form trees, but these joints hang in a cycle: {', '.join(stuck[:5])}")

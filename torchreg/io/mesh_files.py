@@ -64,10 +64,6 @@ class MeshFiles:
         Args:
             filename: relative to the folder of the description, or ``file://``, ``package://``, ``model://``.
             what: the name of the mesh in messages.
-
-        Raises:
-            FormatError: if the file is required and missing, or damaged, oversized, remote or of unknown kind.
-            MissingExtraError: if a COLLADA (.dae) mesh is required and pycollada is not installed.
         """
         tried = self._candidates(filename, what)
         found = next((path for path in tried if _is_file(path)), None)

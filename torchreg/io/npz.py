@@ -23,9 +23,6 @@ def read_npz(content: bytes, limits: FileLimits) -> RawCloud:
 
     ``normals``, ``colors`` and ``faces`` are read where present. Shapes are compared with the sizes of the members
     before memory is allocated; arrays of Python objects are refused.
-
-    Raises:
-        FormatError: if it is not clear which array holds the points, or one is damaged.
     """
     with open_zip(content, limits) as archive:
         names = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
@@ -58,11 +55,7 @@ def _only_points(archive: zipfile.ZipFile, names: dict[str, str]) -> str:
 
 
 def read_npy_header(stream: IO[bytes], what: str) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Return the shape of an array, whether it is in Fortran's order, and its dtype; the stream is then at its numbers.
-
-    Raises:
-        FormatError: if the header is damaged or of an unknown version; names ``what`` holds the array.
-    """
+    """Return shape, Fortran order and dtype of an array, and leave the stream at its numbers."""
     try:
         version = np.lib.format.read_magic(stream)
         if version == (1, 0):

@@ -27,11 +27,7 @@ class _Field:
 
 
 def read_pcd(content: bytes, limits: FileLimits) -> RawCloud:
-    """Return the points of a PCD file, in the order of the file (organized clouds row by row).
-
-    Raises:
-        FormatError: if the header is damaged, or the body holds less or more than the header says.
-    """
+    """Return the points of a PCD file, in the order of the file (organized clouds row by row)."""
     match = _DATA_LINE.search(content[: 1 << 16])  # headers are shorter
     if match is None:
         raise FormatError("must have a header closed by a line 'DATA ascii', 'DATA binary' or 'DATA binary_compressed'")
@@ -146,9 +142,6 @@ def decompress_lzf(packed: bytes, size: int) -> bytes:
 
     A control byte below 32 announces that many plus one literal bytes; any other is a copy: 3 bits of length (7: one
     more byte to add) and 13 bits of distance back into the bytes expanded so far.
-
-    Raises:
-        FormatError: if the block is damaged or expands to another number of bytes.
     """
     expanded, position, end = bytearray(), 0, len(packed)
     while position < end and len(expanded) <= size:

@@ -52,11 +52,7 @@ _Columns = dict[str, "Array | _Ragged"]
 
 
 def read_ply(content: bytes, limits: FileLimits) -> RawCloud:
-    """Return the vertices (and faces) of a PLY file.
-
-    Raises:
-        FormatError: if the header is damaged, or the body holds less or more than the header says.
-    """
+    """Return the vertices (and faces) of a PLY file."""
     end = _HEADER_END.search(content[: 1 << 20])  # headers are shorter
     if not content.startswith(b"ply") or end is None:
         raise FormatError("must start with 'ply' and a header closed by 'end_header'")

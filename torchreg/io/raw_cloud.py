@@ -1,4 +1,7 @@
-"""The result of the readers of single formats: numpy arrays as in the file, not yet checked."""
+"""Unchecked numpy arrays of a file: the result of the readers of single formats.
+
+Readers raise FormatError without the name of the file, which their callers add.
+"""
 
 from __future__ import annotations
 
@@ -38,9 +41,6 @@ def parse_table(lines: Sequence[bytes], columns: int | None, what: str) -> Array
         lines: non-blank lines.
         columns: numbers per line; None takes the number of the first line.
         what: name of a row, for messages.
-
-    Raises:
-        FormatError: if a line holds another count of numbers, or a word that is no number.
     """
     if not lines:
         return np.zeros((0, columns or 0))
@@ -89,9 +89,6 @@ def fan_triangles(counts: Array, indices: Array) -> Array:
     Args:
         counts: (P,) corners of each polygon, int64.
         indices: (sum of counts,) vertex indices of all polygons, one after the other.
-
-    Raises:
-        FormatError: if a polygon has fewer than three corners.
     """
     if counts.size and counts.min() < 3:
         raise FormatError(f"a face must have at least 3 corners, got {int(counts.min())}")

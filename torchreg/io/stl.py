@@ -14,11 +14,7 @@ _FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attrib
 
 
 def read_stl(content: bytes, limits: FileLimits) -> RawCloud:
-    """Return the surface of an STL file; corners at exactly one position become one vertex, by first occurrence.
-
-    Raises:
-        FormatError: if the file holds fewer or more facets than it says, or an ASCII facet is not closed.
-    """
+    """Return the surface of an STL file; corners at exactly one position become one vertex, by first occurrence."""
     claimed = _num_claimed(content)
     if is_binary_stl(content):
         check_allowed(claimed, "faces", limits)

@@ -32,11 +32,7 @@ class _StrictBuilder(ET.TreeBuilder):
 
 
 def parse_xml(content: bytes) -> ET.Element:
-    """Return the outermost element of a document.
-
-    Raises:
-        FormatError: if it is not well-formed, declares a document type, or nests more than 64 deep.
-    """
+    """Return the outermost element of a document."""
     parser = ET.XMLParser(target=_StrictBuilder())
     try:
         # Blank lines before the declaration are common, harmless, and an error to the parser.

@@ -19,9 +19,6 @@ def read_xyz(content: bytes, limits: FileLimits) -> RawCloud:
 
     Columns are separated by blanks, commas or semicolons; ``#`` and ``//`` begin comments; the first line may hold
     column names, or the number of points alone.
-
-    Raises:
-        FormatError: if rows differ in length, the count does not agree, or columns 4 to 6 cannot be unit normals.
     """
     check_allowed(0 if content.isspace() else content.count(b"\n"), "points", limits)
     commented = b"#" in content or b"//" in content
@@ -72,9 +69,6 @@ def read_obj(content: bytes, limits: FileLimits) -> RawCloud:
 
     Vertex colors after the coordinates are read, and normals if every vertex has exactly one, of its own number.
     Polygons are cut into fans.
-
-    Raises:
-        FormatError: if a line is damaged or a face refers to a vertex that does not exist.
     """
     content = content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
     vertices, normals, corners = list[bytes](), list[bytes](), list[bytes]()

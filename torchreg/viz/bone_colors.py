@@ -83,11 +83,6 @@ def save_weight_ply(
         points: (N, 3) before they are moved.
         faces: (F, 3) over the points, if any.
         moved: whether the points are written as moved by the model.
-
-    Raises:
-        InputError: if shapes do not fit, a number is not finite, the ending is another, or the model holds several
-            poses and points are to be moved.
-        FileNotFoundError: if the folder does not exist.
     """
     points = as_float_tensor(points, "points", like=model.weights)
     check_shape(points, "points", ("N", 3))
@@ -116,10 +111,6 @@ def save_error_ply(
         errors: (N,) not negative, such as distances from the target; those that are not finite are painted gray.
         faces: (F, 3) over the points, if any.
         largest: the error at the end of the scale; the largest one by default.
-
-    Raises:
-        InputError: if shapes do not fit, an error is negative, a coordinate not finite or the ending is another.
-        FileNotFoundError: if the folder does not exist.
     """
     points = as_float_tensor(points, "points")
     check_shape(points, "points", ("N", 3))

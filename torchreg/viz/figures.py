@@ -158,9 +158,6 @@ def watch(
 
     Returns:
         The view, with the pixels that `render_mesh` averages.
-
-    Raises:
-        InputError: if a point lies beside or behind the camera.
     """
     points = as_float_tensor(points, "points").detach().double()
     check_points(points, "points", batch=False)

@@ -28,10 +28,6 @@ class LiveTrack:
     Args:
         skin: the surface to draw, with faces.
         port: to listen on at 127.0.0.1, or a later one if it is taken.
-
-    Raises:
-        InputError: if the skin has no faces.
-        MissingExtraError: if viser is not installed.
     """
 
     def __init__(self, skin: LinearBlendSkin, *, port: int = 8080) -> None:

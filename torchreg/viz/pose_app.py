@@ -55,9 +55,6 @@ class PoseApp:
         output: name of files without their endings .safetensors, .ply and .glb; a number is added if one exists.
         port: to listen on at 127.0.0.1, or a later one if it is taken.
         up: upright direction, see `Scene`.
-
-    Raises:
-        MissingExtraError: if viser is not installed.
     """
 
     def __init__(
@@ -132,11 +129,7 @@ class PoseApp:
             self._refresh()
 
     def play(self) -> None:
-        """Play the key poses once, without changing the pose.
-
-        Raises:
-            InputError: if there are fewer than two.
-        """
+        """Play the key poses once, without changing the pose."""
         poses = self.editor.animation()
         self._playing.set()
         for pose in poses:

@@ -166,9 +166,6 @@ class StereoPictures:
         frames: of the tracker.
         skin: the surface of the shape, with faces.
         folder: of the pictures.
-
-    Raises:
-        InputError: if the skin has no faces.
     """
 
     def __init__(self, frames: StereoFrames, skin: LinearBlendSkin, folder: Path) -> None:

@@ -74,11 +74,7 @@ def spine_view(
 def save_skeleton_picture(
     path: str | Path, mesh: TriangleMesh, skeleton: Skeleton, *, view: View | None = None
 ) -> Path:
-    """Return the path of a picture of a skeleton in its translucent surface, limbs in different colors.
-
-    Raises:
-        InputError: if the skeleton is a single node.
-    """
+    """Return the path of a picture of a skeleton in its translucent surface, limbs in different colors."""
     shown = spine_view([mesh]) if view is None else view
     figure, (ax,) = new_figure(*picture_size(shown))
     draw_spine_frame(ax, mesh, skeleton.resample(_STYLE.num_samples)[0], len(skeleton.tips), view=shown)
@@ -93,11 +89,7 @@ def save_spine_pictures(
     view: View | None = None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
-    """Return the paths of one picture per frame, frame_0000.png and so on, in a folder, which is made if need be.
-
-    Raises:
-        InputError: if there is not one surface per frame.
-    """
+    """Return the paths of one picture per frame, frame_0000.png and so on, in a folder, which is made if need be."""
     draw, size = _drawings(spine, meshes, view)
     Path(folder).mkdir(exist_ok=True)
     paths = []
@@ -119,11 +111,7 @@ def save_spine_movie(
     fps: float = 12.0,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Return the path of a moving picture, .gif or .mp4, of all frames.
-
-    Raises:
-        InputError: if there is not one surface per frame.
-    """
+    """Return the path of a moving picture, .gif or .mp4, of all frames."""
     draw, size = _drawings(spine, meshes, view)
     return save_animation(path, draw, fps, size=size, on_frame=on_frame)
 

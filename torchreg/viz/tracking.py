@@ -113,10 +113,6 @@ class FrameOverlays:
             path: to write (.png, .pdf, .svg); the file is written whole or not at all.
             data: (M, 3) of the frame, metres.
             result: of the tracker.
-
-        Raises:
-            InputError: if sizes do not fit or the suffix is another.
-            FileNotFoundError: if the folder does not exist.
         """
         self._view = self._follow(data, result.pose)
         figure, (ax,) = new_figure(*self._size)

@@ -41,9 +41,6 @@ class SceneViewer:
     Args:
         scene: to show.
         port: to listen on at 127.0.0.1, or a later one if it is taken.
-
-    Raises:
-        MissingExtraError: if viser is not installed.
     """
 
     def __init__(self, scene: Scene, *, port: int = 8080) -> None:
@@ -67,11 +64,7 @@ class SceneViewer:
         return self._drawn.frame
 
     def show(self, frame: int) -> None:
-        """Show a frame.
-
-        Raises:
-            InputError: if there is no such frame.
-        """
+        """Show a frame."""
         if not 0 <= frame < self.scene.num_frames:
             raise InputError(f"frame must be from 0 to {self.scene.num_frames - 1}, got {frame}")
         if self._timeline is not None:

@@ -35,9 +35,6 @@ def start_server(title: str, port: int) -> viser.ViserServer:
     Args:
         title: above the controls.
         port: to listen on, or a later one if it is taken.
-
-    Raises:
-        MissingExtraError: if viser is not installed.
     """
     library = import_viser()
     with contextlib.redirect_stdout(io.StringIO()):  # viser greets
