@@ -1,4 +1,4 @@
-"""Colors of pictures: their brightness, and what stands before a screen of one color."""
+"""Colors of pictures: their brightness, and masks of objects before a screen of one color."""
 
 from __future__ import annotations
 

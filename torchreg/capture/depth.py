@@ -1,4 +1,4 @@
-"""Depth images to range scans: filters against what sensors do at edges, and several views fused into one scan."""
+"""Depth images to range scans: filters of errors at edges, and several views fused into one scan."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def _undistorted(scan: RangeScan, camera: Camera) -> RangeScan:
 def without_flying_pixels(
     depth: Tensor, focal: tuple[float, float], *, max_steepness: float = 6.0, min_support: int = 3
 ) -> Tensor:
-    """Return depth images with zero where pixels hang between two surfaces, as at edges and steep slopes they do.
+    """Return depth images with zero at flying pixels, which lie between two surfaces at edges and steep slopes.
 
     A pixel stays if at least ``min_support`` of its eight neighbors could lie on one surface with it: their depths
     differ by no more than ``max_steepness`` times the distance between the two rays there. A straight edge leaves its

@@ -13,7 +13,7 @@ _BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
 
 @dataclass(frozen=True)
 class _WindowFit:
-    """How the window of a pixel is fitted; lengths in pixels."""
+    """Fit of the window of a pixel; lengths in pixels."""
 
     radius: int = 5  # half of the window's side: 11 x 11 pixels
     spread: float = 2.0  # standard deviation of the Gaussian weights in the picture

@@ -123,7 +123,7 @@ def _cameras_of(folders: Sequence[Path], cameras: CameraRig) -> CameraRig:
 
 
 def _stored_mesh(path: Path, fingerprint: str) -> TriangleMesh | None:
-    """Return the mesh of a file, None if there is none or it was made of something else."""
+    """Return the mesh of a file, None if there is none or its fingerprint differs."""
     try:
         tensors, metadata = load_tensors(path)
         return TriangleMesh(tensors["vertices"], tensors["faces"]) if metadata.get("masks") == fingerprint else None

@@ -23,7 +23,7 @@ _CHUNK = 1 << 20
 
 @dataclass(frozen=True)
 class _Carving:
-    """How a hull is found."""
+    """Search for a hull."""
 
     num_levels: int = 4  # of blocks above voxels: the largest, 16^3 voxels, are decided first, then their eighths
     max_resolution: int = 512  # voxels along the longest side

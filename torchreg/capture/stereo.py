@@ -32,7 +32,7 @@ class _CornerSearch:
 
 @dataclass(frozen=True)
 class _OrderCheck:
-    """How swapped pictures are told."""
+    """Test for swapped pictures."""
 
     shrink: int = 4  # pictures are compared at that part of their size
     min_ratio: float = 1.5  # of pixels that match as given to those that match swapped

@@ -20,7 +20,7 @@ from torchreg.io.images import list_frames, load_image
 
 @dataclass(frozen=True)
 class _FarEnd:
-    """How the far end of an arm is found."""
+    """Search for the far end of an arm."""
 
     border: int = 12  # pixels this near to the border of the common view may belong to an object that extends beyond
     num_neighbors: int = 3  # the end is the outermost corner with so many neighbors,
@@ -48,7 +48,7 @@ class StereoSight:
 
 
 class StereoFrames(Sequence[Tensor]):
-    """The clouds (M, 3) of a sequence of stereo pictures, float32, in world coordinates; made when asked for, and kept.
+    """The clouds (M, 3) of a sequence of stereo pictures, float32, in world coordinates; made on request, and kept.
 
     Reading raises what `load_image` and `stereo_points` raise, the latter as FormatError that names the picture.
 
@@ -99,7 +99,7 @@ class StereoFrames(Sequence[Tensor]):
         return self._clouds[number]
 
     def sight(self, number: int) -> StereoSight:
-        """Return the points of a frame and what they come from; the frame asked for last is kept."""
+        """Return the points of a frame with their picture and cameras; the last frame is kept."""
         if self._last is None or self._last[0] != number:
             self._last = number, self._matched(number)
         return self._last[1]

@@ -1,4 +1,4 @@
-"""Arguments that all commands have which fit a shape to point clouds, and their readers."""
+"""Common arguments of commands that fit a shape to point clouds, and their readers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The files that a command writes: their endings and numbers, and a check that nothing is overwritten unasked."""
+"""The files that a command writes: their endings and numbers, and a check against overwriting."""
 
 from __future__ import annotations
 

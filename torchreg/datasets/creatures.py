@@ -18,7 +18,7 @@ TOUCHING = ("none", "flanks", "tips")
 
 @dataclass(frozen=True)
 class _ArmMotion:
-    """How arms are shaped and move; lengths in shares of an arm's."""
+    """Form and motion of arms; lengths in shares of an arm's."""
 
     num_samples: int = 48  # along the axis of an arm; the balls around them are the arm
     length_spread: float = 0.08  # of arms
@@ -31,7 +31,7 @@ class _ArmMotion:
 
 @dataclass(frozen=True)
 class _Painting:
-    """How voxels are filled."""
+    """Filling of voxels."""
 
     reach: int = 3  # voxels outside of the surface up to which the field is known
     batch: int = 24  # balls of nearly one radius that are painted at a time

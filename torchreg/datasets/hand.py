@@ -26,7 +26,7 @@ _FACING = (math.pi / 2, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class _Stage:
-    """Where shapes are put and how far they move: metres, for a shape at ``distance`` from the camera."""
+    """Positions and motions of shapes, metres, for a shape at ``distance`` from the camera."""
 
     distance: float = 0.5
     drift: float = 0.03  # of the middle of the shape, to each side

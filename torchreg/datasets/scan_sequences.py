@@ -107,7 +107,7 @@ def _labels_of_motion(
 
 @dataclass(frozen=True, eq=False)
 class ScanSequence(Sequence[RangeScan]):
-    """Frames of a moving figure, each scanned from one side when it is asked for, always with the same result.
+    """Frames of a moving figure, each scanned from one side on request, always with the same result.
 
     ``sequence[t]`` is a `RangeScan` and ``sequence.pair(s, t)`` a `ScanPair`. The camera is at the origin and looks
     along +z with -y up.

@@ -23,7 +23,7 @@ from torchreg.shapes.skin import LinearBlendSkin
 
 @dataclass(frozen=True)
 class _Surroundings:
-    """What stands around the shape, and how many points lie on it."""
+    """Surroundings of the shape, and numbers of points on them."""
 
     on_forearm: float = 0.4  # share of the outliers
     on_wall: float = 0.3  # share of the outliers; the rest is spread over the working volume
@@ -46,7 +46,7 @@ class _ForearmForm:
 
 
 class _Owner(IntEnum):
-    """What a face of the scene belongs to."""
+    """Owners of the faces of a scene."""
 
     SHAPE = 0
     FOREARM = 1
@@ -126,7 +126,7 @@ def stereo_clouds(
     Points lie at pixels of the left picture whose surface the right camera sees too, drawn uniformly from them. Four
     tenths of the outliers lie on a forearm behind the wrist, where the shape is a hand and as far as it is seen, three
     tenths on a wall behind the shape, the rest uniformly in the working volume: the box of all frames, slightly grown.
-    An obstacle hides what is behind it and adds outliers of its own, 8 % as dense as the points of the shape.
+    An obstacle hides surfaces behind it and adds outliers, 8 % as dense as the points of the shape.
 
     Args:
         shape: the true shape.

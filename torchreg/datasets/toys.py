@@ -23,7 +23,7 @@ _DIRECTIONS: tuple[Vector, ...] = tuple((s * x, s * y, s * z) for x, y, z in _AX
 
 @dataclass(frozen=True)
 class _CollisionTest:
-    """When a pose is refused because parts run into each other."""
+    """Test for parts that run into each other."""
 
     max_overlap: float = 0.002  # of parts that do not meet, metres
     num_vertices: int = 4000  # that are tested, evenly chosen

@@ -31,7 +31,7 @@ PathLike = str | os.PathLike[str]
 
 
 class Frames(Sequence[Tensor]):
-    """Clouds in the order of time, each read when it is asked for, and not kept.
+    """Clouds in the order of time, each read on request, and not kept.
 
     Indexing and iterating give (M, 3) tensors on the CPU, a slice gives `Frames` again. M may be zero in archives.
     Reading raises what `load_points` raises; every message names the file, and in an archive the frame. Made by
@@ -90,7 +90,7 @@ def load_frames(
     limits: FileLimits = DEFAULT_LIMITS,
     dtype: torch.dtype = torch.float32,
 ) -> Frames:
-    """Return the clouds of a sequence, read one by one when asked for.
+    """Return the clouds of a sequence, read one by one on request.
 
     Args:
         path: a folder whose files are frames, all of one format; a list of files; one file; or one NPZ of frames: an
@@ -203,7 +203,7 @@ def _checked(files: list[Path]) -> list[Path]:
 
 
 def _read_archive(file: Path, limits: FileLimits) -> list[Array] | None:
-    """Return the rows of each frame of an archive, None if it holds a single cloud or something else."""
+    """Return the rows of each frame of an archive, None if it does not hold frames."""
     content = read_bytes(file, limits)
     try:
         with open_zip(content, limits) as archive:

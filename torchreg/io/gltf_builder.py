@@ -1,4 +1,4 @@
-"""glTF documents (.glb) under construction: accessors, meshes, nodes, animations, and checks of what goes into them."""
+"""glTF documents (.glb) under construction: accessors, meshes, nodes, animations, and checks of their content."""
 
 from __future__ import annotations
 

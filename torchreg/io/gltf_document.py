@@ -41,7 +41,7 @@ class GltfDocument:
 
     Args:
         content: bytes of the .glb or .gltf file.
-        path: where they came from; buffers in files of their own must lie in its folder or below.
+        path: of the file; separate buffers must lie in its folder or below.
         limits: ``max_bytes`` applies to each buffer and each accessor.
     """
 

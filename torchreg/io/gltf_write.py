@@ -1,4 +1,4 @@
-"""Writing animated glTF (.glb): a skinned mesh on a moving skeleton, or rigid parts that move as nodes."""
+"""Writing animated glTF (.glb): a skinned mesh on a moving skeleton, or rigid parts as moving nodes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from torchreg.io.gltf_document import parents_first
 
 @dataclass(frozen=True)
 class _SkinFormat:
-    """How skins are written."""
+    """Format of skins."""
 
     set_size: int = 4  # weights per vertex that an attribute holds, and that all viewers read
     min_weight: float = 1e-4  # a second set is written if any vertex has a fifth weight above this
@@ -129,7 +129,7 @@ def save_animated_parts(
     part_names: Sequence[str] | None = None,
     colors: Tensor | None = None,
 ) -> Path:
-    """Return the path of a .glb file in which each rigid part moves as a node of its own.
+    """Return the path of a .glb file in which each rigid part is a moving node.
 
     Args:
         path: where to write; the suffix must be .glb. An existing file is replaced once the new one is complete.

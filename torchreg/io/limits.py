@@ -1,4 +1,4 @@
-"""What a file may cost before it is opened: local regular files only, bounded in bytes, counts and expansion."""
+"""Limits of files, checked before they are opened: local regular files only, bounded in bytes, counts, expansion."""
 
 from __future__ import annotations
 

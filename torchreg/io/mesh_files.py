@@ -146,7 +146,7 @@ class _MeshFormat:
     module: tuple[str, str] | None = None
 
     def is_readable(self) -> bool:
-        """Return whether the packages it needs are installed."""
+        """Return whether the package of the format is installed."""
         return self.module is None or importlib.util.find_spec(self.module[0]) is not None
 
     def errors(self) -> tuple[type[BaseException], ...]:

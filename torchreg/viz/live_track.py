@@ -1,4 +1,4 @@
-"""A running tracker in the browser: every frame is shown as soon as it is done."""
+"""A running tracker in the browser: every frame is shown when it is done."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ FIELD_OF_VIEW = math.radians(45)
 
 @dataclass(frozen=True)
 class _CameraRule:
-    """How a camera is chosen."""
+    """Choice of the camera."""
 
     far_share: float = 0.75  # points were measured from the origin if their middle is farther, in diagonals
     one_sided: float = 0.3  # surfaces were seen from one side if the mean of their normals is longer
