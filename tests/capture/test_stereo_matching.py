@@ -50,17 +50,13 @@ def test_subpixel_shift_is_found():
     assert float(found[:, 20:].nanmedian()) == pytest.approx(6.75, abs=0.2)
 
 
-def test_batches_dtypes_and_offsets():
+def test_batches_and_dtypes():
     left, right, _ = scene()
     both = match_disparity(torch.stack((left, left)), torch.stack((right, right)), 20)
     one = match_disparity(left, right, 20)
     assert torch.equal(both[1].nan_to_num(-1), one.nan_to_num(-1))
     single = match_disparity(left.float(), right.float(), 20)
     assert single.dtype == torch.float32
-    offset = match_disparity(left, right, 20, min_disparity=4)
-    assert ((offset - one).abs() < 0.3).double().mean() > 0.6
-    everything = match_disparity(left, right, 20, max_difference=None)
-    assert everything.isfinite().sum() > one.isfinite().sum()
 
 
 def test_census_ignores_brightness_and_counts_darker_neighbors():
@@ -77,15 +73,6 @@ def test_a_missing_opencv_is_told_with_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(MissingExtraError, match=r"torchreg\[stereo\]"):
         match_disparity(left, right, 20, method="opencv")
-
-
-def test_whole_and_other_penalties_come_to_the_same():
-    left, right, _ = scene()
-    whole = match_disparity(left, right, 20)
-    nearly = match_disparity(left, right, 20, small_step=6.0 + 1e-9)
-    assert torch.equal(whole.nan_to_num(-1), nearly.nan_to_num(-1))
-    steep = match_disparity(left, right, 20, small_step=6.0, large_step=1e6)
-    assert steep.isfinite().double().mean() > 0.5
 
 
 def test_opencv_matches_up_to_the_left_border():

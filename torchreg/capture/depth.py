@@ -108,20 +108,17 @@ def _undistorted(scan: RangeScan, camera: Camera) -> RangeScan:
     return straight if bool(seen.all()) else straight.subset(seen, mark_cut=True)
 
 
-def without_flying_pixels(
-    depth: Tensor, focal: tuple[float, float], *, max_steepness: float = 6.0, min_support: int = 3
-) -> Tensor:
+def without_flying_pixels(depth: Tensor, focal: tuple[float, float], *, max_steepness: float = 6.0) -> Tensor:
     """Return depth images with zero at flying pixels, which lie between two surfaces at edges and steep slopes.
 
-    A pixel stays if at least ``min_support`` of its eight neighbors could lie on one surface with it: their depths
-    differ by no more than ``max_steepness`` times the distance between the two rays there. A straight edge leaves its
-    pixels five such neighbors, a right-angled corner three.
+    A pixel stays if at least three of its eight neighbors could lie on one surface with it: their depths differ by no
+    more than ``max_steepness`` times the distance between the two rays there. A straight edge leaves its pixels five
+    such neighbors, a right-angled corner three.
 
     Args:
         depth: (..., H, W) metres; zero, negative or not finite where nothing was measured.
         focal: fx and fy, pixels.
         max_steepness: tangent of the steepest slope; 6 is 80 degrees.
-        min_support: number of neighbors, 1 to 8.
 
     Differentiable: no.
     """
@@ -132,7 +129,7 @@ def without_flying_pixels(
             neighbor = _shifted(clean, row, column)
             distance = torch.minimum(clean, neighbor) * ((row / focal[1]) ** 2 + (column / focal[0]) ** 2) ** 0.5
             support += (neighbor - clean).abs() <= max_steepness * distance  # NaN is not
-        return torch.where(support >= min_support, clean, 0.0).nan_to_num(0.0)
+        return torch.where(support >= 3, clean, 0.0).nan_to_num(0.0)
 
 
 def bilateral_filter(depth: Tensor, noise: float, *, radius: int = 2, spread: float = 1.5) -> Tensor:

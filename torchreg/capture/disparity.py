@@ -14,28 +14,21 @@ METHODS = ("semi-global", "block", "opencv")
 
 
 @dataclass(frozen=True)
-class _CensusWindow:
-    """The window of the census transform, 7 x 9 pixels: its comparisons fit into an int64 with the sign bit unused."""
+class _Matching:
+    """Costs and checks of matching."""
 
-    half_rows: int = 3
-    half_columns: int = 4
+    half_rows: int = 3  # of the census window, 7 x 9 pixels:
+    half_columns: int = 4  # its comparisons fit into an int64 with the sign bit unused
     num_bits: int = 62  # comparisons with the middle, and so the largest cost
+    small_step: int = 6  # P1, the cost of a change of disparity by one pixel
+    large_step: int = 60  # P2, the cost of a larger change; sums below 4 (62 + P2) need 16 bits
+    max_difference: float = 1.0  # between the disparities of both directions, pixels
 
 
-_CENSUS = _CensusWindow()
+_MATCHING = _Matching()
 
 
-def match_disparity(
-    left: Tensor,
-    right: Tensor,
-    max_disparity: int,
-    *,
-    min_disparity: int = 0,
-    method: str = "semi-global",
-    small_step: float = 6.0,
-    large_step: float = 60.0,
-    max_difference: float | None = 1.0,
-) -> Tensor:
+def match_disparity(left: Tensor, right: Tensor, max_disparity: int, *, method: str = "semi-global") -> Tensor:
     """Return the disparity of every left pixel, ``x_left - x_right``, NaN where it is not known.
 
     The cost of a disparity is the number of differing bits of the two census transforms (7 x 9). Semi-global matching
@@ -47,44 +40,36 @@ def match_disparity(
     Args:
         left: (..., H, W) gray pictures of one scale, rectified.
         right: (..., H, W).
-        max_disparity: the largest disparity, pixels; below the width, and 2 or more above the smallest.
-        min_disparity: the smallest disparity, pixels.
+        max_disparity: the largest disparity, pixels; from 2 to below the width.
         method: "semi-global", "block", or "opencv" for OpenCV's own semi-global matcher (extra ``stereo``).
-        small_step: P1, the cost of a change by one pixel.
-        large_step: P2, the cost of a larger change, no less.
-        max_difference: between both directions, pixels; None keeps all.
 
     Returns:
         Disparities (..., H, W), pixels, in the dtype of ``left``.
 
     Raises:
-        MissingExtraError: if OpenCV is asked for and not installed.
+        MissingExtraError: if ``method`` is OpenCV's and OpenCV is not installed.
 
     Differentiable: no.
 
     Cost: about 60 operations per pixel and disparity, and three numbers of 16 bits: 2 s for 640 x 480 pixels and 128
-        disparities on one CPU core, twice that with penalties that are no whole numbers. Batches and GPUs run the same
-        code.
+        disparities on one CPU core. Batches and GPUs run the same code.
 
     References: Zabih and Woodfill 1994 (census); Hirschmueller 2008 (semi-global matching).
     """
     with torch.no_grad():
         pairs = left.reshape(-1, *left.shape[-2:]), right.reshape(-1, *left.shape[-2:])
         if method == "opencv":
-            found = torch.stack([_opencv(*pair, min_disparity, max_disparity) for pair in zip(*pairs, strict=True)])
+            found = torch.stack([_opencv(*pair, max_disparity) for pair in zip(*pairs, strict=True)])
             return found.to(left).reshape(left.shape)
-        volume = _cost_volume(census(pairs[0]), census(pairs[1]), min_disparity, max_disparity)
-        volume = _block_mean(volume) if method == "block" else _semi_global(volume, small_step, large_step)
-        found = min_disparity + _minima(volume)
-        if max_difference is not None:
-            reverse = min_disparity + _minima(_seen_from_right(volume)).roll(-min_disparity, dims=-1)
-            found = _agreeing(found, reverse, max_difference)
+        volume = _cost_volume(census(pairs[0]), census(pairs[1]), max_disparity)
+        volume = _block_mean(volume) if method == "block" else _semi_global(volume)
+        found = _agreeing(_minima(volume), _minima(_seen_from_right(volume)))
         return found.to(left).reshape(left.shape)
 
 
 def census(image: Tensor) -> Tensor:
     """Return the census (..., H, W) int64 of pictures: a bit per neighbor in a window of 7 x 9, set if it is darker."""
-    rows, columns = _CENSUS.half_rows, _CENSUS.half_columns
+    rows, columns = _MATCHING.half_rows, _MATCHING.half_columns
     flat = image.reshape(-1, 1, *image.shape[-2:])
     padded = torch.nn.functional.pad(flat, (columns, columns, rows, rows), mode="replicate").reshape(
         *image.shape[:-2], image.shape[-2] + 2 * rows, image.shape[-1] + 2 * columns
@@ -109,14 +94,14 @@ def _set_bits(code: Tensor) -> Tensor:
     return (code + (code >> 32)) & 0x7F
 
 
-def _cost_volume(left: Tensor, right: Tensor, lowest: int, highest: int) -> Tensor:
+def _cost_volume(left: Tensor, right: Tensor, highest: int) -> Tensor:
     """Return (B, H, W, D) int16 costs; the largest where the right pixel lies beside the picture."""
     width = left.shape[-1]
-    shape = (*left.shape, highest - lowest + 1)
-    volume = torch.full(shape, _CENSUS.num_bits, dtype=torch.int16, device=left.device)
-    for disparity in range(lowest, highest + 1):
+    shape = (*left.shape, highest + 1)
+    volume = torch.full(shape, _MATCHING.num_bits, dtype=torch.int16, device=left.device)
+    for disparity in range(highest + 1):
         differing = _set_bits(left[..., disparity:] ^ right[..., : width - disparity])
-        volume[..., disparity:, disparity - lowest] = differing.to(torch.int16)
+        volume[..., disparity:, disparity] = differing.to(torch.int16)
     return volume
 
 
@@ -125,31 +110,25 @@ def _block_mean(volume: Tensor) -> Tensor:
     return torch.nn.functional.avg_pool2d(planes, 9, stride=1, padding=4, count_include_pad=False).movedim(1, -1)
 
 
-def _semi_global(volume: Tensor, small: float, large: float) -> Tensor:
+def _semi_global(volume: Tensor) -> Tensor:
     """Return the sums of the costs of the cheapest paths to every pixel from the left, the right, above and below."""
-    # Whole numbers of 16 bits take half the time of floats; the sums stay below 4 (62 + P2).
-    in_16_bits = 4 * (_CENSUS.num_bits + large) < torch.iinfo(volume.dtype).max
-    if float(small).is_integer() and float(large).is_integer() and in_16_bits:
-        small, large = int(small), int(large)
-    else:
-        volume = volume.float()
     total = torch.zeros_like(volume)
     for axis in (1, 2):
         steps, sums = volume.unbind(axis), total.unbind(axis)
         for order in (range(len(steps)), range(len(steps) - 1, -1, -1)):
             path = None
             for line in order:
-                path = steps[line] if path is None else steps[line] + _cheapest_step(path, small, large)
+                path = steps[line] if path is None else steps[line] + _cheapest_step(path)
                 sums[line].add_(path)
     return total
 
 
-def _cheapest_step(path: Tensor, small: float, large: float) -> Tensor:
+def _cheapest_step(path: Tensor) -> Tensor:
     """Return the cost of the best step from the previous pixel to each disparity, less the least path cost there."""
     level = path - path.amin(-1, keepdim=True)
-    best = level.clamp(max=large)
-    best[..., 1:] = torch.minimum(best[..., 1:], level[..., :-1] + small)
-    best[..., :-1] = torch.minimum(best[..., :-1], level[..., 1:] + small)
+    best = level.clamp(max=_MATCHING.large_step)
+    best[..., 1:] = torch.minimum(best[..., 1:], level[..., :-1] + _MATCHING.small_step)
+    best[..., :-1] = torch.minimum(best[..., :-1], level[..., 1:] + _MATCHING.small_step)
     return best
 
 
@@ -168,7 +147,7 @@ def _minima(volume: Tensor) -> Tensor:
 def _seen_from_right(volume: Tensor) -> Tensor:
     """Return the cost volume (B, H, W, D) of the right picture, as a view: its column x is x + d on the left.
 
-    Columns are counted from the lowest disparity on; beyond the left picture costs are the largest.
+    Beyond the left picture costs are the largest.
     """
     batch, height, width, count = volume.shape
     padded = volume.new_full((batch, height, width + count, count), volume.max().item())
@@ -178,30 +157,30 @@ def _seen_from_right(volume: Tensor) -> Tensor:
     return padded.as_strided((batch, height, width, count), (*strides[:3], strides[2] + strides[3]))
 
 
-def _agreeing(found: Tensor, reverse: Tensor, slack: float) -> Tensor:
-    """Return disparities, NaN where the right picture's disparity of the matched pixel differs by more than slack."""
+def _agreeing(found: Tensor, reverse: Tensor) -> Tensor:
+    """Return disparities, NaN where the right picture's disparity of the matched pixel differs too much."""
     column = torch.arange(found.shape[-1], device=found.device)
     matched = (column - found).round().nan_to_num(-1).long()
     back = reverse.gather(-1, matched.clamp(0, found.shape[-1] - 1))
-    return torch.where((matched >= 0) & ((back - found).abs() <= slack), found, torch.nan)
+    return torch.where((matched >= 0) & ((back - found).abs() <= _MATCHING.max_difference), found, torch.nan)
 
 
-def _opencv(left: Tensor, right: Tensor, lowest: int, highest: int) -> Tensor:
+def _opencv(left: Tensor, right: Tensor, highest: int) -> Tensor:
     """Return the disparities (H, W) of OpenCV's semi-global matcher, which has a left-right check of its own."""
     try:
         import cv2
     except ImportError as error:
         raise MissingExtraError("method 'opencv' takes the extra stereo: pip install 'torchreg[stereo]'") from error
-    count = 16 * -(-(highest - lowest + 1) // 16)
+    count = 16 * -(-(highest + 1) // 16)
     # Blocks of 5 x 5 pixels; P1 and P2 are 8 and 32 times their area, as OpenCV advises.
     matcher = cv2.StereoSGBM.create(
-        minDisparity=lowest, numDisparities=count, blockSize=5, P1=200, P2=800, disp12MaxDiff=1, uniquenessRatio=5,
+        minDisparity=0, numDisparities=count, blockSize=5, P1=200, P2=800, disp12MaxDiff=1, uniquenessRatio=5,
         speckleWindowSize=50, speckleRange=2,
     )  # fmt: skip
     scale = 255 / max(float(left.max()), float(right.max()), 1e-9)
     gray = [(part.cpu().clamp(min=0) * scale).round().numpy().astype(np.uint8) for part in (left, right)]
     # OpenCV leaves out columns for which not all disparities lie in the picture; its border repeated, none does.
-    wide = [np.pad(part, ((0, 0), (lowest + count, 0)), mode="edge") for part in gray]
-    found = torch.from_numpy(matcher.compute(*wide))[:, lowest + count :].double() / 16
+    wide = [np.pad(part, ((0, 0), (count, 0)), mode="edge") for part in gray]
+    found = torch.from_numpy(matcher.compute(*wide))[:, count:].double() / 16
     inside = torch.arange(found.shape[1]) >= found
-    return torch.where((found >= lowest) & inside, found, torch.nan)
+    return torch.where((found >= 0) & inside, found, torch.nan)

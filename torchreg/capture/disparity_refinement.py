@@ -84,25 +84,6 @@ class _Windows:
         return (self.weights * values).sum(-1) / self.weights.sum(-1).clamp(min=1e-9)
 
 
-@dataclass(frozen=True, eq=False)
-class _Linearization:
-    """The weighted least squares of the last Gauss-Newton step.
-
-    Args:
-        normal: (N, 3, 3) normal matrix, prior included.
-        ridge: (N, 3, 3) the prior's part of it.
-        weighted: (N, K, 3) Jacobian times the weights.
-        noise: (N,) variance of the residuals, in units of the window's variance.
-        correlation: (N,) of the two windows.
-    """
-
-    normal: Tensor
-    ridge: Tensor
-    weighted: Tensor
-    noise: Tensor
-    correlation: Tensor
-
-
 def refine_disparity(left: Tensor, right: Tensor, dense: Tensor, pixels: Tensor) -> RefinedDisparity:
     """Return the disparities of N pixels to a fraction of a pixel, from windows of 11 x 11.
 
@@ -127,15 +108,22 @@ def refine_disparity(left: Tensor, right: Tensor, dense: Tensor, pixels: Tensor)
     windows = _Windows.from_dense(dense, pixels)
     start = dense[pixels[:, 1], pixels[:, 0]].double()
     first, second = _smoothed(torch.stack((left, right)).double())
-    plane, last = _fit_planes(first, second, windows, start)
-    found, std = plane[:, 0], _plane_std(plane, windows, last)
+    plane, variance, correlation = _fit_planes(first, second, windows, start)
+    # Where the dense disparity is no plane, fit and noise do not cover the error of the plane.
+    unevenness = windows.mean((windows.disparity - (plane.unsqueeze(1) * windows.basis).sum(-1)).nan_to_num(0.0) ** 2)
+    std = (variance + _FIT.uneven_share**2 * unevenness + _FIT.min_std**2).sqrt()
+    found = plane[:, 0]
     near = (found - start).abs() <= _FIT.max_move
-    good = near & (last.correlation >= _FIT.min_correlation) & std.isfinite() & found.isfinite()
+    good = near & (correlation >= _FIT.min_correlation) & std.isfinite() & found.isfinite()
     return RefinedDisparity(found.to(left), std.to(left), good)
 
 
-def _fit_planes(first: Tensor, second: Tensor, windows: _Windows, start: Tensor) -> tuple[Tensor, _Linearization]:
-    """Return disparity and slopes (N, 3) of a plane in each window, by Gauss-Newton from disparities ``start`` (N,)."""
+def _fit_planes(first: Tensor, second: Tensor, windows: _Windows, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return planes of disparity in windows, fitted by Gauss-Newton from disparities ``start`` (N,).
+
+    Returns:
+        Disparity and slopes (N, 3), variances (N,) of the disparities, correlations (N,) of the windows.
+    """
     target = first[windows.row, windows.column]
     plane = torch.stack((start, torch.zeros_like(start), torch.zeros_like(start)), dim=-1)
     prior = torch.diag(plane.new_tensor([1e-9, 1.0, 1.0])) / _FIT.slope_std**2
@@ -151,20 +139,12 @@ def _fit_planes(first: Tensor, second: Tensor, windows: _Windows, start: Tensor)
         normal = weighted.mT @ jacobian + ridge
         gradient = (weighted.mT @ residual.unsqueeze(-1))[..., 0] - (ridge @ _slopes(plane).unsqueeze(-1))[..., 0]
         plane = plane + torch.linalg.solve(normal, gradient).clamp(-0.5, 0.5)
-    correlation = windows.mean(wanted * seen)
-    return plane, _Linearization(normal=normal, ridge=ridge, weighted=weighted, noise=noise, correlation=correlation)
-
-
-def _plane_std(plane: Tensor, windows: _Windows, last: _Linearization) -> Tensor:
-    """Return the standard deviations (N,) of the disparities of fitted planes (N, 3), pixels."""
-    inverse, rows = torch.linalg.inv(last.normal), last.weighted.mT
     # Smoothed noise: raw noise of a variance so much larger, seen through the smoothed weights of the fit.
-    side = 2 * _FIT.radius + 1
-    filtered = _smoothed(rows.reshape(-1, side, side)).reshape(rows.shape)
-    spread = inverse @ (filtered @ filtered.mT / sum(tap**2 for tap in _BINOMIAL) ** 2 + last.ridge) @ inverse
-    # Where the dense disparity is no plane, neither fit nor noise tell how far off the plane is.
-    unevenness = windows.mean((windows.disparity - (plane.unsqueeze(1) * windows.basis).sum(-1)).nan_to_num(0.0) ** 2)
-    return (spread[:, 0, 0] * last.noise + _FIT.uneven_share**2 * unevenness + _FIT.min_std**2).sqrt()
+    rows, side = weighted.mT, 2 * _FIT.radius + 1
+    rows = _smoothed(rows.reshape(-1, side, side)).reshape(rows.shape)
+    inverse = torch.linalg.inv(normal)
+    spread = inverse @ (rows @ rows.mT / sum(tap**2 for tap in _BINOMIAL) ** 2 + ridge) @ inverse
+    return plane, spread[:, 0, 0] * noise, windows.mean(wanted * seen)
 
 
 def _smoothed(images: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ class SilhouetteFrames:
     Args:
         folders: one per camera, with its masks in the order of the numbers in their names. A folder belongs to the
             camera of its name; if no camera has the name of any, the folders are in the order of the cameras.
-        cameras: calibrated; those without a folder are left out where names tell which.
+        cameras: calibrated; those without a folder are omitted if folders have the names of cameras.
         screen: whether the files are pictures before a screen of one color instead of masks, see `chroma_key`.
         resolution: see `visual_hull`.
 

@@ -78,8 +78,8 @@ class StereoConfig:
     """Settings of `stereo_points`.
 
     Args:
-        nearest: depth of the nearest thing of interest, metres; it limits the disparities that are searched.
-        farthest: depth beyond which everything is background, metres.
+        nearest: smallest depth of interest, metres; it limits the disparities that are searched.
+        farthest: largest depth of interest, metres; surfaces beyond are background.
         num_corners: most that are kept, the strongest first.
         method: see `match_disparity`.
         max_disparity_std: corners whose disparity is less certain are dropped, pixels.
@@ -132,7 +132,7 @@ def stereo_points(
         pair: the cameras, rectified; see `rectify`.
         config: depths, numbers and method.
         box: (2, 3) lower and upper corner of the volume of interest in world coordinates, or None.
-        check_order: whether swapped pictures are told by matching them swapped, too; once per sequence is enough.
+        check_order: whether to test for swapped pictures; once per sequence is enough.
 
     Returns:
         The points, in the dtype of the pictures; there may be none.

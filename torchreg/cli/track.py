@@ -80,7 +80,7 @@ def track(
     fps: Annotated[float, typer.Option(help="Frames per second.")] = 20.0,
     scale: Scale = 1.0,
     nan_policy: NanPolicy = "omit",
-    prediction: Annotated[str, typer.Option(help="How the shape goes on: velocity, or none.")] = "velocity",
+    prediction: Annotated[str, typer.Option(help="Prediction of the motion: velocity, or none.")] = "velocity",
     points: Annotated[int, typer.Option(help="Number of model points.")] = 500,
     model_points: Annotated[
         str, typer.Option(help="What is aligned: points of the shape seen last, data of the frame before, or shape.")
@@ -88,7 +88,7 @@ def track(
     recovery: Annotated[
         str, typer.Option(help="What finding a lost shape may cost: full, starts (milliseconds), or none.")
     ] = "full",
-    seed: Annotated[int, typer.Option(help="Of all that is drawn.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0,
     parents: Parents = None,
     package_dir: PackageDir = None,
     free_base: FreeBase = None,
@@ -164,7 +164,7 @@ def track(
 def _files(
     output: Path, movie: str, gltf: bool, overlay: Path | None, resume: bool, force: bool
 ) -> tuple[TrackFiles, bool]:
-    """Return the outputs, once they are known to be writable, and whether an earlier run goes on."""
+    """Return the outputs, after a check that they are writable, and whether an earlier run is resumed."""
     from torchreg._checks import check_choice
 
     check_choice(movie, "--movie", MOVIES)

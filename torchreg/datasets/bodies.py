@@ -11,7 +11,7 @@ from torchreg._checks import check_positive
 from torchreg.datasets.figures import Figure, Part, bending_figure
 from torchreg.datasets.solids import RoundCone, Vector
 
-# Arms and legs stand off in the rest pose so that they fuse with nothing; gaits bring them back.
+# Angles of arms and legs from the trunk in the rest pose, so that they do not fuse with it; gaits undo them.
 REST_ARM, REST_LEG = math.radians(40), math.radians(5)
 SIDES = {"left": 1.0, "right": -1.0}
 

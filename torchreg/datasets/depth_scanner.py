@@ -80,7 +80,7 @@ class DepthScanner:
             InputError: if the camera sees nothing of the mesh.
         """
         check_positive(reach, "reach")
-        first = _centered_view(2 * reach / 128, reach)  # 128 pixels a side tell the area that is seen
+        first = _centered_view(2 * reach / 128, reach)  # 128 pixels a side, to measure the area that is seen
         seen = int(self._measurable(mesh, first)[1].sum())
         if not seen:
             raise InputError("mesh must lie before the camera, which looks along +z, and face it; it sees nothing")
@@ -120,7 +120,7 @@ class DepthScanner:
         face = raster.face_index[shown]
         corners = mesh.vertices[mesh.faces[face]].double()
         normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        # Faces are small: the ray to one corner stands for all.
+        # Faces are small: the ray to their first corner is used.
         facing = -torch.nn.functional.cosine_similarity(corners[:, 0], normals, dim=-1)
         return raster, shown.index_put((shown,), facing > math.cos(self.max_slant))
 

@@ -137,7 +137,7 @@ def stereo_clouds(
             to the pixels that both cameras see.
         outlier_ratio: outliers as a share of all points in that frame, at least 0 and below 1; every frame has the
             same number. Points on an obstacle come on top.
-        obstacle: that stands still, faces outwards, metres.
+        obstacle: a still mesh, faces outwards, metres.
         seed: of forearm, wall and measurements.
 
     Returns:

@@ -77,7 +77,7 @@ def _load_json(file: Path, *, limits: FileLimits) -> CameraRig:
         raise FormatError(f"{file}: {error}") from error
 
 
-# Loaders by the ending of the file; those of files in a folder stand under a name that is no ending.
+# Loaders by the ending of the file; a folder has a key that is no ending. A new format is one more row.
 _FOLDER = "folder"
 _LOADERS: dict[str, Callable[..., CameraRig]] = {
     _FOLDER: load_colmap,

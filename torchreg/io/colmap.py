@@ -45,9 +45,9 @@ def load_colmap(folder: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_
         FormatError: if a line is cut off or not understood, a lens is of another kind, or an image names no camera.
         FileNotFoundError: if one of the files is missing.
     """
-    place = local_path(folder)
-    lenses = _lenses(place / "cameras.txt", limits)
-    path = place / "images.txt"
+    directory = local_path(folder)
+    lenses = _lenses(directory / "cameras.txt", limits)
+    path = directory / "images.txt"
     # Every image has a second line, of its points; it may be empty.
     lines = [(number, line) for number, line in _lines(path, limits) if not line.startswith("#")]
     while lines and not lines[0][1]:
@@ -70,7 +70,7 @@ def save_colmap(folder: str | os.PathLike[str], cameras: CameraRig) -> None:
         InputError: if a name holds blanks.
         FileNotFoundError: if the folder does not exist.
     """
-    place = local_path(folder)
+    directory = local_path(folder)
     lenses = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]
     images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# POINTS2D[] as (X Y POINT3D_ID)"]
     for number, camera in enumerate(cameras, start=1):
@@ -84,8 +84,8 @@ def save_colmap(folder: str | os.PathLike[str], cameras: CameraRig) -> None:
         pose = torch.cat((quaternion_from_rotation(motion[:3, :3]), motion[:3, 3])).tolist()
         lenses.append(f"{number} {model} {camera.width} {camera.height} {_joined(values)}")
         images += [f"{number} {_joined(pose)} {number} {camera.name}", ""]
-    write_atomic(place / "cameras.txt", ("\n".join(lenses) + "\n").encode())
-    write_atomic(place / "images.txt", ("\n".join(images) + "\n").encode())
+    write_atomic(directory / "cameras.txt", ("\n".join(lenses) + "\n").encode())
+    write_atomic(directory / "images.txt", ("\n".join(images) + "\n").encode())
 
 
 def _joined(values: list[float]) -> str:

@@ -118,8 +118,8 @@ def load_frames(
     if dtype not in (torch.float32, torch.float64):
         raise InputTypeError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
     if isinstance(path, (str, os.PathLike)):
-        place = local_path(path)
-        files = _files_of(place) if place.is_dir() else _checked([place])
+        target = local_path(path)
+        files = _files_of(target) if target.is_dir() else _checked([target])
     else:
         files = _listed(path)
     if sort:
@@ -149,19 +149,19 @@ def save_frames(path: PathLike, frames: Sequence[Any]) -> list[Path]:
         FormatError: if the path is an address or has another ending than .npz.
         FileNotFoundError: if the folder of ``path`` does not exist.
     """
-    place = local_path(path)
+    target = local_path(path)
     clouds = [as_float_tensor(frame, f"frames[{number}]").detach().cpu() for number, frame in enumerate(frames)]
     if not clouds:
         raise InputError("frames must hold at least one cloud, got none")
     for number, cloud in enumerate(clouds):
         check_shape(cloud, f"frames[{number}]", ("M", 3))
         check_finite(cloud, f"frames[{number}]")
-    if place.suffix.lower() == ".npz":
-        write_atomic(place, _archive(clouds))
-        return [place]
-    if place.suffix:
-        raise FormatError(f"{place} has the ending {place.suffix!r}; name an archive ending in .npz or a folder")
-    return _save_folder(place, clouds)
+    if target.suffix.lower() == ".npz":
+        write_atomic(target, _archive(clouds))
+        return [target]
+    if target.suffix:
+        raise FormatError(f"{target} has the ending {target.suffix!r}; name an archive ending in .npz or a folder")
+    return _save_folder(target, clouds)
 
 
 def natural_key(path: PathLike) -> list[tuple[int, int | str, str]]:

@@ -35,17 +35,17 @@ def list_pictures(folder: str | os.PathLike[str]) -> list[Path]:
     """Return the pictures in a folder, in the order of the numbers in their names.
 
     Raises:
-        FormatError: if it holds none, or names the folder of something else.
+        FormatError: if it holds none, or is no folder.
         FileNotFoundError: if there is no such folder.
     """
-    place = local_path(folder)
-    if not place.exists():
-        raise FileNotFoundError(f"the folder {place} does not exist")
-    if not place.is_dir():
-        raise FormatError(f"{place}: must be a folder of pictures")
-    files = [file for file in place.iterdir() if file.suffix.lower() in ENDINGS and not file.name.startswith(".")]
+    directory = local_path(folder)
+    if not directory.exists():
+        raise FileNotFoundError(f"the folder {directory} does not exist")
+    if not directory.is_dir():
+        raise FormatError(f"{directory}: must be a folder of pictures")
+    files = [file for file in directory.iterdir() if file.suffix.lower() in ENDINGS and not file.name.startswith(".")]
     if not files:
-        raise FormatError(f"{place} holds no pictures: no file ends in one of {', '.join(ENDINGS)}")
+        raise FormatError(f"{directory} holds no pictures: no file ends in one of {', '.join(ENDINGS)}")
     return sorted(files, key=natural_key)
 
 

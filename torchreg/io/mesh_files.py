@@ -75,7 +75,7 @@ class MeshFiles:
                 f"package_dirs=, or meshes='skip' to go without"
             )
         kind = _FORMATS.get(found.suffix.lower())
-        if kind is not None and not kind.is_readable():
+        if kind is not None and kind.module is not None and importlib.util.find_spec(kind.module[0]) is None:
             if not self._require:
                 return None
             raise MissingExtraError(
@@ -108,10 +108,6 @@ def _is_file(path: Path) -> bool:
         return False
 
 
-def _unchanged(content: bytes) -> tuple[bytes, float]:
-    return content, 1.0
-
-
 def _checked_stl(content: bytes) -> tuple[bytes, float]:
     """Return an STL file and its unit; ValueError unless it is as long as its binary header says, or text.
 
@@ -139,24 +135,11 @@ class _MeshFormat:
 
     Args:
         prepare: returns the content for trimesh, and the metres per unit.
-        module: a package that trimesh needs, with the name of its error in ``module.common``.
+        module: that trimesh needs for it, and the name of its error in ``module.common``.
     """
 
-    prepare: Callable[[bytes], tuple[bytes, float]] = _unchanged
+    prepare: Callable[[bytes], tuple[bytes, float]] = lambda content: (content, 1.0)
     module: tuple[str, str] | None = None
-
-    def is_readable(self) -> bool:
-        """Return whether the package of the format is installed."""
-        return self.module is None or importlib.util.find_spec(self.module[0]) is not None
-
-    def errors(self) -> tuple[type[BaseException], ...]:
-        """Return the exceptions that damaged files raise."""
-        from trimesh.exchange.stl import HeaderError
-
-        if self.module is None:
-            return (*_PARSER_ERRORS, HeaderError)
-        package, name = self.module
-        return (*_PARSER_ERRORS, HeaderError, getattr(importlib.import_module(f"{package}.common"), name))
 
 
 # By ending. A new format is one more row.
@@ -177,8 +160,11 @@ def _read_mesh(path: Path, limits: FileLimits) -> TriangleMesh:
         raise FormatError(f"{path}: meshes of kind {ending!r} are not read; known: {', '.join(_FORMATS)}")
     content, kind = read_bytes(path, limits), _FORMATS[ending]
     import trimesh
+    from trimesh.exchange.stl import HeaderError
 
-    errors = kind.errors()
+    errors: tuple[type[BaseException], ...] = (*_PARSER_ERRORS, HeaderError)
+    if kind.module is not None:
+        errors = (*errors, getattr(importlib.import_module(f"{kind.module[0]}.common"), kind.module[1]))
     try:
         content, unit = kind.prepare(content)
         # From memory and without a resolver, so that no material or texture file is opened.

@@ -40,7 +40,7 @@ def save_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], me
 
     Raises:
         InputError: if the ending is another, or a metadata key is reserved.
-        InputTypeError: if a value is not a tensor, or metadata holds something else; names where.
+        InputTypeError: if a value is not a tensor, or metadata holds another type; names the entry.
         FormatError: if the path is an address.
         FileNotFoundError: if the folder does not exist.
     """

@@ -154,7 +154,7 @@ def common_view(
     size: tuple[int, int] = (360, 360),
 ) -> View:
     """Return the view that shows a surface in all poses (T, num_dofs); see `watch`."""
-    sample = poses[:: max(1, len(poses) // 32)]  # that many poses tell the bounds
+    sample = poses[:: max(1, len(poses) // 32)]  # enough poses for the bounds
     with torch.no_grad():
         points = torch.cat([skin(pose) for pose in sample]).cpu()
     return watch(points, camera=camera, up=up, size=size, margin=0.1)

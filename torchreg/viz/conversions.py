@@ -35,7 +35,7 @@ def to_trimesh(value: Any, frame: int = 0) -> Any:
 
     Raises:
         InputError: if there is no such frame.
-        InputTypeError: if ``value`` is something else.
+        InputTypeError: if ``value`` has another type.
     """
     import trimesh
 
@@ -56,7 +56,7 @@ def to_open3d(value: Any, frame: int = 0) -> Any:
 
     Raises:
         InputError: if there is no such frame.
-        InputTypeError: if ``value`` is something else.
+        InputTypeError: if ``value`` has another type.
         MissingExtraError: if Open3D is not installed.
     """
     open3d = _extra("open3d")
@@ -86,7 +86,7 @@ def to_pyvista(value: Any, frame: int = 0) -> Any:
 
     Raises:
         InputError: if there is no such frame.
-        InputTypeError: if ``value`` is something else.
+        InputTypeError: if ``value`` has another type.
         MissingExtraError: if PyVista is not installed.
     """
     pyvista = _extra("pyvista")

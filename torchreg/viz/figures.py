@@ -323,7 +323,7 @@ def save_picture(figure: Figure, path: str | Path, *, dpi: float | None = None) 
     return path
 
 
-def bending_picture(path: str | Path, sharpness: Sequence[float] = (2.0, 10.0), *, bend_deg: float = 80.0) -> Path:
+def bending_picture(path: str | Path, sharpness: Sequence[float] = (2.0, 10.0)) -> Path:
     """Return the path of a picture of a bent, checkered finger, once for each sharpness of the bending skin.
 
     At a = 2 the pattern compresses and stretches over all of the bend, at a = 10 it follows the nearest part and breaks
@@ -332,7 +332,6 @@ def bending_picture(path: str | Path, sharpness: Sequence[float] = (2.0, 10.0), 
     Args:
         path: the picture to write.
         sharpness: a of each finger, left to right.
-        bend_deg: angle of the joint, degrees.
 
     Raises:
         InputError: if there is no sharpness or one is not positive.
@@ -343,18 +342,18 @@ def bending_picture(path: str | Path, sharpness: Sequence[float] = (2.0, 10.0), 
         raise InputError("sharpness must hold at least one number, got none")
     figure, axes = new_figure(400 * len(sharpness), 400, len(sharpness))
     for ax, value in zip(axes, sharpness, strict=True):
-        draw_bending(ax, float(value), bend_deg=bend_deg)
+        draw_bending(ax, float(value))
         ax.text(0.5, 0.03, f"a = {value:g}", transform=ax.transAxes, ha="center", fontsize=14)
     return save_picture(figure, path)
 
 
-def draw_bending(ax: Axes, sharpness: float, *, bend_deg: float = 80.0, size: tuple[int, int] = (400, 400)) -> None:
-    """Draw a checkered finger with its joint bent under a `BendingSkin` of the given sharpness."""
+def draw_bending(ax: Axes, sharpness: float, *, size: tuple[int, int] = (400, 400)) -> None:
+    """Draw a checkered finger with its joint bent by 80 degrees under a `BendingSkin` of the given sharpness."""
     finger = _finger()
     mesh = finger.surface_mesh(spacing=0.0012)
     skin = BendingSkin(finger, mesh.vertices, sharpness=sharpness, faces=mesh.faces)
     pose = finger.rest_pose()
-    pose[6:] = math.radians(bend_deg)
+    pose[6:] = math.radians(80.0)
     bent = posed_mesh(finger, pose, skin)
     camera = bent.vertices.new_tensor([0.40, 0.12, 0.09])
     view = watch(bent.vertices, camera=camera, up=camera.new_tensor([0.0, 1.0, 0.0]), size=size, margin=0.05)

@@ -151,7 +151,7 @@ class Timeline:
         return int(np.searchsorted(self._seconds, seconds, side="right")) - 1
 
 
-def scene_html(path: str | Path, scene: Scene, *, num_loops: int = 1) -> Path:
+def scene_html(path: str | Path, scene: Scene) -> Path:
     """Return the path of an HTML file that shows a scene in any browser, without a server or a network.
 
     Moving layers are played in a loop, with a timeline. Hidden layers are omitted.
@@ -159,7 +159,6 @@ def scene_html(path: str | Path, scene: Scene, *, num_loops: int = 1) -> Path:
     Args:
         path: to write, ending in .html; an existing file is replaced, whole or not at all.
         scene: to show.
-        num_loops: number of times that moving layers are recorded.
 
     Raises:
         InputError: if the ending is another.
@@ -177,10 +176,9 @@ def scene_html(path: str | Path, scene: Scene, *, num_loops: int = 1) -> Path:
         drawn = DrawnScene(server.scene, shown)
         point_camera(server, scene)
         record = server.get_scene_serializer()
-        for _ in range(num_loops if shown.num_frames > 1 else 0):
-            for frame, seconds in _durations(scene.seconds[: shown.num_frames]):
-                drawn.show(frame)
-                record.insert_sleep(seconds)
+        for frame, seconds in _durations(scene.seconds) if shown.num_frames > 1 else ():
+            drawn.show(frame)
+            record.insert_sleep(seconds)
         content = record.as_html()
     finally:
         stop_server(server)
