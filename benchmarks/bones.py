@@ -26,10 +26,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+import torchreg as tr
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
 from torchreg.registration.bones.correspondences import Correspondences
-from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
 from torchreg.registration.bones.motions import fit_bones
 from torchreg.registration.bones.sparse_grid import SparseGrid
@@ -49,7 +49,7 @@ class Tube:
 
     points: Tensor
     normals: Tensor
-    model: GridLBS
+    model: tr.GridLBS
 
     def pose(self, angle: float) -> Tensor:
         """Return motions (B, 4, 4) that bend every second joint by ``angle`` up, the others sideways."""
@@ -69,7 +69,7 @@ def make_tube(bones: int, count: int, resolution: int, dtype: torch.dtype) -> Tu
     points = 0.05 * bones * ring + torch.stack([bones * along, torch.zeros(count), torch.zeros(count)], dim=-1)
     grid = SparseGrid.from_points(points.to(dtype), resolution)
     labels = grid.cell_centers()[:, 0].long().clamp(0, bones - 1)
-    return Tube(points.to(dtype), ring.to(dtype), GridLBS.from_labels(grid, labels, bones))
+    return Tube(points.to(dtype), ring.to(dtype), tr.GridLBS.from_labels(grid, labels, bones))
 
 
 def milliseconds(call: Callable[[], object], repeats: int) -> str:
@@ -108,7 +108,7 @@ def measure(bones: int, dtype: torch.dtype, scale: float, repeats: int) -> list[
 
 
 def refinement_rows(tube: Tube, few: Tensor, repeats: int) -> list[tuple[str, str]]:
-    model = GridLBS(tube.model.grid, tube.model.weights, tube.pose(0.3))
+    model = tr.GridLBS(tube.model.grid, tube.model.weights, tube.pose(0.3))
     points = tube.points[few]
     share = torch.sigmoid(6 * (points[:, :1] - torch.arange(1, model.num_bones).to(points)))
     smooth = torch.cat([torch.ones_like(share[:, :1]), share], dim=-1)
@@ -130,7 +130,7 @@ def refinement_rows(tube: Tube, few: Tensor, repeats: int) -> list[tuple[str, st
 
 def pose_rows(tube: Tube, repeats: int) -> list[tuple[str, str]]:
     start = tube.pose(0.2)
-    model = GridLBS(tube.model.grid, tube.model.weights, start)
+    model = tr.GridLBS(tube.model.grid, tube.model.weights, start)
     length = model.num_bones
     at = torch.tensor([0.05, 0.3, 0.7, 0.95]).unsqueeze(-1)
     handles = (at * torch.tensor([float(length), 0, 0]) + torch.tensor([0, 0.05 * length, 0])).to(tube.points)

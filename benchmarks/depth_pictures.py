@@ -24,11 +24,9 @@ import torch
 from torch import Tensor
 
 import torchreg as tr
-from torchreg.capture.depth import depth_scan, load_depth_scan
 from torchreg.capture.depth_noise import DepthNoise
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import ScanSequence, jointed_toy
-from torchreg.geometry.camera import Camera
 from torchreg.geometry.rigid import se3_exp
 from torchreg.geometry.visibility import View, rasterize
 from torchreg.io.calibration import save_depth_camera
@@ -48,14 +46,14 @@ def reprojection(size: int) -> dict[str, float]:
     motion = se3_exp(torch.tensor([0.1, -0.2, 0.3, 0.4, -0.3, 0.2], dtype=torch.float64))
     focal = 0.9 * size
     numbers = torch.tensor([focal, 1.01 * focal, 0.49 * size, 0.37 * size], dtype=torch.float64)
-    camera = Camera(size, size * 3 // 4, numbers, motion, numbers.new_tensor([-0.15, 0.05, 1e-3, -1e-3, 0.0]))
+    camera = tr.Camera(size, size * 3 // 4, numbers, motion, numbers.new_tensor([-0.15, 0.05, 1e-3, -1e-3, 0.0]))
     column, row = camera.pixel_grid().unbind(-1)
     depth = 1 + 0.2 * torch.sin(6 * column / size) * torch.cos(5 * row / size)
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         save_depth(place / "d.png", depth, STEP)
         save_depth_camera(place / "k.json", camera, STEP)
-        scan = load_depth_scan(place / "d.png", place / "k.json")
+        scan = tr.load_depth_scan(place / "d.png", place / "k.json")
     pixels, found = camera.project(scan.points.double())
     off = (pixels - pixels.round()).norm(dim=-1)
     column, row = pixels.round().long().unbind(-1)
@@ -66,7 +64,7 @@ def reprojection(size: int) -> dict[str, float]:
     }
 
 
-def sphere(camera: Camera) -> tuple[Tensor, Tensor]:
+def sphere(camera: tr.Camera) -> tuple[Tensor, Tensor]:
     """Return depth (H, W) and normals (H, W, 3) of a sphere of 15 cm at one metre; depth is zero beside it."""
     rays = camera.directions(camera.pixel_grid())
     square, along = (rays**2).sum(-1), rays[..., 2]
@@ -76,7 +74,7 @@ def sphere(camera: Camera) -> tuple[Tensor, Tensor]:
     return depth, normals
 
 
-def cylinder(camera: Camera) -> tuple[Tensor, Tensor]:
+def cylinder(camera: tr.Camera) -> tuple[Tensor, Tensor]:
     """Return the same of an upright cylinder of 12 cm."""
     rays = camera.directions(camera.pixel_grid())
     flat = rays * rays.new_tensor([1.0, 0.0, 1.0])
@@ -92,13 +90,13 @@ def normals(size: int) -> dict[str, float]:
     focal = 0.9 * size
     high = size * 3 // 4
     numbers = torch.tensor([focal, focal, 0.5 * (size - 1), 0.5 * (high - 1)], dtype=torch.float64)
-    camera = Camera(size, high, numbers)
+    camera = tr.Camera(size, high, numbers)
     figures = {}
     for shape, solid in (("sphere", sphere), ("cylinder", cylinder)):
         depth, true = solid(camera)
         for name, sensor in SENSORS.items():
             measured = sensor.measured(depth, torch.Generator().manual_seed(1))
-            scan = depth_scan(measured, camera, smoothing=float(sensor.depth_std(torch.tensor(1.0))))
+            scan = tr.depth_scan(measured, camera, smoothing=float(sensor.depth_std(torch.tensor(1.0))))
             column, row = camera.project(scan.points)[0].round().long().unbind(-1)
             on_it = depth[row, column] > 0
             cosine = (scan.normals * true[row, column]).sum(-1)[on_it].clamp(-1, 1)
@@ -113,11 +111,11 @@ def depth_camera_scan(sequence: ScanSequence, frame: int, sensor: DepthNoise, fi
     depth = rasterize(sequence.mesh(frame), fine, cull_back=True).depth
     seen = sensor.measured(depth.where(depth.isfinite(), 0.0), torch.Generator().manual_seed(frame))
     focal = torch.full((2,), 1 / fine.pitch, dtype=torch.float64)
-    camera = Camera(fine.width, fine.height, torch.cat((focal, -fine.corner / fine.pitch - 0.5)))
+    camera = tr.Camera(fine.width, fine.height, torch.cat((focal, -fine.corner / fine.pitch - 0.5)))
     save_depth(folder / "d.png", seen, STEP)
     save_depth_camera(folder / "k.json", camera, STEP)
     noise = float(sensor.depth_std(torch.tensor(1.0)))
-    return load_depth_scan(folder / "d.png", folder / "k.json", smoothing=noise if noise > SMOOTHED else 0.0)
+    return tr.load_depth_scan(folder / "d.png", folder / "k.json", smoothing=noise if noise > SMOOTHED else 0.0)
 
 
 def registration(pairs: int, sensors: dict[str, DepthNoise], finer: int) -> dict[str, float]:

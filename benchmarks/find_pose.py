@@ -29,7 +29,6 @@ from tqdm import tqdm
 
 import torchreg as tr
 from torchreg.datasets.hand import HandCloud, make_hand_cloud, surface_skin
-from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 NOISE, OUTLIERS, NUM_POINTS, DISTANCE, BEND = 0.0015, 0.1, 500, 0.5, 0.5
 TIPS, MIN_SEEN = [4, 8, 12, 16, 20], 4
@@ -90,7 +89,7 @@ def random_pose(hand: tr.Hand, generator: torch.Generator) -> Tensor:
     return hand.clamp(pose)
 
 
-def make_cloud(hand: tr.Hand, case: str, surface: LinearBlendSkin, generator: torch.Generator) -> HandCloud:
+def make_cloud(hand: tr.Hand, case: str, surface: tr.LinearBlendSkin, generator: torch.Generator) -> HandCloud:
     front = case == "front"
     return make_hand_cloud(
         hand,
@@ -112,7 +111,7 @@ def seen_tips(hand: tr.Hand, cloud: HandCloud) -> Tensor:
 def measure(hand: tr.Hand, case: str, count: int, seed: int) -> Row:
     """Return what `find_pose` makes, as it comes, of some clouds."""
     generator = torch.Generator().manual_seed(seed)
-    surface, skin = surface_skin(hand), sample_skin(hand)
+    surface, skin = surface_skin(hand), tr.sample_skin(hand)
     errors, seen, confidence, seconds = [], [], [], []
     for _ in tqdm(range(count), desc=case, leave=False, disable=None):
         cloud = make_cloud(hand, case, surface, generator)

@@ -24,7 +24,6 @@ from tqdm import tqdm
 
 import torchreg as tr
 from torchreg.datasets.hand import HandCloud, make_hand_cloud, random_hand_pose, surface_skin
-from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 NOISE, NUM_POINTS = 0.0015, 500
 JOINT_OFF = math.radians(10)
@@ -65,7 +64,7 @@ def start_of(hand: tr.Hand, pose: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def measure(
-    hand: tr.Hand, skin: LinearBlendSkin, view: str, ratio: float, clouds: list[tuple[HandCloud, Tensor]]
+    hand: tr.Hand, skin: tr.LinearBlendSkin, view: str, ratio: float, clouds: list[tuple[HandCloud, Tensor]]
 ) -> Row:
     """Return the row of clouds with their starts."""
     distance = INLIER_SHARE * float((skin.points.amax(0) - skin.points.amin(0)).norm())
@@ -84,7 +83,7 @@ def measure(
 
 
 def make_clouds(
-    hand: tr.Hand, surface: LinearBlendSkin, view: str, ratio: float, num_trials: int, seed: int
+    hand: tr.Hand, surface: tr.LinearBlendSkin, view: str, ratio: float, num_trials: int, seed: int
 ) -> list[tuple[HandCloud, Tensor]]:
     """Return clouds and starts; the same poses at every ratio and in both views."""
     clouds = []
@@ -132,7 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
     options = parser.parse_args(arguments)
     ratios, trials = ((BAR_RATIO,), 2) if options.smoke else (RATIOS, options.trials)
     hand = tr.Hand()
-    surface, skin = surface_skin(hand), sample_skin(hand)
+    surface, skin = surface_skin(hand), tr.sample_skin(hand)
     rows = []
     with tqdm(total=len(VIEWS) * len(ratios), leave=False, disable=None) as progress:
         for view in VIEWS:

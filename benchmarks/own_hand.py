@@ -32,7 +32,6 @@ import torchreg as tr
 from torchreg.alignment.objectives import GaussianPosePrior, SurfaceObjective
 from torchreg.datasets.hand import HandCloud, hand_motion, make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.datasets.sequences import other_hand, range_clouds
-from torchreg.shapes.skin import sample_skin
 from torchreg.shapes.surface import FusedSurface
 from torchreg.solvers.levenberg_marquardt import levenberg_marquardt
 
@@ -105,7 +104,7 @@ def seen_errors(hand: tr.Hand, poses: Sequence[Tensor], trials: Sequence[Trial])
 
 def align_all(hand: tr.Hand, trials: Sequence[Trial], variant: str) -> tuple[Tensor, float]:
     """Return the errors of the seen fingertips after `align` as it comes, and seconds per alignment."""
-    skin = sample_skin(hand)
+    skin = tr.sample_skin(hand)
     tr.align(hand, trials[0].cloud.points, trials[0].starts[variant], model_points=skin)
     poses, begin = [], time.perf_counter()
     for trial in tqdm(trials, desc=f"align {variant}", leave=False, disable=None):

@@ -28,7 +28,6 @@ from torch import Tensor
 
 import torchreg as tr
 from torchreg.geometry.mesh import sample_surface
-from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 FILE = "webxr_hand_right.glb"
 ANGLES = (15, 30)
@@ -87,7 +86,7 @@ def flexed_pose(shape: tr.ArticulatedShape, angle: float) -> Tensor:
     return pose
 
 
-def make_problem(skin: LinearBlendSkin, pose: Tensor, seed: int, count: int = NUM_POINTS) -> Problem:
+def make_problem(skin: tr.LinearBlendSkin, pose: Tensor, seed: int, count: int = NUM_POINTS) -> Problem:
     generator = torch.Generator().manual_seed(seed)
     truth = skin(pose)
     points, _, _ = sample_surface(tr.TriangleMesh(truth, skin.faces), count, generator)
@@ -138,7 +137,7 @@ def coherent_point_drift(problem: Problem) -> Tensor | None:
 def compare(shape: tr.ArticulatedShape, angles: tuple[int, ...], seeds: int, *, rivals: bool, count: int) -> list[Row]:
     """Return the table: ours with and without a search, under two skins, then the rivals."""
     skin, rest = shape.file_skin(), shape.rest_pose()
-    model = sample_skin(shape, 500)
+    model = tr.sample_skin(shape, 500)
     bending = tr.BendingSkin(shape, skin.points, rest)
     configs = {"torchreg": tr.AlignConfig(), "torchreg, search never": tr.AlignConfig(search="never")}
     others: dict[str, Callable[[Problem], Tensor | None]] = {}

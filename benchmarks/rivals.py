@@ -42,7 +42,6 @@ import torchreg as tr
 from torchreg.alignment.annealed_em import CORRESPONDENCES
 from torchreg.alignment.softassign import softassign
 from torchreg.datasets.hand import HandCloud, make_hand_cloud, random_hand_pose, surface_skin
-from torchreg.shapes.skin import BendingSkin, LinearBlendSkin, sample_skin
 from torchreg.solvers.e_step import OUTLIER_CONSTANT, EStep, expectation
 from torchreg.viz.figures import save_picture
 
@@ -89,7 +88,7 @@ class Trial:
     keypoints: Tensor
     seen: Tensor
     start: Tensor
-    skin: LinearBlendSkin
+    skin: tr.LinearBlendSkin
 
 
 @dataclass(frozen=True)
@@ -158,7 +157,7 @@ def conditions(view: str, *, smoke: bool = False) -> list[Condition]:
 
 
 def make_trial(
-    hand: tr.Hand, surface: LinearBlendSkin, skin: LinearBlendSkin, condition: Condition, seed: int
+    hand: tr.Hand, surface: tr.LinearBlendSkin, skin: tr.LinearBlendSkin, condition: Condition, seed: int
 ) -> Trial:
     """Return a trial; the same pose and signs of the start's errors for the same seed."""
     generator = torch.Generator().manual_seed(seed)
@@ -179,7 +178,7 @@ def make_trial(
             hand, start, num_points=NUM_MODEL_POINTS, noise=NOISE, outlier_ratio=0.0, camera=VIEWS["tracked"],
             skin=surface, generator=generator,
         )  # fmt: skip
-        skin = BendingSkin(hand, before.points, start)
+        skin = tr.BendingSkin(hand, before.points, start)
     with torch.no_grad():
         return Trial(cloud, hand.keypoints(pose), seen, start, skin)
 
@@ -361,7 +360,7 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
     trials, views = (1, ["whole"]) if options.smoke else (options.trials, list(VIEWS))
     views = views if options.view == "all" else [options.view]
     hand = tr.Hand()
-    surface, skin = surface_skin(hand), sample_skin(hand, NUM_MODEL_POINTS)
+    surface, skin = surface_skin(hand), tr.sample_skin(hand, NUM_MODEL_POINTS)
     size = float((skin.points.amax(0) - skin.points.amin(0)).norm())
     configs = methods(size)
     cells = [condition for view in views for condition in conditions(view, smoke=options.smoke)]

@@ -31,7 +31,6 @@ from torch import Tensor
 import torchreg as tr
 from torchreg.geometry.mesh import interpolate
 from torchreg.geometry.visibility import sample_visible
-from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 ROBOTS = {
     "UR5 arm": "ur_description/urdf/ur5_robot.urdf",
@@ -113,7 +112,7 @@ def random_poses(shape: tr.ArticulatedShape, size: float, generator: torch.Gener
     return truth, shape.clamp(torch.cat([base, start]))
 
 
-def make_trial(shape: tr.ArticulatedShape, skin: LinearBlendSkin, seed: int, count: int = NUM_POINTS) -> Trial:
+def make_trial(shape: tr.ArticulatedShape, skin: tr.LinearBlendSkin, seed: int, count: int = NUM_POINTS) -> Trial:
     generator = torch.Generator().manual_seed(seed)
     vertices = skin.points
     size = float((vertices.amax(0) - vertices.amin(0)).norm())
@@ -134,7 +133,7 @@ def make_trial(shape: tr.ArticulatedShape, skin: LinearBlendSkin, seed: int, cou
 
 def joint_bounds(
     shape: tr.ArticulatedShape,
-    skin: LinearBlendSkin,
+    skin: tr.LinearBlendSkin,
     pose: Tensor,
     mesh: tr.TriangleMesh,
     points: Tensor,
@@ -143,7 +142,7 @@ def joint_bounds(
 ) -> Tensor:
     """Return the Cramer-Rao bound (J,) of each joint, all others unknown too, from point-to-plane distances."""
     weights = interpolate(skin.weights, skin.faces, face, barycentric)
-    on_surface = LinearBlendSkin(shape, points, weights / weights.sum(-1, keepdim=True), pose)
+    on_surface = tr.LinearBlendSkin(shape, points, weights / weights.sum(-1, keepdim=True), pose)
     normals = mesh.face_normals()[face]
     jacobian = (normals.unsqueeze(-2) @ on_surface.jacobian(pose)[1]).squeeze(-2)
     free = shape.upper > shape.lower
@@ -159,7 +158,7 @@ def measure(
     name: str, shape: tr.ArticulatedShape, trials: int, config: tr.AlignConfig, count: int = NUM_POINTS
 ) -> Outcome:
     """Return errors and times over the trials of one robot."""
-    skin, model = shape.file_skin(), sample_skin(shape, 500)
+    skin, model = shape.file_skin(), tr.sample_skin(shape, 500)
     turning = turning_joints(shape)
     errors, seen, vertices, seconds = [], [], [], 0.0
     for seed in range(trials):

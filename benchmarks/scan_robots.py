@@ -137,7 +137,7 @@ def scan_pair(first: Tensor, second: Tensor, faces: Tensor, up: int, generator: 
     ]
     view = SCANNER.view(meshes[0], REACH)
     source, target = (SCANNER.scan(mesh, view, generator, torch.float64) for mesh in meshes)
-    return Pair(source.scan, target.scan, source.carried(meshes[1].vertices, faces))
+    return Pair(source.scan, target.scan, source.transferred(meshes[1].vertices, faces))
 
 
 def camera_frame(azimuth: float, elevation: float, up: int) -> Tensor:

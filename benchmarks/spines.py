@@ -38,7 +38,6 @@ from torchreg.alignment.skeleton_source import SpineLimbs
 from torchreg.datasets.creatures import OCTOPUS, STARFISH, CreatureForm, CreatureSequence, creature_sequence
 from torchreg.geometry.mesh import concatenate, sample_surface, unit_sphere
 from torchreg.geometry.voxels import VoxelGrid, voxelize
-from torchreg.shapes.skin import sample_skin
 from torchreg.solvers.assignment import assign
 from torchreg.spines.clearance import Inside
 
@@ -190,7 +189,7 @@ def random_pose(hand: tr.Hand, generator: torch.Generator) -> Tensor:
 def hands(count: int, seed: int) -> Tensor:
     """Return per hand the error of the fingertips, metres, and CPU seconds, with skeleton and without, (N, 2, 2)."""
     hand, generator = tr.Hand().requires_grad_(False), torch.Generator().manual_seed(seed)
-    skin, rows = sample_skin(hand), []
+    skin, rows = tr.sample_skin(hand), []
     for _ in tqdm(range(count), desc="hands", leave=False, disable=None):
         pose = random_pose(hand, generator)
         mesh = hand.surface_mesh(pose)

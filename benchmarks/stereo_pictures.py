@@ -25,12 +25,9 @@ from tqdm import tqdm
 
 import torchreg as tr
 from torchreg.capture.disparity import match_disparity
-from torchreg.capture.stereo import StereoConfig
-from torchreg.capture.stereo_frames import StereoFrames
 from torchreg.datasets.hand import hand_motion, surface_skin
 from torchreg.datasets.pictures import PictureStyle, stereo_cameras
 from torchreg.datasets.videos import shape_video
-from torchreg.geometry.camera_rig import StereoPair
 from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.io.images import save_image
 from torchreg.io.npz import save_arrays
@@ -44,7 +41,7 @@ LEAST = 500
 FLIPPING = 0.06
 
 
-def rendered(folder: Path, motion: str, poses: Tensor, hand: tr.Hand, pair: StereoPair) -> None:
+def rendered(folder: Path, motion: str, poses: Tensor, hand: tr.Hand, pair: tr.StereoPair) -> None:
     """Write the pictures and true depths of a motion, unless they are there."""
     done = folder / "done"
     if done.exists():
@@ -68,7 +65,7 @@ def truth_of(folder: Path, number: int) -> tuple[Tensor, Tensor]:
         return torch.from_numpy(file["depth"]), torch.from_numpy(file["mask"])
 
 
-def point_figures(frames: StereoFrames, folder: Path) -> dict[str, float]:
+def point_figures(frames: tr.StereoFrames, folder: Path) -> dict[str, float]:
     """Return what the points of a sequence are worth."""
     counts, errors, inside, on_hand, seconds = [], [], [], [], []
     for number in tqdm(range(len(frames)), desc="points", leave=False, disable=None):
@@ -95,7 +92,7 @@ def point_figures(frames: StereoFrames, folder: Path) -> dict[str, float]:
     }
 
 
-def track_figures(hand: tr.Hand, poses: Tensor, frames: StereoFrames, flips: bool) -> dict[str, float]:
+def track_figures(hand: tr.Hand, poses: Tensor, frames: tr.StereoFrames, flips: bool) -> dict[str, float]:
     """Return how well the tracker follows the hand on these points alone."""
     times = [number / FPS for number in range(len(frames))]
     clouds = tqdm(frames, desc="tracking", leave=False, disable=None)
@@ -118,7 +115,7 @@ def track_figures(hand: tr.Hand, poses: Tensor, frames: StereoFrames, flips: boo
 
 
 def dense_figures(
-    frames: StereoFrames, folder: Path, methods: Sequence[str], count: int
+    frames: tr.StereoFrames, folder: Path, methods: Sequence[str], count: int
 ) -> dict[str, dict[str, float]]:
     """Return error and time of each matcher's dense disparity, everywhere and on the hand, on some of the pairs."""
     rows: dict[str, list[list[float]]] = {method: [] for method in methods}
@@ -173,8 +170,8 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
             folder = (Path(place) if options.smoke else options.folder or _kept()) / name
             poses = hand_motion(hand, motion, count, FPS, distance=DISTANCE)
             rendered(folder, motion, poses, hand, pair)
-            config = StereoConfig(nearest=NEAREST, farthest=FARTHEST, method=matcher, least=LEAST)
-            frames = StereoFrames(folder / "left", folder / "right", pair, config=config, reach=hand.length)
+            config = tr.StereoConfig(nearest=NEAREST, farthest=FARTHEST, method=matcher, least=LEAST)
+            frames = tr.StereoFrames(folder / "left", folder / "right", pair, config=config, reach=hand.length)
             found = {f"{motion}, points by {matcher}": point_figures(frames, folder)}
             if not options.smoke:
                 found[f"{motion}, tracker"] = track_figures(hand, poses, frames, motion == "flip")

@@ -18,25 +18,22 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchreg.capture.silhouettes import visual_hull
+import torchreg as tr
 from torchreg.datasets.creatures import STARFISH, creature_sequence
 from torchreg.datasets.pictures import camera_ring
-from torchreg.geometry.camera import Camera
-from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.visibility import rasterize
-from torchreg.spines.extract_spine import extract_spine
 
 CENTER, RADII = (0.1, -0.05, 0.2), (0.3, 0.2, 0.15)
 
 
-def hits(camera: Camera, rays: Tensor) -> Tensor:
+def hits(camera: tr.Camera, rays: Tensor) -> Tensor:
     """Return which rays (..., 3) from a camera meet the ellipsoid."""
     radii = rays.new_tensor(RADII)
     start, rays = (camera.position.to(rays) - rays.new_tensor(CENTER)) / radii, rays / radii
     return (rays @ start) ** 2 > (rays**2).sum(-1) * ((start**2).sum() - 1)
 
 
-def exact_volume(cameras: CameraRig, samples: int) -> float:
+def exact_volume(cameras: tr.CameraRig, samples: int) -> float:
     """Return the volume of the hull of the exact silhouettes: Monte Carlo, in a box half as large again as the body."""
     generator = torch.Generator().manual_seed(0)
     half = 1.5 * torch.tensor(RADII, dtype=torch.float64)
@@ -57,9 +54,9 @@ def starfish(frames: int, count: int, pixels: int, resolution: int) -> dict[str,
     hulls = []
     for mesh in truth.meshes:
         masks = [rasterize(mesh, camera.view()).face_index >= 0 for camera in cameras]
-        hulls.append(visual_hull(masks, cameras, resolution=resolution).mesh())
+        hulls.append(tr.visual_hull(masks, cameras, resolution=resolution).mesh())
     carved = time.perf_counter() - started
-    spine = extract_spine(hulls, workers=1)
+    spine = tr.extract_spine(hulls, workers=1)
     seconds = time.perf_counter() - started
     # Names are the spine's own: the true tips in the order that fits the first frame.
     order = torch.cdist(spine.tips[0].double(), truth.tips[0].double()).argmin(1)
@@ -89,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, float]:
     cameras = camera_ring(CENTER, 1.2, count, focal=600.0 * scale, width=wide, height=high)
     masks = [hits(camera, camera.directions(camera.pixel_grid())) for camera in cameras]
     started = time.perf_counter()
-    hull = visual_hull(masks, cameras, resolution=resolution)
+    hull = tr.visual_hull(masks, cameras, resolution=resolution)
     carved = time.perf_counter() - started
     mesh = hull.mesh()
     seconds = time.perf_counter() - started

@@ -16,7 +16,7 @@ from torchreg.datasets.creatures import creature_sequence
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.hand import make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.datasets.scan_sequences import jointed_toy
-from torchreg.viz.figures import bending_figure, watch
+from torchreg.viz.figures import bending_picture, watch
 from torchreg.viz.spines import save_spine_movie
 from torchreg.viz.strips import annealing_strip, convergence_figure, registration_strip, spine_strip
 
@@ -75,7 +75,7 @@ def draw_spine(folder, smoke):
 
 def draw_bending(folder, smoke):
     """The skin at a joint, sliding and near rigid; figure 2 of the first paper."""
-    bending_figure(folder / "bending.png", (2.0,) if smoke else (2.0, 10.0))
+    bending_picture(folder / "bending.png", (2.0,) if smoke else (2.0, 10.0))
     return "a = 2 and a = 10"
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 @contextmanager
 def claimed(path: Path, session: str) -> Iterator[int]:
-    """Hold a claim while the block runs; yield which attempt of this session it is, or 0 if another process holds it.
+    """Hold a claim while the block runs; yield the number of the attempt, or 0 if another process holds the claim.
 
     Args:
         path: of the claim's file; its folder must exist.

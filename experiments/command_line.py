@@ -42,7 +42,7 @@ def list_configs() -> None:
 
 @application.command()
 def run(config: Name, overrides: Overrides = None, threads: int = 1) -> None:
-    """Run the one trial that a configuration describes, without its cases and its grid, and print what it found."""
+    """Run the single trial of a configuration, without its cases and its grid, and print its results."""
     plan = replace(load_sweep(config, overrides or []), grid={}, cases=(), seeds=1, picture_seeds=0)
     (trial,) = planned_trials(plan)
     accelerated = find_task(plan.task).accelerated
@@ -59,7 +59,7 @@ def run(config: Name, overrides: Overrides = None, threads: int = 1) -> None:
 
 @application.command()
 def rerun(record: Path, threads: int = 1) -> None:
-    """Run the trial of a record file again, and say whether it finds the same numbers."""
+    """Run the trial of a record file again, and report whether its numbers are the same."""
     with _readable(record):
         old = parse_record(record.read_bytes(), record.name)
     use_threads(threads)
@@ -84,7 +84,7 @@ def sweep(
     sink: Annotated[list[str] | None, typer.Option(help="tensorboard, mlflow or wandb")] = None,
     results: Results = _RESULTS,
 ) -> None:
-    """Run what is missing of a sweep. Give the same command again after a crash, or on several machines at once."""
+    """Run the missing trials of a sweep. Repeat the command after a crash, or run it on several machines at once."""
     plan = load_sweep(config, overrides or [])
     store = Store(results / plan.name)
     options = EngineConfig(jobs, threads, gpus, dict(_pair(text) for text in slurm or []))
@@ -113,7 +113,7 @@ def collect(config: Name, results: Results = _RESULTS) -> None:
 
 @application.command()
 def query(config: Name, sql: str, results: Results = _RESULTS) -> None:
-    """Ask DuckDB about the records of a sweep; the table is called trials."""
+    """Query the records of a sweep by DuckDB; the table is called trials."""
     from experiments.tables import query_records
 
     typer.echo(query_records(Store(results / _sweep_of(config, results).name), sql))
@@ -148,7 +148,7 @@ def report(
 
 
 def main() -> None:
-    """Run a command; errors that a person can put right end with one line and code 1."""
+    """Run a command; errors of experiments end with one line and code 1."""
     try:
         application()
     except ExperimentError as error:
@@ -160,7 +160,7 @@ def main() -> None:
 
 
 def _sweep_of(config: str, results: Path) -> SweepConfig:
-    """Return a sweep as it was last run, else as its configuration says."""
+    """Return the stored configuration of a sweep, else that of its file."""
     name = config if not config.endswith((".yaml", ".yml")) else load_sweep(config).name
     found = Store(results / name).read_sweep()
     return load_sweep(config) if found is None else found

@@ -43,8 +43,8 @@ def load_sweep(name: str, overrides: Sequence[str] = (), root: Path = CONFIGS) -
     if not path.is_file():
         raise ConfigError(f"unknown configuration {name!r}; known ones: {', '.join(known_configs(root))}")
     data = _composed(path.resolve(), [_whole_key(text) for text in overrides])
-    own = path.resolve().relative_to(root.resolve()) if path.resolve().is_relative_to(root.resolve()) else path
-    data.setdefault("name", own.with_suffix("").as_posix() if own != path else path.stem)
+    relative = path.resolve().relative_to(root.resolve()) if path.resolve().is_relative_to(root.resolve()) else path
+    data.setdefault("name", relative.with_suffix("").as_posix() if relative != path else path.stem)
     return from_data(data)
 
 

@@ -1,4 +1,4 @@
-"""A sweep from plan to results: what is finished stays, what is missing runs."""
+"""A sweep from plan to results: finished trials are kept, missing ones are run."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _MAX_IDLE_ROUNDS = 3
 
 @dataclass
 class Summary:
-    """What a run of a driver did.
+    """Counts of a driver's run.
 
     Args:
         planned: number of different trials.
@@ -65,7 +65,7 @@ def run_sweep(
     on_outcome: OnOutcome | None = None,
     sinks: Sequence[Sink] = (),
 ) -> Summary:
-    """Run what is missing of a sweep, and return what was done.
+    """Run the missing trials of a sweep, and return their counts.
 
     Args:
         sweep: which trials there are.
@@ -110,12 +110,12 @@ def run_sweep(
 
 
 def _rounds(engine: Engine, jobs: list[Job]) -> Iterator[Outcome]:
-    """Yield the outcomes of jobs that end with a record; those that another process has, or that are lost, go again."""
+    """Yield the outcomes of jobs that end with a record; lost ones and those of other processes are repeated."""
     idle = 0
     while jobs and idle < _MAX_IDLE_ROUNDS:
-        left, again, lost = {job.id: job for job in jobs}, [], False
+        remaining, again, lost = {job.id: job for job in jobs}, [], False
         for outcome in engine.run(jobs):
-            job = left.pop(outcome.id)
+            job = remaining.pop(outcome.id)
             if outcome.state == "recorded":
                 yield outcome
             else:
@@ -123,7 +123,7 @@ def _rounds(engine: Engine, jobs: list[Job]) -> Iterator[Outcome]:
                 lost |= outcome.state == "lost"
         # A worker that takes a trial counts attempts and gives up itself: only processes that never begin get here.
         idle = idle + 1 if lost and len(again) == len(jobs) and not _begun(again) else 0
-        jobs = [*again, *left.values()]
+        jobs = [*again, *remaining.values()]
         if jobs:
             time.sleep(_BUSY_SECONDS)
 

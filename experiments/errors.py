@@ -1,10 +1,10 @@
-"""What can be wrong with an experiment, told without a traceback by the command line."""
+"""Errors of experiments, which the command line prints without a traceback."""
 
 from __future__ import annotations
 
 
 class ExperimentError(Exception):
-    """Something that the person who runs experiments can put right."""
+    """An error that the person who runs experiments can fix."""
 
 
 class ConfigError(ExperimentError, ValueError):
@@ -16,8 +16,8 @@ class StoreError(ExperimentError, OSError):
 
 
 class CorruptRecordError(ExperimentError, ValueError):
-    """A file of a result that does not hold what it should."""
+    """A damaged file of a result."""
 
 
 class SkippedTrial(Exception):
-    """A trial needs something that is not here, such as an optional package or a folder of data."""
+    """A trial needs a missing resource, such as an optional package or a folder of data."""

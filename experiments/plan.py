@@ -1,4 +1,4 @@
-"""Which trials a sweep has: cases, times the grid, times seeds; each known by what it is."""
+"""The trials of a sweep: cases, times the grid, times seeds; each is identified by its configuration."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def axes_of(sweep: SweepConfig) -> dict[str, list[Any]]:
 
 
 def planned_trials(sweep: SweepConfig) -> list[PlannedTrial]:
-    """Return all trials of a sweep, seed by seed, so that a sweep that is stopped early has a bit of everything.
+    """Return all trials of a sweep, seed by seed, so that a sweep that is stopped early covers all cases.
 
     Raises:
         ConfigError: if a case or axis names an unknown field or holds a wrong value.

@@ -1,4 +1,4 @@
-"""What is kept of a trial: one JSON document that says what was run, what came of it and how to run it again."""
+"""The record of a trial: one JSON document with its configuration, its results and its provenance."""
 
 from __future__ import annotations
 

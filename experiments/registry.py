@@ -1,4 +1,4 @@
-"""What a configuration can name: tasks, each a dataclass of settings and a function that runs one trial.
+"""Tasks by name: each a dataclass of settings and a function that runs one trial.
 
 The functions are loaded when a trial runs; configurations are read without them.
 """
@@ -17,7 +17,7 @@ from experiments.schema import AlignmentTrial, NeuralTrial, ProbeTrial, Registra
 
 @dataclass
 class TrialOutcome:
-    """What a trial found.
+    """The results of a trial.
 
     Args:
         metrics: that depend on the configuration alone, by name.
@@ -34,7 +34,7 @@ class TrialOutcome:
 
 @dataclass(frozen=True)
 class Bench:
-    """Where a trial runs.
+    """The surroundings of a trial.
 
     Args:
         device: "cpu" or "cuda".
@@ -45,7 +45,7 @@ class Bench:
     folder: Path
 
     def file(self, name: str) -> Path:
-        """Return where to write a file to keep."""
+        """Return the path of an artifact to write."""
         self.folder.mkdir(parents=True, exist_ok=True)
         return self.folder / name
 

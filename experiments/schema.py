@@ -42,7 +42,7 @@ class ScheduleConfig:
 
 @dataclass(frozen=True)
 class HandScene:
-    """A cloud of a hand in a random pose, and how far off the start is.
+    """A cloud of a hand in a random pose, and the error of the start.
 
     Args:
         view: "whole": data and model points on all sides. "tracked": data on the side that a camera sees; the model
@@ -70,7 +70,7 @@ class HandScene:
 
 @dataclass(frozen=True)
 class AlignSolver:
-    """How a hand is aligned.
+    """Settings of the alignment of a hand.
 
     Args:
         method: of the library "em", "softassign", "closest" (ICP); of others "cpd" (pycpd, deformable) and "gicp"
@@ -271,7 +271,7 @@ class NeuralTrial:
 
 @dataclass(frozen=True)
 class ProbeTrial:
-    """A trial that costs what it is told to: what the runner itself is measured and tested with.
+    """A trial of given cost, to measure and test the runner.
 
     Args:
         seed: of the numbers.
@@ -294,7 +294,7 @@ class ProbeTrial:
 
 @dataclass(frozen=True)
 class ReportConfig:
-    """What a report shows first.
+    """The focus of a report.
 
     Args:
         metrics: of the table, in this order; all if empty. Names of seconds are "seconds.NAME".
@@ -328,7 +328,7 @@ class ReportConfig:
 
 @dataclass(frozen=True)
 class SweepConfig:
-    """Which trials there are: all cases, times all points of the grid, times all seeds.
+    """The trials of a sweep: all cases, times all points of the grid, times all seeds.
 
     Args:
         name: of the sweep and its folder of results.

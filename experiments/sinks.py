@@ -1,4 +1,4 @@
-"""Where records may also go: a sink is called with every new record. None is needed; files are the truth."""
+"""Further destinations of records: a sink is called with every new record. None is needed; the files suffice."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from experiments.structure import flatten
 
 
 class Sink(Protocol):
-    """Takes records, one by one, as trials end."""
+    """A receiver of records, one by one, as trials end."""
 
     def __call__(self, record: TrialRecord) -> None:
         """Pass a record on."""

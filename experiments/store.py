@@ -1,4 +1,4 @@
-"""A folder of results: one JSON file per trial is the truth, everything else can be made from them again.
+"""A folder of results: one JSON file per trial, from which all other files can be made again.
 
 trials/ID.json          the record of a trial, written whole or not at all
 trials/ID.json.corrupt-N    what was found in its place and was no record; never deleted
@@ -39,7 +39,7 @@ _STALE_SECONDS = 3600
 
 @contextmanager
 def explained(path: Path) -> Iterator[None]:
-    """Turn an OSError while writing to ``path`` into one that says what to do."""
+    """Turn an OSError while writing to ``path`` into a StoreError with a remedy."""
     try:
         yield
     except StoreError:
@@ -82,11 +82,11 @@ class Store:
         return self.root / "claims" / trial
 
     def artifacts(self, trial: str) -> Path:
-        """Return the folder of what a trial keeps."""
+        """Return the folder of a trial's artifacts."""
         return self.root / "artifacts" / trial
 
     def prepare(self) -> None:
-        """Make the folders, and see that they can be written to.
+        """Make the folders, and check that they are writable.
 
         Raises:
             StoreError: if not, saying what to do.
@@ -97,8 +97,8 @@ class Store:
             probe = self.trials / f".probe-{secrets.token_hex(8)}"
             write_atomic(probe, b"probe")
             probe.unlink()
-            for left in self.trials.glob(".*.part"):
-                self._remove_stale(left)
+            for partial in self.trials.glob(".*.part"):
+                self._remove_stale(partial)
 
     def _remove_stale(self, path: Path) -> None:
         try:
@@ -121,7 +121,7 @@ class Store:
         return parse_record(content, path.name, trial)
 
     def write(self, record: TrialRecord) -> None:
-        """Put a record in its place: whole or not at all, and on the disk when this returns.
+        """Write a record, whole or not at all; it is on the disk when this returns.
 
         Raises:
             StoreError: if it cannot be written.
@@ -130,19 +130,19 @@ class Store:
             write_atomic(self.record_path(record.id), record.to_json())
 
     def set_aside(self, trial: str) -> Path:
-        """Give a file that is no record another name, and return it: nothing is deleted.
+        """Rename a corrupt record, and return the new name: nothing is deleted.
 
         Raises:
             StoreError: if it cannot be renamed.
         """
         path = self.record_path(trial)
-        aside = next(one for number in itertools.count(1) if not (one := Path(f"{path}.corrupt-{number}")).exists())
+        aside = next(name for number in itertools.count(1) if not (name := Path(f"{path}.corrupt-{number}")).exists())
         with explained(path):
             path.rename(aside)
         return aside
 
     def records(self) -> tuple[list[TrialRecord], list[CorruptRecordError]]:
-        """Return all records in the order of their ids, and what was no record."""
+        """Return all records in the order of their ids, and the corrupt files."""
         found, bad = [], []
         for path in sorted(self.trials.glob("*.json")):
             try:
@@ -154,11 +154,11 @@ class Store:
         return found, bad
 
     def is_claimed(self, trial: str) -> bool:
-        """Return whether some process runs a trial now."""
+        """Return whether a process runs a trial now."""
         return is_claimed(self.claim_path(trial))
 
     def write_sweep(self, sweep: SweepConfig) -> None:
-        """Keep what was last asked.
+        """Store the configuration of the sweep.
 
         Raises:
             StoreError: if it cannot be written.
@@ -168,7 +168,7 @@ class Store:
             write_atomic(self.root / "sweep.json", content)
 
     def read_sweep(self) -> SweepConfig | None:
-        """Return what was last asked, or None if nothing was.
+        """Return the stored configuration of the sweep, or None if there is none.
 
         Raises:
             StoreError: if the file is damaged.
@@ -185,6 +185,6 @@ class Store:
             ) from error
 
 
-def same_sweep(one: SweepConfig, other: SweepConfig) -> bool:
-    """Return whether two sweeps ask for the same."""
-    return canonical(plain(one)) == canonical(plain(other))
+def same_sweep(first: SweepConfig, second: SweepConfig) -> bool:
+    """Return whether two sweeps have the same configuration."""
+    return canonical(plain(first)) == canonical(plain(second))

@@ -1,4 +1,4 @@
-"""Plain data into dataclasses and back, strictly: an unknown key or a wrong type is told by its full name."""
+"""Plain data into dataclasses and back, strictly: errors give the full name of an unknown key or a wrong type."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def convert(kind: Any, value: Any, path: str) -> Any:
     if origin in (Union, types.UnionType):
         if value is None and type(None) in arguments:
             return None
-        return convert(next(one for one in arguments if one is not type(None)), value, path)
+        return convert(next(argument for argument in arguments if argument is not type(None)), value, path)
     if origin is tuple:
         if isinstance(value, str) or not isinstance(value, Sequence):
             raise ConfigError(f"{path} must be a list, got {_told(value)}")
@@ -124,7 +124,7 @@ def flatten(data: Mapping[str, Any], path: str = "") -> dict[str, Any]:
 
 
 def updated(config: T, changes: Mapping[str, Any], path: str = "trial") -> T:
-    """Return a dataclass with fields changed that dotted keys name, checked like a file.
+    """Return a dataclass with the fields of dotted keys changed, checked like a file.
 
     Raises:
         ConfigError: for an unknown key or a wrong type.

@@ -1,4 +1,4 @@
-"""Records as tables: one Parquet file for all of them, asked by DuckDB."""
+"""Records as tables: one Parquet file for all of them, queried by DuckDB."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def as_table(records: Sequence[TrialRecord]) -> Any:
 
 
 def write_parquet(store: Store) -> tuple[int, list[CorruptRecordError]]:
-    """Write the table of all records of a folder; return how many there are, and which files were none.
+    """Write the table of all records of a folder; return their number, and the corrupt files.
 
     Raises:
         StoreError: if the file cannot be written.
@@ -44,7 +44,7 @@ def write_parquet(store: Store) -> tuple[int, list[CorruptRecordError]]:
 
 
 def query_records(store: Store, sql: str) -> str:
-    """Return what DuckDB answers about the table ``trials``, which is collected first if records are newer.
+    """Return DuckDB's answer about the table ``trials``, which is collected first if records are newer.
 
     Raises:
         ConfigError: if DuckDB does not understand the question.
@@ -77,11 +77,11 @@ def _row(record: TrialRecord) -> dict[str, Any]:
 
 
 def _column(values: list[Any]) -> Any:
-    """Return an Arrow column; where values of one name are of several kinds, of their texts."""
+    """Return an Arrow column of values, or of their texts if they have several types."""
     known = [value for value in values if value is not None]
     if known and all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in known):
-        whole = all(isinstance(value, int) for value in known)
-        return pa.array(values, pa.int64() if whole else pa.float64())
+        integers = all(isinstance(value, int) for value in known)
+        return pa.array(values, pa.int64() if integers else pa.float64())
     try:
         return pa.array(values)
     except (pa.ArrowInvalid, pa.ArrowTypeError):

@@ -59,7 +59,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What an engine tells of a job.
+    """The end of a job, as an engine reports it.
 
     Args:
         id: of the trial.
@@ -77,7 +77,7 @@ class Outcome:
 
 
 def use_threads(count: int) -> None:
-    """Let this process compute on ``count`` threads, so that jobs side by side do not fight for cores."""
+    """Limit this process to ``count`` threads, so that parallel jobs do not compete for cores."""
     for name in THREAD_VARIABLES:
         os.environ[name] = str(count)
     if "torch" in sys.modules:
@@ -87,7 +87,7 @@ def use_threads(count: int) -> None:
 
 
 def finished(record: TrialRecord | None, session: str, retry: bool) -> bool:
-    """Return whether a trial need not be run."""
+    """Return whether a trial has a record."""
     if record is None:
         return False
     return record.status == "done" or not retry or record.session == session
@@ -123,7 +123,7 @@ def measure(task: Task, config: dict[str, Any], bench: Bench) -> TrialOutcome:
 
 
 def _blank(job: Job, attempt: int) -> TrialRecord:
-    """Return a record with what is known before the trial runs."""
+    """Return the record of a trial before it runs."""
     path = Store(Path(job.store)).record_path(job.id)
     return TrialRecord(
         job.id, job.task, torchreg.__version__, job.config, int(job.config.get("seed", 0)), "done",
@@ -164,7 +164,7 @@ def _run(job: Job, store: Store, attempt: int) -> TrialRecord:
             note = f"{type(error).__name__}: {error}"
             record = replace(record, status="failed", note=note, traceback=traceback.format_exc())
         wall = time.perf_counter() - begin
-    texts = tuple(dict.fromkeys(f"{one.category.__name__}: {one.message}" for one in told))
+    texts = tuple(dict.fromkeys(f"{warning.category.__name__}: {warning.message}" for warning in told))
     return replace(
         record, warnings=texts[:_MAX_WARNINGS], wall_seconds=wall, peak_memory_mb=peak[0], peak_gpu_memory_mb=peak[1]
     )

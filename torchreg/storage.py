@@ -1,6 +1,6 @@
-"""Whole results on disk: every field of a result goes to safetensors + JSON and comes back as it was.
+"""Results on disk: every field of a result is stored in safetensors and JSON files and restored exactly.
 
-A file may name only public results, and what the types of their fields name: nothing else is ever built from it.
+A file may name only public results and the types of their fields: no other objects are ever built from it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from torchreg.tracking.results import TrackResult
 
 
 def save_result(result: Result, path: str | os.PathLike[str]) -> None:
-    """Write a result to ``path`` and its JSON file; what `Result.save` calls, see there."""
+    """Write a result to ``path`` and its JSON file; see `Result.save`."""
     name = type(result).__name__
     if _result_kind(name) is not type(result):
         raise InputTypeError(f"result must be of a public kind of torchreg, got {name}")
@@ -42,14 +42,14 @@ def save_result(result: Result, path: str | os.PathLike[str]) -> None:
 
 
 def load(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Result:
-    """Return the result that its ``save`` wrote, every field as it was, on the CPU.
+    """Return the result that `Result.save` wrote, with all its fields, on the CPU.
 
     Args:
         path: the .safetensors file; its JSON file must lie beside it.
         limits: on the size of each of the two.
 
     Returns:
-        an `AlignResult`, or whichever kind of result was saved.
+        The result, of the kind that was saved, such as an `AlignResult`.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -75,65 +75,65 @@ def load_pose(path: str | os.PathLike[str], shape: ArticulatedShape, *, limits: 
         path: a saved `AlignResult`, or `TrackResult` for its last pose (.safetensors or its .json); or .json with a
             list of num_dofs numbers, or with values by name of degree of freedom, the others at rest; or .npz with an
             array ``pose``, or a single array.
-        shape: whose pose it is.
+        shape: of the pose.
         limits: on the size of the file.
 
     Returns:
-        the pose, metres and radians, in the shape's dtype and on its device.
+        The pose, metres and radians, in the shape's dtype and on its device.
 
     Raises:
         FileNotFoundError: if there is no such file.
         FormatError: if the file is damaged, or holds no pose.
         InputError: if the pose is not finite or does not fit the shape; names the file.
     """
-    place = local_path(path)
+    file = local_path(path)
     readers = {".safetensors": _pose_of_result, ".json": _pose_of_json, ".npz": _pose_of_npz}
-    if place.suffix.lower() not in readers:
-        place.stat()  # a missing file is the first thing to say
-        raise FormatError(f"{place} has the ending {place.suffix!r}; a pose is read from {', '.join(readers)}")
-    values = readers[place.suffix.lower()](place, shape, limits)
-    pose = as_float_tensor(values, f"the pose in {place}", like=shape.rest)
-    check_shape(pose, f"the pose in {place}", (shape.num_dofs,))
-    check_finite(pose, f"the pose in {place}")
+    if file.suffix.lower() not in readers:
+        file.stat()  # a missing file is reported first
+        raise FormatError(f"{file} has the ending {file.suffix!r}; a pose is read from {', '.join(readers)}")
+    values = readers[file.suffix.lower()](file, shape, limits)
+    pose = as_float_tensor(values, f"the pose in {file}", like=shape.rest)
+    check_shape(pose, f"the pose in {file}", (shape.num_dofs,))
+    check_finite(pose, f"the pose in {file}")
     return pose
 
 
-def _pose_of_result(place: Path, shape: ArticulatedShape, limits: FileLimits) -> Tensor:
-    result = load(place, limits=limits)
+def _pose_of_result(file: Path, shape: ArticulatedShape, limits: FileLimits) -> Tensor:
+    result = load(file, limits=limits)
     if isinstance(result, TrackResult):
         known = result.poses[result.poses.isfinite().all(-1)]
         if not len(known):
-            raise FormatError(f"{place} holds a TrackResult in which the shape was never found")
+            raise FormatError(f"{file} holds a TrackResult in which the shape was never found")
         return known[-1]
     if not isinstance(result, AlignResult):
-        raise FormatError(f"{place} holds a {type(result).__name__}; a pose is read from an AlignResult or TrackResult")
+        raise FormatError(f"{file} holds a {type(result).__name__}; a pose is read from an AlignResult or TrackResult")
     return result.pose
 
 
-def _pose_of_json(place: Path, shape: ArticulatedShape, limits: FileLimits) -> Any:
+def _pose_of_json(file: Path, shape: ArticulatedShape, limits: FileLimits) -> Any:
     try:
-        content = json.loads(read_bytes(place, limits).decode("utf-8"))
+        content = json.loads(read_bytes(file, limits).decode("utf-8"))
     except (ValueError, RecursionError) as error:
-        raise FormatError(f"{place}: cannot be read as JSON ({error})") from error
+        raise FormatError(f"{file}: cannot be read as JSON ({error})") from error
     if isinstance(content, dict) and content.get("format") == FORMAT:
-        return _pose_of_result(place.with_suffix(".safetensors"), shape, limits)
+        return _pose_of_result(file.with_suffix(".safetensors"), shape, limits)
     entries = content.values() if isinstance(content, dict) else content
     if not isinstance(content, (dict, list)) or not all(type(entry) in (int, float) for entry in entries):
-        raise FormatError(f"{place}: a pose is a list of {shape.num_dofs} numbers, or numbers by name")
+        raise FormatError(f"{file}: a pose is a list of {shape.num_dofs} numbers, or numbers by name")
     if isinstance(content, list):
         return torch.tensor(content, dtype=torch.float64)
     names = shape.dof_names
     unknown = [name for name in content if name not in names]
     if unknown:
-        raise InputError(f"{place}: the shape has no degree of freedom {unknown[0]!r}; known: {', '.join(names)}")
+        raise InputError(f"{file}: the shape has no degree of freedom {unknown[0]!r}; known: {', '.join(names)}")
     pose = shape.rest_pose().double()
     for name, value in content.items():
         pose[names.index(name)] = value
     return pose
 
 
-def _pose_of_npz(place: Path, shape: ArticulatedShape, limits: FileLimits) -> Tensor:
-    content = read_bytes(place, limits)
+def _pose_of_npz(file: Path, shape: ArticulatedShape, limits: FileLimits) -> Tensor:
+    content = read_bytes(file, limits)
     try:
         open_zip(content, limits)
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
@@ -142,14 +142,14 @@ def _pose_of_npz(place: Path, shape: ArticulatedShape, limits: FileLimits) -> Te
                 raise FormatError(f"holds the arrays {', '.join(archive.files)}; call one of them pose")
             values = np.asarray(archive[name], dtype=np.float64)
     except FormatError as error:
-        raise FormatError(f"{place}: {error}") from error
+        raise FormatError(f"{file}: {error}") from error
     except PARSER_ERRORS as error:
-        raise FormatError(f"{place}: cannot be read as NPZ ({error})") from error
+        raise FormatError(f"{file}: cannot be read as NPZ ({error})") from error
     return torch.from_numpy(values)
 
 
 class _WrongContentError(Exception):
-    """The stored fields do not make up the record they claim to be."""
+    """The stored fields are not those of the record that they claim to be."""
 
 
 def _result_kind(name: Any) -> type[Result] | None:
@@ -202,7 +202,7 @@ def _encode_fields(record: Any, prefix: str, known: Mapping[str, type], tensors:
 
 
 def _encode(value: Any, name: str, known: Mapping[str, type], tensors: dict[str, Tensor]) -> Any:
-    """Return ``value`` as plain data; its tensors are put under names that start with ``name``."""
+    """Return ``value`` as plain data; its tensors are stored under names that start with ``name``."""
     if isinstance(value, Tensor):
         tensors[name] = value
         return {"tensor": name}
@@ -226,13 +226,13 @@ def _encode_table(
     """Return records of one kind column by column: tensors of one shape are stacked, so a history is a few tensors."""
     columns: dict[str, Any] = {}
     for item in fields(rows[0]):
-        column, place = [_stored(item, getattr(row, item.name)) for row in rows], f"{name}.{item.name}"
+        column, key = [_stored(item, getattr(row, item.name)) for row in rows], f"{name}.{item.name}"
         if _can_stack(column):
-            tensors[place] = torch.stack([entry.detach() for entry in column])
-            columns[item.name] = {"stack": place}
+            tensors[key] = torch.stack([entry.detach() for entry in column])
+            columns[item.name] = {"stack": key}
         else:
             columns[item.name] = [
-                _encode(entry, f"{place}.{index}", known, tensors) for index, entry in enumerate(column)
+                _encode(entry, f"{key}.{index}", known, tensors) for index, entry in enumerate(column)
             ]
     return {"table": type(rows[0]).__name__, "rows": len(rows), "columns": columns}
 
@@ -243,11 +243,11 @@ def _can_stack(column: Sequence[Any]) -> bool:
 
 
 class _Decoder:
-    """Makes records of plain data again.
+    """Builds records of plain data.
 
     Args:
         tensors: of the file, by name.
-        known: what may be made, by name.
+        known: records and enumerations that may be built, by name.
     """
 
     def __init__(self, tensors: Mapping[str, Tensor], known: Mapping[str, type]) -> None:
@@ -313,7 +313,7 @@ def _member(kind: type, value: Any, where: str) -> Enum:
 
 
 def _make(kind: type, values: dict[str, Any], where: str) -> Any:
-    """Return the record of decoded values, once names and types are seen to be those it declares."""
+    """Return the record of decoded values, whose names and types must be those it declares."""
     if not is_dataclass(kind):
         raise _WrongContentError(f"{where} is of the kind {kind.__name__}, which is no record")
     declared = {item.name: item for item in fields(kind)}

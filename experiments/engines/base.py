@@ -1,4 +1,4 @@
-"""The interface of all engines, and what they share."""
+"""The interface of all engines, and their common functions."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class Engine(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of all processes; jobs that run are given up."""
+        """Release all processes; running jobs are abandoned."""
         ...
 
 
 @dataclass(frozen=True)
 class EngineConfig:
-    """How an engine runs.
+    """Settings of an engine.
 
     Args:
         jobs: trials at a time.
@@ -58,7 +58,7 @@ def visible_gpus() -> list[str]:
     """Return the GPUs of this machine that may be used, without loading torch."""
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
     if named is not None:
-        return [one.strip() for one in named.split(",") if one.strip() not in ("", "-1")]
+        return [name.strip() for name in named.split(",") if name.strip() not in ("", "-1")]
     tool = shutil.which("nvidia-smi")
     if tool is None:
         return []
@@ -71,7 +71,7 @@ def visible_gpus() -> list[str]:
 
 
 def share_code() -> None:
-    """Let processes that start from now on find this package as this process does."""
+    """Give processes that start later the import path of this package."""
     root = str(Path(__file__).resolve().parents[2])
     paths = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     if root not in paths:

@@ -1,4 +1,4 @@
-"""Engines by name; each is imported when it is asked for, as its package may not be installed."""
+"""Engines by name, each imported on request, as its package may not be installed."""
 
 from __future__ import annotations
 

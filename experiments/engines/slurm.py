@@ -21,7 +21,7 @@ _GRACE_ELSEWHERE = 5.0
 
 
 def work(jobs: Sequence[Job]) -> list[str]:
-    """Run all jobs that no one else runs or has run, and return what could not be written."""
+    """Run all jobs that no other process runs or has finished, and return the errors of writing."""
     use_threads(jobs[0].threads)
     told = []
     for job in jobs:
@@ -88,21 +88,21 @@ class SlurmEngine:
         return executor
 
     def _watch(self, jobs: Sequence[Job], running: list[Any]) -> Iterator[Outcome]:
-        """Yield outcomes as records appear, and what is left when all jobs have ended."""
-        left, grace = {job.id: job for job in jobs}, _GRACE_SECONDS.get(self.cluster, _GRACE_ELSEWHERE)
+        """Yield outcomes as records appear, and those of jobs without a record when all have ended."""
+        remaining, grace = {job.id: job for job in jobs}, _GRACE_SECONDS.get(self.cluster, _GRACE_ELSEWHERE)
         ended: float | None = None
-        while left:
-            for outcome in [one for one in map(_recorded, left.values()) if one is not None]:
-                del left[outcome.id]
+        while remaining:
+            for outcome in [outcome for outcome in map(_recorded, remaining.values()) if outcome is not None]:
+                del remaining[outcome.id]
                 yield outcome
             if ended is None and all(job.done() for job in running):
                 ended = time.monotonic()
                 self._raise_unwritten(running)
             if ended is not None and time.monotonic() - ended > grace:
                 break
-            if left:
+            if remaining:
                 time.sleep(_POLL_SECONDS)
-        for job in left.values():
+        for job in remaining.values():
             busy = Store(Path(job.store)).is_claimed(job.id)
             yield Outcome(job.id, "busy" if busy else "lost")
 

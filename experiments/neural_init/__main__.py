@@ -1,4 +1,4 @@
-"""``python -m experiments.neural_init RESULTS``: what the variants of a sweep reached, and after how many steps."""
+"""``python -m experiments.neural_init RESULTS``: final errors of a sweep's variants, and their numbers of steps."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Clouds of hands before a camera, their true poses, and the poses that torchreg finds in them without the truth."""
+"""Clouds of hands before a camera, their true poses, and the poses that torchreg finds without them."""
 
 from __future__ import annotations
 
@@ -52,12 +52,12 @@ class Clouds:
         return self.points.median(dim=1).values
 
     def rows(self, rows: Tensor | slice) -> Clouds:
-        """Return some of the clouds."""
+        """Return the clouds of given rows."""
         truth = None if self.truth is None else self.truth[rows]
         return Clouds(self.points[rows], self.found[rows], self.confidence[rows], truth)
 
     def without_truth(self) -> Clouds:
-        """Return the clouds as one has them who measured them."""
+        """Return the clouds without their true poses."""
         return replace(self, truth=None)
 
 
@@ -132,8 +132,8 @@ def find_poses(hand: tr.Hand, points: Tensor) -> tuple[Tensor, Tensor]:
     layer = tr.PoseInitializer(hand, FROM_A_GUESS)
     starts = guessed_poses(hand, points)
     rows = torch.arange(len(points)).split(_BATCH)
-    found = [layer(points[some], start=starts[some]) for some in rows]
-    return torch.cat([one.pose for one in found]), torch.cat([one.confidence for one in found])
+    found = [layer(points[part], start=starts[part]) for part in rows]
+    return torch.cat([guess.pose for guess in found]), torch.cat([guess.confidence for guess in found])
 
 
 def guessed_poses(hand: tr.Hand, points: Tensor) -> Tensor:

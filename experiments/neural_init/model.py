@@ -110,11 +110,11 @@ class PoseRefiner(nn.Module):
         """Return poses (B, num_dofs)."""
         (hand,), first = self._hand, clouds.found
         turn = hand.part_transforms(first)[:, 0, :3, :3]
-        own = (clouds.points - first[:, None, :3]) @ turn / UNIT
+        local = (clouds.points - first[:, None, :3]) @ turn / UNIT
         with torch.no_grad():
             apart = (hand.part_distances(clouds.points, first) / NEAR).clamp(-1, 2)
         further = torch.cat([first[:, 6:], clouds.confidence.unsqueeze(-1)], dim=-1)
-        step = self.unit * self.net(torch.cat([own, apart], dim=-1), further)
+        step = self.unit * self.net(torch.cat([local, apart], dim=-1), further)
         # The network thinks in the palm's frame, `retract` in the world's.
         base = (step[:, :6].unflatten(-1, (2, 3)) @ turn.mT).flatten(1)
         return hand.retract(first, torch.cat([base, step[:, 6:]], dim=-1))

@@ -1,4 +1,4 @@
-"""Final errors of the variants beside the baseline's, and how soon they reach what it ends with."""
+"""Final errors of the variants beside the baseline's, and the steps after which they reach its final error."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SHARES = (0.1, 0.25, 0.5, 1.0)
 
 
 def steps_to(record: TrialRecord, error: float) -> float | None:
-    """Return the steps after which a trial's error is that low, between points of the curve by interpolation.
+    """Return the steps after which a trial reaches an error, interpolated between points of its curve.
 
     None if it never is.
     """
@@ -31,11 +31,12 @@ def steps_to(record: TrialRecord, error: float) -> float | None:
 
 
 def error_at(records: Sequence[TrialRecord], steps: float) -> float:
-    """Return the mean error of trials after so many steps, at the nearest point of their curves."""
+    """Return the mean error of trials after a number of steps, at the nearest points of their curves."""
     rows = [
-        min(range(len(one.curves["steps"])), key=lambda row: abs(one.curves["steps"][row] - steps)) for one in records
+        min(range(len(record.curves["steps"])), key=lambda row: abs(record.curves["steps"][row] - steps))
+        for record in records
     ]
-    return statistics.fmean(one.curves[METRIC][row] for one, row in zip(records, rows, strict=True))
+    return statistics.fmean(record.curves[METRIC][row] for record, row in zip(records, rows, strict=True))
 
 
 def table(records: Sequence[TrialRecord], baseline: Sequence[TrialRecord]) -> list[str]:
@@ -47,7 +48,7 @@ def table(records: Sequence[TrialRecord], baseline: Sequence[TrialRecord]) -> li
     heads = "  ".join(f"{f'of {share * total:g}':>18}" for share in SHARES)
     lines = [f"{'variant':12} {'tips, mm':>22} {'ratio':>6}  steps to the baseline's error after: {heads}"]
     for variant, members in groups.items():
-        final = [float(one.metrics[METRIC]) for one in members]
+        final = [float(record.metrics[METRIC]) for record in members]
         ratio = statistics.fmean(final) / error_at(baseline, total)
         shown = [_share(members, error_at(baseline, share * total), share * total) for share in SHARES]
         spread = f"{statistics.fmean(final):.2f} ({min(final):.2f} to {max(final):.2f})"
@@ -57,8 +58,8 @@ def table(records: Sequence[TrialRecord], baseline: Sequence[TrialRecord]) -> li
 
 def _share(members: Sequence[TrialRecord], error: float, steps: float) -> str:
     """Return the share of steps, mean and spread over seeds, that trials need for an error."""
-    found = [steps_to(one, error) for one in members]
-    known = [one / steps for one in found if one is not None]
+    found = [steps_to(record, error) for record in members]
+    known = [needed / steps for needed in found if needed is not None]
     if len(known) < len(found):
         return f"not by {len(found) - len(known)} of {len(found)}"
     return f"{statistics.fmean(known):.2f} ({min(known):.2f} to {max(known):.2f})"

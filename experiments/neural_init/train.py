@@ -1,4 +1,4 @@
-"""Five ways to train the same network on the same clouds, and how far off its poses are along the way."""
+"""Five ways to train the same network on the same clouds, and the errors of its poses over the steps."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _WARM_UP, _BATCH = 50, 128
 
 @dataclass(frozen=True)
 class Setup:
-    """What a variant trains with.
+    """The data and settings of a variant.
 
     Args:
         hand: whose poses.
@@ -54,14 +54,14 @@ def scratch(setup: Setup) -> tuple[nn.Module, Loss]:
 
 
 def head(setup: Setup) -> tuple[nn.Module, Loss]:
-    """(b) The truth is known; the last layer starts from what poses torchreg found."""
+    """(b) The truth is known; the last layer starts from the poses that torchreg found."""
     model = PoseRegressor(setup.hand, setup.width, setup.normalized)
     model.start_from_(prior_of(setup))
     return model, to_truth(setup)
 
 
 def labels(setup: Setup) -> tuple[nn.Module, Loss]:
-    """(c) No truth: what torchreg found is the label, and counts as much as it is sure."""
+    """(c) No truth: the poses that torchreg found are the labels, weighted by their confidence."""
     mean = setup.clouds.confidence.mean()
 
     def loss(poses: Tensor, clouds: Clouds, share: float) -> Tensor:
@@ -71,7 +71,7 @@ def labels(setup: Setup) -> tuple[nn.Module, Loss]:
 
 
 def refiner(setup: Setup) -> tuple[nn.Module, Loss]:
-    """(d) The truth is known; the network moves on from what torchreg found."""
+    """(d) The truth is known; the network refines the poses that torchreg found."""
     return PoseRefiner(setup.hand, setup.width, setup.normalized), to_truth(setup)
 
 
@@ -84,8 +84,8 @@ def em(setup: Setup) -> tuple[nn.Module, Loss]:
     def loss(poses: Tensor, clouds: Clouds, share: float) -> Tensor:
         wide, narrow = EM_SIGMA
         sigma = wide * (narrow / wide) ** min(1.0, share / EM_ANNEALED)
-        some = torch.randint(clouds.points.shape[1], (EM_POINTS,), generator=setup.generator)
-        unexplained = tr.EMLoss(sigma, reduction="mean")(skin(poses), clouds.points[:, some])
+        sample = torch.randint(clouds.points.shape[1], (EM_POINTS,), generator=setup.generator)
+        unexplained = tr.EMLoss(sigma, reduction="mean")(skin(poses), clouds.points[:, sample])
         return (unexplained - EM_PRIOR * prior.log_prob(centered(poses, clouds))).mean()
 
     return model, loss
@@ -109,7 +109,7 @@ def to_truth(setup: Setup) -> Loss:
 
 
 def apart(hand: tr.Hand, poses: Tensor, others: Tensor) -> Tensor:
-    """Return how far keypoints (B, K) are apart, metres."""
+    """Return distances (B, K) between keypoints, metres."""
     return (hand.keypoints(poses) - hand.keypoints(others)).norm(dim=-1)
 
 
@@ -119,19 +119,19 @@ def centered(poses: Tensor, clouds: Clouds) -> Tensor:
 
 
 def prior_of(setup: Setup) -> tr.PosePrior:
-    """Return what poses are likely by those that torchreg found and is sure of; by all, if it is sure of too few."""
+    """Return the prior of the poses that torchreg found with confidence; of all, if those are too few."""
     found = centered(setup.clouds.found, setup.clouds)
     sure = setup.clouds.confidence >= TRUSTED
     return tr.PosePrior.fit(setup.hand, found[sure] if int(sure.sum()) > setup.hand.num_dofs else found)
 
 
 def errors_mm(hand: tr.Hand, predict: Callable[[Clouds], Tensor], clouds: Clouds) -> Tensor:
-    """Return how far keypoints (B, K) of predicted poses are from the true ones."""
+    """Return distances (B, K), mm, of the keypoints of predicted poses from the true ones."""
     if clouds.truth is None:
         raise ValueError("clouds that are measured with must have true poses")
     rows = torch.arange(len(clouds)).split(_BATCH)
     with torch.no_grad():
-        poses = torch.cat([predict(clouds.rows(some)) for some in rows])
+        poses = torch.cat([predict(clouds.rows(part)) for part in rows])
         return 1e3 * apart(hand, poses, clouds.truth)
 
 
@@ -151,8 +151,8 @@ def train(hand: tr.Hand, clouds: Clouds, held_out: Clouds, config: NeuralTrial) 
     warm_up = torch.optim.lr_scheduler.LinearLR(optimizer, 1 / _WARM_UP, 1.0, _WARM_UP)
     yield 0, errors_mm(hand, model, held_out)
     for step, rows in enumerate(_batches(len(known), config, generator), start=1):
-        some = known.rows(rows)
-        value = loss(model(some), some, step / config.steps)
+        batch = known.rows(rows)
+        value = loss(model(batch), batch, step / config.steps)
         optimizer.zero_grad()
         value.backward()
         optimizer.step()
@@ -164,8 +164,8 @@ def train(hand: tr.Hand, clouds: Clouds, held_out: Clouds, config: NeuralTrial) 
 
 def _batches(count: int, config: NeuralTrial, generator: torch.Generator) -> Iterator[Tensor]:
     """Yield rows for each step; every cloud once before any comes again."""
-    left = config.steps
-    while left > 0:
-        for rows in torch.randperm(count, generator=generator).split(config.batch)[:left]:
-            left -= 1
+    remaining = config.steps
+    while remaining > 0:
+        for rows in torch.randperm(count, generator=generator).split(config.batch)[:remaining]:
+            remaining -= 1
             yield rows

@@ -1,4 +1,4 @@
-"""A report as a browser shows it: a picture of the page, and what the browser complains about."""
+"""A report in a browser: a picture of the page, and the browser's messages."""
 
 from __future__ import annotations
 
@@ -48,6 +48,6 @@ def photograph(page: Path, picture: Path) -> list[str]:
         time.sleep(_SETTLE_SECONDS)
         with explained(picture):
             write_atomic(picture, chrome.get_screenshot_as_png())
-        return [f"{one['level']}: {one['message']}" for one in chrome.get_log("browser")]
+        return [f"{entry['level']}: {entry['message']}" for entry in chrome.get_log("browser")]
     finally:
         chrome.quit()

@@ -113,12 +113,12 @@ def all_axes(sweep: SweepConfig) -> list[str]:
 
 
 def label(value: Any) -> str:
-    """Return a value of an axis as a text: numbers as short as they go."""
+    """Return a value of an axis as a text, numbers as short as possible."""
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def number(value: float, digits: int = 4) -> str:
-    """Return a number with as many digits, but whole thousands in full."""
+    """Return a number with a number of digits, whole thousands in full."""
     return f"{value:.0f}" if abs(value) >= 10 ** (digits - 1) else f"{value:.{digits}g}"
 
 

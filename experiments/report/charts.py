@@ -40,9 +40,9 @@ def heat_maps(sweep: SweepConfig, cells: Sequence[Cell], metric: str) -> list[st
     found = []
     for rest in itertools.islice(itertools.product(*(axes[name] for name in others)), _MAX_MAPS):
         chosen = dict(zip(others, rest, strict=True))
-        here = [cell for cell in cells if all(cell.axes[name] == value for name, value in chosen.items())]
+        shown = [cell for cell in cells if all(cell.axes[name] == value for name, value in chosen.items())]
         title = ", ".join(f"{short(name)} {label(value)}" for name, value in chosen.items())
-        found.append(_heat_map(sweep, here, metric, (axes[across], axes[down]), title))
+        found.append(_heat_map(sweep, shown, metric, (axes[across], axes[down]), title))
     return found
 
 
@@ -99,8 +99,8 @@ def dots(sweep: SweepConfig, cells: Sequence[Cell], metric: str) -> str | None:
 
 
 def _whiskers(spreads: Sequence[Spread]) -> dict[str, Any]:
-    above = [one.high - one.median for one in spreads]
-    below = [one.median - one.low for one in spreads]
+    above = [spread.high - spread.median for spread in spreads]
+    below = [spread.median - spread.low for spread in spreads]
     return {"type": "data", "symmetric": False, "array": above, "arrayminus": below, "thickness": 1, "width": 3}
 
 
@@ -153,20 +153,20 @@ def _add_band(figure: Any, places: Sequence[float], columns: Sequence[Sequence[f
 
 
 def _places(members: Sequence[TrialRecord], steps: str, count: int) -> list[float]:
-    """Return where the values of curves lie: as the longest trial tells, otherwise at 1, 2, ..."""
+    """Return the steps of the values of curves: those of the longest trial, or else 1, 2, ..."""
     told = max((record.curves.get(steps, []) for record in members), key=len)
     return list(told) if len(told) == count else [float(number) for number in range(1, count + 1)]
 
 
 def _columns(lines: Sequence[Sequence[float | None]]) -> list[list[float]]:
-    """Return the known values at every step; trials that ended before stay at their last value."""
+    """Return the known values at every step; trials that ended earlier keep their last value."""
     length = max(map(len, lines))
     padded = [[*line, *[line[-1]] * (length - len(line))] for line in lines]
     return [[value for value in step if value is not None] for step in zip(*padded, strict=True)]
 
 
 def told(sweep: SweepConfig, cell: Cell, metric: str) -> float | None:
-    """Return what stands for a cell: the median over its seeds, or for a share the mean."""
+    """Return the value of a cell: the median over its seeds, or for a share the mean."""
     spread = cell.metrics.get(metric)
     if spread is None:
         return None

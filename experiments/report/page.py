@@ -1,4 +1,4 @@
-"""The page: what was asked, what came of it, what failed, and how it was made."""
+"""The page of a report: its question, results, failures and provenance."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ def _caption(trial: PlannedTrial) -> str:
 
 
 def _facts(store: Store, records: dict[str, TrialRecord]) -> list[tuple[str, str]]:
-    """Return how the numbers were made."""
+    """Return the provenance of the numbers."""
     every = list(records.values())
     if not every:
         return []
@@ -215,9 +215,12 @@ def _facts(store: Store, records: dict[str, TrialRecord]) -> list[tuple[str, str
         ("device", seen("device")),
         ("threads per worker", seen("threads")),
         ("engine", seen("engine")),
-        ("first and last start", f"{min(one.started for one in every)} to {max(one.started for one in every)}"),
-        ("time of all trials", f"{sum(one.wall_seconds for one in every):.1f} s"),
-        ("processor time of all trials", f"{sum(float(one.seconds.get('cpu') or 0) for one in every):.1f} s"),
-        ("largest peak memory", f"{max(one.peak_memory_mb for one in every):.0f} MB"),
+        (
+            "first and last start",
+            f"{min(record.started for record in every)} to {max(record.started for record in every)}",
+        ),
+        ("time of all trials", f"{sum(record.wall_seconds for record in every):.1f} s"),
+        ("processor time of all trials", f"{sum(float(record.seconds.get('cpu') or 0) for record in every):.1f} s"),
+        ("largest peak memory", f"{max(record.peak_memory_mb for record in every):.0f} MB"),
         ("records", str(store.trials)),
     ]

@@ -1,1 +1,1 @@
-"""What trials do, one module per task: ``run(config, bench)`` returns a `TrialOutcome`."""
+"""The tasks of trials, one module each: ``run(config, bench)`` returns a `TrialOutcome`."""

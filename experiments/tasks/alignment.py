@@ -1,4 +1,4 @@
-"""A hand aligned to a cloud whose pose is known: how far fingertips, joints and model points end from their places."""
+"""A hand aligned to a cloud of known pose: the errors of fingertips, joints and model points."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ PICTURE_PIXELS = (300, 300)
 
 @dataclass(frozen=True)
 class Scene:
-    """What is to be aligned.
+    """The problem of a trial.
 
     Args:
         cloud: the data.
@@ -44,7 +44,7 @@ class Scene:
 
 
 def run(config: AlignmentTrial, bench: Bench) -> TrialOutcome:
-    """Return how well a hand was aligned."""
+    """Return the errors of an alignment."""
     hand = _hand(bench.device)
     begin = time.perf_counter()
     scene = make_scene(hand, config)
@@ -149,7 +149,7 @@ def _metrics(hand: tr.Hand, scene: Scene, found: tr.AlignResult) -> dict[str, fl
 
 
 def _points_mm(scene: Scene, moved: Tensor) -> float:
-    """Return how far model points are from where the true pose takes them, which other programs are measured by too."""
+    """Return the distances of model points from their positions in the true pose, as for other programs, mm."""
     with torch.no_grad():
         return 1e3 * float((moved - scene.skin(scene.cloud.pose)).norm(dim=-1).mean())
 

@@ -1,4 +1,4 @@
-"""A network trained on clouds of hands in one of five ways: how far off its poses are, step by step."""
+"""A network trained on clouds of hands in one of five ways: the errors of its poses, step by step."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RIGHT_MM = 10.0
 
 
 def run(config: NeuralTrial, bench: Bench) -> TrialOutcome:
-    """Return how near a variant comes to the true poses of clouds that it was not trained on."""
+    """Return the errors of a variant on clouds that it was not trained on, over the steps."""
     hand = _hand()
     begin = time.perf_counter()
     clouds, held_out = _clouds(config.scene)
@@ -36,7 +36,7 @@ def run(config: NeuralTrial, bench: Bench) -> TrialOutcome:
     }
     curves = {
         "steps": [float(step) for step in steps],
-        "tips_mm": [float(one.mean()) for one in tips],
+        "tips_mm": [float(error.mean()) for error in tips],
         "keypoints_mm": [float(error.mean()) for error in errors],
     }
     return TrialOutcome(metrics, seconds, curves)
@@ -54,6 +54,6 @@ def _clouds(scene: CloudScene) -> tuple[Clouds, Clouds]:
 
 def _errors(hand: tr.Hand, clouds: Clouds, held_out: Clouds, config: NeuralTrial) -> Iterator[tuple[int, Tensor]]:
     if config.variant == "initializer":
-        alone = errors_mm(hand, lambda some: some.found, held_out)
+        alone = errors_mm(hand, lambda batch: batch.found, held_out)
         return iter([(0, alone), (config.steps, alone)])
     return train(hand, clouds, held_out, config)

@@ -1,4 +1,4 @@
-"""Other programs on the same points, where they are installed: what they move is measured like what torchreg moves."""
+"""Other programs on the same points, where they are installed, measured like torchreg."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def peer(method: str) -> Any:
 
 
 def moved_by(method: str, source: Tensor, target: Tensor, outliers: float = 0.0) -> Tensor:
-    """Return where another program moves source points (N, 3), given target points (M, 3).
+    """Return source points (N, 3) as moved by another program onto target points (M, 3).
 
     Args:
         method: "cpd", deformable Coherent Point Drift, or "gicp", rigid generalized ICP.
@@ -56,14 +56,14 @@ def moved_by(method: str, source: Tensor, target: Tensor, outliers: float = 0.0)
 
 
 def _cpd(package: Any, source: Any, target: Any, outliers: float) -> Any:
-    few, goal = (points[:: max(1, -(-len(points) // _MAX_POINTS))] for points in (source, target))
+    moving, goal = (points[:: max(1, -(-len(points) // _MAX_POINTS))] for points in (source, target))
     found = package.DeformableRegistration(
-        X=goal, Y=few, w=min(outliers, 0.9), tolerance=_CPD_TOLERANCE, max_iterations=_CPD_STEPS
+        X=goal, Y=moving, w=min(outliers, 0.9), tolerance=_CPD_TOLERANCE, max_iterations=_CPD_STEPS
     )
     moved, _ = found.register()
     # Between its points, what it moved is carried by the nearest of them.
-    nearest = torch.cdist(torch.from_numpy(source), torch.from_numpy(few)).argmin(1).numpy()
-    return source + (moved - few)[nearest]
+    nearest = torch.cdist(torch.from_numpy(source), torch.from_numpy(moving)).argmin(1).numpy()
+    return source + (moved - moving)[nearest]
 
 
 def _gicp(package: Any, source: Any, target: Any) -> Any:

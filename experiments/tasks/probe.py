@@ -1,4 +1,4 @@
-"""A trial that costs what it is told to; without torch, so that processes start quickly."""
+"""A trial of given cost; without torch, so that processes start quickly."""
 
 from __future__ import annotations
 

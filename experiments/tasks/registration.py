@@ -1,4 +1,4 @@
-"""A scan registered to another whose truth is known: the share of points near their places, parts, joints, and time."""
+"""A scan registered to another with known truth: the share of points near it, parts, joints, and time."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PICTURE_PIXELS = (300, 300)
 
 @dataclass(frozen=True)
 class Problem:
-    """Two scans and the true places (N, 3) of the source's points; all that is known if the scans are made up."""
+    """Two scans and the true positions (N, 3) of the source's points; the full truth if the scans are made up."""
 
     source: tr.RangeScan
     target: tr.RangeScan
@@ -42,7 +42,7 @@ class Problem:
 
 
 def run(config: RegistrationTrial, bench: Bench) -> TrialOutcome:
-    """Return how well a pair of scans was registered."""
+    """Return the errors of a registration."""
     problem = make_problem(config.pair, config.seed)
     sizes = {"vertices": float(len(problem.source.points)), "target_vertices": float(len(problem.target.points))}
     begin = time.perf_counter()
@@ -75,7 +75,7 @@ def _settings(config: RegistrationTrial) -> tr.RegisterConfig:
 
 @functools.lru_cache(maxsize=2)
 def make_problem(config: ScanPairConfig, seed: int) -> Problem:
-    """Return the scans of a trial: the first pair of a motion of its own for every seed.
+    """Return the scans of a trial: the first pair of a different motion for every seed.
 
     Raises:
         SkippedTrial: if a file is asked for that is not here.
@@ -102,7 +102,7 @@ def _from_file(path: Path) -> Problem:
 
 
 def _accuracy(problem: Problem, moved: Tensor) -> dict[str, float]:
-    """Return errors of moved points, but for a part that the target lacks: nothing tells where it would be."""
+    """Return errors of moved points, without those of a part that the target lacks."""
     known = torch.ones(len(moved), dtype=torch.bool) if problem.pair is None else ~problem.pair.missing
     errors = ((moved - problem.truth).norm(dim=-1) / problem.diagonal)[known]
     before = ((problem.source.points - problem.truth).norm(dim=-1) / problem.diagonal)[known]
@@ -135,7 +135,7 @@ def _model_metrics(problem: Problem, found: tr.ScanRegistration) -> dict[str, fl
 
 
 def _joint_gaps(found: tr.ScanRegistration, pair: ScanPair) -> list[float]:
-    """Return how far each true joint, of parts that moved apart, is from the nearest one found; shares of the size."""
+    """Return distances of true joints, of parts that moved apart, from the nearest ones found; shares of the size."""
     moving, labels = pair.moving_labels(), pair.labels
     part = {int(label): int(moving[labels == label][0]) for label in labels.unique()}
     centers, gaps = found.model.joints().centers, []

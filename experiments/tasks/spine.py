@@ -1,4 +1,4 @@
-"""One spine of a sequence of surfaces: tips that the frames show, trees before and after, names that hold."""
+"""One spine of a sequence of surfaces: tips per frame, trees before and after, constant names."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PICTURE_PIXELS = (300, 300)
 
 @dataclass(frozen=True)
 class Sequence:
-    """Surfaces, and what is known of them.
+    """Surfaces and their truth.
 
     Args:
         meshes: T surfaces.
@@ -40,7 +40,7 @@ class Sequence:
 
 
 def run(config: SpineTrial, bench: Bench) -> TrialOutcome:
-    """Return how well one spine holds a sequence."""
+    """Return the scores of the spine of a sequence."""
     begin = time.perf_counter()
     sequence = make_sequence(config)
     seconds = {"setup": time.perf_counter() - begin}
@@ -55,7 +55,10 @@ def run(config: SpineTrial, bench: Bench) -> TrialOutcome:
     outcome = TrialOutcome(
         _tip_metrics(counts, sequence) | _metrics(spine, sequence),
         seconds,
-        {"own_tips": [float(count) for count in counts], "tips": [float(count_tips(one)) for one in spine.topologies]},
+        {
+            "own_tips": [float(count) for count in counts],
+            "tips": [float(count_tips(topology)) for topology in spine.topologies],
+        },
     )
     if config.pictures:
         outcome.artifacts = _artifacts(sequence, spine, bench)
@@ -87,10 +90,10 @@ def _from_file(path: Path, frames: int) -> Sequence:
         faces = torch.from_numpy(file["faces"].astype(np.int64))
 
     def named(spine: tr.SpineSequence) -> Tensor:
-        """Of each tip the vertex nearest to it in the reference frame should be so in all frames."""
-        tips, places = spine.tips.double(), vertices.double()
-        own = torch.cdist(tips[spine.reference], places[spine.reference]).argmin(-1)
-        return (torch.cdist(tips, places[:, own]).argmin(-1) == torch.arange(spine.num_tips)).all(-1)
+        """Return the mask (T,) of frames in which the vertex nearest to each tip in the reference is nearest again."""
+        tips, positions = spine.tips.double(), vertices.double()
+        nearest = torch.cdist(tips[spine.reference], positions[spine.reference]).argmin(-1)
+        return (torch.cdist(tips, positions[:, nearest]).argmin(-1) == torch.arange(spine.num_tips)).all(-1)
 
     return Sequence(tuple(tr.TriangleMesh(frame, faces) for frame in vertices), 0, named)
 
@@ -114,7 +117,7 @@ def _metrics(spine: tr.SpineSequence, sequence: Sequence) -> dict[str, float]:
         "tips": float(spine.num_tips),
         "trees_before": float(len(set(spine.own_topologies))),
         "trees_after": float(len(set(spine.topologies))),
-        "own_tree": sum(own == final for own in spine.own_topologies) / frames,
+        "own_tree": sum(topology == final for topology in spine.own_topologies) / frames,
         "named": float(sequence.named(spine).double().mean()) if right else 0.0,
         "frames": float(frames),
         "vertices": float(np.mean([mesh.num_vertices for mesh in sequence.meshes])),
@@ -122,10 +125,10 @@ def _metrics(spine: tr.SpineSequence, sequence: Sequence) -> dict[str, float]:
 
 
 def _arms_named(spine: tr.SpineSequence, truth: CreatureSequence) -> Tensor:
-    """Return in which frames (T,) every limb is nearest to the axis of its own arm, the one nearest on average."""
+    """Return the mask (T,) of frames in which every limb is nearest to the arm that it is nearest to on average."""
     curves, axes = spine.curves[:, : spine.num_tips].double(), truth.curves.double().flip(2)
-    few = torch.linspace(0, axes.shape[2] - 1, curves.shape[2]).round().long()
-    apart = (curves.unsqueeze(2) - axes[:, None, :, few]).norm(dim=-1).mean(-1)
+    sample = torch.linspace(0, axes.shape[2] - 1, curves.shape[2]).round().long()
+    apart = (curves.unsqueeze(2) - axes[:, None, :, sample]).norm(dim=-1).mean(-1)
     return (apart.argmin(-1) == apart.mean(0).argmin(-1)).all(-1)
 
 
@@ -143,7 +146,8 @@ def _artifacts(sequence: Sequence, spine: tr.SpineSequence, bench: Bench) -> dic
     frame = spine.reference
     view = spine_view([sequence.meshes[frame]], size=PICTURE_PIXELS)
     figure, (ax,) = new_figure(*PICTURE_PIXELS)
-    draw_spine_frame(ax, sequence.meshes[frame], spine.curves[frame], spine.num_tips, view=view, own=spine.own[frame])
+    curves, transferred = spine.curves[frame], ~spine.own[frame]
+    draw_spine_frame(ax, sequence.meshes[frame], curves, spine.num_tips, view=view, transferred=transferred)
     save_picture(figure, bench.file("spine.png"))
     save_spine_animation(bench.file("spine.glb"), spine.model)
     return {"spine": "spine.png", "spine, moving": "spine.glb"}

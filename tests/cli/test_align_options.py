@@ -8,7 +8,7 @@ import torch
 
 from torchreg.alignment.results import AlignResult
 from torchreg.alignment.sigma_schedule import SigmaSchedule
-from torchreg.cli.align_options import read_cloud, read_schedule, summary, write_pose
+from torchreg.cli.align_options import alignment_summary, read_cloud, read_schedule, write_pose
 from torchreg.errors import FormatError, InputError
 from torchreg.io.points import save_points
 from torchreg.result import Status
@@ -55,6 +55,6 @@ def test_the_summary_counts_inliers_and_tells_their_distance():
         "distances": distances, "posterior": torch.zeros(3), "sigma": torch.tensor(0.005), "cost": torch.tensor(12.5),
     }  # fmt: skip
     found = AlignResult(inliers=distances.abs() < 0.01, status=Status.CONVERGED, **common)
-    assert summary(found) == "converged, 2 of 3 points inliers, rms 3.54 mm, cost 12.5"
+    assert alignment_summary(found) == "converged, 2 of 3 points inliers, rms 3.54 mm, cost 12.5"
     lost = AlignResult(inliers=torch.zeros(3, dtype=torch.bool), status=Status.FEW_INLIERS, **common)
-    assert summary(lost) == f"{Status.FEW_INLIERS.value}, 0 of 3 points inliers, cost 12.5"
+    assert alignment_summary(lost) == f"{Status.FEW_INLIERS.value}, 0 of 3 points inliers, cost 12.5"

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchreg.cli.cameras import check_used, load_rig, seen_folder, stereo_job, stereo_source
+from torchreg.cli.cameras import check_used, load_calibration, seen_folder, stereo_job, stereo_source
 from torchreg.datasets.pictures import PictureStyle, render, stereo_cameras
 from torchreg.errors import InputError
 from torchreg.geometry.camera_rig import CameraRig
@@ -47,9 +47,9 @@ def test_pictures_go_beside_the_result_and_are_not_overwritten(tmp_path):
 
 
 def test_calibrations_are_called_for(ball):
-    assert load_rig(ball / "calib.json", "--stereo").names == ("left", "right")
+    assert load_calibration(ball / "calib.json", "--stereo").names == ("left", "right")
     with pytest.raises(InputError, match="--stereo takes --calibration FILE"):
-        load_rig(None, "--stereo")
+        load_calibration(None, "--stereo")
 
 
 def test_stereo_source_is_what_options_say(ball, plain_hand):

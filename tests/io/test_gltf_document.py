@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from torchreg.errors import FormatError, ModelError
-from torchreg.io.gltf_document import FAN, STRIP, TRIANGLES, GltfDocument, parents_first, triangles
+from torchreg.io.gltf_document import GltfDocument, Mode, parents_first, triangles
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 
 COMPONENTS = {"<i1": 5120, "<u1": 5121, "<i2": 5122, "<u2": 5123, "<u4": 5125, "<f4": 5126}
@@ -326,9 +326,9 @@ def test_parents_come_first_and_cycles_are_left_out(parents):
 @pytest.mark.parametrize(
     ("mode", "faces"),
     [
-        (TRIANGLES, [[7, 1, 2], [3, 4, 5]]),
-        (STRIP, [[7, 1, 2], [2, 1, 3], [2, 3, 4], [4, 3, 5]]),
-        (FAN, [[7, 1, 2], [7, 2, 3], [7, 3, 4], [7, 4, 5]]),
+        (Mode.TRIANGLES, [[7, 1, 2], [3, 4, 5]]),
+        (Mode.STRIP, [[7, 1, 2], [2, 1, 3], [2, 3, 4], [4, 3, 5]]),
+        (Mode.FAN, [[7, 1, 2], [7, 2, 3], [7, 3, 4], [7, 4, 5]]),
         (0, []),
     ],
 )
@@ -340,11 +340,11 @@ def test_triangles_of_every_mode(mode, faces):
 
 def test_a_strip_keeps_the_side_of_its_triangles():
     zigzag = np.array([[k / 2, k % 2, 0] for k in range(8)])
-    corners = zigzag[triangles(STRIP, np.arange(8), "a strip")]
+    corners = zigzag[triangles(Mode.STRIP, np.arange(8), "a strip")]
     sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2]
     assert (sides < 0).all()
 
 
 def test_separate_triangles_have_three_corners():
     with pytest.raises(FormatError, match="primitive 3 has 4 triangle corners, not a multiple of three"):
-        triangles(TRIANGLES, np.arange(4), "primitive 3")
+        triangles(Mode.TRIANGLES, np.arange(4), "primitive 3")

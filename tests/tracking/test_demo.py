@@ -96,5 +96,5 @@ def test_a_pose_moves_to_the_mean_of_a_cloud_and_keeps_its_rotation():
 
 
 def test_there_is_at_least_one_frame():
-    with pytest.raises(InputError, match="num_frames must be a positive integer, got 0"):
+    with pytest.raises(InputError, match="num_frames must be at least 1, got 0"):
         demo.run_demo(0)

@@ -20,8 +20,6 @@ def test_bones_have_distinct_colors():
     assert float(apart.min()) > 0.03
     assert float((torch.cdist(colors[:6], colors[:6]) + torch.eye(6)).min()) > 0.2
     assert torch.equal(bone_palette(5), colors[:5])
-    with pytest.raises(InputError, match="count must be at least 1"):
-        bone_palette(0)
 
 
 def test_weights_mix_colors():
@@ -31,10 +29,6 @@ def test_weights_mix_colors():
     torch.testing.assert_close(weight_colors(weights), expected)
     positive = (weights.double() + 0.1).requires_grad_()
     assert torch.autograd.gradcheck(weight_colors, (positive,))
-    with pytest.raises(InputError, match="weights must not be negative"):
-        weight_colors(-weights)
-    with pytest.raises(InputError, match="weights must be finite"):
-        weight_colors(weights * math.nan)
 
 
 def test_errors_run_from_blue_to_red():
@@ -46,10 +40,6 @@ def test_errors_run_from_blue_to_red():
     torch.testing.assert_close(error_colors(2 * errors, 2.0), colors)
     inside = torch.tensor([0.1, 0.4, 0.9], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda e: error_colors(e, 1.0), (inside,))
-    with pytest.raises(InputError, match="errors must not be negative"):
-        error_colors(-errors, 1.0)
-    with pytest.raises(InputError, match="largest must be positive"):
-        error_colors(errors, 0.0)
 
 
 def scan():
@@ -92,3 +82,7 @@ def test_error_colors_are_written(tmp_path):
     save_error_ply(tmp_path / "e.ply", points, torch.full((50,), math.nan))
     with pytest.raises(InputError, match="errors must have shape"):
         save_error_ply(tmp_path / "e.ply", points, torch.zeros(3))
+    with pytest.raises(InputError, match="errors must not be negative"):
+        save_error_ply(tmp_path / "e.ply", points, -torch.ones(len(points)))
+    with pytest.raises(InputError, match="largest must be zero or positive"):
+        save_error_ply(tmp_path / "e.ply", points, torch.ones(len(points)), largest=-1.0)

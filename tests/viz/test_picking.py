@@ -5,7 +5,6 @@ import math
 import pytest
 import torch
 
-from torchreg.errors import InputError
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.viz.picking import meet_triangles, pick_vertex
@@ -61,15 +60,3 @@ def test_points_are_met_near_the_ray_the_first_one_first():
     assert pick_vertex(points, None, *ray) == 1
     assert pick_vertex(points, torch.zeros(0, 3, dtype=torch.long), *ray, reach=0.001) == 0
     assert pick_vertex(points[2:], None, *ray) is None
-
-
-def test_what_does_not_fit_is_refused():
-    ray = torch.zeros(3), torch.tensor([0.0, 0, 1])
-    with pytest.raises(InputError, match="direction must not be zero"):
-        meet_triangles(BALL.vertices, BALL.faces, torch.zeros(3), torch.zeros(3))
-    with pytest.raises(InputError, match="faces must have shape"):
-        meet_triangles(BALL.vertices, BALL.faces[:, :2], *ray)
-    with pytest.raises(InputError, match="origin"):
-        meet_triangles(BALL.vertices, BALL.faces, torch.full((3,), math.nan), ray[1])
-    with pytest.raises(InputError, match="reach"):
-        pick_vertex(BALL.vertices, None, *ray, reach=0.0)

@@ -8,7 +8,7 @@ from torchreg.geometry.mesh import unit_sphere
 from torchreg.tracking.results import TrackState
 from torchreg.viz.bone_colors import bone_palette
 from torchreg.viz.result_scenes import result_scene
-from torchreg.viz.scene import Cloud, Meshes, Surface
+from torchreg.viz.scene import Cloud, Meshes, MovingMesh
 
 
 def names(scene):
@@ -70,7 +70,7 @@ def test_a_registration_moves_from_the_source_onto_the_target(registration):
     target = unit_sphere(1)
     scene = result_scene(registration, data=[target])
     moved = scene.layer("moved, by bones")
-    assert isinstance(moved, Surface)
+    assert isinstance(moved, MovingMesh)
     torch.testing.assert_close(moved.points(0), registration.points)
     torch.testing.assert_close(moved.points(scene.num_frames - 1), registration.deformed)
     torch.testing.assert_close(moved.paint.to(registration.weights), registration.weights @ bone_palette(3).double())

@@ -7,7 +7,7 @@ import torch
 
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import unit_sphere
-from torchreg.viz.scene import FIELD_OF_VIEW, Cloud, Curves, Meshes, Scene, Surface
+from torchreg.viz.scene import FIELD_OF_VIEW, Cloud, Curves, Meshes, MovingMesh, Scene
 
 BALL = unit_sphere(2)
 POINTS = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
@@ -15,7 +15,7 @@ POINTS = torch.rand(20, 3, generator=torch.Generator().manual_seed(0))
 
 def test_patches_hold_every_face_once_with_its_color():
     paint = (BALL.vertices + 1) / 2
-    surface = Surface("ball", BALL.vertices, BALL.faces, paint)
+    surface = MovingMesh("ball", BALL.vertices, BALL.faces, paint)
     patches = surface.patches()
     assert 1 < len(patches) <= 48
     found = torch.cat([used[faces] for used, faces, _ in patches])
@@ -25,19 +25,19 @@ def test_patches_hold_every_face_once_with_its_color():
         assert int(faces.max()) == len(used) - 1
         assert (paint[used[faces]].mean(1) - torch.tensor(color)).abs().max() < 0.35
     assert len(surface.patches(most=8)) <= 8
-    ((used, faces, color),) = Surface("ball", BALL.vertices, BALL.faces, (1.0, 0.0, 0.5)).patches()
+    ((used, faces, color),) = MovingMesh("ball", BALL.vertices, BALL.faces, (1.0, 0.0, 0.5)).patches()
     assert torch.equal(used[faces], BALL.faces)
     assert color == (1.0, 0.0, 0.5)
 
 
 def test_a_painted_surface_without_faces_has_no_patches():
-    nothing = Surface("empty", BALL.vertices, BALL.faces[:0], torch.zeros_like(BALL.vertices))
+    nothing = MovingMesh("empty", BALL.vertices, BALL.faces[:0], torch.zeros_like(BALL.vertices))
     assert nothing.patches() == []
 
 
 def test_layers_that_stand_still_are_shown_in_every_frame():
     moving = torch.stack([BALL.vertices, BALL.vertices + 1])
-    scene = Scene("two", (Surface("ball", moving, BALL.faces), Cloud("still", [POINTS], (1.0, 0.0, 0.0))))
+    scene = Scene("two", (MovingMesh("ball", moving, BALL.faces), Cloud("still", [POINTS], (1.0, 0.0, 0.0))))
     assert scene.num_frames == 2
     assert scene.seconds == [0.0, 0.05]
     assert torch.equal(scene.layer("ball").points(1), moving[1])
@@ -62,7 +62,7 @@ def test_curves_become_pieces():
 @pytest.mark.parametrize("up", [None, (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0)])
 def test_the_camera_sees_everything(offset, up):
     points = BALL.vertices * torch.tensor([1.0, 0.4, 0.6]) + torch.tensor(offset)
-    scene = Scene("ball", (Surface("ball", points, BALL.faces),), up=up)
+    scene = Scene("ball", (MovingMesh("ball", points, BALL.faces),), up=up)
     position, target, upright = scene.camera()
     forward = (target - position) / (target - position).norm()
     rays = points.double() - position
@@ -79,7 +79,7 @@ def test_the_camera_sees_everything(offset, up):
 def test_a_scan_from_one_side_is_seen_from_there(direction):
     towards = torch.tensor(direction)
     seen = (BALL.vertices[BALL.faces].mean(1) @ towards) > 0.2
-    scan = Surface("scan", BALL.vertices, BALL.faces[seen])
+    scan = MovingMesh("scan", BALL.vertices, BALL.faces[seen])
     for up in ((0.0, 1.0, 0.0), (0.0, -1.0, 0.0)):
         position, target, _ = Scene("scan", (scan,), up=up).camera()
         looking = (position - target) / (position - target).norm()
@@ -92,13 +92,13 @@ def test_outliers_do_not_decide_where_the_camera_stands():
     ball = Meshes("ball", [BALL])
     assert Scene("both", (ball, far)).diagonal == pytest.approx(Scene("one", (ball,)).diagonal)
     assert Scene("points", (far,)).diagonal > 50
-    hidden = Surface("hidden", torch.full((4, 3), torch.nan), BALL.faces[:0], visible=False)
+    hidden = MovingMesh("hidden", torch.full((4, 3), torch.nan), BALL.faces[:0], visible=False)
     assert Scene("nothing", (hidden,)).diagonal == 1.0
 
 
 def test_what_does_not_fit_is_refused():
     with pytest.raises(InputError, match="paint of ball"):
-        Surface("ball", BALL.vertices, BALL.faces, POINTS)
+        MovingMesh("ball", BALL.vertices, BALL.faces, POINTS)
     with pytest.raises(InputError, match=r"frames\[0\] of data"):
         Cloud("data", [POINTS[:, :2]], (0.0, 0.0, 0.0))
     with pytest.raises(InputError, match="paints of data must be 1"):
@@ -107,7 +107,7 @@ def test_what_does_not_fit_is_refused():
         Cloud("data", [POINTS], [POINTS[:3]])
     with pytest.raises(InputError, match="labels of limbs"):
         Curves("limbs", torch.zeros(1, 2, 3), torch.zeros(1, 3), labels=("a", "b"))
-    ball = Surface("ball", BALL.vertices, BALL.faces)
+    ball = MovingMesh("ball", BALL.vertices, BALL.faces)
     with pytest.raises(InputError, match="different names"):
         Scene("twice", (ball, ball))
     with pytest.raises(InputError, match="got none"):

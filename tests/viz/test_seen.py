@@ -1,31 +1,27 @@
-import pytest
 import torch
 
 from torchreg.datasets.pictures import camera_ring
-from torchreg.errors import InputError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
 from torchreg.viz.seen import (
     cut_picture,
+    depth_colors,
     hull_picture,
     hull_sheet,
     mask_outline,
     model_mask,
     picture_with_points,
-    ramp_colors,
 )
 
 CAMERA = Camera.looking_at([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], focal=60.0, width=48, height=40)
 
 
 def test_ramp_goes_from_dark_blue_to_orange():
-    colors = ramp_colors(torch.tensor([1.0, 2.0, 9.0, torch.nan]), 1.0, 3.0)
+    colors = depth_colors(torch.tensor([1.0, 2.0, 9.0, torch.nan]), 1.0, 3.0)
     assert colors[0, 2] > colors[0, 0]
     assert colors[2, 0] > 0.9
     assert torch.equal(colors[3], torch.zeros(3))
-    assert torch.equal(ramp_colors(torch.tensor([3.0]), 1.0, 3.0)[0], colors[2])
-    with pytest.raises(InputError, match="highest must be above lowest"):
-        ramp_colors(torch.zeros(1), 1.0, 1.0)
+    assert torch.equal(depth_colors(torch.tensor([3.0]), 1.0, 3.0)[0], colors[2])
 
 
 def test_points_are_squares_and_inliers_hide_others():
@@ -39,8 +35,6 @@ def test_points_are_squares_and_inliers_hide_others():
     assert red[0] > red[2]
     assert torch.equal(drawn[0, 0], blue)  # half beside the picture
     assert torch.allclose(drawn[11], torch.full((20, 3), 0.4))
-    with pytest.raises(InputError, match="inliers must have shape"):
-        picture_with_points(torch.zeros(12, 20), pixels, torch.ones(3, dtype=torch.bool))
 
 
 def test_outline_of_a_ball_runs_around_its_mask():
@@ -69,8 +63,6 @@ def test_cut_and_hull_pictures_tell_pixels_apart():
     row = hull_picture(mask, hull)[0]
     assert len({tuple(color.tolist()) for color in row}) == 4
     assert torch.equal(row[3], torch.zeros(3))
-    with pytest.raises(InputError, match="hull must have shape"):
-        hull_picture(mask, hull[:, :2])
 
 
 def test_model_mask_follows_the_lens():
@@ -95,5 +87,3 @@ def test_sheet_holds_the_picture_of_every_camera():
     assert torch.equal(sheet[1:41, 1:49], hull_picture(masks[0], masks[0]))
     assert not sheet[42:, 50:].any()
     assert hull_sheet(masks, ring, ball, width=24).shape == (44, 52, 3)
-    with pytest.raises(InputError, match="one per camera"):
-        hull_sheet(masks[:2], ring, ball)

@@ -32,11 +32,11 @@ def spine():
     return SimpleNamespace(curves=torch.stack((curves, turned)), num_tips=3, own=own)
 
 
-def test_limbs_keep_their_colors_and_carried_ones_are_dashed(spine):
+def test_limbs_keep_their_colors_and_transferred_ones_are_dashed(spine):
     view = spine_view([SPHERE], size=(160, 120))
     for frame in range(2):
         _, (ax,) = new_figure(80, 60)
-        draw_spine_frame(ax, SPHERE, spine.curves[frame], 3, view=view, own=spine.own[frame])
+        draw_spine_frame(ax, SPHERE, spine.curves[frame], 3, view=view, transferred=~spine.own[frame])
         limbs = [line for line in ax.lines if len(line.get_xdata()) == 5]
         assert [line.get_linestyle() for line in limbs] == ["-" if own else "--" for own in spine.own[frame].tolist()]
         for line, color in zip(limbs, bone_palette(3).tolist(), strict=True):

@@ -59,6 +59,8 @@ def test_a_registration_by_bones_and_by_error(registration, tmp_path):
     assert registration_strip(tmp_path / "s.png", registration, target).exists()
     with pytest.raises(InputError, match="must have triangles"):
         registration_strip(tmp_path / "t.png", replace(registration, faces=None), target)
+    with pytest.raises(InputError, match="errors must have shape"):
+        registration_strip(tmp_path / "t.png", registration, target, errors=torch.zeros(2))
 
 
 def test_a_spine_over_time(spine, tmp_path):

@@ -79,7 +79,7 @@ def drawing(plain_hand, skin, tracked):
 def test_a_surface_is_gray_where_no_data_support_it(drawing, tracked):
     nothing = tracked[0][0][:0]
     found = drawing(data=nothing, inliers=torch.zeros(0, dtype=torch.bool))
-    held = drawing(data=nothing, inliers=torch.zeros(0, dtype=torch.bool), held=True)
+    held = drawing(data=nothing, inliers=torch.zeros(0, dtype=torch.bool), predicted=True)
     assert (spread(found) > 30).mean() > 0.1
     assert (spread(held) > 30).mean() == 0
     # The same place, another color.

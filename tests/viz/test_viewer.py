@@ -82,7 +82,7 @@ def test_one_file_holds_it_all(spine, tmp_path):
     path = scene_html(tmp_path / "spine.html", scene)
     content = path.read_text(encoding="utf-8")
     assert "__VISER_EMBED_DATA__" in content
-    still = scene_html(tmp_path / "still.html", Scene("still", scene.layers[:1]), num_loops=0)
+    still = scene_html(tmp_path / "still.html", Scene("still", scene.layers[:1]))
     assert still.stat().st_size < path.stat().st_size
     with pytest.raises(InputError, match=r"end in \.html"):
         scene_html(tmp_path / "spine.htm", scene)

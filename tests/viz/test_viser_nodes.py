@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchreg.geometry.mesh import unit_sphere
-from torchreg.viz.scene import Cloud, Curves, Meshes, Scene, Surface
+from torchreg.viz.scene import Cloud, Curves, Meshes, MovingMesh, Scene
 from torchreg.viz.viser_nodes import DrawnScene, as_floats
 from torchreg.viz.viser_server import start_server, stop_server
 
@@ -27,8 +27,8 @@ def test_every_layer_goes_from_frame_to_frame(server):
     scene = Scene(
         "all",
         (
-            Surface("plain", moving, BALL.faces, opacity=0.5),
-            Surface("painted", BALL.vertices, BALL.faces, (BALL.vertices + 1) / 2),
+            MovingMesh("plain", moving, BALL.faces, opacity=0.5),
+            MovingMesh("painted", BALL.vertices, BALL.faces, (BALL.vertices + 1) / 2),
             Meshes("meshes", [unit_sphere(0), BALL]),
             Cloud("cloud", clouds, [cloud.abs() for cloud in clouds]),
             Curves("curves", curves, torch.ones(1, 3), labels=("tip",)),
@@ -60,7 +60,7 @@ def test_every_layer_goes_from_frame_to_frame(server):
 
 
 def test_patches_of_paint_make_up_the_surface(server):
-    scene = Scene("painted", (Surface("ball", BALL.vertices, BALL.faces, (BALL.vertices + 1) / 2),))
+    scene = Scene("painted", (MovingMesh("ball", BALL.vertices, BALL.faces, (BALL.vertices + 1) / 2),))
     DrawnScene(server.scene, scene)
     number, faces = 0, 0
     while (node := server.scene.get_handle_by_name(f"/layers/0/{number}")) is not None:

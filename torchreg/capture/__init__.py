@@ -1,1 +1,1 @@
-"""Cameras to geometry: depth images, silhouettes and stereo pairs; the place of kornia and of image processing."""
+"""Cameras to geometry: depth images, silhouettes and stereo pairs; with image processing by kornia."""

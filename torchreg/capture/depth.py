@@ -1,4 +1,4 @@
-"""Depth images to range scans: filters against what sensors do at edges, and several views fused into one scan."""
+"""Depth images to range scans: filters of errors at edges, and several views fused into one scan."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_count, check_positive, check_shape
+from torchreg._checks import as_float_tensor, check_positive, check_shape
 from torchreg.errors import FormatError, InputError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.io.calibration import load_depth_camera
 from torchreg.io.images import load_depth
 
-_NEIGHBORS = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0))
+_EIGHT_NEIGHBORS = tuple((i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0))
 
 
 def load_depth_scan(path: str | os.PathLike[str], intrinsics: str | os.PathLike[str], **options: Any) -> RangeScan:
@@ -59,13 +59,13 @@ def depth_scan(
         camera: its picture has that size; a lens that distorts is undone.
         max_jump: see `RangeScan.from_depth`.
         max_steepness: see `without_flying_pixels`; None keeps all.
-        smoothing: deviation of the sensor's noise at one metre, metres: points are smoothed by `bilateral_filter`, and
-            normals come from `plane_normals`; zero does neither.
+        smoothing: standard deviation of the sensor's noise at one metre, metres: points are smoothed by
+            `bilateral_filter`, and normals come from `plane_normals`; zero does neither.
         nearest: nearer pixels are left out, metres.
         farthest: pixels beyond are left out, metres.
 
     Returns:
-        the scan, in the dtype of ``depth``, its viewpoint the camera.
+        The scan, in the dtype of ``depth``, its viewpoint the camera.
 
     Raises:
         InputError: if sizes or numbers do not fit, or no surface is left.
@@ -77,6 +77,9 @@ def depth_scan(
     depth = as_float_tensor(depth, "depth")
     check_shape(depth, "depth", (camera.height, camera.width))
     check_positive(nearest, "nearest", allow_zero=True)
+    check_positive(smoothing, "smoothing", allow_zero=True)
+    if max_steepness is not None:
+        check_positive(max_steepness, "max_steepness")
     if not farthest > nearest:
         raise InputError(f"farthest must be beyond nearest, got {farthest} and {nearest}")
     depth = torch.where((depth >= nearest) & (depth <= farthest), depth, 0.0)
@@ -92,10 +95,11 @@ def depth_scan(
         column, row = camera.project(scan.points)[0].round().long().unbind(-1)
         normals = local[row, column] @ camera.world_to_camera[:3, :3].to(local)
         scan = RangeScan(scan.points, scan.faces, normals, viewpoint=scan.viewpoint)
-    return _lens_undone(scan, camera) if camera.is_distorted else scan
+    return _undistorted(scan, camera) if camera.is_distorted else scan
 
 
-def _lens_undone(scan: RangeScan, camera: Camera) -> RangeScan:
+def _undistorted(scan: RangeScan, camera: Camera) -> RangeScan:
+    """Return a scan of a picture that was read as if the lens did not distort, its points on their true rays."""
     plain = Camera(camera.width, camera.height, camera.intrinsics, camera.world_to_camera)
     pixels, depth = plain.project(scan.points.double())
     points = camera.unproject(pixels, depth).to(scan.points)
@@ -104,37 +108,28 @@ def _lens_undone(scan: RangeScan, camera: Camera) -> RangeScan:
     return straight if bool(seen.all()) else straight.subset(seen, mark_cut=True)
 
 
-def without_flying_pixels(
-    depth: Tensor, focal: tuple[float, float], *, max_steepness: float = 6.0, min_support: int = 3
-) -> Tensor:
-    """Return depth images with zero where pixels hang between two surfaces, as at edges and steep slopes they do.
+def without_flying_pixels(depth: Tensor, focal: tuple[float, float], *, max_steepness: float = 6.0) -> Tensor:
+    """Return depth images with zero at flying pixels, which lie between two surfaces at edges and steep slopes.
 
-    A pixel stays if at least ``min_support`` of its eight neighbors could lie on one surface with it: their depths
-    differ by no more than ``max_steepness`` times the distance between the two rays there. A straight edge leaves its
-    pixels five such neighbors, a right-angled corner three.
+    A pixel stays if at least three of its eight neighbors could lie on one surface with it: their depths differ by no
+    more than ``max_steepness`` times the distance between the two rays there. A straight edge leaves its pixels five
+    such neighbors, a right-angled corner three.
 
     Args:
         depth: (..., H, W) metres; zero, negative or not finite where nothing was measured.
         focal: fx and fy, pixels.
         max_steepness: tangent of the steepest slope; 6 is 80 degrees.
-        min_support: number of neighbors, 1 to 8.
-
-    Raises:
-        InputError: if a number is out of range.
 
     Differentiable: no.
     """
-    check_shape(depth, "depth", ("H", "W"), batch=True)
-    check_positive(max_steepness, "max_steepness")
-    check_count(min_support, "min_support", 1)
     with torch.no_grad():
         clean = _measured(depth)
         support = torch.zeros_like(clean, dtype=torch.int8)
-        for row, column in _NEIGHBORS:
-            other = _shifted(clean, row, column)
-            apart = torch.minimum(clean, other) * ((row / focal[1]) ** 2 + (column / focal[0]) ** 2) ** 0.5
-            support += (other - clean).abs() <= max_steepness * apart  # NaN is not
-        return torch.where(support >= min_support, clean, 0.0).nan_to_num(0.0)
+        for row, column in _EIGHT_NEIGHBORS:
+            neighbor = _shifted(clean, row, column)
+            distance = torch.minimum(clean, neighbor) * ((row / focal[1]) ** 2 + (column / focal[0]) ** 2) ** 0.5
+            support += (neighbor - clean).abs() <= max_steepness * distance  # NaN is not
+        return torch.where(support >= 3, clean, 0.0).nan_to_num(0.0)
 
 
 def bilateral_filter(depth: Tensor, noise: float, *, radius: int = 2, spread: float = 1.5) -> Tensor:
@@ -145,13 +140,10 @@ def bilateral_filter(depth: Tensor, noise: float, *, radius: int = 2, spread: fl
     together, their mean standing for both, so that slopes are not flattened.
 
     Args:
-        depth: (..., H, W) metres; zero, negative or not finite where nothing was measured, and there it stays zero.
+        depth: (..., H, W) metres; zero, negative or not finite where nothing was measured, and zero there afterwards.
         noise: standard deviation of depths at one metre, metres; it grows with the square of the depth.
         radius: of the window, pixels.
         spread: standard deviation in the picture, pixels.
-
-    Raises:
-        InputError: if a number is not positive.
 
     Differentiable: no.
 
@@ -159,10 +151,6 @@ def bilateral_filter(depth: Tensor, noise: float, *, radius: int = 2, spread: fl
 
     References: Tomasi and Manduchi 1998.
     """
-    check_shape(depth, "depth", ("H", "W"), batch=True)
-    check_positive(noise, "noise")
-    check_positive(spread, "spread")
-    check_count(radius, "radius", 1)
     with torch.no_grad():
         clean = _measured(depth)
         scale = 3 * noise * clean**2
@@ -182,9 +170,9 @@ def plane_normals(
 ) -> Tensor:
     """Return the normals of depth images, each that of the plane which fits a window best, towards the camera.
 
-    On a plane ``n . X = d`` the nearness ``1 / z`` is ``n . (x, y, 1) / d``, linear in the picture: a linear fit to
-    nearness is exact however the plane is tilted. Only neighbors that could be on one surface with the middle count:
-    closer in depth than three deviations of the noise and the steepest slope allow.
+    On a plane ``n . X = d`` the inverse depth ``1 / z`` is ``n . (x, y, 1) / d``, linear in the picture: a linear fit
+    to inverse depths is exact however the plane is tilted. Only neighbors that could be on one surface with the middle
+    count: those closer in depth than three standard deviations of the noise and the steepest slope allow.
 
     Args:
         depth: (..., H, W) metres; zero, negative or not finite where nothing was measured.
@@ -194,45 +182,37 @@ def plane_normals(
         max_steepness: tangent of the steepest slope.
 
     Returns:
-        (..., H, W, 3) unit vectors in camera coordinates, zero where fewer than three pixels determine no plane.
-
-    Raises:
-        InputError: if a number is not positive.
+        Normals (..., H, W, 3) in camera coordinates, zero where fewer than three pixels determine no plane.
 
     Differentiable: no.
 
     Cost: (2 radius + 1)^2 / 2 passes over the picture with a few operations: 1 s for 640 x 480 on one CPU core.
     """
-    check_shape(depth, "depth", ("H", "W"), batch=True)
-    check_positive(noise, "noise")
-    check_count(radius, "radius", 1)
     fx, fy, cx, cy = intrinsics
     with torch.no_grad():
         clean = _measured(depth)
-        nearness = 1 / clean.double()
-        sums = [torch.zeros_like(nearness) for _ in range(9)]
+        inverse = 1 / clean.double()
+        sums = [torch.zeros_like(inverse) for _ in range(9)]
         for row in range(-radius, radius + 1):
             for column in range(-radius, radius + 1):
-                apart = clean * ((row / fy) ** 2 + (column / fx) ** 2) ** 0.5
-                allowed = 3 * noise * clean**2 + max_steepness * apart
+                distance = clean * ((row / fy) ** 2 + (column / fx) ** 2) ** 0.5
+                allowed = 3 * noise * clean**2 + max_steepness * distance
                 near = ((_shifted(clean, row, column) - clean).abs() <= allowed).double()
-                rise = torch.where(near > 0, _shifted(nearness, row, column) - nearness, 0.0)
+                rise = torch.where(near > 0, _shifted(inverse, row, column) - inverse, 0.0)
                 powers = (1, column, row, column**2, column * row, row**2)
                 for total, power in zip(sums[:6], powers, strict=True):
                     total.add_(near, alpha=power)
                 for total, power in zip(sums[6:], powers[:3], strict=True):
                     total.add_(rise, alpha=power)
-        along, down, middle = _fitted_line(sums)
-        steps = (
-            torch.arange(depth.shape[-1]).to(nearness) - cx,
-            torch.arange(depth.shape[-2]).to(nearness)[:, None] - cy,
-        )
-        forward = nearness + middle - along * steps[0] - down * steps[1]
+        along, down, middle = _fitted_plane(sums)
+        right = torch.arange(depth.shape[-1]).to(inverse) - cx
+        below = torch.arange(depth.shape[-2]).to(inverse)[:, None] - cy
+        forward = inverse + middle - along * right - down * below
         normals = -torch.stack((along * fx, down * fy, forward), dim=-1)
         return torch.nn.functional.normalize(normals, dim=-1).nan_to_num(0.0).to(depth)
 
 
-def _fitted_line(sums: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+def _fitted_plane(sums: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
     """Return slopes and intercept of z = a x + b y + c from sums of 1, x, y, xx, xy, yy, z, xz, yz; NaN if singular."""
     count, x, y, xx, xy, yy, z, xz, yz = sums
     x, y, z = x / count, y / count, z / count
@@ -250,6 +230,7 @@ def _fitted_line(sums: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _measured(depth: Tensor) -> Tensor:
+    """Return depths with NaN where nothing was measured."""
     return torch.where(depth.isfinite() & (depth > 0), depth.detach(), torch.nan)
 
 
@@ -260,22 +241,22 @@ def _shifted(depth: Tensor, row: int, column: int) -> Tensor:
         return torch.full_like(depth, torch.nan)
     pad = (max(-column, 0), max(column, 0), max(-row, 0), max(row, 0))
     padded = torch.nn.functional.pad(depth, pad, value=torch.nan)
-    top, left = max(row, 0), max(column, 0)
-    return padded[..., top : top + height, left : left + width]
+    first_row, first_column = max(row, 0), max(column, 0)
+    return padded[..., first_row : first_row + height, first_column : first_column + width]
 
 
 def fuse_scans(scans: Sequence[RangeScan], spacing: float | None = None) -> RangeScan:
-    """Return one cloud of what several views saw: points of one cell and one facing averaged, outliers of none merged.
+    """Return one scan of several views of a surface: points in one cell that face alike are averaged.
 
-    Space is cut into cubes; points in one whose normals have the same largest component, by axis and sign, are one
-    surface seen several times. The two sides of a thin sheet stay apart.
+    Space is cut into cubes; points of a cube whose normals have the same largest component, by axis and sign, belong to
+    one surface seen several times. The two sides of a thin sheet stay apart.
 
     Args:
         scans: in one world, in the same dtype and on the same device.
         spacing: edge of the cubes; by default the median spacing of the scans.
 
     Returns:
-        the scan, without faces and viewpoint; its boundary is that of the fused points.
+        The scan, without faces and viewpoint; its boundary is that of the fused points.
 
     Raises:
         InputError: if there is no scan, or ``spacing`` is not positive or leaves fewer than three points.

@@ -1,4 +1,4 @@
-"""What real depth cameras add to the truth: noise, steps, flying pixels and holes, with presets."""
+"""The errors of real depth cameras: noise, steps, flying pixels and holes, with presets."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from torchreg.errors import InputError
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """How a depth camera errs. The deviation of a depth z is ``sqrt(constant^2 + (quadratic z^2)^2)``, metres.
+    """Error model of a depth camera.
+
+    The standard deviation of a depth z is ``sqrt(constant^2 + (quadratic z^2)^2)``, metres.
 
     Args:
-        constant: metres, what timing adds.
-        quadratic: 1 / metre, what an error of disparity adds.
+        constant: deviation from errors of timing, metres.
+        quadratic: deviation from errors of disparity, 1 / metre.
         step: 1 / metre; depths are rounded to multiples of that in ``1 / z``, as disparities are. Zero does not round.
-        jitter: standard deviation of where a pixel looks, pixels: it ruffles edges.
+        jitter: standard deviation of the position at which a pixel measures, pixels: it ruffles edges.
         flying: share of pixels at a jump in depth that mix both sides.
         dropout: share of pixels that measure nothing, everywhere.
 
@@ -60,14 +62,14 @@ class DepthNoise:
         return torch.sqrt(self.constant**2 + (self.quadratic**2 + rounding**2) * depth**4)
 
     def measured(self, depth: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return what the camera makes of true depth images.
+        """Return true depth images with the camera's errors.
 
         Args:
             depth: (..., H, W) metres; zero or not finite where there is nothing.
             generator: source of randomness on the CPU; None draws from a fresh one with seed 0, the same at every call.
 
         Returns:
-            (..., H, W), zero where nothing is measured.
+            Measured depths (..., H, W), metres; zero where nothing is measured.
         """
         check_shape(depth, "depth", ("H", "W"), batch=True)
         generator = torch.Generator().manual_seed(0) if generator is None else generator
@@ -78,7 +80,7 @@ class DepthNoise:
 
         seen = torch.where(depth.isfinite() & (depth > 0), depth, 0.0)
         if self.jitter:
-            seen = _looked_up(seen, self.jitter * drawn("normal"), self.jitter * drawn("normal"))
+            seen = _jittered(seen, self.jitter * drawn("normal"), self.jitter * drawn("normal"))
         if self.flying:
             seen = _with_flying_pixels(seen, drawn("uniform") < self.flying, drawn("uniform"))
         valid = seen > 0
@@ -93,16 +95,17 @@ class DepthNoise:
         return torch.where(valid, noisy, 0.0)
 
 
-def _looked_up(depth: Tensor, right: Tensor, down: Tensor) -> Tensor:
+def _jittered(depth: Tensor, right: Tensor, down: Tensor) -> Tensor:
+    """Return depths (..., H, W) looked up at pixels shifted by steps (..., H, W) to the right and down."""
     height, width = depth.shape[-2:]
     row = torch.arange(height, device=depth.device)[:, None] + down.round().long()
     column = torch.arange(width, device=depth.device) + right.round().long()
-    place = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
-    return depth.flatten(-2).gather(-1, place.flatten(-2)).reshape(depth.shape)
+    pixel = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+    return depth.flatten(-2).gather(-1, pixel.flatten(-2)).reshape(depth.shape)
 
 
 def _with_flying_pixels(depth: Tensor, chosen: Tensor, share: Tensor) -> Tensor:
-    """Return depths of which chosen ones mix with the farthest of the four neighbors, where that is a jump away."""
+    """Return depths whose chosen pixels mix with the farthest of four neighbors, where that is 3 % farther or more."""
     padded = torch.nn.functional.pad(depth, (1, 1, 1, 1))
     sides = (padded[..., :-2, 1:-1], padded[..., 2:, 1:-1], padded[..., 1:-1, :-2], padded[..., 1:-1, 2:])
     behind = torch.stack(sides).amax(0)

@@ -2,36 +2,37 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_choice, check_count, check_positive, check_shape
-from torchreg.errors import InputError, MissingExtraError
+from torchreg.errors import MissingExtraError
 
-# Bits per whole number: the window of 7 x 9 has 62 comparisons, which fit into one int64 with its sign bit unused.
-_HALF_ROWS, _HALF_COLUMNS = 3, 4
-_LARGEST_COST = (2 * _HALF_ROWS + 1) * (2 * _HALF_COLUMNS + 1) - 1
-_OPENCV_BLOCK = 5
-# Penalties up to this keep sums of 16 bits from overflowing.
-_LARGEST_WHOLE = 8000
+METHODS = ("semi-global", "block", "opencv")
 
 
-def match_disparity(
-    left: Tensor,
-    right: Tensor,
-    max_disparity: int,
-    *,
-    min_disparity: int = 0,
-    method: str = "semi-global",
-    small_step: float = 6.0,
-    large_step: float = 60.0,
-    max_difference: float | None = 1.0,
-) -> Tensor:
+@dataclass(frozen=True)
+class _Matching:
+    """Costs and checks of matching."""
+
+    half_rows: int = 3  # of the census window, 7 x 9 pixels:
+    half_columns: int = 4  # its comparisons fit into an int64 with the sign bit unused
+    num_bits: int = 62  # comparisons with the middle, and so the largest cost
+    small_step: int = 6  # P1, the cost of a change of disparity by one pixel
+    large_step: int = 60  # P2, the cost of a larger change; sums below 4 (62 + P2) need 16 bits
+    max_difference: float = 1.0  # between the disparities of both directions, pixels
+
+
+_MATCHING = _Matching()
+
+
+def match_disparity(left: Tensor, right: Tensor, max_disparity: int, *, method: str = "semi-global") -> Tensor:
     """Return the disparity of every left pixel, ``x_left - x_right``, NaN where it is not known.
 
     The cost of a disparity is the number of differing bits of the two census transforms (7 x 9). Semi-global matching
-    sums along four directions r the cheapest ways to a pixel,
+    sums along four directions r the costs of the cheapest paths to a pixel,
     ``L(p, d) = C(p, d) + min(L(p - r, d), L(p - r, d +- 1) + P1, min_k L(p - r, k) + P2) - min_k L(p - r, k)``;
     block matching averages costs over 9 x 9 pixels instead. Minima are refined to fractions by a parabola, and kept
     where the right picture, matched with the left one, agrees.
@@ -39,58 +40,36 @@ def match_disparity(
     Args:
         left: (..., H, W) gray pictures of one scale, rectified.
         right: (..., H, W).
-        max_disparity: the largest disparity, pixels.
-        min_disparity: the smallest disparity, pixels.
+        max_disparity: the largest disparity, pixels; from 2 to below the width.
         method: "semi-global", "block", or "opencv" for OpenCV's own semi-global matcher (extra ``stereo``).
-        small_step: P1, what a change by one pixel costs.
-        large_step: P2, what a larger one costs.
-        max_difference: between both directions, pixels; None keeps all.
 
     Returns:
-        (..., H, W), in the dtype of ``left``.
+        Disparities (..., H, W), pixels, in the dtype of ``left``.
 
     Raises:
-        InputError: if sizes or numbers do not fit.
-        MissingExtraError: if OpenCV is asked for and not installed.
+        MissingExtraError: if ``method`` is OpenCV's and OpenCV is not installed.
 
     Differentiable: no.
 
     Cost: about 60 operations per pixel and disparity, and three numbers of 16 bits: 2 s for 640 x 480 pixels and 128
-        disparities on one CPU core, twice that with penalties that are no whole numbers. Batches and GPUs run the same
-        code.
+        disparities on one CPU core. Batches and GPUs run the same code.
 
     References: Zabih and Woodfill 1994 (census); Hirschmueller 2008 (semi-global matching).
     """
-    left = as_float_tensor(left, "left")
-    right = as_float_tensor(right, "right", like=left)
-    check_shape(left, "left", ("H", "W"), batch=True)
-    check_shape(right, "right", tuple(left.shape))
-    check_choice(method, "method", ("semi-global", "block", "opencv"))
-    check_count(min_disparity, "min_disparity", 0)
-    check_count(max_disparity, "max_disparity", min_disparity + 2)
-    check_positive(small_step, "small_step")
-    if not large_step >= small_step:
-        raise InputError(f"large_step must be no less than small_step, got {large_step} and {small_step}")
-    if max_disparity >= left.shape[-1]:
-        raise InputError(f"max_disparity must be below the width {left.shape[-1]}, got {max_disparity}")
     with torch.no_grad():
         pairs = left.reshape(-1, *left.shape[-2:]), right.reshape(-1, *left.shape[-2:])
         if method == "opencv":
-            found = torch.stack([_opencv(*pair, min_disparity, max_disparity) for pair in zip(*pairs, strict=True)])
+            found = torch.stack([_opencv(*pair, max_disparity) for pair in zip(*pairs, strict=True)])
             return found.to(left).reshape(left.shape)
-        volume = _cost_volume(census(pairs[0]), census(pairs[1]), min_disparity, max_disparity)
-        volume = _block_mean(volume) if method == "block" else _semi_global(volume, small_step, large_step)
-        found = min_disparity + _minima(volume)
-        if max_difference is not None:
-            other = min_disparity + _minima(_seen_from_right(volume)).roll(-min_disparity, dims=-1)
-            found = _agreeing(found, other, max_difference)
+        volume = _cost_volume(census(pairs[0]), census(pairs[1]), max_disparity)
+        volume = _block_mean(volume) if method == "block" else _semi_global(volume)
+        found = _agreeing(_minima(volume), _minima(_seen_from_right(volume)))
         return found.to(left).reshape(left.shape)
 
 
 def census(image: Tensor) -> Tensor:
-    """Return for pixels of pictures (..., H, W) which of the 62 neighbors in a window of 7 x 9 are darker, as bits."""
-    check_shape(image, "image", ("H", "W"), batch=True)
-    rows, columns = _HALF_ROWS, _HALF_COLUMNS
+    """Return the census (..., H, W) int64 of pictures: a bit per neighbor in a window of 7 x 9, set if it is darker."""
+    rows, columns = _MATCHING.half_rows, _MATCHING.half_columns
     flat = image.reshape(-1, 1, *image.shape[-2:])
     padded = torch.nn.functional.pad(flat, (columns, columns, rows, rows), mode="replicate").reshape(
         *image.shape[:-2], image.shape[-2] + 2 * rows, image.shape[-1] + 2 * columns
@@ -106,7 +85,7 @@ def census(image: Tensor) -> Tensor:
 
 
 def _set_bits(code: Tensor) -> Tensor:
-    """Return how many of the 62 low bits are set, summing pairs, fours and eights of bits side by side."""
+    """Return the number of set bits among the 62 low ones, summing pairs, fours and eights of bits side by side."""
     code = code - ((code >> 1) & 0x5555555555555555)
     code = (code & 0x3333333333333333) + ((code >> 2) & 0x3333333333333333)
     code = (code + (code >> 4)) & 0x0F0F0F0F0F0F0F0F
@@ -115,14 +94,14 @@ def _set_bits(code: Tensor) -> Tensor:
     return (code + (code >> 32)) & 0x7F
 
 
-def _cost_volume(left: Tensor, right: Tensor, lowest: int, highest: int) -> Tensor:
-    """Return (B, H, W, D) int16 costs; the largest where the other pixel lies beside the picture."""
+def _cost_volume(left: Tensor, right: Tensor, highest: int) -> Tensor:
+    """Return (B, H, W, D) int16 costs; the largest where the right pixel lies beside the picture."""
     width = left.shape[-1]
-    shape = (*left.shape, highest - lowest + 1)
-    volume = torch.full(shape, _LARGEST_COST, dtype=torch.int16, device=left.device)
-    for disparity in range(lowest, highest + 1):
+    shape = (*left.shape, highest + 1)
+    volume = torch.full(shape, _MATCHING.num_bits, dtype=torch.int16, device=left.device)
+    for disparity in range(highest + 1):
         differing = _set_bits(left[..., disparity:] ^ right[..., : width - disparity])
-        volume[..., disparity:, disparity - lowest] = differing.to(torch.int16)
+        volume[..., disparity:, disparity] = differing.to(torch.int16)
     return volume
 
 
@@ -131,50 +110,44 @@ def _block_mean(volume: Tensor) -> Tensor:
     return torch.nn.functional.avg_pool2d(planes, 9, stride=1, padding=4, count_include_pad=False).movedim(1, -1)
 
 
-def _semi_global(volume: Tensor, small: float, large: float) -> Tensor:
-    """Return the sum of the cheapest ways to every pixel from the left, the right, above and below."""
-    # Whole numbers of 16 bits take half the time of floats; the sums stay below 4 (62 + P2).
-    whole = float(small).is_integer() and float(large).is_integer() and large <= _LARGEST_WHOLE
-    if whole:
-        small, large = int(small), int(large)
-    else:
-        volume = volume.float()
+def _semi_global(volume: Tensor) -> Tensor:
+    """Return the sums of the costs of the cheapest paths to every pixel from the left, the right, above and below."""
     total = torch.zeros_like(volume)
     for axis in (1, 2):
         steps, sums = volume.unbind(axis), total.unbind(axis)
         for order in (range(len(steps)), range(len(steps) - 1, -1, -1)):
-            way = None
-            for place in order:
-                way = steps[place] if way is None else steps[place] + _cheapest_step(way, small, large)
-                sums[place].add_(way)
+            path = None
+            for line in order:
+                path = steps[line] if path is None else steps[line] + _cheapest_step(path)
+                sums[line].add_(path)
     return total
 
 
-def _cheapest_step(way: Tensor, small: float, large: float) -> Tensor:
-    """Return what the best step from the pixel before adds to each disparity, less the least cost there."""
-    level = way - way.amin(-1, keepdim=True)
-    best = level.clamp(max=large)
-    best[..., 1:] = torch.minimum(best[..., 1:], level[..., :-1] + small)
-    best[..., :-1] = torch.minimum(best[..., :-1], level[..., 1:] + small)
+def _cheapest_step(path: Tensor) -> Tensor:
+    """Return the cost of the best step from the previous pixel to each disparity, less the least path cost there."""
+    level = path - path.amin(-1, keepdim=True)
+    best = level.clamp(max=_MATCHING.large_step)
+    best[..., 1:] = torch.minimum(best[..., 1:], level[..., :-1] + _MATCHING.small_step)
+    best[..., :-1] = torch.minimum(best[..., :-1], level[..., 1:] + _MATCHING.small_step)
     return best
 
 
 def _minima(volume: Tensor) -> Tensor:
-    """Return where along the last axis the cost is least (...,), to a fraction by a parabola; NaN at the ends."""
-    place = volume.argmin(-1, keepdim=True)
+    """Return the indices (...,) of least cost along the last axis, to a fraction by a parabola; NaN at the ends."""
+    index = volume.argmin(-1, keepdim=True)
     last = volume.shape[-1] - 1
-    middle = place.clamp(1, last - 1)
-    before, here, after = (volume.gather(-1, middle + step)[..., 0].float() for step in (-1, 0, 1))
-    bend = before - 2 * here + after
+    middle = index.clamp(1, last - 1)
+    before, cost, after = (volume.gather(-1, middle + step)[..., 0].float() for step in (-1, 0, 1))
+    bend = before - 2 * cost + after
     shift = torch.where(bend > 0, 0.5 * (before - after) / torch.where(bend > 0, bend, 1.0), 0.0).clamp(-0.5, 0.5)
-    place = place[..., 0]
-    return torch.where((place > 0) & (place < last), place + shift, torch.nan)
+    index = index[..., 0]
+    return torch.where((index > 0) & (index < last), index + shift, torch.nan)
 
 
 def _seen_from_right(volume: Tensor) -> Tensor:
-    """Return the volume (B, H, W, D) of the right picture, as a view: its column x is x + step on the left.
+    """Return the cost volume (B, H, W, D) of the right picture, as a view: its column x is x + d on the left.
 
-    Columns are counted from the lowest disparity on; what lies beyond the left picture costs most.
+    Beyond the left picture costs are the largest.
     """
     batch, height, width, count = volume.shape
     padded = volume.new_full((batch, height, width + count, count), volume.max().item())
@@ -184,29 +157,30 @@ def _seen_from_right(volume: Tensor) -> Tensor:
     return padded.as_strided((batch, height, width, count), (*strides[:3], strides[2] + strides[3]))
 
 
-def _agreeing(found: Tensor, other: Tensor, slack: float) -> Tensor:
+def _agreeing(found: Tensor, reverse: Tensor) -> Tensor:
+    """Return disparities, NaN where the right picture's disparity of the matched pixel differs too much."""
     column = torch.arange(found.shape[-1], device=found.device)
-    there = (column - found).round().nan_to_num(-1).long()
-    back = other.gather(-1, there.clamp(0, found.shape[-1] - 1))
-    return torch.where((there >= 0) & ((back - found).abs() <= slack), found, torch.nan)
+    matched = (column - found).round().nan_to_num(-1).long()
+    back = reverse.gather(-1, matched.clamp(0, found.shape[-1] - 1))
+    return torch.where((matched >= 0) & ((back - found).abs() <= _MATCHING.max_difference), found, torch.nan)
 
 
-def _opencv(left: Tensor, right: Tensor, lowest: int, highest: int) -> Tensor:
-    """Return what OpenCV's semi-global matcher finds, with its own left-right check."""
+def _opencv(left: Tensor, right: Tensor, highest: int) -> Tensor:
+    """Return the disparities (H, W) of OpenCV's semi-global matcher, which has a left-right check of its own."""
     try:
         import cv2
     except ImportError as error:
         raise MissingExtraError("method 'opencv' takes the extra stereo: pip install 'torchreg[stereo]'") from error
-    count = 16 * -(-(highest - lowest + 1) // 16)
-    area = _OPENCV_BLOCK**2
+    count = 16 * -(-(highest + 1) // 16)
+    # Blocks of 5 x 5 pixels; P1 and P2 are 8 and 32 times their area, as OpenCV advises.
     matcher = cv2.StereoSGBM.create(
-        minDisparity=lowest, numDisparities=count, blockSize=_OPENCV_BLOCK, P1=8 * area, P2=32 * area,
-        disp12MaxDiff=1, uniquenessRatio=5, speckleWindowSize=50, speckleRange=2,
+        minDisparity=0, numDisparities=count, blockSize=5, P1=200, P2=800, disp12MaxDiff=1, uniquenessRatio=5,
+        speckleWindowSize=50, speckleRange=2,
     )  # fmt: skip
     scale = 255 / max(float(left.max()), float(right.max()), 1e-9)
     gray = [(part.cpu().clamp(min=0) * scale).round().numpy().astype(np.uint8) for part in (left, right)]
     # OpenCV leaves out columns for which not all disparities lie in the picture; its border repeated, none does.
-    wide = [np.pad(part, ((0, 0), (lowest + count, 0)), mode="edge") for part in gray]
-    found = torch.from_numpy(matcher.compute(*wide))[:, lowest + count :].double() / 16
+    wide = [np.pad(part, ((0, 0), (count, 0)), mode="edge") for part in gray]
+    found = torch.from_numpy(matcher.compute(*wide))[:, count:].double() / 16
     inside = torch.arange(found.shape[1]) >= found
-    return torch.where((found >= lowest) & inside, found, torch.nan)
+    return torch.where((found >= 0) & inside, found, torch.nan)

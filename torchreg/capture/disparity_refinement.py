@@ -7,20 +7,27 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_shape
-
-_RADIUS, _SPREAD = 5, 2.0
-_STEPS = 8
-# Pixels of the window further in disparity from its middle belong to something else.
-_SAME_SURFACE = 1.5
-# The fit may not leave the dense disparity by more, must correlate so well, and is never surer than that (pixels).
-_MAX_MOVE, _MIN_CORRELATION, _FLOOR = 1.5, 0.8, 0.05
-# Share of how far the surface in a window is from a plane by which the middle may be off.
-_UNEVEN = 0.5
-# Pictures are smoothed by this before, along rows and columns: noise is then the same at fractional places.
+# Pictures are smoothed by this binomial first, along rows and columns: noise is then the same at fractional positions.
 _BINOMIAL = (1 / 16, 4 / 16, 6 / 16, 4 / 16, 1 / 16)
-# A prior on the slopes of disparity: standard deviation, pixels per pixel; and the least noise of a picture.
-_SLOPE, _LEAST_NOISE = 0.3, 1e-3
+
+
+@dataclass(frozen=True)
+class _WindowFit:
+    """Fit of the window of a pixel; lengths in pixels."""
+
+    radius: int = 5  # half of the window's side: 11 x 11 pixels
+    spread: float = 2.0  # standard deviation of the Gaussian weights in the picture
+    num_steps: int = 9  # of Gauss-Newton
+    same_surface: float = 1.5  # pixels farther in dense disparity from the middle lie on another surface
+    slope_std: float = 0.3  # of the prior on the slopes of disparity, pixels per pixel
+    min_noise: float = 1e-3  # of pictures from 0 to 1; without noise a flat window would have no uncertainty
+    max_move: float = 1.5  # a fit that leaves the dense disparity by more is refused
+    min_correlation: float = 0.8  # windows that correlate less are refused
+    uneven_share: float = 0.5  # of the window's deviation from a plane, by which the middle may be off
+    min_std: float = 0.05  # no fit is more certain
+
+
+_FIT = _WindowFit()
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +37,7 @@ class RefinedDisparity:
     Args:
         disparity: (N,) pixels.
         std: (N,) standard deviation, pixels.
-        good: (N,) bool, whether the fit stayed near and the windows look alike.
+        good: (N,) bool, whether the fit stayed near the dense disparity and the windows look alike.
     """
 
     disparity: Tensor
@@ -38,8 +45,47 @@ class RefinedDisparity:
     good: Tensor
 
 
+@dataclass(frozen=True, eq=False)
+class _Windows:
+    """The K pixels around each of N pixels, all numbers float64.
+
+    Args:
+        column: (N, K) int64, within the picture.
+        row: (N, K) int64, within the picture.
+        basis: (K, 3) of a plane in the window: one, the step along the row, the step down.
+        disparity: (N, K) dense disparity, NaN where it is not known.
+        weights: (N, K) Gaussian in the picture, zero on other surfaces.
+    """
+
+    column: Tensor
+    row: Tensor
+    basis: Tensor
+    disparity: Tensor
+    weights: Tensor
+
+    @classmethod
+    def from_dense(cls, dense: Tensor, pixels: Tensor) -> _Windows:
+        """Return the windows around pixels (N, 2) of a dense disparity (H, W)."""
+        step = torch.arange(-_FIT.radius, _FIT.radius + 1, device=dense.device)
+        down, along = (part.reshape(-1) for part in torch.meshgrid(step, step, indexing="ij"))
+        column = (pixels[:, :1] + along).clamp(0, dense.shape[1] - 1)
+        row = (pixels[:, 1:] + down).clamp(0, dense.shape[0] - 1)
+        disparity, middle = dense[row, column], dense[pixels[:, 1], pixels[:, 0]].double()
+        same = ((disparity - middle[:, None]).abs() <= _FIT.same_surface).double()
+        # Smoothing spreads another surface over its edge by a pixel and more.
+        square = (1 - same).reshape(-1, 1, len(step), len(step))
+        same = 1 - torch.nn.functional.max_pool2d(square, 3, 1, 1).reshape(same.shape)
+        weights = same * torch.exp(-0.5 * (along**2 + down**2) / _FIT.spread**2).double()
+        basis = torch.stack((torch.ones_like(along), along, down), dim=-1).double()
+        return cls(column=column, row=row, basis=basis, disparity=disparity.double(), weights=weights)
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Return the weighted means (N,) of values (N, K)."""
+        return (self.weights * values).sum(-1) / self.weights.sum(-1).clamp(min=1e-9)
+
+
 def refine_disparity(left: Tensor, right: Tensor, dense: Tensor, pixels: Tensor) -> RefinedDisparity:
-    """Return the disparities of some pixels to a fraction of a pixel, from windows of 11 x 11.
+    """Return the disparities of N pixels to a fraction of a pixel, from windows of 11 x 11.
 
     Minimizes ``sum_q w_q (I_L(q) - g I_R(q - d - s . (q - p)) - b)^2`` over disparity d and slopes s by Gauss-Newton,
     the gain g and offset b taken from the windows' means and deviations. The weights are a Gaussian, zero where the
@@ -53,60 +99,52 @@ def refine_disparity(left: Tensor, right: Tensor, dense: Tensor, pixels: Tensor)
         pixels: (N, 2) int64 as (column, row), where ``dense`` is known.
 
     Returns:
-        one entry per pixel.
-
-    Raises:
-        InputError: if sizes differ.
+        Refined disparities (N,), their standard deviations and whether each fit is good.
 
     Differentiable: no.
 
     References: Lucas and Kanade 1981.
     """
-    check_shape(right, "right", tuple(left.shape))
-    check_shape(dense, "dense", tuple(left.shape))
-    check_shape(pixels, "pixels", ("N", 2))
-    step = torch.arange(-_RADIUS, _RADIUS + 1, device=left.device)
-    down, along = (part.reshape(-1) for part in torch.meshgrid(step, step, indexing="ij"))
-    column = (pixels[:, :1] + along).clamp(0, left.shape[1] - 1)
-    row = (pixels[:, 1:] + down).clamp(0, left.shape[0] - 1)
+    windows = _Windows.from_dense(dense, pixels)
     start = dense[pixels[:, 1], pixels[:, 0]].double()
-    same = ((dense[row, column] - start[:, None]).abs() <= _SAME_SURFACE).double()
-    # Smoothing carries what is beside a surface over its edge.
-    side = 2 * _RADIUS + 1
-    same = 1 - torch.nn.functional.max_pool2d((1 - same).reshape(-1, 1, side, side), 3, 1, 1).reshape(same.shape)
-    weights = same * torch.exp(-0.5 * (along**2 + down**2) / _SPREAD**2).double()
     first, second = _smoothed(torch.stack((left, right)).double())
-    target = first[row, column]
-    shape = torch.stack((torch.ones_like(along), along, down), dim=-1).double()
-    unknowns = torch.stack((start, torch.zeros_like(start), torch.zeros_like(start)), dim=-1)
-    prior = torch.diag(shape.new_tensor([1e-9, 1.0, 1.0])) / _SLOPE**2
-    for _ in range(_STEPS + 1):
-        place = column - unknowns @ shape.mT
-        seen, slope = _interpolated(second, place, row)
-        wanted, seen, scale = _normalized(target, seen, weights)
+    plane, variance, correlation = _fit_planes(first, second, windows, start)
+    # Where the dense disparity is no plane, fit and noise do not cover the error of the plane.
+    unevenness = windows.mean((windows.disparity - (plane.unsqueeze(1) * windows.basis).sum(-1)).nan_to_num(0.0) ** 2)
+    std = (variance + _FIT.uneven_share**2 * unevenness + _FIT.min_std**2).sqrt()
+    found = plane[:, 0]
+    near = (found - start).abs() <= _FIT.max_move
+    good = near & (correlation >= _FIT.min_correlation) & std.isfinite() & found.isfinite()
+    return RefinedDisparity(found.to(left), std.to(left), good)
+
+
+def _fit_planes(first: Tensor, second: Tensor, windows: _Windows, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return planes of disparity in windows, fitted by Gauss-Newton from disparities ``start`` (N,).
+
+    Returns:
+        Disparity and slopes (N, 3), variances (N,) of the disparities, correlations (N,) of the windows.
+    """
+    target = first[windows.row, windows.column]
+    plane = torch.stack((start, torch.zeros_like(start), torch.zeros_like(start)), dim=-1)
+    prior = torch.diag(plane.new_tensor([1e-9, 1.0, 1.0])) / _FIT.slope_std**2
+    for _ in range(_FIT.num_steps):
+        values, derivative = _interpolated(second, windows.column - plane @ windows.basis.mT, windows.row)
+        wanted, seen, scale = _normalized(target, values, windows.weights)
         residual = wanted - seen
         # d I_R(x - d) / dd = -I_R', in units of the window's deviation.
-        jacobian = -(slope / scale).unsqueeze(-1) * shape
-        noise = (weights * residual**2).sum(-1) / weights.sum(-1).clamp(min=1e-9)
-        noise = noise + (_LEAST_NOISE / scale[:, 0]) ** 2
-        weighted = jacobian * weights.unsqueeze(-1)
+        jacobian = -(derivative / scale).unsqueeze(-1) * windows.basis
+        noise = windows.mean(residual**2) + (_FIT.min_noise / scale[:, 0]) ** 2
+        weighted = jacobian * windows.weights.unsqueeze(-1)
         ridge = prior * noise[:, None, None]
         normal = weighted.mT @ jacobian + ridge
-        right_side = (weighted.mT @ residual.unsqueeze(-1))[..., 0] - (ridge @ _slopes(unknowns).unsqueeze(-1))[..., 0]
-        unknowns = unknowns + torch.linalg.solve(normal, right_side).clamp(-0.5, 0.5)
-    inverse = torch.linalg.inv(normal)
+        gradient = (weighted.mT @ residual.unsqueeze(-1))[..., 0] - (ridge @ _slopes(plane).unsqueeze(-1))[..., 0]
+        plane = plane + torch.linalg.solve(normal, gradient).clamp(-0.5, 0.5)
     # Smoothed noise: raw noise of a variance so much larger, seen through the smoothed weights of the fit.
-    pull = _smoothed(weighted.mT.reshape(-1, side, side)).reshape(weighted.mT.shape)
-    spread = inverse @ (pull @ pull.mT / sum(tap**2 for tap in _BINOMIAL) ** 2 + ridge) @ inverse
-    # Where the dense disparity is no plane, neither fit nor noise tell how far off the plane is.
-    plane = (unknowns.unsqueeze(1) * shape).sum(-1)
-    bumps = (weights * (dense[row, column].double() - plane).nan_to_num(0.0) ** 2).sum(-1)
-    bumps = bumps / weights.sum(-1).clamp(min=1e-9)
-    std = (spread[:, 0, 0] * noise + _UNEVEN**2 * bumps + _FLOOR**2).sqrt()
-    alike = (weights * wanted * seen).sum(-1) / weights.sum(-1).clamp(min=1e-9)
-    found = unknowns[:, 0]
-    good = ((found - start).abs() <= _MAX_MOVE) & (alike >= _MIN_CORRELATION) & std.isfinite() & found.isfinite()
-    return RefinedDisparity(found.to(left), std.to(left), good)
+    rows, side = weighted.mT, 2 * _FIT.radius + 1
+    rows = _smoothed(rows.reshape(-1, side, side)).reshape(rows.shape)
+    inverse = torch.linalg.inv(normal)
+    spread = inverse @ (rows @ rows.mT / sum(tap**2 for tap in _BINOMIAL) ** 2 + ridge) @ inverse
+    return plane, spread[:, 0, 0] * noise, windows.mean(wanted * seen)
 
 
 def _smoothed(images: Tensor) -> Tensor:
@@ -117,16 +155,16 @@ def _smoothed(images: Tensor) -> Tensor:
     return torch.nn.functional.conv2d(down, kernel.reshape(1, 1, 1, -1))[:, 0]
 
 
-def _slopes(unknowns: Tensor) -> Tensor:
-    """Return the unknowns with zero for the disparity, on which there is no prior."""
-    return unknowns * unknowns.new_tensor([0.0, 1.0, 1.0])
+def _slopes(plane: Tensor) -> Tensor:
+    """Return planes (N, 3) with zero for the disparity, on which there is no prior."""
+    return plane * plane.new_tensor([0.0, 1.0, 1.0])
 
 
 def _interpolated(image: Tensor, column: Tensor, row: Tensor) -> tuple[Tensor, Tensor]:
     """Return values and slopes along the rows at (N, K) fractional columns: cubic convolution (Keys 1981)."""
-    whole = column.floor()
-    t = column - whole
-    taps = [image[row, (whole.long() + k).clamp(0, image.shape[1] - 1)] for k in (-1, 0, 1, 2)]
+    floor = column.floor()
+    t = column - floor
+    taps = [image[row, (floor.long() + k).clamp(0, image.shape[1] - 1)] for k in (-1, 0, 1, 2)]
     a, b, c, d = taps
     rise, bend, twist = 0.5 * (c - a), a - 2.5 * b + 2 * c - 0.5 * d, 0.5 * (d - a) + 1.5 * (b - c)
     return b + t * (rise + t * (bend + t * twist)), rise + t * (2 * bend + 3 * t * twist)
@@ -135,9 +173,6 @@ def _interpolated(image: Tensor, column: Tensor, row: Tensor) -> tuple[Tensor, T
 def _normalized(target: Tensor, seen: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return both windows (N, K) with weighted mean zero and deviation one, and the deviation (N, 1) of the second."""
     share = weights / weights.sum(-1, keepdim=True).clamp(min=1e-9)
-    both = []
-    for window in (target, seen):
-        window = window - (share * window).sum(-1, keepdim=True)
-        scale = (share * window**2).sum(-1, keepdim=True).sqrt().clamp(min=1e-6)
-        both.append((window / scale, scale))
-    return both[0][0], both[1][0], both[1][1]
+    centered = [window - (share * window).sum(-1, keepdim=True) for window in (target, seen)]
+    scales = [(share * window**2).sum(-1, keepdim=True).sqrt().clamp(min=1e-6) for window in centered]
+    return centered[0] / scales[0], centered[1] / scales[1], scales[1]

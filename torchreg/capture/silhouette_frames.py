@@ -1,4 +1,4 @@
-"""Sequences of silhouettes as surfaces: the masks of all cameras read frame by frame, and the mesh of their hull."""
+"""Sequences of silhouettes as surfaces: the masks of all cameras, frame by frame, and the mesh of their hull."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from pathlib import Path
 from torch import Tensor
 
 from torchreg._checks import check_count
-from torchreg.capture.silhouettes import chroma_key, visual_hull
+from torchreg.capture.color import chroma_key
+from torchreg.capture.silhouettes import visual_hull
 from torchreg.errors import FormatError, InputError
 from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.mesh import TriangleMesh
@@ -19,13 +20,13 @@ from torchreg.io.tensors import load_tensors, save_tensors
 
 
 class SilhouetteFrames:
-    """The masks of several cameras, frame after frame, and the surface of each frame's visual hull.
+    """The masks of several cameras, frame by frame, and the surface of each frame's visual hull.
 
     Args:
         folders: one per camera, with its masks in the order of the numbers in their names. A folder belongs to the
             camera of its name; if no camera has the name of any, the folders are in the order of the cameras.
-        cameras: calibrated; those without a folder are left out where names tell which.
-        screen: pictures before a screen of one color instead of masks, see `chroma_key`.
+        cameras: calibrated; those without a folder are omitted if folders have the names of cameras.
+        screen: whether the files are pictures before a screen of one color instead of masks, see `chroma_key`.
         resolution: see `visual_hull`.
 
     Raises:
@@ -43,9 +44,9 @@ class SilhouetteFrames:
         resolution: int = 128,
     ) -> None:
         check_count(resolution, "resolution", 8)
-        places = [Path(folder) for folder in folders]
-        self.cameras, self.screen, self.resolution = _matched(places, cameras), screen, resolution
-        self._files = list_frames(places)
+        paths = [Path(folder) for folder in folders]
+        self.cameras, self.screen, self.resolution = _cameras_of(paths, cameras), screen, resolution
+        self._files = list_frames(paths)
         self.names = tuple(str(frame[0]) for frame in self._files)
 
     def __len__(self) -> int:
@@ -55,7 +56,7 @@ class SilhouetteFrames:
         """Return the masks (H, W) of a frame, one per camera.
 
         Raises:
-            FormatError: as `load_mask`, and if a picture has not the size that its camera's have; names the file.
+            FormatError: as `load_mask`, and if a picture does not have the size of its camera's; names the file.
         """
         masks = []
         for file, camera in zip(self._files[number], self.cameras, strict=True):
@@ -79,25 +80,25 @@ class SilhouetteFrames:
 
         Args:
             number: of the frame.
-            progress: a folder, made if need be, in which surfaces are kept; that of the same masks, cameras and
-                resolution is not made again.
+            progress: a folder, made if need be, in which surfaces are kept; the surface of the same masks, cameras and
+                resolution is read from it.
 
         Raises:
             FormatError: as `masks`, and as `visual_hull`; names the frame.
         """
         masks = self.masks(number)
-        place = None if progress is None else Path(progress) / f"hull_{number:05d}.safetensors"
-        made_of = self._fingerprint(masks)
-        kept = None if place is None else _kept(place, made_of)
-        if kept is not None:
-            return kept
+        path = None if progress is None else Path(progress) / f"hull_{number:05d}.safetensors"
+        fingerprint = self._fingerprint(masks)
+        stored = None if path is None else _stored_mesh(path, fingerprint)
+        if stored is not None:
+            return stored
         try:
             mesh = visual_hull(masks, self.cameras, resolution=self.resolution).mesh()
         except InputError as error:
             raise FormatError(f"frame {number} ({self.names[number]}): {error}") from error
-        if place is not None:
-            place.parent.mkdir(parents=True, exist_ok=True)
-            save_tensors(place, {"vertices": mesh.vertices, "faces": mesh.faces}, {"masks": made_of})
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            save_tensors(path, {"vertices": mesh.vertices, "faces": mesh.faces}, {"masks": fingerprint})
         return mesh
 
     def _fingerprint(self, masks: Sequence[Tensor]) -> str:
@@ -108,23 +109,23 @@ class SilhouetteFrames:
         return digest.hexdigest()
 
 
-def _matched(places: Sequence[Path], cameras: CameraRig) -> CameraRig:
-    """Return the camera of each folder, by name if a folder has that of one, else in order."""
-    names = [place.resolve().name for place in places]
-    known = [name in cameras.names for name in names]
-    if any(known):
-        strange = [name for name, there in zip(names, known, strict=True) if not there]
-        if strange:
-            raise InputError(f"folders must have the names of cameras; there is none called {', '.join(strange)}")
+def _cameras_of(folders: Sequence[Path], cameras: CameraRig) -> CameraRig:
+    """Return the camera of each folder, by name if any folder has the name of a camera, else in order."""
+    names = [folder.resolve().name for folder in folders]
+    unknown = [name for name in names if name not in cameras.names]
+    if len(unknown) < len(names):
+        if unknown:
+            raise InputError(f"folders must have the names of cameras; there is none called {', '.join(unknown)}")
         return CameraRig(tuple(cameras[name] for name in names))
     if len(names) != len(cameras):
         raise InputError(f"folders must be one per camera, got {len(names)} folders and {len(cameras)} cameras")
     return cameras
 
 
-def _kept(place: Path, made_of: str) -> TriangleMesh | None:
+def _stored_mesh(path: Path, fingerprint: str) -> TriangleMesh | None:
+    """Return the mesh of a file, None if there is none or its fingerprint differs."""
     try:
-        tensors, metadata = load_tensors(place)
-        return TriangleMesh(tensors["vertices"], tensors["faces"]) if metadata.get("masks") == made_of else None
+        tensors, metadata = load_tensors(path)
+        return TriangleMesh(tensors["vertices"], tensors["faces"]) if metadata.get("masks") == fingerprint else None
     except (FileNotFoundError, FormatError, KeyError, InputError):
         return None

@@ -1,4 +1,4 @@
-"""Silhouettes to surfaces: the visual hull of calibrated masks, refined only where its surface runs, and its mesh."""
+"""Silhouettes to surfaces: the visual hull of calibrated masks, refined only near its surface, and its mesh."""
 
 from __future__ import annotations
 
@@ -17,27 +17,34 @@ from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.marching_cubes import marching_cubes
 from torchreg.geometry.mesh import TriangleMesh
 
-# Blocks of 16^3 voxels are looked at first, then their eighths, down to voxels.
-_LEVELS = 4
-_MAX_RESOLUTION = 512
-# Points looked at in one go; bounds memory at about 50 MB.
+# Points looked up at a time; bounds memory at about 50 MB.
 _CHUNK = 1 << 20
-# Resolution at which the box is looked for, how often, and empty layers around it.
-_BOX_RESOLUTION, _BOX_ROUNDS, _BORDER = 32, 3, 2
-_SMALLEST_MASK = 4
-# The hull covers all of every mask that fits; exchanged ones are covered by less than half.
-_LEAST_COVERED = 0.6
-# By so many pixels interpolation between the middles of pixels may change more than the distance itself.
-_INTERPOLATION = 1.5
+
+
+@dataclass(frozen=True)
+class _Carving:
+    """Search for a hull."""
+
+    num_levels: int = 4  # of blocks above voxels: the largest, 16^3 voxels, are decided first, then their eighths
+    max_resolution: int = 512  # voxels along the longest side
+    border: int = 2  # empty layers of voxels around the box
+    interpolation: float = 1.5  # pixels by which bilinear interpolation may change more than the distance itself
+    box_resolution: int = 32  # cells along the longest side of the box while it is shrunk
+    box_rounds: int = 3  # in which it is shrunk
+    min_mask: int = 4  # pixels of a mask that is not empty
+    min_covered: float = 0.6  # share of each mask that its hull covers: all if masks fit, below a half if exchanged
+
+
+_CARVING = _Carving()
 
 
 @dataclass(frozen=True, eq=False)
 class VisualHull:
-    """The largest body with given silhouettes, as a field on a grid.
+    """The largest body with given silhouettes, as a signed distance field on a grid.
 
     Args:
-        field: (X, Y, Z) signed distance to the outline in the picture that is least inside, times the size of a pixel
-            there: negative inside, in the unit of the cameras. Far from the surface only its sign tells anything.
+        field: (X, Y, Z) largest signed distance to the masks' outlines, times the size of a pixel at that depth:
+            negative inside, in the unit of the cameras. Far from the surface only its sign is meaningful.
         origin: (3,) of sample (0, 0, 0).
         spacing: between samples.
     """
@@ -67,16 +74,16 @@ def visual_hull(
     """Return the visual hull of calibrated silhouettes: all points that every camera sees inside its mask.
 
     Blocks of the grid whose picture lies clear of every outline are decided at once; the others are split into eight.
-    What a camera does not see, because it lies beside its picture or behind it, counts as outside.
+    Points that a camera does not see, beside its picture or behind it, count as outside.
 
     Args:
         masks: one (H, W) bool per camera; True on the object.
-        cameras: where the masks were taken.
+        cameras: one per mask.
         resolution: samples along the longest side of the box.
         box: (2, 3) lower and upper corner of what may hold the object; found from the masks by default.
 
     Returns:
-        the hull, float32.
+        The hull, float32.
 
     Raises:
         InputError: if numbers or sizes do not fit, a mask is (nearly) empty or touches the border of its picture, or
@@ -90,10 +97,10 @@ def visual_hull(
 
     References: Laurentini 1994 (the hull); Szeliski 1993 (octrees from silhouettes).
     """
-    silhouettes = [_Silhouette.of(mask, camera) for mask, camera in _paired(masks, cameras)]
+    silhouettes = [_Silhouette.from_mask(mask, camera) for mask, camera in _paired(masks, cameras)]
     check_count(resolution, "resolution", 8)
-    if resolution > _MAX_RESOLUTION:
-        raise InputError(f"resolution must be at most {_MAX_RESOLUTION}, got {resolution}")
+    if resolution > _CARVING.max_resolution:
+        raise InputError(f"resolution must be at most {_CARVING.max_resolution}, got {resolution}")
     with torch.no_grad():
         bounds = _found_box(silhouettes) if box is None else _checked_box(box)
         hull = _carved(silhouettes, bounds, resolution)
@@ -108,6 +115,7 @@ def visual_hull(
 
 
 def _paired(masks: Sequence[Tensor], cameras: CameraRig | Sequence[Camera]) -> list[tuple[Tensor, Camera]]:
+    """Return each mask with its camera; InputError unless every mask shows the whole object."""
     cameras = list(cameras)
     if len(masks) != len(cameras) or len(cameras) < 2:
         raise InputError(f"masks must be one per camera, two or more, got {len(masks)} and {len(cameras)} cameras")
@@ -120,24 +128,31 @@ def _paired(masks: Sequence[Tensor], cameras: CameraRig | Sequence[Camera]) -> l
                 f"{camera.height} pixels, the mask has shape {tuple(mask.shape)}"
             )
         rim = torch.cat((mask[0], mask[-1], mask[:, 0], mask[:, -1]))
-        if int(mask.sum()) < _SMALLEST_MASK or bool(rim.any()):
-            what = "touches the border of the picture" if bool(rim.any()) else "is empty"
+        if int(mask.sum()) < _CARVING.min_mask or bool(rim.any()):
+            defect = "touches the border of the picture" if bool(rim.any()) else "is empty"
             raise InputError(
-                f"masks must show the whole object, that of {camera.name or 'a camera'} {what}; leave it out"
+                f"masks must show the whole object, that of {camera.name or 'a camera'} {defect}; leave it out"
             )
     return list(zip(masks, cameras, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
 class _Silhouette:
-    """A camera, the signed distance (1, 1, H, W) to its mask's outline, and by how much its lens stretches at most."""
+    """A mask as seen by its camera.
+
+    Args:
+        camera: float32.
+        distance: (1, 1, H, W) signed distance to the outline, pixels.
+        stretch: largest factor by which the lens stretches the picture.
+    """
 
     camera: Camera
     distance: Tensor
     stretch: float
 
     @classmethod
-    def of(cls, mask: Tensor, camera: Camera) -> _Silhouette:
+    def from_mask(cls, mask: Tensor, camera: Camera) -> _Silhouette:
+        """Return the silhouette of a mask (H, W)."""
         camera = camera.to(device=mask.device, dtype=torch.float32)
         # Averaged over 3 x 3 pixels, the steps of the outline vanish, and its curves lose a hundredth of a pixel.
         distance = torch.nn.functional.pad(signed_mask_distance(mask)[None, None], (1, 1, 1, 1), mode="replicate")
@@ -150,27 +165,27 @@ class _Silhouette:
             stretch = 1.1 * float(torch.linalg.matrix_norm(jacobian.nan_to_num(0.0), 2).max())
         return cls(camera, distance, stretch)
 
-    def look(self, points: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-        """Return for points (N, 3) the signed distance in pixels, how much it may change within ``radius``."""
+    def look_up(self, points: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+        """Return signed distances (N,) of points (N, 3), and bounds (N,) of their change within a radius, pixels."""
         local = points @ self.camera.world_to_camera[:3, :3].mT + self.camera.world_to_camera[:3, 3]
         depth = local[:, 2]
         plane = local[:, :2] / depth.clamp(min=1e-9).unsqueeze(-1)
         focal, center = self.camera.intrinsics.split(2)
         pixels = self.camera.distorted(plane) * focal + center
         size = pixels.new_tensor([self.camera.width, self.camera.height])
-        place = (2 * pixels + 1) / size - 1
+        normalized = (2 * pixels + 1) / size - 1
         sampled = torch.nn.functional.grid_sample(
-            self.distance, place[None, None], mode="bilinear", padding_mode="border", align_corners=False
+            self.distance, normalized[None, None], mode="bilinear", padding_mode="border", align_corners=False
         )[0, 0, 0]
         # Beside the picture it is at least as far outside as from the border.
         beyond = (pixels - pixels.clamp(torch.zeros_like(size), size - 1)).norm(dim=-1)
         sampled = torch.where((beyond > 0) | (depth <= 0), sampled.clamp(min=0.5) + beyond, sampled)
         slope = float(focal.max()) * self.stretch * (1 + (plane**2).sum(-1)).sqrt()
-        reach = torch.where(depth > 1.001 * radius, slope * radius / (depth - radius).clamp(min=1e-9), torch.inf)
-        return sampled, reach
+        change = torch.where(depth > 1.001 * radius, slope * radius / (depth - radius).clamp(min=1e-9), torch.inf)
+        return sampled, change
 
     def pixel_size(self, points: Tensor) -> Tensor:
-        """Return the width of a pixel at points (N, 3)."""
+        """Return the widths (N,) of a pixel at the depths of points (N, 3)."""
         depth = points @ self.camera.world_to_camera[2, :3] + self.camera.world_to_camera[2, 3]
         return depth.clamp(min=0.0) / self.camera.intrinsics[0]
 
@@ -178,13 +193,13 @@ class _Silhouette:
 def _carved(silhouettes: list[_Silhouette], box: Tensor, resolution: int) -> VisualHull:
     """Return the hull within a box, by blocks that are split while an outline passes through their picture."""
     spacing = float((box[1] - box[0]).max()) / (resolution - 1)
-    edge = 1 << _LEVELS
-    counts = [math.ceil((math.ceil(side / spacing) + 1 + 2 * _BORDER) / edge) for side in (box[1] - box[0]).tolist()]
+    edge, border = 1 << _CARVING.num_levels, 2 * _CARVING.border
+    counts = [math.ceil((math.ceil(side / spacing) + 1 + border) / edge) for side in (box[1] - box[0]).tolist()]
     middle = 0.5 * (box[0] + box[1])
     origin = middle - 0.5 * spacing * (middle.new_tensor(counts) * edge - 1)
     state = torch.zeros(counts, dtype=torch.int8, device=box.device)
-    for level in range(_LEVELS + 1):
-        edge = 1 << (_LEVELS - level)
+    for level in range(_CARVING.num_levels + 1):
+        edge = 1 << (_CARVING.num_levels - level)
         if level:
             state = state.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
         open_blocks = (state == 0).nonzero()
@@ -194,7 +209,7 @@ def _carved(silhouettes: list[_Silhouette], box: Tensor, resolution: int) -> Vis
         state[tuple(open_blocks.unbind(-1))] = _decided(silhouettes, centers, spacing * 0.5 * (edge - 1) * 3**0.5)
     field = state.to(box) * (10 * spacing)
     field[tuple(open_blocks.unbind(-1))] = _sampled(silhouettes, origin + spacing * open_blocks)
-    # What reaches out of the box is cut there, so that the surface is closed.
+    # The field is cut at the sides of the box, so that the surface is closed.
     for axis in range(3):
         along = origin[axis] + spacing * torch.arange(field.shape[axis]).to(box)
         beyond = torch.maximum(box[0, axis] - along, along - box[1, axis])
@@ -203,16 +218,22 @@ def _carved(silhouettes: list[_Silhouette], box: Tensor, resolution: int) -> Vis
 
 
 def _decided(silhouettes: list[_Silhouette], centers: Tensor, radius: float) -> Tensor:
-    """Return 1 for blocks (N, 3) that lie outside one mask, -1 for those inside all, 0 for the others, int8."""
-    verdict = torch.full(centers.shape[:1], -1, dtype=torch.int8, device=centers.device)
-    left = torch.arange(len(centers), device=centers.device)
+    """Return states (N,) int8 of blocks: 1 outside of one mask or more, -1 inside all of them, 0 undecided.
+
+    Args:
+        silhouettes: of all cameras.
+        centers: (N, 3) of the blocks.
+        radius: of the balls around them.
+    """
+    state = torch.full(centers.shape[:1], -1, dtype=torch.int8, device=centers.device)
+    remaining = torch.arange(len(centers), device=centers.device)
     for silhouette in silhouettes:
-        distance, reach = silhouette.look(centers[left], radius)
-        outside = distance > reach + _INTERPOLATION
-        inside = distance < -reach - _INTERPOLATION
-        verdict[left] = torch.where(outside, 1, torch.where(inside, verdict[left], 0)).to(torch.int8)
-        left = left[~outside]
-    return verdict
+        distance, change = silhouette.look_up(centers[remaining], radius)
+        outside = distance > change + _CARVING.interpolation
+        inside = distance < -change - _CARVING.interpolation
+        state[remaining] = torch.where(outside, 1, torch.where(inside, state[remaining], 0)).to(torch.int8)
+        remaining = remaining[~outside]
+    return state
 
 
 def _check_covered(hull: VisualHull, silhouettes: list[_Silhouette], masks: Sequence[Tensor]) -> None:
@@ -222,14 +243,14 @@ def _check_covered(hull: VisualHull, silhouettes: list[_Silhouette], masks: Sequ
         camera = silhouette.camera
         pixels, depth = camera.project(points)
         pixels = pixels[camera.contains(pixels)]
-        # Cells of the picture that are wider than the points lie apart.
+        # Cells of the picture that are wider than the spacing of the points.
         side = max(2, math.ceil(4 * hull.spacing * float(camera.intrinsics[0] / depth.median())))
         wanted = torch.nn.functional.avg_pool2d(mask[None, None].float(), side, ceil_mode=True)[0, 0] > 0.5
         covered = torch.zeros_like(wanted)
         column, row = ((pixels + 0.5) / side).floor().long().unbind(-1)
         covered[row, column] = True
         share = float((covered & wanted).sum() / wanted.sum().clamp(min=1))
-        if bool(wanted.any()) and share < _LEAST_COVERED:
+        if bool(wanted.any()) and share < _CARVING.min_covered:
             raise InputError(
                 f"masks must fit together, but what all of them have in common fills {100 * share:.0f} % of that of "
                 f"{camera.name or 'a camera'}; check that masks and cameras are in the same order"
@@ -242,39 +263,38 @@ def _sampled(silhouettes: list[_Silhouette], points: Tensor) -> Tensor:
     for chunk in points.split(_CHUNK):
         field = chunk.new_full(chunk.shape[:1], -torch.inf)
         for silhouette in silhouettes:
-            distance, _ = silhouette.look(chunk, 0.0)
+            distance, _ = silhouette.look_up(chunk, 0.0)
             field = torch.maximum(field, distance * silhouette.pixel_size(chunk))
         parts.append(field)
     return torch.cat(parts) if parts else points.new_zeros(0)
 
 
 def _found_box(silhouettes: list[_Silhouette]) -> Tensor:
-    """Return a box (2, 3) around the hull: first about the point nearest to all middles of masks, then ever tighter."""
-    places = torch.stack([silhouette.camera.position for silhouette in silhouettes])
+    """Return a box (2, 3) around the hull: about the point nearest to the rays of all masks' middles, then shrunk."""
+    positions = torch.stack([silhouette.camera.position for silhouette in silhouettes])
     middles = []
     for silhouette in silhouettes:
-        inside = (silhouette.distance[0, 0] < 0).nonzero().flip(-1).to(places)
+        inside = (silhouette.distance[0, 0] < 0).nonzero().flip(-1).to(positions)
         middles.append(silhouette.camera.directions(inside.mean(0, keepdim=True))[0])
     rays = torch.nn.functional.normalize(torch.stack(middles), dim=-1)
     across = torch.eye(3).to(rays) - rays.unsqueeze(-1) * rays.unsqueeze(-2)
-    center = torch.linalg.lstsq(across.sum(0), (across @ places.unsqueeze(-1)).sum(0)).solution[:, 0]
-    half = (places - center).norm(dim=-1).min()
-    # Rays within half a degree of each other tell nothing of the depth.
+    center = torch.linalg.lstsq(across.sum(0), (across @ positions.unsqueeze(-1)).sum(0)).solution[:, 0]
+    half = (positions - center).norm(dim=-1).min()
+    # Rays within half a degree of each other do not determine the depth.
     if float(torch.linalg.eigvalsh(across.mean(0))[0]) < 1e-4:
         raise InputError("cameras must stand around the object; pass box= where they do not")
     box = torch.stack((center - half, center + half))
-    for _ in range(_BOX_ROUNDS):
+    for _ in range(_CARVING.box_rounds):
         box = _shrunk(silhouettes, box)
     return box
 
 
 def _shrunk(silhouettes: list[_Silhouette], box: Tensor) -> Tensor:
-    """Return the box of the cells of a box, 32 to its longest side, in which part of the hull may lie."""
-    size = float((box[1] - box[0]).max()) / _BOX_RESOLUTION
+    """Return the bounds (2, 3) of the cells of a box, 32 to its longest side, in which part of the hull may lie."""
+    size = float((box[1] - box[0]).max()) / _CARVING.box_resolution
     counts = [max(1, math.ceil(side / size - 1e-6)) for side in (box[1] - box[0]).tolist()]
     cells = torch.ones(counts, dtype=torch.bool).nonzero().to(box)
-    verdict = _decided(silhouettes, box[0] + size * (cells + 0.5), 0.5 * size * 3**0.5)
-    kept = cells[verdict < 1]
+    kept = cells[_decided(silhouettes, box[0] + size * (cells + 0.5), 0.5 * size * 3**0.5) < 1]
     if not len(kept):
         return box
     return torch.stack((box[0] + size * kept.amin(0), box[0] + size * (kept.amax(0) + 1)))
@@ -287,56 +307,3 @@ def _checked_box(box: Tensor) -> Tensor:
     if not bool((box[1] > box[0]).all()):
         raise InputError(f"box must hold its lower and its upper corner, got {box.tolist()}")
     return box
-
-
-def chroma_key(image: Tensor, background: Sequence[float] | None = None, *, tolerance: float = 0.12) -> Tensor:
-    """Return which pixels differ from a background of one color, in light and in shade.
-
-    Pixels are compared by chroma, their blue and red less their brightness: ``(B - Y, R - Y)``, with that of the
-    background scaled to each pixel's own brightness, since in shade a screen keeps its hue. Specks are removed and
-    pinholes closed, one pixel wide.
-
-    Args:
-        image: (..., H, W, 3) from 0 to 1.
-        background: its red, green and blue; the median of the border of each picture by default.
-        tolerance: distance in chroma from which a pixel is foreground.
-
-    Returns:
-        (..., H, W) bool.
-
-    Raises:
-        InputError: if the shape does not fit or ``tolerance`` is not positive.
-
-    Differentiable: no.
-    """
-    image = as_float_tensor(image, "image")
-    check_shape(image, "image", ("H", "W", 3), batch=True)
-    if not tolerance > 0:
-        raise InputError(f"tolerance must be positive, got {tolerance}")
-    with torch.no_grad():
-        if background is None:
-            sides = (image[..., 0, :, :], image[..., -1, :, :], image[..., :, 0, :], image[..., :, -1, :])
-            rim = torch.cat(sides, dim=-2)
-            screen = rim.median(dim=-2).values[..., None, None, :]
-        else:
-            screen = torch.as_tensor(background).to(image)
-            check_shape(screen, "background", (3,))
-        luma = image.new_tensor([0.299, 0.587, 0.114])
-        brightness, own = (image @ luma).unsqueeze(-1), (screen @ luma).unsqueeze(-1)
-        shaded = screen * (brightness / own.clamp(min=1e-3)).clamp(max=1.5)
-        difference = (image - brightness) - (shaded - (shaded @ luma).unsqueeze(-1))
-        mask = difference[..., [0, 2]].norm(dim=-1) > tolerance
-        return _tidied(mask)
-
-
-def _tidied(mask: Tensor) -> Tensor:
-    """Return masks (..., H, W) opened and then closed by squares of 3 x 3."""
-    flat = mask.reshape(-1, 1, *mask.shape[-2:]).float()
-
-    def grown(values: Tensor) -> Tensor:
-        return torch.nn.functional.max_pool2d(values, 3, stride=1, padding=1)
-
-    def shrunk(values: Tensor) -> Tensor:
-        return -grown(-values)
-
-    return (shrunk(grown(grown(shrunk(flat)))) > 0.5).reshape(mask.shape)

@@ -1,4 +1,4 @@
-"""Sequences of stereo pictures as clouds: pair after pair read, rectified, matched, and what is no shape cut off."""
+"""Sequences of stereo pictures as clouds: each pair is read, rectified and matched, and an arm is cut off."""
 
 from __future__ import annotations
 
@@ -17,21 +17,28 @@ from torchreg.geometry.camera_rig import StereoPair
 from torchreg.geometry.neighbors import k_nearest_others
 from torchreg.io.images import list_frames, load_image
 
-# Nearer to the border of what both cameras see, pixels, a thing may go on beyond it.
-_BORDER = 12
-# The far end is the outermost corner with so many others within this distance, metres.
-_COMPANIONS, _COMPANY = 3, 0.015
+
+@dataclass(frozen=True)
+class _FarEnd:
+    """Search for the far end of an arm."""
+
+    border: int = 12  # pixels this near to the border of the common view may belong to an object that extends beyond
+    num_neighbors: int = 3  # the end is the outermost corner with so many neighbors,
+    neighbor_distance: float = 0.015  # none farther away, metres
+
+
+_FAR_END = _FarEnd()
 
 
 @dataclass(frozen=True, eq=False)
 class StereoSight:
-    """What a frame shows.
+    """The points of a frame.
 
     Args:
         left: (H, W) or (H, W, 3) the left picture, rectified.
         pair: the rectified cameras.
-        corners: all that was found in it.
-        points: of those, what is within reach.
+        corners: all points of the pair.
+        points: those within reach of the far end.
     """
 
     left: Tensor
@@ -41,7 +48,7 @@ class StereoSight:
 
 
 class StereoFrames(Sequence[Tensor]):
-    """The clouds (M, 3) of a sequence of stereo pictures, float32, in world coordinates; made when asked for, and kept.
+    """The clouds (M, 3) of a sequence of stereo pictures, float32, in world coordinates; made on request, and kept.
 
     Reading raises what `load_image` and `stereo_points` raise, the latter as FormatError that names the picture.
 
@@ -49,7 +56,7 @@ class StereoFrames(Sequence[Tensor]):
         left: folder with the pictures of the left camera, in the order of the numbers in their names.
         right: likewise.
         pair: the cameras; pictures are rectified if they are not.
-        config: what to look for.
+        config: of `stereo_points`.
         box: (2, 3) lower and upper corner of the volume of interest in world coordinates, or None.
         reach: see `far_end`; None keeps all.
 
@@ -74,10 +81,10 @@ class StereoFrames(Sequence[Tensor]):
             check_positive(reach, "reach")
         self.names = tuple(str(first) for first, _ in self._files)
         self.pair, self.config, self.box, self.reach = pair, config or StereoConfig(), box, reach
-        self._straight = pair.is_rectified
+        self._is_rectified = pair.is_rectified
         self._clouds: dict[int, Tensor] = {}
         self._last: tuple[int, StereoSight] | None = None
-        self._checked = False
+        self._order_checked = False
 
     def __len__(self) -> int:
         return len(self._files)
@@ -92,61 +99,63 @@ class StereoFrames(Sequence[Tensor]):
         return self._clouds[number]
 
     def sight(self, number: int) -> StereoSight:
-        """Return all that is seen in a frame; the frame asked for last is kept."""
+        """Return the points of a frame with their picture and cameras; the last frame is kept."""
         if self._last is None or self._last[0] != number:
-            self._last = number, self._seen(number)
+            self._last = number, self._matched(number)
         return self._last[1]
 
     def pictures(self, number: int) -> tuple[Tensor, Tensor]:
-        """Return both pictures (H, W) of a frame as they are, in gray."""
+        """Return both pictures (H, W) of a frame in gray, not rectified."""
         left, right = (load_image(file) for file in self._files[number])
         return as_gray(left, self.pair.left, "left"), as_gray(right, self.pair.right, "right")
 
-    def _seen(self, number: int) -> StereoSight:
+    def _matched(self, number: int) -> StereoSight:
         first, second = self._files[number]
         left, right = load_image(first), load_image(second)
         try:
             pair = self.pair
-            if not self._straight:
+            if not self._is_rectified:
                 left, right, pair = rectify(left, right, pair)
-            order = not self._checked
-            found = stereo_points(left, right, pair, config=self.config, box=self.box, check_order=order)
+            check = not self._order_checked
+            corners = stereo_points(left, right, pair, config=self.config, box=self.box, check_order=check)
         except InputError as error:
             raise FormatError(f"{first} and {second}: {error}") from error
-        self._checked = True
-        kept = found
+        self._order_checked = True
+        points = corners
         if self.reach is not None:
-            kept = found.subset(far_end(found, pair, self.config, self.reach))
-        return StereoSight(left, pair, found, kept)
+            points = corners.subset(far_end(corners, pair, self.config, self.reach))
+        return StereoSight(left, pair, corners, points)
 
 
-def far_end(found: StereoPoints, pair: StereoPair, config: StereoConfig, reach: float) -> Tensor:
-    """Return which points (N,) lie within a reach of the end of what comes in through the border, as a hand on an arm.
+def far_end(corners: StereoPoints, pair: StereoPair, config: StereoConfig, reach: float) -> Tensor:
+    """Return the mask (N,) of points near the far end of an object that enters through the border, as an arm does.
 
-    All of them, if nothing of the wanted depth touches the border of what both cameras see. Else the end is the point
-    farthest from there, and the reach is measured along the line between.
+    All points, if nothing in the depths of interest touches the border of what both cameras see. Else the far end is
+    the point farthest from where the object enters, and the reach is measured along the line between the two.
 
     Args:
-        found: of a pair.
+        corners: points of a pair.
         pair: the cameras.
-        config: the depths that are wanted.
+        config: the depths of interest.
         reach: metres.
     """
-    dense = found.dense
+    dense = corners.dense
     depth = pair.depth(dense)
     row, column = ((depth >= config.nearest) & (depth <= config.farthest)).nonzero().unbind(-1)
     seen_right = column - dense[row, column]
-    last_row, last_column = dense.shape[0] - 1 - _BORDER, dense.shape[1] - 1 - _BORDER
-    rim = (row <= _BORDER) | (row >= last_row) | (column >= last_column) | (seen_right <= _BORDER)
-    everything = torch.ones(len(found), dtype=torch.bool, device=dense.device)
-    if not bool(rim.any()) or len(found) <= _COMPANIONS:
+    border = _FAR_END.border
+    last_row, last_column = dense.shape[0] - 1 - border, dense.shape[1] - 1 - border
+    rim = (row <= border) | (row >= last_row) | (column >= last_column) | (seen_right <= border)
+    everything = torch.ones(len(corners), dtype=torch.bool, device=dense.device)
+    if not bool(rim.any()) or len(corners) <= _FAR_END.num_neighbors:
         return everything
     pixels = torch.stack((column, row), dim=-1)[rim].to(dense)
     entry = pair.left.unproject(pixels, depth[row, column][rim]).median(0).values
-    away = found.points - entry
-    company = k_nearest_others(found.points, _COMPANIONS)[1][:, -1] < _COMPANY
-    if not bool(company.any()):
+    offset = corners.points - entry
+    distances = k_nearest_others(corners.points, _FAR_END.num_neighbors)[1]
+    supported = distances[:, -1] < _FAR_END.neighbor_distance
+    if not bool(supported.any()):
         return everything
-    farthest = torch.where(company, away.norm(dim=-1), -1.0).argmax()
-    along = away @ torch.nn.functional.normalize(away[farthest], dim=0)
+    farthest = torch.where(supported, offset.norm(dim=-1), -1.0).argmax()
+    along = offset @ torch.nn.functional.normalize(offset[farthest], dim=0)
     return along >= along[farthest] - reach

@@ -16,13 +16,13 @@ from torchreg.cli.align_options import (
     Scale,
     Search,
     Sigma,
+    alignment_summary,
     read_cloud,
     read_schedule,
-    summary,
     write_pose,
 )
 from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending
-from torchreg.cli.reporting import UNUSABLE, interruption, reporting
+from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, load_shape
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class _Files:
-    """Where the outputs of one cloud go."""
+    """The outputs of one cloud."""
 
     result: Path
     pose: Path | None
@@ -44,6 +44,7 @@ class _Files:
     picture: Path | None
 
     def all(self) -> Iterable[Path | None]:
+        """Yield the paths of all outputs."""
         yield from (self.result, self.result.with_suffix(".json"), self.pose, self.ply, self.picture)
 
 
@@ -97,8 +98,8 @@ def align(
     count = len(clouds)
     files = [_Files(numbered(output, k, count), *(numbered(name, k, count) for name in optional)) for k in range(count)]
     check_outputs([*(path for entry in files for path in entry.all()), with_ending(gltf, (".glb",))], force)
-    for place in clouds:
-        place.stat()  # a missing file is told before the first is aligned
+    for path in clouds:
+        path.stat()  # a missing file is reported before the first is aligned
 
     from tqdm import tqdm
 
@@ -114,12 +115,12 @@ def align(
         run = _AlignRun(model, config, skin, scale, first)
         interrupted = False
         try:
-            for place, entry in zip(clouds, files, strict=True):
-                bar.set_description(place.name)
-                result = run.align(place, entry, on_step=lambda record: _show_stage(bar, record.stage))
+            for path, entry in zip(clouds, files, strict=True):
+                bar.set_description(path.name)
+                result = run.align(path, entry, on_step=lambda record: _show_stage(bar, record.stage))
                 bar.update()
                 if not quiet:
-                    bar.write(f"{place}: {summary(result)} -> {entry.result}")
+                    bar.write(f"{path}: {alignment_summary(result)} -> {entry.result}")
         except KeyboardInterrupt:
             interrupted = True
         if gltf is not None and run.results:
@@ -127,7 +128,7 @@ def align(
     if interrupted:
         raise interruption(f"{len(run.results)} of {count} clouds are done")
     if not all(result.statuses[0].usable for result in run.results):
-        raise typer.Exit(UNUSABLE)
+        raise typer.Exit(ExitCode.UNUSABLE)
 
 
 def _show_stage(bar: Any, stage: str) -> None:
@@ -137,7 +138,7 @@ def _show_stage(bar: Any, stage: str) -> None:
 
 @dataclass
 class _AlignRun:
-    """Aligns clouds one after another and writes what was asked for."""
+    """Aligns clouds one after another and writes the requested files."""
 
     shape: ArticulatedShape
     config: AlignConfig
@@ -148,17 +149,17 @@ class _AlignRun:
 
     @functools.cached_property
     def surface(self) -> LinearBlendSkin:
-        """The surface that pictures show, meshed once."""
+        """The surface of pictures, meshed once."""
         from torchreg.datasets.hand import surface_skin
 
         return surface_skin(self.shape)
 
-    def align(self, place: Path, files: _Files, on_step: Callable[[Any], None]) -> AlignResult:
-        """Return the alignment to one cloud, which is on disk then."""
+    def align(self, path: Path, files: _Files, on_step: Callable[[Any], None]) -> AlignResult:
+        """Return the alignment to one cloud, after writing it."""
         from torchreg.alignment.align import align
         from torchreg.tracking.demo import moved_to_mean
 
-        data = read_cloud(place, self.scale, self.config.nan_policy)
+        data = read_cloud(path, self.scale, self.config.nan_policy)
         start = moved_to_mean(self.skin, self.shape.rest_pose(), data) if self.start is None else self.start
         result = align(self.shape, data, start, model_points=self.skin, config=self.config, on_step=on_step)
         self._write(result, data, files)
@@ -179,7 +180,7 @@ class _AlignRun:
 
             ax = draw_alignment(None, self.shape, result.pose, data, result.inliers, skin=self.surface)
             save_picture(ax.get_figure(), files.picture)  # type: ignore[arg-type]
-        # The result comes last: where it is, the others are.
+        # The result is written last: if it exists, all others do.
         result.save(files.result)
 
     def save_motion(self, path: Path) -> None:

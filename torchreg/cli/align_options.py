@@ -1,4 +1,4 @@
-"""What commands that fit a shape to point clouds have in common: their arguments, and how those are read."""
+"""Common arguments of commands that fit a shape to point clouds, and their readers."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def read_schedule(text: str | None) -> SigmaSchedule | None:
     return SigmaSchedule.geometric(*values)
 
 
-def read_cloud(place: Path, scale: float, nan_policy: str) -> Tensor:
+def read_cloud(path: Path, scale: float, nan_policy: str) -> Tensor:
     """Return the points (M, 3) of a file, metres."""
     from torchreg._checks import check_positive
     from torchreg.io.points import load_points
 
     check_positive(scale, "--scale")
-    return load_points(place, nan_policy=nan_policy).points * scale
+    return load_points(path, nan_policy=nan_policy).points * scale
 
 
 def write_pose(path: Path, shape: ArticulatedShape, pose: Tensor) -> None:
@@ -58,8 +58,8 @@ def write_pose(path: Path, shape: ArticulatedShape, pose: Tensor) -> None:
     write_atomic(path, (json.dumps(named, indent=2) + "\n").encode())
 
 
-def summary(result: AlignResult) -> str:
-    """Return what an alignment came to, in one line."""
+def alignment_summary(result: AlignResult) -> str:
+    """Return status, inliers, residual and cost of an alignment in one line."""
     near = result.distances[result.inliers]
     rms = f"rms {1e3 * float(near.square().mean().sqrt()):.2f} mm, " if len(near) else ""
     counts = f"{len(near)} of {len(result.distances)} points inliers"

@@ -1,4 +1,4 @@
-"""Options of commands that begin at pictures, and the folder in which they show what was seen."""
+"""Options of commands that read pictures, and the folder of pictures that they write."""
 
 from __future__ import annotations
 
@@ -44,12 +44,8 @@ Seen = Annotated[
 ]
 
 
-# Corners alone may be too few where fingers point at the camera.
-_LEAST_POINTS = 500
-
-
 def check_used(wanted: bool, flag: str, options: Mapping[str, Any]) -> None:
-    """Raise InputError if options are given that mean nothing without a flag."""
+    """Raise InputError if options are given that have no meaning without a flag."""
     for name, value in options.items():
         if value is not None and not wanted:
             raise InputError(f"{name} has no meaning without {flag}; leave it out")
@@ -66,8 +62,8 @@ def seen_folder(seen: Path | None, result: Path, force: bool) -> Path:
     return folder
 
 
-def load_rig(calibration: Path | None, flag: str) -> CameraRig:
-    """Return the cameras of a calibration, which a flag calls for."""
+def load_calibration(calibration: Path | None, flag: str) -> CameraRig:
+    """Return the cameras of a calibration, which a flag requires."""
     from torchreg.io.calibration import load_cameras
 
     if calibration is None:
@@ -84,7 +80,7 @@ def stereo_source(
     matcher: str | None,
     reach: float | None,
 ) -> StereoFrames:
-    """Return the clouds of stereo pictures; the first pair has been looked at, so that swapped ones are refused."""
+    """Return the clouds of stereo pictures, after a check of the first pair for swapped cameras."""
     from importlib.util import find_spec
 
     import torch
@@ -97,7 +93,7 @@ def stereo_source(
         raise InputError(
             f"--stereo takes two folders as FRAMES, the left pictures and the right ones; got {len(folders)}"
         )
-    rig = load_rig(calibration, "--stereo")
+    rig = load_calibration(calibration, "--stereo")
     if len(rig) != 2:
         raise InputError(f"--calibration must hold the left and the right camera, in this order; got {len(rig)}")
     method = matcher or ("opencv" if find_spec("cv2") else "semi-global")
@@ -108,7 +104,8 @@ def stereo_source(
         folders[0],
         folders[1],
         rig.stereo(),
-        config=StereoConfig(nearest=near, farthest=far, method=method, least=_LEAST_POINTS),
+        # Corners alone may be too few where fingers point at the camera.
+        config=StereoConfig(nearest=near, farthest=far, method=method, least=500),
         box=None if volume is None else torch.tensor(volume).reshape(2, 3),
         reach=reach or None,
     )
@@ -117,7 +114,7 @@ def stereo_source(
 
 
 def stereo_job(frames: StereoFrames) -> dict[str, Any]:
-    """Return what decides about the clouds of stereo pictures, as plain data."""
+    """Return all settings that determine the clouds of stereo pictures, as plain data."""
     from dataclasses import asdict
 
     cameras = [

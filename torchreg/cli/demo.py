@@ -22,7 +22,7 @@ def demo(
         Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where to write; made if it does not exist.")
     ] = Path("torchreg_demo"),
     frames: Annotated[int, typer.Option(min=1, help="Number of frames, 20 per second.")] = 40,
-    seed: Annotated[int, typer.Option(help="Of motion and measurements.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of motion and measurements.")] = 0,
     picture: Annotated[bool, typer.Option("--picture/--no-picture", help="Whether to draw the animation.")] = True,
     force: Force = False,
 ) -> None:

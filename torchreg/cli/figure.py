@@ -1,4 +1,4 @@
-"""``torchreg figure``: the pictures of the paper and of the README."""
+"""``torchreg figure``: pictures of the paper and of the README."""
 
 from __future__ import annotations
 
@@ -25,6 +25,6 @@ def figure(
     check_choice(name, "NAME", ("bending", "readme"))
     path = with_ending(output or Path(f"{name}.png"), PICTURE_ENDINGS)
     check_outputs([path], force)
-    from torchreg.viz.figures import bending_figure, readme_picture
+    from torchreg.viz.figures import bending_picture, readme_picture
 
-    typer.echo(f"wrote {bending_figure(path) if name == 'bending' else readme_picture(path)}")
+    typer.echo(f"wrote {bending_picture(path) if name == 'bending' else readme_picture(path)}")

@@ -1,4 +1,4 @@
-"""``torchreg info``: what a shape consists of."""
+"""``torchreg info``: the degrees of freedom and the parts of a shape."""
 
 from __future__ import annotations
 

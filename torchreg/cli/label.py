@@ -47,8 +47,8 @@ def label(
     from tqdm import tqdm
 
     with tqdm(total=len(frames), unit="frame", desc="reading", leave=False, disable=quiet) as bar:
-        for place in frames:
-            place.stat()  # a missing file is told before the first is labeled
+        for path in frames:
+            path.stat()  # a missing file is reported before the first is labeled
         from torchreg.alignment.pose_initializer import PoseInitializer
         from torchreg.alignment.pseudo_labels import label_frames
         from torchreg.datasets.pose_labels import label_path
@@ -59,13 +59,13 @@ def label(
         check_outputs([path.with_suffix(ending) for path in paths for ending in (".safetensors", ".json")], force)
         model = load_shape(shape, parents, package_dir, free_base)
         first = None if start is None else load_pose(start, model)
-        clouds = (read_cloud(place, scale, nan_policy) for place in frames)
+        clouds = (read_cloud(path, scale, nan_policy) for path in frames)
         done = 0
         try:
             for found in label_frames(PoseInitializer(model), clouds, trusted=trusted, start=first):
-                path = found.save(output, done)
+                written = found.save(output, done)
                 if not quiet:
-                    bar.write(f"{frames[done]}: confidence {float(found.confidence):.2f} -> {path}")
+                    bar.write(f"{frames[done]}: confidence {float(found.confidence):.2f} -> {written}")
                 done += 1
                 bar.update()
         except KeyboardInterrupt:

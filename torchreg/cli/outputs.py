@@ -1,4 +1,4 @@
-"""The files that a command writes: their endings, their numbers, and that nothing is overwritten unasked."""
+"""The files that a command writes: their endings and numbers, and a check against overwriting."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def with_ending(path: None, endings: Sequence[str], *, add: bool = ...) -> None:
 @overload
 def with_ending(path: Path | None, endings: Sequence[str], *, add: bool = ...) -> Path | None: ...
 def with_ending(path: Path | None, endings: Sequence[str], *, add: bool = False) -> Path | None:
-    """Return the path, its ending added where asked for; InputError if the ending is none of those allowed."""
+    """Return the path, with the first ending added if ``add``; InputError if its ending is not allowed."""
     if path is None or path.suffix.lower() in endings:
         return path
     if add:
@@ -38,14 +38,14 @@ def numbered(path: None, index: int, count: int) -> None: ...
 @overload
 def numbered(path: Path | None, index: int, count: int) -> Path | None: ...
 def numbered(path: Path | None, index: int, count: int) -> Path | None:
-    """Return the path for output number ``index`` of ``count``: itself if there is one only, else as in name_01.ply."""
+    """Return the path of output number ``index`` of ``count``: the same for a single one, else as in name_01.ply."""
     if path is None or count == 1:
         return path
     return path.with_name(f"{path.stem}_{index + 1:0{len(str(count))}}{path.suffix}")
 
 
 def check_outputs(paths: Iterable[Path | None], force: bool) -> None:
-    """Raise before any work is done if an output cannot be written, or exists and may not be overwritten."""
+    """Raise an error if an output cannot be written, or exists and may not be overwritten."""
     wanted = [path for path in paths if path is not None]
     for path in wanted:
         if wanted.count(path) > 1:

@@ -1,4 +1,4 @@
-"""``torchreg pose``: what was registered, posed anew by dragging points."""
+"""``torchreg pose``: a registered scan, posed anew by dragging points."""
 
 from __future__ import annotations
 
@@ -72,10 +72,10 @@ def _load(result: Path, start: Path | None) -> tuple[ScanRegistration | Sequence
     from torchreg.registration.results import PoseSolution, ScanRegistration, SequenceRegistration
     from torchreg.storage import load
 
-    place = result if result.suffix else result.with_suffix(".safetensors")
-    found = load(place)
+    path = result if result.suffix else result.with_suffix(".safetensors")
+    found = load(path)
     if not isinstance(found, (ScanRegistration, SequenceRegistration)):
-        raise FormatError(f"{place} holds a {type(found).__name__}; a pose is solved for a ScanRegistration")
+        raise FormatError(f"{path} holds a {type(found).__name__}; a pose is solved for a ScanRegistration")
     if start is None:
         return found, None
     first = load(start if start.suffix else start.with_suffix(".safetensors"))
@@ -93,7 +93,7 @@ def _pose_once(editor: PoseEditor, handle: list[str], to: list[str], path: Path,
 
     if len(handle) != len(to):
         raise InputError(f"--handle and --to must be given equally often, got {len(handle)} and {len(to)}")
-    handles, targets = (torch.tensor([_place(text) for text in texts]) for texts in (handle, to))
+    handles, targets = (torch.tensor([_point(text) for text in texts]) for texts in (handle, to))
     solution = solve_pose(editor.model, handles, targets)
     editor.model.set_transforms_(solution.transforms)
     save_weight_ply(path, editor.model, editor.points, editor.faces, moved=True)
@@ -101,7 +101,7 @@ def _pose_once(editor: PoseEditor, handle: list[str], to: list[str], path: Path,
         typer.echo(f"handles miss their targets by at most {float(solution.residuals.max()):.3g} -> {path}")
 
 
-def _place(text: str) -> list[float]:
+def _point(text: str) -> list[float]:
     """Return three numbers, separated by commas or blanks."""
     from torchreg.errors import InputError
 

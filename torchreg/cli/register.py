@@ -10,7 +10,7 @@ import typer
 
 from torchreg.cli.cameras import DepthRange, Seen, check_used, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
-from torchreg.cli.reporting import UNUSABLE, reporting
+from torchreg.cli.reporting import ExitCode, reporting
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torchreg.geometry.range_scan import RangeScan
     from torchreg.registration.results import ScanRegistration
 
-# Pictures of what was kept of source and target.
+# Pictures of the depth of source and target that was kept.
 _KEPT = ("source.png", "target.png")
 
 
@@ -104,7 +104,7 @@ def register(
     if not quiet:
         typer.echo(f"{_summary(found)} -> {scene or result}")
     if not found.status.usable:
-        raise typer.Exit(UNUSABLE)
+        raise typer.Exit(ExitCode.UNUSABLE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ class _DepthImage:
         return cls(path, intrinsics, camera, load_depth(path, scale, camera=camera))
 
     def scan(self, depths: tuple[float, float] | None, smoothing: float, picture: Path) -> RangeScan:
-        """Return the scan, and draw what was kept of the image."""
+        """Return the scan, and draw the depths that were kept."""
         import torch
 
         from torchreg.capture.depth import load_depth_scan

@@ -1,22 +1,28 @@
-"""How a command ends: one line per error or warning, and an exit code."""
+"""The end of a command: one line per error or warning, and an exit code."""
 
 from __future__ import annotations
 
 import functools
 import warnings
 from collections.abc import Callable
+from enum import IntEnum
 from typing import Any, TextIO
 
 import typer
 
 from torchreg.errors import TorchregError, TorchregWarning
 
-# Exit codes beside 0; 2 is also what wrong usage ends with.
-UNUSABLE, ERROR, INTERRUPTED = 1, 2, 130
+
+class ExitCode(IntEnum):
+    """Exit codes of commands that do not end with 0."""
+
+    UNUSABLE = 1
+    ERROR = 2  # also of wrong usage
+    INTERRUPTED = 130
 
 
 def reporting(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with errors and warnings of the library told in one line, and Ctrl-C as exit code 130."""
+    """Return the command with errors and warnings of the library printed in one line, and Ctrl-C as exit code 130."""
 
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> None:
@@ -31,15 +37,15 @@ def reporting(command: Callable[..., None]) -> Callable[..., None]:
                 raise
             except (TorchregError, OSError) as error:
                 typer.echo(f"torchreg: {_one_line(error)}", err=True)
-                raise typer.Exit(ERROR) from None
+                raise typer.Exit(ExitCode.ERROR) from None
 
     return run
 
 
 def interruption(done: str = "") -> typer.Exit:
-    """Return the exit of an interrupted command, which has said what is done, as in "2 of 4 clouds are done"."""
+    """Print that a command was interrupted, and its progress, as in "2 of 4 clouds are done"; return its exit."""
     typer.echo(f"torchreg: interrupted{'; ' if done else ''}{done}", err=True)
-    return typer.Exit(INTERRUPTED)
+    return typer.Exit(ExitCode.INTERRUPTED)
 
 
 def _one_line(error: Exception) -> str:
@@ -52,6 +58,6 @@ def show_warning(
     message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None,
     line: str | None = None,
 ) -> None:  # fmt: skip
-    """Print a warning in one line; those that the library does not raise itself say where they come from."""
-    place = "" if issubclass(category, TorchregWarning) else f"{filename}:{lineno}: "
-    typer.echo(f"torchreg: warning: {place}{' '.join(str(message).split())}", err=True)
+    """Print a warning in one line, with file and line if it is not one of the library's."""
+    origin = "" if issubclass(category, TorchregWarning) else f"{filename}:{lineno}: "
+    typer.echo(f"torchreg: warning: {origin}{' '.join(str(message).split())}", err=True)

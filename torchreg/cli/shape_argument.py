@@ -1,4 +1,4 @@
-"""The argument SHAPE: a hand by name, or a robot or rigged character by file, with the options of its kind."""
+"""The argument SHAPE: a hand by name, or a robot or rigged character by file, with its options."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def load_shape(
     package_dirs: Sequence[Path] | None = None,
     free_base: bool | None = None,
 ) -> ArticulatedShape:
-    """Return the shape of a name or file; options that its kind has no use for are refused."""
+    """Return the shape of a name or file; InputError if an option has no meaning for its kind."""
     ending = Path(name).suffix.lower()
     uses = {".urdf": {"--package-dir", "--free-base/--fixed-base"}, ".glb": {"--parents"}, ".gltf": {"--parents"}}
     given = {"--parents": parents, "--package-dir": package_dirs or None, "--free-base/--fixed-base": free_base}

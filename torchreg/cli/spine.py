@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchreg.cli.cameras import Calibration, Seen, check_used, load_rig, seen_folder
+from torchreg.cli.cameras import Calibration, Seen, check_used, load_calibration, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, numbered, with_ending
 from torchreg.cli.reporting import reporting
 
@@ -118,7 +118,7 @@ def spine(
 
 
 def _read(frames: list[Path]) -> tuple[list[TriangleMesh], tuple[str, ...]]:
-    """Return the meshes in the order of time, and what they are called."""
+    """Return the meshes in the order of time, and their names."""
     from torchreg.errors import InputError
     from torchreg.io.frames import load_frames
     from torchreg.io.points import load_mesh
@@ -134,12 +134,12 @@ def _silhouettes(
 ) -> SilhouetteFrames:
     from torchreg.capture.silhouette_frames import SilhouetteFrames
 
-    rig = load_rig(calibration, "--silhouettes")
+    rig = load_calibration(calibration, "--silhouettes")
     return SilhouetteFrames(folders, rig, screen=screen, resolution=resolution or 128)
 
 
 def _hulls(source: SilhouetteFrames, folder: Path, progress: Path | None, quiet: bool) -> list[TriangleMesh]:
-    """Return the visual hulls of all frames, and draw how each covers its masks."""
+    """Return the visual hulls of all frames, and draw each over its masks."""
     from tqdm import tqdm
 
     from torchreg.io.images import save_image
@@ -181,15 +181,12 @@ def _draw(
 
 
 def _named(warning: str, names: tuple[str, ...]) -> str:
-    """Return a warning with the file of its frame in the place of its number."""
+    """Return a warning with the name of its frame's file instead of the number."""
     frame, _, text = warning.removeprefix("frame ").partition(": ")
     return f"{names[int(frame)]}: {text}"
 
 
 def _summary(found: SpineSequence, glb: Path) -> str:
-    share = sum(own == same for own, same in zip(found.own_topologies, found.topologies, strict=True))
-    limbs, frames = len(found.graph), len(found.curves)
-    return (
-        f"{found.num_tips} tips, {found.junctions.shape[1]} junctions, {limbs} limbs; {share} of {frames} frames have "
-        f"this tree by themselves -> {glb}"
-    )
+    agreeing = sum(pair[0] == pair[1] for pair in zip(found.own_topologies, found.topologies, strict=True))
+    counts = f"{found.num_tips} tips, {found.junctions.shape[1]} junctions, {len(found.graph)} limbs"
+    return f"{counts}; {agreeing} of {len(found.curves)} frames have this tree by themselves -> {glb}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -23,7 +23,7 @@ from torchreg.cli.cameras import (
     stereo_source,
 )
 from torchreg.cli.outputs import Force, Quiet, with_ending
-from torchreg.cli.reporting import UNUSABLE, interruption, reporting
+from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, load_shape
 from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary, track_job
 from torchreg.cli.view import Browser, Port, tell_url
@@ -32,8 +32,11 @@ from torchreg.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from torchreg.capture.stereo_frames import StereoFrames
     from torchreg.shapes.skin import LinearBlendSkin
     from torchreg.tracking.results import FrameResult
+
+    OnFrame = Callable[[Tensor, FrameResult], object]
 
 MOVIES = ("gif", "mp4", "none")
 
@@ -77,7 +80,7 @@ def track(
     fps: Annotated[float, typer.Option(help="Frames per second.")] = 20.0,
     scale: Scale = 1.0,
     nan_policy: NanPolicy = "omit",
-    prediction: Annotated[str, typer.Option(help="How the shape goes on: velocity, or none.")] = "velocity",
+    prediction: Annotated[str, typer.Option(help="Prediction of the motion: velocity, or none.")] = "velocity",
     points: Annotated[int, typer.Option(help="Number of model points.")] = 500,
     model_points: Annotated[
         str, typer.Option(help="What is aligned: points of the shape seen last, data of the frame before, or shape.")
@@ -85,7 +88,7 @@ def track(
     recovery: Annotated[
         str, typer.Option(help="What finding a lost shape may cost: full, starts (milliseconds), or none.")
     ] = "full",
-    seed: Annotated[int, typer.Option(help="Of all that is drawn.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0,
     parents: Parents = None,
     package_dir: PackageDir = None,
     free_base: FreeBase = None,
@@ -118,73 +121,113 @@ def track(
 
     Exit codes: 0; 1 if in any frame the shape was lost or there were no data; 2 for an error; 130 for Ctrl-C.
     """
-    from torchreg._checks import check_choice, check_positive
-    from torchreg.io.frames import load_frames
+    from torchreg._checks import check_positive
 
-    check_choice(movie, "--movie", MOVIES)
+    files, resumed = _files(output, movie, gltf, overlay, resume, force)
     check_positive(fps, "--fps")
     check_positive(scale, "--scale")
-    files = TrackFiles.at(with_ending(output, (".safetensors",), add=True), movie, gltf, overlay)
-    resumed = resume and files.progress.exists()
-    files.check(force or resumed)
     views = {"--depth-range": depth_range, "--volume": volume, "--matcher": matcher, "--reach": reach, "--seen": seen}
     check_used(stereo, "--stereo", {"--calibration": calibration, **views})
+    options = parents, package_dir, free_base
+    pictures = None
     if stereo:
         if scale != 1:
             raise InputError("--scale has no meaning with --stereo: calibrations are in metres; leave it out")
-        model = load_shape(shape, parents, package_dir, free_base)
-        source = stereo_source(frames, calibration, model, depth_range, volume, matcher, reach)
-        clouds = Clouds(source, 1.0)
-        pictures = seen_folder(seen, files.result, force or resumed)
+        model = load_shape(shape, *options)
+        pictures = stereo_source(frames, calibration, model, depth_range, volume, matcher, reach)
+        clouds, folder = Clouds(pictures, 1.0), seen_folder(seen, files.result, force or resumed)
     else:
-        clouds = Clouds(load_frames(frames[0] if len(frames) == 1 else frames, nan_policy=nan_policy), scale)
+        clouds, model = _clouds(frames, scale, nan_policy), load_shape(shape, *options)
 
+    from torchreg.storage import load_pose
+    from torchreg.tracking.tracker import TrackConfig, Tracker
+
+    config = TrackConfig(
+        model_points=model_points, num_model_points=points, prediction=prediction, recovery=recovery, seed=seed
+    )
+    first = None if start is None else load_pose(start, model)
+    job = track_job(shape, options, first, config, fps, scale, nan_policy, clouds)
+    with ExitStack() as pages, _progress_bar(len(clouds), quiet) as bar:
+        tracker, report = Tracker(model, first, config=config), Report(bar, clouds, quiet)
+        run = TrackRun(
+            tracker=tracker, clouds=clouds, fps=fps, job=job, files=files, report=report, save_every=save_every
+        )
+        if pictures is not None:
+            run.job |= stereo_job(pictures)
+            run.seen = _drawn_pictures(pictures, folder)
+        if view:
+            run.live = _live_page(pages, port, browser, quiet)
+        complete = _run(run, bar, resumed)
+    _report_end(run, complete, quiet)
+
+
+def _files(
+    output: Path, movie: str, gltf: bool, overlay: Path | None, resume: bool, force: bool
+) -> tuple[TrackFiles, bool]:
+    """Return the outputs, after a check that they are writable, and whether an earlier run is resumed."""
+    from torchreg._checks import check_choice
+
+    check_choice(movie, "--movie", MOVIES)
+    files = TrackFiles.at(with_ending(output, (".safetensors",), add=True), movie, gltf, overlay)
+    resumed = resume and files.progress.exists()
+    files.check(force or resumed)
+    return files, resumed
+
+
+def _clouds(frames: list[Path], scale: float, nan_policy: str) -> Clouds:
+    from torchreg.io.frames import load_frames
+
+    return Clouds(load_frames(frames[0] if len(frames) == 1 else frames, nan_policy=nan_policy), scale)
+
+
+def _progress_bar(count: int, quiet: bool) -> Any:
     from tqdm import tqdm
 
-    with (
-        ExitStack() as pages,
-        tqdm(total=len(clouds), unit="frame", desc="tracking", leave=False, disable=quiet) as bar,
-    ):
-        model = model if stereo else load_shape(shape, parents, package_dir, free_base)
-        from torchreg.cli.track_checkpoint import load_progress
-        from torchreg.storage import load_pose
-        from torchreg.tracking.tracker import TrackConfig, Tracker
+    return tqdm(total=count, unit="frame", desc="tracking", leave=False, disable=quiet)
 
-        config = TrackConfig(
-            model_points=model_points, num_model_points=points, prediction=prediction, recovery=recovery, seed=seed
-        )
-        first = None if start is None else load_pose(start, model)
-        job = track_job(shape, (parents, package_dir, free_base), first, config, fps, scale, nan_policy, clouds)
-        tracker = Tracker(model, first, config=config)
-        run = TrackRun(tracker, clouds, fps, job, files, Report(bar, clouds, quiet), save_every)
-        if stereo:
-            from torchreg.viz.seen import StereoPictures
 
-            run.job |= stereo_job(source)
-            run.seen = lambda skin: StereoPictures(source, skin, pictures)
-        if view:
-            from torchreg.viz.live_track import LiveTrack
-            from torchreg.viz.viser_server import import_viser
+def _drawn_pictures(frames: StereoFrames, folder: Path) -> Callable[[LinearBlendSkin], OnFrame]:
+    """Return the function that draws the frames of stereo pictures into a folder, with a skin's outline."""
+    from torchreg.viz.seen import StereoPictures
 
-            import_viser()  # a missing extra is told before the first frame
+    return lambda skin: StereoPictures(frames, skin, folder)
 
-            def begin(skin: LinearBlendSkin) -> Callable[[Tensor, FrameResult], None]:
-                page = pages.enter_context(LiveTrack(skin, port=port))
-                tell_url(page.url, browser, quiet)
-                return page.show
 
-            run.live = begin
-        if resumed:
-            run.go_on(load_progress(files.progress))
-        complete = run.run()
-        if complete:
-            bar.reset(len(clouds))
-            bar.set_description("drawing")
-            run.write(on_frame=lambda done, planned: bar.update())
-    result = run.result
+def _live_page(pages: ExitStack, port: int, browser: bool, quiet: bool) -> Callable[[LinearBlendSkin], OnFrame]:
+    """Return the function that opens a page for a skin, on which each frame is shown; it closes with ``pages``."""
+    from torchreg.viz.live_track import LiveTrack
+    from torchreg.viz.viser_server import import_viser
+
+    import_viser()  # a missing extra is reported before the first frame
+
+    def begin(skin: LinearBlendSkin) -> OnFrame:
+        page = pages.enter_context(LiveTrack(skin, port=port))
+        tell_url(page.url, browser, quiet)
+        return page.show
+
+    return begin
+
+
+def _report_end(run: TrackRun, complete: bool, quiet: bool) -> None:
+    """Print the summary of a run; raise its exit unless it is complete and usable."""
+    statuses = run.result.statuses
     if not quiet:
-        typer.echo(f"{summary(result)} -> {files.result}")
+        typer.echo(f"{summary(run.result)} -> {run.files.result}")
     if not complete:
-        raise interruption(f"{len(result.statuses)} of {len(clouds)} frames are done; --resume goes on from there")
-    if not all(status.usable for status in result.statuses):
-        raise typer.Exit(UNUSABLE)
+        raise interruption(f"{len(statuses)} of {len(run.clouds)} frames are done; --resume goes on from there")
+    if not all(status.usable for status in statuses):
+        raise typer.Exit(ExitCode.UNUSABLE)
+
+
+def _run(run: TrackRun, bar: Any, resumed: bool) -> bool:
+    """Track all frames, write what belongs to a complete run, and return whether it is complete."""
+    from torchreg.cli.track_checkpoint import load_progress
+
+    if resumed:
+        run.go_on(load_progress(run.files.progress))
+    complete = run.run()
+    if complete:
+        bar.reset(len(run.clouds))
+        bar.set_description("drawing")
+        run.write(on_frame=lambda done, planned: bar.update())
+    return complete

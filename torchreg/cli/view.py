@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from torchreg.viz.scene import Scene
 
 UPS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-UPS |= {f"-{name}": (-place[0], -place[1], -place[2]) for name, place in UPS.items()}
+UPS |= {f"-{name}": (-up[0], -up[1], -up[2]) for name, up in UPS.items()}
 
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Where to listen on 127.0.0.1; if taken, a later one.")]
 Browser = Annotated[bool, typer.Option("--browser/--no-browser", help="Whether to open a window of the browser.")]
@@ -83,21 +83,21 @@ def view(
 
 
 def check_up(up: str | None) -> tuple[float, float, float] | None:
-    """Return the direction of a name; InputError if it is none."""
+    """Return the direction of a name; InputError if there is none of that name."""
     if up is not None and up not in UPS:
         raise InputError(f"--up must be one of {', '.join(sorted(UPS))}, got {up!r}")
     return None if up is None else UPS[up]
 
 
 def with_up(scene: Scene, up: tuple[float, float, float] | None) -> Scene:
-    """Return a scene with another upright direction, if one is given."""
+    """Return a scene with an upright direction, if one is given."""
     from dataclasses import replace
 
     return scene if up is None else replace(scene, up=up)
 
 
 def tell_url(url: str, browser: bool, quiet: bool) -> None:
-    """Tell where a page is, and open it if asked to."""
+    """Print the address of a page, and open it if ``browser``."""
     if not quiet:
         typer.echo(f"{url} (Ctrl-C ends)")
     if browser:
@@ -107,7 +107,7 @@ def tell_url(url: str, browser: bool, quiet: bool) -> None:
 
 
 def wait_for_interrupt(url: str, browser: bool, quiet: bool) -> None:
-    """Tell where a page is, open it if asked to, and wait until Ctrl-C."""
+    """Print the address of a page, open it if ``browser``, and wait until Ctrl-C."""
     tell_url(url, browser, quiet)
     try:
         while True:
@@ -124,7 +124,7 @@ def _serve(scene: Scene, port: int, browser: bool, quiet: bool) -> None:
 
 
 def _read(paths: list[Path]) -> list[Tensor | TriangleMesh]:
-    """Return what files hold, meshes where they have triangles; of a folder or one .npz, its frames in their order."""
+    """Return the meshes or clouds of files, or the frames of a folder or one .npz, in their order."""
     from torchreg.geometry.mesh import TriangleMesh
     from torchreg.io.frames import load_frames
     from torchreg.io.points import load_points

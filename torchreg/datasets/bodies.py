@@ -11,10 +11,9 @@ from torchreg._checks import check_positive
 from torchreg.datasets.figures import Figure, Part, bending_figure
 from torchreg.datasets.solids import RoundCone, Vector
 
-# Arms and legs stand off in the rest pose so that they fuse with nothing; gaits bring them back.
+# Angles of arms and legs from the trunk in the rest pose, so that they do not fuse with it; gaits undo them.
 REST_ARM, REST_LEG = math.radians(40), math.radians(5)
 SIDES = {"left": 1.0, "right": -1.0}
-_BLEND, _SOFTNESS = 0.015, 0.02
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class Proportions:
 
         Args:
             generator: source of randomness; None draws from a fresh generator with seed 0.
-            spread: see above.
+            spread: largest relative deviation.
         """
         check_positive(spread, "spread", allow_zero=True)
         generator = torch.Generator().manual_seed(0) if generator is None else generator
@@ -67,7 +66,7 @@ class Proportions:
 
 
 def person(proportions: Proportions | None = None, *, spacing: float = 0.02) -> Figure:
-    """Return a person of 13 parts and 1.75 m that stands with arms and legs a little apart, looking along +z, y up.
+    """Return a standing person of 13 parts and 1.75 m, arms and legs a little apart, looking along +z with y up.
 
     Parts: pelvis, torso, head, and on each side upper arm, forearm (with the hand), thigh, shin and foot. Bone lengths
     are those of an average adult.
@@ -120,11 +119,11 @@ def _trunk(shape: Proportions, hip: float, waist: float) -> list[Part]:
 
 
 def _arm(shape: Proportions, side: str, sign: float, height: float) -> list[Part]:
-    out, down, thick = sign * math.sin(REST_ARM), -math.cos(REST_ARM), shape.limbs
+    outward, down, thick = sign * math.sin(REST_ARM), -math.cos(REST_ARM), shape.limbs
 
     def along(length: float, forward: float = 0.0) -> Vector:
         start = 0.19 * shape.shoulders
-        return sign * start + length * shape.arms * out, height + length * shape.arms * down, forward
+        return sign * start + length * shape.arms * outward, height + length * shape.arms * down, forward
 
     upper = (
         RoundCone(along(0), along(0.08), 0.058, 0.053 * thick),
@@ -170,7 +169,7 @@ def _leg(shape: Proportions, side: str, sign: float, hip: float) -> list[Part]:
 
 
 def quadruped(proportions: Proportions | None = None, *, spacing: float = 0.02) -> Figure:
-    """Return a four-legged animal of 17 parts and 1.4 m length, standing, looking along +z, y up.
+    """Return a standing four-legged animal of 17 parts and 1.4 m length, looking along +z with y up.
 
     Parts: chest, rump, neck, head, tail, and three for each leg: "front left thigh", "... shin", "... foot" and so on.
 
@@ -221,7 +220,7 @@ def _long_trunk(shape: Proportions, back: float, half: float) -> list[Part]:
 
 
 def _animal_leg(shape: Proportions, name: str, parent: str, top: Vector) -> list[Part]:
-    """Return the three parts of a leg that stands on the ground below ``top``."""
+    """Return the three parts of a leg from ``top`` down to the ground."""
     x, height, z = top
     thick = shape.limbs
     knee: Vector = (1.12 * x, 0.58 * height, z + 0.02)
@@ -240,6 +239,7 @@ def _ball(center: Vector, radius: float) -> RoundCone:
 
 def _sized(parts: list[Part], size: float, spacing: float) -> Figure:
     """Return the figure of the parts, larger by ``size``."""
-    figure = bending_figure(parts, spacing=spacing, blend=_BLEND, softness=_SOFTNESS)
+    # Seams of 1.5 cm, and skin that bends over 8 cm.
+    figure = bending_figure(parts, spacing=spacing, blend=0.015, softness=0.02)
     mesh = replace(figure.mesh, vertices=size * figure.mesh.vertices)
     return replace(figure, mesh=mesh, joints=size * figure.joints)

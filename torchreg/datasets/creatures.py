@@ -1,4 +1,4 @@
-"""Made-up creatures of many arms that bend and sway: voxels meshed anew in every frame, with the exact truth."""
+"""Made-up creatures of many arms that bend and sway: voxels meshed anew in each frame, with the exact truth."""
 
 from __future__ import annotations
 
@@ -14,27 +14,41 @@ from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import so3_exp
 
 TOUCHING = ("none", "flanks", "tips")
-# Samples along the axis of an arm; the balls around them are the arm.
-_SAMPLES = 48
-# Of one creature to the next: lengths as a share, directions of the arms in radians.
-_LENGTH_SPREAD, _DIRECTION_SPREAD = 0.08, 0.06
-# Arms touch while this share of the motion lasts, where their axes are so many radii apart.
-_CONTACT, _CLOSENESS = (0.35, 0.65), 1.5
-# The field is known this many voxels around the surface.
-_REACH = 3
-# Balls of nearly one radius that are painted at a time.
-_PAINTED = 24
+
+
+@dataclass(frozen=True)
+class _ArmMotion:
+    """Form and motion of arms; lengths in shares of an arm's."""
+
+    num_samples: int = 48  # along the axis of an arm; the balls around them are the arm
+    length_spread: float = 0.08  # of arms
+    direction_spread: float = 0.06  # of arms, radians
+    frames_per_half_cycle: int = 12  # of swaying
+    touch_from: float = 0.35  # of the sequence: arms 0 and 1 touch from that share on
+    touch_until: float = 0.65
+    touch_distance: float = 1.5  # between the axes of arms that touch, in their radii
+
+
+@dataclass(frozen=True)
+class _Painting:
+    """Filling of voxels."""
+
+    reach: int = 3  # voxels outside of the surface up to which the field is known
+    batch: int = 24  # balls of nearly one radius that are painted at a time
+
+
+_MOTION, _PAINTING = _ArmMotion(), _Painting()
 
 
 @dataclass(frozen=True)
 class CreatureForm:
-    """What a creature looks like and how much it moves; lengths in shares of an arm's.
+    """The form of a creature and the amplitudes of its motion; lengths in shares of an arm's.
 
     Args:
         num_arms: evenly around the body.
         body: radius of the body.
-        root: radius of an arm where it leaves the body.
-        end: radius at its tip.
+        root: radius of an arm at the body.
+        end: radius of an arm at its tip.
         sway: largest turn of an arm's end in the plane of the body, radians; all arms sway together by half of it.
         curl: largest turn of an arm's end out of that plane, radians.
     """
@@ -60,14 +74,14 @@ OCTOPUS = CreatureForm(num_arms=8, body=0.3, root=0.1, end=0.05, sway=0.4, curl=
 
 @dataclass(frozen=True, eq=False)
 class CreatureSequence:
-    """A creature in T frames whose meshes share nothing, and the truth behind them; one arm's length is about 1.
+    """A creature in T frames whose meshes are unrelated, and the truth; the length of an arm is about 1.
 
     Args:
         meshes: T closed surfaces.
-        tips: (T, K, 3) where the arms end, on the surface.
+        tips: (T, K, 3) ends of the arms, on the surface.
         curves: (T, K, S, 3) axes of the arms, from the middle of the body to the middle of the last ball.
         radii: (K, S) of the arms around their axes.
-        touching: (T,) True where two arms, 0 and 1, are merged.
+        touching: (T,) bool, True where arms 0 and 1 are merged.
         topology: of the tree of arms in the form of `Skeleton.topology`.
     """
 
@@ -93,10 +107,10 @@ def creature_sequence(
 
     Args:
         form: `STARFISH`, `OCTOPUS` or another.
-        num_frames: number of frames; the motion is as long as it is smooth: half a cycle of swaying in 12 frames.
+        num_frames: number of frames; half a cycle of swaying takes 12.
         touching: whether arms 0 and 1 merge in the middle third of the sequence: ``"none"``; ``"flanks"`` side by
             side, the tips apart; ``"tips"`` end to end.
-        noise: standard deviation of how far each voxel moves the surface, in voxels.
+        noise: standard deviation of the field at each voxel, in voxels.
         resolution: voxels along the longest side of the box.
         dtype: of everything.
         seed: of form, motion and noise.
@@ -112,8 +126,8 @@ def creature_sequence(
     check_count(resolution, "resolution", 16)
     generator = torch.Generator().manual_seed(seed)
     curves, headings, merged = _moving_axes(form, num_frames, touching, generator)
-    share = torch.linspace(0, 1, _SAMPLES, dtype=torch.float64)
-    radii = (form.root + share * (form.end - form.root)).expand(form.num_arms, _SAMPLES)
+    share = torch.linspace(0, 1, _MOTION.num_samples, dtype=torch.float64)
+    radii = (form.root + share * (form.end - form.root)).expand(form.num_arms, -1)
     meshes = [_surface(axes, radii, form.body, resolution, noise, generator, dtype) for axes in curves]
     return CreatureSequence(
         meshes=tuple(meshes),
@@ -128,21 +142,21 @@ def creature_sequence(
 def _moving_axes(
     form: CreatureForm, num_frames: int, touching: str, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return axes (T, K, S, 3), the directions (T, K, 3) in which they end, and whether arms touch (T,)."""
+    """Return axes (T, K, S, 3), their directions at the tips (T, K, 3), and whether arms 0 and 1 touch (T,)."""
     arms, draw = form.num_arms, lambda *size: torch.rand(*size, generator=generator, dtype=torch.float64)
     time = torch.arange(num_frames, dtype=torch.float64)
-    lengths = 1 + _LENGTH_SPREAD * (2 * draw(arms) - 1)
-    facing = 2 * math.pi * torch.arange(arms, dtype=torch.float64) / arms + _DIRECTION_SPREAD * (2 * draw(arms) - 1)
+    lengths = 1 + _MOTION.length_spread * (2 * draw(arms) - 1)
+    even = 2 * math.pi * torch.arange(arms, dtype=torch.float64) / arms
+    facing = even + _MOTION.direction_spread * (2 * draw(arms) - 1)
     phase = 2 * math.pi * draw(arms)
-    cycle = math.pi * time / 12
+    cycle = math.pi * time / _MOTION.frames_per_half_cycle
     # All arms sway alike, and each a little by itself: neighbors stay apart.
     sway = 0.5 * form.sway * cycle.sin().unsqueeze(-1) + 0.5 * form.sway * (cycle.unsqueeze(-1) + phase).sin()
     curl = form.curl * (1.3 * cycle.unsqueeze(-1) + 2 * phase).sin()
-    first, last = (share * num_frames for share in _CONTACT)
-    merged = (time >= first) & (time <= last) if touching != "none" else torch.zeros(num_frames, dtype=torch.bool)
-    turned = torch.zeros(num_frames, arms, _SAMPLES, dtype=torch.float64)
-    share = torch.linspace(0, 1, _SAMPLES, dtype=torch.float64)
-    turned += facing.unsqueeze(-1) + sway.unsqueeze(-1) * share
+    merged = (time >= _MOTION.touch_from * num_frames) & (time <= _MOTION.touch_until * num_frames)
+    merged &= touching != "none"
+    share = torch.linspace(0, 1, _MOTION.num_samples, dtype=torch.float64)
+    turned = facing.unsqueeze(-1) + sway.unsqueeze(-1) * share
     raised = curl.unsqueeze(-1) * share
     if touching != "none":
         _bring_together(form, turned, raised, lengths, merged, touching)
@@ -150,50 +164,50 @@ def _moving_axes(
     spin = 0.04 * time.unsqueeze(-1) * torch.tensor([0.3, 0.2, 1.0], dtype=torch.float64)
     pose = so3_exp(spin + (2 * draw(3) - 1))
     drift = 0.02 * time[:, None] * (2 * draw(3) - 1)
-    placed = torch.einsum("tij,tksj->tksi", pose, axes) + drift[:, None, None]
-    return placed, torch.einsum("tij,tkj->tki", pose, headings), merged
+    moved = torch.einsum("tij,tksj->tksi", pose, axes) + drift[:, None, None]
+    return moved, torch.einsum("tij,tkj->tki", pose, headings), merged
 
 
 def _integrated(turned: Tensor, raised: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
-    """Return axes (T, K, S, 3) that start at the origin, and their last directions, of headings and elevations."""
+    """Return axes (T, K, S, 3) from the origin along headings and elevations (T, K, S), and their last directions."""
     direction = torch.stack((turned.cos() * raised.cos(), turned.sin() * raised.cos(), raised.sin()), dim=-1)
-    steps = 0.5 * (direction[:, :, 1:] + direction[:, :, :-1]) * (lengths / (_SAMPLES - 1))[:, None, None]
+    steps = 0.5 * (direction[:, :, 1:] + direction[:, :, :-1]) * (lengths / (_MOTION.num_samples - 1))[:, None, None]
     return torch.nn.functional.pad(steps.cumsum(2), (0, 0, 1, 0)), direction[:, :, -1]
 
 
 def _bring_together(
     form: CreatureForm, turned: Tensor, raised: Tensor, lengths: Tensor, merged: Tensor, touching: str
 ) -> None:
-    """Bend arms 0 and 1 towards each other, in place, until they merge in the frames marked; halfway in the others."""
-    share = torch.linspace(0, 1, _SAMPLES, dtype=turned.dtype)
+    """Bend arms 0 and 1 towards each other, in place: in merged frames until they touch, in the frames around less."""
+    share = torch.linspace(0, 1, _MOTION.num_samples, dtype=turned.dtype)
     # Flanks: bent at the root, then parallel, then apart. Tips: bent evenly.
     bend = 2 * share if touching == "tips" else (share / 0.35).clamp_max(1.0) - 2.2 * (share - 0.6).clamp_min(0.0)
     raised[:, 1] = raised[:, 0]
-    gap = _CLOSENESS * (form.end if touching == "tips" else 0.5 * (form.root + form.end))
+    distance = _MOTION.touch_distance * (form.end if touching == "tips" else 0.5 * (form.root + form.end))
     start = turned.clone()
-    ways = torch.tensor([1.0, -1.0], dtype=turned.dtype)[:, None]
+    signs = torch.tensor([1.0, -1.0], dtype=turned.dtype)[:, None]
     low, high = (torch.full((len(turned), 1, 1), value, dtype=turned.dtype) for value in (-0.5, 1.6))
-    for _ in range(40):  # bisection for the turn that brings the axes as near as wanted
+    for _ in range(40):  # bisection for the turn that brings the axes to that distance
         middle = 0.5 * (low + high)
-        turned[:, :2] = start[:, :2] + middle * ways * bend
+        turned[:, :2] = start[:, :2] + middle * signs * bend
         axes, _ = _integrated(turned[:, :2], raised[:, :2], lengths[:2])
-        outer = axes[:, :, _SAMPLES // 3 :]
-        near = torch.cdist(outer[:, 0], outer[:, 1]).amin((1, 2))[:, None, None] < gap
+        outer = axes[:, :, _MOTION.num_samples // 3 :]
+        near = torch.cdist(outer[:, 0], outer[:, 1]).amin((1, 2))[:, None, None] < distance
         high, low = torch.where(near, middle, high), torch.where(near, low, middle)
-    # Smoothly on its way there in the frames around.
+    # The frames around approach it smoothly.
     frames = torch.arange(len(turned), dtype=turned.dtype)
     inside = frames[merged]
     off = (torch.cdist(frames[:, None], inside[:, None]).amin(1) / 4).clamp_max(1.0) if len(inside) else frames * 0 + 1
     amount = 0.5 + 0.5 * (math.pi * off).cos()
     amount = torch.where(merged, amount, 0.85 * amount)[:, None, None]
-    turned[:, :2] = start[:, :2] + amount * high * ways * bend
+    turned[:, :2] = start[:, :2] + amount * high * signs * bend
 
 
 def _surface(
     axes: Tensor, radii: Tensor, body: float, resolution: int, noise: float, generator: torch.Generator,
     dtype: torch.dtype,
 ) -> TriangleMesh:  # fmt: skip
-    """Return the surface around arms (K, S, 3) and the body in their middle, on a grid of its own."""
+    """Return the surface around arms (K, S, 3) and the body in their middle, on a randomly shifted grid."""
     balls = torch.cat((axes.flatten(0, 1), axes[:1, 0]))
     sizes = torch.cat((radii.flatten(), radii.new_tensor([body])))
     lower, upper = (balls - sizes[:, None]).amin(0), (balls + sizes[:, None]).amax(0)
@@ -202,8 +216,8 @@ def _surface(
     counts = ((upper - origin) / spacing).ceil().long() + 3
     # In steps of the grid: numbers of one size, so that float32 serves.
     centers, widths = ((balls - origin) / spacing).to(dtype), (sizes / spacing).to(dtype)
-    field = torch.full(tuple(counts.tolist()), float(_REACH), dtype=dtype)
-    for part in widths.argsort().split(_PAINTED):
+    field = torch.full(tuple(counts.tolist()), float(_PAINTING.reach), dtype=dtype)
+    for part in widths.argsort().split(_PAINTING.batch):
         _paint(field, centers[part], widths[part])
     if noise:
         shaken = torch.randn(field.shape, generator=generator, dtype=torch.float64).to(dtype)
@@ -213,8 +227,8 @@ def _surface(
 
 
 def _paint(field: Tensor, centers: Tensor, radii: Tensor) -> None:
-    """Lower a field (X, Y, Z), in place, to the distance to balls, up to `_REACH` outside of them."""
-    half = math.ceil(float(radii.max())) + _REACH
+    """Lower a field (X, Y, Z), in place, to the signed distance to balls (N, 3), up to the reach outside of them."""
+    half = math.ceil(float(radii.max())) + _PAINTING.reach
     reach = torch.arange(-half, half + 1)
     offsets = torch.stack(torch.meshgrid(reach, reach, reach, indexing="ij"), -1).reshape(-1, 3)
     cells = centers.round().long().unsqueeze(1) + offsets

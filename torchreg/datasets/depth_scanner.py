@@ -1,4 +1,4 @@
-"""A made-up depth camera: what it measures of a mesh, with noise, missing pixels and the true place of every point."""
+"""A made-up depth camera: scans of a mesh, with noise, missing pixels and the true position of every point."""
 
 from __future__ import annotations
 
@@ -14,26 +14,23 @@ from torchreg.geometry.mesh import TriangleMesh, interpolate
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.visibility import Raster, View, rasterize
 
-# The size of a pixel is found from a picture of this many pixels along the longer side.
-_FIRST_LOOK = 128
-
 
 @dataclass(frozen=True, eq=False)
 class SurfaceScan:
-    """A range scan, and where on the mesh each of its points was measured.
+    """A range scan, and the true position of each of its points on the mesh.
 
     Args:
         scan: N points.
         face: (N,) face of the mesh.
-        barycentric: (N, 3) float64 weights of its corners at the true, noiseless place.
+        barycentric: (N, 3) float64 weights of its corners at the true, noiseless position.
     """
 
     scan: RangeScan
     face: Tensor
     barycentric: Tensor
 
-    def carried(self, values: Tensor, faces: Tensor) -> Tensor:
-        """Return values (N, C) at the points from values (V, C) at the vertices: true places in any pose, or weights.
+    def transferred(self, values: Tensor, faces: Tensor) -> Tensor:
+        """Return values (N, C) at the points from values (V, C) at the vertices, such as positions or weights.
 
         Args:
             values: (V, C) in the dtype to be returned.
@@ -47,10 +44,10 @@ class DepthScanner:
     """A depth camera at the origin that looks along +z with -y up.
 
     Args:
-        num_points: about how many points the first frame is to give; the pixels are made as large as that needs.
+        num_points: approximate number of points of the first frame, which determines the size of the pixels.
         noise: standard deviation of a depth z as a multiple of z^2, 1/m: 2e-4 is 1.8 mm at 3 m, a good stereo camera.
         max_slant: no depth is measured where the ray meets the surface at more than this from its normal, radians.
-        num_holes: round patches without data at random places of the surface.
+        num_holes: round patches without data at random positions on the surface.
         hole_radius: of those, as a share of the diagonal of the mesh.
 
     Raises:
@@ -73,24 +70,24 @@ class DepthScanner:
         check_positive(self.hole_radius, "hole_radius", allow_zero=True)
 
     def view(self, mesh: TriangleMesh, reach: float) -> View:
-        """Return the camera and its pixels, made for one frame and good for all others.
+        """Return the camera and its pixels for all frames, chosen by the first one.
 
         Args:
             mesh: the first frame, before the camera.
-            reach: largest tangent of an angle to the axis of the camera that it has to see.
+            reach: largest tangent of an angle to the axis of the camera within its picture.
 
         Raises:
             InputError: if the camera sees nothing of the mesh.
         """
         check_positive(reach, "reach")
-        first = _centered_view(2 * reach / _FIRST_LOOK, reach)
+        first = _centered_view(2 * reach / 128, reach)  # 128 pixels a side, to measure the area that is seen
         seen = int(self._measurable(mesh, first)[1].sum())
         if not seen:
             raise InputError("mesh must lie before the camera, which looks along +z, and face it; it sees nothing")
         return _centered_view(first.pitch * math.sqrt(seen / self.num_points), reach)
 
     def scan(self, mesh: TriangleMesh, view: View, generator: torch.Generator, dtype: torch.dtype) -> SurfaceScan:
-        """Return what the camera measures of a closed mesh.
+        """Return the camera's scan of a closed mesh.
 
         Args:
             mesh: faces outwards.
@@ -106,9 +103,9 @@ class DepthScanner:
         row, column = pixel.unbind(-1)
         if not len(pixel):
             raise InputError("mesh must lie before the camera, which looks along +z, and face it; it sees nothing")
-        places = interpolate(mesh.vertices.double(), mesh.faces, raster.face_index[valid], raster.barycentric[valid])
+        points = interpolate(mesh.vertices.double(), mesh.faces, raster.face_index[valid], raster.barycentric[valid])
         error = self.noise * torch.randn(len(pixel), generator=generator, dtype=torch.float64)
-        depth = torch.where(self._in_holes(places, mesh, generator), 0.0, places[:, 2] * (1 + error * places[:, 2]))
+        depth = torch.where(self._in_holes(points, mesh, generator), 0.0, points[:, 2] * (1 + error * points[:, 2]))
         image = torch.zeros_like(raster.depth).index_put((row, column), depth)
         center = (-view.corner / view.pitch - 0.5).tolist()
         scan = RangeScan.from_depth(image.to(dtype), (1 / view.pitch, 1 / view.pitch, *center))
@@ -117,23 +114,23 @@ class DepthScanner:
         return SurfaceScan(scan, raster.face_index[row, column], raster.barycentric[row, column])
 
     def _measurable(self, mesh: TriangleMesh, view: View) -> tuple[Raster, Tensor]:
-        """Return what every pixel shows, and where (H, W) that is not too slanted to be measured."""
+        """Return the faces that the pixels show, and the mask (H, W) of those not too slanted to be measured."""
         raster = rasterize(mesh, view, cull_back=True)
         shown = raster.face_index >= 0
         face = raster.face_index[shown]
         corners = mesh.vertices[mesh.faces[face]].double()
         normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        # Faces are small: the ray to one corner stands for all.
+        # Faces are small: the ray to their first corner is used.
         facing = -torch.nn.functional.cosine_similarity(corners[:, 0], normals, dim=-1)
         return raster, shown.index_put((shown,), facing > math.cos(self.max_slant))
 
-    def _in_holes(self, places: Tensor, mesh: TriangleMesh, generator: torch.Generator) -> Tensor:
-        """Return which places (N, 3) lie in one of the holes, which are centered at some of them."""
+    def _in_holes(self, points: Tensor, mesh: TriangleMesh, generator: torch.Generator) -> Tensor:
+        """Return the mask (N,) of points in holes, whose centers are drawn from the points (N, 3)."""
         if self.num_holes == 0:
-            return torch.zeros(len(places), dtype=torch.bool)
+            return torch.zeros(len(points), dtype=torch.bool)
         lower, upper = mesh.bounds().double()
-        centers = places[torch.randint(len(places), (self.num_holes,), generator=generator)]
-        return (torch.cdist(places, centers) < self.hole_radius * (upper - lower).norm()).any(-1)
+        centers = points[torch.randint(len(points), (self.num_holes,), generator=generator)]
+        return (torch.cdist(points, centers) < self.hole_radius * (upper - lower).norm()).any(-1)
 
 
 def _centered_view(pitch: float, reach: float) -> View:

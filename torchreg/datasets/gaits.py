@@ -1,4 +1,4 @@
-"""How made-up people and animals walk: turns of their parts over the gait cycle, never twice quite the same."""
+"""Walks of made-up people and animals: rotations of their parts over the gait cycle, with random variations."""
 
 from __future__ import annotations
 
@@ -10,21 +10,20 @@ from torch import Tensor
 from torchreg._checks import check_choice
 from torchreg.datasets.bodies import REST_ARM, REST_LEG, SIDES
 from torchreg.datasets.figures import Figure
-from torchreg.errors import InputError
 from torchreg.geometry.rotation import so3_exp
 
-# Shares of the cycle by which the feet of an animal come after its left hind foot.
+# Phases of an animal's feet behind its left hind foot, as shares of the cycle.
 GAITS = {
     "walk": {"hind left": 0.0, "front left": 0.25, "hind right": 0.5, "front right": 0.75},
     "trot": {"hind left": 0.0, "front left": 0.5, "hind right": 0.5, "front right": 0.0},
     "gallop": {"hind left": 0.0, "front left": 0.6, "hind right": 0.1, "front right": 0.5},
 }
-# Arms hang at this angle from the trunk.
+# Angle between hanging arms and the trunk.
 _HANGING_ARM = math.radians(14)
 
 
 def person_walk(figure: Figure, phase: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
-    """Return how the parts of a person turn while walking, and how far the whole rises.
+    """Return the rotations of the parts of a walking person, and the heights of the person.
 
     Joint angles of hips, knees and ankles follow those measured of people; arms swing against the legs, elbows bend as
     the arms come forward, trunk and pelvis turn against each other. Over the cycles strides get longer and shorter,
@@ -33,10 +32,10 @@ def person_walk(figure: Figure, phase: Tensor, generator: torch.Generator | None
     Args:
         figure: a `person`.
         phase: (T,) cycles; the left heel strikes at whole numbers.
-        generator: decides about the variations; None draws from a fresh generator with seed 0.
+        generator: of the variations; None draws from a fresh generator with seed 0.
 
     Returns:
-        rotations (T, P, 3, 3) for `Figure.transforms`, and heights (T,), metres.
+        Rotations (T, P, 3, 3) for `Figure.transforms`, and heights (T,), metres.
 
     Raises:
         InputError: if the figure is no person.
@@ -53,35 +52,36 @@ def person_walk(figure: Figure, phase: Tensor, generator: torch.Generator | None
     turns.add("torso", x=wander(5.0, 5.0), y=12 * stride * beat + wander(8.0), z=wander(4.0))
     turns.add("head", x=wander(12.0), y=wander(30.0) - 6 * stride * beat, z=wander(5.0))
     for side, sign in SIDES.items():
-        own = phase if side == "left" else phase + 0.5
+        cycle = phase if side == "left" else phase + 0.5
         outward = sign * math.degrees(REST_LEG)
-        turns.add(f"{side} thigh", x=-stride * (10 + 24 * torch.cos(2 * math.pi * own)), z=-outward - sign * 0.5)
-        turns.bend(f"{side} shin", stride * (4 + 14 * _bump(own, 0.14, 0.07) + 56 * _bump(own, 0.72, 0.095)), outward)
+        turns.add(f"{side} thigh", x=-stride * (10 + 24 * torch.cos(2 * math.pi * cycle)), z=-outward - sign * 0.5)
+        knee = 4 + 14 * _bump(cycle, 0.14, 0.07) + 56 * _bump(cycle, 0.72, 0.095)
+        turns.bend(f"{side} shin", stride * knee, outward)
         turns.bend(
             f"{side} foot",
-            stride * (6 * _bump(own, 0.07, 0.05) - 9 * _bump(own, 0.42, 0.12) + 18 * _bump(own, 0.62, 0.07)),
+            stride * (6 * _bump(cycle, 0.07, 0.05) - 9 * _bump(cycle, 0.42, 0.12) + 18 * _bump(cycle, 0.62, 0.07)),
             outward,
         )
-        forward = swing * (3 - 24 * torch.cos(2 * math.pi * own))
+        forward = swing * (3 - 24 * torch.cos(2 * math.pi * cycle))
         hanging = sign * math.degrees(REST_ARM - _HANGING_ARM)
         turns.add(f"{side} upper arm", x=-forward, z=-hanging + sign * wander(3.0, 2.0))
-        turns.bend(f"{side} forearm", -(12 + swing * (18 - 16 * torch.cos(2 * math.pi * (own - 0.05)))), hanging)
+        turns.bend(f"{side} forearm", -(12 + swing * (18 - 16 * torch.cos(2 * math.pi * (cycle - 0.05)))), hanging)
     return turns.rotations, -0.02 * torch.cos(4 * math.pi * phase)
 
 
 def animal_walk(
     figure: Figure, phase: Tensor, gait: str = "walk", generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:
-    """Return how the parts of a four-legged animal turn while moving, and how far the whole rises.
+    """Return the rotations of the parts of a moving four-legged animal, and the heights of the animal.
 
     Args:
         figure: a `quadruped`.
         phase: (T,) cycles; the left hind foot is foremost at whole numbers.
         gait: "walk", "trot" or "gallop".
-        generator: decides about variations from cycle to cycle; None draws from a fresh generator with seed 0.
+        generator: of variations from cycle to cycle; None draws from a fresh generator with seed 0.
 
     Returns:
-        rotations (T, P, 3, 3) for `Figure.transforms`, and heights (T,), metres.
+        Rotations (T, P, 3, 3) for `Figure.transforms`, and heights (T,), metres.
 
     Raises:
         InputError: if the gait is unknown or the figure no quadruped.
@@ -99,15 +99,15 @@ def animal_walk(
     turns.add("head", x=wander(12.0) - 8 * twice, y=wander(15.0))
     turns.add("tail", x=wander(10.0), y=20 * beat)
     for leg, lag in GAITS[gait].items():
-        own = phase - lag
-        turns.add(f"{leg} thigh", x=-stride * (24 * torch.cos(2 * math.pi * own) + 8 * _bump(own, 0.8, 0.1)))
-        turns.add(f"{leg} shin", x=stride * (4 + 45 * _bump(own, 0.72, 0.1)))
-        turns.add(f"{leg} foot", x=stride * (15 * _bump(own, 0.6, 0.07) + 20 * _bump(own, 0.75, 0.08)))
+        cycle = phase - lag
+        turns.add(f"{leg} thigh", x=-stride * (24 * torch.cos(2 * math.pi * cycle) + 8 * _bump(cycle, 0.8, 0.1)))
+        turns.add(f"{leg} shin", x=stride * (4 + 45 * _bump(cycle, 0.72, 0.1)))
+        turns.add(f"{leg} foot", x=stride * (15 * _bump(cycle, 0.6, 0.07) + 20 * _bump(cycle, 0.75, 0.08)))
     return turns.rotations, -0.015 * twice
 
 
 class _Turns:
-    """Turns of all parts of a figure over time, the identity where nothing is said; angles in degrees."""
+    """Rotations of all parts of a figure over time, at first the identity; angles in degrees."""
 
     def __init__(self, figure: Figure, frames: int) -> None:
         self._figure = figure
@@ -117,24 +117,17 @@ class _Turns:
 
     def add(self, part: str, x: Tensor | float = 0.0, y: Tensor | float = 0.0, z: Tensor | float = 0.0) -> None:
         """Turn a part about z, then x, then y of its parent."""
-        self.rotations[:, self._index(part)] = self._about(1, y) @ self._about(0, x) @ self._about(2, z)
+        self.rotations[:, self._figure.index(part)] = self._about(1, y) @ self._about(0, x) @ self._about(2, z)
 
-    def bend(self, part: str, angle: Tensor, stands_off: float) -> None:
-        """Turn a part about the x axis as it lies when what carries it has been turned back by ``stands_off``."""
-        back = self._about(2, -stands_off)
-        self.rotations[:, self._index(part)] = back.mT @ self._about(0, angle) @ back
+    def bend(self, part: str, angle: Tensor, rest_angle: float) -> None:
+        """Turn a part about the x axis of its parent, which in the rest pose is turned about z by ``rest_angle``."""
+        back = self._about(2, -rest_angle)
+        self.rotations[:, self._figure.index(part)] = back.mT @ self._about(0, angle) @ back
 
     def _about(self, axis: int, degrees: Tensor | float) -> Tensor:
         vector = torch.zeros(self._frames, 3, dtype=torch.float64)
         vector[:, axis] = torch.as_tensor(degrees, dtype=torch.float64).deg2rad()
         return so3_exp(vector)
-
-    def _index(self, part: str) -> int:
-        if part not in self._figure.part_names:
-            raise InputError(
-                f"figure must have a part called {part!r} to move so, got {', '.join(self._figure.part_names)}"
-            )
-        return self._figure.part_names.index(part)
 
 
 class _Wander:
@@ -150,6 +143,6 @@ class _Wander:
         return middle + amplitude * waves.mean(0)
 
 
-def _bump(phase: Tensor, at: float, width: float) -> Tensor:
-    """Return a bell of height 1 around ``at`` in every cycle."""
-    return torch.exp(-0.5 * ((((phase - at) + 0.5) % 1.0 - 0.5) / width) ** 2)
+def _bump(phase: Tensor, center: float, width: float) -> Tensor:
+    """Return a bell (T,) of height 1 around ``center`` in every cycle."""
+    return torch.exp(-0.5 * ((((phase - center) + 0.5) % 1.0 - 0.5) / width) ** 2)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_choice, check_positive
+from torchreg._checks import check_choice, check_count, check_positive
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
@@ -17,24 +17,38 @@ from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.skin import BendingSkin, LinearBlendSkin
 
-_DISTANCE = 0.5
-_POSITION_SPREAD = 0.03
-_BOX_MARGIN = 0.05
-# Fingers up, palm to a camera that looks along +z with -y up.
-_FACING = (math.pi / 2, 0.0, 0.0)
 MOTIONS = ("bend", "rotate", "rotation", "bending_palm", "bending_back", "flip", "fast", "occlusion")
 # Points that a part must have at least to count as measured.
 MIN_SEEN_POINTS = 8
-_SECONDS_PER_BEND = 2.5
-_SECONDS_PER_TURN = 5.0
-_SECONDS_PER_ROTATION = 4.5
-# Flips and passages are undone after the second time, and all begins anew after the first.
-_SECONDS_PER_RETURN = (8.0, 4.0)
-_SECONDS_PER_FLIP, _SECONDS_PER_PASSAGE = 1.0, 1.5
-# To each side of the obstacle, at a distance of half a metre.
-_PASSAGE = 0.14
-# Joints without limits are moved within these, radians (metres for sliding joints).
-_OPEN_LIMIT = math.pi / 2
+# Rotation vector of a hand with fingers up, palm to a camera that looks along +z with -y up.
+_FACING = (math.pi / 2, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """Positions and motions of shapes, metres, for a shape at ``distance`` from the camera."""
+
+    distance: float = 0.5
+    drift: float = 0.03  # of the middle of the shape, to each side
+    passage: float = 0.14  # to each side of an obstacle
+    clutter_margin: float = 0.05  # by which the box of outliers is larger than the surface, on each side
+    open_limit: float = math.pi / 2  # of joints without limits, radians (metres for sliding joints)
+
+
+@dataclass(frozen=True)
+class _Periods:
+    """Durations of motions, seconds."""
+
+    bend: float = 2.5  # fingers close and open
+    sway: float = 5.0  # and one turn about the own axis
+    rotation: float = 4.5  # to and fro
+    flip: float = 1.0
+    passage: float = 1.5
+    undone: float = 4.0  # from a flip or passage to its reverse
+    again: float = 8.0  # to the next flip or passage
+
+
+_STAGE, _PERIODS = _Stage(), _Periods()
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +60,8 @@ class HandCloud:
         inliers: (M,) bool, True for points of the shape.
         part_labels: (M,) int64 part of each point, -1 for outliers.
         pose: (num_dofs,) the true pose.
-        keypoints: (K, 3) true places of the shape's keypoints, metres.
-        vertices: (V, 3) true places of the vertices of the skin that was measured, metres.
+        keypoints: (K, 3) true positions of the shape's keypoints, metres.
+        vertices: (V, 3) true positions of the vertices of the skin that was measured, metres.
         part_counts: (P,) int64 points on each part.
     """
 
@@ -61,7 +75,7 @@ class HandCloud:
 
     @property
     def seen_parts(self) -> Tensor:
-        """Which parts (P,) hold at least 8 points; of a hand, ``seen_parts[list(hand.fingertip_parts)]`` are tips."""
+        """Mask (P,) of parts with at least 8 points; of a hand, ``seen_parts[list(hand.fingertip_parts)]`` are tips."""
         return self.part_counts >= MIN_SEEN_POINTS
 
 
@@ -74,7 +88,7 @@ def surface_skin(shape: ArticulatedShape, *, spacing: float | None = None, sharp
         sharpness: a of the bending skin.
 
     Returns:
-        `shape.file_skin()` or a `BendingSkin`, with faces.
+        The skin, with faces: `shape.file_skin()` or a `BendingSkin`.
 
     Cost: meshing takes about a second; keep the skin.
     """
@@ -82,6 +96,13 @@ def surface_skin(shape: ArticulatedShape, *, spacing: float | None = None, sharp
         return shape.file_skin()
     mesh = shape.surface_mesh(spacing=spacing)
     return BendingSkin(shape, mesh.vertices, shape.rest_pose(), sharpness, faces=mesh.faces)
+
+
+def faces_of(skin: LinearBlendSkin) -> Tensor:
+    """Return the faces (F, 3) of a skin; InputError if it has none."""
+    if skin.faces is None:
+        raise InputError("skin must have faces; make it with surface_skin(shape)")
+    return skin.faces
 
 
 def make_hand_cloud(
@@ -106,17 +127,16 @@ def make_hand_cloud(
             of the posed surface grown by 5 cm on each side.
         camera: (3,) position of a camera; points then lie on the side it sees, uniformly over its picture. None: on
             all sides, uniformly by area.
-        skin: what moves the true surface, with faces; by default `surface_skin`, which is made anew at every call.
+        skin: of the true surface, with faces; by default `surface_skin`, which is made anew at every call.
         generator: source of randomness; None draws from a fresh generator with seed 0, the same cloud at every call.
 
     Returns:
-        the cloud, in the shape's dtype and on its device.
+        The cloud, in the shape's dtype and on its device.
 
     Raises:
         InputError: if an argument is out of range or the skin has no faces.
     """
-    if isinstance(num_points, bool) or not isinstance(num_points, int) or num_points < 1:
-        raise InputError(f"num_points must be a positive integer, got {num_points!r}")
+    check_count(num_points, "num_points", 1)
     check_positive(noise, "noise", allow_zero=True)
     if not 0 <= outlier_ratio < 1:
         raise InputError(f"outlier_ratio must be at least 0 and below 1, got {outlier_ratio}")
@@ -124,11 +144,10 @@ def make_hand_cloud(
     if pose.ndim != 1:
         raise InputError(f"pose must have shape ({shape.num_dofs},), got {tuple(pose.shape)}; make one cloud per pose")
     skin = surface_skin(shape) if skin is None else skin
-    if skin.faces is None:
-        raise InputError("skin must have faces to draw points from; make it with surface_skin(shape)")
+    faces = faces_of(skin)
     generator = torch.Generator().manual_seed(0) if generator is None else generator
     with torch.no_grad():
-        mesh = TriangleMesh(skin(pose), skin.faces)
+        mesh = TriangleMesh(skin(pose), faces)
         if camera is None:
             surface, face, barycentric = sample_surface(mesh, num_points, generator)
         else:
@@ -137,8 +156,8 @@ def make_hand_cloud(
         surface = surface + noise * _normal((num_points, 3), generator, surface)
         num_outliers = round(num_points * outlier_ratio / (1 - outlier_ratio))
         lower, upper = mesh.bounds()
-        place = _uniform((num_outliers, 3), generator, surface)
-        clutter = lower - _BOX_MARGIN + place * (upper - lower + 2 * _BOX_MARGIN)
+        share, margin = _uniform((num_outliers, 3), generator, surface), _STAGE.clutter_margin
+        clutter = lower - margin + share * (upper - lower + 2 * margin)
         return shuffled_cloud(shape, pose, mesh.vertices, surface, labels, clutter, generator)
 
 
@@ -151,7 +170,7 @@ def shuffled_cloud(
     outliers: Tensor,
     generator: torch.Generator,
 ) -> HandCloud:
-    """Return points of a shape and outliers as one cloud in random order, with the truth beside it.
+    """Return points of a shape and outliers as one cloud in random order, with the truth.
 
     Args:
         shape: the true shape.
@@ -159,24 +178,24 @@ def shuffled_cloud(
         vertices: (V, 3) the posed surface.
         surface: (N, 3) measured points of the shape.
         labels: (N,) int64 parts of those.
-        outliers: (O, 3) other points.
+        outliers: (O, 3).
         generator: of the order.
 
     Returns:
-        the cloud of N + O points.
+        The cloud of N + O points.
     """
     order = torch.randperm(len(surface) + len(outliers), generator=generator, device=generator.device)
     order = order.to(surface.device)
     with torch.no_grad():
         keypoints = shape.keypoints(pose)
     return HandCloud(
-        torch.cat([surface, outliers])[order],
-        order < len(surface),
-        torch.cat([labels, labels.new_full((len(outliers),), -1)])[order],
-        pose,
-        keypoints,
-        vertices,
-        torch.bincount(labels, minlength=shape.num_parts),
+        points=torch.cat([surface, outliers])[order],
+        inliers=order < len(surface),
+        part_labels=torch.cat([labels, labels.new_full((len(outliers),), -1)])[order],
+        pose=pose,
+        keypoints=keypoints,
+        vertices=vertices,
+        part_counts=torch.bincount(labels, minlength=shape.num_parts),
     )
 
 
@@ -185,12 +204,12 @@ def random_hand_pose(
     generator: torch.Generator | None = None,
     *,
     bend: float = 0.6,
-    distance: float = _DISTANCE,
+    distance: float = _STAGE.distance,
 ) -> Tensor:
     """Return a random pose within the joint limits, turned at random, before a camera at the origin looking along +z.
 
-    A hand's fingers curl each as a whole and spread apart, so that they do not run through each other; the joints of
-    other shapes move independently around the rest pose.
+    All joints of a finger curl together, and fingers spread apart, so that they do not run through each other; the
+    joints of other shapes move independently around the rest pose.
 
     Args:
         hand: the shape.
@@ -200,7 +219,7 @@ def random_hand_pose(
             choose a few times the size of the shape.
 
     Returns:
-        (num_dofs,), metres and radians; a base that cannot move stays where it is.
+        The pose (num_dofs,), metres and radians; a base that cannot move stays in place.
 
     Raises:
         InputError: if ``bend`` is not between 0 and 1 or ``distance`` not positive.
@@ -214,7 +233,7 @@ def random_hand_pose(
     pose = hand.rest_pose()
     curls, share = _curl_groups(hand), bend * draws[0]
     if isinstance(hand, Hand):
-        # One draw per finger and a little of each joint's own.
+        # One draw per finger, and a little of one per joint.
         share = bend * (0.8 * draws[1][curls] + 0.2 * draws[0])
         pose[6:] = _hand_joints(hand, share, 2 * draws[2] - 1, bend)
     else:
@@ -222,7 +241,7 @@ def random_hand_pose(
         pose[6:] = pose[6:] + bend * torch.where(draws[1] < 0.5, lower, upper) * draws[0]
     axis_length = quaternion[1:].norm()
     pose[3:6] = 2 * torch.atan2(axis_length, quaternion[0].abs()) * quaternion[1:] / axis_length * quaternion[0].sign()
-    shift = distance / _DISTANCE * _POSITION_SPREAD * (2 * offset - 1)
+    shift = distance / _STAGE.distance * _STAGE.drift * (2 * offset - 1)
     target = hand.rest.new_tensor([0.0, 0.0, distance]) + shift
     return placed(hand, pose, target)
 
@@ -236,7 +255,7 @@ def placed(shape: ArticulatedShape, pose: Tensor, target: Tensor) -> Tensor:
         target: (..., 3), metres.
 
     Returns:
-        (..., num_dofs); a base that cannot move stays where it is.
+        Poses (..., num_dofs); a base that cannot move stays in place.
     """
     pose = torch.maximum(torch.minimum(pose, shape.upper), shape.lower)
     still = torch.cat([torch.zeros_like(pose[..., :6]), pose[..., 6:]], dim=-1)
@@ -254,7 +273,7 @@ def hand_motion(
     fps: float = 20.0,
     *,
     bend: float = 0.6,
-    distance: float = _DISTANCE,
+    distance: float = _STAGE.distance,
     seed: int = 0,
 ) -> Tensor:
     """Return the poses of a smooth motion before a camera at the origin that looks along +z with -y up.
@@ -280,10 +299,10 @@ def hand_motion(
         fps: frames per second.
         bend: share of the way to their limits that joints move at most, 0 to 1.
         distance: from the origin to the middle of the shape, metres.
-        seed: decides about how deep each joint bends and when, and about axes, amplitudes, speeds and times.
+        seed: of depths and phases of the bends, and of axes, amplitudes, speeds and times.
 
     Returns:
-        (num_frames, num_dofs), metres and radians; the rotation vectors have angles of at most pi.
+        Poses (num_frames, num_dofs), metres and radians; the rotation vectors have angles of at most pi.
 
     Raises:
         InputError: if an argument is out of range.
@@ -291,17 +310,16 @@ def hand_motion(
     References: Dewaele et al. 2006, section 5 ("rotation", "bending_palm", "bending_back", "flip").
     """
     check_choice(kind, "kind", MOTIONS)
-    if isinstance(num_frames, bool) or not isinstance(num_frames, int) or num_frames < 1:
-        raise InputError(f"num_frames must be a positive integer, got {num_frames!r}")
+    check_count(num_frames, "num_frames", 1)
     check_positive(fps, "fps")
     check_positive(distance, "distance")
     _check_share(bend, "bend")
     generator = torch.Generator().manual_seed(seed)
     draws = _uniform((3, shape.num_dofs - 6), generator, shape.rest)
     sway = _uniform((6,), generator, shape.rest)
-    own = _uniform((4,), generator, shape.rest)
+    chance = _uniform((4,), generator, shape.rest)
     seconds = (torch.arange(num_frames, dtype=torch.float64) / fps).to(shape.rest)
-    seconds = seconds * (3 + own[0]) if kind == "fast" else seconds
+    seconds = seconds * (3 + chance[0]) if kind == "fast" else seconds
     share = bend * (0.8 + 0.2 * draws[0]) * _closing(kind, seconds, _curl_groups(shape))
     pose = shape.rest_pose().expand(num_frames, -1).clone()
     if isinstance(shape, Hand):
@@ -309,66 +327,65 @@ def hand_motion(
     else:
         lower, upper = _joint_ranges(shape)
         pose[:, 6:] = pose[:, 6:] + share * torch.where(draws[2] < 0.5, lower, upper)
-    tilts, shifts = torch.sin(2 * math.pi * (seconds[:, None] / _SECONDS_PER_TURN + sway.view(2, 1, 3)))
-    pose[:, 3:6] = _turns(kind, seconds, tilts, own)
-    drift = _POSITION_SPREAD * (1.6 if kind == "fast" else 1.0) * shifts
+    tilts, shifts = torch.sin(2 * math.pi * (seconds[:, None] / _PERIODS.sway + sway.view(2, 1, 3)))
+    pose[:, 3:6] = _base_rotations(kind, seconds, tilts, chance)
+    drift = _STAGE.drift * (1.6 if kind == "fast" else 1.0) * shifts
     if kind == "occlusion":
-        passed = 2 * _there_and_back(seconds, 1.6 + 0.3 * own[3], _SECONDS_PER_PASSAGE) - 1
-        drift[:, 0] = 0.5 * drift[:, 0] + torch.where(own[2] < 0.5, _PASSAGE, -_PASSAGE) * passed
-    target = shape.rest.new_tensor([0.0, 0.0, distance]) + distance / _DISTANCE * drift
+        passed = 2 * _step_and_return(seconds, 1.6 + 0.3 * chance[3], _PERIODS.passage) - 1
+        drift[:, 0] = 0.5 * drift[:, 0] + torch.where(chance[2] < 0.5, _STAGE.passage, -_STAGE.passage) * passed
+    target = shape.rest.new_tensor([0.0, 0.0, distance]) + distance / _STAGE.distance * drift
     return placed(shape, pose, target)
 
 
 def _closing(kind: str, seconds: Tensor, fingers: Tensor) -> Tensor:
-    """Return how far each joint (..., D) is closed at each time, from 0 to 1."""
+    """Return the closure (T, D) of each joint at each time, 0 open to 1 closed."""
     lag: float | Tensor = 0.1
     if kind in ("bending_palm", "bending_back", "fast"):
-        lag = 0.075 * (1 + torch.cos(2 * math.pi * seconds[:, None] / _SECONDS_PER_TURN))
-    wave = 0.5 - 0.5 * torch.cos(2 * math.pi * (seconds[:, None] / _SECONDS_PER_BEND - lag * fingers))
+        lag = 0.075 * (1 + torch.cos(2 * math.pi * seconds[:, None] / _PERIODS.sway))
+    wave = 0.5 - 0.5 * torch.cos(2 * math.pi * (seconds[:, None] / _PERIODS.bend - lag * fingers))
     if kind == "rotate":
         return 0.4 + 0.2 * wave
     return 0.15 + 0.2 * wave if kind in ("rotation", "flip", "occlusion") else wave
 
 
-def _turns(kind: str, seconds: Tensor, tilts: Tensor, own: Tensor) -> Tensor:
-    """Return rotation vectors (T, 3) of the base."""
+def _base_rotations(kind: str, seconds: Tensor, tilts: Tensor, chance: Tensor) -> Tensor:
+    """Return rotation vectors (T, 3) of the base, from swaying (T, 3) and four draws from 0 to 1."""
     sway = {"fast": 0.3, "rotation": 0.05}.get(kind, 0.2) * tilts
     turn = compose_rotation_vectors(sway, sway.new_tensor(_FACING).expand_as(sway))
     if kind == "rotate":
-        about = 2 * math.pi * seconds / _SECONDS_PER_TURN
+        about = 2 * math.pi * seconds / _PERIODS.sway
         return compose_rotation_vectors(turn, about[:, None] * turn.new_tensor([0.0, 0.0, 1.0]))
-    tilt = torch.zeros_like(own[2])
+    tilt = torch.zeros_like(chance[2])
     if kind == "rotation":
-        tilt = math.radians(25) * (2 * own[2] - 1)
-        angle = torch.deg2rad(60 + 10 * own[1]) * torch.sin(2 * math.pi * seconds / _SECONDS_PER_ROTATION)
+        tilt = math.radians(25) * (2 * chance[2] - 1)
+        angle = torch.deg2rad(60 + 10 * chance[1]) * torch.sin(2 * math.pi * seconds / _PERIODS.rotation)
     elif kind == "bending_back":
         angle = torch.full_like(seconds, math.pi)
     elif kind == "flip":
-        tilt = math.radians(10) * (2 * own[2] - 1)
-        angle = math.pi * _there_and_back(seconds, 1.8 + 0.4 * own[3], _SECONDS_PER_FLIP)
+        tilt = math.radians(10) * (2 * chance[2] - 1)
+        angle = math.pi * _step_and_return(seconds, 1.8 + 0.4 * chance[3], _PERIODS.flip)
     else:
         return turn
-    angle = torch.where(own[0] < 0.5, angle, -angle)
+    angle = torch.where(chance[0] < 0.5, angle, -angle)
     axis = torch.stack([tilt.sin(), tilt.cos(), torch.zeros_like(tilt)])
     return compose_rotation_vectors(angle[:, None] * axis, turn)
 
 
-def _there_and_back(seconds: Tensor, start: Tensor, duration: float) -> Tensor:
-    """Return a smooth step from 0 to 1 that is undone later, again and again."""
-    period, pause = _SECONDS_PER_RETURN
-    since = torch.remainder(seconds, period) - start
-    share = torch.stack([since, since - pause]).div(duration).clamp(0, 1)
-    there, back = share**3 * (10 - 15 * share + 6 * share**2)
-    return there - back
+def _step_and_return(seconds: Tensor, start: Tensor, duration: float) -> Tensor:
+    """Return a smooth step (T,) from 0 to 1 that is undone later, again and again."""
+    since = torch.remainder(seconds, _PERIODS.again) - start
+    share = torch.stack([since, since - _PERIODS.undone]).div(duration).clamp(0, 1)
+    forth, back = share**3 * (10 - 15 * share + 6 * share**2)
+    return forth - back
 
 
 def _uniform(size: tuple[int, ...], generator: torch.Generator, like: Tensor) -> Tensor:
-    """Return numbers in [0, 1) drawn in double precision where the generator lives, in the kind of ``like``."""
+    """Return numbers in [0, 1) of the kind of ``like``, drawn in float64 on the generator's device."""
     return torch.rand(size, generator=generator, device=generator.device, dtype=torch.float64).to(like)
 
 
 def _normal(size: tuple[int, ...], generator: torch.Generator, like: Tensor) -> Tensor:
-    """Return normal numbers drawn in double precision where the generator lives, in the kind of ``like``."""
+    """Return standard normal numbers of the kind of ``like``, drawn in float64 on the generator's device."""
     return torch.randn(size, generator=generator, device=generator.device, dtype=torch.float64).to(like)
 
 
@@ -379,15 +396,15 @@ def _check_share(value: float, name: str) -> None:
 
 
 def _joint_ranges(shape: ArticulatedShape) -> tuple[Tensor, Tensor]:
-    """Return how far each joint may move down and up from rest."""
+    """Return the ranges (D,) of each joint below and above its rest angle."""
     rest = shape.rest[6:]
-    lower = shape.lower[6:].clamp(min=-_OPEN_LIMIT) - rest
-    upper = shape.upper[6:].clamp(max=_OPEN_LIMIT) - rest
+    lower = shape.lower[6:].clamp(min=-_STAGE.open_limit) - rest
+    upper = shape.upper[6:].clamp(max=_STAGE.open_limit) - rest
     return lower.clamp(max=0), upper.clamp(min=0)
 
 
 def _curl_groups(shape: ArticulatedShape) -> Tensor:
-    """Return for each joint the number of its finger, or of the joint in other shapes."""
+    """Return the number (D,) of each joint's finger; of shapes other than hands, the number of the joint."""
     if not isinstance(shape, Hand):
         return torch.arange(shape.num_dofs - 6, device=shape.rest.device)
     fingers = [name.split("_")[0] for name in shape.dof_names[6:]]
@@ -396,7 +413,7 @@ def _curl_groups(shape: ArticulatedShape) -> Tensor:
 
 
 def _hand_joints(hand: Hand, share: Tensor, spread: Tensor, bend: float) -> Tensor:
-    """Return joint angles (..., 21) of a hand: flexions at ``share`` of their limits, spread -1 to 1 of abductions."""
+    """Return joint angles (..., 21) of a hand: flexions at a share of their limits, abductions by a spread -1 to 1."""
     names = hand.dof_names[6:]
     # Away from the middle finger: thumb and index towards the thumb side, ring and little finger away from it.
     outward = {"index": 1.0, "ring": -1.0, "little": -1.0}

@@ -9,30 +9,41 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_count, check_positive, check_shape
-from torchreg.datasets.hand import surface_skin
-from torchreg.errors import InputError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.camera_rig import CameraRig, StereoPair
 from torchreg.geometry.mesh import TriangleMesh, interpolate
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.visibility import rasterize
-from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.skin import LinearBlendSkin
 
-# Light skin: its mean color, and what blood and melanin change of it.
-_SKIN, _BLOTCH = (0.78, 0.58, 0.48), (0.10, -0.05, -0.06)
-_WALL = (0.32, 0.40, 0.46)
-# Wavelengths of skin, metres, and their share of the brightness: blotches, folds, creases and pores.
-_SKIN_WAVES = ((0.012, 0.10), (0.005, 0.18), (0.0025, 0.22), (0.0015, 0.16))
-_WALL_WAVES = ((0.05, 0.2), (0.012, 0.25), (0.005, 0.2))
-# Primes that mix the three whole numbers of a lattice point, and the mixing itself, all below 2^63.
+# Smooth noise of several scales: pairs of a wavelength, metres, and its share of the brightness.
+_Waves = tuple[tuple[float, float], ...]
+
+
+@dataclass(frozen=True)
+class _Texture:
+    """Colors, red, green and blue from 0 to 1, and grain of skin and wall."""
+
+    skin: tuple[float, float, float] = (0.78, 0.58, 0.48)  # light skin, its mean
+    blotch: tuple[float, float, float] = (0.10, -0.05, -0.06)  # change by blood and melanin
+    skin_waves: _Waves = (
+        (0.012, 0.10),  # blotches
+        (0.005, 0.18),  # folds
+        (0.0025, 0.22),  # creases
+        (0.0015, 0.16),  # pores
+    )
+    wall: tuple[float, float, float] = (0.32, 0.40, 0.46)
+    wall_waves: _Waves = ((0.05, 0.2), (0.012, 0.25), (0.005, 0.2))
+    ambient: float = 0.35  # light from all sides, as a share of all light
+
+
+_TEXTURE = _Texture()
+# Primes that mix the three whole numbers of a lattice point (Teschner et al. 2003); products stay below 2^63.
 _PRIMES = (73_856_093, 19_349_663, 83_492_791)
-_AMBIENT = 0.35
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """What a camera sees.
+    """A picture with the exact depth, mask and faces.
 
     Args:
         image: (H, W, 3) from 0 to 1.
@@ -81,16 +92,16 @@ def value_noise(points: Tensor, wavelength: float, seed: int = 0) -> Tensor:
     Args:
         points: (..., 3).
         wavelength: spacing of the lattice, in the unit of the points.
-        seed: of the values; each is a function of its place alone, the same on every device.
+        seed: of the values; each is a function of its position alone, the same on every device.
 
     References: Perlin 1985 (solid texture).
     """
     check_positive(wavelength, "wavelength")
-    place = points.double() / wavelength
-    cell = place.floor()
-    share = place - cell
+    position = points.double() / wavelength
+    cell = position.floor()
+    share = position - cell
     share = share * share * (3 - 2 * share)
-    total = torch.zeros_like(place[..., 0])
+    total = torch.zeros_like(position[..., 0])
     for corner in range(8):
         step = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2 & 1], device=points.device)
         weight = torch.where(step > 0, share, 1 - share).prod(-1)
@@ -99,7 +110,7 @@ def value_noise(points: Tensor, wavelength: float, seed: int = 0) -> Tensor:
 
 
 def _hashed(cell: Tensor, seed: int) -> Tensor:
-    """Return a number from -1 to 1 for every lattice point (..., 3)."""
+    """Return numbers (...,) from -1 to 1, one per lattice point (..., 3)."""
     x, y, z = cell.unbind(-1)
     code = (x * _PRIMES[0]) ^ (y * _PRIMES[1]) ^ (z * _PRIMES[2]) ^ (seed * 2_654_435_761)
     for _ in range(2):
@@ -111,10 +122,16 @@ def _hashed(cell: Tensor, seed: int) -> Tensor:
 
 
 def skin_color(points: Tensor, seed: int = 0) -> Tensor:
-    """Return the color (..., 3) of skin at points (..., 3) of the surface in rest, metres, before any light."""
-    tone = 1 + sum(share * value_noise(points, wave, seed + k) for k, (wave, share) in enumerate(_SKIN_WAVES))
-    blotch = value_noise(points, _SKIN_WAVES[0][0], seed + 100).unsqueeze(-1) * points.new_tensor(_BLOTCH)
-    return ((points.new_tensor(_SKIN) + 0.5 * blotch) * torch.as_tensor(tone).unsqueeze(-1)).clamp(0, 1)
+    """Return colors (..., 3) of skin at points (..., 3) of the surface in rest, metres, before any light."""
+    blotch = value_noise(points, _TEXTURE.skin_waves[0][0], seed + 100).unsqueeze(-1)
+    color = points.new_tensor(_TEXTURE.skin) + 0.5 * (blotch * points.new_tensor(_TEXTURE.blotch))
+    return (color * _tone(points, _TEXTURE.skin_waves, seed).unsqueeze(-1)).clamp(0, 1)
+
+
+def _tone(points: Tensor, waves: _Waves, seed: int) -> Tensor:
+    """Return factors (...,) on the brightness at points (..., 3): one plus noise of all wavelengths."""
+    noise = sum(share * value_noise(points, wavelength, seed + k) for k, (wavelength, share) in enumerate(waves))
+    return 1 + torch.as_tensor(noise)
 
 
 def render(
@@ -132,15 +149,15 @@ def render(
     Args:
         mesh: the surface, oriented outwards, before the camera.
         camera: without distortion, with square pixels.
-        rest: (V, 3) vertices in rest, where the texture is looked up, so that it moves with the surface; the mesh's own
-            by default.
+        rest: (V, 3) vertices in rest, where the texture is looked up, so that it moves with the surface; those of the
+            mesh by default.
         style: light, background and noise.
         seed: of the texture.
         generator: of the noise, on the CPU; None draws from a fresh one with seed 0, the same at every call.
-        behind: what `backdrop` returned for this camera, style and seed; it saves most of the time.
+        behind: colors of the `backdrop` for this camera, style and seed; it saves most of the time.
 
     Returns:
-        the picture; depth, mask and faces are exact in the middles of pixels.
+        The picture; depth, mask and faces are exact in the middles of pixels.
 
     Raises:
         InputError: if sizes do not fit, the camera distorts, or the mesh reaches beside or behind it.
@@ -169,6 +186,7 @@ def render(
 
 
 def _finer(camera: Camera, times: int) -> Camera:
+    """Return a camera with so many pixels per pixel along each axis."""
     focal, center = camera.intrinsics.split(2)
     intrinsics = torch.cat((focal * times, (center + 0.5) * times - 0.5))
     return Camera(camera.width * times, camera.height * times, intrinsics, camera.world_to_camera)
@@ -185,7 +203,7 @@ def _wall_depth(camera: Camera, style: PictureStyle) -> Tensor:
 
 
 def backdrop(camera: Camera, *, style: PictureStyle | None = None, seed: int = 0) -> Tensor:
-    """Return the colors (H, W, 3) behind everything, as float32, one per ray: the same for all frames of a sequence.
+    """Return the background colors (H, W, 3), float32, one per ray: the same for all frames of a sequence.
 
     Args:
         camera: as in `render`.
@@ -198,9 +216,8 @@ def backdrop(camera: Camera, *, style: PictureStyle | None = None, seed: int = 0
         if style.wall is None:
             return torch.tensor(style.background).expand(camera.height, camera.width, 3).clone()
         points = camera.unproject(camera.pixel_grid().double(), _wall_depth(camera, style))
-        waves = enumerate(_WALL_WAVES)
-        tone = 1 + sum(share * value_noise(points, wave, seed + 200 + k) for k, (wave, share) in waves)
-        return (points.new_tensor(_WALL) * torch.as_tensor(tone).unsqueeze(-1)).float()
+        tone = _tone(points, _TEXTURE.wall_waves, seed + 200)
+        return (points.new_tensor(_TEXTURE.wall) * tone.unsqueeze(-1)).float()
 
 
 def _shaded(mesh: TriangleMesh, camera: Camera, rest: Tensor, style: PictureStyle, seed: int, behind: Tensor) -> Tensor:
@@ -213,7 +230,8 @@ def _shaded(mesh: TriangleMesh, camera: Camera, rest: Tensor, style: PictureStyl
     light = torch.nn.functional.normalize(normals.new_tensor(style.light), dim=0)
     lit = (torch.nn.functional.normalize(normals, dim=-1) @ light).clamp(min=0)
     skin = skin_color(interpolate(rest, mesh.faces, face, weights), seed)
-    colors[seen] = skin * (_AMBIENT + (1 - _AMBIENT) * lit).unsqueeze(-1)
+    ambient = _TEXTURE.ambient
+    colors[seen] = skin * (ambient + (1 - ambient) * lit).unsqueeze(-1)
     return colors.clamp(0, 1)
 
 
@@ -248,8 +266,8 @@ def camera_ring(
     """Return cameras spread evenly over a sphere that look at its middle (the spiral of golden angles).
 
     Args:
-        center: (3,) what they look at, metres.
-        distance: from there, metres.
+        center: (3,) middle of the sphere, metres.
+        distance: of the cameras from it, metres.
         count: two or more.
         focal: focal length, pixels.
         width: of the pictures, pixels.
@@ -261,44 +279,14 @@ def camera_ring(
     turn = torch.arange(count, dtype=torch.float64) * (torch.pi * (3 - 5**0.5))
     rise = 1 - (2 * torch.arange(count, dtype=torch.float64) + 1) / count
     flat = (1 - rise**2).sqrt()
-    places = middle + distance * torch.stack((flat * turn.cos(), rise, flat * turn.sin()), dim=-1)
+    positions = middle + distance * torch.stack((flat * turn.cos(), rise, flat * turn.sin()), dim=-1)
     cameras = [
-        Camera.looking_at(place, middle, focal=focal, width=width, height=height, name=f"camera{k:02d}")
-        for k, place in enumerate(places)
+        Camera.looking_at(position, middle, focal=focal, width=width, height=height, name=f"camera{k:02d}")
+        for k, position in enumerate(positions)
     ]
     return CameraRig(tuple(cameras))
 
 
-def hand_pictures(
-    shape: ArticulatedShape,
-    pose: Tensor,
-    cameras: CameraRig | StereoPair,
-    *,
-    skin: LinearBlendSkin | None = None,
-    style: PictureStyle | None = None,
-    seed: int = 0,
-) -> list[Picture]:
-    """Return the pictures of a textured shape in one pose, one per camera, with the exact truth.
-
-    Args:
-        shape: such as a hand.
-        pose: (num_dofs,) in the world of the cameras, see `placed`.
-        cameras: a pair or a rig.
-        skin: what moves the surface, with faces; by default `surface_skin`.
-        style: light, background and noise; for stereo set its wall behind the shape.
-        seed: of texture and noise.
-
-    Raises:
-        InputError: if the skin has no faces, and as `render`.
-    """
-    pose = shape.check_pose(pose, "pose").detach()
-    check_shape(pose, "pose", (shape.num_dofs,))
-    skin = surface_skin(shape) if skin is None else skin
-    if skin.faces is None:
-        raise InputError("skin must have faces to draw; make it with surface_skin(shape)")
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        mesh = TriangleMesh(skin(pose), skin.faces)
-        rest = skin(shape.rest_pose())
-    every = (cameras.left, cameras.right) if isinstance(cameras, StereoPair) else tuple(cameras)
-    return [render(mesh, camera, rest, style=style, seed=seed, generator=generator) for camera in every]
+def cameras_of(cameras: CameraRig | StereoPair) -> tuple[Camera, ...]:
+    """Return the cameras of a rig, or the left and the right one of a pair."""
+    return (cameras.left, cameras.right) if isinstance(cameras, StereoPair) else tuple(cameras)

@@ -1,4 +1,4 @@
-"""Clouds with the poses that torchreg found in them, on disk, as networks are trained on them."""
+"""Clouds labeled with the poses found in them, on disk, to train networks on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _KIND, _STEM = "PoseLabel", "label_"
 
 @dataclass(frozen=True)
 class PoseLabel:
-    """One cloud and what was found in it.
+    """One cloud and its pose.
 
     Args:
         points: (M, 3), metres.
@@ -48,7 +48,7 @@ class PoseLabel:
 
 
 def label_path(folder: str | os.PathLike[str], number: int) -> Path:
-    """Return where the label of a frame lies in a folder."""
+    """Return the path of the label of a frame in a folder."""
     return local_path(folder) / f"{_STEM}{number:06d}.safetensors"
 
 
@@ -56,12 +56,12 @@ class PoseLabels(Dataset[dict[str, Tensor]]):
     """The labels in a folder, in the order of the frames, each a dict of the tensors of a `PoseLabel`.
 
     Args:
-        folder: what ``torchreg label`` wrote.
-        min_confidence: labels less sure are left out.
+        folder: written by ``torchreg label``.
+        min_confidence: labels of less confidence are left out.
         limits: on the size of each file.
 
     Raises:
-        InputError: if the folder holds no label that is sure enough.
+        InputError: if the folder holds no label of that confidence.
         FormatError: if a file is damaged or holds no label.
     """
 

@@ -1,10 +1,11 @@
-"""Range scans of moving figures with exact truth: a person or an animal that walks, a toy whose joints are turned."""
+"""Range scans of moving figures with exact truth: a walking person or animal, a toy whose joints turn."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -23,11 +24,16 @@ from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.visibility import View, visible_points
 from torchreg.solvers.rigid_groups import merge_alike
 
-# The camera stands this many diagonals of the rest pose away.
-_DISTANCE = 1.7
-# Half the angle of view has this tangent: a figure that fills a ball of its diagonal stays inside.
-_REACH = 0.45
-_SEEDS = 2**62
+
+@dataclass(frozen=True)
+class _CameraSetup:
+    """The camera before a figure."""
+
+    distance: float = 1.7  # in diagonals of the figure's rest pose
+    reach: float = 0.45  # tangent of half the angle of view: a figure that fills a ball of its diagonal stays inside
+
+
+_CAMERA = _CameraSetup()
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,15 +43,15 @@ class ScanPair:
     Args:
         source: the scan to be moved, N points.
         target: the scan to be reached, M points.
-        truth: (N, 3) true places of the source's points in the target's pose, noiseless, seen there or not.
+        truth: (N, 3) true positions of the source's points in the target's pose, noiseless, visible or not.
         labels: (N,) int64 true part of each source point.
         target_labels: (M,) the same of the target's points.
-        joints: (J, 3) true joints in the source's pose: where each part but the root hangs on its parent.
+        joints: (J, 3) true joints in the source's pose, of each part but the root with its parent.
         target_joints: (J, 3) the same in the target's pose.
-        joint_parts: (J, 2) parts that meet there, the parent first.
+        joint_parts: (J, 2) parts that meet at each joint, the parent first.
         transforms: (P, 4, 4) true motions of the parts from source to target.
         part_names: P names.
-        visible: (N,) bool, True where the target's camera sees the true place.
+        visible: (N,) bool, True where the target's camera sees the true position.
         missing: (N,) bool, True on parts that were taken off before the target was scanned.
     """
 
@@ -63,44 +69,45 @@ class ScanPair:
     missing: Tensor
 
     def error(self, deformed: Tensor) -> Tensor:
-        """Return how far moved source points (N, 3) are from the truth, (N,) shares of the source's diagonal."""
+        """Return distances (N,) of moved source points (N, 3) from the truth, as shares of the source's diagonal."""
         return (deformed - self.truth.to(deformed)).norm(dim=-1) / self.source.diagonal
 
     def moving_labels(self, tolerance: float = 0.01) -> Tensor:
-        """Return labels (N,) in which parts that moved as one between the two poses are one.
+        """Return labels (N,) in which parts that moved rigidly together between the two poses share a label.
 
-        The two that meet and moved most alike are joined again and again, and move as the one with more scanned points
-        then, as long as the motion of one leaves the other's within ``tolerance`` of where they went, in the mean: a
-        pair of scans does not tell parts apart that are joined. It is how `ScanRegistration.parts` joins bones.
+        A pair of scans does not distinguish such parts. Of adjacent parts those with the most similar motions are
+        merged first, and move as the part with more scanned points afterwards, as long as the mean distance between
+        the points moved by either motion is at most ``tolerance``. `ScanRegistration.parts` merges bones alike.
 
         Args:
             tolerance: share of the source's diagonal.
         """
-        return _moving_labels(self.source, self.labels, self.joint_parts, self.transforms.unsqueeze(0), tolerance)
+        motions = self.transforms.unsqueeze(0)
+        return _labels_of_motion(self.source, self.labels, self.joint_parts, motions, tolerance)
 
 
-def _moving_labels(
+def _labels_of_motion(
     scan: RangeScan, labels: Tensor, joint_parts: Tensor, transforms: Tensor, tolerance: float
 ) -> Tensor:
-    """Return labels (N,) in which parts that move as one in all of the motions (T, P, 4, 4) are one."""
+    """Return labels (N,) in which parts that move rigidly together in all motions (T, P, 4, 4) share a label."""
     check_positive(tolerance, "tolerance", allow_zero=True)
     counts = torch.bincount(labels, minlength=transforms.shape[1])
     apart = torch.zeros(len(transforms), len(counts), len(counts), dtype=scan.points.dtype, device=labels.device)
     for part in counts.nonzero()[:, 0]:
-        own = scan.points[labels == part]
-        beside = invert_rigid(transforms[:, part]).unsqueeze(1) @ transforms
-        apart[:, :, part] = (transform_points(beside, own) - own).norm(dim=-1).sum(-1) / scan.diagonal
+        points = scan.points[labels == part]
+        relative = invert_rigid(transforms[:, part]).unsqueeze(1) @ transforms
+        apart[:, :, part] = (transform_points(relative, points) - points).norm(dim=-1).sum(-1) / scan.diagonal
     meet = torch.zeros(len(counts), len(counts), dtype=torch.bool, device=labels.device)
     meet[joint_parts[:, 0], joint_parts[:, 1]] = meet[joint_parts[:, 1], joint_parts[:, 0]] = True
     for hidden in (counts == 0).nonzero()[:, 0]:
-        # Nothing seen tells apart what hangs on either side of a part that is not seen.
+        # The neighbors of a part that is not seen count as adjacent.
         meet |= meet[hidden].unsqueeze(1) & meet[hidden]
     return merge_alike(apart, counts, meet, tolerance)[labels]
 
 
 @dataclass(frozen=True, eq=False)
 class ScanSequence(Sequence[RangeScan]):
-    """Frames of a moving figure, each scanned from one side when it is asked for, always the same.
+    """Frames of a moving figure, each scanned from one side on request, always with the same result.
 
     ``sequence[t]`` is a `RangeScan` and ``sequence.pair(s, t)`` a `ScanPair`. The camera is at the origin and looks
     along +z with -y up.
@@ -109,7 +116,7 @@ class ScanSequence(Sequence[RangeScan]):
         figure: the surface and its parts.
         transforms: (T, P, 4, 4) float64 motions of the parts from the rest pose to before the camera.
         scanner: the camera.
-        missing: per frame the number of a part that has been taken off, -1 for none; empty for none at all.
+        missing: per frame the number of a part that was taken off, -1 for none; empty where none ever is.
         seed: of noise and holes.
         dtype: of scans and truth.
     """
@@ -120,14 +127,15 @@ class ScanSequence(Sequence[RangeScan]):
     missing: tuple[int, ...] = ()
     seed: int = 0
     dtype: torch.dtype = torch.float32
-    view: View = field(init=False)
 
     def __post_init__(self) -> None:
-        if not self.missing:
-            object.__setattr__(self, "missing", (-1,) * len(self))
-        if len(self.missing) != len(self):
+        if len(self.missing) not in (0, len(self)):
             raise InputError(f"missing must have one number per frame ({len(self)}), got {len(self.missing)}")
-        object.__setattr__(self, "view", self.scanner.view(self.mesh(0), _REACH))
+
+    @cached_property
+    def view(self) -> View:
+        """The camera, whose pixels are chosen by the first frame."""
+        return self.scanner.view(self.mesh(0), _CAMERA.reach)
 
     def __len__(self) -> int:
         return len(self.transforms)
@@ -136,22 +144,22 @@ class ScanSequence(Sequence[RangeScan]):
         return self.scanned(frame).scan
 
     def mesh(self, frame: int) -> TriangleMesh:
-        """Return the whole surface in a frame, float64, with the parts that are missing."""
+        """Return the complete surface in a frame, float64, with the parts that are missing."""
         return TriangleMesh(self.figure.vertices(self.transforms[frame]), self.figure.mesh.faces)
 
     def scanned(self, frame: int) -> SurfaceScan:
-        """Return the scan of a frame, and where on the mesh its points lie.
+        """Return the scan of a frame, with the positions of its points on the mesh.
 
         Cost: 0.05 s.
         """
         frame = range(len(self))[frame]
         # Unlike generators of neighboring seeds, all draws of one generator are independent.
-        seeds = torch.randint(_SEEDS, (len(self),), generator=torch.Generator().manual_seed(self.seed))
+        seeds = torch.randint(2**62, (len(self),), generator=torch.Generator().manual_seed(self.seed))
         generator = torch.Generator().manual_seed(int(seeds[frame]))
-        left = self._present(frame).nonzero()[:, 0]
+        present = self._present(frame).nonzero()[:, 0]
         mesh = self.mesh(frame)
-        found = self.scanner.scan(TriangleMesh(mesh.vertices, mesh.faces[left]), self.view, generator, self.dtype)
-        return SurfaceScan(found.scan, left[found.face], found.barycentric)
+        found = self.scanner.scan(TriangleMesh(mesh.vertices, mesh.faces[present]), self.view, generator, self.dtype)
+        return SurfaceScan(found.scan, present[found.face], found.barycentric)
 
     def pair(self, source: int, target: int) -> ScanPair:
         """Return two frames with the truth.
@@ -169,23 +177,23 @@ class ScanSequence(Sequence[RangeScan]):
             yield self._pair(target - step, target, scans.pop(0), scans[-1])
 
     def truth(self, source: int, target: int) -> Tensor:
-        """Return the true places (N, 3) of a frame's scanned points in the pose of another."""
-        return self._carried(self.scanned(source), target)
+        """Return the true positions (N, 3) of a frame's scanned points in the pose of another frame."""
+        return self._positions(self.scanned(source), target)
 
     def labels(self, frame: int) -> Tensor:
-        """Return the true part (N,) of each scanned point of a frame."""
+        """Return the true parts (N,) of the scanned points of a frame."""
         return self._labels(self.scanned(frame))
 
     def moving_labels(self, frame: int, tolerance: float = 0.01) -> Tensor:
-        """Return labels (N,) of a frame's points in which parts that moved as one, there and in all others, are one.
+        """Return labels (N,) of a frame's points in which parts that move rigidly together in all frames share a label.
 
         Args:
-            frame: from which motions are counted.
+            frame: the source of all motions.
             tolerance: see `ScanPair.moving_labels`.
         """
         found = self.scanned(frame)
         motions = (self.transforms @ invert_rigid(self.transforms[frame])).to(self.dtype)
-        return _moving_labels(found.scan, self._labels(found), self.joint_parts, motions, tolerance)
+        return _labels_of_motion(found.scan, self._labels(found), self.joint_parts, motions, tolerance)
 
     @property
     def joint_parts(self) -> Tensor:
@@ -194,44 +202,42 @@ class ScanSequence(Sequence[RangeScan]):
         return torch.stack((torch.tensor(self.figure.parents[1:], dtype=torch.int64), children), dim=-1)
 
     def joints(self, frame: int) -> Tensor:
-        """Return where the joints (P - 1, 3) are in a frame, in the order of the parts that hang on them."""
+        """Return the joints (P - 1, 3) in a frame, in the order of the child parts."""
         return self.figure.joint_positions(self.transforms[frame]).to(self.dtype)
 
-    def _pair(self, source: int, target: int, here: SurfaceScan, there: SurfaceScan) -> ScanPair:
+    def _pair(self, source: int, target: int, source_scan: SurfaceScan, target_scan: SurfaceScan) -> ScanPair:
         source, target = range(len(self))[source], range(len(self))[target]
-        figure, motion = self.figure, self.transforms[target] @ invert_rigid(self.transforms[source])
-        truth, mesh = self._carried(here, target), self.mesh(target)
-        left = self._present(target)
-        visible = visible_points(TriangleMesh(mesh.vertices, mesh.faces[left]), truth, torch.zeros(3))
-        missing = ~left[here.face]
+        truth, mesh, present = self._positions(source_scan, target), self.mesh(target), self._present(target)
+        visible = visible_points(TriangleMesh(mesh.vertices, mesh.faces[present]), truth, torch.zeros(3))
+        missing = ~present[source_scan.face]
+        motions = self.transforms[target] @ invert_rigid(self.transforms[source])
         return ScanPair(
-            here.scan,
-            there.scan,
-            truth,
-            self._labels(here),
-            self._labels(there),
-            self.joints(source),
-            self.joints(target),
-            self.joint_parts,
-            motion.to(self.dtype),
-            figure.part_names,
-            visible & ~missing,
-            missing,
+            source=source_scan.scan,
+            target=target_scan.scan,
+            truth=truth,
+            labels=self._labels(source_scan),
+            target_labels=self._labels(target_scan),
+            joints=self.joints(source),
+            target_joints=self.joints(target),
+            joint_parts=self.joint_parts,
+            transforms=motions.to(self.dtype),
+            part_names=self.figure.part_names,
+            visible=visible & ~missing,
+            missing=missing,
         )
 
-    def _carried(self, found: SurfaceScan, frame: int) -> Tensor:
+    def _positions(self, found: SurfaceScan, frame: int) -> Tensor:
+        """Return the true positions (N, 3) of scanned points in the pose of a frame."""
         mesh = self.mesh(frame)
-        return found.carried(mesh.vertices, mesh.faces).to(self.dtype)
+        return found.transferred(mesh.vertices, mesh.faces).to(self.dtype)
 
     def _labels(self, found: SurfaceScan) -> Tensor:
-        return found.carried(self.figure.weights, self.figure.mesh.faces).argmax(-1)
+        return found.transferred(self.figure.weights, self.figure.mesh.faces).argmax(-1)
 
     def _present(self, frame: int) -> Tensor:
-        """Return which faces (F,) of the figure belong to parts that have not been taken off."""
-        faces, missing = self.figure.mesh.faces, self.missing[frame]
-        if missing == -1:
-            return torch.ones(len(faces), dtype=torch.bool)
-        return (self.figure.weights.argmax(-1) != missing)[faces].any(-1)
+        """Return the mask (F,) of the figure's faces on parts that were not taken off."""
+        missing = self.missing[frame] if self.missing else -1
+        return (self.figure.weights.argmax(-1) != missing)[self.figure.mesh.faces].any(-1)
 
 
 def walking_figure(
@@ -251,10 +257,10 @@ def walking_figure(
 
     Args:
         frames: number of frames; 190 give 189 adjacent pairs, as in the paper.
-        seed: of the walk, of where it begins, and of the noise.
+        seed: of the walk, of its first phase, and of the noise.
         proportions: of the `person`; all 1 by default.
         cycles_per_frame: share of two steps from frame to frame.
-        turn: how far the person turns from frame to frame, radians: 2 degrees show every side in 180 frames.
+        turn: rotation of the person from frame to frame, radians: 2 degrees show every side in 180 frames.
         scanner: the camera; `DepthScanner` by default, 4,500 points.
         dtype: of scans and truth.
 
@@ -323,9 +329,10 @@ def jointed_toy(
         seed: of poses, views and noise.
         toy: a `robot` by default.
         step: largest change of a joint angle between adjacent frames, radians.
-        turn: largest change of the direction in which the toy stands, radians; it is also tilted by up to 30 degrees.
-        missing: take one part off in every other frame, so that of each adjacent pair one scan lacks it: a part on
-            which no other hangs, drawn anew each time.
+        turn: largest rotation of the toy about its vertical between adjacent frames, radians; it is also tilted by up
+            to 30 degrees.
+        missing: whether a part without children, drawn anew each time, is taken off in every second frame, so that one
+            scan of each adjacent pair lacks it.
         scanner: the camera; `DepthScanner` by default, 4,500 points.
         dtype: of scans and truth.
 
@@ -347,15 +354,15 @@ def jointed_toy(
     change[0] = 2 * math.pi * draws[0]
     tilt = math.radians(30) * (2 * torch.rand(1, generator=generator, dtype=torch.float64) - 1)
     ends = [part for part in range(1, figure.num_parts) if part not in figure.parents]
-    off = torch.randint(len(ends), (frames,), generator=generator).tolist()
-    taken = tuple(ends[number] if missing and frame % 2 else -1 for frame, number in enumerate(off))
+    drawn = torch.randint(len(ends), (frames,), generator=generator).tolist()
+    absent = tuple(ends[number] if missing and frame % 2 else -1 for frame, number in enumerate(drawn))
     base = _facing_camera(figure, change.cumsum(0), tilt.expand(frames), torch.zeros_like(change))
     transforms = figure.transforms(toy.rotations(angles), base)
-    return ScanSequence(figure, transforms, scanner or DepthScanner(), taken, seed, dtype)
+    return ScanSequence(figure, transforms, scanner or DepthScanner(), absent, seed, dtype)
 
 
 def _gait_phase(frames: int, seed: int, cycles_per_frame: float) -> tuple[torch.Generator, Tensor]:
-    """Return the source of randomness of a walk and its phases (T,), from a random one on."""
+    """Return the source of randomness of a walk and its phases (T,), from a random start on."""
     check_count(frames, "frames", 2)
     check_positive(cycles_per_frame, "cycles_per_frame")
     generator = torch.Generator().manual_seed(seed)
@@ -381,7 +388,7 @@ def _before_camera(
 
 
 def _facing_camera(figure: Figure, angle: Tensor, tilt: Tensor, heights: Tensor) -> Tensor:
-    """Return motions (T, 4, 4) of a figure to before the camera: turned about its vertical, tilted to it, and risen."""
+    """Return motions (T, 4, 4) of a figure to before the camera, from angles, tilts (radians) and heights (T,)."""
     zero = torch.zeros_like(angle)
     lower, upper = figure.mesh.bounds()
     middle = (lower + upper) / 2
@@ -390,5 +397,5 @@ def _facing_camera(figure: Figure, angle: Tensor, tilt: Tensor, heights: Tensor)
         torch.stack((zero, angle, zero), dim=-1)
     )
     risen = torch.stack((zero, heights, zero), dim=-1) - middle
-    place = middle.new_tensor([0.0, 0.0, _DISTANCE * float((upper - lower).norm())])
-    return rigid_matrix(facing, (facing @ risen.unsqueeze(-1)).squeeze(-1) + place)
+    position = middle.new_tensor([0.0, 0.0, _CAMERA.distance * float((upper - lower).norm())])
+    return rigid_matrix(facing, (facing @ risen.unsqueeze(-1)).squeeze(-1) + position)

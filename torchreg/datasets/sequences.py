@@ -1,14 +1,15 @@
-"""Made-up sequences of a moving hand or any shape, as a pair of cameras or one camera measures it; exact truth."""
+"""Made-up sequences of clouds of a moving hand or any shape, from a pair of cameras or from one, with exact truth."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_positive, check_shape
+from torchreg._checks import as_float_tensor, check_count, check_positive, check_shape
 from torchreg.datasets.hand import HandCloud, hand_motion, make_hand_cloud, placed, surface_skin
 from torchreg.datasets.stereo import StereoView, stereo_clouds, tube
 from torchreg.errors import InputError
@@ -18,9 +19,27 @@ from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.skin import LinearBlendSkin
 
-# Pieces of the bar in "occlusion", and seconds of the periods of `rig_sequence`.
-_BAR_PIECES = 20
-_SECONDS_PER_FLEXING, _SECONDS_PER_TURNING = 2.5, 3.0
+
+@dataclass(frozen=True)
+class _RigMotion:
+    """Periods of `rig_sequence`, seconds."""
+
+    bend: float = 2.5
+    turn: float = 3.0
+
+
+@dataclass(frozen=True)
+class _BarForm:
+    """The obstacle in "occlusion"; lengths as shares of the distance of the hand."""
+
+    distance: float = 0.7
+    half_width: float = 0.05  # more or less by up to a tenth
+    half_thickness: float = 0.01
+    max_slant: float = math.radians(20)
+    num_pieces: int = 20  # along its length of one: the rasterizer looks at the whole bounding box of a face
+
+
+_RIG_MOTION, _BAR = _RigMotion(), _BarForm()
 
 
 def other_hand(
@@ -31,8 +50,8 @@ def other_hand(
     For a skin that differs too, give it another sharpness: ``surface_skin(hand, sharpness=10.0)``.
 
     Args:
-        generator: decides part by part which way; None draws from a fresh generator with seed 0.
-        scale: how far off, as a share: the ratio to the plain hand is ``1 + scale`` or ``1 / (1 + scale)``.
+        generator: of longer or shorter, part by part; None draws from a fresh generator with seed 0.
+        scale: relative difference: the ratio to the plain hand is ``1 + scale`` or ``1 / (1 + scale)``.
         side: "right" or "left".
         nu: fusion length, metres; the plain hand has 0.003.
 
@@ -44,8 +63,8 @@ def other_hand(
     hand = Hand(side, nu=nu)
     with torch.no_grad():
         for scales in (hand.log_length_scales, hand.log_radius_scales):
-            ways = torch.randint(2, (hand.num_parts,), generator=generator, device=generator.device)
-            scales.copy_(math.log1p(scale) * (2.0 * ways - 1.0))
+            longer = torch.randint(2, (hand.num_parts,), generator=generator, device=generator.device)
+            scales.copy_(math.log1p(scale) * (2.0 * longer - 1.0))
     return hand
 
 
@@ -64,7 +83,7 @@ def hand_sequence(
     distance: float = 0.6,
     seed: int = 0,
 ) -> list[HandCloud]:
-    """Return what a pair of cameras measures of a moving hand, frame after frame, with the exact truth.
+    """Return the clouds of a moving hand, frame by frame, as a pair of cameras measures it, with the exact truth.
 
     Args:
         motion: a kind of `hand_motion`; "occlusion" puts a bar between the cameras and the path of the hand.
@@ -81,7 +100,7 @@ def hand_sequence(
         seed: of motion and measurements.
 
     Returns:
-        num_frames clouds.
+        Clouds, one per frame.
 
     Raises:
         InputError: if an argument is out of range or no frame shows the shape.
@@ -111,7 +130,7 @@ def range_clouds(
     skin: LinearBlendSkin | None = None,
     seed: int = 0,
 ) -> list[HandCloud]:
-    """Return what a range camera, or None, a scanner that sees all around, measures of given poses, with the truth.
+    """Return the clouds of a shape in given poses, as a range camera or an all-round scanner sees it, with the truth.
 
     Args:
         shape: the true shape.
@@ -119,12 +138,12 @@ def range_clouds(
         num_points: see `make_hand_cloud`.
         noise: see `make_hand_cloud`.
         outlier_ratio: see `make_hand_cloud`.
-        camera: (3,) see `make_hand_cloud`.
+        camera: (3,) see `make_hand_cloud`; None measures on all sides.
         skin: see `make_hand_cloud`; made once for all poses.
         seed: of the measurements.
 
     Returns:
-        T clouds.
+        Clouds, one per pose.
 
     Raises:
         InputError: if an argument is out of range.
@@ -161,11 +180,11 @@ def rig_sequence(
 
     Args:
         shape: the true shape.
-        full_bend: (num_dofs,) what is added to the rest pose at the deepest bend, radians; zero for the base.
+        full_bend: (num_dofs,) added to the rest pose at the deepest bend, radians; zero for the base.
         num_frames: number of frames.
         fps: frames per second.
         facing: (3,) rotation vector of the base before it turns; -y is up in the picture.
-        turn: how far it turns to each side, radians.
+        turn: angle to each side, radians.
         distance: from the camera to the middle of the shape, metres.
         num_points: see `make_hand_cloud`.
         noise: see `make_hand_cloud`.
@@ -174,7 +193,7 @@ def rig_sequence(
         seed: of the measurements.
 
     Returns:
-        num_frames clouds; their ``vertices`` are the true places of the skin's points.
+        Clouds, one per frame; their ``vertices`` are the true positions of the skin's points.
 
     Raises:
         InputError: if an argument is out of range.
@@ -183,16 +202,15 @@ def rig_sequence(
     check_shape(full_bend, "full_bend", (shape.num_dofs,))
     if bool(full_bend[:6].any()):
         raise InputError("full_bend must be zero for the six degrees of freedom of the base; use facing and turn")
-    if isinstance(num_frames, bool) or not isinstance(num_frames, int) or num_frames < 1:
-        raise InputError(f"num_frames must be a positive integer, got {num_frames!r}")
+    check_count(num_frames, "num_frames", 1)
     check_positive(fps, "fps")
     check_positive(turn, "turn", allow_zero=True)
     check_positive(distance, "distance")
     front = as_float_tensor(facing, "facing", like=full_bend)
     check_shape(front, "facing", (3,))
     seconds = (torch.arange(num_frames, dtype=torch.float64) / fps).to(full_bend).unsqueeze(-1)
-    share = 0.5 - 0.5 * torch.cos(2 * math.pi * seconds / _SECONDS_PER_FLEXING)
-    angle = turn * torch.sin(2 * math.pi * seconds / _SECONDS_PER_TURNING)
+    share = 0.5 - 0.5 * torch.cos(2 * math.pi * seconds / _RIG_MOTION.bend)
+    angle = turn * torch.sin(2 * math.pi * seconds / _RIG_MOTION.turn)
     poses = shape.rest_pose() + share * full_bend
     poses[:, 3:6] = compose_rotation_vectors(angle * angle.new_tensor([0.0, 1.0, 0.0]), front.expand(num_frames, 3))
     poses = placed(shape, poses, poses.new_tensor([0.0, 0.0, distance]))
@@ -203,12 +221,11 @@ def rig_sequence(
 
 
 def _bar(distance: float, generator: torch.Generator) -> TriangleMesh:
-    """Return a slanted, upright bar in the middle of the picture, before what passes at ``distance``."""
+    """Return a slanted, upright bar in the middle of the picture, before a hand that passes at ``distance``."""
     draws = 2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1
-    # Cut into short pieces: the rasterizer looks at the whole bounding box of a face.
-    along = torch.linspace(-0.5, 0.5, _BAR_PIECES + 1, dtype=torch.float64).unsqueeze(-1)
-    across = 0.05 * (1 + 0.1 * draws[0]) * along.new_tensor([1.0, 1.0, -1.0, -1.0])
-    deep = 0.01 * along.new_tensor([-1.0, 1.0, 1.0, -1.0])
+    along = torch.linspace(-0.5, 0.5, _BAR.num_pieces + 1, dtype=torch.float64).unsqueeze(-1)
+    across = _BAR.half_width * (1 + 0.1 * draws[0]) * along.new_tensor([1.0, 1.0, -1.0, -1.0])
+    deep = _BAR.half_thickness * along.new_tensor([-1.0, 1.0, 1.0, -1.0])
     corners = torch.stack(torch.broadcast_tensors(across, along, deep), dim=-1)
-    turn = so3_exp(torch.cat([torch.zeros_like(draws), math.radians(20) * draws[1:]]))
-    return tube(distance * (corners @ turn.mT + corners.new_tensor([0.0, 0.0, 0.7])))
+    turn = so3_exp(torch.cat([torch.zeros_like(draws), _BAR.max_slant * draws[1:]]))
+    return tube(distance * (corners @ turn.mT + corners.new_tensor([0.0, 0.0, _BAR.distance])))

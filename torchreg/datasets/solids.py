@@ -1,4 +1,4 @@
-"""Simple solids as distance fields, and the smooth union that makes bodies of them."""
+"""Simple solids as distance fields, and their smooth union."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_positive
-from torchreg.errors import InputError
 from torchreg.geometry.isosurface import isosurface
 from torchreg.geometry.mesh import TriangleMesh
 
@@ -26,9 +24,6 @@ class RoundCone:
         end: center of the last ball.
         start_radius: of the first ball, same unit.
         end_radius: of the last ball.
-
-    Raises:
-        InputError: if a radius is not positive.
     """
 
     start: Vector
@@ -36,12 +31,8 @@ class RoundCone:
     start_radius: float
     end_radius: float
 
-    def __post_init__(self) -> None:
-        check_positive(self.start_radius, "start_radius")
-        check_positive(self.end_radius, "end_radius")
-
     def distance(self, points: Tensor) -> Tensor:
-        """Return the distance (N,) of points (N, 3) to the ball that is nearest by its center, negative inside."""
+        """Return signed distances (N,) of points (N, 3) to the ball with the nearest center, negative inside."""
         start, end = points.new_tensor(self.start), points.new_tensor(self.end)
         axis = end - start
         squared = axis.square().sum()
@@ -64,25 +55,15 @@ class RoundBox:
     Args:
         center: its middle.
         half: half of its sides, rounding included.
-        radius: of the edges.
-
-    Raises:
-        InputError: if a side is not positive, or the radius above half of the shortest one.
+        radius: of the edges, at most the shortest half side.
     """
 
     center: Vector
     half: Vector
     radius: float
 
-    def __post_init__(self) -> None:
-        check_positive(self.radius, "radius", allow_zero=True)
-        for side in self.half:
-            check_positive(side, "half")
-        if self.radius > min(self.half):
-            raise InputError(f"radius must be at most the shortest half side {min(self.half)}, got {self.radius}")
-
     def distance(self, points: Tensor) -> Tensor:
-        """Return the exact distance (N,) of points (N, 3), negative inside."""
+        """Return exact signed distances (N,) of points (N, 3), negative inside."""
         excess = (points - points.new_tensor(self.center)).abs() - points.new_tensor(self.half) + self.radius
         return excess.clamp_min(0).norm(dim=-1) + excess.amax(-1).clamp_max(0) - self.radius
 
@@ -96,12 +77,12 @@ Solid = RoundCone | RoundBox
 
 
 def union_distance(solids: Sequence[Solid], points: Tensor, blend: float) -> Tensor:
-    """Return the distance (N,) to a union whose seams are rounded: ``-b log sum_i exp(-d_i / b)``.
+    """Return signed distances (N,) to a union with rounded seams: ``-b log sum_i exp(-d_i / b)``.
 
     Args:
         solids: at least one.
         points: (N, 3).
-        blend: b, about the radius of the seams, same unit; zero for a sharp union.
+        blend: b, the approximate radius of the seams, same unit; zero for a sharp union.
 
     Differentiable: in ``points``, almost everywhere.
     """
@@ -116,14 +97,7 @@ def mesh_of(solids: Sequence[Solid], spacing: float, blend: float = 0.0) -> Tria
         solids: at least one.
         spacing: edge length of the grid on which the surface is found, same unit.
         blend: see `union_distance`.
-
-    Raises:
-        InputError: if there is no solid, or a number is not positive.
     """
-    if not solids:
-        raise InputError("solids must hold at least one solid, got none")
-    check_positive(spacing, "spacing")
-    check_positive(blend, "blend", allow_zero=True)
     corners = [torch.tensor(corner, dtype=torch.float64) for solid in solids for corner in solid.bounds()]
     lower, upper = torch.stack(corners).amin(0), torch.stack(corners).amax(0)
     # A smooth union is a little larger than its solids.

@@ -16,19 +16,29 @@ from torchreg.errors import InputError
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.geometry.rotation import so3_exp
 
-# Parts that do not meet may overlap by this much before a pose is refused, metres, and vertices looked at for that.
-_OVERLAP, _LOOK_AT = 0.002, 4000
-_MAX_TRIALS = 200
-# Of the limbs of random toys; every other one is an axis.
-_DIRECTIONS: tuple[Vector, ...] = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+# Directions of the limbs of random toys: both ways along each axis.
+_AXES: tuple[Vector, ...] = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+_DIRECTIONS: tuple[Vector, ...] = tuple((s * x, s * y, s * z) for x, y, z in _AXES for s in (1, -1))
+
+
+@dataclass(frozen=True)
+class _CollisionTest:
+    """Test for parts that run into each other."""
+
+    max_overlap: float = 0.002  # of parts that do not meet, metres
+    num_vertices: int = 4000  # that are tested, evenly chosen
+    max_trials: int = 200  # poses drawn per frame
+
+
+_COLLISIONS = _CollisionTest()
 
 
 @dataclass(frozen=True)
 class Hinge:
-    """An axis about which a part turns; a part with several turns about the last one first.
+    """An axis about which a part turns; a part with several hinges turns about the last one first.
 
     Args:
-        part: name of the part that turns against its parent, about its joint.
+        part: name of the part that turns relative to its parent, about its joint.
         axis: unit vector in the rest pose.
         lower: least angle, radians.
         upper: largest angle.
@@ -46,7 +56,7 @@ class Toy:
 
     Args:
         figure: the pieces.
-        parts: the same as solids, to tell whether they run into each other.
+        parts: the same as solids, to test for collisions.
         hinges: H axes.
     """
 
@@ -55,7 +65,7 @@ class Toy:
     hinges: tuple[Hinge, ...]
 
     def rotations(self, angles: Tensor) -> Tensor:
-        """Return turns (..., P, 3, 3) for `Figure.transforms` from angles (..., H), radians."""
+        """Return rotations (..., P, 3, 3) for `Figure.transforms` from angles (..., H), radians."""
         check_shape(angles, "angles", (len(self.hinges),), batch=True)
         eye = torch.eye(3, dtype=angles.dtype)
         turns = [eye.expand(*angles.shape[:-1], 3, 3)] * self.figure.num_parts
@@ -65,18 +75,18 @@ class Toy:
         return torch.stack(turns, dim=-3)
 
     def overlap(self, angles: Tensor) -> float:
-        """Return how deep parts that do not meet run into each other, metres; zero if they do not.
+        """Return the largest penetration of parts that do not meet, metres; zero if none collide.
 
         Args:
             angles: (H,) of one pose.
         """
         transforms = self.figure.transforms(self.rotations(angles.double()))
-        some = slice(None, None, max(1, self.figure.mesh.num_vertices // _LOOK_AT))
-        vertices, owner = self.figure.vertices(transforms)[some], self.figure.weights[some].argmax(-1)
+        sample = slice(None, None, max(1, self.figure.mesh.num_vertices // _COLLISIONS.num_vertices))
+        vertices, owner = self.figure.vertices(transforms)[sample], self.figure.weights[sample].argmax(-1)
         deepest = 0.0
         for index, part in enumerate(self.parts):
-            strangers = torch.tensor([not self._meet(index, other) for other in range(len(self.parts))])[owner]
-            local = transform_points(invert_rigid(transforms[index]), vertices[strangers])
+            apart = torch.tensor([not self._meet(index, second) for second in range(len(self.parts))])[owner]
+            local = transform_points(invert_rigid(transforms[index]), vertices[apart])
             if len(local):
                 deepest = max(deepest, -float(union_distance(part.solids, local, 0.0).min()))
         return deepest
@@ -103,18 +113,20 @@ class Toy:
         upper = torch.tensor([hinge.upper for hinge in self.hinges], dtype=torch.float64)
         poses: list[Tensor] = []
         for _ in range(frames):
-            for _ in range(_MAX_TRIALS):
+            for _ in range(_COLLISIONS.max_trials):
                 draw = torch.rand(len(lower), generator=generator, dtype=torch.float64)
                 angles = poses[-1] + step * (2 * draw - 1) if poses else lower + (upper - lower) * draw
                 angles = _reflected(angles, lower, upper)
-                if self.overlap(angles) <= _OVERLAP:
+                if self.overlap(angles) <= _COLLISIONS.max_overlap:
                     break
             else:
-                raise InputError(f"hinges must leave room: in {_MAX_TRIALS} random poses parts ran into each other")
+                trials = _COLLISIONS.max_trials
+                raise InputError(f"hinges must leave room: in {trials} random poses parts ran into each other")
             poses.append(angles)
         return torch.stack(poses)
 
     def _meet(self, first: int, second: int) -> bool:
+        """Return whether two parts are one, or a part and its parent."""
         return first in (self.figure.parents[second], second) or self.figure.parents[first] == second
 
 
@@ -181,6 +193,20 @@ def excavator(*, spacing: float = 0.01) -> Toy:
 
     Cost: 0.5 s.
     """
+    tracks, cab, blade = _excavator_base()
+    parts = [tracks, cab, *_excavator_arm(), blade]
+    hinges = [
+        Hinge("cab", (0, 1, 0), -math.pi / 2, math.pi / 2),
+        Hinge("boom", (1, 0, 0), -0.4, 0.5),
+        Hinge("stick", (1, 0, 0), -0.9, 0.6),
+        Hinge("bucket", (1, 0, 0), -0.9, 0.9),
+        Hinge("blade", (1, 0, 0), -0.5, 0.15),
+    ]
+    return _toy(parts, hinges, spacing)
+
+
+def _excavator_base() -> tuple[Part, Part, Part]:
+    """Return tracks, cab and blade."""
     tracks: tuple[Solid, ...] = (
         *(RoundBox((x, 0.04, 0), (0.03, 0.04, 0.13), 0.025) for x in (-0.08, 0.08)),
         RoundBox((0, 0.05, 0), (0.06, 0.03, 0.07), 0.01),
@@ -192,6 +218,19 @@ def excavator(*, spacing: float = 0.01) -> Toy:
         RoundBox((0.035, 0.19, -0.09), (0.04, 0.03, 0.035), 0.01),
         RoundCone((0.05, 0.2, -0.05), (0.05, 0.27, -0.05), 0.01, 0.01),
     )
+    blade: tuple[Solid, ...] = (
+        *(RoundCone((x, 0.035, 0.13), (x, 0.04, 0.19), 0.012, 0.012) for x in (-0.05, 0.05)),
+        RoundBox((0, 0.045, 0.205), (0.11, 0.04, 0.012), 0.008),
+    )
+    return (
+        Part("tracks", None, (0, 0.04, 0), tracks),
+        Part("cab", "tracks", (0, 0.1, 0), cab),
+        Part("blade", "tracks", (0, 0.035, 0.13), blade),
+    )
+
+
+def _excavator_arm() -> tuple[Part, Part, Part]:
+    """Return boom, stick and bucket."""
     boom = (
         RoundCone((0.02, 0.15, 0.09), (0.06, 0.15, 0.09), 0.026, 0.026),
         RoundCone((0.04, 0.15, 0.09), (0.04, 0.32, 0.2), 0.024, 0.027),
@@ -207,30 +246,15 @@ def excavator(*, spacing: float = 0.01) -> Toy:
         RoundBox((0.04, 0.06, 0.34), (0.05, 0.03, 0.045), 0.012),
         RoundBox((0.04, 0.035, 0.31), (0.045, 0.012, 0.04), 0.006),
     )
-    blade: tuple[Solid, ...] = (
-        *(RoundCone((x, 0.035, 0.13), (x, 0.04, 0.19), 0.012, 0.012) for x in (-0.05, 0.05)),
-        RoundBox((0, 0.045, 0.205), (0.11, 0.04, 0.012), 0.008),
-    )
-    parts = [
-        Part("tracks", None, (0, 0.04, 0), tracks),
-        Part("cab", "tracks", (0, 0.1, 0), cab),
+    return (
         Part("boom", "cab", (0.04, 0.15, 0.09), boom),
         Part("stick", "boom", (0.04, 0.3, 0.36), stick),
         Part("bucket", "stick", (0.04, 0.11, 0.36), bucket),
-        Part("blade", "tracks", (0, 0.035, 0.13), blade),
-    ]
-    hinges = [
-        Hinge("cab", (0, 1, 0), -math.pi / 2, math.pi / 2),
-        Hinge("boom", (1, 0, 0), -0.4, 0.5),
-        Hinge("stick", (1, 0, 0), -0.9, 0.6),
-        Hinge("bucket", (1, 0, 0), -0.9, 0.9),
-        Hinge("blade", (1, 0, 0), -0.5, 0.15),
-    ]
-    return _toy(parts, hinges, spacing)
+    )
 
 
 def random_toy(generator: torch.Generator | None = None, num_parts: int = 7, *, spacing: float = 0.008) -> Toy:
-    """Return a toy that nobody designed: a box, and limbs of boxes and cones in random directions, up to two in a row.
+    """Return a random toy: a box, and limbs of boxes and cones in random directions, up to two in a row.
 
     Args:
         generator: source of randomness; None draws from a fresh generator with seed 0, the same toy at every call.
@@ -251,15 +275,15 @@ def random_toy(generator: torch.Generator | None = None, num_parts: int = 7, *, 
     parts, hinges = [Part("body", None, (0, 0, 0), (RoundBox((0, 0, 0), half, 0.012), knob))], []
     directions = [_DIRECTIONS[number] for number in draw.order(len(_DIRECTIONS))]
     for number in range(num_parts - 1):
-        # First one limb in each of some directions, then a second one at the ends of those.
+        # First limbs in different directions, then second ones at their ends.
         limb = number % ((num_parts + 1) // 2 if num_parts > 2 else 1)
         direction, first = directions[limb], number == limb
         parent = parts[0] if first else next(part for part in parts if part.name == f"limb {limb}")
-        reach = [side * abs(way) for side, way in zip(half, direction, strict=True)]
+        reach = [side * abs(along) for side, along in zip(half, direction, strict=True)]
         start = sum(reach) + 0.012 if first else _tip(parent, direction)
         name = f"limb {limb}" if first else f"end {limb}"
         parts.append(_random_limb(name, parent.name, direction, start, draw))
-        across = [axis for axis, way in zip(_DIRECTIONS[::2], direction, strict=True) if not way]
+        across = [axis for axis, along in zip(_AXES, direction, strict=True) if not along]
         hinges += [Hinge(name, axis, -0.9, 0.9) for axis in (across if first else across[:1])]
     return _toy(parts, hinges, spacing)
 
@@ -280,23 +304,23 @@ class _Draw:
 def _random_limb(name: str, parent: str, direction: Vector, start: float, draw: _Draw) -> Part:
     """Return a limb with a ball at its joint, ``start`` away from the origin, and a box or cone along ``direction``."""
 
-    def at(distance: float) -> Vector:
-        x, y, z = (distance * way for way in direction)
+    def point(distance: float) -> Vector:
+        x, y, z = (distance * along for along in direction)
         return x, y, z
 
     ball, length = draw(0.022, 0.028), draw(0.09, 0.14)
     thick, wide = draw(0.016, 0.024), draw(0.016, 0.03)
-    solids: tuple[Solid, ...] = (RoundCone(at(start), at(start), ball, ball),)
+    solids: tuple[Solid, ...] = (RoundCone(point(start), point(start), ball, ball),)
     if draw(0, 1) < 0.5:
-        solids += (RoundCone(at(start), at(start + length), thick, draw(0.014, 0.03)),)
+        solids += (RoundCone(point(start), point(start + length), thick, draw(0.014, 0.03)),)
     else:
-        sides = [length / 2 if way else side for way, side in zip(direction, (thick, wide, thick), strict=True)]
-        solids += (RoundBox(at(start + length / 2), (sides[0], sides[1], sides[2]), 0.006),)
-    return Part(name, parent, at(start), solids)
+        sides = [length / 2 if along else side for along, side in zip(direction, (thick, wide, thick), strict=True)]
+        solids += (RoundBox(point(start + length / 2), (sides[0], sides[1], sides[2]), 0.006),)
+    return Part(name, parent, point(start), solids)
 
 
 def _tip(part: Part, direction: Vector) -> float:
-    """Return how far a limb reaches along its direction from the origin."""
+    """Return the largest distance from the origin of a limb along its direction."""
     corners = [corner for solid in part.solids for corner in solid.bounds()]
     return max(sum(map(math.prod, zip(corner, direction, strict=True))) for corner in corners)
 
@@ -306,7 +330,7 @@ def _toy(parts: list[Part], hinges: list[Hinge], spacing: float) -> Toy:
 
 
 def _reflected(angles: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Return angles that stepped over a limit thrown back from it."""
+    """Return angles (H,), those beyond a limit reflected at it."""
     angles = torch.where(angles > upper, 2 * upper - angles, angles)
     angles = torch.where(angles < lower, 2 * lower - angles, angles)
     return torch.minimum(torch.maximum(angles, lower), upper)

@@ -1,17 +1,17 @@
-"""What cameras see of a moving shape, frame after frame: textured hands with their forearm before a still wall."""
+"""Pictures of a moving shape, frame by frame: textured hands with their forearm before a still wall."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from torchreg._checks import check_shape
-from torchreg.datasets.hand import surface_skin
-from torchreg.datasets.pictures import Picture, PictureStyle, backdrop, render
+from torchreg.datasets.hand import faces_of, surface_skin
+from torchreg.datasets.pictures import Picture, PictureStyle, backdrop, cameras_of, render
 from torchreg.datasets.stereo import drawn_forearm
-from torchreg.errors import InputError
 from torchreg.geometry.camera_rig import CameraRig, StereoPair
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import transform_points
@@ -38,9 +38,9 @@ def shape_video(
         shape: such as a hand.
         poses: (T, num_dofs) in the world of the cameras; `hand_motion` makes some.
         cameras: a pair or a rig.
-        skin: what moves the surface, with faces; by default `surface_skin`.
+        skin: of the surface, with faces; by default `surface_skin`.
         style: light, background and noise; for stereo set its wall behind the shape.
-        forearm: a hand's forearm is seen too. The masks are those of the hand alone.
+        forearm: whether a hand's forearm is seen too. The masks are those of the hand alone.
         seed: of forearm, texture and noise.
 
     Raises:
@@ -51,37 +51,34 @@ def shape_video(
     poses = shape.check_pose(poses, "poses").detach()
     check_shape(poses, "poses", ("T", shape.num_dofs))
     skin = surface_skin(shape) if skin is None else skin
-    if skin.faces is None:
-        raise InputError("skin must have faces to draw; make it with surface_skin(shape)")
+    num_faces = len(faces_of(skin))
     style = PictureStyle() if style is None else style
-    every = (cameras.left, cameras.right) if isinstance(cameras, StereoPair) else tuple(cameras)
+    rig = cameras_of(cameras)
     generator = torch.Generator().manual_seed(seed)
-    behind = [backdrop(camera, style=style, seed=seed) for camera in every]
-    scene = _Scene(shape, skin, forearm, generator)
+    behind = [backdrop(camera, style=style, seed=seed) for camera in rig]
+    scene = _FilmedShape(shape, skin, forearm, generator)
     with torch.no_grad():
         rest = scene.vertices(shape.rest_pose())
         for pose in poses:
             mesh = TriangleMesh(scene.vertices(pose), scene.faces)
             pictures = (
                 render(mesh, camera, rest, style=style, seed=seed, generator=generator, behind=colors)
-                for camera, colors in zip(every, behind, strict=True)
+                for camera, colors in zip(rig, behind, strict=True)
             )
-            yield [_shape_alone(picture, len(skin.faces)) for picture in pictures]
+            yield [replace(picture, mask=picture.mask & (picture.face_index < num_faces)) for picture in pictures]
 
 
-class _Scene:
+class _FilmedShape:
     """A shape and, if it is a hand, its forearm, as one mesh."""
 
     def __init__(
         self, shape: ArticulatedShape, skin: LinearBlendSkin, forearm: bool, generator: torch.Generator
     ) -> None:
-        if skin.faces is None:
-            raise InputError("skin must have faces to draw; make it with surface_skin(shape)")
-        self.shape, self.skin, self.faces = shape, skin, skin.faces
+        self.shape, self.skin, self.faces = shape, skin, faces_of(skin)
         self.arm: TriangleMesh | None = None
         if forearm and isinstance(shape, Hand):
             self.arm = drawn_forearm(shape, generator)
-            self.faces = torch.cat((skin.faces, self.arm.faces + len(skin.points)))
+            self.faces = torch.cat((self.faces, self.arm.faces + len(skin.points)))
 
     def vertices(self, pose: Tensor) -> Tensor:
         """Return the vertices (V, 3) in a pose."""
@@ -89,8 +86,3 @@ class _Scene:
         if self.arm is None:
             return surface
         return torch.cat((surface, transform_points(self.shape.part_transforms(pose)[0], self.arm.vertices)))
-
-
-def _shape_alone(picture: Picture, num_faces: int) -> Picture:
-    mask = picture.mask & (picture.face_index < num_faces)
-    return Picture(picture.image, picture.depth, mask, picture.face_index)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 
 def write_atomic(path: Path, content: bytes) -> None:
-    """Put ``content`` at ``path`` in one step: a crash leaves the old file or the new one, never a part.
+    """Write ``content`` to ``path`` in one step: a crash leaves the old file or the new one, never a part.
 
     Args:
         path: the file to write; its folder must exist.
-        content: what it shall hold.
+        content: of the file.
 
     Raises:
         FileNotFoundError: if the folder does not exist.

@@ -9,16 +9,18 @@ The JSON is one object::
                   "world_to_camera": [[r, r, r, x], [r, r, r, y], [r, r, r, z], [0, 0, 0, 1]]}, ...]}
 
 or one of those cameras alone. Pixels are OpenCV's: whole numbers are the middles of pixels. The motion is in metres and
-takes world coordinates to camera coordinates (right, down, forward); ``camera_to_world`` may stand for its inverse, and
-without either the camera is at the origin. Name and distortion (0, 4, 5 or 8 numbers, see `Camera`) may be missing. The
-camera of a depth image also has ``depth_scale``, metres per unit of the file's numbers: 0.001 by default.
+maps world coordinates to camera coordinates (right, down, forward); ``camera_to_world`` may give its inverse instead,
+and without either the camera is at the origin. Name and distortion (0, 4, 5 or 8 numbers, see `Camera`) may be missing.
+The camera of a depth image also has ``depth_scale``, metres per unit of the file's numbers: 0.001 by default.
 """
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NoReturn
 
 import torch
@@ -29,6 +31,7 @@ from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.rigid import invert_rigid
 from torchreg.io.atomic import write_atomic
 from torchreg.io.colmap import load_colmap
+from torchreg.io.images import MILLIMETER
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 from torchreg.io.opencv_yaml import load_opencv
 
@@ -36,7 +39,6 @@ FORMAT = "torchreg-cameras"
 _VERSION = 1
 _NUMBERS = ("fx", "fy", "cx", "cy")
 _KNOWN = {"name", "width", "height", *_NUMBERS, "distortion", "world_to_camera", "camera_to_world", "depth_scale"}
-_MILLIMETERS = 1e-3
 
 
 def load_cameras(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> CameraRig:
@@ -48,30 +50,41 @@ def load_cameras(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_L
         limits: ``max_bytes`` applies.
 
     Raises:
-        FormatError: if the file is cut off, lacks something, or holds what is no camera; names the file.
+        FormatError: if the file is cut off, lacks an entry, or does not describe a camera; names the file.
         FileNotFoundError: if there is no such file.
     """
-    place = local_path(path)
-    if place.is_dir():
-        return load_colmap(place, limits=limits)
-    if place.suffix.lower() in (".yml", ".yaml"):
-        return load_opencv(place, limits=limits)
-    if place.suffix.lower() != ".json":
-        raise FormatError(f"{place}: calibrations are .json, .yml or .yaml files or a COLMAP folder")
-    document = _document(place, limits)
+    file = local_path(path)
+    loader = _LOADERS.get(_FOLDER if file.is_dir() else file.suffix.lower())
+    if loader is None:
+        raise FormatError(f"{file}: calibrations are .json, .yml or .yaml files or a COLMAP folder")
+    return loader(file, limits=limits)
+
+
+def _load_json(file: Path, *, limits: FileLimits) -> CameraRig:
+    document = _document(file, limits)
     entries = document.get("cameras", [document])
     if "cameras" in document and (document.get("format"), document.get("version")) != (FORMAT, _VERSION):
         raise FormatError(
-            f'{place}: must hold "format": "{FORMAT}" and "version": {_VERSION}, got {document.get("format")!r} and '
+            f'{file}: must hold "format": "{FORMAT}" and "version": {_VERSION}, got {document.get("format")!r} and '
             f"{document.get('version')!r}"
         )
     if not isinstance(entries, list) or not entries:
-        raise FormatError(f"{place}: cameras must be a list of at least one camera")
-    cameras = tuple(_camera(entry, f"{place}: camera {number}") for number, entry in enumerate(entries))
+        raise FormatError(f"{file}: cameras must be a list of at least one camera")
+    cameras = tuple(_camera(entry, f"{file}: camera {number}") for number, entry in enumerate(entries))
     try:
         return CameraRig(cameras)
     except InputError as error:
-        raise FormatError(f"{place}: {error}") from error
+        raise FormatError(f"{file}: {error}") from error
+
+
+# Loaders by the ending of the file; a folder has a key that is no ending. A new format is one more row.
+_FOLDER = "folder"
+_LOADERS: dict[str, Callable[..., CameraRig]] = {
+    _FOLDER: load_colmap,
+    ".json": _load_json,
+    ".yml": load_opencv,
+    ".yaml": load_opencv,
+}
 
 
 def load_depth_camera(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> tuple[Camera, float]:
@@ -85,15 +98,15 @@ def load_depth_camera(path: str | os.PathLike[str], *, limits: FileLimits = DEFA
         FormatError: as `load_cameras`, and if there are several cameras.
         FileNotFoundError: if there is no such file.
     """
-    place = local_path(path)
-    document = _document(place, limits)
+    file = local_path(path)
+    document = _document(file, limits)
     entries = document.get("cameras", [document])
     if not isinstance(entries, list) or len(entries) != 1:
-        raise FormatError(f"{place}: must hold the one camera of the depth image")
-    camera = _camera(entries[0], str(place))
-    scale = _number(entries[0].get("depth_scale", _MILLIMETERS), "depth_scale", str(place))
+        raise FormatError(f"{file}: must hold the one camera of the depth image")
+    camera = _camera(entries[0], str(file))
+    scale = _number(entries[0].get("depth_scale", MILLIMETER), "depth_scale", str(file))
     if scale <= 0:
-        raise FormatError(f"{place}: depth_scale must be positive, got {scale}")
+        raise FormatError(f"{file}: depth_scale must be positive, got {scale}")
     return camera, scale
 
 
@@ -102,31 +115,31 @@ def save_cameras(path: str | os.PathLike[str], cameras: CameraRig) -> None:
 
     Args:
         path: a ``.json`` file; its folder must exist.
-        cameras: what to write.
+        cameras: at least one.
 
     Raises:
-        FormatError: if the name ends in something else.
+        FormatError: if the name has another ending.
         FileNotFoundError: if the folder does not exist.
     """
     entries = [_entry(camera) for camera in cameras]
     _write(path, {"format": FORMAT, "version": _VERSION, "cameras": entries})
 
 
-def save_depth_camera(path: str | os.PathLike[str], camera: Camera, depth_scale: float = _MILLIMETERS) -> None:
+def save_depth_camera(path: str | os.PathLike[str], camera: Camera, depth_scale: float = MILLIMETER) -> None:
     """Write the camera of a depth image as JSON, see `load_depth_camera`.
 
     Raises:
-        FormatError: if the name ends in something else than ``.json``.
+        FormatError: if the name does not end in ``.json``.
         FileNotFoundError: if the folder does not exist.
     """
     _write(path, _entry(camera) | {"depth_scale": depth_scale})
 
 
 def _write(path: str | os.PathLike[str], document: dict[str, Any]) -> None:
-    place = local_path(path)
-    if place.suffix.lower() != ".json":
-        raise FormatError(f"{place}: must end in .json")
-    write_atomic(place, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+    file = local_path(path)
+    if file.suffix.lower() != ".json":
+        raise FormatError(f"{file}: must end in .json")
+    write_atomic(file, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
 
 
 def _entry(camera: Camera) -> dict[str, Any]:
@@ -135,21 +148,21 @@ def _entry(camera: Camera) -> dict[str, Any]:
     named = {"name": camera.name} if camera.name else {}
     size = {"width": camera.width, "height": camera.height}
     numbers = dict(zip(_NUMBERS, camera.intrinsics.tolist(), strict=True))
-    bent = {"distortion": lens[:length]} if length else {}
-    return named | size | numbers | bent | {"world_to_camera": camera.world_to_camera.tolist()}
+    distortion = {"distortion": lens[:length]} if length else {}
+    return named | size | numbers | distortion | {"world_to_camera": camera.world_to_camera.tolist()}
 
 
-def _document(place: os.PathLike[str], limits: FileLimits) -> dict[str, Any]:
+def _document(file: os.PathLike[str], limits: FileLimits) -> dict[str, Any]:
     def refuse(constant: str) -> NoReturn:
-        raise FormatError(f"{place}: numbers must be finite, got {constant}")
+        raise FormatError(f"{file}: numbers must be finite, got {constant}")
 
-    content = read_bytes(place, limits)
+    content = read_bytes(file, limits)
     try:
         document = json.loads(content.decode("utf-8-sig"), parse_constant=refuse)
     except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise FormatError(f"{place}: is cut off or no JSON ({error})") from error
+        raise FormatError(f"{file}: is cut off or no JSON ({error})") from error
     if not isinstance(document, dict):
-        raise FormatError(f"{place}: must hold a JSON object, got {type(document).__name__}")
+        raise FormatError(f"{file}: must hold a JSON object, got {type(document).__name__}")
     return document
 
 

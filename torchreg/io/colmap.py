@@ -1,4 +1,4 @@
-"""COLMAP's text models: cameras.txt with the lenses and images.txt with the places."""
+"""COLMAP's text models: cameras.txt with the lenses and images.txt with the poses."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import os
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from torchreg.errors import FormatError, InputError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.rigid import rigid_matrix
+from torchreg.geometry.rotation_representations import quaternion_from_rotation, rotation_from_quaternion
 from torchreg.io.atomic import write_atomic
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 
-# Per model which of its parameters are fx, fy, cx, cy, and then k1, k2, p1, p2, k3, k4, k5, k6; None is zero.
+# Per model the indices of fx, fy, cx, cy, and then k1, k2, p1, p2, k3, k4, k5, k6 among its parameters; None is zero.
 _MODELS: dict[str, tuple[int | None, ...]] = {
     "SIMPLE_PINHOLE": (0, 0, 1, 2),
     "PINHOLE": (0, 1, 2, 3),
@@ -25,7 +25,7 @@ _MODELS: dict[str, tuple[int | None, ...]] = {
     "OPENCV": (0, 1, 2, 3, 4, 5, 6, 7),
     "FULL_OPENCV": (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11),
 }
-# COLMAP counts pixels from the corner of the picture, we from the middle of the first.
+# COLMAP's pixel coordinates start at the corner of the picture, ours at the middle of the first pixel.
 _CORNER = 0.5
 
 
@@ -39,16 +39,16 @@ def load_colmap(folder: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_
         limits: ``max_bytes`` applies to each.
 
     Returns:
-        float64 cameras.
+        The cameras, float64.
 
     Raises:
         FormatError: if a line is cut off or not understood, a lens is of another kind, or an image names no camera.
         FileNotFoundError: if one of the files is missing.
     """
-    place = local_path(folder)
-    lenses = _lenses(place / "cameras.txt", limits)
-    path = place / "images.txt"
-    # Every image has a second line, of its points; it is empty where there are none.
+    directory = local_path(folder)
+    lenses = _lenses(directory / "cameras.txt", limits)
+    path = directory / "images.txt"
+    # Every image has a second line, of its points; it may be empty.
     lines = [(number, line) for number, line in _lines(path, limits) if not line.startswith("#")]
     while lines and not lines[0][1]:
         lines.pop(0)
@@ -70,7 +70,7 @@ def save_colmap(folder: str | os.PathLike[str], cameras: CameraRig) -> None:
         InputError: if a name holds blanks.
         FileNotFoundError: if the folder does not exist.
     """
-    place = local_path(folder)
+    directory = local_path(folder)
     lenses = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"]
     images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", "# POINTS2D[] as (X Y POINT3D_ID)"]
     for number, camera in enumerate(cameras, start=1):
@@ -81,11 +81,11 @@ def save_colmap(folder: str | os.PathLike[str], cameras: CameraRig) -> None:
         model = "FULL_OPENCV" if any(lens[4:]) else "OPENCV" if any(lens) else "PINHOLE"
         values = [fx, fy, cx + _CORNER, cy + _CORNER, *lens][: {"PINHOLE": 4, "OPENCV": 8}.get(model, 12)]
         motion = camera.world_to_camera.detach().double().cpu()
-        pose = [*_quaternion(motion[:3, :3]), *motion[:3, 3].tolist()]
+        pose = torch.cat((quaternion_from_rotation(motion[:3, :3]), motion[:3, 3])).tolist()
         lenses.append(f"{number} {model} {camera.width} {camera.height} {_joined(values)}")
         images += [f"{number} {_joined(pose)} {number} {camera.name}", ""]
-    write_atomic(place / "cameras.txt", ("\n".join(lenses) + "\n").encode())
-    write_atomic(place / "images.txt", ("\n".join(images) + "\n").encode())
+    write_atomic(directory / "cameras.txt", ("\n".join(lenses) + "\n").encode())
+    write_atomic(directory / "images.txt", ("\n".join(images) + "\n").encode())
 
 
 def _joined(values: list[float]) -> str:
@@ -114,11 +114,11 @@ def _lenses(path: Path, limits: FileLimits) -> dict[str, tuple[int, int, list[fl
         if model not in _MODELS:
             raise FormatError(f"{where}: lenses must be one of {', '.join(_MODELS)}; got {model}")
         which = _MODELS[model]
-        needed = 1 + max(place for place in which if place is not None)
+        needed = 1 + max(number for number in which if number is not None)
         if len(values) != needed:
             raise FormatError(f"{where}: {model} has {needed} parameters, got {len(values)}: it is cut off or damaged")
         if words[0] in found:
-            raise FormatError(f"{where}: camera {words[0]} is there twice")
+            raise FormatError(f"{where}: camera {words[0]} is listed twice")
         found[words[0]] = int(words[2]), int(words[3]), [0.0 if k is None else values[k] for k in which]
     return found
 
@@ -133,7 +133,8 @@ def _placed(line: str, lenses: dict[str, tuple[int, int, list[float]]], where: s
     width, height, values = lenses[words[8]]
     if not abs(math.hypot(*pose[:4]) - 1) < 1e-2:
         raise FormatError(f"{where}: QW QX QY QZ must be a unit quaternion, got length {math.hypot(*pose[:4]):.3g}")
-    motion = rigid_matrix(_rotation(pose[:4]), torch.tensor(pose[4:], dtype=torch.float64))
+    quaternion, position = torch.tensor(pose, dtype=torch.float64).split((4, 3))
+    motion = rigid_matrix(rotation_from_quaternion(quaternion), position)
     numbers = torch.tensor(values, dtype=torch.float64)
     numbers[2:4] -= _CORNER
     try:
@@ -150,28 +151,3 @@ def _values(words: list[str], where: str) -> list[float]:
     if not all(math.isfinite(value) for value in values):
         raise FormatError(f"{where}: numbers must be finite, got {' '.join(words)[:80]}")
     return values
-
-
-def _rotation(quaternion: list[float]) -> Tensor:
-    """Return the rotation (3, 3) of a quaternion w, x, y, z of any length."""
-    w, x, y, z = (torch.tensor(quaternion, dtype=torch.float64) / math.hypot(*quaternion)).tolist()
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return torch.tensor(rows, dtype=torch.float64)
-
-
-def _quaternion(rotation: Tensor) -> list[float]:
-    """Return the unit quaternion w, x, y, z with w >= 0, by that of four ways which divides by most."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
-    ways = [
-        [1 + a + e + i, h - f, c - g, d - b],
-        [h - f, 1 + a - e - i, b + d, c + g],
-        [c - g, b + d, 1 - a + e - i, f + h],
-        [d - b, c + g, f + h, 1 - a - e + i],
-    ]
-    best = max(range(4), key=lambda k: ways[k][k])
-    length = math.copysign(math.hypot(*ways[best]), ways[best][0])
-    return [value / length for value in ways[best]]

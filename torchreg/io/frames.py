@@ -19,25 +19,26 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_choice, check_finite, check_shape
 from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.io.atomic import write_atomic
-from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_count, local_path, open_zip, read_bytes
-from torchreg.io.points import PARSER_ERRORS, load_points, save_points
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, open_zip, read_bytes
+from torchreg.io.npz import read_npy_header
+from torchreg.io.points import FORMATS, PARSER_ERRORS, load_points, save_points
 from torchreg.io.raw_cloud import Array, as_indices
 
-ENDINGS = (".ply", ".pcd", ".xyz", ".txt", ".obj", ".stl", ".npz", ".glb", ".gltf")
+ENDINGS = tuple(FORMATS)
 _DIGITS = re.compile(r"(\d+)")
 _NUMBERED = re.compile(r"frame_?(\d+)")
 PathLike = str | os.PathLike[str]
 
 
 class Frames(Sequence[Tensor]):
-    """Clouds in the order of time; each is read when it is asked for, and not kept.
+    """Clouds in the order of time, each read on request, and not kept.
 
     Indexing and iterating give (M, 3) tensors on the CPU, a slice gives `Frames` again. M may be zero in archives.
     Reading raises what `load_points` raises; every message names the file, and in an archive the frame. Made by
     `load_frames`.
 
     Args:
-        names: what each frame is called: the path of its file, in an archive also its number.
+        names: of the frames: the path of its file, in an archive also its number.
         sources: per frame the path of its file, or its rows (M, 3).
         nan_policy: see `load_points`.
         limits: see `load_points`.
@@ -89,7 +90,7 @@ def load_frames(
     limits: FileLimits = DEFAULT_LIMITS,
     dtype: torch.dtype = torch.float32,
 ) -> Frames:
-    """Return the clouds of a sequence, read one by one when asked for.
+    """Return the clouds of a sequence, read one by one on request.
 
     Args:
         path: a folder whose files are frames, all of one format; a list of files; one file; or one NPZ of frames: an
@@ -103,13 +104,13 @@ def load_frames(
         dtype: torch.float32 or torch.float64.
 
     Returns:
-        at least one frame; points keep the order and the unit of the file.
+        The sequence, at least one frame; points keep the order and the unit of the file.
 
     Raises:
         FileNotFoundError: if a file is missing.
         IsADirectoryError: if a list holds a folder.
         FormatError: if there is nothing to read, a folder mixes formats, an ending is unknown or an archive is damaged
-            or holds no frames; files are otherwise looked at when they are read.
+            or holds no frames; other defects of files are found when they are read.
         InputError: if ``nan_policy`` is unknown.
         InputTypeError: if ``path`` or ``dtype`` is of another type.
     """
@@ -117,8 +118,8 @@ def load_frames(
     if dtype not in (torch.float32, torch.float64):
         raise InputTypeError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
     if isinstance(path, (str, os.PathLike)):
-        place = local_path(path)
-        files = _files_of(place) if place.is_dir() else _checked([place])
+        target = local_path(path)
+        files = _files_of(target) if target.is_dir() else _checked([target])
     else:
         files = _listed(path)
     if sort:
@@ -135,38 +136,38 @@ def save_frames(path: PathLike, frames: Sequence[Any]) -> list[Path]:
     """Write a sequence of clouds and return the files: one NPZ of frames, or a folder with one PLY per frame.
 
     Args:
-        path: an archive ending in .npz, which is replaced, or a folder, which is made if it does not exist; in there
+        path: an archive ending in .npz, which is replaced, or a folder, which is made if it does not exist; in it the
             files ``frame_0000.ply``, ``frame_0001.ply``, ... are replaced.
         frames: T clouds (M_t, 3), finite; a folder cannot hold frames without points.
 
     Returns:
-        the files, in order.
+        Paths of the files, in order.
 
     Raises:
         InputError: if there are no frames, one is not finite, of the wrong shape or, for a folder, empty; or if the
             folder holds other point files, which `load_frames` would take for frames.
         FormatError: if the path is an address or has another ending than .npz.
-        FileNotFoundError: if the folder that shall hold ``path`` does not exist.
+        FileNotFoundError: if the folder of ``path`` does not exist.
     """
-    place = local_path(path)
+    target = local_path(path)
     clouds = [as_float_tensor(frame, f"frames[{number}]").detach().cpu() for number, frame in enumerate(frames)]
     if not clouds:
         raise InputError("frames must hold at least one cloud, got none")
     for number, cloud in enumerate(clouds):
         check_shape(cloud, f"frames[{number}]", ("M", 3))
         check_finite(cloud, f"frames[{number}]")
-    if place.suffix.lower() == ".npz":
-        write_atomic(place, _archive(clouds))
-        return [place]
-    if place.suffix:
-        raise FormatError(f"{place} has the ending {place.suffix!r}; name an archive ending in .npz or a folder")
-    return _save_folder(place, clouds)
+    if target.suffix.lower() == ".npz":
+        write_atomic(target, _archive(clouds))
+        return [target]
+    if target.suffix:
+        raise FormatError(f"{target} has the ending {target.suffix!r}; name an archive ending in .npz or a folder")
+    return _save_folder(target, clouds)
 
 
 def natural_key(path: PathLike) -> list[tuple[int, int | str, str]]:
-    """Return what sorts paths with the numbers in them counted as numbers: frame2 before frame10."""
+    """Return a key that sorts paths with the numbers in them as numbers: frame2 before frame10."""
     pieces = _DIGITS.split(os.fspath(path))
-    # Digits of other scripts and leading zeros are told apart by the text itself.
+    # Digits of other scripts and leading zeros are distinguished by the text itself.
     return [(0, int(piece), piece) if number % 2 else (1, piece, piece) for number, piece in enumerate(pieces)]
 
 
@@ -191,9 +192,9 @@ def _listed(paths: Any) -> list[Path]:
 
 
 def _checked(files: list[Path]) -> list[Path]:
-    """Return the files; raise unless each is there and ends like a cloud."""
+    """Return the files; raise unless each exists and has the ending of a cloud."""
     for file in files:
-        file.stat()  # a missing file is the first thing to say
+        file.stat()  # a missing file is reported first
         if file.is_dir():
             raise IsADirectoryError(f"{file} is a folder; pass it alone, or the files in it")
         if file.suffix.lower() not in ENDINGS:
@@ -201,16 +202,16 @@ def _checked(files: list[Path]) -> list[Path]:
     return files
 
 
-def _read_archive(place: Path, limits: FileLimits) -> list[Array] | None:
-    """Return the rows of each frame of an archive, None if it holds a single cloud or something else."""
-    content = read_bytes(place, limits)
+def _read_archive(file: Path, limits: FileLimits) -> list[Array] | None:
+    """Return the rows of each frame of an archive, None if it does not hold frames."""
+    content = read_bytes(file, limits)
     try:
         with open_zip(content, limits) as archive:
             return _frames_in(archive, limits)
     except FormatError as error:
-        raise FormatError(f"{place}: {error}") from error
+        raise FormatError(f"{file}: {error}") from error
     except PARSER_ERRORS as error:
-        raise FormatError(f"{place}: cannot be read as NPZ ({type(error).__name__}: {error})") from error
+        raise FormatError(f"{file}: cannot be read as NPZ ({type(error).__name__}: {error})") from error
 
 
 def _frames_in(archive: zipfile.ZipFile, limits: FileLimits) -> list[Array] | None:
@@ -233,7 +234,7 @@ def _frames_in(archive: zipfile.ZipFile, limits: FileLimits) -> list[Array] | No
     for number, frame in enumerate(frames):
         if frame.ndim != 2 or frame.shape[1] != 3:
             raise FormatError(f"frame {number} must have shape (M, 3), got {frame.shape}")
-        check_count(len(frame), "points", limits)
+        check_allowed(len(frame), "points", limits)
     return frames
 
 
@@ -256,13 +257,9 @@ def _cut(archive: zipfile.ZipFile, points: Array, name: str, shapes: dict[str, t
 
 
 def _shape_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> tuple[int, ...]:
-    """Return the shape that a member claims, compared with the bytes behind it before anything is allocated."""
+    """Return the shape that a member claims, compared with its bytes before memory is allocated."""
     with archive.open(info) as stream:
-        version = np.lib.format.read_magic(stream)
-        if version not in ((1, 0), (2, 0)):
-            raise FormatError(f"member {info.filename!r} has the unknown array format {version}")
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(stream)
+        shape, _, dtype = read_npy_header(stream, f"member {info.filename!r}")
         held = info.file_size - stream.tell()
     if not dtype.hasobject and (any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != held):
         raise FormatError(f"member {info.filename!r} claims the shape {shape} of {dtype} but holds {held} bytes")

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from torchreg.errors import FormatError, ModelError
-from torchreg.io.gltf_document import TRIANGLES, GltfDocument, triangles
-from torchreg.io.limits import FileLimits, check_count
+from torchreg.io.gltf_document import GltfDocument, Mode, triangles
+from torchreg.io.limits import FileLimits, check_allowed
 from torchreg.io.raw_cloud import Array, RawCloud, as_indices
 
 
@@ -17,17 +17,14 @@ def read_gltf(content: bytes, path: Path, limits: FileLimits) -> RawCloud:
     """Return the triangles (or the points, if there are no triangles) of the default scene in world coordinates.
 
     Meshes appear in the order of the node tree, vertices in the order of the file. Skinned meshes come in their bind
-    pose, without their node's transform, as the standard says. Lines, morph targets and materials are not looked at.
-
-    Raises:
-        FormatError: if the file is damaged, cyclic, too large, compressed or refers to remote data.
+    pose, without their node's transform, as the standard says. Lines, morph targets and materials are ignored.
     """
     document = GltfDocument(content, path, limits)
     if not str(document.entry(document.json, "asset", dict).get("version")).startswith("2"):
         raise FormatError("must be glTF of version 2")
     try:
         instances = _instances(document)
-    except ModelError as error:  # a surface has no model that could be wrong: its file is
+    except ModelError as error:  # a defect of the node tree is one of the file, as nothing is a model here
         raise FormatError(str(error)) from error
     parts, total, corners = list[RawCloud](), 0, 0
     for mesh, transform in instances:
@@ -40,10 +37,10 @@ def read_gltf(content: bytes, path: Path, limits: FileLimits) -> RawCloud:
             key = tuple(attributes.get(name) for name in ("POSITION", "NORMAL", "COLOR_0"))
             if key not in shared:  # primitives of one mesh often split the faces, not the vertices
                 shared[key], total = total, total + document.accessor_count(key[0])
-                check_count(total, "points", limits)
+                check_allowed(total, "points", limits)
                 parts.append(_vertices(document, key, transform))
             corners += document.accessor_count(key[0] if primitive.get("indices") is None else primitive["indices"])
-            check_count(corners // 3, "faces", limits)
+            check_allowed(corners // 3, "faces", limits)
             faces = _faces(document, primitive, document.accessor_count(key[0]))
             if np.linalg.det(transform[:3, :3]) < 0:
                 faces = faces[:, ::-1]
@@ -52,6 +49,7 @@ def read_gltf(content: bytes, path: Path, limits: FileLimits) -> RawCloud:
 
 
 def _join(parts: list[RawCloud]) -> RawCloud:
+    """Return one cloud of clouds without faces, and of the faces over them."""
     clouds = [part for part in parts if part.faces is None]
     faces = [part.faces for part in parts if part.faces is not None]
     if not clouds:
@@ -78,7 +76,7 @@ def _instances(document: GltfDocument) -> list[tuple[dict[str, Any], Array]]:
         index, parent = pending.pop()
         node = document.item("nodes", index)
         if index in seen:
-            raise FormatError(f"reaches nodes[{index}] on two ways: the node tree is cyclic or shared")
+            raise FormatError(f"reaches nodes[{index}] on two paths: the node tree is cyclic or shared")
         seen.add(index)
         transform = parent @ document.node_transform(index)
         if "mesh" in node:
@@ -112,4 +110,4 @@ def _faces(document: GltfDocument, primitive: dict[str, Any], count: int) -> Arr
         indices = as_indices(document.accessor(primitive["indices"])[:, 0], "vertex indices")
     if indices.size and (indices.min() < 0 or indices.max() >= count):
         raise FormatError(f"a face names a vertex outside 0 to {count - 1}: the file is damaged")
-    return triangles(document.entry(primitive, "mode", int, TRIANGLES), indices, "a primitive")
+    return triangles(document.entry(primitive, "mode", int, Mode.TRIANGLES), indices, "a primitive")

@@ -12,15 +12,23 @@ import torch
 from torch import Tensor
 
 from torchreg.errors import FormatError, ModelError
-from torchreg.io.gltf_document import FAN, STRIP, TRIANGLES, GltfDocument, parents_first, triangles
+from torchreg.io.gltf_document import GltfDocument, Mode, parents_first, triangles
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 from torchreg.io.raw_cloud import Array
 
-_MAX_JOINTS = 1000
-_MAX_NODES = 100_000
-_MAX_WEIGHTS = 100_000_000
-_SCALE_TOLERANCE = 1e-3
-_LARGEST_SCALE = 1e6
+
+@dataclass(frozen=True)
+class _RigLimits:
+    """Largest rigs that are read."""
+
+    max_joints: int = 1000
+    max_nodes: int = 100_000
+    max_weights: int = 100_000_000  # vertices times joints
+    max_scale: float = 1e6  # of the skeleton on the skin, and its inverse
+    scale_tolerance: float = 1e-3  # relative differences of scales below this are rounding
+
+
+_LIMITS = _RigLimits()
 
 
 @dataclass(frozen=True)
@@ -28,7 +36,7 @@ class RigRecord:
     """A skinned mesh and the skeleton that moves it, all in one coordinate system, metres.
 
     The file's own deformation is ``x = sum_j w_j T_world_joint_j joint_transforms_j^-1 v``; with
-    ``rest_transforms`` it gives the pose that a viewer shows before any animation runs.
+    ``rest_transforms`` it gives the pose that a viewer shows before an animation plays.
 
     Args:
         name: name of the skin, or of the file.
@@ -40,7 +48,7 @@ class RigRecord:
         faces: (F, 3) int64.
         normals: (V, 3) float64, or None when a part of the mesh has none.
         weights: (V, J) float64, rows sum to one.
-        scale: what stored lengths were multiplied with to become the scene's metres (1 unless the skeleton scales).
+        scale: factor from stored lengths to the scene's metres (1 unless the skeleton scales).
     """
 
     name: str
@@ -65,8 +73,9 @@ def load_rig(
 ) -> RigRecord:
     """Return the skeleton, the mesh and the skin weights of a glTF file.
 
-    All triangle primitives of all meshes that the skin moves are concatenated. Uniform scale on joints is stripped
-    (it does not show in what a rotation does to the skin); the mesh node's own transform is ignored, as glTF demands.
+    All triangle primitives of all meshes that the skin moves are concatenated. Uniform scale on joints is removed, as
+    it does not change the effect of rotations on the skin; the transform of the mesh's node is ignored, as glTF
+    demands.
 
     Args:
         path: a .glb or .gltf file; buffers may be embedded or lie in the same folder or below.
@@ -100,15 +109,15 @@ def _read_rig(
     limits: FileLimits,
 ) -> RigRecord:
     nodes = document.items("nodes")
-    if len(nodes) > _MAX_NODES:
-        raise FormatError(f"{len(nodes)} nodes, at most {_MAX_NODES} are read")
+    if len(nodes) > _LIMITS.max_nodes:
+        raise FormatError(f"{len(nodes)} nodes, at most {_LIMITS.max_nodes} are read")
     skin_index, meshes = _choose(document, mesh, skin)
     chosen = document.item("skins", skin_index)
     listed = document.entry(chosen, "joints", list)
     joints = [document.index("nodes", joint, f"a joint of skin {skin_index}") for joint in listed]
-    if not 0 < len(joints) <= _MAX_JOINTS or len(set(joints)) < len(joints):
+    if not 0 < len(joints) <= _LIMITS.max_joints or len(set(joints)) < len(joints):
         raise ModelError(
-            f"skin {skin_index} must list 1 to {_MAX_JOINTS} different joints, got {len(joints)} "
+            f"skin {skin_index} must list 1 to {_LIMITS.max_joints} different joints, got {len(joints)} "
             f"({len(set(joints))} different)"
         )
     names = _unique_names([nodes[joint].get("name") for joint in joints])
@@ -148,7 +157,7 @@ def _numbers(document: GltfDocument, index: Any, what: str, shape: str) -> Array
 
 
 def _choose(document: GltfDocument, mesh: str | int | None, skin: str | int | None) -> tuple[int, list[int]]:
-    """Return the skin and the meshes it moves, of those asked for."""
+    """Return the index of the requested skin, and those of the requested meshes that it moves."""
     wanted_mesh = None if mesh is None else _find(document.items("meshes"), mesh, "mesh")
     wanted_skin = None if skin is None else _find(document.items("skins"), skin, "skin")
     pairs = set()
@@ -196,7 +205,7 @@ def _bind_transforms(document: GltfDocument, inverse_bind: Any, names: Sequence[
 
 
 def _strip_scale(matrices: Array, names: Sequence[str], pose: str) -> Array:
-    """Return rigid motions at the same places; ModelError where more than a uniform scale would be lost."""
+    """Return rigid motions (J, 4, 4) without the uniform scale of matrices; ModelError if one has another scale."""
     result = np.tile(np.eye(4), (len(matrices), 1, 1))
     result[:, :3, 3] = matrices[:, :3, 3]
     for index, matrix in enumerate(matrices):
@@ -205,7 +214,7 @@ def _strip_scale(matrices: Array, names: Sequence[str], pose: str) -> Array:
         u, stretch, vt = np.linalg.svd(matrix[:3, :3])
         spread = np.inf if stretch[0] <= 0 else (stretch[0] - stretch[2]) / stretch[0]
         bottom = np.abs(matrix[3] - np.array([0.0, 0.0, 0.0, 1.0])).max()
-        if spread > _SCALE_TOLERANCE or bottom > 1e-4 or np.linalg.det(u @ vt) < 0:
+        if spread > _LIMITS.scale_tolerance or bottom > 1e-4 or np.linalg.det(u @ vt) < 0:
             raise ModelError(
                 f"the {pose} transform of joint {names[index]!r} is not a rotation, a translation and a "
                 f"uniform scale (stretches {', '.join(f'{s:.4g}' for s in stretch)}); apply scale and shear in the "
@@ -216,19 +225,19 @@ def _strip_scale(matrices: Array, names: Sequence[str], pose: str) -> Array:
 
 
 def _skin_scale(world: Array, bind: Array, names: Sequence[str]) -> float:
-    """Return by how much the skeleton at rest enlarges what is stored: 0.01 for many rigs drawn in centimetres."""
+    """Return the factor by which the skeleton at rest scales the stored mesh: 0.01 for many rigs in centimetres."""
     stretch = [np.linalg.svd(matrices[:, :3, :3], compute_uv=False).mean(1) for matrices in (world, bind)]
     ratio = stretch[0] / stretch[1]
     common = float(np.median(ratio))
-    if not 1 / _LARGEST_SCALE < common < _LARGEST_SCALE:
+    if not 1 / _LIMITS.max_scale < common < _LIMITS.max_scale:
         raise ModelError(f"the skeleton scales the skin by {common:.4g}, which no rig does; check its nodes")
     off = np.abs(ratio / common - 1)
-    if off.max() > _SCALE_TOLERANCE:
+    if off.max() > _LIMITS.scale_tolerance:
         raise ModelError(
             f"joint {names[int(off.argmax())]!r} scales its part of the skin by "
             f"{ratio[off.argmax()]:.4g}, others by {common:.4g}; apply scale in the program that made the rig"
         )
-    return common if abs(common - 1) > _SCALE_TOLERANCE else 1.0
+    return common if abs(common - 1) > _LIMITS.scale_tolerance else 1.0
 
 
 def _joint_parents(
@@ -237,13 +246,13 @@ def _joint_parents(
     names: Sequence[str],
     given: Mapping[str, str | None],
 ) -> tuple[int, ...]:
-    place = {node: index for index, node in enumerate(joints)}
+    index_of = {node: index for index, node in enumerate(joints)}
     parents = []
     for node in joints:
         above = node_parents[node]
-        while above >= 0 and above not in place:
+        while above >= 0 and above not in index_of:
             above = node_parents[above]
-        parents.append(place.get(above, -1))
+        parents.append(index_of.get(above, -1))
     unknown = sorted({name for pair in given.items() for name in pair if name is not None and name not in names})
     if unknown:
         raise ModelError(f"parents names unknown joints {', '.join(unknown[:5])}; known: {', '.join(names)}")
@@ -269,8 +278,8 @@ def _read_meshes(
             what = f"primitive {number} of mesh {mesh.get('name') or index!r}"
             if not isinstance(primitive, dict):
                 raise FormatError(f"{what} must be an object")
-            mode = document.entry(primitive, "mode", int, TRIANGLES)
-            if mode not in (TRIANGLES, STRIP, FAN):
+            mode = document.entry(primitive, "mode", int, Mode.TRIANGLES)
+            if mode not in set(Mode):
                 continue
             attributes = document.entry(primitive, "attributes", dict)
             # Primitives often share their vertices and differ in indices and material only.
@@ -284,8 +293,9 @@ def _read_meshes(
     if not faces:
         raise ModelError("the skinned mesh has no triangles")
     vertices, normals, weights = zip(*blocks, strict=True)
-    whole = None if any(n is None for n in normals) else np.concatenate([n for n in normals if n is not None])
-    return np.concatenate(vertices), np.concatenate(faces), whole, np.concatenate(weights)
+    known = [block for block in normals if block is not None]
+    all_normals = np.concatenate(known) if len(known) == len(blocks) else None
+    return np.concatenate(vertices), np.concatenate(faces), all_normals, np.concatenate(weights)
 
 
 def _read_vertices(
@@ -293,10 +303,10 @@ def _read_vertices(
 ) -> tuple[Array, Array | None, Array]:
     points = _numbers(document, attributes.get("POSITION"), f"POSITION of {what}", "VEC3").astype(np.float64)
     total = before + len(points)
-    if total > limits.max_points or total * num_joints > _MAX_WEIGHTS:
+    if total > limits.max_points or total * num_joints > _LIMITS.max_weights:
         raise FormatError(
             f"{total} vertices with {num_joints} joints; at most {limits.max_points} vertices "
-            f"(FileLimits.max_points) and {_MAX_WEIGHTS} weights are read"
+            f"(FileLimits.max_points) and {_LIMITS.max_weights} weights are read"
         )
     normals = None
     if attributes.get("NORMAL") is not None:

@@ -1,9 +1,7 @@
-"""glTF documents (.glb) under construction: accessors, meshes, nodes, animations, and checks of what goes into them."""
+"""glTF documents (.glb) under construction: accessors, meshes, nodes, animations, and checks of their content."""
 
 from __future__ import annotations
 
-import os
-import uuid
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,8 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.rotation_representations import quaternion_from_rotation
+from torchreg.io.atomic import write_atomic
 
 _TYPES = {1: pygltflib.SCALAR, 2: pygltflib.VEC2, 3: pygltflib.VEC3, 4: pygltflib.VEC4, 16: pygltflib.MAT4}
 _COMPONENTS = {
@@ -24,7 +24,7 @@ _COMPONENTS = {
     np.dtype(np.uint32): pygltflib.UNSIGNED_INT,
     np.dtype(np.float32): pygltflib.FLOAT,
 }
-_LARGEST_UINT16 = 65535
+# Matte skin: red, green, blue, opacity.
 DEFAULT_COLOR = (0.8, 0.62, 0.52, 1.0)
 
 Array = NDArray[Any]
@@ -74,9 +74,9 @@ class GltfBuilder:
     def add_mesh(
         self, name: str, attributes: pygltflib.Attributes, triangles: Array, color: Sequence[float] | None
     ) -> int:
-        """Return the index of a new mesh with a matte material of its own."""
+        """Return the index of a new mesh with a new matte material."""
         # The largest index of each type means "restart" in glTF and must not occur.
-        small = int(triangles.max()) < _LARGEST_UINT16
+        small = int(triangles.max()) < np.iinfo(np.uint16).max
         indices = self.add(
             triangles.reshape(-1).astype(np.uint16 if small else np.uint32), target=pygltflib.ELEMENT_ARRAY_BUFFER
         )
@@ -120,19 +120,12 @@ class GltfBuilder:
         self.gltf.animations.append(animation)
 
     def write(self, path: Path, roots: list[int]) -> Path:
-        """Return ``path`` after writing the document there in one step, so that no reader sees half a file."""
+        """Write the document, whole or not at all, and return its path."""
         self.gltf.scenes.append(pygltflib.Scene(nodes=roots))
         self.gltf.scene = 0
         self.gltf.buffers.append(pygltflib.Buffer(byteLength=len(self.blob)))
         self.gltf.set_binary_blob(bytes(self.blob))
-        temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
-        try:
-            with temporary.open("xb") as file:
-                for chunk in self.gltf.save_to_bytes():
-                    file.write(chunk)
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_atomic(path, b"".join(self.gltf.save_to_bytes()))
         return path
 
 
@@ -201,27 +194,12 @@ def unit_rows(vectors: Array) -> Array:
 
 
 def _quaternions(rotations: Array) -> Array:
-    """Return (T, 4) unit quaternions (x, y, z, w) of (T, 3, 3) rotations.
-
-    The symmetric matrix K = 4 q q^T of each rotation is filled in and its row with the largest diagonal normalized, so
-    that no angle loses digits.
-    """
-    r = np.moveaxis(rotations, 0, -1)
-    outer = np.empty((len(rotations), 4, 4))
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        outer[:, i, i] = 1 + r[i, i] - r[j, j] - r[k, k]
-        outer[:, i, j] = outer[:, j, i] = r[i, j] + r[j, i]
-        outer[:, i, 3] = outer[:, 3, i] = r[k, j] - r[j, k]
-    outer[:, 3, 3] = 1 + r[0, 0] + r[1, 1] + r[2, 2]
-    best = np.einsum("tii->ti", outer).argmax(1)
-    rows = outer[np.arange(len(outer)), best]
-    quaternions = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    return np.where(quaternions[:, 3:] < 0, -quaternions, quaternions)
+    """Return unit quaternions (T, 4), in glTF's order (x, y, z, w), of rotations (T, 3, 3)."""
+    return quaternion_from_rotation(torch.from_numpy(rotations))[:, [1, 2, 3, 0]].numpy()
 
 
 def _continuous(quaternions: Array) -> Array:
-    """Return the same rotations with neighbors in time on the same side, so that viewers turn the short way."""
+    """Return the same rotations with neighbors in time on the same side, so that viewers take the shorter arc."""
     dots = np.einsum("ti,ti->t", quaternions[1:], quaternions[:-1])
     signs = np.concatenate([[1.0], np.cumprod(np.where(dots < 0, -1.0, 1.0))])
     return quaternions * signs[:, None]

@@ -6,6 +6,7 @@ import base64
 import json
 import struct
 from collections.abc import Sequence
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -16,7 +17,14 @@ from torchreg.errors import FormatError, ModelError
 from torchreg.io.limits import FileLimits, read_bytes
 from torchreg.io.raw_cloud import Array
 
-TRIANGLES, STRIP, FAN = 4, 5, 6
+
+class Mode(IntEnum):
+    """Modes of primitives that draw triangles."""
+
+    TRIANGLES = 4
+    STRIP = 5
+    FAN = 6
+
 
 _COMPONENTS = {
     number: np.dtype(name)
@@ -24,22 +32,17 @@ _COMPONENTS = {
 }
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
-# Products of larger numbers overflow float64.
-_LARGEST_NUMBER = 1e300
 
 
 class GltfDocument:
     """The JSON and the buffers of a glTF file, with every index, size and number checked when it is used.
 
-    Errors do not name the file: callers do.
+    Errors do not name the file; callers add it.
 
     Args:
         content: bytes of the .glb or .gltf file.
-        path: where they came from; buffers in files of their own must lie in its folder or below.
+        path: of the file; separate buffers must lie in its folder or below.
         limits: ``max_bytes`` applies to each buffer and each accessor.
-
-    Raises:
-        FormatError: if the container or its JSON is damaged, or the geometry is compressed.
     """
 
     def __init__(self, content: bytes, path: Path, limits: FileLimits) -> None:
@@ -60,11 +63,7 @@ class GltfDocument:
 
     @staticmethod
     def entry(owner: dict[str, Any], key: str, kind: type, default: Any = None) -> Any:
-        """Return ``owner[key]``, an instance of ``kind``; ``default`` (or an empty ``kind``) if it is missing or null.
-
-        Raises:
-            FormatError: if it is of another type.
-        """
+        """Return ``owner[key]`` of type ``kind``; ``default`` (or an empty ``kind``) if it is missing or null."""
         value = owner.get(key)
         if value is None:
             return kind() if default is None else default
@@ -84,7 +83,7 @@ class GltfDocument:
         return items
 
     def index(self, collection: str, value: Any, what: str | None = None) -> int:
-        """Return ``value`` if it is an index into a top-level list; if not, FormatError says that of ``what``."""
+        """Return ``value`` if it is an index into a top-level list; FormatError, which names ``what``, if it is not."""
         count = len(self.entry(self.json, collection, list))
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < count:
             raise FormatError(
@@ -94,14 +93,14 @@ class GltfDocument:
         return value
 
     def item(self, collection: str, index: Any, what: str | None = None) -> dict[str, Any]:
-        """Return element ``index`` of a top-level list; FormatError, which names ``what`` refers to it, if none."""
+        """Return element ``index`` of a top-level list; FormatError, naming ``what`` refers to it, if there is none."""
         found = self.entry(self.json, collection, list)[self.index(collection, index, what)]
         if not isinstance(found, dict):
             raise FormatError(f"{collection}[{index}] must be an object")
         return found
 
     def accessor_count(self, index: Any, what: str | None = None) -> int:
-        """Return how many elements an accessor claims, at least zero."""
+        """Return the number of elements that an accessor claims, at least zero."""
         item = self.item("accessors", index, what and f"the accessor of {what}")
         count = self.entry(item, "count", int)
         if count < 0:
@@ -113,11 +112,8 @@ class GltfDocument:
 
         Args:
             index: of the accessor.
-            what: it holds, for messages.
+            what: the accessor holds, for messages.
             types: names such as "VEC3", of which its type must be one.
-
-        Raises:
-            FormatError: if it is of another or an unknown type, without data or beyond its buffer or the size limit.
         """
         count = self.accessor_count(index, what)
         item = self.item("accessors", index)
@@ -148,13 +144,13 @@ class GltfDocument:
 
     def _with_sparse(self, values: Array, sparse: dict[str, Any], what: str) -> Array:
         """Return a copy of values in which those that a sparse accessor lists are replaced."""
-        places, replacements = self.entry(sparse, "indices", dict), self.entry(sparse, "values", dict)
-        if not places or not replacements:
+        indices, replacements = self.entry(sparse, "indices", dict), self.entry(sparse, "values", dict)
+        if not indices or not replacements:
             raise FormatError(f"{what} is sparse, but lacks indices or values")
-        count, dtype = self.entry(sparse, "count", int), self._component(places, f"the sparse part of {what}")
+        count, dtype = self.entry(sparse, "count", int), self._component(indices, f"the sparse part of {what}")
         if dtype.kind != "u" or not 0 < count <= len(values):
             raise FormatError(f"the sparse part of {what} has {count} entries of unusable type or number")
-        rows = self._elements(places, count, 1, dtype, what)[:, 0]
+        rows = self._elements(indices, count, 1, dtype, what)[:, 0]
         if int(rows.max()) >= len(values):
             raise FormatError(f"the sparse part of {what} points at element {rows.max()} of {len(values)}")
         values = values.copy()
@@ -162,7 +158,7 @@ class GltfDocument:
         return values
 
     def _elements(self, owner: dict[str, Any], count: int, width: int, dtype: np.dtype[Any], what: str) -> Array:
-        """Return a read-only (count, width) window into the buffer view of ``owner``, seen to lie inside."""
+        """Return a read-only (count, width) window into the buffer view of ``owner``, checked to lie inside."""
         index = owner.get("bufferView")
         view = self.item("bufferViews", index, f"the bufferView of {what}")
         data = self._buffer(self.index("buffers", view.get("buffer"), f"the buffer of {what}"))
@@ -213,28 +209,23 @@ class GltfDocument:
             except ValueError as error:
                 raise FormatError(f"buffer {index} is damaged base64, not valid base64 ({error})") from error
         name, folder = unquote(uri), self._path.parent.resolve()
-        place = (folder / name).resolve() if not {":", "\0", "\\"} & set(name) else None
-        if place is None or not place.is_relative_to(folder):
+        file = (folder / name).resolve() if not {":", "\0", "\\"} & set(name) else None
+        if file is None or not file.is_relative_to(folder):
             raise FormatError(f"refers to the buffer {uri[:100]!r}, which must lie in the file's folder or below")
         try:
-            return read_bytes(place, self._limits)
+            return read_bytes(file, self._limits)
         except FileNotFoundError as error:
             raise FormatError(f"its buffer {uri[:100]!r} cannot be read: it is not there") from error
         except OSError as error:
             raise FormatError(f"its buffer {uri[:100]!r} cannot be read ({error})") from error
 
     def node_label(self, index: int) -> str:
-        """Return how messages call a node: by its name, by its number without one."""
+        """Return the name of a node for messages, or its number if it has none."""
         name = self.item("nodes", index).get("name")
         return repr(name) if name else str(index)
 
     def node_parents(self) -> list[int]:
-        """Return the parent of each node, -1 for roots.
-
-        Raises:
-            FormatError: if a child is no node.
-            ModelError: if a node has two parents.
-        """
+        """Return the parent of each node, -1 for roots."""
         nodes = self.items("nodes")
         parents = [-1] * len(nodes)
         for number, node in enumerate(nodes):
@@ -246,12 +237,7 @@ class GltfDocument:
         return parents
 
     def node_transform(self, index: int) -> Array:
-        """Return the (4, 4) transform of a node in its parent.
-
-        Raises:
-            FormatError: if it is not made of numbers, as many as needed.
-            ModelError: if they are not finite, or a rotation is zero.
-        """
+        """Return the (4, 4) transform of a node in its parent."""
         node, what = self.item("nodes", index), f"of node {self.node_label(index)}"
         if node.get("matrix") is not None:
             return self._numbers(node, "matrix", [0.0] * 16, what).reshape(4, 4).T
@@ -268,12 +254,7 @@ class GltfDocument:
         return transform
 
     def node_globals(self, parents: Sequence[int]) -> Array:
-        """Return the (nodes, 4, 4) transforms of all nodes in the scene, infinite where they overflow.
-
-        Raises:
-            FormatError: as `node_transform`.
-            ModelError: as `node_transform`, and if ``parents`` are cyclic.
-        """
+        """Return the (nodes, 4, 4) transforms of all nodes in the scene, infinite where they overflow."""
         order = parents_first(parents)
         if len(order) < len(parents):
             stuck = sorted(set(range(len(parents))) - set(order))
@@ -291,7 +272,7 @@ class GltfDocument:
             raise FormatError(
                 f"not a readable glTF document: the {key} {what} must hold {len(default)} numbers, got {values!r}"[:300]
             )
-        if not all(abs(value) < _LARGEST_NUMBER for value in values):
+        if not all(abs(value) < 1e300 for value in values):  # products of larger numbers overflow
             raise ModelError(f"the {key} {what} is not finite: {values!r}"[:300])
         return np.array(values, dtype=np.float64)
 
@@ -306,20 +287,20 @@ def _open_container(content: bytes) -> tuple[bytes, bytes | None]:
             f"expected glTF 2 of {len(content)} bytes; the header says version {version} and {length} bytes: it is cut "
             f"off or damaged"
         )
-    chunks, place = list[tuple[bytes, bytes]](), 12
-    while place + 8 <= length:
-        size, kind = struct.unpack_from("<I4s", content, place)
-        if place + 8 + size > length:
-            raise FormatError(f"the chunk at byte {place} reaches beyond the end of the file: it is damaged")
-        chunks.append((kind, content[place + 8 : place + 8 + size]))
-        place += 8 + size
+    chunks, offset = list[tuple[bytes, bytes]](), 12
+    while offset + 8 <= length:
+        size, kind = struct.unpack_from("<I4s", content, offset)
+        if offset + 8 + size > length:
+            raise FormatError(f"the chunk at byte {offset} reaches beyond the end of the file: it is damaged")
+        chunks.append((kind, content[offset + 8 : offset + 8 + size]))
+        offset += 8 + size
     if chunks[0][0] != b"JSON":
         raise FormatError(f"must begin with a JSON chunk, got {chunks[0][0]!r}")
     return chunks[0][1], next((data for kind, data in chunks[1:] if kind == b"BIN\0"), None)
 
 
 def parents_first(parents: Sequence[int]) -> list[int]:
-    """Return indices with every parent before its children; those in a cycle are left out."""
+    """Return indices with every parent before its children, without those in cycles."""
     children: dict[int, list[int]] = {}
     for index, parent in enumerate(parents):
         children.setdefault(parent, []).append(index)
@@ -333,21 +314,18 @@ def triangles(mode: int, corners: Array, what: str) -> Array:
     """Return the (F, 3) triangles of a primitive, none where ``mode`` draws points or lines.
 
     Args:
-        mode: `TRIANGLES`, `STRIP`, `FAN` or another mode of glTF.
+        mode: a `Mode` or another number of glTF.
         corners: (C,) int64 vertices in the order of the file.
         what: they are of, for messages.
-
-    Raises:
-        FormatError: if the corners of separate triangles are not a multiple of three.
     """
-    if mode == TRIANGLES:
+    if mode == Mode.TRIANGLES:
         if len(corners) % 3:
             raise FormatError(f"{what} has {len(corners)} triangle corners, not a multiple of three: it is damaged")
         return corners.reshape(-1, 3)
-    if mode not in (STRIP, FAN) or len(corners) < 3:
+    if mode not in (Mode.STRIP, Mode.FAN) or len(corners) < 3:
         return np.zeros((0, 3), dtype=np.int64)
-    first = np.full(len(corners) - 2, corners[0]) if mode == FAN else corners[:-2]
+    first = np.full(len(corners) - 2, corners[0]) if mode == Mode.FAN else corners[:-2]
     faces = np.stack((first, corners[1:-1], corners[2:]), axis=-1)
-    if mode == STRIP:
+    if mode == Mode.STRIP:
         faces[1::2, :2] = faces[1::2, 1::-1]  # every second triangle of a strip is turned over
     return faces

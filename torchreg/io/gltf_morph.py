@@ -1,4 +1,4 @@
-"""Writing surfaces that deform in any way as animated glTF (.glb): every frame is a morph target."""
+"""Writing surfaces that deform freely as animated glTF (.glb): every frame is a morph target."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def save_vertex_animation(
 ) -> Path:
     """Return the path of a .glb file with a mesh whose vertices move freely, in straight lines from frame to frame.
 
-    What no skeleton shows, such as a blend of dual quaternions, any glTF viewer plays from this file as it is. The
-    first frame is the mesh, the others are morph targets, of which the animation mixes two at a time.
+    Motions that no skeleton gives, such as blends of dual quaternions, play exactly in any glTF viewer. The first frame
+    is the mesh, the others are morph targets, of which the animation mixes two at a time.
 
     Args:
         path: where to write; the suffix must be .glb. An existing file is replaced once the new one is complete.
@@ -69,7 +69,7 @@ def save_vertex_animation(
     stored = points.astype(np.float32)
     primitive.targets = [
         {
-            # From what the file has, so that rounding does not add up.
+            # From the rounded first frame, so that errors do not add up.
             "POSITION": document.add(stored[frame] - stored[0], target=pygltflib.ARRAY_BUFFER, bounds=True),
             "NORMAL": document.add((normals[frame] - normals[0]).astype(np.float32), target=pygltflib.ARRAY_BUFFER),
         }

@@ -1,8 +1,9 @@
-"""Writing animated glTF (.glb): a skinned mesh on a moving skeleton, or rigid parts that move as nodes."""
+"""Writing animated glTF (.glb): a skinned mesh on a moving skeleton, or rigid parts as moving nodes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,10 +22,19 @@ from torchreg.io.gltf_builder import (
     checked_times,
     checked_triangles,
 )
+from torchreg.io.gltf_document import parents_first
 
-_WEIGHTS_PER_SET = 4
-_SMALLEST_WEIGHT = 1e-4
-_RIGID_TOLERANCE = 1e-4
+
+@dataclass(frozen=True)
+class _SkinFormat:
+    """Format of skins."""
+
+    set_size: int = 4  # weights per vertex that an attribute holds, and that all viewers read
+    min_weight: float = 1e-4  # a second set is written if any vertex has a fifth weight above this
+    rigid_tolerance: float = 1e-4  # of entries of a transform, from those of a rigid motion
+
+
+_FORMAT = _SkinFormat()
 
 
 def save_animated_skin(
@@ -46,7 +56,7 @@ def save_animated_skin(
 
     The file plays ``x(t) = sum_j w_j T_world_joint_j(t) T_world_joint_j(rest)^-1 x`` in any glTF viewer. glTF stores
     weights by fours: the four largest are kept and renormalized, eight where any vertex has a fifth above 1e-4 unless
-    ``most_weights`` is 4, all that many viewers look at.
+    ``most_weights`` is 4, all that many viewers read.
 
     Convention: ``T_world_joint`` maps joint to world coordinates; between frames, translations are interpolated
     linearly and rotations along the shorter arc, each relative to the parent joint.
@@ -95,19 +105,19 @@ def save_animated_skin(
     inverse_bind = np.linalg.inv(rest)
     inverse_bind[:, 3] = (0.0, 0.0, 0.0, 1.0)
     local_rest = _local(rest, parents)
-    joints_at = [document.add_node(name, local_rest[index]) for index, name in enumerate(joint_names)]
+    joint_nodes = [document.add_node(name, local_rest[index]) for index, name in enumerate(joint_names)]
     for index in order:
         if parents[index] >= 0:
-            document.gltf.nodes[joints_at[parents[index]]].children.append(joints_at[index])
-    # Skins with several roots need one common ancestor, and a skinned mesh is placed by its joints alone.
+            document.gltf.nodes[joint_nodes[parents[index]]].children.append(joint_nodes[index])
+    # Skins with several roots need one common ancestor; the position of a skinned mesh is that of its joints alone.
     armature = document.add_node("armature", None)
-    document.gltf.nodes[armature].children = [joints_at[index] for index in order if parents[index] < 0]
-    skin = pygltflib.Skin(name="skin", joints=joints_at, skeleton=armature)
+    document.gltf.nodes[armature].children = [joint_nodes[index] for index in order if parents[index] < 0]
+    skin = pygltflib.Skin(name="skin", joints=joint_nodes, skeleton=armature)
     skin.inverseBindMatrices = document.add(_column_major(inverse_bind))
     document.gltf.skins.append(skin)
     holder = document.add_node("mesh", None)
     document.gltf.nodes[holder].mesh, document.gltf.nodes[holder].skin = mesh, 0
-    document.animate("motion", seconds, joints_at, _local(moving, parents))
+    document.animate("motion", seconds, joint_nodes, _local(moving, parents))
     return document.write(target, [armature, holder])
 
 
@@ -119,7 +129,7 @@ def save_animated_parts(
     part_names: Sequence[str] | None = None,
     colors: Tensor | None = None,
 ) -> Path:
-    """Return the path of a .glb file in which each rigid part moves as a node of its own.
+    """Return the path of a .glb file in which each rigid part is a moving node.
 
     Args:
         path: where to write; the suffix must be .glb. An existing file is replaced once the new one is complete.
@@ -172,14 +182,10 @@ def _checked_parents(parents: Sequence[int], count: int, names: Sequence[str]) -
     """Return the joint indices with every parent before its children."""
     if len(parents) != count:
         raise InputError(f"parents must hold one index per joint ({count}), got {len(parents)}")
-    children: dict[int, list[int]] = {}
     for index, parent in enumerate(parents):
         if not -1 <= parent < count:
             raise InputError(f"parents of joint {names[index]!r} must be -1 to {count - 1}, got {parent}")
-        children.setdefault(int(parent), []).append(index)
-    order = list(children.get(-1, []))
-    for index in order:
-        order.extend(children.get(index, []))
+    order = parents_first(parents)
     if len(order) < count:
         stuck = [names[index] for index in range(count) if index not in set(order)]
         raise InputError(f"parents must form trees, but these joints hang in a cycle: {', '.join(stuck[:5])}")
@@ -191,7 +197,7 @@ def _rigid(value: Tensor, name: str, shape: Sequence[int]) -> Array:
     rotation = matrices[..., :3, :3]
     error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max()
     bottom = np.abs(matrices[..., 3, :] - np.array([0.0, 0.0, 0.0, 1.0])).max()
-    if error > _RIGID_TOLERANCE or bottom > _RIGID_TOLERANCE or np.linalg.det(rotation).min() < 0:
+    if max(error, bottom) > _FORMAT.rigid_tolerance or np.linalg.det(rotation).min() < 0:
         raise InputError(
             f"{name} must hold rigid motions, got one with scale, shear, mirror or a last row other than 0 0 0 1 "
             f"(off by {max(error, bottom):.2g})"
@@ -207,9 +213,9 @@ def _weight_sets(weights: Array, most: int | None) -> list[tuple[Array, Array]]:
     if total.min() <= 0:
         raise InputError(f"weights must have a positive entry in every row, got {int((total <= 0).sum())} zero row(s)")
     weights = weights / total
-    count = weights.shape[1]
-    fifth = count > _WEIGHTS_PER_SET and np.sort(weights, axis=1)[:, -_WEIGHTS_PER_SET - 1].max() > _SMALLEST_WEIGHT
-    slots = _WEIGHTS_PER_SET * (2 if fifth and most != _WEIGHTS_PER_SET else 1)
+    count, size = weights.shape[1], _FORMAT.set_size
+    fifth = count > size and np.sort(weights, axis=1)[:, -size - 1].max() > _FORMAT.min_weight
+    slots = size * (2 if fifth and most != size else 1)
     order = np.argsort(-weights, axis=1, kind="stable")[:, :slots]
     largest = np.take_along_axis(weights, order, axis=1)
     pad = ((0, 0), (0, slots - order.shape[1]))
@@ -218,8 +224,8 @@ def _weight_sets(weights: Array, most: int | None) -> list[tuple[Array, Array]]:
     # The validator adds the float32 values as stored: the largest takes up their rounding.
     stored[:, 0] += (1.0 - stored.sum(1, dtype=np.float64)).astype(np.float32)
     order = np.where(stored > 0, order, 0).astype(np.uint8 if count <= 256 else np.uint16)
-    split = range(0, slots, _WEIGHTS_PER_SET)
-    return [(order[:, at : at + _WEIGHTS_PER_SET], stored[:, at : at + _WEIGHTS_PER_SET]) for at in split]
+    sets = [slice(first, first + size) for first in range(0, slots, size)]
+    return [(order[:, columns], stored[:, columns]) for columns in sets]
 
 
 def _column_major(matrices: Array) -> Array:

@@ -20,11 +20,15 @@ from torchreg.geometry.camera import Camera
 from torchreg.io.atomic import write_atomic
 from torchreg.io.frames import natural_key
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
+from torchreg.io.npz import read_npy_header
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-_DEPTH_KINDS = {"I;16": 16, "I;16B": 16, "I;16L": 16, "I": 32, "F": 32}
+# Metres per unit of most depth images.
+MILLIMETER = 1e-3
+# Modes in which PIL sees depth, and those of pictures with what they are converted to.
+_DEPTH_KINDS = ("I;16", "I;16B", "I;16L", "I", "F")
 _COLOR_KINDS = {"1": "L", "L": "L", "P": "RGB", "RGB": "RGB", "RGBA": "RGB", "LA": "L"}
-# The channel of an EXR file that holds depth, by what renderers call it.
+# Names of the depth channel of an EXR file.
 _EXR_CHANNELS = ("Z", "depth.Z", "Depth.Z", "Y", "V", "R", "RGB")
 
 
@@ -32,17 +36,17 @@ def list_pictures(folder: str | os.PathLike[str]) -> list[Path]:
     """Return the pictures in a folder, in the order of the numbers in their names.
 
     Raises:
-        FormatError: if it holds none, or names the folder of something else.
+        FormatError: if it holds none, or is no folder.
         FileNotFoundError: if there is no such folder.
     """
-    place = local_path(folder)
-    if not place.exists():
-        raise FileNotFoundError(f"the folder {place} does not exist")
-    if not place.is_dir():
-        raise FormatError(f"{place}: must be a folder of pictures")
-    files = [file for file in place.iterdir() if file.suffix.lower() in ENDINGS and not file.name.startswith(".")]
+    directory = local_path(folder)
+    if not directory.exists():
+        raise FileNotFoundError(f"the folder {directory} does not exist")
+    if not directory.is_dir():
+        raise FormatError(f"{directory}: must be a folder of pictures")
+    files = [file for file in directory.iterdir() if file.suffix.lower() in ENDINGS and not file.name.startswith(".")]
     if not files:
-        raise FormatError(f"{place} holds no pictures: no file ends in one of {', '.join(ENDINGS)}")
+        raise FormatError(f"{directory} holds no pictures: no file ends in one of {', '.join(ENDINGS)}")
     return sorted(files, key=natural_key)
 
 
@@ -50,8 +54,8 @@ def list_frames(folders: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, .
     """Return the pictures of several cameras frame by frame: one folder per camera, in the order of their numbers.
 
     Raises:
-        FormatError: as `list_pictures`, if the folders do not hold equally many pictures, or a frame is missing in
-            some: the last numbers in the names are partly the same, but not frame by frame.
+        FormatError: as `list_pictures`, if the folders do not hold equally many pictures, or a frame is missing in one
+            of them: the last numbers in the names are partly the same, but not frame by frame.
         FileNotFoundError: if there is no such folder.
     """
     files = [list_pictures(folder) for folder in folders]
@@ -59,10 +63,10 @@ def list_frames(folders: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, .
         counts = ", ".join(f"{os.fspath(folder)} {len(found)}" for folder, found in zip(folders, files, strict=True))
         raise FormatError(f"folders must hold equally many pictures, one per frame; got {counts}")
     numbers = [[_last_number(file) for file in found] for found in files]
-    for own, found in zip(numbers, files, strict=True):
-        if own != numbers[0] and set(own) & set(numbers[0]):
-            place = next(k for k, (one, two) in enumerate(zip(own, numbers[0], strict=True)) if one != two)
-            raise FormatError(f"a frame is missing: {files[0][place]} and {found[place]} have different numbers")
+    for listed, found in zip(numbers, files, strict=True):
+        if listed != numbers[0] and set(listed) & set(numbers[0]):
+            frame = next(k for k, pair in enumerate(zip(listed, numbers[0], strict=True)) if pair[0] != pair[1])
+            raise FormatError(f"a frame is missing: {files[0][frame]} and {found[frame]} have different numbers")
     return list(zip(*files, strict=True))
 
 
@@ -82,30 +86,30 @@ def load_image(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIM
         FormatError: if it is cut off, too large, no picture or of another bit depth; names the file.
         FileNotFoundError: if there is no such file.
     """
-    place = local_path(path)
-    kind, pixels = _decoded(read_bytes(place, limits), place)
+    file = local_path(path)
+    kind, pixels = _decoded(read_bytes(file, limits), file)
     if kind not in _COLOR_KINDS:
-        raise FormatError(f"{place}: pictures must have 8 bits per channel, gray or color; got PIL mode {kind}")
+        raise FormatError(f"{file}: pictures must have 8 bits per channel, gray or color; got PIL mode {kind}")
     return torch.from_numpy(pixels.astype(np.float32) / 255)
 
 
 def load_mask(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Tensor:
-    """Return which pixels of a mask are set, (H, W) bool: at least half as bright as white, or in ``.npy`` not zero.
+    """Return a mask (H, W), bool: pixels at least half as bright as white, or in ``.npy`` not zero.
 
     Raises:
         FormatError: as `load_image`.
         FileNotFoundError: if there is no such file.
     """
-    place = local_path(path)
-    if place.suffix.lower() == ".npy":
-        return torch.from_numpy(_array(read_bytes(place, limits), place) != 0)
-    image = load_image(place, limits=limits)
+    file = local_path(path)
+    if file.suffix.lower() == ".npy":
+        return torch.from_numpy(_read_npy(read_bytes(file, limits), file) != 0)
+    image = load_image(file, limits=limits)
     return (image if image.ndim == 2 else image.amax(-1)) >= 0.5
 
 
 def load_depth(
     path: str | os.PathLike[str],
-    scale: float = 1e-3,
+    scale: float = MILLIMETER,
     *,
     camera: Camera | None = None,
     limits: FileLimits = DEFAULT_LIMITS,
@@ -124,34 +128,26 @@ def load_depth(
         FileNotFoundError: if there is no such file.
         MissingExtraError: if it is an EXR file and the extra ``exr`` is not installed.
     """
-    place = local_path(path)
-    content = read_bytes(place, limits)
-    suffix = place.suffix.lower()
-    if suffix == ".npy":
-        values = _array(content, place)
-    elif suffix == ".exr":
-        values = _exr(content, place)
-    else:
-        kind, values = _decoded(content, place)
-        if kind not in _DEPTH_KINDS:
-            raise FormatError(f"{place}: depth takes 16 bits or floating-point numbers, got PIL mode {kind} of 8 bits")
+    file = local_path(path)
+    content = read_bytes(file, limits)
+    values = _DEPTH_READERS.get(file.suffix.lower(), _decoded_depth)(content, file)
     if values.dtype.kind not in "fiu" or values.dtype.itemsize < 2:
-        raise FormatError(f"{place}: depth takes 16 bits or floating-point numbers, got {values.dtype}")
+        raise FormatError(f"{file}: depth takes 16 bits or floating-point numbers, got {values.dtype}")
     if camera is not None and values.shape != (camera.height, camera.width):
         raise FormatError(
-            f"{place}: is {values.shape[1]} x {values.shape[0]} pixels, the camera's pictures are "
+            f"{file}: is {values.shape[1]} x {values.shape[0]} pixels, the camera's pictures are "
             f"{camera.width} x {camera.height}"
         )
     depth = values.astype(np.float32) * np.float32(scale)
     # Sensors mark what they did not measure by zero, NaN, infinity or a negative number.
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
     if not depth.any():
-        raise FormatError(f"{place}: holds no depth, all of {depth.size} pixels are zero, negative or not finite")
+        raise FormatError(f"{file}: holds no depth, all of {depth.size} pixels are zero, negative or not finite")
     return torch.from_numpy(depth)
 
 
-def save_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = 1e-3) -> None:
-    """Write a depth image (H, W) in metres as 16-bit PNG, rounded to ``scale``; what does not fit becomes zero."""
+def save_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = MILLIMETER) -> None:
+    """Write a depth image (H, W) in metres as 16-bit PNG, rounded to ``scale``; depths out of range become zero."""
     from PIL import Image
 
     steps = (depth.detach().cpu().double() / scale).round().nan_to_num(0, 0, 0)
@@ -168,22 +164,23 @@ def save_image(path: str | os.PathLike[str], image: Tensor) -> None:
 
 
 def _save_png(path: str | os.PathLike[str], image: Any) -> None:
-    place = local_path(path)
-    if place.suffix.lower() != ".png":
-        raise FormatError(f"{place}: must end in .png")
+    file = local_path(path)
+    if file.suffix.lower() != ".png":
+        raise FormatError(f"{file}: must end in .png")
     stream = io.BytesIO()
     image.save(stream, format="PNG")
-    write_atomic(place, stream.getvalue())
+    write_atomic(file, stream.getvalue())
 
 
-def _check_pixels(shape: tuple[int, ...], place: Path) -> None:
+def _check_pixels(shape: tuple[int, ...], file: Path) -> None:
+    """Raise FormatError unless a shape is that of a picture of allowed size."""
     pixels = shape[0] * shape[1] if len(shape) == 2 else 0
     if not 0 < pixels <= BUDGET.picture_pixels:
-        raise FormatError(f"{place}: must be (H, W) with 1 to 64 million pixels, got shape {shape}")
+        raise FormatError(f"{file}: must be (H, W) with 1 to 64 million pixels, got shape {shape}")
 
 
-def _decoded(content: bytes, place: Path) -> tuple[str, Any]:
-    """Return the mode in which PIL sees a picture and its pixels."""
+def _decoded(content: bytes, file: Path) -> tuple[str, Any]:
+    """Return the PIL mode of a picture, and its pixels."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -191,50 +188,59 @@ def _decoded(content: bytes, place: Path) -> tuple[str, Any]:
             # The size is checked here, before anything is decoded; damage raises.
             warnings.simplefilter("ignore")
             with Image.open(io.BytesIO(content), formats=("PNG", "TIFF", "JPEG", "BMP")) as image:
-                _check_pixels(image.size, place)
+                _check_pixels(image.size, file)
                 kind = str(image.mode)
                 plain = image.convert(_COLOR_KINDS[kind]) if kind in _COLOR_KINDS else image
                 return kind, np.array(plain)
     except FormatError:
         raise
     except Image.DecompressionBombError as error:
-        raise FormatError(f"{place}: has more than 64 megapixels") from error
+        raise FormatError(f"{file}: has more than 64 megapixels") from error
     except UnidentifiedImageError as error:
-        raise FormatError(f"{place}: is no PNG, TIFF, JPEG or BMP picture") from error
+        raise FormatError(f"{file}: is no PNG, TIFF, JPEG or BMP picture") from error
     except (OSError, SyntaxError, ValueError, EOFError, IndexError, KeyError, TypeError) as error:
-        raise FormatError(f"{place}: is cut off or damaged ({error})") from error
+        raise FormatError(f"{file}: is cut off or damaged ({error})") from error
 
 
-def _array(content: bytes, place: Path) -> Any:
+def _decoded_depth(content: bytes, file: Path) -> Any:
+    """Return the numbers (H, W) of a PNG or TIFF depth image."""
+    kind, values = _decoded(content, file)
+    if kind not in _DEPTH_KINDS:
+        raise FormatError(f"{file}: depth takes 16 bits or floating-point numbers, got PIL mode {kind} of 8 bits")
+    return values
+
+
+def _read_npy(content: bytes, file: Path) -> Any:
+    """Return the array (H, W) of a ``.npy`` file."""
     stream = io.BytesIO(content)
-    try:
-        version = np.lib.format.read_magic(stream)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(stream)
-    except (ValueError, EOFError) as error:
-        raise FormatError(f"{place}: is no .npy file ({error})") from error
-    _check_pixels(shape, place)
+    shape, _, dtype = read_npy_header(stream, f"{file}:")
+    _check_pixels(shape, file)
     if dtype.hasobject or len(content) - stream.tell() != shape[0] * shape[1] * dtype.itemsize:
         raise FormatError(
-            f"{place}: holds {len(content) - stream.tell()} bytes, not {shape} numbers of {dtype}: cut off?"
+            f"{file}: holds {len(content) - stream.tell()} bytes, not {shape} numbers of {dtype}: cut off?"
         )
     return np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
 
 
-def _exr(content: bytes, place: Path) -> Any:
+def _read_exr(content: bytes, file: Path) -> Any:
+    """Return the depth channel (H, W) of an OpenEXR file."""
     try:
         import OpenEXR
     except ImportError as error:
-        raise MissingExtraError(f"{place}: EXR files take the extra exr: pip install 'torchreg[exr]'") from error
+        raise MissingExtraError(f"{file}: EXR files take the extra exr: pip install 'torchreg[exr]'") from error
     try:
-        with OpenEXR.File(str(place), header_only=True) as file:
-            (left, top), (right, bottom) = (corner.tolist() for corner in file.header()["dataWindow"])
-            _check_pixels((bottom - top + 1, right - left + 1), place)
-        with OpenEXR.File(str(place)) as file:
-            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+        with OpenEXR.File(str(file), header_only=True) as header:
+            first, last = (corner.tolist() for corner in header.header()["dataWindow"])
+            _check_pixels((last[1] - first[1] + 1, last[0] - first[0] + 1), file)
+        with OpenEXR.File(str(file)) as picture:
+            channels = {name: np.array(channel.pixels) for name, channel in picture.channels().items()}
     except (RuntimeError, ValueError, OSError) as error:
-        raise FormatError(f"{place}: is cut off or damaged, {len(content)} bytes ({error})") from error
+        raise FormatError(f"{file}: is cut off or damaged, {len(content)} bytes ({error})") from error
     name = next((name for name in _EXR_CHANNELS if name in channels), None)
     if name is None:
-        raise FormatError(f"{place}: has none of the channels {', '.join(_EXR_CHANNELS)}, but {', '.join(channels)}")
+        raise FormatError(f"{file}: has none of the channels {', '.join(_EXR_CHANNELS)}, but {', '.join(channels)}")
     return channels[name] if channels[name].ndim == 2 else channels[name][..., 0]
+
+
+# Readers of depth images that PIL does not decode.
+_DEPTH_READERS = {".npy": _read_npy, ".exr": _read_exr}

@@ -1,4 +1,4 @@
-"""What a file may cost before it is opened: local regular files only, bounded in bytes, counts and expansion."""
+"""Limits of files, checked before they are opened: local regular files only, bounded in bytes, counts, expansion."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ZIP_ERRORS = (
 
 @dataclass(frozen=True)
 class FileLimits:
-    """Upper bounds that every loader checks before it allocates.
+    """Upper bounds that every loader checks before it allocates memory.
 
     Args:
         max_bytes: size of one file in bytes.
@@ -75,7 +75,7 @@ def local_path(path: str | os.PathLike[str]) -> Path:
 
 
 def read_bytes(path: str | os.PathLike[str], limits: FileLimits = DEFAULT_LIMITS) -> bytes:
-    """Return the content of a local regular file, after looking at its size.
+    """Return the content of a local regular file, once its size is checked.
 
     Args:
         path: the file.
@@ -86,15 +86,15 @@ def read_bytes(path: str | os.PathLike[str], limits: FileLimits = DEFAULT_LIMITS
         IsADirectoryError: if it is a folder.
         FormatError: if it is an address, a device, pipe or socket, or larger than allowed.
     """
-    place = local_path(path)
-    mode = place.stat().st_mode  # before open(), which waits forever on a pipe
+    file = local_path(path)
+    mode = file.stat().st_mode  # before open(), which waits forever on a pipe
     if stat.S_ISDIR(mode):
-        raise IsADirectoryError(f"{place} is a folder; pass one file of it")
+        raise IsADirectoryError(f"{file} is a folder; pass one file of it")
     if not stat.S_ISREG(mode):
-        raise FormatError(f"{place} is not a regular file (a device, pipe or socket); copy its content into a file")
-    with place.open("rb") as stream:
+        raise FormatError(f"{file} is not a regular file (a device, pipe or socket); copy its content into a file")
+    with file.open("rb") as stream:
         size = os.fstat(stream.fileno()).st_size
-        check_size(size, place, limits)
+        check_size(size, file, limits)
         return stream.read(size)  # a size, because the file may be growing
 
 
@@ -107,8 +107,8 @@ def check_size(size: int, path: Path, limits: FileLimits) -> None:
         )
 
 
-def check_count(count: int, what: str, limits: FileLimits) -> None:
-    """Raise FormatError unless ``count`` items are allowed; ``what`` is "points" or "faces"."""
+def check_allowed(count: int, what: str, limits: FileLimits) -> None:
+    """Raise FormatError if a file claims more items than allowed; ``what`` is "faces", or names points."""
     name = "max_faces" if what == "faces" else "max_points"
     if not 0 <= count <= getattr(limits, name):
         raise FormatError(
@@ -127,7 +127,7 @@ def check_expansion(packed: int, expanded: int, what: str, limits: FileLimits) -
 
 
 def open_zip(content: bytes, limits: FileLimits = DEFAULT_LIMITS) -> zipfile.ZipFile:
-    """Return the archive held in ``content``, with the claimed sizes of all members checked before any is expanded.
+    """Return the zip archive in ``content``; the claimed sizes of all members are checked before any is expanded.
 
     Args:
         content: the bytes of the archive.

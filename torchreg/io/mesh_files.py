@@ -1,4 +1,4 @@
-"""The meshes that a robot description names: found by relative path, file or package address, and read once."""
+"""Meshes of a robot description: found by relative path, file or package address, and read once."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ import importlib.util
 import io
 import struct
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote
 
 import numpy as np
@@ -17,10 +19,10 @@ import torch
 from torchreg.errors import FormatError, MissingExtraError
 from torchreg.geometry.mesh import TriangleMesh, concatenate
 from torchreg.io.limits import FileLimits, read_bytes
+from torchreg.io.raw_cloud import Array
+from torchreg.io.stl import is_binary_stl
 from torchreg.io.strict_xml import parse_xml
 
-_MESH_SUFFIXES = (".stl", ".obj", ".dae", ".glb", ".ply", ".off")
-_DAE_LOOKS = ("library_images", "library_effects", "library_materials", "bind_material")
 _PARSER_ERRORS = (
     ValueError,
     TypeError,
@@ -36,13 +38,18 @@ _PARSER_ERRORS = (
 )
 
 
+# Elements of COLLADA files without which meshes are read.
+_MATERIALS = ("library_images", "library_effects", "library_materials", "bind_material")
+
+
 class MeshFiles:
     """Finds and reads mesh files, each once.
 
     Args:
-        path: the description that names them.
-        package_dirs: folders to search for ``package://`` and ``model://`` names, as are those above the description.
-        require: whether a file that is missing, or needs a reader not installed, is an error.
+        path: of the description.
+        package_dirs: folders to search for ``package://`` and ``model://`` names; those above the description are
+            searched as well.
+        require: whether it is an error if a file is missing or needs a reader that is not installed.
         limits: largest size of a file.
     """
 
@@ -52,18 +59,14 @@ class MeshFiles:
         self._cache: dict[Path, TriangleMesh] = {}
 
     def read(self, filename: str, what: str) -> TriangleMesh | None:
-        """Return the triangles of a mesh file, float64; None if it may be left out and has to be.
+        """Return the triangles of a mesh file, float64; None if it cannot be read and is not required.
 
         Args:
-            filename: as the description gives it: relative to its folder, or ``file://``, ``package://``, ``model://``.
-            what: names it, for messages.
-
-        Raises:
-            FormatError: if the file is required and missing, or damaged, oversized, remote or of unknown kind.
-            MissingExtraError: if a COLLADA (.dae) mesh is required and pycollada is not installed.
+            filename: relative to the folder of the description, or ``file://``, ``package://``, ``model://``.
+            what: the name of the mesh in messages.
         """
         tried = self._candidates(filename, what)
-        found = next((place for place in tried if _is_file(place)), None)
+        found = next((path for path in tried if _is_file(path)), None)
         if found is None:
             if not self._require:
                 return None
@@ -71,7 +74,8 @@ class MeshFiles:
                 f"{what}: mesh file {filename!r} was not found (looked at {', '.join(map(str, tried[:3]))}, ...); pass "
                 f"package_dirs=, or meshes='skip' to go without"
             )
-        if found.suffix.lower() == ".dae" and importlib.util.find_spec("collada") is None:
+        kind = _FORMATS.get(found.suffix.lower())
+        if kind is not None and kind.module is not None and importlib.util.find_spec(kind.module[0]) is None:
             if not self._require:
                 return None
             raise MissingExtraError(
@@ -82,7 +86,7 @@ class MeshFiles:
         return self._cache[found]
 
     def _candidates(self, filename: str, what: str) -> list[Path]:
-        """Return the places where a mesh may lie, likeliest first."""
+        """Return the possible paths of a mesh, most likely first."""
         scheme, separator, rest = filename.partition("://")
         if not separator:
             return [self._path.parent / filename]
@@ -91,74 +95,94 @@ class MeshFiles:
         if scheme not in ("package", "model"):
             raise FormatError(f"{what}: mesh {filename!r} is remote; save it beside the URDF and give a relative path")
         package, _, inner = rest.partition("/")
-        places = [folder / package / inner for folder in self._folders]
+        paths = [folder / package / inner for folder in self._folders]
         named = [folder / inner for folder in self._folders if folder.name == package]
-        return [*named, *places]
+        return [*named, *paths]
 
 
-def _is_file(place: Path) -> bool:
+def _is_file(path: Path) -> bool:
+    """Return whether a path is that of a file, also where the path is invalid."""
     try:
-        return place.is_file()
+        return path.is_file()
     except OSError:  # a name that the file system cannot hold
         return False
 
 
+def _checked_stl(content: bytes) -> tuple[bytes, float]:
+    """Return an STL file and its unit; ValueError unless it is as long as its binary header says, or text.
+
+    The result of trimesh for other files depends on which detectors of encodings are installed.
+    """
+    if not is_binary_stl(content):
+        content.decode("utf-8")
+    return content, 1.0
+
+
+def _bare_collada(content: bytes) -> tuple[bytes, float]:
+    """Return a COLLADA document without materials, whose broken references would make the mesh fail, and its unit."""
+    root = parse_xml(content)
+    unit = root.find("{*}asset/{*}unit")
+    for parent in list(root.iter()):
+        for child in list(parent):
+            if child.tag.rpartition("}")[2] in _MATERIALS:
+                parent.remove(child)
+    return ET.tostring(root), 1.0 if unit is None else float(unit.get("meter", "1"))
+
+
+@dataclass(frozen=True)
+class _MeshFormat:
+    """A format of meshes that trimesh reads.
+
+    Args:
+        prepare: returns the content for trimesh, and the metres per unit.
+        module: that trimesh needs for it, and the name of its error in ``module.common``.
+    """
+
+    prepare: Callable[[bytes], tuple[bytes, float]] = lambda content: (content, 1.0)
+    module: tuple[str, str] | None = None
+
+
+# By ending. A new format is one more row.
+_FORMATS = {
+    ".stl": _MeshFormat(_checked_stl),
+    ".obj": _MeshFormat(),
+    ".dae": _MeshFormat(_bare_collada, module=("collada", "DaeError")),
+    ".glb": _MeshFormat(),
+    ".ply": _MeshFormat(),
+    ".off": _MeshFormat(),
+}
+
+
 def _read_mesh(path: Path, limits: FileLimits) -> TriangleMesh:
-    """Return the triangles of a mesh file, in metres where the file knows its unit."""
-    kind = path.suffix.lower()
-    if kind not in _MESH_SUFFIXES:
-        raise FormatError(f"{path}: meshes of kind {kind!r} are not read; known: {', '.join(_MESH_SUFFIXES)}")
-    content = read_bytes(path, limits)
-    unit = 1.0
+    """Return the triangles of a mesh file, in metres where the file has a unit."""
+    ending = path.suffix.lower()
+    if ending not in _FORMATS:
+        raise FormatError(f"{path}: meshes of kind {ending!r} are not read; known: {', '.join(_FORMATS)}")
+    content, kind = read_bytes(path, limits), _FORMATS[ending]
     import trimesh
     from trimesh.exchange.stl import HeaderError
 
     errors: tuple[type[BaseException], ...] = (*_PARSER_ERRORS, HeaderError)
-    if kind == ".dae":
-        errors = (*errors, importlib.import_module("collada.common").DaeError)
+    if kind.module is not None:
+        errors = (*errors, getattr(importlib.import_module(f"{kind.module[0]}.common"), kind.module[1]))
     try:
-        if kind == ".dae":
-            content, unit = _bare_collada(content)
-        elif kind == ".stl":
-            _check_stl(content)
+        content, unit = kind.prepare(content)
         # From memory and without a resolver, so that no material or texture file is opened.
-        scene = trimesh.load_scene(io.BytesIO(content), file_type=kind[1:], process=False, maintain_order=True)
-        parts = [
-            (
-                np.asarray(piece.vertices, dtype=np.float64),
-                np.asarray(piece.faces, dtype=np.int64),
-                scene.graph[node][0],
-            )
-            for node in scene.graph.nodes_geometry
-            if isinstance(piece := scene.geometry[scene.graph[node][1]], trimesh.Trimesh)
-        ]
+        scene = trimesh.load_scene(io.BytesIO(content), file_type=ending[1:], process=False, maintain_order=True)
         pieces = [
-            TriangleMesh(torch.from_numpy((v @ matrix[:3, :3].T + matrix[:3, 3]) * unit), torch.from_numpy(f.copy()))
-            for v, f, matrix in parts
-            if len(f)
+            _piece(geometry, scene.graph[node][0], unit)
+            for node in scene.graph.nodes_geometry
+            if isinstance(geometry := scene.geometry[scene.graph[node][1]], trimesh.Trimesh)
         ]
     except errors as error:
-        raise FormatError(f"{path}: not a readable {kind[1:]} mesh ({type(error).__name__}: {error})") from error
+        raise FormatError(f"{path}: not a readable {ending[1:]} mesh ({type(error).__name__}: {error})") from error
+    pieces = [piece for piece in pieces if piece.num_faces]
     if not pieces:
         raise FormatError(f"{path}: holds no triangles")
     return concatenate(pieces)
 
 
-def _check_stl(content: bytes) -> None:
-    """Raise a ValueError unless a file is as long as its binary header says, or text.
-
-    What trimesh makes of others depends on which detectors of encodings happen to be installed.
-    """
-    if len(content) != 84 + 50 * int.from_bytes(content[80:84], "little"):
-        content.decode("utf-8")
-
-
-def _bare_collada(content: bytes) -> tuple[bytes, float]:
-    """Return a COLLADA document without materials, whose broken references would take the mesh along, and its unit."""
-    root = parse_xml(content)
-    unit = root.find("{*}asset/{*}unit")
-    for parent in list(root.iter()):
-        for child in list(parent):
-            if child.tag.rpartition("}")[2] in _DAE_LOOKS:
-                parent.remove(child)
-    return ET.tostring(root), 1.0 if unit is None else float(unit.get("meter", "1"))
+def _piece(geometry: Any, transform: Array, unit: float) -> TriangleMesh:
+    """Return a mesh of trimesh, moved by a transform (4, 4), in metres."""
+    vertices = np.asarray(geometry.vertices, dtype=np.float64) @ transform[:3, :3].T + transform[:3, 3]
+    return TriangleMesh(torch.from_numpy(vertices * unit), torch.from_numpy(geometry.faces.astype(np.int64)))

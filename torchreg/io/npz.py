@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import zipfile
 from collections.abc import Mapping
@@ -13,18 +14,15 @@ from torch import Tensor
 
 from torchreg.errors import FormatError, InputError
 from torchreg.io.atomic import write_atomic
-from torchreg.io.limits import FileLimits, check_count, local_path, open_zip
+from torchreg.io.limits import FileLimits, check_allowed, local_path, open_zip
 from torchreg.io.raw_cloud import Array, RawCloud, as_indices
 
 
 def read_npz(content: bytes, limits: FileLimits) -> RawCloud:
-    """Return the cloud of an archive: the array ``points`` (or ``vertices``), or the only (N, 3) array there is.
+    """Return the cloud of an archive: the array ``points`` (or ``vertices``), or the only (N, 3) array.
 
-    ``normals``, ``colors`` and ``faces`` are read when they are there. Shapes are compared with the bytes behind them
-    before anything is allocated; arrays of Python objects are refused.
-
-    Raises:
-        FormatError: if no array can be told to be the points, or one is damaged.
+    ``normals``, ``colors`` and ``faces`` are read where present. Shapes are compared with the sizes of the members
+    before memory is allocated; arrays of Python objects are refused.
     """
     with open_zip(content, limits) as archive:
         names = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
@@ -33,10 +31,10 @@ def read_npz(content: bytes, limits: FileLimits) -> RawCloud:
         wanted = [name for name in (key, "normals", "colors", "faces") if name in names]
         arrays = {name: _read_array(archive, names[name]) for name in wanted}
     points = arrays[key]
-    check_count(len(points) if points.ndim else 0, "points", limits)
+    check_allowed(len(points) if points.ndim else 0, "points", limits)
     faces = arrays.get("faces")
     if faces is not None:
-        check_count(len(faces) if faces.ndim else 0, "faces", limits)
+        check_allowed(len(faces) if faces.ndim else 0, "faces", limits)
         faces = as_indices(faces, "faces")
     return RawCloud(points, arrays.get("normals"), arrays.get("colors"), faces)
 
@@ -45,7 +43,7 @@ def _only_points(archive: zipfile.ZipFile, names: dict[str, str]) -> str:
     found = []
     for key, name in names.items():
         with archive.open(name) as stream:
-            shape, _, dtype = _read_header(stream, name)
+            shape, _, dtype = _read_real_header(stream, name)
         if len(shape) == 2 and shape[1] == 3 and dtype.kind == "f":
             found.append(key)
     if len(found) != 1:
@@ -56,12 +54,22 @@ def _only_points(archive: zipfile.ZipFile, names: dict[str, str]) -> str:
     return found[0]
 
 
-def _read_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bool, np.dtype]:
-    version = np.lib.format.read_magic(stream)
-    if version not in ((1, 0), (2, 0)):
-        raise FormatError(f"member {name!r} has the unknown array format {version}")
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran, dtype = read(stream)
+def read_npy_header(stream: IO[bytes], what: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Return shape, Fortran order and dtype of an array, and leave the stream at its numbers."""
+    try:
+        version = np.lib.format.read_magic(stream)
+        if version == (1, 0):
+            return np.lib.format.read_array_header_1_0(stream)
+        if version == (2, 0):
+            return np.lib.format.read_array_header_2_0(stream)
+    except (ValueError, EOFError) as error:
+        raise FormatError(f"{what} is no .npy file ({error})") from error
+    raise FormatError(f"{what} has the unknown array format {version}")
+
+
+def _read_real_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Return the header of a member that holds real numbers."""
+    shape, fortran, dtype = read_npy_header(stream, f"member {name!r}")
     if dtype.hasobject or dtype.kind not in "iuf":
         raise FormatError(f"member {name!r} must hold real numbers, got {dtype}; pickled objects are never loaded")
     return shape, fortran, dtype
@@ -69,17 +77,15 @@ def _read_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bool, n
 
 def _read_array(archive: zipfile.ZipFile, name: str) -> Array:
     stream = io.BytesIO(archive.read(name))
-    shape, fortran, dtype = _read_header(stream, name)
-    body, count = stream.read(), 1
-    for size in shape:
-        count *= size
-    if any(size < 0 for size in shape) or count * dtype.itemsize != len(body):
+    shape, fortran, dtype = _read_real_header(stream, name)
+    body = stream.read()
+    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != len(body):
         raise FormatError(f"member {name!r} claims the shape {shape} of {dtype} but holds {len(body)} bytes")
     return np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
 
 
 def write_npz(cloud: RawCloud) -> bytes:
-    """Return an archive with the arrays that the cloud has."""
+    """Return an archive with the arrays of a cloud."""
     arrays = {name: getattr(cloud, name) for name in ("points", "normals", "colors", "faces")}
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, **{name: array for name, array in arrays.items() if array is not None})
@@ -97,9 +103,9 @@ def save_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Tensor]) -> N
         InputError: if the ending is another.
         FileNotFoundError: if the folder does not exist.
     """
-    place = local_path(path)
-    if place.suffix.lower() != ".npz":
-        raise InputError(f"path must end in .npz, got {place.name!r}; rename the output file")
+    file = local_path(path)
+    if file.suffix.lower() != ".npz":
+        raise InputError(f"path must end in .npz, got {file.name!r}; rename the output file")
     stream = io.BytesIO()
     np.savez(stream, allow_pickle=False, **{name: value.detach().cpu().numpy() for name, value in arrays.items()})
-    write_atomic(place, stream.getvalue())
+    write_atomic(file, stream.getvalue())

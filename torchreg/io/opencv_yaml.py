@@ -20,7 +20,7 @@ from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_byte
 
 _KEY = re.compile(r"^([A-Za-z_]\w*):[ \t]*(.*)$", re.MULTILINE)
 _FIELD = re.compile(r"^[ \t]+(rows|cols|dt|data):[ \t]*", re.MULTILINE)
-# What calibrations call the same things.
+# Names of the same entries in calibrations of different origin.
 _SINGLE = (("camera_matrix", "distortion_coefficients"), ("cameraMatrix", "distCoeffs"), ("K", "D"), ("M", "D"))
 _PAIR = (
     ("M1", "D1", "M2", "D2"),
@@ -41,40 +41,40 @@ def load_opencv(
 ) -> CameraRig:
     """Return the camera, or the stereo pair left and right, of an OpenCV YAML file.
 
-    A pair has ``M1 D1 M2 D2 R T`` (or ``cameraMatrix1 distCoeffs1 ...``, ``K1 ...``), where R and T take coordinates of
+    A pair has ``M1 D1 M2 D2 R T`` (or ``cameraMatrix1 distCoeffs1 ...``, ``K1 ...``), where R and T map coordinates of
     the left camera to the right one; the left one is at the origin. One camera has ``camera_matrix`` and
     ``distortion_coefficients`` (or ``cameraMatrix distCoeffs``, ``K D``), and maybe R and T from the world.
 
     Args:
         path: the file.
         size: (width, height) of the pictures, for files without ``image_width`` and ``image_height``.
-        unit: metres per unit of T; calibrations are in that of their board, often 0.001.
+        unit: metres per unit of T, which is that of the calibration board, often 0.001.
         limits: ``max_bytes`` applies.
 
     Returns:
-        float64 cameras.
+        The cameras, float64.
 
     Raises:
-        FormatError: if the file is cut off, a matrix has another size, a number is not finite, something is missing, or
+        FormatError: if the file is cut off, a matrix has another size, a number is not finite, an entry is missing, or
             the cameras of a pair are swapped; names the file.
         FileNotFoundError: if there is no such file.
         InputError: if ``unit`` is not positive.
     """
     if not (math.isfinite(unit) and unit > 0):
         raise InputError(f"unit must be positive and finite, got {unit}")
-    place = local_path(path)
+    file = local_path(path)
     try:
-        text = read_bytes(place, limits).decode("utf-8-sig")
+        text = read_bytes(file, limits).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise FormatError(f"{place}: is no text ({error})") from error
+        raise FormatError(f"{file}: is no text ({error})") from error
     if not text.startswith("%YAML"):
-        raise FormatError(f"{place}: must begin with %YAML, as OpenCV's FileStorage writes it")
-    values = _parsed(text, place)
-    width, height = _picture_size(values, size, place)
+        raise FormatError(f"{file}: must begin with %YAML, as OpenCV's FileStorage writes it")
+    values = _parsed(text, file)
+    width, height = _picture_size(values, size, file)
     try:
-        return CameraRig(tuple(_cameras(values, width, height, unit, place)))
+        return CameraRig(tuple(_cameras(values, width, height, unit, file)))
     except InputError as error:
-        raise FormatError(f"{place}: {error}") from error
+        raise FormatError(f"{file}: {error}") from error
 
 
 def save_opencv(path: str | os.PathLike[str], cameras: CameraRig) -> None:

@@ -10,13 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchreg.errors import FormatError
-from torchreg.io.limits import FileLimits, check_count
+from torchreg.io.limits import FileLimits, check_allowed
 from torchreg.io.raw_cloud import Array, RawCloud, as_integers, parse_table, stack_columns
 
-_MAX_HEADER = 1 << 16
 _DATA_LINE = re.compile(rb"^DATA[ \t]+(\w+)[ \t]*\r?(\n|$)", re.MULTILINE)
 _KINDS = {"I": "i", "U": "u", "F": "f"}
-# Three bytes can stand for at most this many in LZF.
+# Largest ratio of expanded to packed bytes in LZF: three bytes for 264.
 _LZF_RATIO = 264 / 3
 
 
@@ -28,12 +27,8 @@ class _Field:
 
 
 def read_pcd(content: bytes, limits: FileLimits) -> RawCloud:
-    """Return the points of a PCD file, in the order of the file (organized clouds row by row).
-
-    Raises:
-        FormatError: if the header is damaged, or the body holds less or more than the header says.
-    """
-    match = _DATA_LINE.search(content[:_MAX_HEADER])
+    """Return the points of a PCD file, in the order of the file (organized clouds row by row)."""
+    match = _DATA_LINE.search(content[: 1 << 16])  # headers are shorter
     if match is None:
         raise FormatError("must have a header closed by a line 'DATA ascii', 'DATA binary' or 'DATA binary_compressed'")
     fields, count = _parse_header(content[: match.start()].decode("latin-1"), limits)
@@ -71,7 +66,7 @@ def _parse_header(text: str, limits: FileLimits) -> tuple[list[_Field], int]:
     points = _number(entries, "POINTS", entries.get("WIDTH", []))
     if "WIDTH" in entries and _number(entries, "WIDTH", []) * _number(entries, "HEIGHT", ["1"]) != points:
         raise FormatError("the header's POINTS is not WIDTH x HEIGHT")
-    check_count(points, "points", limits)
+    check_allowed(points, "points", limits)
     if points == 0:
         raise FormatError("holds no points")
     return fields, points
@@ -101,15 +96,15 @@ def _read_ascii(body: bytes, fields: list[_Field], count: int) -> dict[str, Arra
     lines = [line for line in body.splitlines() if line.strip()]
     _check_length(len(lines), count, "points")
     table = parse_table(lines, sum(field.count for field in fields), "point")
-    columns, place = dict[str, Array](), 0
+    columns, column = dict[str, Array](), 0
     for field in fields:
-        values = table[:, place]
+        values = table[:, column]
         # PCL writes packed colors as the float that has their bits, or as an integer.
         integer = field.dtype.kind != "f" and field.count == 1
         columns[field.name] = as_integers(values, field.dtype.str, field.name) if integer else values
         if field.name in ("rgb", "rgba") and not integer:
             columns[field.name] = values.astype("<f4")
-        place += field.count
+        column += field.count
     return columns
 
 
@@ -133,47 +128,44 @@ def _read_compressed(body: bytes, fields: list[_Field], count: int, limits: File
         raise FormatError(f"the compressed block of {packed} bytes is cut off or damaged")
     if expanded > limits.max_expanded_bytes:
         raise FormatError(f"would expand to {expanded} bytes, the limit is {limits.max_expanded_bytes}")
-    block, place = decompress_lzf(body[8 : 8 + packed], expanded), 0
+    block, offset = decompress_lzf(body[8 : 8 + packed], expanded), 0
     columns = dict[str, Array]()
     for field in fields:  # one field after the other, not point after point
         size = count * field.count * field.dtype.itemsize
-        columns[field.name] = np.frombuffer(block[place : place + size], field.dtype).reshape(count, -1)[:, 0]
-        place += size
+        columns[field.name] = np.frombuffer(block[offset : offset + size], field.dtype).reshape(count, -1)[:, 0]
+        offset += size
     return columns
 
 
 def decompress_lzf(packed: bytes, size: int) -> bytes:
-    """Return the ``size`` bytes that an LZF block stands for.
+    """Return the ``size`` bytes of an expanded LZF block.
 
     A control byte below 32 announces that many plus one literal bytes; any other is a copy: 3 bits of length (7: one
-    more byte to add) and 13 bits of distance into what was written so far.
-
-    Raises:
-        FormatError: if the block is damaged or stands for another number of bytes.
+    more byte to add) and 13 bits of distance back into the bytes expanded so far.
     """
-    out, place, end = bytearray(), 0, len(packed)
-    while place < end and len(out) <= size:
-        control = packed[place]
-        place += 1
+    expanded, position, end = bytearray(), 0, len(packed)
+    while position < end and len(expanded) <= size:
+        control = packed[position]
+        position += 1
         if control < 32:
-            out += packed[place : place + control + 1]
-            place += control + 1
+            expanded += packed[position : position + control + 1]
+            position += control + 1
             continue
         length = control >> 5
         more = 1 if length == 7 else 0
-        if place + more >= end:
+        if position + more >= end:
             break
-        length += 2 + (packed[place] if more else 0)
-        distance = ((control & 31) << 8) + packed[place + more] + 1
-        place += more + 1
-        if distance > len(out):
+        length += 2 + (packed[position] if more else 0)
+        distance = ((control & 31) << 8) + packed[position + more] + 1
+        position += more + 1
+        if distance > len(expanded):
             raise FormatError("the compressed block points before its beginning: it is damaged")
-        source = out[len(out) - distance : len(out) - distance + length]
-        # A copy may overlap what it writes: the piece repeats.
-        out += (source * (length // len(source) + 1))[:length]
-    if place != end or len(out) != size:
+        source = expanded[len(expanded) - distance : len(expanded) - distance + length]
+        # A copy may overlap its target: the piece repeats.
+        expanded += (source * (length // len(source) + 1))[:length]
+    if position != end or len(expanded) != size:
         raise FormatError(f"the compressed block does not expand to the {size} bytes it announces: it is damaged")
-    return bytes(out)
+    return bytes(expanded)
 
 
 def _colors(columns: dict[str, Array]) -> Array | None:

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from torchreg.errors import FormatError
-from torchreg.io.limits import FileLimits, check_count
+from torchreg.io.limits import FileLimits, check_allowed
 from torchreg.io.raw_cloud import Array, RawCloud, as_indices, as_integers, fan_triangles, parse_table, stack_columns
 
 _TYPES = {
@@ -18,7 +18,6 @@ _TYPES = {
     "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
 _FORMATS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
-_MAX_HEADER = 1 << 20
 _HEADER_END = re.compile(rb"^end_header[ \t]*\r?(\n|$)", re.MULTILINE)
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
@@ -43,7 +42,7 @@ class _Element:
 
 @dataclass(frozen=True)
 class _Ragged:
-    """A list property: how many values each row holds, and all values in order."""
+    """A list property: the number of values per row, and all values in order."""
 
     counts: Array
     values: Array
@@ -53,12 +52,8 @@ _Columns = dict[str, "Array | _Ragged"]
 
 
 def read_ply(content: bytes, limits: FileLimits) -> RawCloud:
-    """Return the vertices (and faces) of a PLY file.
-
-    Raises:
-        FormatError: if the header is damaged, or the body holds less or more than the header says.
-    """
-    end = _HEADER_END.search(content[:_MAX_HEADER])
+    """Return the vertices (and faces) of a PLY file."""
+    end = _HEADER_END.search(content[: 1 << 20])  # headers are shorter
     if not content.startswith(b"ply") or end is None:
         raise FormatError("must start with 'ply' and a header closed by 'end_header'")
     order, elements = _parse_header(content[: end.start()].decode("latin-1").split("\n"), limits)
@@ -76,7 +71,7 @@ def _parse_header(lines: list[str], limits: FileLimits) -> tuple[str | None, lis
             case ["format", name, "1.0"] if name in _FORMATS:
                 formats.append(_FORMATS[name])
             case ["element", name, count] if count.isdecimal():
-                check_count(int(count), "faces" if name == "face" else "points", limits)
+                check_allowed(int(count), "faces" if name == "face" else "points", limits)
                 elements.append(_Element(name, int(count), []))
             case ["property", "list", count_kind, kind, name] if elements and count_kind in _TYPES and kind in _TYPES:
                 if _TYPES[count_kind].startswith("f"):
@@ -134,25 +129,25 @@ def _read_ascii(body: bytes, elements: list[_Element]) -> dict[str, _Columns]:
 
 
 def _ascii_lists(rows: list[bytes], element: _Element) -> _Columns:
-    # All numbers in one flat array, then one walk over the rows to find where each property begins.
+    # All numbers in one flat array, then one pass over the rows to find the start of each property.
     words = [row.split() for row in rows]
     flat = parse_table([word for row in words for word in row], 1, f"entry of element {element.name!r}")[:, 0]
     starts: list[list[int]] = [[] for _ in element.properties]
     counts: list[list[int]] = [[] for _ in element.properties]
-    place = 0
+    position = 0
     for row in words:
-        end = place + len(row)
+        end = position + len(row)
         for prop, begin, length in zip(element.properties, starts, counts, strict=True):
             size = 1
             if prop.count_kind:
-                size = int(flat[place]) if place < end and 0 <= flat[place] <= len(row) else -1
-                place += 1
-            if size < 0 or place + size > end:
+                size = int(flat[position]) if position < end and 0 <= flat[position] <= len(row) else -1
+                position += 1
+            if size < 0 or position + size > end:
                 raise FormatError(f"a row of element {element.name!r} is shorter than its list says")
-            begin.append(place)
+            begin.append(position)
             length.append(size)
-            place += size
-        if place != end:
+            position += size
+        if position != end:
             raise FormatError(f"a row of element {element.name!r} is longer than its list says")
     return {
         prop.name: _gather(prop, np.array(begin, np.int64), np.array(length, np.int64), flat)
@@ -167,27 +162,27 @@ def _gather(prop: _Property, starts: Array, counts: Array, flat: Array) -> Array
 
 
 def _spread(starts: Array, counts: Array, stride: int) -> Array:
-    """Return the places of all list entries, given where each list starts and how long it is."""
+    """Return the positions of all list entries, given the starts and lengths of the lists."""
     within = np.arange(int(counts.sum())) - np.repeat(np.cumsum(counts) - counts, counts)
     return np.repeat(starts, counts) + stride * within
 
 
 def _read_binary(body: bytes, elements: list[_Element], order: str) -> dict[str, _Columns]:
-    tables, place = dict[str, _Columns](), 0
+    tables, offset = dict[str, _Columns](), 0
     for element in elements:
         least = sum(np.dtype(p.count_kind or p.kind).itemsize for p in element.properties)
-        if element.count * least > len(body) - place:
+        if element.count * least > len(body) - offset:
             raise _cut_off(element)
         if element.has_lists:
-            found = _binary_equal_lists(body, place, element, order)
-            tables[element.name], place = found or _binary_lists(body, place, element, order)
+            found = _binary_equal_lists(body, offset, element, order)
+            tables[element.name], offset = found or _binary_lists(body, offset, element, order)
         else:
             dtype = np.dtype([(p.name, order + p.kind) for p in element.properties])
-            rows = np.frombuffer(body, dtype, element.count, place)
+            rows = np.frombuffer(body, dtype, element.count, offset)
             tables[element.name] = {p.name: rows[p.name] for p in element.properties}
-            place += rows.nbytes
-    if body[place:].strip():
-        raise FormatError(f"holds {len(body) - place} bytes more than its header says: it is damaged")
+            offset += rows.nbytes
+    if body[offset:].strip():
+        raise FormatError(f"holds {len(body) - offset} bytes more than its header says: it is damaged")
     return tables
 
 
@@ -197,12 +192,12 @@ def _cut_off(element: _Element) -> FormatError:
     )
 
 
-def _binary_equal_lists(body: bytes, place: int, element: _Element, order: str) -> tuple[_Columns, int] | None:
-    """Read an element whose lists are as long in every row as in the first (a triangle mesh); None if they are not."""
+def _binary_equal_lists(body: bytes, offset: int, element: _Element, order: str) -> tuple[_Columns, int] | None:
+    """Return an element whose lists are equally long in all rows, as in a triangle mesh, and its end; else None."""
     if element.count == 0:
         return None
     fields: list[tuple[str, str, tuple[int, ...]]] = []
-    sizes, scan = list[int](), place
+    sizes, scan = list[int](), offset
     for k, prop in enumerate(element.properties):
         size = 1
         if prop.count_kind:
@@ -217,9 +212,9 @@ def _binary_equal_lists(body: bytes, place: int, element: _Element, order: str) 
         fields.append((f"value{k}", order + prop.kind, (size,) if prop.count_kind else ()))
         sizes.append(size)
         scan += size * np.dtype(prop.kind).itemsize
-    if (scan - place) * element.count > len(body) - place:
+    if (scan - offset) * element.count > len(body) - offset:
         return None
-    rows = np.frombuffer(body, np.dtype(fields), element.count, place)
+    rows = np.frombuffer(body, np.dtype(fields), element.count, offset)
     columns: _Columns = {}
     for k, (prop, size) in enumerate(zip(element.properties, sizes, strict=True)):
         values = rows[f"value{k}"]
@@ -228,10 +223,10 @@ def _binary_equal_lists(body: bytes, place: int, element: _Element, order: str) 
         columns[prop.name] = (
             _Ragged(np.full(element.count, size, np.int64), values.reshape(-1)) if prop.count_kind else values
         )
-    return columns, place + rows.nbytes
+    return columns, offset + rows.nbytes
 
 
-def _binary_lists(body: bytes, place: int, element: _Element, order: str) -> tuple[_Columns, int]:
+def _binary_lists(body: bytes, offset: int, element: _Element, order: str) -> tuple[_Columns, int]:
     starts: list[list[int]] = [[] for _ in element.properties]
     counts: list[list[int]] = [[] for _ in element.properties]
     byte_order: Literal["little", "big"] = "little" if order == "<" else "big"
@@ -244,13 +239,13 @@ def _binary_lists(body: bytes, place: int, element: _Element, order: str) -> tup
         for (width, counter), begin, length in zip(layout, starts, counts, strict=True):
             size = 1
             if counter:
-                size = int.from_bytes(body[place : place + counter[0]], byte_order, signed=counter[1])
-                place += counter[0]
-            if size < 0 or place + size * width > end:
+                size = int.from_bytes(body[offset : offset + counter[0]], byte_order, signed=counter[1])
+                offset += counter[0]
+            if size < 0 or offset + size * width > end:
                 raise _cut_off(element)
-            begin.append(place)
+            begin.append(offset)
             length.append(size)
-            place += size * width
+            offset += size * width
     raw = np.frombuffer(body, np.uint8)
     columns: _Columns = {}
     for prop, begin, length in zip(element.properties, starts, counts, strict=True):
@@ -258,7 +253,7 @@ def _binary_lists(body: bytes, place: int, element: _Element, order: str) -> tup
         where = _spread(np.array(begin, np.int64), size_of, dtype.itemsize)
         values = raw[where[:, None] + np.arange(dtype.itemsize)].reshape(-1).view(dtype)
         columns[prop.name] = _Ragged(size_of, values) if prop.count_kind else values
-    return columns, place
+    return columns, offset
 
 
 def write_ply(cloud: RawCloud) -> bytes:

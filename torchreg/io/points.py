@@ -1,4 +1,4 @@
-"""One loader for point clouds and meshes, whatever the format, and its counterpart that writes them."""
+"""Point clouds and meshes from files of any known format, and the counterpart that writes them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.io.atomic import write_atomic
 from torchreg.io.glb import read_gltf
-from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_count, local_path, read_bytes
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, read_bytes
 from torchreg.io.npz import read_npz, write_npz
 from torchreg.io.pcd import read_pcd, write_pcd
 from torchreg.io.ply import read_ply, write_ply
@@ -29,32 +29,55 @@ from torchreg.io.raw_cloud import Array, RawCloud
 from torchreg.io.stl import read_stl
 from torchreg.io.text_formats import read_obj, read_xyz, write_xyz
 
-# All that parsing damaged bytes with struct, json, zipfile and numpy's text and header readers was seen to raise.
+# Exceptions that struct, json, zipfile and numpy's text and header readers raise on damaged bytes.
 PARSER_ERRORS = (
     ValueError, TypeError, LookupError, AttributeError, ArithmeticError, EOFError, MemoryError, RecursionError,
     NotImplementedError, RuntimeError, SyntaxError, OSError, struct.error, tokenize.TokenError, zipfile.BadZipFile,
     zlib.error,
 )  # fmt: skip
 
-_READERS: dict[str, Callable[[bytes, Path, FileLimits], RawCloud]] = {
-    ".ply": lambda content, _, limits: read_ply(content, limits),
-    ".pcd": lambda content, _, limits: read_pcd(content, limits),
-    ".xyz": lambda content, _, limits: read_xyz(content, limits),
-    ".txt": lambda content, _, limits: read_xyz(content, limits),
-    ".obj": lambda content, _, limits: read_obj(content, limits),
-    ".stl": lambda content, _, limits: read_stl(content, limits),
-    ".npz": lambda content, _, limits: read_npz(content, limits),
-    ".glb": read_gltf,
-    ".gltf": read_gltf,
+Reader = Callable[[bytes, Path, FileLimits], RawCloud]
+
+
+@dataclass(frozen=True)
+class CloudFormat:
+    """A file format of clouds and meshes.
+
+    Args:
+        read: the content of a file; the path is that of files beside it.
+        write: a cloud; None for formats that are read only.
+        colors: whether `write` keeps them.
+        faces: whether `write` keeps them.
+    """
+
+    read: Reader
+    write: Callable[[RawCloud], bytes] | None = None
+    colors: bool = False
+    faces: bool = False
+
+
+def _from_content(read: Callable[[bytes, FileLimits], RawCloud]) -> Reader:
+    """Return a reader that needs no path."""
+    return lambda content, _, limits: read(content, limits)
+
+
+# By ending. A new format is one more row.
+FORMATS = {
+    ".ply": CloudFormat(_from_content(read_ply), write_ply, colors=True, faces=True),
+    ".pcd": CloudFormat(_from_content(read_pcd), write_pcd, colors=True),
+    ".xyz": CloudFormat(_from_content(read_xyz), write_xyz),
+    ".txt": CloudFormat(_from_content(read_xyz), write_xyz),
+    ".obj": CloudFormat(_from_content(read_obj)),
+    ".stl": CloudFormat(_from_content(read_stl)),
+    ".npz": CloudFormat(_from_content(read_npz), write_npz, colors=True, faces=True),
+    ".glb": CloudFormat(read_gltf),
+    ".gltf": CloudFormat(read_gltf),
 }
-_WRITERS = {".ply": write_ply, ".pcd": write_pcd, ".xyz": write_xyz, ".txt": write_xyz, ".npz": write_npz}
-_HOLDS_COLORS = (".ply", ".pcd", ".npz")
-_HOLDS_FACES = (".ply", ".npz")
 
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Points and what a file knows about them.
+    """Points with the normals, faces and colors of a file.
 
     Args:
         points: (N, 3) finite coordinates, float32 or float64.
@@ -63,7 +86,7 @@ class PointCloud:
         colors: (N, 3) red, green, blue from 0 to 1, or None.
 
     Raises:
-        InputError: if shapes do not agree, a number is not finite or a face names a point that does not exist.
+        InputError: if shapes do not agree, a number is not finite or a face refers to a point that does not exist.
     """
 
     points: Tensor
@@ -104,16 +127,16 @@ def load_points(
 ) -> PointCloud:
     """Return the points of a file, with normals, faces and colors where it has them.
 
-    Formats, told by the ending: PLY (ASCII, binary of both byte orders), PCD (ASCII, binary, binary_compressed), XYZ
-    and TXT (x y z, or x y z nx ny nz), OBJ, STL (corners at one place become one vertex), GLB and glTF (default scene,
-    world coordinates, bind pose) and NPZ (array ``points`` or the only (N, 3) array). Points keep the order and the
-    unit of the file.
+    Formats, by the ending: PLY (ASCII, binary of both byte orders), PCD (ASCII, binary, binary_compressed), XYZ and TXT
+    (x y z, or x y z nx ny nz), OBJ, STL (corners at one position become one vertex), GLB and glTF (default scene, world
+    coordinates, bind pose) and NPZ (array ``points`` or the only (N, 3) array). Points keep the order and the unit of
+    the file.
 
     Args:
         path: a local file; addresses are refused.
         nan_policy: ``"raise"`` refuses non-finite numbers; ``"omit"`` drops the points that have any, also in normals
             or colors, and the faces that use them.
-        limits: bounds on size and counts, looked at before anything is allocated.
+        limits: bounds on size and counts, checked before memory is allocated.
         dtype: torch.float32 or torch.float64; double properties keep their full precision in the latter.
 
     Returns:
@@ -129,20 +152,20 @@ def load_points(
     check_choice(nan_policy, "nan_policy", ("raise", "omit"))
     if dtype not in (torch.float32, torch.float64):
         raise InputTypeError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
-    place = local_path(path)
-    reader = _READERS.get(place.suffix.lower())
-    if reader is None:
-        place.stat()  # a missing file is the first thing to say
-        raise FormatError(f"{place} has the unknown ending {place.suffix!r}; known: {', '.join(_READERS)}")
-    content = read_bytes(place, limits)
+    file = local_path(path)
+    kind = FORMATS.get(file.suffix.lower())
+    if kind is None:
+        file.stat()  # a missing file is reported first
+        raise FormatError(f"{file} has the unknown ending {file.suffix!r}; known: {', '.join(FORMATS)}")
+    content = read_bytes(file, limits)
     try:
-        with np.errstate(all="ignore"):  # what overflows becomes infinite and is judged as that
-            return _judge(reader(content, place, limits), nan_policy, limits, dtype)
+        with np.errstate(all="ignore"):  # overflowing numbers become infinite and are treated as such
+            return _checked_cloud(kind.read(content, file, limits), nan_policy, limits, dtype)
     except FormatError as error:
-        raise FormatError(f"{place}: {error}") from error
+        raise FormatError(f"{file}: {error}") from error
     except PARSER_ERRORS as error:
-        name = place.suffix[1:].upper()
-        raise FormatError(f"{place}: cannot be read as {name} ({type(error).__name__}: {error})") from error
+        name = file.suffix[1:].upper()
+        raise FormatError(f"{file}: cannot be read as {name} ({type(error).__name__}: {error})") from error
 
 
 def load_mesh(
@@ -172,10 +195,10 @@ def load_mesh(
     return cloud.to_mesh()
 
 
-def _judge(raw: RawCloud, nan_policy: str, limits: FileLimits, dtype: torch.dtype) -> PointCloud:
+def _checked_cloud(raw: RawCloud, nan_policy: str, limits: FileLimits, dtype: torch.dtype) -> PointCloud:
     points = _rows(raw.points, "points", None, dtype)
     count = len(points)
-    check_count(count, "points", limits)
+    check_allowed(count, "points", limits)
     if count == 0:
         raise FormatError("holds no points")
     normals = None if raw.normals is None else _rows(raw.normals, "normals", count, dtype)
@@ -197,7 +220,7 @@ def _judge(raw: RawCloud, nan_policy: str, limits: FileLimits, dtype: torch.dtyp
         faces = None if faces is None else (torch.cumsum(finite, 0) - 1)[faces[finite[faces].all(dim=-1)]]
         points = points[finite]
         normals, colors = (None if values is None else values[finite] for values in (normals, colors))
-    return PointCloud(points, normals, faces, colors)
+    return PointCloud(points=points, normals=normals, faces=faces, colors=colors)
 
 
 def _rows(values: Array, what: str, count: int | None, dtype: torch.dtype) -> Tensor:
@@ -213,7 +236,7 @@ def _to_unit_range(colors: Array) -> Array:
 def _face_rows(faces: Array, count: int, limits: FileLimits) -> Tensor:
     if faces.ndim != 2 or faces.shape[1] != 3:
         raise FormatError(f"faces must have shape (F, 3), got {faces.shape}")
-    check_count(len(faces), "faces", limits)
+    check_allowed(len(faces), "faces", limits)
     if faces.size and (faces.min() < 0 or faces.max() >= count):
         wrong = int(faces.max() if faces.max() >= count else faces.min())
         raise FormatError(f"a face names vertex {wrong}, outside 0 to {count - 1}: the file is cut off or damaged")
@@ -239,28 +262,32 @@ def save_points(
 
     Raises:
         FormatError: if the path is an address or its ending is none of these.
-        InputError: if shapes do not agree, numbers are not finite or the format cannot hold what is given.
+        InputError: if shapes do not agree, numbers are not finite or the format cannot hold colors or faces.
         FileNotFoundError: if the folder does not exist.
     """
-    place = local_path(path)
-    ending = place.suffix.lower()
-    if ending not in _WRITERS:
-        raise FormatError(f"{place} has the ending {place.suffix!r}; points are written as {', '.join(_WRITERS)}")
-    for name, value, able in (("colors", colors, _HOLDS_COLORS), ("faces", faces, _HOLDS_FACES)):
+    file = local_path(path)
+    ending = file.suffix.lower()
+    writable = {known: kind for known, kind in FORMATS.items() if kind.write is not None}
+    write = None if ending not in writable else writable[ending].write
+    if write is None:
+        raise FormatError(f"{file} has the ending {file.suffix!r}; points are written as {', '.join(writable)}")
+    for name, value in (("colors", colors), ("faces", faces)):
+        able = [known for known, kind in writable.items() if getattr(kind, name)]
         if value is not None and ending not in able:
             raise InputError(f"{name} cannot be held by {ending}; use one of {', '.join(able)}")
     cloud = PointCloud(points, normals, faces, colors)
     if cloud.colors is not None and bool(((cloud.colors < 0) | (cloud.colors > 1)).any()):
         raise InputError("colors must lie between 0 and 1; divide bytes by 255")
-    write_atomic(place, _WRITERS[ending](_to_raw(cloud)))
+    write_atomic(file, write(_to_raw(cloud)))
 
 
 def _to_raw(cloud: PointCloud) -> RawCloud:
+    """Return the arrays of a cloud as they are written."""
     dtype = torch.float64 if cloud.points.dtype == torch.float64 else torch.float32
     normals, colors, faces = cloud.normals, cloud.colors, cloud.faces
     return RawCloud(
-        cloud.points.detach().cpu().to(dtype).numpy(),
-        None if normals is None else normals.detach().cpu().to(dtype).numpy(),
-        None if colors is None else (colors.detach().cpu().double() * 255).round().to(torch.uint8).numpy(),
-        None if faces is None else faces.cpu().numpy(),
+        points=cloud.points.detach().cpu().to(dtype).numpy(),
+        normals=None if normals is None else normals.detach().cpu().to(dtype).numpy(),
+        colors=None if colors is None else (colors.detach().cpu().double() * 255).round().to(torch.uint8).numpy(),
+        faces=None if faces is None else faces.cpu().numpy(),
     )

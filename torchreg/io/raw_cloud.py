@@ -1,4 +1,7 @@
-"""What the readers of single formats hand over: numpy arrays as they stood in the file, not yet judged."""
+"""Unchecked numpy arrays of a file: the result of the readers of single formats.
+
+Readers raise FormatError without the name of the file, which their callers add.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,6 @@ from numpy.typing import NDArray
 from torchreg.errors import FormatError
 
 Array = NDArray[Any]
-
-# Beyond this, float64 no longer holds every integer.
-_LARGEST_EXACT = 2**53
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,8 @@ def parse_table(lines: Sequence[bytes], columns: int | None, what: str) -> Array
 
     Args:
         lines: non-blank lines.
-        columns: how many numbers each line must hold; None takes what the first holds.
+        columns: numbers per line; None takes the number of the first line.
         what: name of a row, for messages.
-
-    Raises:
-        FormatError: if a line holds another count of numbers, or something else.
     """
     if not lines:
         return np.zeros((0, columns or 0))
@@ -65,17 +62,18 @@ def as_indices(values: Array, what: str) -> Array:
             raise FormatError(f"{what} must be whole numbers")
     elif values.dtype.kind not in "iu":
         raise FormatError(f"{what} must be whole numbers, got {values.dtype}")
-    if values.size and (values.max() >= _LARGEST_EXACT or values.min() <= -_LARGEST_EXACT):
+    exact = 2 / np.finfo(np.float64).eps  # beyond this, float64 does not hold every integer
+    if values.size and (values.max() >= exact or values.min() <= -exact):
         raise FormatError(f"{what} are out of range")
     return values.astype(np.int64)
 
 
 def as_integers(values: Array, kind: str, what: str) -> Array:
     """Return whole numbers read as text in the integer type ``kind``; FormatError unless they fit."""
-    whole, bounds = as_indices(values, what), np.iinfo(kind)
-    if whole.size and (whole.min() < bounds.min or whole.max() > bounds.max):
+    integers, bounds = as_indices(values, what), np.iinfo(kind)
+    if integers.size and (integers.min() < bounds.min or integers.max() > bounds.max):
         raise FormatError(f"{what} must lie between {bounds.min} and {bounds.max}")
-    return whole.astype(kind)
+    return integers.astype(kind)
 
 
 def stack_columns(columns: dict[str, Array], names: Sequence[str]) -> Array | None:
@@ -91,9 +89,6 @@ def fan_triangles(counts: Array, indices: Array) -> Array:
     Args:
         counts: (P,) corners of each polygon, int64.
         indices: (sum of counts,) vertex indices of all polygons, one after the other.
-
-    Raises:
-        FormatError: if a polygon has fewer than three corners.
     """
     if counts.size and counts.min() < 3:
         raise FormatError(f"a face must have at least 3 corners, got {int(counts.min())}")

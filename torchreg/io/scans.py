@@ -22,19 +22,19 @@ def load_scan(
     limits: FileLimits = DEFAULT_LIMITS,
     dtype: torch.dtype = torch.float32,
 ) -> RangeScan:
-    """Return the range scan that a file holds, with its faces and normals where it has them.
+    """Return the range scan of a file, with its faces and normals where it has them.
 
-    Points keep the order and the unit of the file. What it does not hold is computed, see `RangeScan`.
+    Points keep the order and the unit of the file. Missing normals and boundaries are computed, see `RangeScan`.
 
     Args:
         path: a local file; see `load_points` for the formats.
-        viewpoint: (3,) where the camera was, in the unit of the file; None if that is not known.
-        nan_policy: see `load_points`; ``"omit"`` drops what a scanner writes where it measured nothing.
+        viewpoint: (3,) position of the camera, in the unit of the file; None if unknown.
+        nan_policy: see `load_points`; ``"omit"`` drops the points of rays that measured nothing.
         limits: see `load_points`.
         dtype: torch.float32 or torch.float64.
 
     Returns:
-        the scan, on the CPU.
+        The scan, on the CPU.
 
     Raises:
         FormatError: if there are too few points for a surface, and as `load_points`; names the file.

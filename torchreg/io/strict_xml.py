@@ -6,11 +6,12 @@ import xml.etree.ElementTree as ET
 
 from torchreg.errors import FormatError
 
+# Elements within each other in any honest robot description are far fewer.
 _MAX_DEPTH = 64
 
 
 class _StrictBuilder(ET.TreeBuilder):
-    """Builds the element tree, but refuses document types (which bring entities) and absurd nesting."""
+    """A builder of the element tree that refuses document types (which bring entities) and absurd nesting."""
 
     depth = 0
 
@@ -31,11 +32,7 @@ class _StrictBuilder(ET.TreeBuilder):
 
 
 def parse_xml(content: bytes) -> ET.Element:
-    """Return the outermost element of a document.
-
-    Raises:
-        FormatError: if it is not well-formed, declares a document type, or nests more than 64 deep.
-    """
+    """Return the outermost element of a document."""
     parser = ET.XMLParser(target=_StrictBuilder())
     try:
         # Blank lines before the declaration are common, harmless, and an error to the parser.

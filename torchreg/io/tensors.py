@@ -27,10 +27,10 @@ _NON_FINITE = "$float"
 
 
 def save_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], metadata: Mapping[str, Any]) -> None:
-    """Write tensors to ``path`` and what describes them to a JSON file of the same stem.
+    """Write tensors to ``path``, and their description and metadata to a JSON file of the same stem.
 
     Each file appears whole or not at all. The JSON file is written last and holds the checksum of the other, so a crash
-    between the two is noticed when they are loaded.
+    between the two is detected when they are loaded.
 
     Args:
         path: a local file ending in .safetensors; an existing pair is replaced.
@@ -40,11 +40,11 @@ def save_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], me
 
     Raises:
         InputError: if the ending is another, or a metadata key is reserved.
-        InputTypeError: if a value is not a tensor, or metadata holds something else; names where.
+        InputTypeError: if a value is not a tensor, or metadata holds another type; names the entry.
         FormatError: if the path is an address.
         FileNotFoundError: if the folder does not exist.
     """
-    place, described_by = _pair(path)
+    file, description = _pair(path)
     stored = dict[str, Tensor]()
     for name, value in tensors.items():
         if not isinstance(name, str) or not isinstance(value, Tensor):
@@ -65,14 +65,14 @@ def save_tensors(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], me
         "tensors": {name: _describe(value) for name, value in stored.items()},
         "metadata": plain,
     }
-    write_atomic(place, content)
-    write_atomic(described_by, (json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode())
+    write_atomic(file, content)
+    write_atomic(description, (json.dumps(record, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode())
 
 
 def load_tensors(
     path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Return what ``save_tensors`` wrote: the tensors by name, on the CPU, and the metadata.
+    """Return the tensors of a file by name, on the CPU, and the metadata that `save_tensors` wrote with them.
 
     Args:
         path: the .safetensors file; its JSON file must lie beside it.
@@ -83,30 +83,30 @@ def load_tensors(
         FormatError: if the JSON file is missing, either is damaged, or the two do not belong together; names the file.
         InputError: if the ending is another.
     """
-    place, described_by = _pair(path)
-    content = read_bytes(place, limits)
+    file, description = _pair(path)
+    content = read_bytes(file, limits)
     try:
-        text = read_bytes(described_by, limits)
+        text = read_bytes(description, limits)
     except FileNotFoundError as error:
-        raise FormatError(f"{place}: the file {described_by.name} must lie beside it; copy both together") from error
-    record = _read_record(text, described_by)
+        raise FormatError(f"{file}: the file {description.name} must lie beside it; copy both together") from error
+    record = _read_record(text, description)
     if hashlib.sha256(content).hexdigest() != record["sha256"]:
-        raise FormatError(f"{place}: is damaged, or is not the file that {described_by.name} describes")
+        raise FormatError(f"{file}: is damaged, or is not the file that {description.name} describes")
     try:
         tensors = safetensors.torch.load(content)
     except (safetensors.SafetensorError, ValueError, LookupError, TypeError, OverflowError) as error:
-        raise FormatError(f"{place}: cannot be read as safetensors ({error})") from error
+        raise FormatError(f"{file}: cannot be read as safetensors ({error})") from error
     if {name: _describe(value) for name, value in tensors.items()} != record["tensors"]:
-        raise FormatError(f"{place}: its tensors are not those that {described_by.name} lists")
+        raise FormatError(f"{file}: its tensors are not those that {description.name} lists")
     # The order of the JSON file is that in which they were saved.
     return {name: tensors[name] for name in record["tensors"]}, _decode(record["metadata"])
 
 
 def _pair(path: str | os.PathLike[str]) -> tuple[Path, Path]:
-    place = local_path(path)
-    if place.suffix != _SUFFIX:
-        raise InputError(f"path must end in {_SUFFIX}, got {str(place)!r}")
-    return place, place.with_suffix(".json")
+    file = local_path(path)
+    if file.suffix != _SUFFIX:
+        raise InputError(f"path must end in {_SUFFIX}, got {str(file)!r}")
+    return file, file.with_suffix(".json")
 
 
 def _describe(value: Tensor) -> dict[str, Any]:

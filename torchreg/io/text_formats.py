@@ -7,7 +7,7 @@ import re
 import numpy as np
 
 from torchreg.errors import FormatError
-from torchreg.io.limits import FileLimits, check_count
+from torchreg.io.limits import FileLimits, check_allowed
 from torchreg.io.raw_cloud import Array, RawCloud, as_indices, fan_triangles, parse_table
 
 _COMMENT = re.compile(rb"(#|//).*$")
@@ -17,13 +17,10 @@ _SEPARATORS = bytes.maketrans(b",;", b"  ")
 def read_xyz(content: bytes, limits: FileLimits) -> RawCloud:
     """Return the points of a table with the columns x y z or x y z nx ny nz.
 
-    Columns are separated by blanks, commas or semicolons; ``#`` and ``//`` begin comments; a first line of column names
-    or one that holds the number of points alone is understood.
-
-    Raises:
-        FormatError: if rows differ in length, the count does not agree, or columns 4 to 6 cannot be unit normals.
+    Columns are separated by blanks, commas or semicolons; ``#`` and ``//`` begin comments; the first line may hold
+    column names, or the number of points alone.
     """
-    check_count(0 if content.isspace() else content.count(b"\n"), "points", limits)
+    check_allowed(0 if content.isspace() else content.count(b"\n"), "points", limits)
     commented = b"#" in content or b"//" in content
     lines = content.translate(_SEPARATORS).splitlines()
     lines = [line for line in (_COMMENT.sub(b"", line) if commented else line for line in lines) if line.strip()]
@@ -60,7 +57,7 @@ def _check_names(line: bytes) -> None:
 
 
 def write_xyz(cloud: RawCloud) -> bytes:
-    """Return a text table of x y z (nx ny nz) with as many digits as the precision holds."""
+    """Return a text table of x y z (nx ny nz) with all digits of the precision."""
     table = cloud.points if cloud.normals is None else np.concatenate((cloud.points, cloud.normals), axis=-1)
     digits = 9 if table.dtype.itemsize <= 4 else 17
     row = " ".join([f"%.{digits}g"] * table.shape[1])
@@ -68,13 +65,10 @@ def write_xyz(cloud: RawCloud) -> bytes:
 
 
 def read_obj(content: bytes, limits: FileLimits) -> RawCloud:
-    """Return the vertices and faces of an OBJ file, in the file's order and numbering; materials are not looked at.
+    """Return the vertices and faces of an OBJ file, in the file's order and numbering, without materials.
 
-    Vertex colors behind the coordinates are read; normals when each vertex has exactly its own. Polygons are cut into
-    fans.
-
-    Raises:
-        FormatError: if a line is damaged or a face names a vertex that does not exist.
+    Vertex colors after the coordinates are read, and normals if every vertex has exactly one, of its own number.
+    Polygons are cut into fans.
     """
     content = content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
     vertices, normals, corners = list[bytes](), list[bytes](), list[bytes]()
@@ -90,8 +84,8 @@ def read_obj(content: bytes, limits: FileLimits) -> RawCloud:
             corners += words
             sizes.append(len(words))
             seen.append((len(vertices), len(normals)))
-    check_count(len(vertices), "points", limits)
-    check_count(len(sizes), "faces", limits)
+    check_allowed(len(vertices), "points", limits)
+    check_allowed(len(sizes), "faces", limits)
     table = parse_table(vertices, None, "vertex")
     if len(table) and table.shape[1] not in (3, 4, 6, 7):
         raise FormatError(f"a vertex must be 3 numbers (with w 4, with a color 6 or 7), got {table.shape[1]}")
@@ -99,16 +93,17 @@ def read_obj(content: bytes, limits: FileLimits) -> RawCloud:
     counts = np.array(sizes, dtype=np.int64)
     before = np.repeat(np.array(seen, dtype=np.int64).reshape(-1, 2), counts, axis=0)
     indices = _resolve([corner.partition(b"/")[0] for corner in corners], before[:, 0], len(table), "vertex")
-    own_normals = None
+    vertex_normals = None
     if normals and len(normals) == len(table):
         named = [corner.split(b"/")[2] if corner.count(b"/") == 2 else b"" for corner in corners]
         if all(named) and np.array_equal(_resolve(named, before[:, 1], len(normals), "normal"), indices):
-            own_normals = parse_table(normals, 3, "normal")
-    return RawCloud(table[:, :3].reshape(-1, 3), own_normals, colors, fan_triangles(counts, indices) if sizes else None)
+            vertex_normals = parse_table(normals, 3, "normal")
+    faces = fan_triangles(counts, indices) if sizes else None
+    return RawCloud(table[:, :3].reshape(-1, 3), vertex_normals, colors, faces)
 
 
 def _resolve(words: list[bytes], before: Array, count: int, what: str) -> Array:
-    """Return 0-based indices; negative numbers count back from what stood before the line."""
+    """Return 0-based indices; negative numbers count back from the items before the line."""
     if not words:
         return np.zeros(0, dtype=np.int64)
     values = as_indices(parse_table(words, 1, f"{what} index")[:, 0], f"{what} indices")

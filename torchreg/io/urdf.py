@@ -15,12 +15,10 @@ from torchreg._checks import check_choice
 from torchreg.errors import FormatError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh, concatenate
-from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_count, local_path, read_bytes
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, read_bytes
 from torchreg.io.mesh_files import MeshFiles
 from torchreg.io.strict_xml import parse_xml
 
-_MAX_LINKS = 2000
-_MAX_URDF_BYTES = 64 * 1024**2
 _KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": "fixed"}
 # Attributes of each kind of solid, with the count of their numbers.
 _PRIMITIVES = {
@@ -29,6 +27,17 @@ _PRIMITIVES = {
     "capsule": {"radius": 1, "length": 1},
     "sphere": {"radius": 1},
 }
+
+
+@dataclass(frozen=True)
+class _UrdfLimits:
+    """Largest descriptions that are read."""
+
+    max_links: int = 2000
+    max_bytes: int = 64 * 1024**2  # of XML
+
+
+_LIMITS = _UrdfLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +58,11 @@ class UrdfPrimitive:
 
 @dataclass(frozen=True, eq=False)
 class UrdfRecord:
-    """A robot as its file describes it: one frame per link, metres and radians.
+    """A robot description: one frame per link, metres and radians.
 
     Args:
         name: name of the robot.
-        tree: one frame per link; a frame is called like the joint that carries it, the root like its link.
+        tree: one frame per link; a frame has the name of its joint with the parent, the root that of its link.
         link_names: names of the links, in the order of ``tree.joints``.
         link_meshes: mesh in link coordinates, float64, or None; visual geometry, else collision geometry.
         link_primitives: boxes, cylinders, capsules and spheres of the same geometry.
@@ -86,7 +95,7 @@ def load_urdf(
         limits: largest sizes accepted; a robot may have 2000 links.
 
     Returns:
-        The robot. Where a link has no readable visual geometry, its collision geometry stands in.
+        The robot. A link without readable visual geometry has its collision geometry.
 
     Raises:
         FormatError: if the XML or a mesh is damaged, oversized, unexpanded xacro, or a mesh file is missing.
@@ -112,8 +121,8 @@ def load_urdf(
 
 def _parse(path: Path, limits: FileLimits) -> ET.Element:
     content = read_bytes(path, limits)
-    if len(content) > _MAX_URDF_BYTES:
-        raise FormatError(f"{path}: {len(content)} bytes of XML, at most {_MAX_URDF_BYTES} are read")
+    if len(content) > _LIMITS.max_bytes:
+        raise FormatError(f"{path}: {len(content)} bytes of XML, at most {_LIMITS.max_bytes} are read")
     expand = f"{path}: holds xacro macros; expand them first with `xacro {path.name} > robot.urdf`"
     try:
         robot = parse_xml(content)
@@ -138,8 +147,8 @@ def _named(path: Path, robot: ET.Element, tag: str) -> dict[str, ET.Element]:
         if name in found:
             raise ModelError(f"{path}: two {tag}s are called {name!r}; names must be unique")
         found[name] = element
-    if tag == "link" and not 0 < len(found) <= _MAX_LINKS:
-        raise ModelError(f"{path}: a robot must have 1 to {_MAX_LINKS} links, got {len(found)}")
+    if tag == "link" and not 0 < len(found) <= _LIMITS.max_links:
+        raise ModelError(f"{path}: a robot must have 1 to {_LIMITS.max_links} links, got {len(found)}")
     return found
 
 
@@ -184,7 +193,7 @@ def _link_of(path: Path, joint: ET.Element, name: str, role: str, links: Mapping
 def _build_tree(
     path: Path, order: Sequence[tuple[str, tuple[str, int] | None]], joints: Mapping[str, ET.Element]
 ) -> KinematicTree:
-    index = {carrier[0]: place for place, (_, carrier) in enumerate(order) if carrier is not None}
+    index = {carrier[0]: number for number, (_, carrier) in enumerate(order) if carrier is not None}
     root = order[0][0]
     frames = [Joint(f"{root}_root" if root in joints else root, -1, torch.eye(4, dtype=torch.float64))]
     for _, carrier in order[1:]:
@@ -233,7 +242,7 @@ def _limits(element: ET.Element, what: str) -> tuple[float, float]:
     given = None if limit is None else (limit.get("lower"), limit.get("upper"))
     if element.get("type") == "continuous" or given is None or given == (None, None):
         return -math.inf, math.inf
-    # One bound alone: the other one is zero by the format's definition.
+    # A missing bound is zero by the format's definition.
     return _floats(limit, "lower", 1, (0.0,), what)[0], _floats(limit, "upper", 1, (0.0,), what)[0]
 
 
@@ -241,9 +250,9 @@ def _mimic(
     path: Path, name: str, joints: Mapping[str, ET.Element], index: Mapping[str, int]
 ) -> tuple[int, float, float] | None:
     """Return (followed frame, multiplier, offset), through chains of mimic joints to the one that moves by itself."""
-    multiplier, offset, at, seen = 1.0, 0.0, name, {name}
-    while (mimic := joints[at].find("mimic")) is not None:
-        what = f"{path}: joint {at!r}"
+    multiplier, offset, leader, seen = 1.0, 0.0, name, {name}
+    while (mimic := joints[leader].find("mimic")) is not None:
+        what = f"{path}: joint {leader!r}"
         target = mimic.get("joint")
         if target is None or target not in joints:
             raise ModelError(f"{what} mimics joint {target!r}, which the file does not define")
@@ -253,9 +262,9 @@ def _mimic(
             raise ModelError(f"{what} mimics joint {target!r}, which is fixed")
         offset += multiplier * _floats(mimic, "offset", 1, (0.0,), what)[0]
         multiplier *= _floats(mimic, "multiplier", 1, (1.0,), what)[0]
-        at = target
+        leader = target
         seen.add(target)
-    return None if at == name else (index[at], multiplier, offset)
+    return None if leader == name else (index[leader], multiplier, offset)
 
 
 def _floats(
@@ -331,7 +340,7 @@ class _Geometry:
             return []
         self._total += mesh.num_vertices
         try:
-            check_count(self._total, "vertices", self._limits)
+            check_allowed(self._total, "vertices", self._limits)
         except FormatError as error:
             raise FormatError(f"{what}: with this mesh the robot {error}") from error
         vertices = (mesh.vertices * scale) @ origin[:3, :3].mT + origin[:3, 3]

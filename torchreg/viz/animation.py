@@ -1,4 +1,4 @@
-"""Moving pictures, animated GIFs or MP4s, of shapes that follow clouds."""
+"""Moving pictures of shapes that follow clouds, as animated GIF or MP4."""
 
 from __future__ import annotations
 
@@ -28,11 +28,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 ANIMATION_ENDINGS = (".gif", ".mp4")
-# Tones of a color channel that are kept: GIFs compress runs of equal pixels.
-_TONES = 32
-# Poses that decide about the common view.
-_VIEW_POSES = 32
-_POINT_SIZE = 2.8
+# Diameter of data points in moving pictures, points (1/72 inch).
+MOVIE_POINT_SIZE = 2.8
 
 Frame = Callable[["Axes"], object] | NDArray[Any] | Tensor
 
@@ -48,16 +45,12 @@ def save_animation(
     """Return the path of a moving picture: an animated GIF that plays in a loop, or an MP4.
 
     Args:
-        path: where to write; the suffix must be .gif or .mp4, for which the program ffmpeg must be installed. The file
-            is written whole or not at all; an interruption by the keyboard leaves the frames drawn so far in it.
-        frames: pictures (H, W, 3) of one size, uint8 or in [0, 1], or functions that draw on the matplotlib axes they
-            are given.
+        path: to write; the suffix must be .gif or .mp4, for which the program ffmpeg must be installed. The file is
+            written whole or not at all; an interruption by the keyboard leaves the frames drawn so far in it.
+        frames: pictures (H, W, 3) of one size, uint8 or in [0, 1], or functions that draw on given matplotlib axes.
         fps: frames per second; GIF rounds the time of a frame to 0.01 s.
         size: width and height of frames that are functions, pixels.
-        on_frame: is told (frames done, all frames) after each.
-
-    Returns:
-        The path written.
+        on_frame: called with (frames done, all frames) after each.
 
     Raises:
         InputError: if there are no frames, sizes differ, or the suffix is another.
@@ -89,7 +82,7 @@ def save_animation(
                 if on_frame is not None:
                     on_frame(grabbed, len(frames))
         except BaseException as error:
-            # An encoder outside of this process is told to end in any case.
+            # An encoder outside of this process must end in any case.
             with contextlib.suppress(subprocess.CalledProcessError, IndexError):
                 writer.finish()
                 if isinstance(error, KeyboardInterrupt) and grabbed:
@@ -117,20 +110,17 @@ def animate_alignment(
     """Return the path of a moving picture of a shape that follows clouds.
 
     Args:
-        path: where to write; see `save_animation`.
+        path: to write; see `save_animation`.
         shape: the articulated shape.
         poses: (T, num_dofs), one per frame.
         clouds: T clouds (M, 3), metres.
         inliers: T masks (M,) bool; all by default.
         fps: frames per second.
         skin: the surface to draw, with faces; by default a coarse one.
-        camera: (3,) position, see `watch`; it stays where it is.
+        camera: (3,) position in all frames, see `watch`.
         up: (3,) see `watch`.
         size: width and height, pixels.
-        on_frame: is told (frames done, all frames) after each.
-
-    Returns:
-        The path written.
+        on_frame: called with (frames done, all frames) after each.
 
     Raises:
         InputError: if the numbers of poses, clouds and masks differ, or as for `save_animation`.
@@ -150,7 +140,7 @@ def animate_alignment(
     def draw(index: int) -> Callable[[Axes], object]:
         mask = None if inliers is None else inliers[index]
         return lambda ax: draw_alignment(
-            ax, shape, poses[index], clouds[index], mask, skin=surface, view=view, point_size=_POINT_SIZE
+            ax, shape, poses[index], clouds[index], mask, skin=surface, view=view, point_size=MOVIE_POINT_SIZE
         )
 
     return save_animation(path, [draw(index) for index in range(len(clouds))], fps, size=size, on_frame=on_frame)
@@ -164,18 +154,19 @@ def common_view(
     size: tuple[int, int] = (360, 360),
 ) -> View:
     """Return the view that shows a surface in all poses (T, num_dofs); see `watch`."""
-    few = poses[:: max(1, len(poses) // _VIEW_POSES)]
+    sample = poses[:: max(1, len(poses) // 32)]  # enough poses for the bounds
     with torch.no_grad():
-        points = torch.cat([skin(pose) for pose in few]).cpu()
+        points = torch.cat([skin(pose) for pose in sample]).cpu()
     return watch(points, camera=camera, up=up, size=size, margin=0.1)
 
 
 def coarse_skin(shape: ArticulatedShape) -> LinearBlendSkin:
-    """Return the surface of a shape with a grid of 1.5 fusion lengths, which small pictures cannot tell from finer."""
+    """Return the surface of a shape on a grid of 1.5 fusion lengths, fine enough for small pictures."""
     return surface_skin(shape, spacing=None if shape.surface is not None else 1.5 * shape.nu)
 
 
 def _picture(frame: Frame, size: tuple[int, int], index: int) -> NDArray[np.uint8]:
+    """Return the picture (H, W, 3) of a frame."""
     if callable(frame):
         figure, (ax,) = new_figure(*size)
         frame(ax)
@@ -193,12 +184,13 @@ def _picture(frame: Frame, size: tuple[int, int], index: int) -> NDArray[np.uint
 
 
 def _few_tones(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    step = 255 / (_TONES - 1)
+    """Return a picture with 32 tones per channel: GIFs compress runs of equal pixels."""
+    step = 255 / 31
     return np.round(np.round(picture / step) * step).astype(np.uint8)
 
 
 def check_animation_path(path: str | Path) -> Path:
-    """Return the path if a moving picture can be written there; raises what `save_animation` raises, but earlier."""
+    """Return the path of a moving picture; raises the errors of `save_animation` about it, before frames are drawn."""
     path = Path(path)
     if path.suffix.lower() not in ANIMATION_ENDINGS:
         raise InputError(f"path must end in .gif or .mp4, got {path.name!r}; rename the output file")

@@ -35,7 +35,7 @@ def to_trimesh(value: Any, frame: int = 0) -> Any:
 
     Raises:
         InputError: if there is no such frame.
-        InputTypeError: if ``value`` is something else.
+        InputTypeError: if ``value`` has another type.
     """
     import trimesh
 
@@ -52,11 +52,11 @@ def to_trimesh(value: Any, frame: int = 0) -> Any:
 
 
 def to_open3d(value: Any, frame: int = 0) -> Any:
-    """Return an Open3D ``TriangleMesh``, ``PointCloud`` or ``LineSet``; see `to_trimesh` for what of.
+    """Return an Open3D ``TriangleMesh``, ``PointCloud`` or ``LineSet`` of a value that `to_trimesh` takes.
 
     Raises:
         InputError: if there is no such frame.
-        InputTypeError: if ``value`` is something else.
+        InputTypeError: if ``value`` has another type.
         MissingExtraError: if Open3D is not installed.
     """
     open3d = _extra("open3d")
@@ -82,11 +82,11 @@ def to_open3d(value: Any, frame: int = 0) -> Any:
 
 
 def to_pyvista(value: Any, frame: int = 0) -> Any:
-    """Return a PyVista ``PolyData``, colors as its array ``rgb``; see `to_trimesh` for what of.
+    """Return a PyVista ``PolyData``, colors as its array ``rgb``, of a value that `to_trimesh` takes.
 
     Raises:
         InputError: if there is no such frame.
-        InputTypeError: if ``value`` is something else.
+        InputTypeError: if ``value`` has another type.
         MissingExtraError: if PyVista is not installed.
     """
     pyvista = _extra("pyvista")
@@ -113,7 +113,7 @@ def _extra(name: str) -> Any:
 
 
 def _cloud(value: Any, frame: int) -> PointCloud:
-    """Return points, and triangles, normals, colors where there are some."""
+    """Return points, with triangles, normals and colors where the value has them."""
     if isinstance(value, PointCloud):
         return value
     if isinstance(value, TriangleMesh):
@@ -137,7 +137,7 @@ def _cloud(value: Any, frame: int) -> PointCloud:
 
 
 def _lines(value: Any, frame: int) -> tuple[Array, Array, Array] | None:
-    """Return points (N, 3), edges (E, 2) and their colors (E, 4) of curves; None of anything else."""
+    """Return points (N, 3), edges (E, 2) and their colors (E, 4) of curves; None of other values."""
     if isinstance(value, Skeleton):
         edges = value.edges
         color = torch.tensor([0.2, 0.2, 0.25]).expand(len(edges), 3)
@@ -172,6 +172,6 @@ def _opaque(colors: Tensor) -> Array:
 
 
 def _counted(rows: Tensor | Array) -> Array:
-    """Return the flat form of VTK: how many corners, then the corners, of each cell."""
+    """Return cells in the flat form of VTK: the number of corners, then the corners, of each."""
     array = _array(rows) if isinstance(rows, Tensor) else rows
     return np.insert(array, 0, array.shape[1], axis=1).reshape(-1)

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_positive, check_shape
-from torchreg.datasets.hand import surface_skin
-from torchreg.errors import InputError
+from torchreg.datasets.hand import faces_of, surface_skin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.io.gltf_write import save_animated_skin
 from torchreg.shapes.articulated import ArticulatedShape
@@ -28,18 +27,15 @@ def save_shape_animation(
     """Return the path of a .glb file in which the shape's skinned surface moves through poses.
 
     Each part becomes a joint; its bending weights become the weights of the file's skin, so that a viewer shows exactly
-    what the skin gives in each pose.
+    the vertices of the skin in each pose.
 
     Args:
-        path: where to write; the suffix must be .glb.
+        path: to write; the suffix must be .glb.
         shape: the articulated shape.
         poses: (T, num_dofs), one per frame.
         times: (T,) seconds, not negative, strictly increasing; one frame every 1 / fps by default.
         fps: frames per second where no times are given.
         skin: the surface, with faces; by default `surface_skin`, which is made anew at every call.
-
-    Returns:
-        The path written.
 
     Raises:
         InputError: if sizes do not fit, the suffix is not .glb or the skin has no faces.
@@ -50,21 +46,19 @@ def save_shape_animation(
     seconds = torch.arange(len(poses), dtype=torch.float64) / fps if times is None else as_float_tensor(times, "times")
     check_shape(seconds, "times", (len(poses),))
     skin = surface_skin(shape) if skin is None else skin
-    if skin.faces is None:
-        raise InputError("skin must have faces to be written; make it with surface_skin(shape)")
+    faces = faces_of(skin)
     with torch.no_grad():
         moving = shape.part_transforms(poses)
         rest = shape.part_transforms(skin.reference_pose)
-    normals = TriangleMesh(skin.points, skin.faces).vertex_normals()
     return save_animated_skin(
         path,
-        skin.points,
-        skin.faces,
-        skin.weights,
-        shape.part_names,
-        shape.part_parents,
-        rest,
-        moving,
-        seconds,
-        normals,
+        vertices=skin.points,
+        faces=faces,
+        weights=skin.weights,
+        joint_names=shape.part_names,
+        parents=shape.part_parents,
+        rest_transforms=rest,
+        joint_transforms=moving,
+        times=seconds,
+        normals=TriangleMesh(skin.points, faces).vertex_normals(),
     )

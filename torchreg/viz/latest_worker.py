@@ -1,4 +1,4 @@
-"""A thread that does the newest work alone: what arrives while it is busy replaces what waits."""
+"""A thread that works on the newest values alone: values that arrive while it is busy replace waiting ones."""
 
 from __future__ import annotations
 
@@ -11,20 +11,18 @@ from typing import Generic, TypeVar
 
 from torchreg.errors import TorchregError
 
-_REMEMBERED = 1000
-
 Key = TypeVar("Key", bound=Hashable)
 Value = TypeVar("Value")
 
 
 class LatestWorker(Generic[Key, Value]):
-    """Calls ``work`` with the newest value of every key that has changed since the last call, on a thread of its own.
+    """A thread that calls ``work`` with the newest value of every key that has changed since the last call.
 
-    Whoever submits never waits: a mouse that moves faster than poses are solved makes no queue.
+    Submitting never waits: a mouse that moves faster than poses are solved makes no queue.
 
     Args:
-        work: is called with {key: newest value}; an error of torchreg that it raises is given to ``on_error``.
-        on_error: what to do with such an error.
+        work: called with {key: newest value}.
+        on_error: called with errors of torchreg that ``work`` raises.
         name: of the thread.
     """
 
@@ -38,19 +36,13 @@ class LatestWorker(Generic[Key, Value]):
         self._condition = threading.Condition()
         self._waiting: dict[Key, Value] = {}
         self._busy, self._closed = False, False
-        self._seconds: deque[float] = deque(maxlen=_REMEMBERED)
-        self._num_submitted = 0
+        self._seconds: deque[float] = deque(maxlen=1000)
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
     @property
-    def num_submitted(self) -> int:
-        """How many values have been submitted."""
-        return self._num_submitted
-
-    @property
     def seconds(self) -> tuple[float, ...]:
-        """How long the last calls took, oldest first."""
+        """Durations of the last 1,000 calls, oldest first."""
         with self._condition:
             return tuple(self._seconds)
 
@@ -60,27 +52,26 @@ class LatestWorker(Generic[Key, Value]):
         return statistics.median(self.seconds or (float("nan"),))
 
     def submit(self, key: Key, value: Value) -> None:
-        """Let the work be done for a value, unless a newer one of the same key comes first, or it was closed."""
+        """Ask for work on a value; a newer value of the same key replaces it, and nothing happens after `close`."""
         with self._condition:
             if self._closed:
                 return
             self._waiting[key] = value
-            self._num_submitted += 1
             self._condition.notify_all()
 
     def drop(self) -> None:
-        """Forget what waits, and return once nothing is being done."""
+        """Drop waiting values, and return once the running call is done."""
         with self._condition:
             self._waiting.clear()
             self._condition.wait_for(lambda: not self._busy)
 
     def flush(self, timeout: float | None = None) -> bool:
-        """Return once all is done; False if that took longer than ``timeout`` seconds."""
+        """Return once all values are worked on; False if that took longer than ``timeout`` seconds."""
         with self._condition:
             return self._condition.wait_for(lambda: not self._busy and not self._waiting, timeout)
 
     def close(self) -> None:
-        """End the thread, once what is being done is done."""
+        """End the thread, once the running call is done."""
         with self._condition:
             self._closed = True
             self._waiting.clear()

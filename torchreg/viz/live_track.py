@@ -1,4 +1,4 @@
-"""A tracker in the browser while it runs: every frame is shown as soon as it is done."""
+"""A running tracker in the browser: every frame is shown when it is done."""
 
 from __future__ import annotations
 
@@ -8,21 +8,18 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchreg.errors import InputError
+from torchreg.datasets.hand import faces_of
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.tracking.results import FrameResult
 from torchreg.viz.figures import SKIN_COLOR
 from torchreg.viz.result_scenes import inlier_paint
-from torchreg.viz.scene import Cloud, Layer, Scene, Surface
-from torchreg.viz.tracking import frame_label
+from torchreg.viz.scene import Cloud, Layer, MovingMesh, Scene
+from torchreg.viz.tracking import PREDICTED_COLOR, frame_label
 from torchreg.viz.viser_nodes import as_bytes, as_floats
 from torchreg.viz.viser_server import page_url, point_camera, start_server, stop_server
 
 if TYPE_CHECKING:
     import viser
-
-# A pose that no data support is drawn in gray.
-_HELD = (0.72, 0.73, 0.76)
 
 
 class LiveTrack:
@@ -30,17 +27,11 @@ class LiveTrack:
 
     Args:
         skin: the surface to draw, with faces.
-        port: where to listen on 127.0.0.1; where it is taken, a later one.
-
-    Raises:
-        InputError: if the skin has no faces.
-        MissingExtraError: if viser is not installed.
+        port: to listen on at 127.0.0.1, or a later one if it is taken.
     """
 
     def __init__(self, skin: LinearBlendSkin, *, port: int = 8080) -> None:
-        if skin.faces is None:
-            raise InputError("skin must have faces to be shown; make it with surface_skin(shape)")
-        self._skin, self._faces = skin, skin.faces.cpu()
+        self._skin, self._faces = skin, faces_of(skin).cpu()
         self.server = start_server("torchreg track", port)
         self._label = self.server.gui.add_markdown("waiting for the first frame")
         self._surface: viser.MeshHandle | None = None
@@ -48,13 +39,13 @@ class LiveTrack:
 
     @property
     def url(self) -> str:
-        """Where a browser on this machine finds it."""
+        """Address for a browser on this machine."""
         return page_url(self.server)
 
     def show(self, points: Tensor, frame: FrameResult) -> None:
-        """Show a frame: the data (M, 3) and what the tracker made of them.
+        """Show a frame: the data (M, 3) and the tracker's result for them.
 
-        The camera stays where the first frame with anything in it put it.
+        The camera is placed by the first frame that is not empty.
         """
         known = points.isfinite().all(-1).cpu()
         data = points.detach().cpu()[known]
@@ -86,10 +77,10 @@ class LiveTrack:
         self.close()
 
     def _begin(self, data: Tensor, paint: Tensor, vertices: Tensor | None) -> None:
-        """Draw the first frame that has anything in it and let the camera see it."""
+        """Draw the first frame that is not empty, and point the camera at it."""
         layers: list[Layer] = [Cloud("data", [data], [paint])]
         if vertices is not None:
-            layers.append(Surface("shape", vertices, self._faces))
+            layers.append(MovingMesh("shape", vertices, self._faces))
         scene = Scene("track", tuple(layers))
         self._cloud = self.server.scene.add_point_cloud(
             "/data", as_floats(data), as_floats(paint), point_size=0.006 * scene.diagonal, point_shape="circle",
@@ -107,5 +98,5 @@ class LiveTrack:
             self._surface.visible = vertices is not None
             if vertices is not None:
                 self._surface.vertices = as_floats(vertices)
-                red, green, blue = SKIN_COLOR if usable else _HELD
+                red, green, blue = SKIN_COLOR if usable else PREDICTED_COLOR
                 self._surface.color = round(255 * red), round(255 * green), round(255 * blue)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -15,39 +16,45 @@ from torchreg.errors import TorchregError
 from torchreg.viz.latest_worker import LatestWorker
 from torchreg.viz.picking import pick_vertex
 from torchreg.viz.pose_editor import PoseEditor
-from torchreg.viz.scene import Cloud, Scene, Surface
+from torchreg.viz.scene import Cloud, MovingMesh, Scene
 from torchreg.viz.viser_nodes import as_floats, draw_patches
 from torchreg.viz.viser_server import page_url, point_camera, start_server, stop_server
 
 if TYPE_CHECKING:
     import viser
 
-# As shares of the diagonal of the scan.
-_GIZMO, _BALL, _POINT = 0.12, 0.008, 0.006
-_FREE, _PINNED = (230, 80, 40), (40, 90, 200)
 _HELP = (
     "Click a point of the shape to make it a handle, then drag its arrows. "
     "Pinned handles (blue) stay where they are while others are dragged; the rest follow."
 )
-# Pictures per second of a played animation.
-_RATE = 30
+
+
+@dataclass(frozen=True)
+class _PageStyle:
+    """Sizes, as shares of the diagonal of the scan, and colors of handles and points."""
+
+    arrows: float = 0.12
+    ball: float = 0.008
+    point: float = 0.006
+    free: tuple[int, int, int] = (230, 80, 40)
+    pinned: tuple[int, int, int] = (40, 90, 200)
+    frame_rate: int = 30  # of played key poses, per second
+
+
+_STYLE = _PageStyle()
 
 
 class PoseApp:
     """A page on which a registered scan is posed; usable in a ``with`` statement, at whose end the server stops.
 
-    Dragging only stores the newest target: one thread solves, from the pose before, and puts the shape where it finds
-    it, so that no drag waits for a solution and none is solved twice.
+    Dragging only stores the newest target: one thread solves, from the previous pose, and moves the shape, so that no
+    drag waits for a solution and none is solved twice.
 
     Args:
-        editor: what is posed.
-        output: files are written as this name with the endings .safetensors, .ply and .glb; where one exists, with a
-            number.
-        port: where to listen on 127.0.0.1; where it is taken, a later one.
-        up: what is upright, see `Scene`.
-
-    Raises:
-        MissingExtraError: if viser is not installed.
+        editor: of the posed scan.
+        output: name of files without their endings .safetensors, .ply and .glb; a number is added if one exists.
+        port: to listen on at 127.0.0.1, or a later one if it is taken.
+        up: upright direction, see `Scene`.
     """
 
     def __init__(
@@ -74,12 +81,12 @@ class PoseApp:
 
     @property
     def url(self) -> str:
-        """Where a browser on this machine finds it."""
+        """Address for a browser on this machine."""
         return page_url(self.server)
 
     @property
     def selected(self) -> int:
-        """Number of the handle that the buttons are about, -1 without one."""
+        """Number of the handle that the buttons act on, -1 without one."""
         return self._selected
 
     def close(self) -> None:
@@ -98,7 +105,7 @@ class PoseApp:
         self.close()
 
     def pick(self, origin: Tensor, direction: Tensor) -> int | None:
-        """Make the point that a ray points at a handle and return its number; None if it points at nothing."""
+        """Make the point that a ray points at a handle and return its number; None if there is no such point."""
         vertex = pick_vertex(self.editor.moved(), self.editor.faces, origin, direction)
         if vertex is None:
             return None
@@ -109,7 +116,7 @@ class PoseApp:
         return self._selected
 
     def drag(self, number: int, target: Tensor) -> None:
-        """Let a handle be moved to a target (3,); returns at once."""
+        """Ask for a handle to be moved to a target (3,), without waiting."""
         self._playing.clear()
         self.worker.submit(number, target)
 
@@ -122,15 +129,11 @@ class PoseApp:
             self._refresh()
 
     def play(self) -> None:
-        """Play the key poses once; the pose stays what it was.
-
-        Raises:
-            InputError: if there are fewer than two.
-        """
+        """Play the key poses once, without changing the pose."""
         poses = self.editor.animation()
         self._playing.set()
         for pose in poses:
-            if not self._playing.is_set() or self._stopped.wait(1 / _RATE):
+            if not self._playing.is_set() or self._stopped.wait(1 / _STYLE.frame_rate):
                 break
             self._update_shape(self.editor.moved(pose))
         self._playing.clear()
@@ -138,7 +141,7 @@ class PoseApp:
             self._update_shape(self.editor.moved())
 
     def _solve(self, targets: Mapping[int, Tensor]) -> None:
-        """Solve for the newest targets and show what is found; runs on the worker's thread alone."""
+        """Solve for the newest targets and show the solution; runs on the worker's thread alone."""
         self.editor.drag(targets)
         self._update_shape(self.editor.moved())
         with self._lock:
@@ -149,28 +152,28 @@ class PoseApp:
     def _scene(self, up: tuple[float, float, float] | None) -> Scene:
         editor = self.editor
         if editor.faces is not None and len(editor.faces):
-            return Scene("pose", (Surface("shape", editor.moved(), editor.faces, editor.colors),), up=up)
+            return Scene("pose", (MovingMesh("shape", editor.moved(), editor.faces, editor.colors),), up=up)
         return Scene("pose", (Cloud("shape", [editor.moved()], [editor.colors]),), up=up)
 
     def _draw_shape(self) -> Callable[[Tensor], None]:
-        """Draw the shape and return the function that puts its points elsewhere."""
+        """Draw the shape and return the function that moves its points."""
         (layer,) = self._scene(None).layers
-        if isinstance(layer, Surface):
+        if isinstance(layer, MovingMesh):
             patches = draw_patches(self.server.scene, "/shape", layer)
             for node, _ in patches:
                 node.on_click(self._clicked)
 
             def move(points: Tensor) -> None:
-                places = as_floats(points)
+                positions = as_floats(points)
                 for node, index in patches:
-                    node.vertices = places[index]
+                    node.vertices = positions[index]
 
             return move
         node = self.server.scene.add_point_cloud(
             "/shape", as_floats(layer.points(0)), as_floats(self.editor.colors), precision="float32",
-            point_size=_POINT * self.editor.diagonal, point_shape="circle",
+            point_size=_STYLE.point * self.editor.diagonal, point_shape="circle",
         )  # fmt: skip
-        # Points are no target of the mouse by themselves.
+        # Nodes of points take no clicks, the page does.
         self.server.scene.on_click()(self._clicked)
 
         def move_points(points: Tensor) -> None:
@@ -214,7 +217,7 @@ class PoseApp:
         self.server.gui.add_button(label).on_click(clicked)
 
     def _step(self, act: Callable[[], object]) -> Callable[[], None]:
-        """Return what a button does that goes to another state: what is being solved is waited for."""
+        """Return the action of a button that changes the state: it waits for the running solution."""
 
         def go() -> None:
             self.worker.drop()
@@ -253,7 +256,7 @@ class PoseApp:
         self._status.content = f"**{error}**"
 
     def _refresh(self) -> None:
-        """Show shape, handles and buttons as the editor has them."""
+        """Show shape, handles and buttons in the editor's state."""
         state = self.editor.state
         self._update_shape(self.editor.moved())
         while len(self._gizmos) > len(state.vertices):
@@ -263,27 +266,28 @@ class PoseApp:
             self._gizmos.append(self._add_gizmo(len(self._gizmos)))
         for number, (gizmo, pinned) in enumerate(zip(self._gizmos, state.pinned, strict=True)):
             gizmo.position = as_floats(state.targets[number])
-            self._balls[number].color = _PINNED if pinned else _FREE
+            self._balls[number].color = _STYLE.pinned if pinned else _STYLE.free
         chosen = 0 <= self._selected < len(state.vertices)
         self._name.content = f"handle {self._selected + 1} of {len(state.vertices)}" if chosen else "none yet"
         self._pinned.value = chosen and state.pinned[self._selected]  # type: ignore[misc]
         if state.solution is not None:
-            miss = float(state.solution.residuals.max()) / self.editor.diagonal
+            residual = float(state.solution.residuals.max()) / self.editor.diagonal
             milliseconds = 1000 * self.worker.median_seconds
-            self._status.content = f"handles miss by {miss:.2%} of the size; {milliseconds:.0f} ms per pose"
+            self._status.content = f"handles miss by {residual:.2%} of the size; {milliseconds:.0f} ms per pose"
 
     def _add_gizmo(self, number: int) -> viser.TransformControlsHandle:
         size = self.editor.diagonal
         gizmo = self.server.scene.add_transform_controls(
-            f"/handles/{number}", scale=_GIZMO * size, disable_rotations=True, depth_test=False
+            f"/handles/{number}", scale=_STYLE.arrows * size, disable_rotations=True, depth_test=False
         )
         ball = self.server.scene.add_icosphere(
-            f"/handles/{number}/ball", radius=_BALL * size, color=_FREE, cast_shadow=False, receive_shadow=False
-        )
+            f"/handles/{number}/ball", radius=_STYLE.ball * size, color=_STYLE.free, cast_shadow=False,
+            receive_shadow=False,
+        )  # fmt: skip
         ball.on_click(lambda _: self._select(number))
         self._balls.append(ball)
 
-        # On the loop of the server, in the order of the mouse; nothing here may wait.
+        # Runs on the loop of the server, in the order of the mouse, and must not wait.
         async def moved(event: viser.TransformControlsEvent) -> None:
             target = torch.from_numpy(event.target.position.copy())
             if event.phase == "start":

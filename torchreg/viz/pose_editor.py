@@ -14,6 +14,7 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg.errors import InputError
 from torchreg.io.gltf_morph import save_vertex_animation
+from torchreg.io.points import save_points
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.results import PoseSolution, ScanRegistration, SequenceRegistration
 from torchreg.registration.solve_pose import PoseSolver, SolvePoseConfig
@@ -21,22 +22,28 @@ from torchreg.viz.bone_colors import weight_colors
 from torchreg.viz.key_poses import between_poses
 from torchreg.viz.scan_gltf import save_grid_animation
 
-# Frames between two key poses when they are played.
-_FRAMES_PER_KEY = 30
-# The same in files that hold every vertex of every frame.
-_BAKED_PER_KEY = 10
+
+@dataclass(frozen=True)
+class _Playback:
+    """Frames between two key poses."""
+
+    played: int = 30
+    stored: int = 10  # in files that hold every vertex of every frame
+
+
+_PLAYBACK = _Playback()
 
 
 @dataclass(frozen=True, eq=False)
 class PoseState:
-    """What undo brings back.
+    """A state that undo restores.
 
     Args:
         transforms: (B, 4, 4) of the bones.
-        vertices: of the H handles, their numbers in the scan.
-        targets: (H, 3) where the handles should be; a handle that is neither dragged nor pinned follows the shape.
-        pinned: per handle, whether it is held where it is while others are dragged.
-        solution: that led here, None before anything was dragged.
+        vertices: numbers of the H handles' points in the scan.
+        targets: (H, 3) of the handles; a handle that is neither dragged nor pinned follows the shape.
+        pinned: per handle, whether it is fixed while others are dragged.
+        solution: of the last drag, None before the first.
     """
 
     transforms: Tensor
@@ -50,9 +57,9 @@ class PoseEditor:
     """A registered scan that is posed by dragging handles. All methods may be called from any thread.
 
     Args:
-        registration: whose bones move.
-        frame: of a `SequenceRegistration`, the pose to start from.
-        start: (B, 4, 4) to start from instead, such as ``transforms`` of a `PoseSolution`.
+        registration: with the bones.
+        frame: of a `SequenceRegistration`, whose pose is the first one.
+        start: (B, 4, 4) the first pose instead, such as ``transforms`` of a `PoseSolution`.
         config: of the solver.
 
     Raises:
@@ -67,26 +74,26 @@ class PoseEditor:
         start: Tensor | None = None,
         config: SolvePoseConfig | None = None,
     ) -> None:
-        own = registration.transforms.detach()
-        if own.ndim == 4 and not 0 <= frame < len(own):
-            raise InputError(f"frame must be from 0 to {len(own) - 1}, got {frame}")
-        transforms = own[frame] if own.ndim == 4 else own
+        poses = registration.transforms.detach()
+        if poses.ndim == 4 and not 0 <= frame < len(poses):
+            raise InputError(f"frame must be from 0 to {len(poses) - 1}, got {frame}")
+        transforms = poses[frame] if poses.ndim == 4 else poses
         if start is not None:
-            transforms = as_float_tensor(start, "start", like=own).detach()
-            check_shape(transforms, "start", tuple(own.shape[-3:]))
-        # A copy in one pose: later changes of the registration do not come through.
+            transforms = as_float_tensor(start, "start", like=poses).detach()
+            check_shape(transforms, "start", tuple(poses.shape[-3:]))
+        # A copy in one pose, independent of later changes of the registration.
         self.model: GridLBS = GridLBS.from_record(replace(registration.model.record(), transforms=transforms.cpu()))
         self.points, self.faces = registration.points.detach().cpu(), registration.faces
         self._weights = self.model.weights_at(self.points).detach()
         self._solver = PoseSolver(self.model, config=config)
         self._lock = threading.RLock()
         self._state = PoseState(transforms.cpu().clone(), (), self.points.new_zeros(0, 3), ())
-        self._history, self._at = [self._state], 0
+        self._history, self._step = [self._state], 0
         self._keys: list[Tensor] = []
 
     @property
     def state(self) -> PoseState:
-        """The state as it is."""
+        """The current state."""
         return self._state
 
     @property
@@ -101,33 +108,28 @@ class PoseEditor:
 
     @property
     def can_undo(self) -> bool:
-        """Whether there is anything to undo."""
-        return self._at > 0
+        """Whether there is a step to undo."""
+        return self._step > 0
 
     @property
     def can_redo(self) -> bool:
-        """Whether anything was undone."""
-        return self._at + 1 < len(self._history)
-
-    @property
-    def num_keys(self) -> int:
-        """Number of key poses."""
-        return len(self._keys)
+        """Whether there is a step to redo."""
+        return self._step + 1 < len(self._history)
 
     @torch.no_grad()
     def moved(self, transforms: Tensor | None = None) -> Tensor:
-        """Return the points (N, 3) in the current pose, or in another (B, 4, 4)."""
+        """Return the points (N, 3) in a pose (B, 4, 4), the current one by default."""
         pose = self._state.transforms if transforms is None else transforms
         return self.model.move(self.points, self._weights, pose)
 
     @torch.no_grad()
     def placed(self) -> Tensor:
-        """Return where the handles (H, 3) are."""
+        """Return the positions (H, 3) of the handles."""
         index = list(self._state.vertices)
         return self.model.move(self.points[index], self._weights[index], self._state.transforms)
 
     def add_handle(self, vertex: int) -> int:
-        """Make a point of the scan a handle and return its number; that of the handle it already is.
+        """Make a point of the scan a handle, unless it is one, and return its number.
 
         Raises:
             InputError: if there is no such point.
@@ -139,8 +141,7 @@ class PoseEditor:
             if vertex in state.vertices:
                 return state.vertices.index(vertex)
             vertices = (*state.vertices, vertex)
-            place = self.moved()[vertex].unsqueeze(0)
-            targets = torch.cat([state.targets, place])
+            targets = torch.cat([state.targets, self.moved()[vertex].unsqueeze(0)])
             self._enter(replace(state, vertices=vertices, targets=targets, pinned=(*state.pinned, False)))
             return len(vertices) - 1
 
@@ -153,11 +154,11 @@ class PoseEditor:
         with self._lock:
             self._check(number)
             state, keep = self._state, [k for k in range(len(self._state.vertices)) if k != number]
-            vertices, pinned = (tuple(row[k] for k in keep) for row in (state.vertices, state.pinned))
-            self._enter(replace(state, vertices=vertices, targets=state.targets[keep], pinned=pinned))  # type: ignore[arg-type]
+            vertices, pinned = tuple(state.vertices[k] for k in keep), tuple(state.pinned[k] for k in keep)
+            self._enter(replace(state, vertices=vertices, targets=state.targets[keep], pinned=pinned))
 
     def pin(self, number: int, pinned: bool = True) -> None:
-        """Hold a handle where it is while others are dragged, or let it go.
+        """Fix a handle at its position while others are dragged, or release it.
 
         Raises:
             InputError: if there is none.
@@ -173,12 +174,10 @@ class PoseEditor:
             self._enter(replace(state, pinned=flags, targets=targets))
 
     def drag(self, targets: Mapping[int, Tensor]) -> PoseSolution:
-        """Move handles to targets (3,) each, and the shape with them; `commit` makes it one step of undo.
+        """Move handles to targets (3,) each, and the shape with them, and return the solution.
 
-        The solver starts from the pose as it is. Pinned handles count as dragged to where they are held; others follow.
-
-        Returns:
-            the solution.
+        The solver starts from the current pose. Pinned handles are dragged to their positions; others follow the shape.
+        `commit` makes drags one step of undo.
 
         Raises:
             InputError: if there is no such handle, or a target is not finite.
@@ -188,62 +187,62 @@ class PoseEditor:
             wanted = state.targets.clone()
             for number, target in targets.items():
                 self._check(number)
-                place = as_float_tensor(target, "targets", like=wanted)
-                check_shape(place, "targets", (3,))
-                check_finite(place, "targets")
-                wanted[number] = place
-            held = [k for k, pinned in enumerate(state.pinned) if pinned or k in targets]
-            index = [state.vertices[k] for k in held]
-            solution = self._solver.solve(self.points[index], wanted[held], start=state.transforms)
+                position = as_float_tensor(target, "targets", like=wanted)
+                check_shape(position, "targets", (3,))
+                check_finite(position, "targets")
+                wanted[number] = position
+            fixed = [k for k, pinned in enumerate(state.pinned) if pinned or k in targets]
+            index = [state.vertices[k] for k in fixed]
+            solution = self._solver.solve(self.points[index], wanted[fixed], start=state.transforms)
             self._state = replace(state, transforms=solution.transforms, targets=wanted, solution=solution)
-            free = [k for k in range(len(state.vertices)) if k not in held]
+            free = [k for k in range(len(state.vertices)) if k not in fixed]
             if free:
                 wanted[free] = self.placed()[free]
             return solution
 
     def commit(self) -> None:
-        """Make what was dragged since the last step one step of undo."""
+        """Make the drags since the last step one step of undo."""
         with self._lock:
-            if self._state is not self._history[self._at]:
+            if self._state is not self._history[self._step]:
                 self._enter(self._state)
 
     def undo(self) -> bool:
-        """Go back one step; False if there is none. What was dragged but not committed counts as a step."""
+        """Go back one step; False if there is none. Drags that were not committed count as a step."""
         with self._lock:
             self.commit()
             if not self.can_undo:
                 return False
-            self._at -= 1
-            self._state = self._history[self._at]
+            self._step -= 1
+            self._state = self._history[self._step]
             return True
 
     def redo(self) -> bool:
         """Go forward one step that was undone; False if there is none."""
         with self._lock:
-            if not self.can_redo or self._state is not self._history[self._at]:
+            if not self.can_redo or self._state is not self._history[self._step]:
                 return False
-            self._at += 1
-            self._state = self._history[self._at]
+            self._step += 1
+            self._state = self._history[self._step]
             return True
 
     def reset(self) -> None:
-        """Bring the pose at the start back and drop all handles, as a step of undo."""
+        """Restore the first pose and drop all handles, as a step of undo."""
         with self._lock:
             self._enter(self._history[0])
 
     def add_key(self) -> int:
-        """Add the current pose to the key poses and return how many there are."""
+        """Add the current pose to the key poses and return their number."""
         self._keys.append(self._state.transforms.clone())
         return len(self._keys)
 
     def remove_key(self) -> int:
-        """Remove the last key pose, if any, and return how many there are."""
+        """Remove the last key pose, if any, and return their number."""
         if self._keys:
             self._keys.pop()
         return len(self._keys)
 
-    def animation(self, frames_per_key: int = _FRAMES_PER_KEY) -> Tensor:
-        """Return poses (T, B, 4, 4) that go through the key poses, as a glTF viewer plays the file of `save_gltf`.
+    def animation(self, frames_per_key: int = _PLAYBACK.played) -> Tensor:
+        """Return poses (T, B, 4, 4) through the key poses, as a glTF viewer plays the file of `save_gltf`.
 
         Raises:
             InputError: if there are fewer than two key poses.
@@ -251,14 +250,14 @@ class PoseEditor:
         if len(self._keys) < 2:
             raise InputError(f"an animation needs two key poses at least, got {len(self._keys)}")
         steps = frames_per_key * (len(self._keys) - 1)
-        at = torch.linspace(0, len(self._keys) - 1, steps + 1)
-        return between_poses(self.model, torch.stack(self._keys), at)
+        times = torch.linspace(0, len(self._keys) - 1, steps + 1)
+        return between_poses(self.model, torch.stack(self._keys), times)
 
     def save_pose(self, path: str | Path) -> Path:
         """Return the path of the current `PoseSolution` (.safetensors and .json).
 
         Raises:
-            InputError: if nothing was dragged yet, or the ending is another.
+            InputError: before the first drag, or if the ending is another.
         """
         solution = self._state.solution
         if solution is None:
@@ -268,8 +267,6 @@ class PoseEditor:
 
     def save_ply(self, path: str | Path) -> Path:
         """Return the path of the scan in the current pose, colored by bones (.ply)."""
-        from torchreg.io.points import save_points
-
         save_points(path, self.moved(), colors=self.colors, faces=self.faces)
         return Path(path)
 
@@ -287,9 +284,9 @@ class PoseEditor:
         poses = torch.stack(self._keys if self._keys else [rest, self._state.transforms])
         times = torch.arange(len(poses), dtype=torch.float64) * seconds_per_key
         if self.model.blend != "linear" and len(poses) > 1:
-            at = torch.linspace(0, len(poses) - 1, _BAKED_PER_KEY * (len(poses) - 1) + 1)
-            frames = self.moved(between_poses(self.model, poses, at))
-            return save_vertex_animation(path, frames, self.faces, at * seconds_per_key, self.colors)
+            keys = torch.linspace(0, len(poses) - 1, _PLAYBACK.stored * (len(poses) - 1) + 1)
+            frames = self.moved(between_poses(self.model, poses, keys))
+            return save_vertex_animation(path, frames, self.faces, keys * seconds_per_key, self.colors)
         return save_grid_animation(path, self.model, self.points, self.faces, poses, times).path
 
     def _check(self, number: int) -> None:
@@ -297,7 +294,7 @@ class PoseEditor:
             raise InputError(f"number must be that of one of {len(self._state.vertices)} handles, got {number}")
 
     def _enter(self, state: PoseState) -> None:
-        """Make a state a step: what was undone before is gone."""
+        """Make a state a step; steps that were undone are dropped."""
         self._state = state
-        self._history = [*self._history[: self._at + 1], state]
-        self._at += 1
+        self._history = [*self._history[: self._step + 1], state]
+        self._step += 1

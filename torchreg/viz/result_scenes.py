@@ -1,9 +1,9 @@
-"""Scenes of results: what a viewer shows of an alignment, a tracked sequence, registered scans, a spine."""
+"""Scenes of results: of an alignment, a tracked sequence, registered scans, a spine."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import singledispatch
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchreg._checks import check_shape
 from torchreg.alignment.results import AlignResult, Calibration, PoseStarts
+from torchreg.datasets.hand import faces_of
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import transform_points
@@ -25,33 +26,42 @@ from torchreg.viz.animation import coarse_skin
 from torchreg.viz.bone_colors import bone_palette, error_colors, weight_colors
 from torchreg.viz.figures import SKIN_COLOR
 from torchreg.viz.key_poses import between_poses
-from torchreg.viz.scene import Cloud, Curves, Layer, Meshes, Scene, Surface
+from torchreg.viz.scene import Cloud, Color, Curves, Layer, Meshes, MovingMesh, Scene
 
 Data = Sequence[Tensor | TriangleMesh]
 
-_GRAY, _BODY = (0.62, 0.62, 0.64), (0.78, 0.76, 0.74)
-_TARGET, _INLIER, _OUTLIER = (0.45, 0.52, 0.62), (0.04, 0.31, 0.62), (0.62, 0.62, 0.62)
-# An inlier of no posterior at all is drawn in this share of its color, the rest white.
-_PALEST = 0.35
-# Frames of the way from a scan to where it was registered.
-_STEPS = 25
-# Data this near a surface, as a share of the size of the shape, belong to it where nobody says so.
-_NEAR = 0.02
+
+@dataclass(frozen=True)
+class _SceneStyle:
+    """Colors, red, green and blue from 0 to 1, and numbers of the scenes."""
+
+    source: Color = (0.62, 0.62, 0.64)
+    target: Color = (0.45, 0.52, 0.62)
+    body: Color = (0.78, 0.76, 0.74)
+    inlier: Color = (0.04, 0.31, 0.62)
+    outlier: Color = (0.62, 0.62, 0.62)
+    keypoint: Color = (0.85, 0.25, 0.2)
+    palest: float = 0.35  # share of its color in an inlier of posterior zero, the rest white
+    num_steps: int = 25  # frames from a scan to its registration
+    near: float = 0.02  # data are inliers of a tracked shape within this distance, as a share of its size
+
+
+_STYLE = _SceneStyle()
 
 
 def result_scene(result: Result, *, shape: ArticulatedShape | None = None, data: Data = ()) -> Scene:
     """Return the scene of a result.
 
     Args:
-        result: of any of the three systems: an `AlignResult`, `TrackResult`, `DemoResult`, `PoseStarts`, `Calibration`,
+        result: of any system: an `AlignResult`, `TrackResult`, `DemoResult`, `PoseStarts`, `Calibration`,
             `ScanRegistration`, `SequenceRegistration` or `SpineSequence`.
         shape: that was aligned or tracked; without it keypoints and registered points alone are shown.
-        data: what was measured, one cloud or mesh per frame: the clouds of alignments and sequences, the target of a
-            registration, the surfaces of a spine; may be left out.
+        data: measurements, one cloud or mesh per frame: the clouds of alignments and sequences, the target of a
+            registration, the surfaces of a spine; optional.
 
     Raises:
-        InputError: if sizes do not fit, or ``shape`` is given to a result of scans.
-        InputTypeError: if there is nothing to show of such a result.
+        InputError: if sizes do not fit, or ``shape`` is given for a result of scans.
+        InputTypeError: if there is no scene of such a result.
     """
     if shape is not None and isinstance(result, (ScanRegistration, SequenceRegistration, SpineSequence)):
         raise InputError(f"shape has no meaning for a {type(result).__name__}; leave it out")
@@ -69,8 +79,8 @@ def _align_scene(result: AlignResult, shape: ArticulatedShape | None, data: Data
     masks, posterior = _batched(result.inliers, 1), _batched(result.posterior, 1)
     clouds = _clouds(data, len(poses))
     layers = _shape_layers(shape, poses)
-    layers.append(_points("registered points", _batched(result.registered, 2), _INLIER, visible=shape is None))
-    layers.append(_points("keypoints", _batched(result.keypoints, 2), (0.85, 0.25, 0.2), 0.02, visible=shape is None))
+    layers.append(_points("registered points", _batched(result.registered, 2), _STYLE.inlier, visible=shape is None))
+    layers.append(_keypoints(_batched(result.keypoints, 2), visible=shape is None))
     for frame, cloud in enumerate(clouds):
         check_shape(masks[frame], "result.inliers", (len(cloud),))
     if clouds:
@@ -83,7 +93,7 @@ def _align_scene(result: AlignResult, shape: ArticulatedShape | None, data: Data
 def _track_scene(result: TrackResult, shape: ArticulatedShape | None, data: Data) -> Scene:
     clouds = _clouds(data, len(result.poses))
     layers = _shape_layers(shape, result.poses)
-    layers.append(_points("keypoints", result.keypoints, (0.85, 0.25, 0.2), 0.02, visible=shape is None))
+    layers.append(_keypoints(result.keypoints, visible=shape is None))
     if clouds:
         layers.append(
             _cloud("data", clouds, [_nearness(shape, *pair) for pair in zip(clouds, result.poses, strict=True)])
@@ -106,7 +116,7 @@ def _starts_scene(result: PoseStarts, shape: ArticulatedShape | None, data: Data
     poses = result.poses.reshape(-1, result.poses.shape[-1])
     layers = _shape_layers(shape, poses)
     if data:
-        layers.append(_cloud("data", _clouds(data, 1), _INLIER))
+        layers.append(_cloud("data", _clouds(data, 1), _STYLE.inlier))
     return Scene("poses found, best first", tuple(layers), torch.arange(float(len(poses))))
 
 
@@ -117,7 +127,7 @@ def _calibration_scene(result: Calibration, shape: ArticulatedShape | None, data
     if shape is not None:
         layers += [_renamed(layer, f"given {layer.name}") for layer in _shape_layers(shape, result.poses)]
     if clouds:
-        layers.append(_cloud("data", clouds, _INLIER))
+        layers.append(_cloud("data", clouds, _STYLE.inlier))
     return Scene("calibrated shape", tuple(layers))
 
 
@@ -126,23 +136,23 @@ def _registration_scene(result: ScanRegistration, shape: None, data: Data) -> Sc
     with torch.no_grad():
         rest = torch.eye(4).to(result.transforms).expand_as(result.transforms)
         keys = torch.stack([rest, result.transforms])
-        poses = between_poses(result.model, keys, torch.linspace(0, 1, _STEPS))
+        poses = between_poses(result.model, keys, torch.linspace(0, 1, _STYLE.num_steps))
         moving = result.model.move(result.points, result.weights, poses)
     moving[-1] = result.deformed
     errors = result.distances.clamp(min=0).nan_to_num(0.0, 0.0)
     largest = float(errors.quantile(0.98)) or 1.0
     faces = result.faces
     layers = [
-        _scan("source", result.points, faces, _GRAY, visible=False),
+        _scan("source", result.points, faces, _STYLE.source, visible=False),
         _scan("moved, by bones", moving, faces, weight_colors(result.weights).clamp(0, 1)),
         _scan(f"moved, by error (red: {largest:.3g})", moving, faces, error_colors(errors, largest), visible=False),
         _bones(result.model, poses),
     ]
     for target in data[:1]:
         points, over = (target.vertices, target.faces) if isinstance(target, TriangleMesh) else (target, None)
-        layers.append(_scan("target", points, over, _TARGET, opacity=0.5))
+        layers.append(_scan("target", points, over, _STYLE.target, opacity=0.5))
     title = f"{result.model.num_bones} bones, {float(result.matched.float().mean()):.0%} of the points match"
-    return Scene(title, tuple(layers), torch.linspace(0, 2, _STEPS))
+    return Scene(title, tuple(layers), torch.linspace(0, 2, _STYLE.num_steps))
 
 
 @_scene.register
@@ -156,7 +166,7 @@ def _sequence_scene(result: SequenceRegistration, shape: None, data: Data) -> Sc
         hue = bone_palette(len(result.deformed)).to(result.fused)[result.fused_frames]
         layers.append(_cloud("fused, by frame", [result.fused], [hue], visible=False))
     if clouds:
-        layers.append(_cloud("scans", clouds, _TARGET))
+        layers.append(_cloud("scans", clouds, _STYLE.target))
     return Scene(f"{len(result.deformed)} scans, {result.model.num_bones} bones", tuple(layers))
 
 
@@ -172,16 +182,16 @@ def _spine_scene(result: SpineSequence, shape: None, data: Data) -> Scene:
 
 
 def _surface_frames(data: Data) -> list[Layer]:
-    """Return surfaces, each frame's with triangles of its own, or clouds."""
+    """Return the layer of meshes, one per frame, or else of their points; none without data."""
     meshes = [item for item in data if isinstance(item, TriangleMesh)]
     if meshes and len(meshes) == len(data):
-        return [Meshes("surface", meshes, _BODY, opacity=0.3)]
+        return [Meshes("surface", meshes, _STYLE.body, opacity=0.3)]
     clouds = [(item.vertices if isinstance(item, TriangleMesh) else item).detach() for item in data]
-    return [Cloud("surface", clouds, _BODY, size=0.003)] if clouds else []
+    return [Cloud("surface", clouds, _STYLE.body, size=0.003)] if clouds else []
 
 
 def _shape_layers(shape: ArticulatedShape | None, poses: Tensor) -> list[Layer]:
-    """Return the surface of a shape in poses (T, num_dofs) and its bones; NaN where there is no pose."""
+    """Return the surface and the bones of a shape in poses (T, num_dofs), NaN in frames without a pose."""
     if shape is None:
         return []
     poses = poses.to(shape.rest)
@@ -189,12 +199,11 @@ def _shape_layers(shape: ArticulatedShape | None, poses: Tensor) -> list[Layer]:
     found = poses.isfinite().all(-1)
     safe = torch.where(found.unsqueeze(-1), poses, shape.rest_pose())
     skin = coarse_skin(shape)
-    if skin.faces is None:
-        raise InputError("shape must have a surface with faces to be shown")
+    faces = faces_of(skin)
     with torch.no_grad():
         vertices = torch.where(found[:, None, None], skin(safe), torch.nan)
         origins = torch.where(found[:, None, None], shape.part_transforms(safe)[..., :3, 3], torch.nan)
-    layers: list[Layer] = [Surface("shape", vertices, skin.faces, SKIN_COLOR)]
+    layers: list[Layer] = [MovingMesh("shape", vertices, faces, SKIN_COLOR)]
     pairs = [(parent, part) for part, parent in enumerate(shape.part_parents) if parent >= 0]
     if pairs:
         layers.append(Curves("bones", origins[:, torch.tensor(pairs)], bone_palette(len(pairs)), visible=False))
@@ -202,11 +211,11 @@ def _shape_layers(shape: ArticulatedShape | None, poses: Tensor) -> list[Layer]:
 
 
 def _bones(model: GridLBS, poses: Tensor) -> Curves:
-    """Return the bones of a model in poses (T, B, 4, 4): from each joint to those that hang on it."""
+    """Return the bones of a model in poses (T, B, 4, 4), from each joint to those of its children."""
     tree = model.skeleton(poses)
-    places = transform_points(poses, tree.origins.to(poses).unsqueeze(-2)).squeeze(-2).detach()
-    pairs = [(max(parent, 0) if parent >= 0 else bone, bone) for bone, parent in enumerate(tree.parents)]
-    return Curves("bones", places[:, torch.tensor(pairs)], bone_palette(len(pairs)), visible=False)
+    joints = transform_points(poses, tree.origins.to(poses).unsqueeze(-2)).squeeze(-2).detach()
+    pairs = [(parent if parent >= 0 else bone, bone) for bone, parent in enumerate(tree.parents)]
+    return Curves("bones", joints[:, torch.tensor(pairs)], bone_palette(len(pairs)), visible=False)
 
 
 def _scan(
@@ -218,10 +227,10 @@ def _scan(
     visible: bool = True,
     opacity: float = 1.0,
 ) -> Layer:
-    """Return a scan: a surface if it has triangles, else points."""
+    """Return the layer of a scan: a mesh if it has triangles, else points."""
     points = points.detach()
     if faces is not None and len(faces):
-        return Surface(name, points, faces, paint, opacity=opacity, visible=visible)
+        return MovingMesh(name, points, faces, paint, opacity=opacity, visible=visible)
     frames = list(points) if points.ndim == 3 else [points]
     return _cloud(name, frames, paint if isinstance(paint, tuple) else [paint] * len(frames), visible=visible)
 
@@ -229,7 +238,7 @@ def _scan(
 def _cloud(
     name: str, frames: Sequence[Tensor], paints: Sequence[Tensor] | tuple[float, float, float], *, visible: bool = True
 ) -> Cloud:
-    """Return a cloud without the points that are not finite."""
+    """Return a layer of clouds without the points that are not finite."""
     keep = [points.isfinite().all(-1) for points in frames]
     if not isinstance(paints, tuple):
         paints = [paint[mask] for paint, mask in zip(paints, keep, strict=True)]
@@ -245,13 +254,17 @@ def _points(
     return Cloud(name, frames, color, size=size, visible=visible)
 
 
+def _keypoints(points: Tensor, *, visible: bool) -> Cloud:
+    return _points("keypoints", points, _STYLE.keypoint, 0.02, visible=visible)
+
+
 def inlier_paint(inliers: Tensor, posterior: Tensor) -> Tensor:
     """Return colors (M, 3): outliers gray, inliers from pale to full blue by their posterior."""
     share = posterior.double().nan_to_num(0.0)
     share = (share / share.max().clamp(min=1e-12) if len(share) else share).unsqueeze(-1).clamp(0, 1)
-    strength = _PALEST + (1 - _PALEST) * share
-    blue = 1 - strength * (1 - torch.tensor(_INLIER, dtype=torch.float64))
-    return torch.where(inliers.unsqueeze(-1), blue, torch.tensor(_OUTLIER, dtype=torch.float64)).float()
+    strength = _STYLE.palest + (1 - _STYLE.palest) * share
+    blue = 1 - strength * (1 - torch.tensor(_STYLE.inlier, dtype=torch.float64))
+    return torch.where(inliers.unsqueeze(-1), blue, torch.tensor(_STYLE.outlier, dtype=torch.float64)).float()
 
 
 def _nearness(shape: ArticulatedShape | None, cloud: Tensor, pose: Tensor) -> Tensor:
@@ -261,7 +274,7 @@ def _nearness(shape: ArticulatedShape | None, cloud: Tensor, pose: Tensor) -> Te
     if shape is not None and bool(pose.isfinite().all()) and bool(known.any()):
         with torch.no_grad():
             points = shape.keypoints(shape.rest_pose())
-            reach = _NEAR * float((points.amax(0) - points.amin(0)).norm())
+            reach = _STYLE.near * float((points.amax(0) - points.amin(0)).norm())
             near[known] = (shape.distance(cloud[known].to(shape.rest), pose.to(shape.rest)).abs() < reach).cpu()
     return inlier_paint(near | torch.tensor(shape is None), torch.ones(len(cloud)))
 
@@ -273,7 +286,7 @@ def _clouds(data: Data, count: int) -> list[Tensor]:
 
 
 def _batched(value: Tensor, dimensions: int) -> Tensor:
-    """Return a tensor with a leading dimension of frames, of one that may lack it."""
+    """Return a tensor on the CPU with a leading dimension of frames, added if it lacks one."""
     return value.detach().cpu().unsqueeze(0) if value.ndim == dimensions else value.detach().cpu()
 
 

@@ -1,4 +1,4 @@
-"""What was registered as a skinned, animated mesh for any glTF viewer."""
+"""Registered scans as skinned, animated meshes for any glTF viewer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_choice, check_count, check_finite, check_points, check_shape
+from torchreg._checks import as_float_tensor, check_choice, check_finite, check_points, check_shape
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import rigid_matrix
@@ -18,7 +18,6 @@ from torchreg.registration.blend import blend_linear, check_rigid_motions
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.viz.bone_colors import weight_colors
 
-_WEIGHTS = (4, 8)
 HIERARCHIES = ("tree", "flat")
 
 
@@ -28,8 +27,8 @@ class GridAnimation:
 
     Args:
         path: of the file.
-        residual: largest distance, over vertices and frames, of what the file shows from what the model gives: weights
-            beyond the fourth that were dropped, and blends that glTF does not know.
+        residual: largest distance, over vertices and frames, between the file's vertices and the model's: from weights
+            beyond the fourth, which are dropped, and blends that glTF does not have.
         parents: of the bones' nodes, -1 for roots.
     """
 
@@ -52,14 +51,14 @@ def save_grid_animation(
     most_weights: int = 4,
     hierarchy: str = "tree",
 ) -> GridAnimation:
-    """Return what was written: a .glb file in which the bones of a model move a mesh through poses.
+    """Write a .glb file in which the bones of a model move a mesh through poses, and return its description.
 
-    Each bone is a node of the skeleton that the joints make, at its joint with its parent. Every node has a track of
-    rotations and one of translations relative to its parent: joints of scans open a little, and with both the file
-    shows every pose exactly, also where bones do not hang together at all.
+    Each bone is a node of the skeleton of joints, at its joint with its parent. Every node has a track of rotations and
+    one of translations relative to its parent: joints of scans open a little, and with both tracks the file shows every
+    pose exactly, also of bones that are not connected.
 
     Args:
-        path: where to write; the suffix must be .glb.
+        path: to write; the suffix must be .glb.
         model: the bones and weights.
         points: (V, 3) of the mesh before it is moved, such as the source scan's.
         faces: (F, 3) over the points.
@@ -67,12 +66,12 @@ def save_grid_animation(
         times: (T,) seconds, not negative, strictly increasing; a second apart by default.
         normals: (V, 3) at the points; those of the faces by default.
         colors: (V, 3) or (V, 4) in [0, 1]; those of the weights by default.
-        most_weights: weights kept per vertex, 4, or 8, which some viewers ignore.
-        hierarchy: "tree", or "flat" for nodes that all hang on the scene: between the poses bones then move on
-            straight lines instead of about their joints.
+        most_weights: weights kept per vertex, 4, or 8, of which some viewers ignore the second four.
+        hierarchy: "tree", or "flat" for nodes without parents: between the poses bones then move on straight lines
+            instead of about their joints.
 
     Returns:
-        a `GridAnimation`.
+        Path, error and skeleton of the file.
 
     Raises:
         InputError: if shapes do not fit, a number is not finite, a pose is not rigid or the suffix is not .glb.
@@ -81,8 +80,7 @@ def save_grid_animation(
     References: the glTF 2.0 specification, section 3.7.3, on skins.
     """
     check_choice(hierarchy, "hierarchy", HIERARCHIES)
-    check_count(most_weights, "most_weights", 1)
-    if most_weights not in _WEIGHTS:
+    if most_weights not in (4, 8):
         raise InputError(f"most_weights must be 4 or 8, got {most_weights}")
     points = as_float_tensor(points, "points", like=model.weights)
     check_points(points, "points", batch=False)
@@ -93,23 +91,23 @@ def save_grid_animation(
     check_finite(seconds, "times")
     tree = model.skeleton(moving)
     parents = tree.parents if hierarchy == "tree" else (-1,) * model.num_bones
-    # In double precision: what is stored relative to a parent is put together again by the viewer.
+    # In double precision: the viewer multiplies the relative motions again.
     identity = torch.eye(3, dtype=torch.float64).expand(model.num_bones, 3, 3)
     rest = rigid_matrix(identity, tree.origins.double().cpu())
     weights = model.vertex_weights(points, most=most_weights)
     exact = weights.double().cpu()
     file = save_animated_skin(
         Path(path),
-        points,
-        mesh.faces,
-        exact / exact.sum(-1, keepdim=True),
-        [f"bone_{number}" for number in range(model.num_bones)],
-        parents,
-        rest,
-        _orthogonal(moving.double().cpu()) @ rest,
-        seconds,
-        mesh.vertex_normals() if normals is None else normals,
-        weight_colors(model.weights_at(points)).clamp(0, 1) if colors is None else colors,
+        vertices=points,
+        faces=mesh.faces,
+        weights=exact / exact.sum(-1, keepdim=True),
+        joint_names=[f"bone_{number}" for number in range(model.num_bones)],
+        parents=parents,
+        rest_transforms=rest,
+        joint_transforms=_orthogonal(moving.double().cpu()) @ rest,
+        times=seconds,
+        normals=mesh.vertex_normals() if normals is None else normals,
+        colors=weight_colors(model.weights_at(points)).clamp(0, 1) if colors is None else colors,
         most_weights=most_weights,
     )
     shown = blend_linear(points, weights, moving)
@@ -120,9 +118,9 @@ def save_grid_animation(
 def _poses(model: GridLBS, poses: Tensor | None) -> Tensor:
     """Return the poses (T, B, 4, 4) to play."""
     if poses is None:
-        own = model.transforms.reshape(-1, model.num_bones, 4, 4)
-        rest = torch.eye(4, dtype=own.dtype, device=own.device).expand(1, model.num_bones, 4, 4)
-        return torch.cat([rest, own])
+        poses = model.transforms.reshape(-1, model.num_bones, 4, 4)
+        rest = torch.eye(4, dtype=poses.dtype, device=poses.device).expand(1, model.num_bones, 4, 4)
+        return torch.cat([rest, poses])
     poses = as_float_tensor(poses, "poses", like=model.weights)
     check_shape(poses, "poses", ("T", model.num_bones, 4, 4))
     check_rigid_motions(poses, "poses")
@@ -132,6 +130,6 @@ def _poses(model: GridLBS, poses: Tensor | None) -> Tensor:
 
 
 def _orthogonal(transforms: Tensor) -> Tensor:
-    """Return motions with the nearest rotations: what single precision leaves off adds up along chains of nodes."""
-    left, _, right = torch.linalg.svd(transforms[..., :3, :3])
-    return rigid_matrix(left @ right, transforms[..., :3, 3])
+    """Return motions with the nearest rotations: errors of single precision add up along chains of nodes."""
+    u, _, vt = torch.linalg.svd(transforms[..., :3, :3])
+    return rigid_matrix(u @ vt, transforms[..., :3, 3])

@@ -1,4 +1,4 @@
-"""What a viewer shows, as plain data: surfaces, clouds and curves, standing still or moving frame by frame."""
+"""Scenes of a viewer as plain data: meshes, clouds and curves, still or moving frame by frame."""
 
 from __future__ import annotations
 
@@ -16,25 +16,34 @@ from torchreg.geometry.mesh import TriangleMesh
 Color = tuple[float, float, float]
 
 FIELD_OF_VIEW = math.radians(45)
-# Points whose middle is farther from the origin than this share of their diagonal were measured from there.
-_FAR_SHARE = 0.75
-# Surfaces whose normals have a longer mean were seen from one side.
-_ONE_SIDED = 0.3
-# Points that decide about the camera.
-_FEW_POINTS = 4000
-# Levels per color channel that are tried, most first, until a painted surface has few enough colors.
-_LEVELS = (7, 6, 5, 4, 3, 2)
+
+
+@dataclass(frozen=True)
+class _CameraRule:
+    """Choice of the camera."""
+
+    far_share: float = 0.75  # points were measured from the origin if their middle is farther, in diagonals
+    one_sided: float = 0.3  # surfaces were seen from one side if the mean of their normals is longer
+    num_points: int = 4000  # from which the bounds of the scene are taken
+
+
+_CAMERA = _CameraRule()
+
+
+def is_before_camera(lower: Tensor, upper: Tensor) -> bool:
+    """Return whether points with bounds (3,) lie away from the origin, as if measured by a camera there."""
+    return bool(((lower + upper) / 2).norm() > _CAMERA.far_share * (upper - lower).norm().clamp(min=1e-6))
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
-    """Triangles.
+class MovingMesh:
+    """Triangles with moving vertices.
 
-    A frame in which a coordinate is not finite is not shown: the shape was not found there.
+    A frame in which a coordinate is not finite is not shown: the shape was not found in it.
 
     Args:
-        name: what the viewer calls it.
-        vertices: (T, V, 3), or (V, 3) where nothing moves.
+        name: in the viewer.
+        vertices: (T, V, 3), or (V, 3) of a still mesh.
         faces: (F, 3) int64.
         paint: (V, 3) colors in [0, 1], or one color.
         opacity: from 0 to 1.
@@ -59,7 +68,7 @@ class Surface:
 
     @property
     def num_frames(self) -> int:
-        """Number of frames, 1 where nothing moves."""
+        """Number of frames, 1 of a still mesh."""
         return len(self.vertices) if self.vertices.ndim == 3 else 1
 
     def points(self, frame: int) -> Tensor:
@@ -69,12 +78,12 @@ class Surface:
     def patches(self, most: int = 48) -> list[tuple[Tensor, Tensor, Color]]:
         """Return patches of one color each: their vertices (K,) by index, faces (G, 3) over these, color.
 
-        Viewers that know one color per mesh show paint so. Colors are rounded until there are at most ``most``.
+        For viewers with one color per mesh. Colors are rounded until there are at most ``most``.
         """
         if not isinstance(self.paint, Tensor):
             return [(torch.arange(self.vertices.shape[-2]), self.faces, self.paint)]
         color = self.paint.detach().cpu().double().clamp(0, 1)[self.faces.cpu()].mean(1)
-        for levels in _LEVELS:
+        for levels in range(7, 1, -1):
             _, group = (color * (levels - 1)).round().unique(dim=0, return_inverse=True)
             count = int(group.max()) + 1 if len(group) else 0
             if count <= most:
@@ -89,10 +98,10 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Meshes:
-    """Surfaces that share nothing, one per frame.
+    """Unrelated meshes, one per frame.
 
     Args:
-        name: what the viewer calls them.
+        name: in the viewer.
         frames: T meshes.
         color: of all.
         opacity: from 0 to 1.
@@ -120,8 +129,8 @@ class Cloud:
     """Points.
 
     Args:
-        name: what the viewer calls it.
-        frames: T clouds (N_t, 3), or one where nothing moves.
+        name: in the viewer.
+        frames: T clouds (N_t, 3), or a single still one.
         paints: as many colorings, (N_t, 3) in [0, 1] each; or one color.
         size: diameter of a point as a share of the diagonal of the scene.
         visible: whether it is shown at first.
@@ -152,7 +161,7 @@ class Cloud:
 
     @property
     def num_frames(self) -> int:
-        """Number of frames, 1 where nothing moves."""
+        """Number of frames, 1 of a still cloud."""
         return len(self.frames)
 
     def points(self, frame: int) -> Tensor:
@@ -169,11 +178,11 @@ class Cloud:
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """Polylines in a color each, such as limbs, bones or the parts of a skeleton.
+    """Polylines in a color each, such as limbs or bones.
 
     Args:
-        name: what the viewer calls them.
-        curves: (T, L, S, 3), or (L, S, 3) where nothing moves.
+        name: in the viewer.
+        curves: (T, L, S, 3), or (L, S, 3) of still curves.
         paint: (L, 3) colors in [0, 1].
         labels: of the first points of the first curves; none by default.
         thickness: as a share of the diagonal of the scene.
@@ -198,7 +207,7 @@ class Curves:
 
     @property
     def num_frames(self) -> int:
-        """Number of frames, 1 where nothing moves."""
+        """Number of frames, 1 of still curves."""
         return len(self.curves) if self.curves.ndim == 4 else 1
 
     def points(self, frame: int) -> Tensor:
@@ -206,16 +215,16 @@ class Curves:
         return self.curves[frame] if self.curves.ndim == 4 else self.curves
 
     def segments(self, frame: int) -> Tensor:
-        """Return the pieces (L (S - 1), 2, 3) of a frame, curve by curve."""
+        """Return the segments (L (S - 1), 2, 3) of a frame, curve by curve."""
         points = self.points(frame)
         return torch.stack((points[:, :-1], points[:, 1:]), dim=2).flatten(0, 1)
 
     def segment_paint(self) -> Tensor:
-        """Return the colors (L (S - 1), 3) of the pieces."""
+        """Return the colors (L (S - 1), 3) of the segments."""
         return self.paint.repeat_interleave(self.curves.shape[-2] - 1, dim=0)
 
 
-Layer = Surface | Meshes | Cloud | Curves
+Layer = MovingMesh | Meshes | Cloud | Curves
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,10 +232,10 @@ class Scene:
     """Layers that are shown together.
 
     Args:
-        title: of the whole.
-        layers: with different names; those that move have T frames each.
+        title: of the page.
+        layers: with different names; moving ones have T frames each.
         times: (T,) seconds, strictly increasing; one frame every 1 / 20 second by default.
-        up: what is upright; by default -y for measurements of a camera at the origin, else z.
+        up: upright direction; by default -y for measurements of a camera at the origin, else z.
 
     Raises:
         InputError: if there is no layer, two have one name, or numbers of frames differ.
@@ -249,12 +258,12 @@ class Scene:
 
     @property
     def num_frames(self) -> int:
-        """Number T of frames, 1 where nothing moves."""
+        """Number T of frames, 1 of a still scene."""
         return max(layer.num_frames for layer in self.layers)
 
     @property
     def seconds(self) -> list[float]:
-        """When the frames are, starting at zero."""
+        """Times of the frames, starting at zero."""
         if self.times is None:
             return [frame / 20 for frame in range(self.num_frames)]
         return (self.times.double() - float(self.times[0])).tolist()
@@ -267,7 +276,7 @@ class Scene:
         raise InputError(f"the scene has no layer {name!r}; it has {', '.join(item.name for item in self.layers)}")
 
     def camera(self, field_of_view: float = FIELD_OF_VIEW) -> tuple[Tensor, Tensor, Tensor]:
-        """Return where a camera that sees all frames stands, what it looks at, and what it shows upright, (3,) each.
+        """Return the position, the target and the upright direction of a camera that sees all frames, (3,) each.
 
         Args:
             field_of_view: radians, of the shorter side of the picture.
@@ -275,12 +284,12 @@ class Scene:
         lower, upper = self.bounds()
         middle = (lower + upper) / 2
         size = (upper - lower).norm().clamp(min=1e-9)
-        from_camera = bool(middle.norm() > _FAR_SHARE * size)
+        from_camera = is_before_camera(lower, upper)
         up = torch.tensor(self.up or ((0.0, -1.0, 0.0) if from_camera else (0.0, 0.0, 1.0))).to(middle)
         facing = self._facing()
         side = torch.linalg.cross(up, facing)
-        if facing.norm() > _ONE_SIDED and side.norm() > 0.2 * facing.norm():
-            # A scan from one side is seen from there, from a little right of and above it.
+        if facing.norm() > _CAMERA.one_sided and side.norm() > 0.2 * facing.norm():
+            # A scan from one side is viewed from that side, a little from the right and above.
             direction = -facing / facing.norm() - 0.3 * side / side.norm() - 0.2 * up
         elif from_camera and self.up is None:
             direction = middle - middle.norm() * middle.new_tensor([0.35, -0.25, 0.0])
@@ -291,8 +300,8 @@ class Scene:
         return middle - 0.5 * size / math.sin(field_of_view / 2) * direction, middle, up
 
     def bounds(self) -> tuple[Tensor, Tensor]:
-        """Return the lower and upper corner (3,) of all that is shown in any frame."""
-        points = self._few_points()
+        """Return the lower and upper corner (3,) of all visible layers in all frames."""
+        points = self._sample()
         return points.amin(0), points.amax(0)
 
     @property
@@ -302,23 +311,24 @@ class Scene:
         return float((upper - lower).norm()) or 1.0
 
     def _facing(self) -> Tensor:
-        """Return the mean normal (3,) of the surfaces shown at first: zero if closed, long if seen from one side."""
+        """Return the mean normal (3,) of the visible meshes: zero if they are closed, long if scanned from one side."""
         total, area = torch.zeros(3, dtype=torch.float64), 0.0
         for layer in self.layers:
-            if isinstance(layer, Surface) and layer.visible:
+            if isinstance(layer, MovingMesh) and layer.visible:
                 corner, second, third = layer.points(0).detach().cpu().double()[layer.faces.cpu()].unbind(1)
                 normal = torch.linalg.cross(second - corner, third - corner).nan_to_num()
                 total, area = total + normal.sum(0), area + float(normal.norm(dim=-1).sum())
         return total / area if area > 0 else total
 
-    def _few_points(self) -> Tensor:
-        # Outliers reach far: where there is more than points, they do not decide.
+    def _sample(self) -> Tensor:
+        """Return evenly chosen points (N, 3) of the visible layers."""
+        # Outliers reach far: clouds count only if there are no other layers.
         visible = [layer for layer in self.layers if layer.visible] or list(self.layers)
         shown = [layer for layer in visible if not isinstance(layer, Cloud)] or visible
         found = [points for layer in shown for points in _all_points(layer)]
         points = torch.cat(found) if found else torch.zeros(1, 3)
         points = points[points.isfinite().all(-1)]
-        return points[:: max(1, len(points) // _FEW_POINTS)] if len(points) else torch.zeros(1, 3)
+        return points[:: max(1, len(points) // _CAMERA.num_points)] if len(points) else torch.zeros(1, 3)
 
 
 def _all_points(layer: Layer) -> Iterator[Tensor]:

@@ -1,17 +1,18 @@
-"""Pictures of what cameras saw: disparity, inliers over the picture, outlines of the model, what filters cut."""
+"""Pictures of measurements: disparity, points and outlines over the picture, filtered depth, covered masks."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_shape
 from torchreg.capture.stereo_frames import StereoFrames
-from torchreg.errors import FormatError, InputError
+from torchreg.datasets.hand import faces_of
+from torchreg.errors import FormatError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.mesh import TriangleMesh
@@ -19,56 +20,58 @@ from torchreg.geometry.visibility import rasterize
 from torchreg.io.images import save_image
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.tracking.results import FrameResult
+from torchreg.viz.bone_colors import scale_colors
 
-# From far to near.
-_RAMP = ((0.19, 0.07, 0.23), (0.15, 0.43, 0.84), (0.11, 0.79, 0.62), (0.86, 0.89, 0.21), (0.98, 0.42, 0.13))
-_INLIER, _OUTLIER, _OUTLINE = (0.10, 0.65, 1.0), (1.0, 0.25, 0.15), (0.2, 1.0, 0.3)
-_FADED = 0.6
+# From far to near: dark blue, blue, green, yellow, orange.
+_DEPTH_COLORS = ((0.19, 0.07, 0.23), (0.15, 0.43, 0.84), (0.11, 0.79, 0.62), (0.86, 0.89, 0.21), (0.98, 0.42, 0.13))
 
 
-def ramp_colors(values: Tensor, lowest: float, highest: float) -> Tensor:
-    """Return colors (..., 3) of values (...,), dark blue at the lowest, orange at the highest, black where NaN."""
-    if not highest > lowest:
-        raise InputError(f"highest must be above lowest, got {highest} and {lowest}")
-    ramp = torch.tensor(_RAMP, device=values.device)
-    place = ((values.float() - lowest) / (highest - lowest)).clamp(0, 1).nan_to_num(0.0) * (len(ramp) - 1)
-    below = place.floor().long().clamp(max=len(ramp) - 2)
-    share = (place - below).unsqueeze(-1)
-    colors = ramp[below] * (1 - share) + ramp[below + 1] * share
+@dataclass(frozen=True)
+class _OverlayStyle:
+    """Colors drawn on pictures."""
+
+    inlier: tuple[float, float, float] = (0.10, 0.65, 1.0)
+    outlier: tuple[float, float, float] = (1.0, 0.25, 0.15)
+    outline: tuple[float, float, float] = (0.2, 1.0, 0.3)
+    covered: tuple[float, float, float] = (0.9, 0.9, 0.9)
+    contrast: float = 0.6  # of the picture under it, the rest white
+
+
+_OVERLAY = _OverlayStyle()
+
+
+def depth_colors(values: Tensor, lowest: float, highest: float) -> Tensor:
+    """Return colors (..., 3) of values (...), dark blue at the lowest, orange at the highest, black where NaN."""
+    share = ((values.float() - lowest) / (highest - lowest)).clamp(0, 1).nan_to_num(0.0)
+    colors = scale_colors(share, _DEPTH_COLORS)
     return torch.where(values.isnan().unsqueeze(-1), torch.zeros_like(colors), colors)
 
 
 def picture_with_points(
     image: Tensor, pixels: Tensor, inliers: Tensor, outline: Tensor | None = None, *, radius: int = 1
 ) -> Tensor:
-    """Return a faded picture (H, W, 3) with points on it, blue inliers and red others, and an outline in green.
+    """Return a faded picture (H, W, 3) with points, inliers blue and others red, and an outline in green.
 
     Args:
         image: (H, W) or (H, W, 3) from 0 to 1.
-        pixels: (N, 2) as (column, row); those beside the picture and NaN are left out.
+        pixels: (N, 2) as (column, row); those beside the picture and NaN are omitted.
         inliers: (N,) bool.
         outline: (H, W) bool, see `model_outline`.
         radius: of a point, pixels.
-
-    Raises:
-        InputError: if sizes do not fit.
     """
     drawn = image.unsqueeze(-1).expand(*image.shape, 3) if image.ndim == 2 else image
-    check_shape(drawn, "image", ("H", "W", 3))
-    check_shape(pixels, "pixels", ("N", 2))
-    check_shape(inliers, "inliers", (len(pixels),))
-    drawn = 1 - _FADED * (1 - drawn.float())
+    drawn = 1 - _OVERLAY.contrast * (1 - drawn.float())
     if outline is not None:
-        check_shape(outline, "outline", tuple(drawn.shape[:2]))
-        drawn = torch.where(outline.unsqueeze(-1), drawn.new_tensor(_OUTLINE), drawn)
+        drawn = torch.where(outline.unsqueeze(-1), drawn.new_tensor(_OVERLAY.outline), drawn)
     step = torch.arange(-radius, radius + 1, device=pixels.device)
     square = torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1).reshape(-1, 2)
     known = pixels.isfinite().all(-1)
-    # Inliers last, so that nothing hides them.
+    # Inliers are drawn last, over the others.
     order = inliers[known].int().argsort()
-    places = pixels[known][order].round().long()[:, None] + square
-    colors = torch.where(inliers[known][order, None], drawn.new_tensor(_INLIER), drawn.new_tensor(_OUTLIER))
-    column, row = places.reshape(-1, 2).unbind(-1)
+    covered = pixels[known][order].round().long()[:, None] + square
+    inlier, outlier = drawn.new_tensor(_OVERLAY.inlier), drawn.new_tensor(_OVERLAY.outlier)
+    colors = torch.where(inliers[known][order, None], inlier, outlier)
+    column, row = covered.reshape(-1, 2).unbind(-1)
     inside = (column >= 0) & (column < drawn.shape[1]) & (row >= 0) & (row < drawn.shape[0])
     drawn = drawn.clone()
     drawn[row[inside], column[inside]] = colors.repeat_interleave(len(square), 0)[inside]
@@ -76,9 +79,9 @@ def picture_with_points(
 
 
 def model_mask(mesh: TriangleMesh, camera: Camera) -> Tensor:
-    """Return which pixels (H, W) of a camera show a mesh; none if a part of it lies beside or behind the camera.
+    """Return the mask (H, W) of a mesh in a camera's picture; empty if a part of it lies beside or behind the camera.
 
-    What a lens bends into the picture from beyond the border of a plain one is left out.
+    Parts that only the distortion of the lens brings into the picture are missing.
     """
     if bool((camera.project(mesh.vertices)[1] <= 0).any()):
         return torch.zeros(camera.height, camera.width, dtype=torch.bool)
@@ -91,69 +94,52 @@ def model_mask(mesh: TriangleMesh, camera: Camera) -> Tensor:
     plane = camera.undistorted((camera.pixel_grid() - center) / focal)
     pixels = plane * square + center
     column, row = pixels.nan_to_num(0.0).round().long().unbind(-1)
-    there = mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
-    return there & plain.contains(pixels)
+    return mask[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)] & plain.contains(pixels)
 
 
 def mask_outline(mask: Tensor) -> Tensor:
-    """Return the pixels (H, W) of a mask with a neighbor that is none of its."""
-    check_shape(mask, "mask", ("H", "W"))
+    """Return the pixels (H, W) of a mask with a neighbor outside of it."""
     grown = torch.nn.functional.max_pool2d((~mask)[None, None].float(), 3, 1, 1)[0, 0] > 0
     return mask & grown
 
 
 def cut_picture(depth: Tensor, kept: Tensor) -> Tensor:
-    """Return a depth image in color (H, W, 3): by depth where it was kept, red where it was cut, black where unknown.
+    """Return a depth image in color (H, W, 3): by depth where kept, red where filtered, black where not measured.
 
     Args:
         depth: (H, W) metres, zero where nothing was measured.
         kept: (H, W) bool.
-
-    Raises:
-        InputError: if sizes differ.
     """
-    check_shape(depth, "depth", ("H", "W"))
-    check_shape(kept, "kept", tuple(depth.shape))
     known = depth > 0
     seen = torch.where(kept & known, -depth, torch.nan)
     values = seen[kept & known]
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
-    colors = ramp_colors(seen, low, max(high, low + 1e-6))
-    return torch.where((known & ~kept).unsqueeze(-1), colors.new_tensor(_OUTLIER), colors)
+    colors = depth_colors(seen, low, max(high, low + 1e-6))
+    return torch.where((known & ~kept).unsqueeze(-1), colors.new_tensor(_OVERLAY.outlier), colors)
 
 
 def hull_picture(mask: Tensor, hull: Tensor) -> Tensor:
-    """Return how a hull covers a mask (H, W, 3): white where both are, red where it misses the mask, blue beyond it.
+    """Return a picture (H, W, 3) of a mask and its hull: white in both, red in the mask alone, blue in the hull alone.
 
     Args:
         mask: (H, W) bool.
         hull: (H, W) bool, see `model_mask`.
-
-    Raises:
-        InputError: if sizes differ.
     """
-    check_shape(mask, "mask", ("H", "W"))
-    check_shape(hull, "hull", tuple(mask.shape))
-    colors = torch.zeros(*mask.shape, 3)
-    for where, color in ((mask & hull, (0.9, 0.9, 0.9)), (mask & ~hull, _OUTLIER), (hull & ~mask, _INLIER)):
-        colors[where] = colors.new_tensor(color)
+    colors, style = torch.zeros(*mask.shape, 3), _OVERLAY
+    for region, color in ((mask & hull, style.covered), (mask & ~hull, style.outlier), (hull & ~mask, style.inlier)):
+        colors[region] = colors.new_tensor(color)
     return colors
 
 
 def hull_sheet(masks: Sequence[Tensor], cameras: CameraRig, mesh: TriangleMesh, width: int = 240) -> Tensor:
-    """Return the `hull_picture` of every camera side by side in rows, each about so many pixels wide, (H, W, 3).
+    """Return the `hull_picture` of every camera side by side in rows (H, W, 3).
 
     Args:
         masks: one (H, W) bool per camera.
         cameras: calibrated.
         mesh: the surface of the hull.
-        width: of each picture, pixels.
-
-    Raises:
-        InputError: if there are not as many masks as cameras.
+        width: approximate width of each picture, pixels.
     """
-    if len(masks) != len(cameras):
-        raise InputError(f"masks must be one per camera, got {len(masks)} and {len(cameras)} cameras")
     pictures = []
     for mask, camera in zip(masks, cameras, strict=True):
         step = max(1, camera.width // width)
@@ -166,39 +152,34 @@ def hull_sheet(masks: Sequence[Tensor], cameras: CameraRig, mesh: TriangleMesh, 
     high, wide = (max(picture.shape[side] for picture in pictures) for side in (1, 2))
     sheet = torch.zeros(3, high * math.ceil(len(pictures) / across), wide * across)
     for number, picture in enumerate(pictures):
-        top, left = high * (number // across), wide * (number % across)
-        sheet[:, top : top + picture.shape[1], left : left + picture.shape[2]] = picture
+        row, column = high * (number // across), wide * (number % across)
+        sheet[:, row : row + picture.shape[1], column : column + picture.shape[2]] = picture
     return sheet.movedim(0, -1)
 
 
 class StereoPictures:
-    """Writes two pictures of every frame that is tracked: disparity_0000.png, and frame_0000.png with the points.
+    """Writes two pictures of every tracked frame: disparity_0000.png, and frame_0000.png with the points.
 
-    In the second, points are blue where they are inliers, and the outline of the shape in its pose is green.
+    In the second, inliers are blue, and the outline of the shape in its pose is green.
 
     Args:
-        frames: what the tracker reads.
+        frames: of the tracker.
         skin: the surface of the shape, with faces.
-        folder: where pictures go.
-
-    Raises:
-        InputError: if the skin has no faces.
+        folder: of the pictures.
     """
 
     def __init__(self, frames: StereoFrames, skin: LinearBlendSkin, folder: Path) -> None:
-        if skin.faces is None:
-            raise InputError("skin must have faces to draw; make it with surface_skin(shape)")
-        self._frames, self._skin, self._faces, self._folder = frames, skin, skin.faces, folder
+        self._frames, self._skin, self._faces, self._folder = frames, skin, faces_of(skin), folder
 
     def __call__(self, points: Tensor, frame: FrameResult) -> None:
-        """Draw a frame; one that could not be read has no pictures."""
+        """Draw a frame, unless it could not be read."""
         try:
             sight = self._frames.sight(frame.frame)
         except (FormatError, OSError):
             return
         config, pair, found = self._frames.config, sight.pair, sight.points
         near = float(pair.disparity(torch.tensor(config.nearest)))
-        save_image(self._folder / f"disparity_{frame.frame:04d}.png", ramp_colors(found.dense, 0.0, near))
+        save_image(self._folder / f"disparity_{frame.frame:04d}.png", depth_colors(found.dense, 0.0, near))
         outline = None
         if frame.statuses[0].usable and bool(frame.pose.isfinite().all()):
             with torch.no_grad():

@@ -1,7 +1,8 @@
-"""Spines for any glTF viewer: curves as tubes in a translucent body that they move."""
+"""Spines for any glTF viewer: curves as tubes in a translucent surface that they move."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -17,10 +18,17 @@ from torchreg.spines.labeled_tree import path_lengths
 from torchreg.spines.spine import Spine
 from torchreg.viz.bone_colors import bone_palette
 
-# Radius of the tubes as a share of the length of all limbs, and their sides.
-_TUBE, _SIDES = 0.004, 8
-_BODY = (0.80, 0.78, 0.76, 0.35)
-_MAX_FACES = 40_000
+
+@dataclass(frozen=True)
+class _SpineStyle:
+    """Tubes around the curves, and the surface."""
+
+    radius: float = 0.004  # of the tubes, as a share of the length of all limbs
+    num_sides: int = 8  # of the tubes
+    body: tuple[float, float, float, float] = (0.80, 0.78, 0.76, 0.35)  # red, green, blue, opacity
+
+
+_STYLE = _SpineStyle()
 
 
 @torch.no_grad()
@@ -30,14 +38,15 @@ def save_spine_animation(
 ) -> Path:  # fmt: skip
     """Return the path of a .glb file in which a spine moves, and with it the surface of one of its frames.
 
-    Joints lie along every limb and move as its nodes do. Tubes around the curves, in a color per limb, and the surface,
-    translucent, are bound to the joints near them along the limbs: an arm does not hold what it only touches.
+    Joints lie along every limb and move as its nodes do. Tubes around the curves, in a color per limb, and the
+    translucent surface are bound to the joints near them, by distance along the limbs: an arm does not move a surface
+    that it only touches.
 
     Args:
-        path: where to write; the suffix must be .glb.
+        path: to write; the suffix must be .glb.
         spine: its frames are played in their order.
         mesh: the surface of frame ``frame``; None for the curves alone.
-        frame: number of the frame that the surface is of.
+        frame: number of the surface's frame.
         num_joints: per limb, at least 2.
         fps: frames per unit of `Spine.times`.
 
@@ -59,45 +68,45 @@ def save_spine_animation(
     paint = torch.cat((torch.cat(colors), torch.ones(sum(map(len, colors)), 1)), dim=1)
     if mesh is not None:
         parts.append(TriangleMesh(mesh.vertices.detach().cpu().double(), mesh.faces.cpu()))
-        paint = torch.cat((paint, torch.tensor(_BODY).expand(mesh.num_vertices, 4)))
-    whole = concatenate(parts)
+        paint = torch.cat((paint, torch.tensor(_STYLE.body).expand(mesh.num_vertices, 4)))
+    surface = concatenate(parts)
     moving = rigid_matrix(axes[:, :, picked], curves[:, :, picked]).flatten(1, 2)
-    weights = _weights(whole.vertices, skeleton, spine.limb_nodes[:, picked].reshape(-1))
     return save_animated_skin(
         path,
-        whole.vertices,
-        whole.faces,
-        weights,
-        [f"limb_{limb}_{k}" for limb in range(limbs) for k in range(len(picked))],
-        [-1] * (limbs * len(picked)),
-        moving[frame],
-        moving,
-        (spine.times - spine.times[0]) / fps,
-        whole.vertex_normals(),
-        paint,
-        most_weights=4,  # all that many viewers look at
+        vertices=surface.vertices,
+        faces=surface.faces,
+        weights=_weights(surface.vertices, skeleton, spine.limb_nodes[:, picked].reshape(-1)),
+        joint_names=[f"limb_{limb}_{k}" for limb in range(limbs) for k in range(len(picked))],
+        parents=[-1] * (limbs * len(picked)),
+        rest_transforms=moving[frame],
+        joint_transforms=moving,
+        times=(spine.times - spine.times[0]) / fps,
+        normals=surface.vertex_normals(),
+        colors=paint,
+        most_weights=4,  # all that many viewers read
     )
 
 
 def _weights(points: Tensor, skeleton: Skeleton, joints: Tensor) -> Tensor:
-    """Return how much points (V, 3) hang on the joints, nodes (J,) of the skeleton: by lengths along the limbs."""
-    nodes = skeleton.nodes.double()
-    holder = torch.cat([(torch.cdist(some, nodes) - skeleton.radii.double()).argmin(-1) for some in points.split(4096)])
+    """Return weights (V, J) of points (V, 3) for joints, nodes (J,) of the skeleton, by lengths along the limbs."""
+    nodes, radii = skeleton.nodes.double(), skeleton.radii.double()
+    nearest = torch.cat([(torch.cdist(chunk, nodes) - radii).argmin(-1) for chunk in points.split(4096)])
     # Joints that share a node share its weight.
     lengths = path_lengths(skeleton, joints)
     spacing = torch.where(lengths[:, joints] > 0, lengths[:, joints], torch.inf).amin(-1).median()
     weights = torch.exp(-0.5 * ((lengths - lengths.amin(0)) / (0.6 * spacing)).square()).mT
-    return weights[holder]
+    return weights[nearest]
 
 
 def _tube(curve: Tensor, frames: Tensor, size: float) -> TriangleMesh:
     """Return a thin tube around a curve (S, 3), open at its ends."""
-    angle = 2 * torch.pi * torch.arange(_SIDES, dtype=curve.dtype) / _SIDES
+    sides = _STYLE.num_sides
+    angle = 2 * torch.pi * torch.arange(sides, dtype=curve.dtype) / sides
     ring = torch.stack((angle.cos(), angle.sin(), torch.zeros_like(angle)), dim=-1)
-    vertices = curve.unsqueeze(1) + _TUBE * size * (frames.unsqueeze(1) @ ring.unsqueeze(-1)).squeeze(-1)
-    here = torch.arange(len(curve) * _SIDES).reshape(len(curve), _SIDES)
-    after = here.roll(-1, 1)
+    vertices = curve.unsqueeze(1) + _STYLE.radius * size * (frames.unsqueeze(1) @ ring.unsqueeze(-1)).squeeze(-1)
+    corner = torch.arange(len(curve) * sides).reshape(len(curve), sides)
+    beside = corner.roll(-1, 1)
     quads = [torch.stack(corners, -1).reshape(-1, 3) for corners in (
-        (here[:-1], after[:-1], after[1:]), (here[:-1], after[1:], here[1:])
+        (corner[:-1], beside[:-1], beside[1:]), (corner[:-1], beside[1:], corner[1:])
     )]  # fmt: skip
     return TriangleMesh(vertices.reshape(-1, 3), torch.cat(quads))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_count, check_points
+from torchreg._checks import as_float_tensor, check_count, check_points, check_shape
 from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
@@ -36,10 +37,19 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_PANEL = 300
-# Share of a panel's height that its caption takes.
-_CAPTION = 0.09
-_SOURCE, _TARGET = (0.80, 0.78, 0.76), (0.55, 0.63, 0.75)
+
+@dataclass(frozen=True)
+class _StripStyle:
+    """Panels of a row of pictures."""
+
+    panel: int = 300  # side of each panel, pixels
+    caption: float = 0.09  # height of the captions, as a share of the figure's
+    bar: float = 0.35  # width of the room for a color bar, in panels
+    source: tuple[float, float, float] = (0.80, 0.78, 0.76)
+    target: tuple[float, float, float] = (0.55, 0.63, 0.75)
+
+
+_STYLE = _StripStyle()
 
 
 def annealing_strip(
@@ -59,7 +69,7 @@ def annealing_strip(
         shape: that was aligned.
         data: (M, 3), metres.
         result: of `align`, with its history.
-        start: (num_dofs,) the first picture; that after the first step by default.
+        start: (num_dofs,) pose of the first picture; that after the first step by default.
         skin: the surface to draw; by default a coarse one.
         columns: number of pictures, at least 2.
 
@@ -77,13 +87,12 @@ def annealing_strip(
     steps: list[tuple[Tensor, str]] = [] if start is None else [(start, "start")]
     steps += [(record.pose[0], _step_label(record)) for record in _spread(result.history, columns - len(steps))]
     meshes = [posed_mesh(shape, pose, surface) for pose, _ in steps]
-    view = watch(torch.cat([mesh.vertices for mesh in meshes]), size=(_PANEL, _PANEL))
-    figure, axes = _row(len(steps), [label for _, label in steps])
+    view = watch(torch.cat([mesh.vertices for mesh in meshes]), size=(_STYLE.panel, _STYLE.panel))
+    figure, axes = _row([label for _, label in steps])
     inliers = result.inliers.cpu()
     for ax, mesh in zip(axes, meshes, strict=True):
         draw_mesh(ax, mesh, view)
         draw_points(ax, mesh, view, data.cpu(), inliers, tolerance=2 * shape.nu, point_size=3.0, color=INLIER_COLOR)
-        _frame(ax, view)
     return save_picture(figure, path)
 
 
@@ -114,22 +123,23 @@ def registration_strip(
     if result.faces is None or not len(result.faces):
         raise InputError("result must have triangles to be drawn; register scans with faces")
     known = (result.distances if errors is None else as_float_tensor(errors, "errors")).detach().cpu()
+    check_shape(known, "errors", (len(result.points),))
     known = known.nan_to_num(0.0, 0.0).clamp(min=0)
     if largest is None:
         largest = float(known.double().quantile(0.98)) or 1.0
     moved = TriangleMesh(result.deformed.detach().cpu(), result.faces.cpu())
     panels: list[tuple[str, TriangleMesh, Tensor]] = [
-        ("source", TriangleMesh(result.points.detach().cpu(), moved.faces), _plain(moved, _SOURCE)),
-        ("target", target, _plain(target, _TARGET)),
+        ("source", TriangleMesh(result.points.detach().cpu(), moved.faces), _plain(moved, _STYLE.source)),
+        ("target", target, _plain(target, _STYLE.target)),
         ("moved, by bones", moved, weight_colors(result.weights.cpu()).clamp(0, 1)),
         ("moved, by error", moved, error_colors(known, largest)),
     ]
     if view is None:
-        view = watch(torch.cat([mesh.vertices.detach().cpu() for _, mesh, _ in panels]), size=(_PANEL, _PANEL))
-    figure, axes = _row(len(panels), [label for label, _, _ in panels], margin=0.35)
+        points = torch.cat([mesh.vertices.detach().cpu() for _, mesh, _ in panels])
+        view = watch(points, size=(_STYLE.panel, _STYLE.panel))
+    figure, axes = _row([label for label, _, _ in panels], margin=_STYLE.bar)
     for ax, (_, mesh, paint) in zip(axes, panels, strict=True):
         draw_mesh(ax, _facing(mesh, view), view, paint)
-        _frame(ax, view)
     _color_bar(axes[-1], largest, unit)
     return save_picture(figure, path)
 
@@ -142,13 +152,13 @@ def spine_strip(
     columns: int = 4,
     view: View | None = None,
 ) -> Path:
-    """Return the path of a row of pictures of a spine over time, limbs in colors and numbers that stay.
+    """Return the path of a row of pictures of a spine over time, limbs in constant colors and numbers.
 
     Args:
         path: the picture to write.
         spine: of T frames.
         meshes: T surfaces.
-        columns: number of frames that are drawn, evenly spread.
+        columns: number of frames, evenly spread.
         view: of square pictures, see `spine_view`.
 
     Raises:
@@ -158,12 +168,12 @@ def spine_strip(
     if len(meshes) != len(spine.curves):
         raise InputError(f"meshes must hold one surface per frame ({len(spine.curves)}), got {len(meshes)}")
     chosen = [int(number) for number in np.unique(np.linspace(0, len(meshes) - 1, columns).round())]
-    shown = spine_view([meshes[number] for number in chosen], size=(_PANEL, _PANEL)) if view is None else view
-    figure, axes = _row(len(chosen), [f"frame {number}" for number in chosen])
+    size = _STYLE.panel, _STYLE.panel
+    shown = spine_view([meshes[number] for number in chosen], size=size) if view is None else view
+    figure, axes = _row([f"frame {number}" for number in chosen])
     for ax, number in zip(axes, chosen, strict=True):
-        draw_spine_frame(
-            ax, meshes[number], spine.curves[number], spine.num_tips, view=shown, own=spine.own[number]
-        )  # fmt: skip
+        curves, transferred = spine.curves[number], ~spine.own[number]
+        draw_spine_frame(ax, meshes[number], curves, spine.num_tips, view=shown, transferred=transferred)
     return save_picture(figure, path)
 
 
@@ -175,8 +185,8 @@ def convergence_figure(
     Args:
         path: the picture to write.
         curves: numbers per step by name, such as ``[float(record.cost) for record in result.history]``.
-        ylabel: what the numbers are.
-        logarithmic: whether the scale of the numbers is; those that are not positive are left out then.
+        ylabel: name of the numbers.
+        logarithmic: whether their scale is; numbers that are not positive are then omitted.
 
     Raises:
         InputError: if there is no line.
@@ -202,8 +212,8 @@ def convergence_figure(
 
 def _spread(history: Sequence[AlignRecord], count: int) -> list[AlignRecord]:
     """Return records spread evenly over a history, the first and the last among them."""
-    at = np.unique(np.linspace(0, len(history) - 1, max(count, 1)).round().astype(int))
-    return [history[number] for number in at] if count > 1 else [history[-1]]
+    steps = np.unique(np.linspace(0, len(history) - 1, max(count, 1)).round().astype(int))
+    return [history[step] for step in steps] if count > 1 else [history[-1]]
 
 
 def _step_label(record: AlignRecord) -> str:
@@ -212,21 +222,17 @@ def _step_label(record: AlignRecord) -> str:
     return f"surface fit, step {record.step + 1}"
 
 
-def _row(count: int, captions: Sequence[str], margin: float = 0.0) -> tuple[Figure, list[Axes]]:
-    """Return a figure with square panels side by side, captions below, and room at the right for a color bar."""
-    width, height = int((count + margin) * _PANEL), int(_PANEL / (1 - _CAPTION))
+def _row(captions: Sequence[str], margin: float = 0.0) -> tuple[Figure, list[Axes]]:
+    """Return a figure with square panels side by side, captions below, and a margin on the right, in panels."""
+    panel, bottom = _STYLE.panel, _STYLE.caption
+    width, height = int((len(captions) + margin) * panel), int(panel / (1 - bottom))
     figure, _ = new_figure(width, height, 0)
     axes = []
     for column, caption in enumerate(captions):
-        axes.append(figure.add_axes((column * _PANEL / width, _CAPTION, _PANEL / width, 1 - _CAPTION)))
+        axes.append(figure.add_axes((column * panel / width, bottom, panel / width, 1 - bottom)))
         axes[-1].set_axis_off()
-        figure.text((column + 0.5) * _PANEL / width, 0.03, caption, ha="center", fontsize=10)
+        figure.text((column + 0.5) * panel / width, 0.03, caption, ha="center", fontsize=10)
     return figure, axes
-
-
-def _frame(ax: Axes, view: View) -> None:
-    ax.set_xlim(0, view.width)
-    ax.set_ylim(view.height, 0)
 
 
 def _plain(mesh: TriangleMesh, color: tuple[float, float, float]) -> Tensor:
@@ -234,7 +240,7 @@ def _plain(mesh: TriangleMesh, color: tuple[float, float, float]) -> Tensor:
 
 
 def _facing(mesh: TriangleMesh, view: View) -> TriangleMesh:
-    """Return a scan with triangles that face the camera, whichever way round the file has them."""
+    """Return a scan with all triangles turned to the camera, whatever their orientation in the file."""
     vertices = mesh.vertices.detach().cpu().double()
     corner, second, third = vertices[mesh.faces].unbind(1)
     normal = torch.linalg.cross(second - corner, third - corner)

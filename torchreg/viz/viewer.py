@@ -1,10 +1,11 @@
-"""Scenes in the browser, served by this machine to itself alone, or as one HTML file that needs no network."""
+"""Scenes in the browser, served to this machine alone, or as one HTML file that needs no network."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -20,22 +21,26 @@ from torchreg.viz.viser_server import page_url, point_camera, start_server, stop
 if TYPE_CHECKING:
     import viser
 
-# How often the timeline looks whether to go on, and how long it holds the last frame, seconds.
-_TICK = 1 / 60
-_HOLD = 0.5
+
+@dataclass(frozen=True)
+class _Pace:
+    """Times of a timeline, seconds."""
+
+    tick: float = 1 / 60  # between updates
+    pause: float = 0.5  # at the last frame
+
+
+_PACE = _Pace()
 
 
 class SceneViewer:
-    """A scene on a running server, with a control per layer, and a timeline where something moves.
+    """A scene on a running server, with a control per layer, and a timeline if a layer moves.
 
     Usable in a ``with`` statement, at whose end the server stops.
 
     Args:
-        scene: what to show.
-        port: where to listen on 127.0.0.1; where it is taken, a later one.
-
-    Raises:
-        MissingExtraError: if viser is not installed.
+        scene: to show.
+        port: to listen on at 127.0.0.1, or a later one if it is taken.
     """
 
     def __init__(self, scene: Scene, *, port: int = 8080) -> None:
@@ -50,20 +55,16 @@ class SceneViewer:
 
     @property
     def url(self) -> str:
-        """Where a browser on this machine finds it."""
+        """Address for a browser on this machine."""
         return page_url(self.server)
 
     @property
     def frame(self) -> int:
-        """The frame that is shown."""
+        """The current frame."""
         return self._drawn.frame
 
     def show(self, frame: int) -> None:
-        """Show a frame.
-
-        Raises:
-            InputError: if there is no such frame.
-        """
+        """Show a frame."""
         if not 0 <= frame < self.scene.num_frames:
             raise InputError(f"frame must be from 0 to {self.scene.num_frames - 1}, got {frame}")
         if self._timeline is not None:
@@ -89,12 +90,12 @@ class SceneViewer:
 
 
 class Timeline:
-    """A slider, play and pause, speed; tells which frame to show.
+    """Controls for the frame: a slider, play and pause, speed.
 
     Args:
-        server: whose controls to add to.
-        seconds: (T,) when the frames are.
-        show: is called with the number of a frame, by one thread at a time.
+        server: of the page.
+        seconds: (T,) times of the frames.
+        show: called with the number of a frame, by one thread at a time.
     """
 
     def __init__(self, server: viser.ViserServer, seconds: list[float], show: Callable[[int], None]) -> None:
@@ -110,17 +111,17 @@ class Timeline:
         self._thread.start()
 
     def play(self) -> None:
-        """Go on from the frame shown, over and over."""
+        """Play from the current frame on, in a loop."""
         self._play.label = "Pause"
         self._playing.set()
 
     def pause(self) -> None:
-        """Stay at the frame shown."""
+        """Stop at the current frame."""
         self._play.label = "Play"
         self._playing.clear()
 
     def go_to(self, frame: int) -> None:
-        """Show a frame and put the slider there."""
+        """Show a frame and set the slider."""
         self._slider.value = frame  # type: ignore[misc]
         self._show(frame)
 
@@ -132,39 +133,39 @@ class Timeline:
 
     def _run(self) -> None:
         while self._playing.wait() and not self._stopped.is_set():
-            at, before = self._seconds[int(self._slider.value)], time.perf_counter()
-            while self._playing.is_set() and not self._stopped.wait(_TICK):
+            shown, before = self._seconds[int(self._slider.value)], time.perf_counter()
+            while self._playing.is_set() and not self._stopped.wait(_PACE.tick):
                 now = time.perf_counter()
-                at += (now - before) * float(self._speed.value)
+                shown += (now - before) * float(self._speed.value)
                 before = now
-                frame = self._frame_at(at)
-                if frame is None:  # the last frame is held for a while
-                    at, frame = self._seconds[0], 0
+                frame = self._frame_at(shown)
+                if frame is None:
+                    shown, frame = self._seconds[0], 0
                 if frame != int(self._slider.value):
                     self.go_to(frame)
 
-    def _frame_at(self, at: float) -> int | None:
-        if at > self._seconds[-1] + _HOLD:
+    def _frame_at(self, seconds: float) -> int | None:
+        """Return the frame at a time, None after the pause at the last one."""
+        if seconds > self._seconds[-1] + _PACE.pause:
             return None
-        return int(np.searchsorted(self._seconds, at, side="right")) - 1
+        return int(np.searchsorted(self._seconds, seconds, side="right")) - 1
 
 
-def scene_html(path: str | Path, scene: Scene, *, num_loops: int = 1) -> Path:
+def scene_html(path: str | Path, scene: Scene) -> Path:
     """Return the path of an HTML file that shows a scene in any browser, without a server or a network.
 
-    What moves is played in a loop, with a timeline. Layers hidden at first are left out.
+    Moving layers are played in a loop, with a timeline. Hidden layers are omitted.
 
     Args:
-        path: where to write, ending in .html; an existing file is replaced, whole or not at all.
-        scene: what to show.
-        num_loops: how often what moves is recorded.
+        path: to write, ending in .html; an existing file is replaced, whole or not at all.
+        scene: to show.
 
     Raises:
         InputError: if the ending is another.
         FileNotFoundError: if the folder does not exist.
         MissingExtraError: if viser is not installed.
 
-    Cost: 1 MB and what the frames need, 12 bytes per vertex and frame before compression.
+    Cost: 1 MB, and 12 bytes per vertex and frame before compression.
     """
     path = Path(path)
     if path.suffix.lower() != ".html":
@@ -175,10 +176,9 @@ def scene_html(path: str | Path, scene: Scene, *, num_loops: int = 1) -> Path:
         drawn = DrawnScene(server.scene, shown)
         point_camera(server, scene)
         record = server.get_scene_serializer()
-        for _ in range(num_loops if shown.num_frames > 1 else 0):
-            for frame, seconds in _durations(scene.seconds[: shown.num_frames]):
-                drawn.show(frame)
-                record.insert_sleep(seconds)
+        for frame, seconds in _durations(scene.seconds) if shown.num_frames > 1 else ():
+            drawn.show(frame)
+            record.insert_sleep(seconds)
         content = record.as_html()
     finally:
         stop_server(server)
@@ -187,6 +187,6 @@ def scene_html(path: str | Path, scene: Scene, *, num_loops: int = 1) -> Path:
 
 
 def _durations(seconds: list[float]) -> Iterator[tuple[int, float]]:
-    """Yield each frame with how long it is shown."""
+    """Yield each frame with its duration."""
     for frame in range(len(seconds)):
-        yield frame, seconds[frame + 1] - seconds[frame] if frame + 1 < len(seconds) else _HOLD
+        yield frame, seconds[frame + 1] - seconds[frame] if frame + 1 < len(seconds) else _PACE.pause

@@ -1,4 +1,4 @@
-"""What the layers of a scene become in a page of viser, and how they go from frame to frame."""
+"""The layers of a scene as nodes of a viser page, and their changes from frame to frame."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchreg.viz.scene import Cloud, Curves, Layer, Meshes, Scene, Surface
+from torchreg.viz.scene import Cloud, Curves, Layer, Meshes, MovingMesh, Scene
 
 if TYPE_CHECKING:
     import viser
 
 
 class DrawnScene:
-    """The nodes that a scene has become on a server, of which one frame is shown.
+    """A scene drawn on a server, one frame at a time.
 
     Args:
         api: ``scene`` of a server.
-        scene: what to draw.
+        scene: to draw.
     """
 
     def __init__(self, api: viser.SceneApi, scene: Scene) -> None:
@@ -52,8 +52,8 @@ class _DrawnLayer:
     """Nodes of one layer.
 
     Args:
-        nodes: its handles.
-        update: puts them where a frame has them and returns those that the frame shows.
+        nodes: their handles.
+        update: moves them to a frame and returns the visible ones.
         num_frames: of the layer.
     """
 
@@ -63,23 +63,23 @@ class _DrawnLayer:
         self._shown: set[int] = set()
 
     def show(self, frame: int, visible: bool) -> None:
-        at = min(frame, self._num_frames - 1)
-        if visible and at != self._frame:
-            self._frame, self._shown = at, {id(node) for node in self._update(at)}
+        frame = min(frame, self._num_frames - 1)
+        if visible and frame != self._frame:
+            self._frame, self._shown = frame, {id(node) for node in self._update(frame)}
         for node in self._nodes:
             node.visible = visible and id(node) in self._shown
 
 
 def _draw(api: viser.SceneApi, name: str, layer: Layer, size: float) -> _DrawnLayer:
-    if isinstance(layer, Surface):
+    if isinstance(layer, MovingMesh):
         return _draw_surface(api, name, layer)
     if isinstance(layer, Meshes):
         return _draw_meshes(api, name, layer)
     return _draw_cloud(api, name, layer, size) if isinstance(layer, Cloud) else _draw_curves(api, name, layer, size)
 
 
-def draw_patches(api: viser.SceneApi, name: str, surface: Surface) -> list[tuple[Any, NDArray[Any]]]:
-    """Return the nodes of a surface at its first frame, with which vertices each of them shows."""
+def draw_patches(api: viser.SceneApi, name: str, surface: MovingMesh) -> list[tuple[Any, NDArray[Any]]]:
+    """Return the nodes of a mesh at its first frame, each with the indices of its vertices."""
     smooth = not isinstance(surface.paint, Tensor)
     points = as_floats(surface.points(0))
     found = []
@@ -94,7 +94,7 @@ def draw_patches(api: viser.SceneApi, name: str, surface: Surface) -> list[tuple
     return found
 
 
-def _draw_surface(api: viser.SceneApi, name: str, layer: Surface) -> _DrawnLayer:
+def _draw_surface(api: viser.SceneApi, name: str, layer: MovingMesh) -> _DrawnLayer:
     patches = draw_patches(api, name, layer)
 
     def update(frame: int) -> list[Any]:

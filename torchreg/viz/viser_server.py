@@ -1,4 +1,4 @@
-"""Pages that this machine serves to itself alone: a server of viser, its camera and its lights."""
+"""Pages served to this machine alone: a viser server, its camera and its lights."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torchreg.viz.scene import FIELD_OF_VIEW, Scene
 if TYPE_CHECKING:
     import viser
 
-Place = NDArray[np.floating]
+Point = NDArray[np.floating]
 
 HOST = "127.0.0.1"
 
@@ -30,19 +30,16 @@ def import_viser() -> Any:
 
 
 def start_server(title: str, port: int) -> viser.ViserServer:
-    """Return a server on 127.0.0.1 that other machines cannot reach and that asks none for anything.
+    """Return a server on 127.0.0.1, which other machines cannot reach, and which contacts none.
 
     Args:
-        title: shown above the controls.
-        port: where to listen; where it is taken, a later one.
-
-    Raises:
-        MissingExtraError: if viser is not installed.
+        title: above the controls.
+        port: to listen on, or a later one if it is taken.
     """
     library = import_viser()
     with contextlib.redirect_stdout(io.StringIO()):  # viser greets
         server: viser.ViserServer = library.ViserServer(host=HOST, port=port, label=title, verbose=False)
-    # Sharing would open a tunnel through a server of others.
+    # Sharing would open a tunnel through a foreign server.
     setattr(server, "request_share_url", lambda verbose=True: None)  # noqa: B010
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
     server.scene.configure_environment_map(None)
@@ -50,35 +47,35 @@ def start_server(title: str, port: int) -> viser.ViserServer:
 
 
 def page_url(server: viser.ViserServer) -> str:
-    """Return where a browser on this machine finds the page."""
+    """Return the address of the page for a browser on this machine."""
     return f"http://{HOST}:{server.get_port()}"
 
 
 def stop_server(server: viser.ViserServer) -> None:
-    """Stop a server without a word."""
+    """Stop a server without printing."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
 
 
 def point_camera(server: viser.ViserServer, scene: Scene) -> None:
-    """Let new windows see all of a scene."""
+    """Point the camera of new windows at a scene, with all of it in view."""
     position, target, up = scene.camera()
     server.scene.set_up_direction(tuple(up.tolist()))
     camera, size = server.initial_camera, scene.diagonal
     camera.fov, camera.near, camera.far = FIELD_OF_VIEW, 0.01 * size, 100 * size
     camera.position, camera.look_at, camera.up = position.numpy(), target.numpy(), up.numpy()
-    _light(server, position.numpy(), target.numpy(), up.numpy())
+    _add_lights(server, position.numpy(), target.numpy(), up.numpy())
 
 
-def _light(server: viser.ViserServer, position: Place, target: Place, up: Place) -> None:
-    """Light a scene from above and from the camera's side, with no shadows."""
+def _add_lights(server: viser.ViserServer, position: Point, target: Point, up: Point) -> None:
+    """Light a scene from above and from the camera's side, without shadows."""
     server.scene.configure_default_lights(enabled=False)
     server.scene.add_light_hemisphere(
         "/lights/sky", sky_color=(255, 255, 255), ground_color=(150, 150, 160), intensity=1.6
     )
     right = np.cross(target - position, up)
-    for name, place, strength in (("key", position + 0.8 * right + up, 2.2), ("back", 2 * target - position + up, 0.7)):
-        toward = tuple(place - target)
+    for name, lamp, strength in (("key", position + 0.8 * right + up, 2.2), ("back", 2 * target - position + up, 0.7)):
+        direction = tuple(lamp - target)
         server.scene.add_light_directional(
-            f"/lights/{name}", color=(255, 255, 255), intensity=strength, position=toward, cast_shadow=False
+            f"/lights/{name}", color=(255, 255, 255), intensity=strength, position=direction, cast_shadow=False
         )

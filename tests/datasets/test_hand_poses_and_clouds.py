@@ -152,7 +152,7 @@ def test_float64_shapes_give_float64_clouds():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"num_points": 0}, "num_points must be a positive integer"),
+        ({"num_points": 0}, "num_points must be at least 1, got 0"),
         ({"noise": -0.1}, "noise must be zero or positive"),
         ({"outlier_ratio": 1.0}, "outlier_ratio must be at least 0 and below 1"),
         ({"pose": torch.zeros(2, 27)}, r"pose must have shape \(27,\), got \(2, 27\)"),
@@ -346,7 +346,7 @@ def test_clouds_carry_the_truth(hand, skin):
     ("options", "message"),
     [
         ({"kind": "wave"}, "kind must be one of bend, rotate"),
-        ({"num_frames": 0}, "num_frames must be a positive integer"),
+        ({"num_frames": 0}, "num_frames must be at least 1, got 0"),
         ({"fps": 0.0}, "fps must be positive"),
         ({"bend": 1.5}, "bend must be between 0 and 1"),
         ({"distance": -1.0}, "distance must be positive"),

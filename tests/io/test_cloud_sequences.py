@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchreg.errors import FormatError, InputError, InputTypeError
-from torchreg.io import points as points_module
-from torchreg.io.frames import ENDINGS, Frames, load_frames, natural_key, save_frames
+from torchreg.io.frames import Frames, load_frames, natural_key, save_frames
 from torchreg.io.limits import FileLimits
 from torchreg.io.points import save_points
 
@@ -23,10 +22,6 @@ def clouds(*counts, dtype=torch.float32, seed=0):
 def same(frames, expected):
     assert len(frames) == len(expected)
     return all(torch.equal(a, b) for a, b in zip(frames, expected, strict=True))
-
-
-def test_the_endings_are_those_of_load_points():
-    assert list(points_module._READERS) == list(ENDINGS)
 
 
 def test_folder_round_trip(tmp_path):

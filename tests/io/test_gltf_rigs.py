@@ -4,6 +4,7 @@ import base64
 import copy
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from torchreg.errors import FormatError, ModelError
+from torchreg.io import gltf
 from torchreg.io.gltf import load_rig
 from torchreg.io.gltf_write import save_animated_skin
 from torchreg.io.limits import FileLimits
@@ -469,7 +471,7 @@ def test_damaged_containers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.raises(FormatError, match="neither an address nor a binary chunk"):
         load_rig(path)
     path.write_bytes(whole)
-    monkeypatch.setattr("torchreg.io.gltf._MAX_NODES", 2)
+    monkeypatch.setattr("torchreg.io.gltf._LIMITS", replace(gltf._LIMITS, max_nodes=2))
     with pytest.raises(FormatError, match="3 nodes, at most 2"):
         load_rig(path)
 

@@ -1,16 +1,17 @@
 import pytest
 import torch
 
-from torchreg.datasets.hand import placed
+from torchreg.datasets.hand import hand_motion, placed
 from torchreg.datasets.pictures import (
     PictureStyle,
+    backdrop,
     camera_ring,
-    hand_pictures,
     render,
     skin_color,
     stereo_cameras,
     value_noise,
 )
+from torchreg.datasets.videos import shape_video
 from torchreg.errors import InputError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
@@ -82,20 +83,21 @@ def test_hand_before_a_pair_and_in_a_ring(plain_hand, plain_hand_surface):
     assert pair.is_rectified
     assert pair.baseline == pytest.approx(0.12)
     pose = placed(plain_hand, plain_hand.rest_pose(), torch.tensor([0.0, 0.0, 0.6]))
-    left, right = hand_pictures(plain_hand, pose, pair, skin=plain_hand_surface, style=PictureStyle(wall=0.9))
+    options = {"skin": plain_hand_surface, "forearm": False}
+    [(left, right)] = shape_video(plain_hand, pose[None], pair, style=PictureStyle(wall=0.9), **options)
     assert left.mask.sum() > 50
     # The disparity of the hand is about that of its distance.
     middle = [picture.mask.nonzero()[:, 1].double().mean() for picture in (left, right)]
     expected = pair.disparity(left.depth[left.mask].mean())
     assert float(middle[0] - middle[1]) == pytest.approx(float(expected), abs=1.5)
     ring = camera_ring([0.0, 0.0, 0.6], 0.5, 5, focal=50.0, width=48, height=48)
-    pictures = hand_pictures(plain_hand, pose, ring, skin=plain_hand_surface)
+    [pictures] = shape_video(plain_hand, pose[None], ring, **options)
     assert len(pictures) == len(ring) == 5
     assert all(picture.mask.sum() > 20 for picture in pictures)
     assert all(camera.project(torch.tensor([[0.0, 0.0, 0.6]]))[1].item() == pytest.approx(0.5) for camera in ring)
 
 
-def test_arguments_are_checked(ball, plain_hand, plain_hand_skin):
+def test_arguments_are_checked(ball):
     with pytest.raises(InputError, match="noise must be zero or positive"):
         PictureStyle(noise=-1.0)
     with pytest.raises(InputError, match="supersampling must be at least 1"):
@@ -106,5 +108,58 @@ def test_arguments_are_checked(ball, plain_hand, plain_hand_skin):
         render(ball, CAMERA, ball.vertices[:3])
     with pytest.raises(InputError, match="count must be at least 2"):
         camera_ring([0, 0, 0], 1.0, 1)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return stereo_cameras(width=80, height=60, focal=100.0)
+
+
+def test_video_is_what_single_pictures_show_with_the_noise_drawn_anew(plain_hand, plain_hand_surface, pair):
+    style = PictureStyle(wall=0.9, noise=0.0, supersampling=1)
+    poses = hand_motion(plain_hand, "rotation", 2, distance=0.6)
+    frames = list(shape_video(plain_hand, poses, pair, skin=plain_hand_surface, style=style, forearm=False, seed=3))
+    assert [len(frame) for frame in frames] == [2, 2]
+    rest = plain_hand_surface(plain_hand.rest_pose())
+    for pose, frame in zip(poses, frames, strict=True):
+        mesh = TriangleMesh(plain_hand_surface(pose), plain_hand_surface.faces)
+        for camera, picture in zip((pair.left, pair.right), frame, strict=True):
+            single = render(mesh, camera, rest, style=style, seed=3)
+            assert torch.allclose(picture.image, single.image, atol=1e-6)
+            assert torch.equal(picture.mask, single.mask)
+    noisy = PictureStyle(wall=0.9, noise=0.05, supersampling=1)
+    still = poses[:1].expand(2, -1)
+    first, second = shape_video(plain_hand, still, pair, skin=plain_hand_surface, style=noisy)
+    assert not torch.equal(first[0].image, second[0].image)
+    assert torch.equal(first[0].depth, second[0].depth)
+
+
+def test_the_forearm_is_seen_but_not_in_the_mask(plain_hand, plain_hand_surface, pair):
+    poses = hand_motion(plain_hand, "bend", 1, distance=0.6)
+    style = PictureStyle(noise=0.0, supersampling=1)
+    with_arm, alone = (
+        next(iter(shape_video(plain_hand, poses, pair, skin=plain_hand_surface, style=style, forearm=arm)))[0]
+        for arm in (True, False)
+    )
+    assert torch.equal(alone.mask, alone.face_index >= 0)
+    assert ((with_arm.face_index >= 0).sum() - alone.mask.sum()) > 100
+    assert (with_arm.mask & ~alone.mask).sum() == 0
+    # It hides the wrist at most.
+    assert with_arm.mask.sum() > 0.9 * alone.mask.sum()
+    # It goes on beyond the picture.
+    assert (with_arm.face_index[-1] >= 0).any()
+
+
+def test_backdrop_has_a_color_per_ray(pair):
+    plain = backdrop(pair.left, style=PictureStyle(background=(0.1, 0.2, 0.3)))
+    assert plain.shape == (120, 160, 3)
+    assert torch.allclose(plain, torch.tensor([0.1, 0.2, 0.3]).expand_as(plain))
+    wall = backdrop(pair.left, style=PictureStyle(wall=1.0))
+    assert wall.std() > 0.02
+
+
+def test_video_arguments_are_checked(plain_hand, plain_hand_skin, pair):
     with pytest.raises(InputError, match="skin must have faces"):
-        hand_pictures(plain_hand, plain_hand.rest_pose(), stereo_cameras(), skin=plain_hand_skin)
+        next(shape_video(plain_hand, plain_hand.rest_pose()[None], pair, skin=plain_hand_skin))
+    with pytest.raises(InputError, match="poses must have shape"):
+        next(shape_video(plain_hand, plain_hand.rest_pose(), pair))

@@ -3,12 +3,17 @@ import math
 import pytest
 import torch
 
-from torchreg.capture.silhouettes import chroma_key, visual_hull
-from torchreg.errors import InputError, InputTypeError
+from torchreg.capture.color import chroma_key
+from torchreg.capture.mask_distance import signed_mask_distance
+from torchreg.capture.silhouette_frames import SilhouetteFrames
+from torchreg.capture.silhouettes import visual_hull
+from torchreg.datasets.pictures import camera_ring
+from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
 from torchreg.geometry.visibility import rasterize
+from torchreg.io.images import save_image
 
 CENTER = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
 RADII = torch.tensor([0.3, 0.2, 0.15], dtype=torch.float64)
@@ -176,3 +181,117 @@ def test_exchanged_masks_are_refused():
     boxes[0], boxes[2] = boxes[2], boxes[0]
     with pytest.raises(InputError, match=r"fills \d+ % of that of c\d; check that masks and cameras are in the same"):
         visual_hull(boxes, cameras, resolution=24)
+
+
+RADIUS = 0.1
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return camera_ring([0.0, 0.0, 0.0], 0.6, 5, focal=120.0, width=80, height=64)
+
+
+def ball_mask(camera, center):
+    rays = camera.directions(camera.pixel_grid())
+    start = camera.position - rays.new_tensor(center)
+    return (rays @ start) ** 2 > (rays**2).sum(-1) * ((start**2).sum() - RADIUS**2)
+
+
+@pytest.fixture(scope="module")
+def folders(rig, tmp_path_factory):
+    """Two frames of a ball that moves, one folder per camera."""
+    place = tmp_path_factory.mktemp("masks")
+    for camera in rig:
+        (place / camera.name).mkdir()
+        for number, x in ((9, 0.0), (10, 0.03)):
+            save_image(place / camera.name / f"{number}.png", ball_mask(camera, [x, 0.0, 0.0]))
+    return place
+
+
+def test_hulls_follow_the_ball_and_are_kept(rig, folders, tmp_path):
+    frames = SilhouetteFrames([folders / camera.name for camera in rig], rig, resolution=32)
+    assert len(frames) == 2
+    assert [name.rpartition("/")[2] for name in frames.names] == ["9.png", "10.png"]
+    meshes = [frames.mesh(number, tmp_path / "kept") for number in range(2)]
+    for mesh, x in zip(meshes, (0.0, 0.03), strict=True):
+        middle = mesh.vertices.mean(0)
+        assert (middle - torch.tensor([x, 0.0, 0.0])).norm() < 0.02
+    assert len(list((tmp_path / "kept").glob("hull_*.safetensors"))) == 2
+    again = frames.mesh(1, tmp_path / "kept")
+    assert torch.equal(again.vertices, meshes[1].vertices)
+    # Another resolution is another surface.
+    other = SilhouetteFrames([folders / camera.name for camera in rig], rig, resolution=24)
+    assert other.mesh(1, tmp_path / "kept").num_vertices < meshes[1].num_vertices
+
+
+def test_folders_belong_to_cameras_by_name_or_by_order(rig, folders, tmp_path):
+    names = [camera.name for camera in rig]
+    turned = [folders / name for name in reversed(names)]
+    frames = SilhouetteFrames(turned, rig, resolution=24)
+    assert frames.cameras.names == tuple(reversed(names))
+    some = SilhouetteFrames(turned[:3], rig, resolution=24)
+    assert some.mesh(0).num_faces > 100
+    plain = tmp_path / "plain"
+    plain.mkdir()
+    for number, name in enumerate(names):
+        (plain / str(number)).mkdir()
+        for file in (folders / name).iterdir():
+            (plain / str(number) / file.name).write_bytes(file.read_bytes())
+    ordered = SilhouetteFrames([plain / str(k) for k in range(5)], rig, resolution=24)
+    named = SilhouetteFrames([folders / name for name in names], rig, resolution=24)
+    assert torch.equal(ordered.mesh(0).vertices, named.mesh(0).vertices)
+
+
+def test_pictures_before_a_screen_become_masks(rig, tmp_path):
+    folders = []
+    for camera in rig:
+        folders.append(tmp_path / camera.name)
+        folders[-1].mkdir()
+        mask = ball_mask(camera, [0.0, 0.0, 0.0]).unsqueeze(-1)
+        image = torch.where(mask, torch.tensor([0.8, 0.6, 0.5]), torch.tensor([0.1, 0.65, 0.2]))
+        save_image(folders[-1] / "0.png", image)
+    frames = SilhouetteFrames(folders, rig, screen=True, resolution=24)
+    for camera, mask in zip(rig, frames.masks(0), strict=True):
+        assert (mask ^ ball_mask(camera, [0.0, 0.0, 0.0])).float().mean() < 0.01
+    save_image(folders[0] / "0.png", torch.zeros(64, 80))
+    with pytest.raises(FormatError, match=r"camera00.0.png: pictures before a screen must be in color"):
+        frames.masks(0)
+
+
+def test_errors_name_the_file_or_the_frame(rig, folders, tmp_path):
+    places = [folders / camera.name for camera in rig]
+    with pytest.raises(InputError, match="one per camera, got 1 folders and 5 cameras"):
+        SilhouetteFrames([folders], rig)
+    with pytest.raises(InputError, match="there is none called other"):
+        SilhouetteFrames([places[0], tmp_path / "other"], rig)
+    (tmp_path / "camera00").mkdir()
+    save_image(tmp_path / "camera00" / "0.png", torch.zeros(10, 20))
+    with pytest.raises(FormatError, match="equally many pictures"):
+        SilhouetteFrames([tmp_path / "camera00", places[1]], rig)
+    save_image(tmp_path / "camera00" / "1.png", torch.zeros(64, 80))
+    frames = SilhouetteFrames([tmp_path / "camera00", places[1]], rig)
+    with pytest.raises(FormatError, match=r"camera00.0.png: is 20 x 10 pixels, the pictures of camera00 are 80 x 64"):
+        frames.mesh(0)
+    with pytest.raises(FormatError, match=r"frame 1 .*1.png\): masks must show the whole object"):
+        frames.mesh(1)
+
+
+def test_distance_to_a_disk_and_its_sign():
+    row, column = torch.meshgrid(torch.arange(40.0), torch.arange(50.0), indexing="ij")
+    radius = torch.hypot(row - 20, column - 25)
+    distance = signed_mask_distance(radius <= 10.3)
+    assert (distance - (radius - 10.3)).abs().max() < 1.0
+    assert ((distance < 0) == (radius <= 10.3)).all()
+    assert torch.equal(signed_mask_distance(radius > 10.3), -distance)
+
+
+def test_a_straight_edge_is_exact():
+    mask = torch.zeros(3, 6, dtype=torch.bool)
+    mask[:, 3:] = True
+    assert signed_mask_distance(mask)[1].tolist() == [2.5, 1.5, 0.5, -0.5, -1.5, -2.5]
+
+
+def test_masks_without_outline_are_half_a_diagonal_away_from_one():
+    full = torch.ones(3, 4, dtype=torch.bool)
+    assert (signed_mask_distance(full) == -2.5).all()
+    assert (signed_mask_distance(~full) == 2.5).all()

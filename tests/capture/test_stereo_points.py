@@ -1,0 +1,246 @@
+import pytest
+import torch
+
+from torchreg.capture.stereo import StereoConfig, StereoPoints, rectify, stereo_points
+from torchreg.capture.stereo_frames import StereoFrames, far_end
+from torchreg.datasets.pictures import PictureStyle, render, stereo_cameras
+from torchreg.errors import FormatError, InputError
+from torchreg.geometry.camera import Camera
+from torchreg.geometry.camera_rig import StereoPair
+from torchreg.geometry.mesh import TriangleMesh, unit_sphere
+from torchreg.geometry.rigid import se3_exp
+from torchreg.io.images import save_image
+
+NEAR = StereoConfig(nearest=0.4, farthest=1.0)
+
+
+def ball_before(cameras, style=None):
+    mesh = unit_sphere(4, dtype=torch.float64)
+    mesh = TriangleMesh(0.1 * mesh.vertices + mesh.vertices.new_tensor([0.0, 0.0, 0.6]), mesh.faces)
+    generator = torch.Generator().manual_seed(0)
+    style = PictureStyle(wall=0.85) if style is None else style
+    return [render(mesh, camera, style=style, generator=generator) for camera in cameras]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    pair = stereo_cameras(width=200, height=150, focal=240.0)
+    left, right = ball_before((pair.left, pair.right))
+    return pair, left, right, stereo_points(left.image, right.image, pair, config=NEAR)
+
+
+def errors(scene, found):
+    pair, left, _, _ = scene
+    column, row = found.pixels.long().unbind(-1)
+    depth = pair.left.project(found.points)[1]
+    return (depth - left.depth[row, column]).abs(), left.mask[row, column]
+
+
+def test_points_are_within_what_they_state(scene):
+    found = scene[3]
+    error, on_ball = errors(scene, found)
+    assert len(found) > 100
+    assert on_ball.sum() > 10
+    assert error.median() < 3e-3
+    assert (error <= 3 * found.depth_std).float().mean() >= 0.95
+
+
+def test_points_lie_on_the_rays_of_corners_of_both_pictures(scene):
+    pair, _, _, found = scene
+    assert torch.equal(found.pixels, found.pixels.round())
+    assert (pair.left.project(found.points)[0] - found.pixels).abs().max() < 1e-2
+    there, _ = pair.right.project(found.points)
+    assert (found.pixels[:, 0] - there[:, 0] - found.disparity).abs().max() < 1e-2
+    assert (there[:, 1] - found.pixels[:, 1]).abs().max() < 1e-2
+    assert found.dense.shape == (150, 200)
+
+
+def test_covariance_is_that_of_the_depth_along_the_ray(scene):
+    pair, _, _, found = scene
+    rays = pair.left.directions(found.pixels)
+    unit = torch.nn.functional.normalize(rays, dim=-1)
+    along = (unit.unsqueeze(-2) @ found.covariance @ unit.unsqueeze(-1))[:, 0, 0].sqrt()
+    assert (along >= found.depth_std * rays.norm(dim=-1) * 0.999).all()
+    assert torch.linalg.eigvalsh(found.covariance).min() > 0
+
+
+def test_background_goes_by_depth_and_by_volume(scene):
+    pair, left, right, found = scene
+    near = stereo_points(left.image, right.image, pair, config=StereoConfig(nearest=0.4, farthest=0.7, both=False))
+    assert 0 < len(near) < len(found)
+    assert near.points[:, 2].max() < 0.71
+    box = torch.tensor([[0.0, -1.0, 0.0], [1.0, 1.0, 2.0]])
+    half = stereo_points(left.image, right.image, pair, config=NEAR, box=box)
+    assert 0 < len(half) < len(found)
+    assert (half.points[:, 0] >= 0).all()
+    few = stereo_points(left.image, right.image, pair, config=StereoConfig(num_corners=20))
+    assert len(few) == 20
+
+
+def test_textured_places_stand_in_for_corners(scene):
+    pair, left, right, found = scene
+    least = len(found) + 100
+    config = StereoConfig(nearest=0.4, farthest=1.0, least=least)
+    more = stereo_points(left.image, right.image, pair, config=config)
+    assert len(more) >= len(found) + 50
+    error, _ = errors(scene, more)
+    assert error.median() < 3e-3
+    assert (error <= 3 * more.depth_std).float().mean() >= 0.95
+    corners = {tuple(pixel) for pixel in found.pixels.tolist()}
+    assert corners <= {tuple(pixel) for pixel in more.pixels.tolist()}
+    added = torch.tensor([pixel for pixel in more.pixels.tolist() if tuple(pixel) not in corners])
+    apart = torch.cdist(added, more.pixels, p=torch.inf)
+    assert apart[apart > 0].min() >= 3
+    with pytest.raises(InputError, match="least must be at most num_corners"):
+        StereoConfig(num_corners=20, least=30)
+
+
+def test_rectified_pictures_of_a_turned_pair_with_lenses_match():
+    pair = stereo_cameras(width=200, height=150, focal=240.0)
+    twist = torch.tensor([0.0, 0.004, 0.002, 0.02, -0.03, 0.02], dtype=torch.float64)
+    turned = Camera(200, 150, pair.right.intrinsics + 1, se3_exp(twist) @ pair.right.world_to_camera)
+    crooked = StereoPair(pair.left, turned)
+    left, right = ball_before((crooked.left, crooked.right))
+    with pytest.raises(InputError, match="is not rectified"):
+        stereo_points(left.image, right.image, crooked, config=NEAR)
+    first, second, straight = rectify(left.image, right.image, crooked)
+    assert straight.is_rectified
+    assert straight.baseline == pytest.approx(crooked.baseline)
+    found = stereo_points(first, second, straight, config=NEAR)
+    # Ball or wall: the points lie on one of them.
+    off = torch.minimum(
+        ((found.points - found.points.new_tensor([0.0, 0.0, 0.6])).norm(dim=-1) - 0.1).abs(),
+        (found.points[:, 2] - 0.85).abs(),
+    )
+    assert len(found) > 100
+    assert off.median() < 3e-3
+
+
+def test_rectify_undoes_lenses():
+    pair = stereo_cameras(width=60, height=40, focal=60.0)
+    bent = Camera(60, 40, pair.left.intrinsics, pair.left.world_to_camera, (-0.2, 0.05, 0.0, 0.0))
+    ramp = pair.left.pixel_grid()[..., 0] / 60
+    first, _, straight = rectify(ramp, ramp.unsqueeze(-1).expand(-1, -1, 3), StereoPair(bent, pair.right))
+    assert straight.is_rectified
+    source, _ = bent.project(bent.position + straight.left.directions(straight.left.pixel_grid()))
+    inner = (slice(10, 30), slice(10, 50))
+    assert torch.allclose(first[inner], source[..., 0][inner] / 60, atol=1e-6)
+
+
+def test_swapped_strange_and_wrongly_sized_pictures_are_refused(scene):
+    pair, left, right, _ = scene
+    with pytest.raises(InputError, match="left and right pictures are swapped"):
+        stereo_points(right.image, left.image, pair, config=NEAR)
+    noise = torch.rand(2, 150, 200, generator=torch.Generator().manual_seed(0))
+    with pytest.raises(InputError, match="left and right hardly match"):
+        stereo_points(noise[0], noise[1], pair, config=NEAR)
+    with pytest.raises(InputError, match=r"right must have shape \(150, 200\)"):
+        stereo_points(noise[0], noise[1, 1:], pair, config=NEAR)
+    with pytest.raises(InputError, match="left must be finite"):
+        stereo_points(noise[0] / 0, noise[1], pair, config=NEAR)
+    with pytest.raises(InputError, match="nearest must keep disparities within the picture"):
+        stereo_points(noise[0], noise[1], pair, config=StereoConfig(nearest=0.05))
+    with pytest.raises(InputError, match="farthest must be beyond nearest"):
+        StereoConfig(nearest=1.0, farthest=0.5)
+    with pytest.raises(InputError, match="method must be one of semi-global, block, opencv; got 'magic'"):
+        StereoConfig(method="magic")
+    with pytest.raises(InputError, match=r"box must have shape \(2, 3\)"):
+        stereo_points(left.image, right.image, pair, config=NEAR, box=torch.zeros(3))
+
+
+NEAR_BALL = StereoConfig(nearest=0.45, farthest=0.8)
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return stereo_cameras(width=160, height=120, focal=190.0)
+
+
+def ball_at(x, cameras):
+    mesh = unit_sphere(3, dtype=torch.float64)
+    mesh = TriangleMesh(0.1 * mesh.vertices + mesh.vertices.new_tensor([x, 0.0, 0.6]), mesh.faces)
+    return [render(mesh, camera, style=PictureStyle(wall=0.9)).image for camera in cameras]
+
+
+@pytest.fixture(scope="module")
+def folders(pair, tmp_path_factory):
+    """Two frames whose numbers sort otherwise than their names."""
+    place = tmp_path_factory.mktemp("pair")
+    for name in ("left", "right"):
+        (place / name).mkdir()
+    for number, x in ((9, -0.02), (10, 0.02)):
+        for name, image in zip(("left", "right"), ball_at(x, (pair.left, pair.right)), strict=True):
+            save_image(place / name / f"f{number}.png", image)
+    return place
+
+
+def test_frames_come_in_order_as_points_on_the_ball(folders, pair):
+    frames = StereoFrames(folders / "left", folders / "right", pair, config=NEAR_BALL)
+    assert len(frames) == 2
+    assert [name[-7:] for name in frames.names] == ["/f9.png", "f10.png"]
+    clouds = frames[:]
+    for cloud, x in zip(clouds, (-0.02, 0.02), strict=True):
+        off = ((cloud - torch.tensor([x, 0.0, 0.6])).norm(dim=-1) - 0.1).abs()
+        assert cloud.dtype == torch.float32
+        assert len(cloud) > 20
+        assert off.median() < 3e-3
+    assert frames[-1] is clouds[1]
+    sight = frames.sight(1)
+    assert sight is frames.sight(1)
+    assert torch.equal(sight.points.points.float(), clouds[1])
+    assert sight.left.shape == (120, 160, 3)
+
+
+def test_pictures_of_a_turned_pair_are_rectified(pair, tmp_path):
+    twist = torch.tensor([0.0, 0.002, 0.0, 0.01, -0.02, 0.01], dtype=torch.float64)
+    turned = Camera(160, 120, pair.right.intrinsics, se3_exp(twist) @ pair.right.world_to_camera)
+    crooked = StereoPair(pair.left, turned)
+    for name, image in zip(("left", "right"), ball_at(0.0, (pair.left, turned)), strict=True):
+        (tmp_path / name).mkdir()
+        save_image(tmp_path / name / "0.png", image)
+    cloud = StereoFrames(tmp_path / "left", tmp_path / "right", crooked, config=NEAR_BALL)[0]
+    assert len(cloud) > 20
+    assert ((cloud - torch.tensor([0.0, 0.0, 0.6])).norm(dim=-1) - 0.1).abs().median() < 3e-3
+
+
+def test_what_comes_in_through_the_border_is_cut_off(pair):
+    # A strip of one depth from the upper border to the middle; its lower end is the far one.
+    dense = torch.full((120, 160), torch.nan, dtype=torch.float64)
+    dense[:70, 80:100] = pair.disparity(torch.tensor(0.6))
+    row, column = torch.meshgrid(torch.arange(2, 70, 3), torch.arange(80, 100, 3), indexing="ij")
+    pixels = torch.stack((column, row), dim=-1).reshape(-1, 2).double()
+    points = pair.left.unproject(pixels, torch.full((len(pixels),), 0.6, dtype=torch.float64))
+    std = torch.ones(len(points), dtype=torch.float64)
+    found = StereoPoints(points, std, std[:, None, None] * torch.eye(3), pixels, std, std, dense)
+    kept = far_end(found, pair, NEAR_BALL, 0.1)
+    low = points[:, 1].max()
+    # The line to the farthest corner is a little slanted.
+    assert (kept != (points[:, 1] >= low - 0.1)).sum() < 6
+    assert 0 < kept.sum() < len(points)
+    # A single point beyond is no end.
+    more = [torch.cat((value, value[:1])) for value in (std, found.covariance, pixels, std, std)]
+    lone = StereoPoints(torch.cat((points, points.new_tensor([[0.0, 0.3, 0.6]]))), *more, dense)
+    assert torch.equal(far_end(lone, pair, NEAR_BALL, 0.1)[:-1], kept)
+    dense[:20] = torch.nan
+    assert far_end(found, pair, NEAR_BALL, 0.1).all()
+    assert len(found.subset(kept)) == int(kept.sum())
+
+
+def test_errors_name_the_files(folders, pair, tmp_path):
+    with pytest.raises(FormatError, match=r"right.f9.png and .*left.f9.png: left and right pictures are swapped"):
+        StereoFrames(folders / "right", folders / "left", pair, config=NEAR_BALL)[0]
+    (tmp_path / "one").mkdir()
+    with pytest.raises(FormatError, match="holds no pictures"):
+        StereoFrames(folders / "left", tmp_path / "one", pair)
+    save_image(tmp_path / "one" / "0.png", torch.zeros(120, 160))
+    with pytest.raises(FormatError, match=r"equally many pictures, one per frame; got .*left 2, .*one 1"):
+        StereoFrames(folders / "left", tmp_path / "one", pair)
+    with pytest.raises(FormatError, match="hardly match"):
+        StereoFrames(tmp_path / "one", tmp_path / "one", pair, config=NEAR_BALL)[0]
+    small = stereo_cameras(width=100, height=120, focal=190.0)
+    with pytest.raises(FormatError, match=r"left must have shape \(120, 100, 3\)"):
+        StereoFrames(folders / "left", folders / "right", small, config=NEAR_BALL)[0]
+    with pytest.raises(FileNotFoundError, match="does not exist"):
+        StereoFrames(tmp_path / "none", tmp_path / "one", pair)
+    with pytest.raises(InputError, match="reach must be positive"):
+        StereoFrames(folders / "left", folders / "right", pair, reach=0.0)
