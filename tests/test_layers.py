@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+import torchreg as tr
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "torchreg"
 
@@ -59,6 +61,8 @@ OWNERS = {
 }
 # `from torchreg import x` names the module x, `from torchreg.geometry.mesh import x` something inside mesh.
 MODULES_INSIDE = {"torchreg", "scipy", "scipy.sparse"}
+# What stands in backticks in the docstring of a system's package may be used outside it.
+DOORS = re.compile(r"`(\w+)`")
 LAZY = {"matplotlib", "viser", "plotly", "cv2", "PIL", "OpenEXR"}
 LOWEST_THIRD_PARTY = {"errors": set(), "metrics": {"torch"}, "_checks": {"torch"}, "_threads": {"torch"}}
 IMPORT_NAMES = {
@@ -135,6 +139,24 @@ def layer_problems(source: str, path: str) -> list[str]:
     return problems
 
 
+def doors_of(system: str) -> set[str]:
+    """Return the names of a system that others may use: the public ones and those that its package names."""
+    docstring = ast.get_docstring(ast.parse((PACKAGE / system / "__init__.py").read_text(encoding="utf-8"))) or ""
+    return {*tr.__all__, *DOORS.findall(docstring)}
+
+
+def door_problems(source: str, path: str) -> list[str]:
+    """Return what torchreg/``path`` imports from another system by other names than its doors."""
+    problems = []
+    for node in ast.walk(ast.parse(source)):
+        module = (node.module or "").split(".") if isinstance(node, ast.ImportFrom) else []
+        if len(module) < 2 or module[0] != "torchreg" or module[1] not in SYSTEMS - {unit_of(path)}:
+            continue
+        closed = {alias.name for alias in node.names} - doors_of(module[1])
+        problems += [f"torchreg/{path}:{node.lineno} imports {name}: no door of {module[1]}" for name in sorted(closed)]
+    return problems
+
+
 def owner_problems(source: str, path: str, declared: set[str]) -> list[str]:
     """Return the third-party imports of torchreg/``path`` that belong elsewhere, are undeclared or not lazy enough."""
     problems = []
@@ -170,6 +192,36 @@ def sources() -> list[str]:
 @pytest.mark.parametrize("path", sources())
 def test_imports_only_from_lower_layers(path):
     assert layer_problems((PACKAGE / path).read_text(encoding="utf-8"), path) == []
+
+
+@pytest.mark.parametrize("path", sources())
+def test_systems_are_entered_through_their_doors(path):
+    assert door_problems((PACKAGE / path).read_text(encoding="utf-8"), path) == []
+
+
+@pytest.mark.parametrize(
+    ("path", "source", "count"),
+    [
+        ("viz/strips.py", "from torchreg.alignment.align import align, _frame", 1),
+        ("viz/strips.py", "from torchreg.spines import tips", 1),
+        ("viz/strips.py", "def f():\n    from torchreg.registration.dense.graph_fit import fit_graph", 1),
+        ("tracking/frame.py", "from torchreg.alignment.problem import AlignProblem, shifted", 0),
+        ("spines/tips.py", "from torchreg.spines.curves import anything", 0),
+    ],
+)
+def test_the_door_check_tells_right_from_wrong(path, source, count):
+    assert len(door_problems(source, path)) == count
+
+
+@pytest.mark.parametrize("system", sorted(SYSTEMS))
+def test_every_door_is_used(system):
+    used = set()
+    for path in sources():
+        if unit_of(path) != system:
+            tree = ast.parse((PACKAGE / path).read_text(encoding="utf-8"))
+            imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+            used |= {a.name for node in imports if f".{system}." in f"{node.module}." for a in node.names}
+    assert doors_of(system) - {*tr.__all__} <= used
 
 
 @pytest.mark.parametrize("path", sources())

@@ -1,1 +1,12 @@
-"""Articulated alignment: the pose of a shape in 3-D points."""
+"""Articulated alignment: the pose of a shape in 3-D points.
+
+Besides the public names, other rooms may use `AlignRecord` and `label_frames`, and tracking, which builds on them,
+
+- the problem: `AlignProblem`, `centered_problem`, `shifted`, `alignment_cost`, `GaussianPosePrior`;
+- the annealed EM: `anneal`, `outlier_level`;
+- the surface fit: `refine_surface`, `surface_steps`, `surface_noise`, `pose_covariance`, `SurfaceResult`;
+- the search for poses: `PoseSearch`, `fit_candidates`, `score_candidates`;
+- checks of input: `check_skin`, `warn_about_units`;
+- numbers: `ANNEALING`, `CLUSTERS`, `INLIER_SHARE`, `OFF_SURFACE`, `PRIOR_SHARE`, `SEARCH_BUDGET`, `SURFACE_FIT`,
+  `UNITS`.
+"""

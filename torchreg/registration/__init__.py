@@ -1,1 +1,4 @@
-"""Scan registration: bones, weights and motions of an articulated thing without a template."""
+"""Scan registration: bones, weights and motions of an articulated thing without a template.
+
+Besides the public names, pictures may use `PoseSolver`, `BoneTree`, `blend_linear` and `check_rigid_motions`.
+"""
