@@ -131,7 +131,7 @@ def _limb_data(problem: AlignProblem, pose: Tensor) -> Tensor:
     explained = soft_inliers(problem, shape.distance(problem.data, pose))
     counts = []
     for limb, _ in _limb_points(problem.skin):
-        others = [number for number in range(shape.num_parts) if number not in limb.parts]
-        by_others = soft_inliers(problem, shape.distance(problem.data, pose, parts=others)) if others else 0.0
-        counts.append((explained - by_others).clamp_min(0).sum(-1))
+        rest = [number for number in range(shape.num_parts) if number not in limb.parts]
+        by_rest = soft_inliers(problem, shape.distance(problem.data, pose, parts=rest)) if rest else 0.0
+        counts.append((explained - by_rest).clamp_min(0).sum(-1))
     return torch.stack(counts, dim=-1) if counts else torch.full_like(explained[:, :1], torch.inf)

@@ -209,11 +209,11 @@ class TrackRun:
         done = len(progress.result.statuses)
         frames = {"frames": self.job["frames"][:done]}
         before = {**progress.job, "frames": progress.job.get("frames", [])[:done]}
-        other = [name for name, value in {**self.job, **frames}.items() if before.get(name) != value]
-        if other:
+        changed = [name for name, value in {**self.job, **frames}.items() if before.get(name) != value]
+        if changed:
             raise InputError(
-                f"{self.files.progress} was written by another command: {', '.join(other)} differ; repeat that one, or "
-                f"pass --force without --resume to begin anew"
+                f"{self.files.progress} was written by another command: {', '.join(changed)} differ; repeat that one, "
+                f"or pass --force without --resume to begin anew"
             )
         self.tracker.state = self.state = progress.state
         self.parts = [progress.result]
@@ -286,8 +286,8 @@ class TrackRun:
 def summary(result: TrackResult) -> str:
     """Return what became of the frames, and the usual time for one, in one line."""
     usable = sum(status.usable for status in result.statuses)
-    others = Counter(status.value.replace("_", " ") for status in result.statuses if not status.usable)
-    counts = [f"{usable} tracked", *(f"{count} {name}" for name, count in others.items())]
+    unusable = Counter(status.value.replace("_", " ") for status in result.statuses if not status.usable)
+    counts = [f"{usable} tracked", *(f"{count} {name}" for name, count in unusable.items())]
     # The mean tells of searches rather than of frames.
     usual = 1e3 * float(result.seconds.median())
     number = f"{len(result.statuses)} frame{'s' * (len(result.statuses) > 1)}"

@@ -298,11 +298,11 @@ def _save_folder(folder: Path, clouds: list[Tensor]) -> list[Path]:
             raise InputError(f"frames[{number}] has no points, which PLY files must have; write an archive (.npz)")
     folder.mkdir(exist_ok=True)
     files = [folder / f"frame_{number:04d}.ply" for number in range(len(clouds))]
-    others = {file for file in folder.iterdir() if file.suffix.lower() in ENDINGS} - set(files)
-    if others:
+    unlisted = {file for file in folder.iterdir() if file.suffix.lower() in ENDINGS} - set(files)
+    if unlisted:
         raise InputError(
-            f"path {folder} holds {len(others)} other point files, such as {min(others).name}, which would be taken "
-            f"for frames; name an empty folder"
+            f"path {folder} holds {len(unlisted)} other point files, such as {min(unlisted).name}, which would be "
+            f"taken for frames; name an empty folder"
         )
     for file, cloud in zip(files, clouds, strict=True):
         save_points(file, cloud)
