@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from torchreg.alignment.closest_point import TRIM, closest_point
 from torchreg.alignment.softassign import MODEL_OUTLIER, softassign
+from torchreg.geometry.budget import Budget
 from torchreg.solvers import e_step
 from torchreg.solvers.e_step import OUTLIER_CONSTANT, expectation
 
@@ -180,7 +181,7 @@ def test_closest_points_are_the_limit_of_the_e_step():
 def test_memory_does_not_change_the_answer(monkeypatch, entries):
     model, data, sigma = cloud(3, 6), cloud(3, 9, seed=1), torch.tensor([0.1, 0.2, 0.4], dtype=D)
     at_once = closest_point(model, data, sigma, mask=some_mask(3, 9))
-    monkeypatch.setattr(e_step, "_CHUNK_ENTRIES", entries)
+    monkeypatch.setattr(e_step, "BUDGET", Budget(table_entries=entries))
     assert_same(closest_point(model, data, sigma, mask=some_mask(3, 9)), at_once)
 
 

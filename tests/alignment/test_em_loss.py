@@ -12,6 +12,7 @@ from torch.func import grad, hessian, jacfwd, jacrev, vmap
 
 from torchreg.alignment.em_loss import EMLoss
 from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.budget import Budget
 from torchreg.solvers import e_step
 from torchreg.solvers.e_step import OUTLIER_CONSTANT, outlier_constant, posterior
 
@@ -35,7 +36,7 @@ def by_loops(posed, data, sigma, c):
 
 @pytest.fixture
 def small_chunks(monkeypatch):
-    monkeypatch.setattr(e_step, "_CHUNK_ENTRIES", 20)
+    monkeypatch.setattr(e_step, "BUDGET", Budget(table_entries=20))
 
 
 # --- value ---

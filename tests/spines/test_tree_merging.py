@@ -6,7 +6,7 @@ from itertools import combinations
 import pytest
 import torch
 
-from torchreg.geometry.geodesics import geodesic_distances
+from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.isosurface import isosurface
 from torchreg.spines.labeled_tree import junctions_from_splits
 from torchreg.spines.level_sets import LevelSets, MeshEdges, level_sets
@@ -48,7 +48,7 @@ def body(trunk=TRUNK, radius=0.12):
 def trees_of(mesh, trunk=TRUNK):
     ends = torch.tensor([(sx * (trunk / 2 + 0.4), sy * 2 * ARM, 0.0) for sx in (-1, 1) for sy in (-1, 1)])
     tips = torch.cdist(ends.double(), mesh.vertices).argmin(1)
-    distances = geodesic_distances(mesh, tips)
+    distances = GeodesicGraph.from_mesh(mesh).distances(tips)
     spacing = float(distances.max()) / 60
     trees = []
     for root, values in enumerate(distances):
