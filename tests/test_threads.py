@@ -130,3 +130,44 @@ def test_an_error_of_either_call_is_raised_once_both_have_ended():
         run_both(int, fails)
     with one_thread():
         assert run_both(who, who)[1][0] is not threading.current_thread()
+
+
+def in_new_thread(call):
+    found = []
+    thread = threading.Thread(target=lambda: found.append(call()))
+    thread.start()
+    thread.join(10)
+    return found[0]
+
+
+def test_a_thread_that_began_beside_such_work_leaves_the_number_as_it_was():
+    used, others_done, leave = threading.Event(), threading.Event(), threading.Event()
+
+    def beside():
+        torch.get_num_threads()  # torch fixes the number of a thread on first use: 1, for now
+        used.set()
+        others_done.wait(10)
+        with one_thread():
+            pass
+        leave.set()
+
+    thread = threading.Thread(target=beside)
+    with one_thread():
+        thread.start()
+        assert used.wait(10)
+    others_done.set()
+    assert leave.wait(10)
+    thread.join(10)
+    assert torch.get_num_threads() == 2
+    assert in_new_thread(torch.get_num_threads) == 2
+
+
+def test_a_second_thread_is_within_the_work_of_the_first():
+    def inner():
+        with one_thread():
+            return torch.get_num_threads()
+
+    with one_thread():
+        assert run_both(inner, inner) == (1, 1)
+        assert in_new_thread(torch.get_num_threads) == 1
+    assert in_new_thread(torch.get_num_threads) == 2

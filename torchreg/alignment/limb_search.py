@@ -300,7 +300,7 @@ class _Search:
         precision, mean = prior.precision[..., dofs], prior.mean[..., None, dofs]
         precision = precision.reshape(-1, 1, len(dofs))
         # The data of the subset count for all.
-        share = self.problem.valid.sum(-1) / self.subset.valid.sum(-1).clamp_min(1)
+        share = self.problem.valid.sum(-1).to(losses) / self.subset.valid.sum(-1).clamp_min(1)
         noise = _PLACEMENT.noise * problem.size
         weights = (losses * problem.valid.unsqueeze(1)) * (share / noise**2)[:, None, None]
         lower, upper = self.shape.lower[dofs], self.shape.upper[dofs]

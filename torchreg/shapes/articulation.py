@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +21,20 @@ from torchreg.geometry.rigid import rigid_matrix
 from torchreg.shapes.posed_tree import PosedTree
 from torchreg.shapes.primitives import Primitive, PrimitiveSet, fuse
 from torchreg.shapes.spec import RigSurface
+
+
+@dataclass(frozen=True)
+class _HeldSizes:
+    """Sizes of one shape that do not change for a while."""
+
+    shape: Articulation
+    offset_scales: Tensor
+    scaled_sizes: list[Tensor]
+    solid_poses: Tensor
+
+
+# Belongs to the running thread, not to the shape, which other threads may use at the same time.
+_HELD: ContextVar[_HeldSizes | None] = ContextVar("torchreg held sizes", default=None)
 
 
 class Articulation(PosedTree):
@@ -49,7 +65,6 @@ class Articulation(PosedTree):
         self.primitives = PrimitiveSet(primitives)
         self.surface = surface
         self.log_radius_scales = nn.Parameter(torch.zeros(len(primitives), dtype=torch.float64))
-        self._held: tuple[Tensor, list[Tensor], Tensor] | None = None
         self.to(dtype or torch.get_default_dtype())
 
     @contextmanager
@@ -58,12 +73,12 @@ class Articulation(PosedTree):
 
         Poses of few points take a fifth less time.
         """
-        before, self._held = self._held, None
-        self._held = self._offset_scales(), self._scaled_sizes(), self._solid_poses()
+        held = _HeldSizes(self, self._offset_scales(), self._scaled_sizes(), self._solid_poses())
+        token = _HELD.set(held)
         try:
             yield
         finally:
-            self._held = before
+            _HELD.reset(token)
 
     def part_distances(self, points: Tensor, pose: Tensor) -> Tensor:
         """Return the distance of points to the solid of every part, before fusion.
@@ -188,12 +203,19 @@ class Articulation(PosedTree):
             spacing = max(self.nu, float((upper - lower).prod() / BUDGET.surface_samples) ** (1 / 3))
         return isosurface(lambda points: self.distance(points, pose), lower, upper, spacing)
 
+    def _held(self) -> _HeldSizes | None:
+        """Return the sizes that the running thread holds of this shape."""
+        held = None if torch.compiler.is_compiling() else _HELD.get()
+        return held if held is not None and held.shape is self else None
+
     def _offset_scales(self) -> Tensor:
-        return super()._offset_scales() if self._held is None else self._held[0]
+        held = self._held()
+        return super()._offset_scales() if held is None else held.offset_scales
 
     def _scaled_sizes(self) -> list[Tensor]:
-        if self._held is not None:
-            return self._held[1]
+        held = self._held()
+        if held is not None:
+            return held.scaled_sizes
         return self.primitives.scaled_sizes(self.log_length_scales.exp(), self.log_radius_scales.exp())
 
     def _neighbors(self, parts: Sequence[int] | None) -> Tensor:
@@ -206,8 +228,9 @@ class Articulation(PosedTree):
 
     def _solid_poses(self) -> Tensor:
         """Return the pose (P, 4, 4) of each solid in its part."""
-        if self._held is not None:
-            return self._held[2]
+        held = self._held()
+        if held is not None:
+            return held.solid_poses
         centers = self.primitives.centers * self.log_length_scales.exp().unsqueeze(-1)
         return rigid_matrix(self.primitives.rotations, centers)
 

@@ -86,6 +86,7 @@ def extract_spine(
         InputError: if there is no frame, one of them has no surface (names it), no frame shows ``num_tips`` limbs, or
             ``times`` do not fit.
         InputTypeError: if something else than meshes is given.
+        SolverError: if a worker process is killed twice.
 
     Differentiable: no; `SpineSequence.model` is.
 

@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import astuple
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchreg.errors import FormatError, InputError
+from torchreg.errors import FormatError, InputError, SolverError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.io.tensors import load_tensors, save_tensors
@@ -29,7 +30,7 @@ _MIN_PARALLEL = 4
 _FIELDS = ("nodes", "edges", "radii", "frames", "confidence")
 # A skeleton's tensors as arrays, which pass between processes without shared memory, its notes, and seconds.
 _Packed = tuple[dict[str, np.ndarray[Any, Any]], tuple[str, ...], float]
-# What a forked process works on: it inherits them, so that no surface is copied.
+# What a forked process works on, set in that process alone: it inherits them, so that no surface is copied.
 _meshes: Sequence[TriangleMesh] = ()
 
 
@@ -54,6 +55,7 @@ def skeletonize_frames(
 
     Raises:
         InputError: if a surface cannot be skeletonized; names the frame.
+        SolverError: if a process is killed, and again on the second attempt.
     """
     skeletons: dict[int, Skeleton] = {}
     folder = None if progress is None else Path(progress)
@@ -96,6 +98,26 @@ def _computed(
     if count < 2 or not can_fork or len(frames) < _MIN_PARALLEL or any(m.vertices.is_cuda for m in meshes):
         yield from ((frame, _compute(meshes[frame], frame, config)) for frame in frames)
         return
+    try:
+        for frame, packed in _forked(meshes, config, frames, count):
+            frames = [other for other in frames if other != frame]
+            yield frame, packed
+        return
+    except BrokenProcessPool:
+        pass  # a worker was killed, perhaps by accident: once more, for the frames that are missing
+    try:
+        yield from _forked(meshes, config, frames, min(count, len(frames)))
+    except BrokenProcessPool as error:
+        raise SolverError(
+            f"a worker process that skeletonized one of the frames {list(frames)} was killed twice, as a system out of "
+            "memory does; pass workers=1, or coarser meshes, and progress=FOLDER to keep what is done"
+        ) from error
+
+
+def _forked(
+    meshes: Sequence[TriangleMesh], config: SkeletonizeConfig, frames: Sequence[int], count: int
+) -> Iterator[tuple[int, _Packed]]:
+    """Yield frames and their skeletons, computed by a number of forked processes."""
     context = multiprocessing.get_context("fork")
     with ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker, initargs=(meshes,)) as pool:
         waiting = {pool.submit(_compute_forked, frame, config): frame for frame in frames}
