@@ -126,7 +126,7 @@ def _is_single() -> bool:
 
 @contextmanager
 def _allowed(number: int, single: bool) -> Iterator[None]:
-    """Let the calling thread and those it starts use a number of threads in a ``with`` block, each a single one or not."""
+    """Let the calling thread, and those it starts, use a number of threads in a ``with`` block."""
     before = getattr(_budget, "allowed", None), _is_single()
     _budget.allowed, _budget.single = number, single
     try:
