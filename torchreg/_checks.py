@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchreg.errors import InputError, InputTypeError
+from torchreg.errors import InputError, InputTypeError, PrecisionWarning
+
+# Share of the size of what is measured up to which rounding is no worse than the noise of good sensors.
+_ROUNDING_SHARE = 1e-3
 
 
 def as_tensor(value: Any, name: str, content: str) -> Tensor:
@@ -103,4 +107,24 @@ def check_same_kind(value: Tensor, name: str, like: Tensor, like_name: str) -> N
         raise InputTypeError(
             f"{name} is {value.dtype} on {value.device} but {like_name} is {like.dtype} on {like.device}; "
             f"convert one with .to()"
+        )
+
+
+def warn_about_rounding(points: Tensor, name: str, size: float, *, stacklevel: int) -> None:
+    """Warn with a `PrecisionWarning` if points lie so far from the origin that their dtype rounds them coarsely.
+
+    Args:
+        points: (..., 3), finite.
+        name: of the argument.
+        size: of what they are points of, in their unit.
+        stacklevel: of the warning: 1 for the caller.
+    """
+    distance = float(points.detach().abs().max()) if points.numel() else 0.0
+    rounding = distance * torch.finfo(points.dtype).eps
+    if rounding > _ROUNDING_SHARE * size:
+        warnings.warn(
+            f"{name} lie {distance:.3g} from the origin, where {str(points.dtype).removeprefix('torch.')} rounds to "
+            f"{rounding:.2g}, of a size of {size:.3g}: subtract an offset in float64 first, or compute in float64",
+            PrecisionWarning,
+            stacklevel=stacklevel + 1,
         )

@@ -33,5 +33,13 @@ class TorchregWarning(UserWarning):
     """Base class of torchreg's warnings."""
 
 
+class DegenerateDataWarning(TorchregWarning):
+    """The data lie at one place, on a line or on a plane, and do not determine the result."""
+
+
+class PrecisionWarning(TorchregWarning):
+    """The data lie so far from the origin that their dtype rounds them coarsely."""
+
+
 class UnitsWarning(TorchregWarning):
     """The sizes of data and model differ so much that the units probably do too."""

@@ -112,6 +112,7 @@ class Status(Enum):
     NO_DATA = "no_data"
     LOST = "lost"
     OTHER_UNITS = "other_units"
+    DEGENERATE = "degenerate"  # data at one place, on a line or on a plane, which determine no pose
 
     @property
     def usable(self) -> bool:

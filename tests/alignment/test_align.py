@@ -500,7 +500,7 @@ def test_non_finite_data_may_be_left_out(plain_hand, plain_hand_skin, clean, sta
 def test_duplicated_points_change_little(plain_hand, plain_hand_skin, clean, start, truth):
     result = align(plain_hand, clean.repeat(3, 1), start, model_points=plain_hand_skin, config=DESCENT)
     assert float(offsets(plain_hand, result.pose, truth).mean()) < 0.001
-    with pytest.warns(UnitsWarning, match="the data spread over"):
+    with pytest.warns(DegenerateDataWarning, match="the data lie at one place"):
         same = align(plain_hand, clean[:1].repeat(50, 1), start, model_points=plain_hand_skin)
     assert bool(torch.isfinite(same.pose).all())
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, fields, replace
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_choice, check_count, check_positive
+from torchreg._checks import as_float_tensor, check_choice, check_count, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.alignment.annealed_em import ANNEALING, CORRESPONDENCES, OnStep, StageResult, anneal, outlier_level
-from torchreg.alignment.inputs import check_clouds, check_skin, warn_about_units
+from torchreg.alignment.inputs import check_clouds, check_skin, warn_about_degenerate, warn_about_units
 from torchreg.alignment.local_search import explore, needs_search
 from torchreg.alignment.problem import (
     INLIER_SHARE,
@@ -138,6 +138,7 @@ def align(
         InputTypeError: if an argument has the wrong type.
 
     Warns:
+        DegenerateDataWarning: if the inliers lie at one place, on a line or on a plane; the status is DEGENERATE.
         UnitsWarning: if the data are more than thirty times larger or smaller than the shape.
 
     Differentiable: no; use `EMLoss` for gradients.
@@ -153,6 +154,7 @@ def align(
         pose, several = _check_start(shape, initial_pose, clouds)
         skin = _model_skin(shape, model_points, pose, config)  # the X_i of eq. 3
         batch = _centered_batch(skin, clouds, valid, pose, config, on_step)
+        warn_about_rounding(clouds, "data", batch.problem.size, stacklevel=2)
         warn_about_units(batch.problem.data, batch.problem.valid, batch.problem.size, stacklevel=2)
         with one_thread(batch.problem.valid.numel() < _LIMITS.many_data):
             found = _register(batch, config)  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3
@@ -290,7 +292,10 @@ def _result(batch: _Batch, found: StageResult, config: AlignConfig) -> AlignResu
     outlier = outlier_level(problem, posed, found.sigma)
     matches = expectation(posed, problem.data, found.sigma, outlier, mask=problem.valid)
     world = shifted(pose, batch.origin)
-    counts = zip(inliers.sum(-1).tolist(), problem.valid.sum(-1).tolist(), found.change.tolist(), strict=True)
+    # What lies off the surface tells nothing of the pose, unless all does.
+    told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
+    degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=3)
+    rows = (inliers.sum(-1), problem.valid.sum(-1), found.change <= config.pose_atol, degenerate)
     return AlignResult(
         pose=world,
         registered=posed + batch.origin.unsqueeze(1),
@@ -300,17 +305,19 @@ def _result(batch: _Batch, found: StageResult, config: AlignConfig) -> AlignResu
         posterior=matches.inlier_posterior,
         sigma=found.sigma,
         cost=cost,
-        status=tuple(_status(num_inliers, num_data, change, config) for num_inliers, num_data, change in counts),
+        status=tuple(_status(*row) for row in zip(*(row.tolist() for row in rows), strict=True)),
         history=tuple(batch.history),
     )
 
 
-def _status(num_inliers: int, num_data: int, change: float, config: AlignConfig) -> Status:
+def _status(num_inliers: int, num_data: int, converged: bool, degenerate: bool) -> Status:
     if num_data == 0:
         return Status.NO_DATA
+    if degenerate:
+        return Status.DEGENERATE
     if num_inliers < max(_LIMITS.min_inliers, _LIMITS.min_share * num_data):
         return Status.FEW_INLIERS
-    return Status.CONVERGED if change <= config.pose_atol else Status.MAX_STEPS
+    return Status.CONVERGED if converged else Status.MAX_STEPS
 
 
 def _unbatched(result: AlignResult) -> AlignResult:

@@ -105,7 +105,8 @@ def calibrate(
         on_step: called with a `CalibrateRecord` after each joint fit.
 
     Returns:
-        a `Calibration`. Its status is FEW_INLIERS if a frame could not be aligned; such frames do not count.
+        a `Calibration`. Its status is FEW_INLIERS, or DEGENERATE, if a frame could not be aligned; such frames do not
+            count.
 
     Raises:
         InputError: if frames are empty, not finite, or do not fit the poses, or the shape has a surface of its own.
@@ -140,6 +141,7 @@ def calibrate(
             better = problem.unexplained(found.pose) < problem.unexplained(poses)
             poses = torch.where(better.unsqueeze(-1), found.pose, poses)
             poses, cost, change = _fit_jointly(problem, poses, config, number, on_step)
+    failed = {status for status in found.statuses if not status.usable}
     status = Status.CONVERGED if change <= config.align.pose_atol else Status.MAX_STEPS
     for parameter, original in zip(fitted.parameters(), shape.parameters(), strict=True):
         parameter.requires_grad_(original.requires_grad)
@@ -149,7 +151,7 @@ def calibrate(
         log_length_scales=fitted.log_length_scales.detach().clone(),
         log_radius_scales=fitted.log_radius_scales.detach().clone(),
         cost=cost,
-        status=status if bool(aligned.all()) else Status.FEW_INLIERS,
+        status=Status.DEGENERATE if Status.DEGENERATE in failed else Status.FEW_INLIERS if failed else status,
     )
 
 

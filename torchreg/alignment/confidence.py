@@ -51,7 +51,7 @@ def pose_confidence(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor
         lead: (B,) by how many data more than the best of different poses it explains.
     """
     clustered, near = clustered_data(problem, pose)
-    left_over = clustered / near.clamp_min(1) + beside_share(problem, pose)
+    left_over = clustered.to(pose) / near.clamp_min(1) + beside_share(problem, pose)
     known = known_ends(problem, pose)
     return (1 - (-lead.clamp_min(0) / EVIDENCE.lead).exp()) * (-left_over / EVIDENCE.left_over).exp() * known
 
@@ -70,7 +70,7 @@ def beside_share(problem: AlignProblem, pose: Tensor, off: OffSurface = OFF_SURF
     noise = surface_noise(distance, problem.valid, problem.size)
     beyond = off.distance(noise, problem.size).unsqueeze(-1)
     beside = (distance.abs() > beyond) & (distance.abs() < _MISFIT.reach * problem.size) & problem.valid
-    return beside.sum(-1) / problem.valid.sum(-1).clamp_min(1)
+    return beside.sum(-1).to(problem.data) / problem.valid.sum(-1).clamp_min(1)
 
 
 def known_ends(problem: AlignProblem, pose: Tensor) -> Tensor:

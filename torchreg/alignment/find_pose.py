@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_choice, check_count, check_positive
+from torchreg._checks import check_choice, check_count, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.alignment.confidence import is_misfit, pose_confidence
-from torchreg.alignment.inputs import check_clouds, check_skin, warn_about_units
+from torchreg.alignment.inputs import check_clouds, check_skin, warn_about_degenerate, warn_about_units
 from torchreg.alignment.limb_search import distinct_first, take_rows
 from torchreg.alignment.pose_search import PoseSearch, mean_distances
 from torchreg.alignment.problem import (
@@ -112,6 +112,7 @@ def find_pose(
         InputTypeError: if an argument has the wrong type.
 
     Warns:
+        DegenerateDataWarning: if the data lie at one place, on a line or on a plane; the confidence is zero.
         UnitsWarning: if the data are more than thirty times larger or smaller than the shape.
 
     Differentiable: no.
@@ -130,11 +131,14 @@ def find_pose(
         count = config.num_model_points
         skin = sample_skin(shape, count) if model_points is None else check_skin(shape, model_points)
         problem = centered_problem(skin, batch, batch_valid, typical, origin, prior_std=config.prior_std, pose_atol=0.0)
+        warn_about_rounding(clouds, "data", problem.size, stacklevel=2)
         warn_about_units(problem.data, problem.valid, problem.size, stacklevel=2)
+        degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=2)
         with one_thread():
             poses, costs = _search_with_retries(problem, sources, config)
         starts = _ranked(problem, poses, costs, num_starts)
-        starts = replace(starts, poses=shifted(starts.poses, origin.unsqueeze(1)))
+        confidence = torch.where(degenerate, 0.0, starts.confidence)
+        starts = replace(starts, poses=shifted(starts.poses, origin.unsqueeze(1)), confidence=confidence)
     return starts if clouds.ndim == 3 else starts.row(0)
 
 

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_shape
-from torchreg.errors import InputError, InputTypeError, UnitsWarning
+from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning
+from torchreg.geometry.spread import SPREADS, spread_dimensions
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
 
@@ -101,7 +102,8 @@ def warn_about_units(data: Tensor, valid: Tensor, size: float, *, stacklevel: in
     """
     radius = torch.where(valid, data.norm(dim=-1), torch.nan).nanmedian(-1).values
     ratio = 2 * float(radius.nanmedian()) / size
-    if int(valid.sum(-1).max()) < UNITS.min_data or 1 / UNITS.ratio < ratio < UNITS.ratio:
+    # Data at one place have no size in any unit.
+    if int(valid.sum(-1).max()) < UNITS.min_data or ratio == 0 or 1 / UNITS.ratio < ratio < UNITS.ratio:
         return False
     warnings.warn(
         f"the data spread over {ratio:.3g} times the model's size of {size:.3g} m: are they in metres? "
@@ -110,3 +112,35 @@ def warn_about_units(data: Tensor, valid: Tensor, size: float, *, stacklevel: in
         stacklevel=stacklevel + 1,
     )
     return True
+
+
+def are_degenerate(data: Tensor, valid: Tensor, size: float) -> Tensor:
+    """Return which clouds ((B,)) lie at one place, on a line or on a plane, and so determine no pose.
+
+    Args:
+        data: ((B,) M, 3).
+        valid: ((B,) M) False where padded; clouds of less than ten points are too small to tell.
+        size: of the shape, metres.
+    """
+    return (spread_dimensions(data, size, valid) < len(SPREADS)) & (valid.sum(-1) >= UNITS.min_data)
+
+
+def warn_about_degenerate(data: Tensor, valid: Tensor, size: float, *, stacklevel: int) -> Tensor:
+    """Return `are_degenerate`, after a `DegenerateDataWarning` about the worst of such clouds.
+
+    Args:
+        data: ((B,) M, 3).
+        valid: ((B,) M) False where padded.
+        size: of the shape, metres.
+        stacklevel: of the warning: 1 for the caller.
+    """
+    degenerate = are_degenerate(data, valid, size)
+    if bool(degenerate.any()):
+        where = SPREADS[int(spread_dimensions(data, size, valid)[degenerate].min())]
+        warnings.warn(
+            f"the data lie {where}, within a thousandth of their extent: they determine no pose; check what was "
+            f"measured",
+            DegenerateDataWarning,
+            stacklevel=stacklevel + 1,
+        )
+    return degenerate

@@ -166,9 +166,13 @@ class LimbSearch:
             for dof, width in zip(dofs, (upper - lower).tolist(), strict=True)
         ]
         if math.prod(counts) > _SAMPLING.max_count:
-            shares = torch.quasirandom.SobolEngine(len(dofs), scramble=True, seed=0).draw(_SAMPLING.max_count)
+            shares = torch.quasirandom.SobolEngine(len(dofs), scramble=True, seed=0).draw(
+                _SAMPLING.max_count, dtype=torch.float32
+            )
         else:
-            grids = torch.meshgrid(*[(torch.arange(count) + 0.5) / count for count in counts], indexing="ij")
+            grids = torch.meshgrid(
+                *[(torch.arange(count, dtype=torch.float32) + 0.5) / count for count in counts], indexing="ij"
+            )
             shares = torch.stack(grids, dim=-1).reshape(-1, len(dofs))
         return lower + (upper - lower) * shares.to(lower)
 
@@ -267,7 +271,7 @@ class _Search:
         batch, count = beam.poses.shape[:2]
         dofs, samples = list(body.dofs), self.limbs.samples[body]
         num_kept = min(len(samples), max(1, _PLACEMENT.max_tried // count - 1))
-        kept = torch.linspace(0, len(samples) - 1, num_kept).round().long()
+        kept = torch.linspace(0, len(samples) - 1, num_kept, dtype=torch.float32).round().long()
         samples = samples[kept]
         values = torch.cat([samples.expand(batch, *samples.shape), pose[:, None, dofs]], dim=1)
         poses = beam.poses.unsqueeze(2).repeat(1, 1, values.shape[1], 1)

@@ -149,15 +149,15 @@ def _scatter(search: PoseSearch, center: Tensor, count: int, generator: torch.Ge
     shape = problem.skin.shape
     scale = (_SCATTER.joints * (shape.upper - shape.lower)).clamp_max(_SCATTER.max_joints)
     scale[:3], scale[3:BASE_DOFS] = _SCATTER.shift * problem.size, _SCATTER.turn
-    noise = torch.randn(count, shape.num_dofs, generator=generator).to(center) * scale
+    noise = torch.randn(count, shape.num_dofs, generator=generator, dtype=torch.float32).to(center) * scale
     noise[0] = 0
     wide = center.unsqueeze(1).expand(-1, count, -1)
     around = shape.retract(wide, noise.expand_as(wide))
     span = (shape.upper - shape.lower).clamp_max(2 * _SCATTER.redrawn_reach)
     low = torch.maximum(center - _SCATTER.redrawn_reach, shape.lower).clamp_max(shape.upper - span)
-    redrawn = low.unsqueeze(1) + span * torch.rand(noise.shape, generator=generator).to(center)
+    redrawn = low.unsqueeze(1) + span * torch.rand(noise.shape, generator=generator, dtype=torch.float32).to(center)
     for limb in search.limbs.limbs:
-        is_redrawn = torch.rand(count, 1, generator=generator).to(center) < _SCATTER.redrawn_limbs
+        is_redrawn = torch.rand(count, 1, generator=generator, dtype=torch.float32).to(center) < _SCATTER.redrawn_limbs
         is_redrawn[0] = False
         around[..., limb.dofs] = torch.where(is_redrawn, redrawn[..., limb.dofs], around[..., limb.dofs])
     return problem.clamp_candidates(around)

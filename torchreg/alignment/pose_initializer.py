@@ -14,7 +14,7 @@ from torchreg.alignment.clusters import clustered_data
 from torchreg.alignment.confidence import EVIDENCE
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.implicit_gradient import FixedPoint, attach_gradients
-from torchreg.alignment.inputs import check_clouds, check_skin
+from torchreg.alignment.inputs import are_degenerate, check_clouds, check_skin
 from torchreg.alignment.objectives import GaussianPosePrior
 from torchreg.alignment.problem import (
     BROAD_PRIOR,
@@ -215,6 +215,7 @@ class PoseInitializer(nn.Module):
             problem = replace(problem, surface=FusedSurface(self.shape))
             fixed, pose = self._last_fit(problem, pose, holds_base=start is not None)
             confidence = confidence * _explained_share(problem, pose)
+            confidence = confidence * ~are_degenerate(problem.data, valid, problem.size)
         mean = shifted(mean, -origin)
         if torch.is_grad_enabled() and (data.requires_grad or mean.requires_grad or fixed.parameters):
             centered = torch.where(valid.unsqueeze(-1), data - origin.unsqueeze(1), 0.0)
@@ -275,6 +276,6 @@ class PoseInitializer(nn.Module):
 def _explained_share(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return the share (B,) of data near the surface, from 0 to 1, lowered where those off it lie in clusters."""
     near = soft_inliers(problem, problem.surface.distance(problem.data, pose))
-    share = near.sum(-1) / problem.valid.sum(-1).clamp_min(1)
+    share = near.sum(-1).to(problem.data) / problem.valid.sum(-1).clamp_min(1)
     clustered, on_surface = clustered_data(problem, pose)
-    return share * (-clustered / on_surface.clamp_min(1) / EVIDENCE.left_over).exp()
+    return share * (-clustered.to(share) / on_surface.clamp_min(1) / EVIDENCE.left_over).exp()

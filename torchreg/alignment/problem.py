@@ -97,7 +97,7 @@ class AlignProblem:
 
     def draw(self, count: int, generator: torch.Generator) -> AlignProblem:
         """Return the problem with at most ``count`` data, drawn from the valid ones, the same alone and in a batch."""
-        draw = torch.rand(self.valid.shape[-1], generator=generator).to(self.data)
+        draw = torch.rand(self.valid.shape[-1], generator=generator, dtype=torch.float32).to(self.data)
         keep = torch.where(self.valid, draw, -1.0).topk(min(count, draw.shape[-1]), dim=-1).indices
         data = self.data.gather(1, keep.unsqueeze(-1).expand(*keep.shape, 3))
         return replace(self, data=data, valid=self.valid.gather(1, keep))

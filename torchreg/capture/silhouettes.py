@@ -205,10 +205,10 @@ def _carved(silhouettes: list[_Silhouette], box: Tensor, resolution: int) -> Vis
         open_blocks = (state == 0).nonzero()
         if edge == 1:
             break
-        centers = origin + spacing * (open_blocks * edge + 0.5 * (edge - 1))
+        centers = origin + spacing * (open_blocks.to(box) * edge + 0.5 * (edge - 1))
         state[tuple(open_blocks.unbind(-1))] = _decided(silhouettes, centers, spacing * 0.5 * (edge - 1) * 3**0.5)
     field = state.to(box) * (10 * spacing)
-    field[tuple(open_blocks.unbind(-1))] = _sampled(silhouettes, origin + spacing * open_blocks)
+    field[tuple(open_blocks.unbind(-1))] = _sampled(silhouettes, origin + spacing * open_blocks.to(box))
     # The field is cut at the sides of the box, so that the surface is closed.
     for axis in range(3):
         along = origin[axis] + spacing * torch.arange(field.shape[axis]).to(box)

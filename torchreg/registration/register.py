@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, as_tensor, check_count, check_finite, check_shape
+from torchreg._checks import as_float_tensor, as_tensor, check_count, check_finite, check_shape, warn_about_rounding
 from torchreg._threads import one_thread
-from torchreg.errors import InputError, InputTypeError
+from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
+from torchreg.geometry.spread import SPREADS, spread_dimensions
 from torchreg.registration.bones.alternation import ReducedFit, Samples
 from torchreg.registration.bones.config import BoneConfig, OnRegisterStep
 from torchreg.registration.bones.labels import CellData, labels_of_parts
@@ -70,6 +72,9 @@ def register(
         InputError: if a number is out of range or not finite, or a shape does not fit.
         InputTypeError: if a scan is none.
 
+    Warns:
+        DegenerateDataWarning: if a scan lies on a line or on a plane; the status is DEGENERATE.
+
     Differentiable: no; `GridLBS` is, for refining what was found.
 
     Cost: 1.3 to 3.5 s for scans of 8,000 points on one core, the alignment three quarters of it.
@@ -78,6 +83,8 @@ def register(
     """
     config = RegisterConfig() if config is None else config
     check_inputs((source, target), num_bones, grid_resolution)
+    warn_about_rounding(source.points, "points of source", source.diagonal, stacklevel=4)
+    degenerate = warn_about_degenerate((source, target), stacklevel=4)
     _check_start(source, start, confidence)
     parts = None if parts is None else _checked_parts(source, parts, num_bones)
     clock = _Clock()
@@ -105,7 +112,7 @@ def register(
     # Line 9: continuous weights.
     converged = fit.refine() and converged
     clock.lap()
-    return _scan_registration(source, normalized_source, normalization, fit, converged, clock.seconds)
+    return _scan_registration(source, normalized_source, normalization, fit, converged, degenerate, clock.seconds)
 
 
 def _scan_registration(
@@ -114,6 +121,7 @@ def _scan_registration(
     normalization: Normalization,
     fit: ReducedFit,
     converged: bool,
+    degenerate: bool,
     seconds: Tensor,
 ) -> ScanRegistration:
     """Return the registration in the unit and frame of the source, from that of the normalized scans."""
@@ -134,18 +142,20 @@ def _scan_registration(
         weights=weights.to(like),
         distances=(normalization.scale * nearest_neighbor(moved, matcher.target.points)[1]).to(like),
         matched=matches.kept.to(like.device),
-        status=fit_status(int(matches.kept.sum()) / len(moved), converged, config),
+        status=fit_status(int(matches.kept.sum()) / len(moved), converged, config, degenerate),
         seconds=seconds,
         history=tuple(fit.history),
     )
 
 
-def fit_status(matched: float, converged: bool, config: BoneConfig) -> Status:
-    """Return the status of a fit that matched a share of the points."""
+def fit_status(matched: float, converged: bool, config: BoneConfig, degenerate: bool) -> Status:
+    """Return the status of a fit that matched a share of the points of scans, degenerate ones or not."""
     if matched == 0:
         return Status.NO_DATA
     if matched < config.min_matched:
         return Status.FEW_INLIERS
+    if degenerate:
+        return Status.DEGENERATE
     return Status.CONVERGED if converged else Status.MAX_STEPS
 
 
@@ -198,6 +208,20 @@ def check_inputs(scans: tuple[Any, ...], num_bones: int, grid_resolution: int) -
     check_count(grid_resolution, "grid_resolution", 1)
     if grid_resolution > MAX_RESOLUTION:
         raise InputError(f"grid_resolution must be at most {MAX_RESOLUTION}, got {grid_resolution}")
+
+
+def warn_about_degenerate(scans: Sequence[RangeScan], *, stacklevel: int) -> bool:
+    """Return whether a scan lies on a line or on a plane, in which it may slide; warn if one does."""
+    spreads = [int(spread_dimensions(scan.points, scan.diagonal)) for scan in scans]
+    if min(spreads) >= len(SPREADS):
+        return False
+    warnings.warn(
+        f"the points of scan {spreads.index(min(spreads))} lie {SPREADS[min(spreads)]}, within a thousandth of their "
+        f"extent: along it their motion is not determined",
+        DegenerateDataWarning,
+        stacklevel=stacklevel + 1,
+    )
+    return True
 
 
 def _checked_parts(source: RangeScan, parts: Any, num_bones: int) -> Tensor:

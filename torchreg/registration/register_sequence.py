@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_count
+from torchreg._checks import check_count, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.errors import InputError
 from torchreg.geometry.neighbors import nearest_neighbor
@@ -20,7 +20,14 @@ from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.align_scans import align_scans
 from torchreg.registration.normalization import Normalization
-from torchreg.registration.register import check_inputs, fit_status, initial_records, register, source_samples
+from torchreg.registration.register import (
+    check_inputs,
+    fit_status,
+    initial_records,
+    register,
+    source_samples,
+    warn_about_degenerate,
+)
 from torchreg.registration.results import SequenceRegistration
 
 
@@ -148,6 +155,9 @@ def register_sequence(
         InputError: if there are fewer than two scans, or a number is out of range.
         InputTypeError: if a scan is none.
 
+    Warns:
+        DegenerateDataWarning: if a scan lies on a line or on a plane; the status is DEGENERATE.
+
     Differentiable: no.
 
     Cost: that of `register` for every frame, and three quarters of a second each for the joint fit.
@@ -160,6 +170,8 @@ def register_sequence(
         raise InputError(f"scans must hold at least two, got {len(scans)}")
     for scan in scans:
         check_inputs((scan, scan), num_bones, grid_resolution)
+    warn_about_rounding(scans[0].points, "points of scans", scans[0].diagonal, stacklevel=4)
+    degenerate = warn_about_degenerate(scans, stacklevel=4)
     check_count(reference, "reference", 0)
     if reference >= len(scans):
         raise InputError(f"reference must be below the number of scans {len(scans)}, got {reference}")
@@ -177,7 +189,7 @@ def register_sequence(
     fit = ReducedFit(data, samples, normalized, config, num_bones=num_bones, on_step=on_step)
     converged = fit.fit_labels()
     converged = fit.refine() and converged
-    return _sequence_registration(source, reference, normalized, normalization, fit, converged)
+    return _sequence_registration(source, reference, normalized, normalization, fit, converged, degenerate)
 
 
 def _aligned_frames(
@@ -196,7 +208,7 @@ def _aligned_frames(
     on from frame to frame.
     """
     source, few_bones = scans[reference], FRAME_TO_FRAME.apply(config)
-    aligned, confidence = {reference: source.points}, {reference: torch.ones(len(source))}
+    aligned, confidence = {reference: source.points}, {reference: torch.ones(len(source)).to(source.points)}
     deformed = {reference: source.points}
     for step, end in ((1, len(scans)), (-1, -1)):
         current = source
@@ -227,6 +239,7 @@ def _sequence_registration(
     normalization: Normalization,
     fit: ReducedFit,
     converged: bool,
+    degenerate: bool,
 ) -> SequenceRegistration:
     """Return the registration in the unit and frame of the source, from that of the normalized scans."""
     like, points = source.points, scans[reference].points
@@ -247,7 +260,7 @@ def _sequence_registration(
         fused_normals=normals.to(like),
         fused_frames=frames.to(like.device),
         reference=reference,
-        status=fit_status(matched, converged, fit.config),
+        status=fit_status(matched, converged, fit.config, degenerate),
         history=tuple(fit.history),
     )
 

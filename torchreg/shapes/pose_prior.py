@@ -218,8 +218,10 @@ class PosePrior(nn.Module):
         """
         check_count(count, "count", 0)
         generator = generator or torch.Generator().manual_seed(0)
-        draw = torch.randn(count, self.num_components, generator=generator).to(self.mean)
-        noise = self.residual * torch.randn(count, len(self.mean) - BASE_DOFS, generator=generator).to(self.mean)
+        draw = torch.randn(count, self.num_components, generator=generator, dtype=torch.float32).to(self.mean)
+        noise = self.residual * torch.randn(
+            count, len(self.mean) - BASE_DOFS, generator=generator, dtype=torch.float32
+        ).to(self.mean)
         joints = self.components[BASE_DOFS:, BASE_DOFS:] if self.has_base else self.components[:, BASE_DOFS:]
         noise = noise - (noise @ joints.mT) @ joints
         step = (draw * self.deviations) @ self.components

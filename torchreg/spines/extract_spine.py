@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_count
+from torchreg._checks import check_count, warn_about_rounding
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
@@ -98,6 +98,8 @@ def extract_spine(
     meshes = _check_meshes(meshes)
     if workers is not None:
         check_count(workers, "workers", 1)
+    first = meshes[0].vertices
+    warn_about_rounding(first, "meshes", float((first.amax(0) - first.amin(0)).norm()), stacklevel=2)
     with torch.no_grad():
         # Section 4.1: the second factor of eq. 3, frame by frame.
         skeletons = skeletonize_frames(meshes, config.skeletons, workers=workers, on_step=on_step, progress=progress)

@@ -142,7 +142,7 @@ def limb_curve(start: Tensor, rings: Rings, end: Tensor, spacing: float) -> tupl
     points, _ = _resampled(binomial_smoothing(points, _SMOOTHING.passes), spacing)
     padded = torch.cat((torch.zeros(1, 3, 3).double(), rings.covariances, torch.zeros(1, 3, 3).double()))
     nearest = index.round().long()
-    nearest = nearest[torch.linspace(0, len(nearest) - 1, len(points)).round().long()]
+    nearest = nearest[torch.linspace(0, len(nearest) - 1, len(points), dtype=torch.float32).round().long()]
     return points, _along_major_axes(curve_frames(points), padded[nearest])
 
 

@@ -13,6 +13,7 @@ from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton, build_skeleton
+from torchreg.geometry.spread import SPREADS, spread_dimensions
 from torchreg.geometry.surface_graph import PIECES, coarsened, one_piece
 from torchreg.spines.centering import centered_curves
 from torchreg.spines.curves import align_frames, tangents
@@ -134,6 +135,9 @@ def _prepared(mesh: TriangleMesh, config: SkeletonizeConfig) -> _Body:
     notes, bridged = piece.notes, bool(len(piece.bridges))
     if not bool(piece.mesh.face_areas().sum().isfinite()):
         raise InputError("mesh must have a finite area, got coordinates whose products overflow; use a larger unit")
+    extent = float((piece.mesh.vertices.amax(0) - piece.mesh.vertices.amin(0)).norm())
+    if int(spread_dimensions(piece.mesh.vertices, extent)) < len(SPREADS):
+        notes += ("the surface is flat: it encloses no body",)
     coarse = coarsened(piece.mesh, config.max_vertices)
     if coarse is not piece.mesh:
         # Coarsening leaves pinholes where patches meet.

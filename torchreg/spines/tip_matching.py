@@ -131,7 +131,7 @@ class _MappingCosts:
                 error = error + _SEARCH.length_weight * _length_errors(self.lengths, known, maps)
             total += reference.weight * error / self.sizes[number]
         weight = sum(reference.weight for reference in self.references)
-        return (total / weight + self.missing_cost * (maps < 0).sum(-1)) / maps.shape[1]
+        return (total / weight + self.missing_cost * (maps < 0).sum(-1).to(total)) / maps.shape[1]
 
     def _rigid_errors(self, number: int, maps: Tensor) -> Tensor:
         """Return the squared errors (P,) of the rigid fits, and of their rotations, to a reference.

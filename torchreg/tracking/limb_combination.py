@@ -34,7 +34,7 @@ FAST_MOTION = FastMotion()
 
 def scatter_joints(pose: Tensor, std: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Return ``count`` poses (count, num_dofs) with joints drawn about a pose (1, num_dofs), of std (num_dofs - 6,)."""
-    offsets = torch.randn(count, len(std), generator=generator).to(pose) * std
+    offsets = torch.randn(count, len(std), generator=generator, dtype=torch.float32).to(pose) * std
     return torch.cat([pose[:, :6].expand(count, -1), pose[:, 6:] + offsets], dim=-1)
 
 

@@ -63,7 +63,7 @@ def _points_from_data(fitter: FrameFitter, state: TrackState, pose: Tensor, data
         weights = skin.weights[nearest_neighbor(data, posed)[0]]
     parts = weights.argmax(-1)
     # In random order within each part.
-    order = (parts + torch.rand(len(parts), generator=frame_generator(state)).to(data)).argsort()
+    order = (parts + torch.rand(len(parts), generator=frame_generator(state), dtype=torch.float32).to(data)).argsort()
     counts = parts.bincount(minlength=fitter.shape.num_parts)
     rank = torch.arange(len(parts), device=data.device) - (counts.cumsum(0) - counts)[parts[order]]
     num_shown = max(1, int((counts >= _SELECTION.min_per_part).sum()))

@@ -113,4 +113,4 @@ def decayed_velocity(state: TrackState, elapsed: float) -> Tensor:
 def _root_mean_square(innovation: Tensor, observed: Tensor) -> Tensor:
     """Return the root mean square () of the innovation over the degrees of freedom that the data tell."""
     counts = observed > FILTER.min_observed
-    return (innovation * counts).norm() / counts.sum().clamp_min(1).sqrt()
+    return (innovation * counts).norm() / counts.sum().clamp_min(1).to(innovation).sqrt()

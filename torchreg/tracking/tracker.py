@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_finite, check_shape
+from torchreg._checks import as_float_tensor, check_finite, check_shape, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.alignment.align import AlignConfig, align
-from torchreg.alignment.inputs import check_skin, warn_about_units
+from torchreg.alignment.inputs import check_skin, warn_about_degenerate, warn_about_units
 from torchreg.errors import InputError, InputTypeError
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
@@ -110,7 +110,8 @@ class Tracker:
                 were dropped, it tells how far the shape may have moved.
 
         Returns:
-            The frame's result. Its pose rests on data unless its status is NO_DATA, LOST or OTHER_UNITS.
+            The frame's result. Its pose rests on data unless its status is NO_DATA, LOST, DEGENERATE or
+            OTHER_UNITS.
 
         Raises:
             InputError: if the points are not (M, 3), or not finite under ``nan_policy="raise"``, or the time is not
@@ -215,6 +216,9 @@ class Tracker:
         if len(data) < MIN_DATA:
             return Status.NO_DATA
         valid = torch.ones_like(data[:, 0], dtype=torch.bool)
+        warn_about_rounding(data, "points", self._fitter.size, stacklevel=3)
+        if bool(warn_about_degenerate(data, valid, self._fitter.size, stacklevel=3)):
+            return Status.DEGENERATE
         if warn_about_units(data - data.mean(0), valid, self._fitter.size, stacklevel=3):
             return Status.OTHER_UNITS
         return None

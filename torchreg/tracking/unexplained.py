@@ -102,7 +102,11 @@ class LimbReach:
         if not bool(on_limbs.any()):
             return
         low, high = shape.lower[6:].clamp_min(-math.pi), shape.upper[6:].clamp_max(math.pi)
-        shares = torch.quasirandom.SobolEngine(len(low), scramble=True, seed=0).draw(_TEST.num_poses).to(low)
+        shares = (
+            torch.quasirandom.SobolEngine(len(low), scramble=True, seed=0)
+            .draw(_TEST.num_poses, dtype=torch.float32)
+            .to(low)
+        )
         poses = shape.rest.repeat(_TEST.num_poses, 1)
         poses[:, 6:] = low + (high - low) * shares
         to_trunk = invert_rigid(shape.part_transforms(poses)[:, 0])

@@ -42,7 +42,7 @@ class PinholeView:
         """Return what a camera sees that looks at the middle of points (S, 3); along z if it is there."""
         middle = points.mean(0)
         distance = (middle - viewpoint).norm()
-        rotation = view_rotation(viewpoint, middle) if float(distance) > 0 else torch.eye(3)
+        rotation = view_rotation(viewpoint, middle) if float(distance) > 0 else torch.eye(3).to(viewpoint)
         return cls(viewpoint, rotation.to(points), distance)
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
