@@ -9,7 +9,7 @@ import torch
 from torchreg.alignment.align import AlignConfig, align
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.datasets.hand import make_hand_cloud
-from torchreg.errors import UnitsWarning
+from torchreg.errors import DegenerateDataWarning
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
