@@ -28,6 +28,7 @@ class Record:
 
     def problems(self, url):
         """Return errors, and requests to anything but the server at a URL or the page itself."""
+        url = url.partition("?")[0]
         near = (url, url.replace("http://", "ws://"), "data:", "blob:")
         return [*self.errors, *(f"asked for {place}" for place in self.requests if not place.startswith(near))]
 

@@ -22,14 +22,14 @@ class LatestWorker(Generic[Key, Value]):
 
     Args:
         work: called with {key: newest value}.
-        on_error: called with errors of torchreg that ``work`` raises.
+        on_error: called with errors that ``work`` raises; the thread goes on.
         name: of the thread.
     """
 
     def __init__(
         self,
         work: Callable[[Mapping[Key, Value]], None],
-        on_error: Callable[[TorchregError], None],
+        on_error: Callable[[Exception], None],
         name: str = "torchreg worker",
     ) -> None:
         self._work, self._on_error = work, on_error
@@ -88,7 +88,8 @@ class LatestWorker(Generic[Key, Value]):
             start = time.perf_counter()
             try:
                 self._work(job)
-            except TorchregError as error:
+            except (TorchregError, RuntimeError, ArithmeticError, ValueError) as error:
+                # The thread lives on whatever a page sent.
                 self._on_error(error)
             finally:
                 with self._condition:

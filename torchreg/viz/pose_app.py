@@ -9,6 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -182,7 +183,9 @@ class PoseApp:
         return move_points
 
     def _clicked(self, event: Any) -> None:
-        self.pick(torch.tensor(event.ray_origin), torch.tensor(event.ray_direction))
+        origin, direction = _vector(event.ray_origin), _vector(event.ray_direction)
+        if origin is not None and direction is not None:
+            self.pick(origin, direction)
 
     def _add_controls(self) -> None:
         gui = self.server.gui
@@ -190,7 +193,7 @@ class PoseApp:
         with gui.add_folder("Handle"):
             self._name = gui.add_markdown("")
             self._pinned = gui.add_checkbox("Pinned", initial_value=False)
-            self._pinned.on_update(lambda _: self._pin(self._pinned.value))
+            self._pinned.on_update(lambda _: self._pin(bool(self._pinned.value)))
             self._button("Remove", self._remove)
         with gui.add_folder("Steps"):
             self._button("Undo", self._step(self.editor.undo))
@@ -252,7 +255,7 @@ class PoseApp:
             number += 1
         self._status.content = f"wrote {save(path)}"
 
-    def _tell_error(self, error: TorchregError | OSError) -> None:
+    def _tell_error(self, error: Exception) -> None:
         self._status.content = f"**{error}**"
 
     def _refresh(self) -> None:
@@ -289,7 +292,9 @@ class PoseApp:
 
         # Runs on the loop of the server, in the order of the mouse, and must not wait.
         async def moved(event: viser.TransformControlsEvent) -> None:
-            target = torch.from_numpy(event.target.position.copy())
+            target = _vector(event.target.position)
+            if target is None:
+                return
             if event.phase == "start":
                 self._select(number)
             elif event.phase == "end":
@@ -306,3 +311,12 @@ class PoseApp:
             state = self.editor.state
             self._name.content = f"handle {number + 1} of {len(state.vertices)}"
             self._pinned.value = state.pinned[number]  # type: ignore[misc]
+
+
+def _vector(value: Any) -> Tensor | None:
+    """Return three finite numbers that a page sent (3,), None for anything else."""
+    try:
+        numbers = torch.as_tensor(np.asarray(value, dtype=np.float64))
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return numbers if numbers.shape == (3,) and bool(numbers.isfinite().all()) else None

@@ -28,9 +28,15 @@ class _Pace:
 
     tick: float = 1 / 60  # between updates
     pause: float = 0.5  # at the last frame
+    speeds: tuple[float, float] = (0.1, 4.0)  # seconds played per second
 
 
 _PACE = _Pace()
+
+
+def _bounded(value: float, low: float, high: float) -> float:
+    """Return a number that a page sent within its bounds; the lower one for NaN."""
+    return min(max(float(value), low), high) if value == value else low
 
 
 class SceneViewer:
@@ -103,9 +109,11 @@ class Timeline:
         with server.gui.add_folder("Timeline"):
             self._slider = server.gui.add_slider("Frame", min=0, max=len(seconds) - 1, step=1, initial_value=0)
             self._play = server.gui.add_button("Play")
-            self._speed = server.gui.add_slider("Speed", min=0.1, max=4.0, step=0.1, initial_value=1.0)
+            self._speed = server.gui.add_slider(
+                "Speed", min=_PACE.speeds[0], max=_PACE.speeds[1], step=0.1, initial_value=1.0
+            )
         self._playing, self._stopped = threading.Event(), threading.Event()
-        self._slider.on_update(lambda _: show(int(self._slider.value)))
+        self._slider.on_update(lambda _: show(self._frame))
         self._play.on_click(lambda _: self.pause() if self._playing.is_set() else self.play())
         self._thread = threading.Thread(target=self._run, name="torchreg timeline", daemon=True)
         self._thread.start()
@@ -131,17 +139,22 @@ class Timeline:
         self._playing.set()
         self._thread.join()
 
+    @property
+    def _frame(self) -> int:
+        """Number on the slider; a page may send any."""
+        return int(_bounded(self._slider.value, 0, len(self._seconds) - 1))
+
     def _run(self) -> None:
         while self._playing.wait() and not self._stopped.is_set():
-            shown, before = self._seconds[int(self._slider.value)], time.perf_counter()
+            shown, before = self._seconds[self._frame], time.perf_counter()
             while self._playing.is_set() and not self._stopped.wait(_PACE.tick):
                 now = time.perf_counter()
-                shown += (now - before) * float(self._speed.value)
+                shown += (now - before) * _bounded(self._speed.value, *_PACE.speeds)
                 before = now
                 frame = self._frame_at(shown)
                 if frame is None:
                     shown, frame = self._seconds[0], 0
-                if frame != int(self._slider.value):
+                if frame != self._frame:
                     self.go_to(frame)
 
     def _frame_at(self, seconds: float) -> int | None:

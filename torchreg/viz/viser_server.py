@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchreg.errors import MissingExtraError
+from torchreg.viz.page_guard import PageGuard
 from torchreg.viz.scene import FIELD_OF_VIEW, Scene
 
 if TYPE_CHECKING:
@@ -30,15 +31,20 @@ def import_viser() -> Any:
 
 
 def start_server(title: str, port: int) -> viser.ViserServer:
-    """Return a server on 127.0.0.1, which other machines cannot reach, and which contacts none.
+    """Return a server on 127.0.0.1, which other machines cannot reach, which contacts none, and lets in `page_url`.
 
     Args:
         title: above the controls.
         port: to listen on, or a later one if it is taken.
     """
     library = import_viser()
-    with contextlib.redirect_stdout(io.StringIO()):  # viser greets
+    guard = PageGuard()
+    with contextlib.redirect_stdout(io.StringIO()), guard.around_start():  # viser greets
         server: viser.ViserServer = library.ViserServer(host=HOST, port=port, label=title, verbose=False)
+    if not guard.engaged:
+        stop_server(server)
+        raise MissingExtraError("the viewer cannot be guarded with this viser; install viser 1.1 to 1.x")
+    setattr(server, "page_guard", guard)  # noqa: B010
     # Sharing would open a tunnel through a foreign server.
     setattr(server, "request_share_url", lambda verbose=True: None)  # noqa: B010
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
@@ -47,8 +53,9 @@ def start_server(title: str, port: int) -> viser.ViserServer:
 
 
 def page_url(server: viser.ViserServer) -> str:
-    """Return the address of the page for a browser on this machine."""
-    return f"http://{HOST}:{server.get_port()}"
+    """Return the address of the page for a browser on this machine, the only one that lets in."""
+    guard: PageGuard = getattr(server, "page_guard")  # noqa: B009
+    return guard.url(HOST, server.get_port())
 
 
 def stop_server(server: viser.ViserServer) -> None:
