@@ -268,9 +268,9 @@ def test_node_transforms_are_those_of_an_independent_library(numbers):
     oracle[:3, 3] = translation
     matrix = oracle.T.flatten().tolist()
     document = opened({"nodes": [node, {"matrix": matrix}, {}]})
-    np.testing.assert_allclose(document.node_transform(0), oracle, atol=1e-14)
-    np.testing.assert_array_equal(document.node_transform(1), oracle)
-    np.testing.assert_array_equal(document.node_transform(2), np.eye(4))
+    np.testing.assert_allclose(document.node_transforms()[0], oracle, atol=1e-14)
+    np.testing.assert_array_equal(document.node_transforms()[1], oracle)
+    np.testing.assert_array_equal(document.node_transforms()[2], np.eye(4))
 
 
 def test_nodes_move_their_children_in_any_order():

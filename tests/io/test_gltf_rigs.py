@@ -16,10 +16,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from torchreg.errors import FormatError, ModelError
-from torchreg.io import gltf
 from torchreg.io.gltf import load_rig
 from torchreg.io.gltf_write import save_animated_skin
-from torchreg.io.limits import FileLimits
+from torchreg.io.limits import FILE_BUDGET, FileLimits
 
 KINDS = {"i1": 5120, "u1": 5121, "u2": 5123, "u4": 5125, "f4": 5126}
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
@@ -471,7 +470,7 @@ def test_damaged_containers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.raises(FormatError, match="neither an address nor a binary chunk"):
         load_rig(path)
     path.write_bytes(whole)
-    monkeypatch.setattr("torchreg.io.gltf._LIMITS", replace(gltf._LIMITS, max_nodes=2))
+    monkeypatch.setattr("torchreg.io.gltf_document.FILE_BUDGET", replace(FILE_BUDGET, nodes=2))
     with pytest.raises(FormatError, match="3 nodes, at most 2"):
         load_rig(path)
 

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from torchreg.errors import FormatError, InputError, ModelError
-from torchreg.io import urdf
-from torchreg.io.limits import FileLimits
+from torchreg.io.limits import FILE_BUDGET, FileLimits
 from torchreg.io.urdf import load_urdf
 
 ARM = """<?xml version="1.0" encoding="utf-8"?>
@@ -291,7 +290,7 @@ def test_size_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path, ARM)
     with pytest.raises(FormatError, match="the limit is 100"):
         load_urdf(path, limits=FileLimits(max_bytes=100))
-    monkeypatch.setattr("torchreg.io.urdf._LIMITS", replace(urdf._LIMITS, max_bytes=100))
+    monkeypatch.setattr("torchreg.io.urdf.FILE_BUDGET", replace(FILE_BUDGET, xml_bytes=100))
     with pytest.raises(FormatError, match="bytes of XML"):
         load_urdf(path)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -39,8 +40,7 @@ class CameraRig:
         )
         if not named:
             raise InputError("cameras must hold at least one camera, got none")
-        names = [camera.name for camera in named]
-        repeated = sorted({name for name in names if names.count(name) > 1})
+        repeated = sorted(name for name, times in Counter(camera.name for camera in named).items() if times > 1)
         if repeated:
             raise InputError(f"cameras must have different names, got {', '.join(repeated)} more than once")
         object.__setattr__(self, "cameras", named)

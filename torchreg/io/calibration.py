@@ -32,7 +32,7 @@ from torchreg.geometry.rigid import invert_rigid
 from torchreg.io.atomic import write_atomic
 from torchreg.io.colmap import load_colmap
 from torchreg.io.images import MILLIMETER
-from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
+from torchreg.io.limits import DEFAULT_LIMITS, FILE_BUDGET, FileLimits, check_budget, local_path, read_bytes
 from torchreg.io.opencv_yaml import load_opencv
 
 FORMAT = "torchreg-cameras"
@@ -70,10 +70,18 @@ def _load_json(file: Path, *, limits: FileLimits) -> CameraRig:
         )
     if not isinstance(entries, list) or not entries:
         raise FormatError(f"{file}: cameras must be a list of at least one camera")
+    _check_number(len(entries), file)
     cameras = tuple(_camera(entry, f"{file}: camera {number}") for number, entry in enumerate(entries))
     try:
         return CameraRig(cameras)
     except InputError as error:
+        raise FormatError(f"{file}: {error}") from error
+
+
+def _check_number(count: int, file: Path) -> None:
+    try:
+        check_budget(count, FILE_BUDGET.cameras, "cameras")
+    except FormatError as error:
         raise FormatError(f"{file}: {error}") from error
 
 
@@ -159,7 +167,7 @@ def _document(file: os.PathLike[str], limits: FileLimits) -> dict[str, Any]:
     content = read_bytes(file, limits)
     try:
         document = json.loads(content.decode("utf-8-sig"), parse_constant=refuse)
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # also numbers of thousands of digits
         raise FormatError(f"{file}: is cut off or no JSON ({error})") from error
     if not isinstance(document, dict):
         raise FormatError(f"{file}: must hold a JSON object, got {type(document).__name__}")
@@ -188,20 +196,23 @@ def _camera(entry: Any, where: str) -> Camera:
         camera = Camera(
             entry["width"], entry["height"], torch.tensor(intrinsics, dtype=torch.float64), motion, lens, name
         )
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise FormatError(f"{where}: {str(error).replace('world_to_camera', key)}") from error
     return replace(camera, world_to_camera=invert_rigid(motion)) if key == "camera_to_world" else camera
 
 
 def _number(value: Any, name: str, where: str) -> float:
-    return float(_numbers([value], name, where)[0])
+    numbers = _numbers([value], name, where)
+    if numbers.shape != (1,):
+        raise FormatError(f"{where}: {name} must be a number, got {value!r:.80}")
+    return float(numbers)
 
 
 def _numbers(value: Any, name: str, where: str) -> torch.Tensor:
     try:
         numbers = torch.tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise FormatError(f"{where}: {name} must hold numbers, all rows equally many, got {value!r}") from error
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
+        raise FormatError(f"{where}: {name} must hold numbers, all rows equally many, got {value!r:.80}") from error
     if not bool(numbers.isfinite().all()):
-        raise FormatError(f"{where}: {name} must be finite, got {value!r}")
+        raise FormatError(f"{where}: {name} must be finite, got {value!r:.80}")
     return numbers

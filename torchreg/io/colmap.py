@@ -14,7 +14,7 @@ from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation_representations import quaternion_from_rotation, rotation_from_quaternion
 from torchreg.io.atomic import write_atomic
-from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
+from torchreg.io.limits import DEFAULT_LIMITS, FILE_BUDGET, FileLimits, local_path, read_bytes
 
 # Per model the indices of fx, fy, cx, cy, and then k1, k2, p1, p2, k3, k4, k5, k6 among its parameters; None is zero.
 _MODELS: dict[str, tuple[int | None, ...]] = {
@@ -50,8 +50,9 @@ def load_colmap(folder: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_
     path = directory / "images.txt"
     # Every image has a second line, of its points; it may be empty.
     lines = [(number, line) for number, line in _lines(path, limits) if not line.startswith("#")]
-    while lines and not lines[0][1]:
-        lines.pop(0)
+    lines = lines[next((row for row, (_, line) in enumerate(lines) if line), len(lines)) :]
+    if len(lines) > 2 * FILE_BUDGET.cameras:
+        raise FormatError(f"{path}: holds {len(lines) // 2} images, at most {FILE_BUDGET.cameras} are read")
     cameras = tuple(_placed(line, lenses, f"{path}, line {number}") for number, line in lines[::2] if line)
     try:
         return CameraRig(cameras)
@@ -108,7 +109,7 @@ def _lenses(path: Path, limits: FileLimits) -> dict[str, tuple[int, int, list[fl
         if not line or line.startswith("#"):
             continue
         words = line.split()
-        if len(words) < 4 or not words[2].isdecimal() or not words[3].isdecimal():
+        if len(words) < 4 or not all(word.isascii() and word.isdecimal() and len(word) < 10 for word in words[2:4]):
             raise FormatError(f"{where}: must be CAMERA_ID MODEL WIDTH HEIGHT PARAMS, got {line[:80]!r}")
         model, values = words[1], _values(words[4:], where)
         if model not in _MODELS:

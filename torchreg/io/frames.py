@@ -19,7 +19,16 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_choice, check_finite, check_shape
 from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.io.atomic import write_atomic
-from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, open_zip, read_bytes
+from torchreg.io.limits import (
+    DEFAULT_LIMITS,
+    FILE_BUDGET,
+    FileLimits,
+    check_allowed,
+    check_budget,
+    local_path,
+    open_zip,
+    read_bytes,
+)
 from torchreg.io.npz import read_npy_header
 from torchreg.io.points import FORMATS, PARSER_ERRORS, load_points, save_points
 from torchreg.io.raw_cloud import Array, as_indices
@@ -241,6 +250,7 @@ def _frames_in(archive: zipfile.ZipFile, limits: FileLimits) -> list[Array] | No
 def _cut(archive: zipfile.ZipFile, points: Array, name: str, shapes: dict[str, tuple[int, ...]]) -> list[Array]:
     """Return the frames of a stack (T, M, 3) without their padding."""
     count, most = points.shape[:2]
+    check_budget(count, FILE_BUDGET.frames, "frames")
     if "counts" in shapes and "mask" in shapes:
         raise FormatError("must hold counts or mask, not both")
     if "counts" in shapes:

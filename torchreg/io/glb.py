@@ -70,6 +70,7 @@ def _instances(document: GltfDocument) -> list[tuple[dict[str, Any], Array]]:
         roots = document.entry(document.item("scenes", document.json.get("scene", 0)), "nodes", list)
     else:
         roots = [index for index, parent in enumerate(document.node_parents()) if parent < 0]
+    local = document.node_transforms()
     pending = [(root, np.eye(4)) for root in reversed(roots)]
     found, seen = list[tuple[dict[str, Any], Array]](), set[int]()
     while pending:
@@ -78,7 +79,7 @@ def _instances(document: GltfDocument) -> list[tuple[dict[str, Any], Array]]:
         if index in seen:
             raise FormatError(f"reaches nodes[{index}] on two paths: the node tree is cyclic or shared")
         seen.add(index)
-        transform = parent @ document.node_transform(index)
+        transform = parent @ local[index]
         if "mesh" in node:
             found.append((document.item("meshes", node["mesh"]), np.eye(4) if "skin" in node else transform))
         pending += [(child, transform) for child in reversed(document.entry(node, "children", list))]
@@ -105,6 +106,7 @@ def _vertices(document: GltfDocument, key: tuple[Any, ...], transform: Array) ->
 
 
 def _faces(document: GltfDocument, primitive: dict[str, Any], count: int) -> Array:
+    document.check_use(0 if primitive.get("indices") is not None else 8 * count, "a primitive without indices")
     indices = np.arange(count)
     if primitive.get("indices") is not None:
         indices = as_indices(document.accessor(primitive["indices"])[:, 0], "vertex indices")

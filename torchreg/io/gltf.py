@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchreg.errors import FormatError, ModelError
 from torchreg.io.gltf_document import GltfDocument, Mode, parents_first, triangles
-from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
+from torchreg.io.limits import DEFAULT_LIMITS, FILE_BUDGET, FileLimits, local_path, read_bytes
 from torchreg.io.raw_cloud import Array
 
 
@@ -21,9 +21,6 @@ from torchreg.io.raw_cloud import Array
 class _RigLimits:
     """Largest rigs that are read."""
 
-    max_joints: int = 1000
-    max_nodes: int = 100_000
-    max_weights: int = 100_000_000  # vertices times joints
     max_scale: float = 1e6  # of the skeleton on the skin, and its inverse
     scale_tolerance: float = 1e-3  # relative differences of scales below this are rounding
 
@@ -109,15 +106,13 @@ def _read_rig(
     limits: FileLimits,
 ) -> RigRecord:
     nodes = document.items("nodes")
-    if len(nodes) > _LIMITS.max_nodes:
-        raise FormatError(f"{len(nodes)} nodes, at most {_LIMITS.max_nodes} are read")
     skin_index, meshes = _choose(document, mesh, skin)
     chosen = document.item("skins", skin_index)
     listed = document.entry(chosen, "joints", list)
     joints = [document.index("nodes", joint, f"a joint of skin {skin_index}") for joint in listed]
-    if not 0 < len(joints) <= _LIMITS.max_joints or len(set(joints)) < len(joints):
+    if not 0 < len(joints) <= FILE_BUDGET.joints or len(set(joints)) < len(joints):
         raise ModelError(
-            f"skin {skin_index} must list 1 to {_LIMITS.max_joints} different joints, got {len(joints)} "
+            f"skin {skin_index} must list 1 to {FILE_BUDGET.joints} different joints, got {len(joints)} "
             f"({len(set(joints))} different)"
         )
     names = _unique_names([nodes[joint].get("name") for joint in joints])
@@ -198,7 +193,9 @@ def _bind_transforms(document: GltfDocument, inverse_bind: Any, names: Sequence[
     if len(stored) < len(names):
         raise FormatError(f"{len(names)} joints but {len(stored)} inverse bind matrices")
     matrices = np.swapaxes(stored[: len(names)].reshape(-1, 4, 4), 1, 2)
-    flat = np.abs(np.linalg.det(matrices[:, :3, :3])) < 1e-30
+    with np.errstate(all="ignore"):
+        determinants = np.stack([np.abs(np.linalg.det(m)) for m in (matrices[:, :3, :3], matrices)])
+    flat = ~((determinants > 1e-30) & (determinants < np.inf)).all(0)
     if flat.any():
         raise ModelError(f"the inverse bind matrix of joint {names[int(flat.argmax())]!r} is singular")
     return np.linalg.inv(matrices)
@@ -301,13 +298,14 @@ def _read_meshes(
 def _read_vertices(
     document: GltfDocument, attributes: dict[str, Any], what: str, num_joints: int, before: int, limits: FileLimits
 ) -> tuple[Array, Array | None, Array]:
-    points = _numbers(document, attributes.get("POSITION"), f"POSITION of {what}", "VEC3").astype(np.float64)
-    total = before + len(points)
-    if total > limits.max_points or total * num_joints > _LIMITS.max_weights:
+    total = before + document.accessor_count(attributes.get("POSITION"), f"POSITION of {what}")
+    max_weights = max(FILE_BUDGET.weights, FILE_BUDGET.weights_per_byte * document.size)
+    if total > limits.max_points or total * num_joints > max_weights:
         raise FormatError(
             f"{total} vertices with {num_joints} joints; at most {limits.max_points} vertices "
-            f"(FileLimits.max_points) and {_LIMITS.max_weights} weights are read"
+            f"(FileLimits.max_points) and {max_weights} weights are read"
         )
+    points = _numbers(document, attributes.get("POSITION"), f"POSITION of {what}", "VEC3").astype(np.float64)
     normals = None
     if attributes.get("NORMAL") is not None:
         normals = _numbers(document, attributes["NORMAL"], f"NORMAL of {what}", "VEC3").astype(np.float64)
@@ -350,6 +348,7 @@ def _add_weights(weights: Array, joints: Array, values: Array, what: str) -> Non
 
 def _read_faces(document: GltfDocument, primitive: dict[str, Any], mode: int, what: str, num_vertices: int) -> Array:
     if primitive.get("indices") is None:
+        document.check_use(8 * num_vertices, f"the triangles of {what}")
         corners = np.arange(num_vertices)
     else:
         corners = _numbers(document, primitive["indices"], f"the indices of {what}", "SCALAR")[:, 0]

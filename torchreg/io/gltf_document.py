@@ -14,7 +14,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from torchreg.errors import FormatError, ModelError
-from torchreg.io.limits import FileLimits, read_bytes
+from torchreg.io.limits import FILE_BUDGET, FileLimits, check_budget, read_bytes
 from torchreg.io.raw_cloud import Array
 
 
@@ -31,6 +31,12 @@ _COMPONENTS = {
     for number, name in {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}.items()
 }
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+_NODE_DEFAULTS: dict[str, list[float]] = {
+    "matrix": [0.0] * 16,
+    "rotation": [0.0, 0.0, 0.0, 1.0],
+    "scale": [1.0, 1.0, 1.0],
+    "translation": [0.0, 0.0, 0.0],
+}
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
 
 
@@ -49,6 +55,8 @@ class GltfDocument:
         text, self._binary = _open_container(content) if content[:4] == b"glTF" else (content, None)
         self._path, self._limits = path, limits
         self._buffers: dict[int, bytes] = {}
+        self._external_bytes, self._used = 0, 0
+        self._own_bytes = len(content)
         try:
             self.json = json.loads(text)
         except (ValueError, RecursionError) as error:
@@ -60,6 +68,11 @@ class GltfDocument:
             raise FormatError(
                 f"needs the extension {compressed[0]}, which is not read; save it again without mesh compression"
             )
+
+    @property
+    def size(self) -> int:
+        """Bytes of the file and of the buffers that were read beside it."""
+        return self._own_bytes + self._external_bytes
 
     @staticmethod
     def entry(owner: dict[str, Any], key: str, kind: type, default: Any = None) -> Any:
@@ -124,6 +137,9 @@ class GltfDocument:
         width, sparse = _WIDTHS[shape], item.get("sparse")
         if count * width * dtype.itemsize > self._limits.max_bytes:
             raise FormatError(f"{what} has {count} elements, more than the size limit allows")
+        if item.get("bufferView") is not None:
+            self._buffer_of(item, what)
+        self.check_use(count * width * dtype.itemsize, what)
         if item.get("bufferView") is None and sparse is None:
             raise FormatError(f"{what} has no data; save the file again without mesh compression")
         if item.get("bufferView") is None:
@@ -135,6 +151,21 @@ class GltfDocument:
         if item.get("normalized") is True and dtype.kind in "iu":
             return np.maximum(values / np.iinfo(dtype).max, -1.0)
         return values
+
+    def _buffer_of(self, owner: dict[str, Any], what: str) -> bytes:
+        """Return the buffer that the buffer view of an entry is part of."""
+        view = self.item("bufferViews", owner.get("bufferView"), f"the bufferView of {what}")
+        return self._buffer(self.index("buffers", view.get("buffer"), f"the buffer of {what}"))
+
+    def check_use(self, size: int, what: str) -> None:
+        """Raise FormatError if all accessors that were read ask for far more bytes than the document holds."""
+        self._used += size
+        allowed = FILE_BUDGET.expanded_bytes + FILE_BUDGET.uses * self.size
+        if self._used > allowed:
+            raise FormatError(
+                f"{what} and what was read before it ask for {self._used} bytes, a document of {self.size} bytes for "
+                f"at most {allowed}"
+            )
 
     def _component(self, owner: dict[str, Any], what: str) -> np.dtype[Any]:
         component = owner.get("componentType")
@@ -161,7 +192,7 @@ class GltfDocument:
         """Return a read-only (count, width) window into the buffer view of ``owner``, checked to lie inside."""
         index = owner.get("bufferView")
         view = self.item("bufferViews", index, f"the bufferView of {what}")
-        data = self._buffer(self.index("buffers", view.get("buffer"), f"the buffer of {what}"))
+        data = self._buffer_of(owner, what)
         start, length = (self._size(view, key, f"bufferViews[{index}]") for key in ("byteOffset", "byteLength"))
         if start + length > len(data):
             raise FormatError(
@@ -180,7 +211,7 @@ class GltfDocument:
 
     def _size(self, owner: dict[str, Any], key: str, what: str) -> int:
         value: int = self.entry(owner, key, int)
-        if value < 0:
+        if not 0 <= value <= self._limits.max_bytes:
             raise FormatError(f"the {key} of {what} is {value}: it reaches beyond its buffer")
         return value
 
@@ -209,15 +240,19 @@ class GltfDocument:
             except ValueError as error:
                 raise FormatError(f"buffer {index} is damaged base64, not valid base64 ({error})") from error
         name, folder = unquote(uri), self._path.parent.resolve()
-        file = (folder / name).resolve() if not {":", "\0", "\\"} & set(name) else None
+        # A lone surrogate, which JSON may hold, is in no file's name.
+        plain = not {":", "\0", "\\"} & set(name) and name.isprintable()
+        file = (folder / name).resolve() if plain else None
         if file is None or not file.is_relative_to(folder):
-            raise FormatError(f"refers to the buffer {uri[:100]!r}, which must lie in the file's folder or below")
+            raise FormatError(f"refers to the buffer {uri[:100]!a}, which must lie in the file's folder or below")
         try:
-            return read_bytes(file, self._limits)
+            data = read_bytes(file, self._limits)
+            self._external_bytes += len(data)
+            return data
         except FileNotFoundError as error:
-            raise FormatError(f"its buffer {uri[:100]!r} cannot be read: it is not there") from error
+            raise FormatError(f"its buffer {uri[:100]!a} cannot be read: it is not there") from error
         except OSError as error:
-            raise FormatError(f"its buffer {uri[:100]!r} cannot be read ({error})") from error
+            raise FormatError(f"its buffer {uri[:100]!a} cannot be read ({error})") from error
 
     def node_label(self, index: int) -> str:
         """Return the name of a node for messages, or its number if it has none."""
@@ -236,22 +271,25 @@ class GltfDocument:
                 parents[child] = number
         return parents
 
-    def node_transform(self, index: int) -> Array:
-        """Return the (4, 4) transform of a node in its parent."""
-        node, what = self.item("nodes", index), f"of node {self.node_label(index)}"
-        if node.get("matrix") is not None:
-            return self._numbers(node, "matrix", [0.0] * 16, what).reshape(4, 4).T
-        quaternion = self._numbers(node, "rotation", [0.0, 0.0, 0.0, 1.0], what)
-        length = np.linalg.norm(quaternion)
-        if not length > 0:
-            raise ModelError(f"the rotation {what} is a zero quaternion")
-        axis, w = quaternion[:3] / length, quaternion[3] / length
-        cross = np.cross(np.eye(3), axis)
-        transform = np.eye(4)
-        transform[:3, :3] = np.eye(3) + 2 * w * cross + 2 * cross @ cross
-        transform[:3, :3] *= self._numbers(node, "scale", [1.0, 1.0, 1.0], what)
-        transform[:3, 3] = self._numbers(node, "translation", [0.0, 0.0, 0.0], what)
-        return transform
+    def node_transforms(self) -> Array:
+        """Return the (nodes, 4, 4) transforms of all nodes in their parents."""
+        nodes = self.items("nodes")
+        check_budget(len(nodes), FILE_BUDGET.nodes, "nodes")
+        result = np.tile(np.eye(4), (len(nodes), 1, 1))
+        columns = {key: self._node_numbers(nodes, key, default) for key, default in _NODE_DEFAULTS.items()}
+        quaternion = columns["rotation"]
+        length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+        has_matrix = np.array([node.get("matrix") is not None for node in nodes], dtype=bool)
+        if not (length[:, 0] > 0)[~has_matrix].all():
+            stuck = int((~(length[:, 0] > 0) & ~has_matrix).argmax())
+            raise ModelError(f"the rotation of node {self.node_label(stuck)} is a zero quaternion")
+        axis, w = (part / np.where(length > 0, length, 1.0) for part in (quaternion[:, :3], quaternion[:, 3:]))
+        cross = np.cross(np.eye(3), axis[:, None])
+        rotation = np.eye(3) + 2 * w[:, None] * cross + 2 * cross @ cross
+        result[:, :3, :3] = rotation * columns["scale"][:, None]
+        result[:, :3, 3] = columns["translation"]
+        result[has_matrix] = columns["matrix"].reshape(-1, 4, 4).swapaxes(1, 2)[has_matrix]
+        return result
 
     def node_globals(self, parents: Sequence[int]) -> Array:
         """Return the (nodes, 4, 4) transforms of all nodes in the scene, infinite where they overflow."""
@@ -260,21 +298,32 @@ class GltfDocument:
             stuck = sorted(set(range(len(parents))) - set(order))
             raise ModelError(f"the node hierarchy is cyclic at {', '.join(map(self.node_label, stuck[:5]))}")
         result = np.empty((len(parents), 4, 4))
+        local = self.node_transforms()
         with np.errstate(over="ignore", invalid="ignore"):
             for index in order:
-                local = self.node_transform(index)
-                result[index] = local if parents[index] < 0 else result[parents[index]] @ local
+                parent = parents[index]
+                result[index] = local[index] if parent < 0 else result[parent] @ local[index]
         return result
 
-    def _numbers(self, node: dict[str, Any], key: str, default: list[float], what: str) -> Array:
-        values = self.entry(node, key, list, default)
+    def _node_numbers(self, nodes: list[dict[str, Any]], key: str, default: list[float]) -> Array:
+        """Return the (nodes, ...) numbers of all nodes under a key."""
+        rows = [
+            default if node.get(key) is None else self._numbers(node, key, default, number)
+            for number, node in enumerate(nodes)
+        ]
+        return np.array(rows, dtype=np.float64).reshape(len(nodes), len(default))
+
+    def _numbers(self, node: dict[str, Any], key: str, default: list[float], number: int) -> list[float]:
+        values: list[float] = self.entry(node, key, list)
+        if len(values) == len(default) and all(type(v) in (int, float) and abs(v) < 1e300 for v in values):
+            return values
+        what = f"of node {self.node_label(number)}"
         if len(values) != len(default) or any(type(value) not in (int, float) for value in values):
             raise FormatError(
-                f"not a readable glTF document: the {key} {what} must hold {len(default)} numbers, got {values!r}"[:300]
+                f"not a readable glTF document: the {key} {what} must hold {len(default)} numbers, got {values!r:.100}"
             )
-        if not all(abs(value) < 1e300 for value in values):  # products of larger numbers overflow
-            raise ModelError(f"the {key} {what} is not finite: {values!r}"[:300])
-        return np.array(values, dtype=np.float64)
+        # Products of larger numbers overflow.
+        raise ModelError(f"the {key} {what} is not finite: {values!r:.100}")
 
 
 def _open_container(content: bytes) -> tuple[bytes, bytes | None]:

@@ -28,6 +28,8 @@ MILLIMETER = 1e-3
 # Modes in which PIL sees depth, and those of pictures with what they are converted to.
 _DEPTH_KINDS = ("I;16", "I;16B", "I;16L", "I", "F")
 _COLOR_KINDS = {"1": "L", "L": "L", "P": "RGB", "RGB": "RGB", "RGBA": "RGB", "LA": "L"}
+# Brightness, of 255, from which a pixel is of the mask.
+_HALF_WHITE = 128
 # Names of the depth channel of an EXR file.
 _EXR_CHANNELS = ("Z", "depth.Z", "Depth.Z", "Y", "V", "R", "RGB")
 
@@ -86,11 +88,16 @@ def load_image(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIM
         FormatError: if it is cut off, too large, no picture or of another bit depth; names the file.
         FileNotFoundError: if there is no such file.
     """
-    file = local_path(path)
+    pixels = _read_pixels(local_path(path), limits)
+    return torch.from_numpy(pixels).to(torch.float32).div_(255)
+
+
+def _read_pixels(file: Path, limits: FileLimits) -> Any:
+    """Return the pixels (H, W) or (H, W, 3) of a picture, uint8."""
     kind, pixels = _decoded(read_bytes(file, limits), file)
     if kind not in _COLOR_KINDS:
         raise FormatError(f"{file}: pictures must have 8 bits per channel, gray or color; got PIL mode {kind}")
-    return torch.from_numpy(pixels.astype(np.float32) / 255)
+    return pixels
 
 
 def load_mask(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Tensor:
@@ -102,9 +109,12 @@ def load_mask(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMI
     """
     file = local_path(path)
     if file.suffix.lower() == ".npy":
-        return torch.from_numpy(_read_npy(read_bytes(file, limits), file) != 0)
-    image = load_image(file, limits=limits)
-    return (image if image.ndim == 2 else image.amax(-1)) >= 0.5
+        values = _read_npy(read_bytes(file, limits), file)
+        if values.dtype.kind not in "biuf":
+            raise FormatError(f"{file}: masks are truth values or real numbers, got {values.dtype}")
+        return torch.from_numpy(values != 0)
+    pixels = torch.from_numpy(_read_pixels(file, limits))
+    return (pixels if pixels.ndim == 2 else pixels.amax(-1)) >= _HALF_WHITE
 
 
 def load_depth(
@@ -138,9 +148,11 @@ def load_depth(
             f"{file}: is {values.shape[1]} x {values.shape[0]} pixels, the camera's pictures are "
             f"{camera.width} x {camera.height}"
         )
-    depth = values.astype(np.float32) * np.float32(scale)
-    # Sensors mark what they did not measure by zero, NaN, infinity or a negative number.
-    depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+    with np.errstate(all="ignore"):
+        depth = values.astype(np.float32)
+        depth *= np.float32(scale)
+        # Sensors mark what they did not measure by zero, NaN, infinity or a negative number.
+        depth[~(np.isfinite(depth) & (depth > 0))] = 0
     if not depth.any():
         raise FormatError(f"{file}: holds no depth, all of {depth.size} pixels are zero, negative or not finite")
     return torch.from_numpy(depth)
@@ -174,7 +186,7 @@ def _save_png(path: str | os.PathLike[str], image: Any) -> None:
 
 def _check_pixels(shape: tuple[int, ...], file: Path) -> None:
     """Raise FormatError unless a shape is that of a picture of allowed size."""
-    pixels = shape[0] * shape[1] if len(shape) == 2 else 0
+    pixels = shape[0] * shape[1] if len(shape) == 2 and min(shape) > 0 else 0
     if not 0 < pixels <= BUDGET.picture_pixels:
         raise FormatError(f"{file}: must be (H, W) with 1 to 64 million pixels, got shape {shape}")
 
@@ -213,13 +225,14 @@ def _decoded_depth(content: bytes, file: Path) -> Any:
 def _read_npy(content: bytes, file: Path) -> Any:
     """Return the array (H, W) of a ``.npy`` file."""
     stream = io.BytesIO(content)
-    shape, _, dtype = read_npy_header(stream, f"{file}:")
+    shape, fortran, dtype = read_npy_header(stream, f"{file}:")
     _check_pixels(shape, file)
-    if dtype.hasobject or len(content) - stream.tell() != shape[0] * shape[1] * dtype.itemsize:
-        raise FormatError(
-            f"{file}: holds {len(content) - stream.tell()} bytes, not {shape} numbers of {dtype}: cut off?"
-        )
-    return np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
+    if dtype.kind not in "biuf":
+        raise FormatError(f"{file}: must hold truth values or real numbers, got {dtype}; objects are never loaded")
+    start = stream.tell()
+    if len(content) - start != shape[0] * shape[1] * dtype.itemsize:
+        raise FormatError(f"{file}: holds {len(content) - start} bytes, not {shape} numbers of {dtype}: cut off?")
+    return np.frombuffer(content, dtype, offset=start).reshape(shape, order="F" if fortran else "C")
 
 
 def _read_exr(content: bytes, file: Path) -> Any:
@@ -231,15 +244,25 @@ def _read_exr(content: bytes, file: Path) -> Any:
     try:
         with OpenEXR.File(str(file), header_only=True) as header:
             first, last = (corner.tolist() for corner in header.header()["dataWindow"])
-            _check_pixels((last[1] - first[1] + 1, last[0] - first[0] + 1), file)
+            size = (last[1] - first[1] + 1, last[0] - first[0] + 1)
+            _check_pixels(size, file)
+            known = [channel.name for channel in header.header()["channels"]]
+            _check_channels(known, size, file)
         with OpenEXR.File(str(file)) as picture:
             channels = {name: np.array(channel.pixels) for name, channel in picture.channels().items()}
     except (RuntimeError, ValueError, OSError) as error:
         raise FormatError(f"{file}: is cut off or damaged, {len(content)} bytes ({error})") from error
-    name = next((name for name in _EXR_CHANNELS if name in channels), None)
-    if name is None:
-        raise FormatError(f"{file}: has none of the channels {', '.join(_EXR_CHANNELS)}, but {', '.join(channels)}")
+    name = next(name for name in _EXR_CHANNELS if name in channels)
     return channels[name] if channels[name].ndim == 2 else channels[name][..., 0]
+
+
+def _check_channels(known: Sequence[str], size: tuple[int, int], file: Path) -> None:
+    """Raise FormatError unless one of the channels is the depth, and all together are not too many."""
+    # Red, green and blue are read as one.
+    if not {*known, *(["RGB"] if {"R", "G", "B"} <= set(known) else [])} & set(_EXR_CHANNELS):
+        raise FormatError(f"{file}: has none of the channels {', '.join(_EXR_CHANNELS)}, but {', '.join(known)}")
+    if len(known) * size[0] * size[1] > BUDGET.picture_pixels:
+        raise FormatError(f"{file}: has {len(known)} channels, together more than 64 megapixels; save the depth alone")
 
 
 # Readers of depth images that PIL does not decode.

@@ -31,7 +31,7 @@ class FileLimits:
         max_bytes: size of one file in bytes.
         max_points: points or vertices of one cloud or mesh.
         max_faces: triangles (or polygons) of one mesh.
-        max_zip_ratio: expanded over packed bytes of a zip archive.
+        max_zip_ratio: expanded over packed bytes of a compressed file; beyond 32 MB, a twentieth of it.
         max_expanded_bytes: sum of the expanded sizes in one archive.
 
     Raises:
@@ -52,6 +52,45 @@ class FileLimits:
 
 
 DEFAULT_LIMITS = FileLimits()
+
+
+@dataclass(frozen=True)
+class FileBudget:
+    """What a file may ask for beyond `FileLimits`, such that none below 10 MB takes 500 MB or 3 s.
+
+    Pictures have their limits in `torchreg.geometry.budget`, for what their pixels need.
+    """
+
+    # Frames of one archive: an hour at 25 per second.
+    frames: int = 100_000
+    # Members of one archive, whose headers are read one by one.
+    members: int = 20_000
+    # Cameras of one file, at 0.5 ms each.
+    cameras: int = 2_000
+    # Nodes of one glTF document; at 10 us each.
+    nodes: int = 100_000
+    # Joints of one skin.
+    joints: int = 1000
+    # Skin weights, vertices times joints, per byte of the file, and in small files.
+    weights_per_byte: int = 2
+    weights: int = 20_000_000
+    # Elements of one XML document, each seen by Python.
+    elements: int = 200_000
+    # Bytes of one XML document.
+    xml_bytes: int = 64 * 1024**2
+    # Links of one robot.
+    links: int = 2000
+    # Bytes that a file of any size may expand to.
+    expanded_bytes: int = 32 * 1024**2
+    # Beyond, the share of the allowed ratio: what is large is measured, and hardly gets smaller.
+    expansion_share: float = 0.05
+    # Times that the bytes of a document may be used: accessors may overlap, and be used over and over.
+    uses: int = 4
+    # Digits of one number: more take time that grows with their square.
+    digits: int = 400
+
+
+FILE_BUDGET = FileBudget()
 
 
 def local_path(path: str | os.PathLike[str]) -> Path:
@@ -107,6 +146,12 @@ def check_size(size: int, path: Path, limits: FileLimits) -> None:
         )
 
 
+def check_budget(count: int, allowed: int, what: str) -> None:
+    """Raise FormatError if a file holds more things of a kind than are read, such as "cameras"."""
+    if count > allowed:
+        raise FormatError(f"holds {count} {what}, at most {allowed} are read; split it into several files")
+
+
 def check_allowed(count: int, what: str, limits: FileLimits) -> None:
     """Raise FormatError if a file claims more items than allowed; ``what`` is "faces", or names points."""
     name = "max_faces" if what == "faces" else "max_points"
@@ -119,10 +164,13 @@ def check_allowed(count: int, what: str, limits: FileLimits) -> None:
 
 def check_expansion(packed: int, expanded: int, what: str, limits: FileLimits) -> None:
     """Raise FormatError if ``packed`` bytes claim to expand beyond the allowed ratio or size."""
-    if expanded > limits.max_expanded_bytes or expanded > limits.max_zip_ratio * max(packed, 1):
+    packed = max(packed, 1)
+    bound = FILE_BUDGET.expanded_bytes + FILE_BUDGET.expansion_share * limits.max_zip_ratio * packed
+    if expanded > min(limits.max_expanded_bytes, limits.max_zip_ratio * packed, bound):
         raise FormatError(
             f"{what} would expand {packed} bytes to {expanded}; allowed are {limits.max_expanded_bytes} bytes and "
-            f"{limits.max_zip_ratio:g}-fold; if you trust it pass FileLimits(max_zip_ratio=..., max_expanded_bytes=...)"
+            f"{limits.max_zip_ratio:g}-fold, and of this file {bound:.0f}; if you trust it pass "
+            f"FileLimits(max_zip_ratio=..., max_expanded_bytes=...)"
         )
 
 
@@ -141,6 +189,8 @@ def open_zip(content: bytes, limits: FileLimits = DEFAULT_LIMITS) -> zipfile.Zip
     except ZIP_ERRORS as error:
         raise FormatError(f"is not a readable zip archive ({error})") from error
     members = archive.infolist()
+    if len(members) > FILE_BUDGET.members:
+        raise FormatError(f"is a zip archive of {len(members)} members; at most {FILE_BUDGET.members} are read")
     names = [member.filename for member in members]
     if len(set(names)) != len(names):
         raise FormatError("is a zip archive with several members of one name")

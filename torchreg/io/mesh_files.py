@@ -33,6 +33,8 @@ _PARSER_ERRORS = (
     AssertionError,
     SyntaxError,
     EOFError,
+    MemoryError,
+    NameError,  # trimesh forgets variables where a file ends early
     ImportError,  # trimesh asks for an encoding detector when text is not UTF-8
     struct.error,
 )

@@ -111,6 +111,8 @@ def _written(name: str, matrix: Tensor) -> str:
 def _parsed(text: str, path: Path) -> Values:
     """Return the matrices, lists of numbers and other words of a file by their names."""
     marks = list(_KEY.finditer(text))
+    if not marks:
+        raise FormatError(f"{path}: holds no entry NAME: VALUE")
     ends = [mark.start() for mark in marks[1:]] + [len(text)]
     values: Values = {}
     for mark, end in zip(marks, ends, strict=True):
@@ -127,15 +129,21 @@ def _parsed(text: str, path: Path) -> Values:
 
 def _matrix(body: str, where: str) -> Tensor:
     marks = list(_FIELD.finditer(body))
-    ends = [mark.start() for mark in marks[1:]] + [len(body)]
+    # Without any field, it lacks them all.
+    ends = [mark.start() for mark in marks[1:]] + [len(body)] * bool(marks)
     fields = {mark.group(1): body[mark.end() : end] for mark, end in zip(marks, ends, strict=True)}
     rows, columns = (fields.get(side, "").strip() for side in ("rows", "cols"))
-    if not rows.isdecimal() or not columns.isdecimal() or "data" not in fields:
+    if not _is_count(rows) or not _is_count(columns) or "data" not in fields:
         raise FormatError(f"{where} lacks rows, cols or data: the file is cut off or damaged")
     data = _listed(fields["data"], where)
     if len(data) != int(rows) * int(columns):
         raise FormatError(f"{where} must hold {rows} x {columns} numbers, got {len(data)}")
     return data.reshape(int(rows), int(columns))
+
+
+def _is_count(word: str) -> bool:
+    """Return whether a word is a whole number that a picture's or matrix's side can be."""
+    return word.isascii() and word.isdecimal() and len(word) < 10
 
 
 def _listed(body: str, where: str) -> Tensor:
@@ -160,7 +168,7 @@ def _picture_size(values: Values, size: tuple[int, int] | None, path: Path) -> t
     if isinstance(pair, Tensor) and pair.numel() == 2:
         return int(pair.flatten()[0]), int(pair.flatten()[1])
     sides = [next((values[name] for name in names if name in values), None) for names in (_WIDTHS, _HEIGHTS)]
-    if all(isinstance(side, str) and side.isdecimal() for side in sides):
+    if all(isinstance(side, str) and _is_count(side) for side in sides):
         return int(str(sides[0])), int(str(sides[1]))
     if size is None:
         raise FormatError(f"{path}: lacks image_width and image_height; pass size=(width, height) to load_opencv")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchreg.errors import FormatError
-from torchreg.io.limits import FileLimits, check_allowed
+from torchreg.io.limits import FileLimits, check_allowed, check_expansion
 from torchreg.io.raw_cloud import Array, RawCloud, as_integers, parse_table, stack_columns
 
 _DATA_LINE = re.compile(rb"^DATA[ \t]+(\w+)[ \t]*\r?(\n|$)", re.MULTILINE)
@@ -126,8 +126,7 @@ def _read_compressed(body: bytes, fields: list[_Field], count: int, limits: File
     _check_length(8 + packed + len(body[8 + packed :].strip(b"\0 \t\r\n")), 8 + packed, "bytes")
     if packed > len(body) - 8 or expanded > math.ceil(_LZF_RATIO * packed):
         raise FormatError(f"the compressed block of {packed} bytes is cut off or damaged")
-    if expanded > limits.max_expanded_bytes:
-        raise FormatError(f"would expand to {expanded} bytes, the limit is {limits.max_expanded_bytes}")
+    check_expansion(packed, expanded, "the compressed block", limits)
     block, offset = decompress_lzf(body[8 : 8 + packed], expanded), 0
     columns = dict[str, Array]()
     for field in fields:  # one field after the other, not point after point

@@ -226,7 +226,8 @@ def _checked_cloud(raw: RawCloud, nan_policy: str, limits: FileLimits, dtype: to
 def _rows(values: Array, what: str, count: int | None, dtype: torch.dtype) -> Tensor:
     if values.ndim != 2 or values.shape[1] != 3 or (count is not None and len(values) != count):
         raise FormatError(f"{what} must have shape ({count or 'N'}, 3), got {values.shape}")
-    return torch.from_numpy(np.array(values, dtype=np.float64 if dtype == torch.float64 else np.float32))
+    with np.errstate(over="ignore"):  # what becomes infinite is counted
+        return torch.from_numpy(np.array(values, dtype=np.float64 if dtype == torch.float64 else np.float32))
 
 
 def _to_unit_range(colors: Array) -> Array:
@@ -240,7 +241,7 @@ def _face_rows(faces: Array, count: int, limits: FileLimits) -> Tensor:
     if faces.size and (faces.min() < 0 or faces.max() >= count):
         wrong = int(faces.max() if faces.max() >= count else faces.min())
         raise FormatError(f"a face names vertex {wrong}, outside 0 to {count - 1}: the file is cut off or damaged")
-    return torch.from_numpy(np.array(faces, dtype=np.int64))
+    return torch.from_numpy(np.require(faces, np.int64, ["C", "W"]))
 
 
 def save_points(

@@ -47,7 +47,7 @@ def parse_table(lines: Sequence[bytes], columns: int | None, what: str) -> Array
     if not all(line.strip() for line in lines):
         raise FormatError(f"each {what} must hold {columns or 'equally many'} numbers, got a blank row")
     try:
-        table = np.loadtxt([line.decode("ascii") for line in lines], dtype=np.float64, comments=None, ndmin=2)
+        table = np.loadtxt((line.decode("ascii") for line in lines), dtype=np.float64, comments=None, ndmin=2)
     except ValueError as error:  # also what is not ASCII
         raise FormatError(f"a {what} is not a row of {columns or 'equally many'} numbers ({error})") from error
     if len(table) != len(lines) or (columns is not None and table.shape[1] != columns):
@@ -83,6 +83,10 @@ def stack_columns(columns: dict[str, Array], names: Sequence[str]) -> Array | No
     return np.stack([columns[name] for name in names], axis=-1)
 
 
+# Polygons that are cut together.
+_POLYGONS = 4096
+
+
 def fan_triangles(counts: Array, indices: Array) -> Array:
     """Return the (F, 3) triangles of polygons, each cut as a fan from its first corner.
 
@@ -92,8 +96,20 @@ def fan_triangles(counts: Array, indices: Array) -> Array:
     """
     if counts.size and counts.min() < 3:
         raise FormatError(f"a face must have at least 3 corners, got {int(counts.min())}")
+    ends = np.cumsum(counts - 2)
+    result = np.empty((int(ends[-1]) if len(ends) else 0, 3), indices.dtype)
+    # A part after the other, as numbers of corners take more memory than corners.
+    for first in range(0, len(counts), _POLYGONS):
+        part = counts[first : first + _POLYGONS]
+        before = int(ends[first - 1]) if first else 0
+        numbers = _fan_corners(part) + before + 2 * first
+        result[before : before + len(numbers)] = indices[numbers]
+    return result
+
+
+def _fan_corners(counts: Array) -> Array:
+    """Return the (F, 3) numbers of the corners of the triangles of polygons with counts (P,) of corners."""
     triangles = counts - 2
     start = np.repeat(np.cumsum(counts) - counts, triangles)
     step = np.arange(int(triangles.sum())) - np.repeat(np.cumsum(triangles) - triangles, triangles)
-    corners = np.stack((start, start + step + 1, start + step + 2), axis=-1)
-    return indices[corners.reshape(-1)].reshape(-1, 3)
+    return np.stack((start, start + step + 1, start + step + 2), axis=-1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 
 from torchreg.errors import FormatError
+from torchreg.io.limits import FILE_BUDGET
 
 # Elements within each other in any honest robot description are far fewer.
 _MAX_DEPTH = 64
@@ -14,6 +15,7 @@ class _StrictBuilder(ET.TreeBuilder):
     """A builder of the element tree that refuses document types (which bring entities) and absurd nesting."""
 
     depth = 0
+    count = 0
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
         raise FormatError(
@@ -22,6 +24,9 @@ class _StrictBuilder(ET.TreeBuilder):
 
     def start(self, tag: str, attrs: dict[str, str], /) -> ET.Element:
         self.depth += 1
+        self.count += 1
+        if self.count > FILE_BUDGET.elements:
+            raise FormatError(f"has more than {FILE_BUDGET.elements} elements, which no robot description has")
         if self.depth > _MAX_DEPTH:
             raise FormatError(f"nests elements more than {_MAX_DEPTH} deep")
         return super().start(tag, attrs)

@@ -15,10 +15,12 @@ from torchreg._checks import check_choice
 from torchreg.errors import FormatError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh, concatenate
-from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, read_bytes
+from torchreg.io.limits import DEFAULT_LIMITS, FILE_BUDGET, FileLimits, check_allowed, local_path, read_bytes
 from torchreg.io.mesh_files import MeshFiles
 from torchreg.io.strict_xml import parse_xml
 
+# Attributes of a mimic joint: added to its multiple of the other.
+_MIMIC = ("offset", "multiplier")
 _KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": "fixed"}
 # Attributes of each kind of solid, with the count of their numbers.
 _PRIMITIVES = {
@@ -27,17 +29,6 @@ _PRIMITIVES = {
     "capsule": {"radius": 1, "length": 1},
     "sphere": {"radius": 1},
 }
-
-
-@dataclass(frozen=True)
-class _UrdfLimits:
-    """Largest descriptions that are read."""
-
-    max_links: int = 2000
-    max_bytes: int = 64 * 1024**2  # of XML
-
-
-_LIMITS = _UrdfLimits()
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,8 +112,8 @@ def load_urdf(
 
 def _parse(path: Path, limits: FileLimits) -> ET.Element:
     content = read_bytes(path, limits)
-    if len(content) > _LIMITS.max_bytes:
-        raise FormatError(f"{path}: {len(content)} bytes of XML, at most {_LIMITS.max_bytes} are read")
+    if len(content) > FILE_BUDGET.xml_bytes:
+        raise FormatError(f"{path}: {len(content)} bytes of XML, at most {FILE_BUDGET.xml_bytes} are read")
     expand = f"{path}: holds xacro macros; expand them first with `xacro {path.name} > robot.urdf`"
     try:
         robot = parse_xml(content)
@@ -147,8 +138,8 @@ def _named(path: Path, robot: ET.Element, tag: str) -> dict[str, ET.Element]:
         if name in found:
             raise ModelError(f"{path}: two {tag}s are called {name!r}; names must be unique")
         found[name] = element
-    if tag == "link" and not 0 < len(found) <= _LIMITS.max_links:
-        raise ModelError(f"{path}: a robot must have 1 to {_LIMITS.max_links} links, got {len(found)}")
+    if tag == "link" and not 0 < len(found) <= FILE_BUDGET.links:
+        raise ModelError(f"{path}: a robot must have 1 to {FILE_BUDGET.links} links, got {len(found)}")
     return found
 
 
@@ -195,10 +186,11 @@ def _build_tree(
 ) -> KinematicTree:
     index = {carrier[0]: number for number, (_, carrier) in enumerate(order) if carrier is not None}
     root = order[0][0]
+    mimics = _mimics(path, joints)
     frames = [Joint(f"{root}_root" if root in joints else root, -1, torch.eye(4, dtype=torch.float64))]
     for _, carrier in order[1:]:
         if carrier is not None:
-            frames.append(_build_joint(path, carrier[0], carrier[1], joints, index))
+            frames.append(_build_joint(path, carrier[0], carrier[1], joints, index, mimics))
     try:
         return KinematicTree(tuple(frames))
     except ModelError as error:
@@ -206,7 +198,12 @@ def _build_tree(
 
 
 def _build_joint(
-    path: Path, name: str, parent: int, joints: Mapping[str, ET.Element], index: Mapping[str, int]
+    path: Path,
+    name: str,
+    parent: int,
+    joints: Mapping[str, ET.Element],
+    index: Mapping[str, int],
+    mimics: Mapping[str, tuple[str, float, float]],
 ) -> Joint:
     element, what = joints[name], f"{path}: joint {name!r}"
     offset = _origin(element, what)
@@ -226,7 +223,7 @@ def _build_joint(
         axis=(axis[0] / length, axis[1] / length, axis[2] / length),
         lower=lower,
         upper=upper,
-        mimic=_mimic(path, name, joints, index),
+        mimic=None if mimics[name][0] == name else (index[mimics[name][0]], *mimics[name][1:]),
     )
 
 
@@ -246,25 +243,38 @@ def _limits(element: ET.Element, what: str) -> tuple[float, float]:
     return _floats(limit, "lower", 1, (0.0,), what)[0], _floats(limit, "upper", 1, (0.0,), what)[0]
 
 
-def _mimic(
-    path: Path, name: str, joints: Mapping[str, ET.Element], index: Mapping[str, int]
-) -> tuple[int, float, float] | None:
-    """Return (followed frame, multiplier, offset), through chains of mimic joints to the one that moves by itself."""
-    multiplier, offset, leader, seen = 1.0, 0.0, name, {name}
-    while (mimic := joints[leader].find("mimic")) is not None:
-        what = f"{path}: joint {leader!r}"
-        target = mimic.get("joint")
-        if target is None or target not in joints:
-            raise ModelError(f"{what} mimics joint {target!r}, which the file does not define")
-        if target in seen:
-            raise ModelError(f"{what} mimics joint {target!r} in a cycle")
-        if _kind(joints, target, f"{path}: joint {target!r}") == "fixed":
-            raise ModelError(f"{what} mimics joint {target!r}, which is fixed")
-        offset += multiplier * _floats(mimic, "offset", 1, (0.0,), what)[0]
-        multiplier *= _floats(mimic, "multiplier", 1, (1.0,), what)[0]
-        leader = target
-        seen.add(target)
-    return None if leader == name else (index[leader], multiplier, offset)
+def _mimics(path: Path, joints: Mapping[str, ET.Element]) -> dict[str, tuple[str, float, float]]:
+    """Return (the joint it follows, multiplier, offset) of every joint; one that moves by itself follows itself."""
+    found: dict[str, tuple[str, float, float]] = {}
+    for name in joints:
+        # Chains of mimic joints are followed to the first whose leader is known.
+        chain: list[tuple[str, float, float]] = []
+        while name not in found:
+            mimic, what = joints[name].find("mimic"), f"{path}: joint {name!r}"
+            if mimic is None:
+                found[name] = (name, 1.0, 0.0)
+                break
+            target = _mimicked(mimic, joints, path, what)
+            offset, multiplier = (_floats(mimic, key, 1, (float(key == "multiplier"),), what)[0] for key in _MIMIC)
+            chain.append((name, multiplier, offset))
+            if len(chain) > len(joints):
+                raise ModelError(f"{what} mimics joint {target!r} in a cycle")
+            name = target
+        leader, multiplier, offset = found[name]
+        for follower, factor, shift in reversed(chain):
+            multiplier, offset = factor * multiplier, factor * offset + shift
+            found[follower] = (leader, multiplier, offset)
+    return found
+
+
+def _mimicked(mimic: ET.Element, joints: Mapping[str, ET.Element], path: Path, what: str) -> str:
+    """Return the name of the joint that an element mimics."""
+    target = mimic.get("joint")
+    if target is None or target not in joints:
+        raise ModelError(f"{what} mimics joint {target!r}, which the file does not define")
+    if _kind(joints, target, f"{path}: joint {target!r}") == "fixed":
+        raise ModelError(f"{what} mimics joint {target!r}, which is fixed")
+    return target
 
 
 def _floats(
