@@ -330,10 +330,12 @@ def test_archives_without_a_pose_are_refused(tmp_path, hand):
 
 def test_the_last_known_pose_of_a_track_is_read(tmp_path, hand):
     poses = torch.arange(3.0).unsqueeze(-1).repeat(1, hand.num_dofs)
-    poses[2] = torch.nan
-    replace(track(3), poses=poses).save(tmp_path / "t.safetensors")
+    poses[2], done = torch.nan, (Status.CONVERGED,) * 3
+    replace(track(3), poses=poses, std=poses, statuses=done, acquired=("tracked",) * 3).save(tmp_path / "t.safetensors")
     assert torch.equal(load_pose(tmp_path / "t.json", hand), poses[1])
-    replace(track(3), poses=poses * torch.nan).save(tmp_path / "n.safetensors")
+    replace(track(3), poses=poses * torch.nan, std=poses, statuses=done, acquired=("tracked",) * 3).save(
+        tmp_path / "n.safetensors"
+    )
     with pytest.raises(FormatError, match="in which the shape was never found"):
         load_pose(tmp_path / "n.safetensors", hand)
 
@@ -381,10 +383,10 @@ def test_models_on_grids_come_back_as_they_were(tmp_path):
     motions = torch.eye(4, dtype=torch.float64).repeat(3, 2, 1, 1)
     motions[:, 1, 2, 3] = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
     model = GridLBS(grid, weights, motions, blend="dual_quaternion")
-    empty = torch.zeros(0)
+    empty, rows = torch.zeros(0), torch.zeros(0, 3)
     saved = ScanRegistration(
-        model=model, points=empty, faces=None, deformed=empty, labels=empty, transforms=empty, weights=empty,
-        distances=empty, matched=empty, status=Status.CONVERGED, seconds=empty,
+        model=model, points=rows, faces=None, deformed=rows, labels=empty, transforms=motions[0],
+        weights=torch.zeros(0, 2), distances=empty, matched=empty, status=Status.CONVERGED, seconds=torch.zeros(4),
     )  # fmt: skip
     saved.save(tmp_path / "m.safetensors")
     again = load(tmp_path / "m.safetensors").model

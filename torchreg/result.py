@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from enum import Enum
 from html import escape
 from importlib import import_module
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -64,6 +64,33 @@ class Result:
 
     It prints in one line, and in notebooks as a table: tensors by type and shape, not by their numbers.
     """
+
+    # Dimensions of fields by name, as "T K 3"; leading dimensions of a batch are the same for all.
+    shapes: ClassVar[Mapping[str, str]] = {}
+
+    def shape_defect(self) -> str | None:
+        """Return which field does not fit the shapes of the others, in words; None if all do."""
+        sizes: dict[str, int] = {}
+        batches: dict[str, tuple[int, ...]] = {}
+        for name, dimensions in self.shapes.items():
+            value, wanted = getattr(self, name), dimensions.split()
+            if value is None:
+                continue
+            shape = (len(value),) if isinstance(value, tuple) else tuple(value.shape)
+            if len(shape) < len(wanted):
+                return f"{name} must have shape ({', '.join(wanted)}), got {shape}"
+            split = len(shape) - len(wanted)
+            batches[name] = shape[:split]
+            for label, size in zip(wanted, shape[split:], strict=True):
+                if sizes.setdefault(label, int(label) if label.isdecimal() else size) != size:
+                    return f"{name} must have shape ({', '.join(wanted)}) with {label} = {sizes[label]}, got {shape}"
+        if len(set(batches.values())) > 1:
+            return f"{', '.join(batches)} must have the same leading dimensions, got {set(batches.values())}"
+        status = getattr(self, "status", None)
+        batch = next(iter(batches.values()), ())
+        if isinstance(status, tuple) and batch != (len(status),):
+            return f"status must be one, or one per row of the batch {batch}, got {len(status)}"
+        return None
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)

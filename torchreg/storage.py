@@ -65,6 +65,9 @@ def load(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -
         result: Result = _Decoder(tensors, _named_types(kind)).build(kind, metadata.get("fields"), "fields")
     except (_WrongContentError, ModelError, InputError) as error:
         raise FormatError(f"{path}: is not a complete {name} ({error}): the file is damaged") from error
+    defect = result.shape_defect()
+    if defect is not None:
+        raise FormatError(f"{path}: is not a complete {name} ({defect}): the file is damaged")
     return result
 
 

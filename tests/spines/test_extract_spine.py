@@ -1,13 +1,18 @@
 """Spines of sequences that share nothing against the truth, on unsound data, in several processes and in two calls."""
 
+import os
+import signal
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 import torch
 
 from torchreg.datasets.creatures import STARFISH, creature_sequence
-from torchreg.errors import InputError, InputTypeError
+from torchreg.errors import InputError, InputTypeError, SolverError
 from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
 from torchreg.geometry.rotation import so3_exp
 from torchreg.result import Status
+from torchreg.spines import frame_skeletons
 from torchreg.spines.extract_spine import SpineConfig, extract_spine
 from torchreg.spines.results import SpineSequence
 from torchreg.spines.skeletonize import SkeletonizeConfig
@@ -235,3 +240,34 @@ def test_a_single_limb_has_no_junction():
     curves = torch.rand(3, 2, 4, 3, generator=torch.Generator().manual_seed(0))[:, :1]
     found = sequence(torch.tensor([[0, 1]]), curves, num_tips=2)
     assert found.junctions.shape == (3, 0, 3)
+
+
+def test_a_worker_that_is_killed_is_replaced_once(meshes, monkeypatch, tmp_path):
+    here, plain = os.getpid(), frame_skeletons.skeletonize
+
+    def dies(mesh, config):
+        if os.getpid() != here and not (tmp_path / "died").exists():
+            (tmp_path / "died").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return plain(mesh, config)
+
+    alone = extract_spine(meshes, workers=1)
+    monkeypatch.setattr(frame_skeletons, "skeletonize", dies)
+    assert torch.equal(extract_spine(meshes, workers=2).curves, alone.curves)
+    assert (tmp_path / "died").exists()
+
+    def always_dies(mesh, config):
+        os.kill(os.getpid(), signal.SIGKILL) if os.getpid() != here else None
+        return plain(mesh, config)
+
+    monkeypatch.setattr(frame_skeletons, "skeletonize", always_dies)
+    with pytest.raises(SolverError, match="was killed twice.*pass workers=1"):
+        extract_spine(meshes, workers=2)
+
+
+def test_two_threads_get_their_own_skeletons(meshes):
+    halves = [meshes, meshes[::-1]]
+    alone = [extract_spine(half, workers=1).curves for half in halves]
+    with ThreadPoolExecutor(2) as pool:
+        both = list(pool.map(lambda half: extract_spine(half, workers=2).curves, halves))
+    assert all(torch.equal(*pair) for pair in zip(alone, both, strict=True))

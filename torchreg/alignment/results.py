@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -51,6 +53,11 @@ class AlignResult(Result):
         history: one `AlignRecord` per step.
     """
 
+    shapes: ClassVar[Mapping[str, str]] = {
+        "pose": "D", "registered": "N 3", "keypoints": "K 3", "distances": "M", "inliers": "M", "posterior": "M",
+        "sigma": "", "cost": "",
+    }  # fmt: skip
+
     pose: Tensor
     registered: Tensor
     keypoints: Tensor
@@ -81,6 +88,13 @@ class Calibration(Result):
         status: of the calibration at its end.
     """
 
+    shapes: ClassVar[Mapping[str, str]] = {
+        "poses": "T D",
+        "log_length_scales": "P",
+        "log_radius_scales": "P",
+        "cost": "",
+    }
+
     shape: ArticulatedShape = field(metadata=stored_as(record_shape, build_shape))
     poses: Tensor
     log_length_scales: Tensor
@@ -98,6 +112,8 @@ class PoseStarts(Result):
         costs: (S,) data that a pose leaves unexplained, softly counted, and a weak prior; lower is better.
         confidence: () from 0 to 1, in the first pose; low too where no data show a limb.
     """
+
+    shapes: ClassVar[Mapping[str, str]] = {"poses": "S D", "costs": "S", "confidence": ""}
 
     poses: Tensor
     costs: Tensor

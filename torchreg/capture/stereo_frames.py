@@ -15,6 +15,7 @@ from torchreg.capture.stereo import StereoConfig, StereoPoints, as_gray, rectify
 from torchreg.errors import FormatError, InputError
 from torchreg.geometry.camera_rig import StereoPair
 from torchreg.geometry.neighbors import k_nearest_others
+from torchreg.io.frames import file_fingerprint
 from torchreg.io.images import list_frames, load_image
 
 
@@ -88,6 +89,10 @@ class StereoFrames(Sequence[Tensor]):
 
     def __len__(self) -> int:
         return len(self._files)
+
+    def fingerprint(self, index: int) -> str:
+        """Return a digest of what the pictures of a frame hold now; empty if one cannot be read."""
+        return file_fingerprint(*self._files[index])
 
     def __getitem__(self, index: Any) -> Any:
         """Return the cloud of a frame, or those of a slice."""

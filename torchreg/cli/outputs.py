@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import os
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, overload
 
 import typer
 
 from torchreg.errors import InputError
 
+fcntl: ModuleType | None
+try:
+    import fcntl
+except ImportError:  # on Windows, where files that are written cannot be opened twice anyway
+    fcntl = None
+
+# Bytes without which no output is worth to be begun.
+_LEAST_SPACE = 256 * 1024
 PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 
 Force = Annotated[bool, typer.Option("--force", help="Overwrite outputs that exist.")]
@@ -44,13 +56,56 @@ def numbered(path: Path | None, index: int, count: int) -> Path | None:
     return path.with_name(f"{path.stem}_{index + 1:0{len(str(count))}}{path.suffix}")
 
 
+@contextmanager
+def claimed(output: Path) -> Iterator[None]:
+    """Let no other run write an output in a ``with`` block; InputError if one does."""
+    if fcntl is None:
+        yield
+        return
+    lock = output.with_name(f".{output.name}.lock")
+    with lock.open("a+") as handle:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # The run before may just have removed the file.
+            owned = lock.exists() and os.path.samestat(os.fstat(handle.fileno()), lock.stat())
+        except BlockingIOError:
+            owned = False
+        if not owned:
+            handle.seek(0)
+            number = handle.read().strip() or "unknown"
+            raise InputError(
+                f"{output} is being written by another run, process {number}; wait for its end, or name another output "
+                f"with -o"
+            )
+        handle.truncate(0)
+        handle.write(str(os.getpid()))
+        handle.flush()
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
+
+
+def _check_folder(folder: Path) -> None:
+    """Raise an OSError, which names the folder, if no file can be written there."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"the folder {folder} does not exist; create it first")
+    try:
+        with tempfile.TemporaryFile(dir=folder) as probe:
+            probe.write(bytes(_LEAST_SPACE))
+            probe.flush()
+    except OSError as error:
+        raise OSError(error.errno, f"nothing can be written there ({error.strerror})", str(folder)) from error
+
+
 def check_outputs(paths: Iterable[Path | None], force: bool) -> None:
     """Raise an error if an output cannot be written, or exists and may not be overwritten."""
-    wanted = [path for path in paths if path is not None]
+    wanted, checked = [path for path in paths if path is not None], set[Path]()
     for path in wanted:
         if wanted.count(path) > 1:
             raise InputError(f"two outputs would be called {path}; rename one")
-        if not path.parent.is_dir():
-            raise FileNotFoundError(f"the folder {path.parent} does not exist; create it first")
+        if path.parent not in checked:
+            _check_folder(path.parent)
+            checked.add(path.parent)
         if path.exists() and not force:
             raise InputError(f"{path} exists; pass --force to overwrite it, or name another output with -o")

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from torchreg.cli.cameras import Calibration, Seen, check_used, load_calibration, seen_folder
-from torchreg.cli.outputs import Force, Quiet, check_outputs, numbered, with_ending
-from torchreg.cli.reporting import reporting
+from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, numbered, with_ending
+from torchreg.cli.reporting import interruption, reporting
 
 if TYPE_CHECKING:
     from torchreg.capture.silhouette_frames import SilhouetteFrames
     from torchreg.geometry.mesh import TriangleMesh
+    from torchreg.spines.extract_spine import SpineConfig
     from torchreg.spines.results import SpineSequence
 
 
@@ -99,22 +101,43 @@ def spine(
 
         check_animation_path(movie)
 
-    if silhouettes:
-        meshes = _hulls(source, seen_folder(seen, glb, force), progress, quiet)
-    from tqdm import tqdm
+    from torchreg.spines.extract_spine import SpineConfig
 
-    from torchreg.spines.extract_spine import SpineConfig, extract_spine
-
-    with tqdm(total=len(meshes), unit="frame", desc="skeletons", leave=False, disable=quiet) as bar:
-        config = SpineConfig(num_tips=tips, num_samples=samples)
-        found = extract_spine(meshes, config=config, workers=workers, on_step=lambda _: bar.update(), progress=progress)
-    found.save(result)
-    _write(found, meshes, glb, curves, npz, fps)
-    _draw(found, meshes, movie, pictures, fps)
+    config = SpineConfig(num_tips=tips, num_samples=samples)
+    with claimed(glb), _kept(progress):
+        if silhouettes:
+            meshes = _hulls(source, seen_folder(seen, glb, force), progress, quiet)
+        found = _extracted(meshes, config, workers, progress, quiet)
+        found.save(result)
+        _write(found, meshes, glb, curves, npz, fps)
+        _draw(found, meshes, movie, pictures, fps)
     if not quiet:
         for warning in found.warnings:
             typer.echo(f"torchreg: warning: {_named(warning, names)}", err=True)
         typer.echo(_summary(found, glb))
+
+
+@contextmanager
+def _kept(progress: Path | None) -> Iterator[None]:
+    """Say on Ctrl-C what is kept, and how to go on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if progress is None:
+            raise interruption("nothing was kept; --progress FOLDER keeps each frame that is done") from None
+        done = len(list(progress.glob("frame_*.safetensors"))) if progress.is_dir() else 0
+        raise interruption(f"{done} frames are kept in {progress}; the same command goes on from there") from None
+
+
+def _extracted(
+    meshes: list[TriangleMesh], config: SpineConfig, workers: int | None, progress: Path | None, quiet: bool
+) -> SpineSequence:
+    from tqdm import tqdm
+
+    from torchreg.spines.extract_spine import extract_spine
+
+    with tqdm(total=len(meshes), unit="frame", desc="skeletons", leave=False, disable=quiet) as bar:
+        return extract_spine(meshes, config=config, workers=workers, on_step=lambda _: bar.update(), progress=progress)
 
 
 def _read(frames: list[Path]) -> tuple[list[TriangleMesh], tuple[str, ...]]:

@@ -22,7 +22,7 @@ from torchreg.cli.cameras import (
     stereo_job,
     stereo_source,
 )
-from torchreg.cli.outputs import Force, Quiet, with_ending
+from torchreg.cli.outputs import Force, Quiet, claimed, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, load_shape
 from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary, track_job
@@ -147,7 +147,7 @@ def track(
     )
     first = None if start is None else load_pose(start, model)
     job = track_job(shape, options, first, config, fps, scale, nan_policy, clouds)
-    with ExitStack() as pages, _progress_bar(len(clouds), quiet) as bar:
+    with claimed(files.result), ExitStack() as pages, _progress_bar(len(clouds), quiet) as bar:
         tracker, report = Tracker(model, first, config=config), Report(bar, clouds, quiet)
         run = TrackRun(
             tracker=tracker, clouds=clouds, fps=fps, job=job, files=files, report=report, save_every=save_every

@@ -7,7 +7,7 @@ import json
 import os
 import tempfile
 import zipfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,8 @@ from torchreg.storage import load, save_result
 from torchreg.tracking.results import TrackResult, TrackState
 
 _RESULT, _STATE, _JOB = "result.safetensors", "state.safetensors", "job.json"
+# The entry of the job that holds the digests of the frames.
+_CONTENTS = "contents of frames"
 _MEMBERS = (_RESULT, "result.json", _STATE, "state.json", _JOB)
 
 
@@ -33,11 +35,13 @@ class TrackProgress:
         result: of the T frames done.
         state: of the tracker after them.
         job: what it was told to do, as plain data: str, bool, int, float, None, lists and dicts of them.
+        contents: digests of the frames done.
     """
 
     result: TrackResult
     state: TrackState
     job: dict[str, Any]
+    contents: list[str] = field(default_factory=list)
 
 
 def save_progress(path: str | os.PathLike[str], progress: TrackProgress) -> None:
@@ -57,7 +61,7 @@ def save_progress(path: str | os.PathLike[str], progress: TrackProgress) -> None
         folder = Path(name)
         save_result(progress.result, folder / _RESULT)
         save_result(progress.state, folder / _STATE)
-        (folder / _JOB).write_text(json.dumps(progress.job), encoding="utf-8")
+        (folder / _JOB).write_text(json.dumps({**progress.job, _CONTENTS: progress.contents}), encoding="utf-8")
         with zipfile.ZipFile(content, "w") as archive:
             for member in _MEMBERS:
                 archive.writestr(member, (folder / member).read_bytes())
@@ -88,9 +92,12 @@ def load_progress(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_
         raise FormatError(f"{place}: is no progress of a tracker, or damaged ({error})") from error
     if not isinstance(result, TrackResult) or not isinstance(state, TrackState) or not isinstance(job, dict):
         raise FormatError(f"{place}: must hold a TrackResult, a TrackState and what was to be done")
+    contents = job.pop(_CONTENTS, [])
+    if not isinstance(contents, list):
+        raise FormatError(f"{place}: must hold a list of digests of the frames")
     if state.frame != len(result.statuses):
         raise FormatError(f"{place}: has the state after {state.frame} frames beside {len(result.statuses)} results")
-    return TrackProgress(result, state, job)
+    return TrackProgress(result, state, job, contents)
 
 
 def first_frames(result: TrackResult, count: int) -> TrackResult:

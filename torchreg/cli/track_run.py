@@ -79,6 +79,13 @@ class Clouds(Sequence["Tensor"]):
     def __init__(self, frames: Frames | StereoFrames, scale: float) -> None:
         self.names, self._frames, self._scale = frames.names, frames, scale
         self.on_drop: Callable[[int, str], None] | None = None
+        self._contents: dict[int, str] = {}
+
+    def content(self, index: int) -> str:
+        """Return a digest of what a frame held when it was first asked for."""
+        if index not in self._contents:
+            self._contents[index] = self._frames.fingerprint(index)
+        return self._contents[index]
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -215,6 +222,14 @@ class TrackRun:
                 f"{self.files.progress} was written by another command: {', '.join(changed)} differ; repeat that one, "
                 f"or pass --force without --resume to begin anew"
             )
+        known = enumerate(progress.contents)
+        other = [self.clouds.names[number] for number, content in known if content != self.clouds.content(number)]
+        if other:
+            names = ", ".join(other[:5]) + (f" and {len(other) - 5} more" if len(other) > 5 else "")
+            raise InputError(
+                f"{names} changed since {self.files.progress} was written; bring the frames back, or pass --force "
+                f"without --resume to begin anew"
+            )
         self.tracker.state = self.state = progress.state
         self.parts = [progress.result]
         self.report.usable = progress.result.statuses[-1].usable
@@ -232,7 +247,8 @@ class TrackRun:
             with self.report.warnings():
                 self._part(range(self.state.frame, end), overlays)
             complete = self.state.frame == end
-            save_progress(self.files.progress, TrackProgress(self.result, self.state, self.job))
+            contents = [self.clouds.content(number) for number in range(self.state.frame)]
+            save_progress(self.files.progress, TrackProgress(self.result, self.state, self.job, contents))
         self.clouds.on_drop = None
         self.result.save(self.files.result)
         return complete

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -65,6 +67,11 @@ class ScanRegistration(Result):
         seconds: (4,) setup, initialization, alignment, refinement.
         history: one `RegisterRecord` per step of the last two stages.
     """
+
+    shapes: ClassVar[Mapping[str, str]] = {
+        "points": "N 3", "faces": "F 3", "deformed": "N 3", "labels": "N", "transforms": "B 4 4", "weights": "N B",
+        "distances": "N", "matched": "N", "seconds": "4",
+    }  # fmt: skip
 
     model: GridLBS = field(metadata=stored_as(GridLBS.record, GridLBS.from_record))
     points: Tensor
@@ -138,6 +145,11 @@ class SequenceRegistration(Result):
         history: one `RegisterRecord` per step of the joint fit.
     """
 
+    shapes: ClassVar[Mapping[str, str]] = {
+        "points": "N 3", "faces": "F 3", "deformed": "T N 3", "labels": "N", "transforms": "T B 4 4", "weights": "N B",
+        "fused": "Q 3", "fused_normals": "Q 3", "fused_frames": "Q",
+    }  # fmt: skip
+
     model: GridLBS = field(metadata=stored_as(GridLBS.record, GridLBS.from_record))
     points: Tensor
     faces: Tensor | None
@@ -173,6 +185,8 @@ class PoseSolution(Result):
         num_steps: linear systems solved.
         status: CONVERGED or MAX_STEPS; a tuple with one entry per problem for a batch.
     """
+
+    shapes: ClassVar[Mapping[str, str]] = {"transforms": "B 4 4", "placed": "H 3", "residuals": "H", "gaps": "J"}
 
     transforms: Tensor
     placed: Tensor

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -53,6 +55,11 @@ class SpineSequence(Result):
         status: WITH_WARNINGS if any frame's is, else CONVERGED.
         warnings: irregularities, with the number of the frame.
     """
+
+    shapes: ClassVar[Mapping[str, str]] = {
+        "graph": "L 2", "curves": "T L S 3", "radii": "T L S", "frames": "T L S 3 3", "times": "T", "found": "T K",
+        "own": "T L", "topologies": "T", "own_topologies": "T", "statuses": "T",
+    }  # fmt: skip
 
     model: Spine = field(metadata=stored_as(Spine.record, Spine.from_record))
     graph: Tensor

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 from torch import Tensor
 
@@ -27,6 +29,8 @@ class FrameResult(AlignResult):
         inlier_ratio: inliers as a share of the finite data.
         residual: robust standard deviation of the distances near the surface, metres.
     """
+
+    shapes: ClassVar[Mapping[str, str]] = {**AlignResult.shapes, "covariance": "D D"}
 
     covariance: Tensor
     acquired: str
@@ -56,6 +60,11 @@ class TrackResult(Result):
         statuses: how each frame ended.
         acquired: what led to each pose, see `FrameResult`.
     """
+
+    shapes: ClassVar[Mapping[str, str]] = {
+        "poses": "T D", "std": "T D", "keypoints": "T K 3", "inlier_ratios": "T", "residuals": "T", "times": "T",
+        "seconds": "T", "statuses": "T", "acquired": "T",
+    }  # fmt: skip
 
     poses: Tensor
     std: Tensor
@@ -97,6 +106,11 @@ class TrackState(Result):
         pending_checks: how often a pose found by a search everywhere is still to be compared with another search.
         seed: of all that is drawn.
     """
+
+    shapes: ClassVar[Mapping[str, str]] = {
+        "pose": "D", "velocity": "D", "points": "N 3", "weights": "N P", "reference_pose": "D", "keyframes": "K D",
+        "unexplained": "S 3", "innovation": "3",
+    }  # fmt: skip
 
     frame: int
     time: float
@@ -145,6 +159,14 @@ class DemoResult(Result):
         tips_seen: (T, 5) True where the cameras saw enough of the fingertip to measure it.
         seed: of motion and measurements.
     """
+
+    shapes: ClassVar[Mapping[str, str]] = {
+        "truths": "T D",
+        "clouds": "T",
+        "inliers": "T",
+        "tip_errors": "T 5",
+        "tips_seen": "T 5",
+    }
 
     track: TrackResult
     truths: Tensor
