@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -80,19 +81,22 @@ def sweep(
     threads: Annotated[int, typer.Option(help="of each worker")] = 1,
     gpus: Annotated[float | None, typer.Option(help="per trial; by default one if there are any")] = None,
     retry_failed: Annotated[bool, typer.Option("--retry-failed", help="run failed and skipped trials again")] = False,
+    timeout: Annotated[float | None, typer.Option(help="seconds after which a trial is ended, as failed")] = None,
     slurm: Annotated[list[str] | None, typer.Option(help="key=value for Slurm, such as partition=short")] = None,
     sink: Annotated[list[str] | None, typer.Option(help="tensorboard, mlflow or wandb")] = None,
     results: Results = _RESULTS,
 ) -> None:
     """Run the missing trials of a sweep. Repeat the command after a crash, or run it on several machines at once."""
     plan = load_sweep(config, overrides or [])
+    if timeout is not None and not 0 < timeout < threading.TIMEOUT_MAX:
+        raise ConfigError(f"--timeout must be a positive number of seconds, got {timeout}")
     store = Store(results / plan.name)
     options = EngineConfig(jobs, threads, gpus, dict(_pair(text) for text in slurm or []))
     sinks = [make_sink(name, plan.name, str(store.root)) for name in sink or []]
-    with _progress(plan) as on_outcome:
+    with _told_if_interrupted(), _progress(plan) as on_outcome:
         summary = run_sweep(
             plan, store, lambda: make_engine(engine, options), engine_name=engine, threads=threads,
-            retry_failed=retry_failed, on_outcome=on_outcome, sinks=sinks,
+            retry_failed=retry_failed, timeout=timeout, on_outcome=on_outcome, sinks=sinks,
         )  # fmt: skip
     _print_summary(summary, store)
     if summary.unfinished:
@@ -159,9 +163,21 @@ def main() -> None:
         sys.exit(130)
 
 
+@contextlib.contextmanager
+def _told_if_interrupted() -> Iterator[None]:
+    """Say on Ctrl-C what is kept; typer would end without a word."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo("interrupted; finished trials are kept, the same command goes on", err=True)
+        raise typer.Exit(130) from None
+
+
 def _sweep_of(config: str, results: Path) -> SweepConfig:
     """Return the stored configuration of a sweep, else that of its file."""
     name = config if not config.endswith((".yaml", ".yml")) else load_sweep(config).name
+    if not (results / name).resolve().is_relative_to(results.resolve()):
+        raise ConfigError(f"{name!r} is not below the results in {results}")
     found = Store(results / name).read_sweep()
     return load_sweep(config) if found is None else found
 

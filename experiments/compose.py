@@ -81,6 +81,7 @@ def _composed(path: Path, overrides: list[str]) -> dict[str, Any]:
         from omegaconf.errors import OmegaConfBaseException
     except ImportError as error:
         raise ExperimentError("hydra is not installed: pip install 'torchreg[experiments]'") from error
+    _check_text(path)
     try:
         with (
             warnings.catch_warnings(),
@@ -89,8 +90,59 @@ def _composed(path: Path, overrides: list[str]) -> dict[str, Any]:
             # A list of defaults without _self_ is read as it always was: the file last.
             warnings.simplefilter("ignore", UserWarning)
             found = OmegaConf.to_container(compose(path.stem, overrides=overrides), resolve=True)
-    except (HydraException, OmegaConfBaseException, yaml.YAMLError) as error:
+    except (HydraException, OmegaConfBaseException, yaml.YAMLError, RecursionError, ValueError, OSError) as error:
         raise ConfigError(f"{path.name} cannot be read: {error}") from error
     if not isinstance(found, dict):
         raise ConfigError(f"{path.name} must hold a mapping")
     return {str(key): value for key, value in found.items()}
+
+
+@dataclasses.dataclass(frozen=True)
+class _TextLimits:
+    """Largest files of configurations."""
+
+    size: int = 1_000_000  # bytes
+    nodes: int = 100_000  # values, those that aliases repeat counted each time
+    depth: int = 50  # of values within each other
+
+
+_LIMITS = _TextLimits()
+
+
+def _check_text(path: Path) -> None:
+    """Raise ConfigError if a file is too large, its aliases repeat too much, or it asks for the environment."""
+    try:
+        text = path.read_bytes()
+        if len(text) > _LIMITS.size:
+            raise ConfigError(f"{path.name} has {len(text)} bytes; configurations have at most {_LIMITS.size}")
+        count = _count_nodes(text)
+    except (yaml.YAMLError, ValueError, RecursionError, OSError) as error:
+        raise (
+            error if isinstance(error, ConfigError) else ConfigError(f"{path.name} cannot be read: {error}")
+        ) from error
+    if count > _LIMITS.nodes:
+        raise ConfigError(f"{path.name} holds more than {_LIMITS.nodes} values, aliases included; write fewer")
+    if b"${oc.env" in text:
+        raise ConfigError(f"{path.name} asks for environment variables, which records would tell; write the value")
+
+
+def _count_nodes(text: bytes) -> int:
+    """Return how many values a document holds once aliases are replaced, without replacing them."""
+    total, sizes, open_nodes = 0, dict[str, int](), list[tuple[str | None, int]]()
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            total += sizes.get(event.anchor, 1)
+        elif isinstance(event, yaml.CollectionStartEvent):
+            open_nodes.append((event.anchor, total))
+            total += 1
+            if len(open_nodes) > _LIMITS.depth:
+                raise ConfigError(f"values lie more than {_LIMITS.depth} deep within each other")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = open_nodes.pop()
+            if anchor is not None:
+                sizes[anchor] = total - before
+        elif isinstance(event, yaml.ScalarEvent):
+            total += 1
+        if total > _LIMITS.nodes:
+            break
+    return total

@@ -5,7 +5,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from experiments.engines.base import Engine
@@ -62,6 +62,7 @@ def run_sweep(
     engine_name: str = "local",
     threads: int = 1,
     retry_failed: bool = False,
+    timeout: float | None = None,
     on_outcome: OnOutcome | None = None,
     sinks: Sequence[Sink] = (),
 ) -> Summary:
@@ -74,6 +75,7 @@ def run_sweep(
         engine_name: for the records.
         threads: of each worker.
         retry_failed: whether trials that failed or were skipped run again.
+        timeout: seconds after which a trial is ended and recorded as failed; None waits for ever.
         on_outcome: called after each trial.
         sinks: called with each new record.
 
@@ -92,7 +94,8 @@ def run_sweep(
             summary.kept += 1
             _count(record.status, summary)
         else:
-            waiting.append(_job(sweep, trial, store, session, engine_name, threads, retry_failed))
+            job = _job(sweep, trial, store, session, engine_name, threads, retry_failed)
+            waiting.append(replace(job, timeout=timeout))
     summary.foreign = sum(path.stem not in trials for path in store.trials.glob("*.json"))
     if waiting:
         engine = start_engine()
@@ -116,6 +119,7 @@ def _rounds(engine: Engine, jobs: list[Job]) -> Iterator[Outcome]:
         remaining, again, lost = {job.id: job for job in jobs}, [], False
         for outcome in engine.run(jobs):
             job = remaining.pop(outcome.id)
+            outcome = _recorded_last(job) or outcome if outcome.state == "lost" else outcome
             if outcome.state == "recorded":
                 yield outcome
             else:
@@ -126,6 +130,17 @@ def _rounds(engine: Engine, jobs: list[Job]) -> Iterator[Outcome]:
         jobs = [*again, *remaining.values()]
         if jobs:
             time.sleep(_BUSY_SECONDS)
+
+
+def _recorded_last(job: Job) -> Outcome | None:
+    """Return the outcome of a job whose process ended once it had written the record, as after a timeout."""
+    try:
+        record = Store(Path(job.store)).read(job.id)
+    except CorruptRecordError:
+        return None
+    if record is None or record.session != job.session:
+        return None
+    return Outcome(job.id, "recorded", record.status, True, record.note)
 
 
 def _begun(jobs: Sequence[Job]) -> bool:

@@ -103,13 +103,25 @@ def parse_record(content: bytes, name: str, expected: str | None = None) -> Tria
     try:
         data = json.loads(content)
         record = build(TrialRecord, data)
-    except (ValueError, RecursionError, ConfigError) as error:
+        _check_numbers(record)
+        own = trial_id(record.task, record.config, record.version)
+    except (ValueError, TypeError, RecursionError, ConfigError) as error:
         raise CorruptRecordError(f"{name} is not a record of a trial: {error}") from error
-    if trial_id(record.task, record.config, record.version) != record.id:
+    if own != record.id:
         raise CorruptRecordError(f"{name}: configuration or version were changed after the trial ran, as its id tells")
     if expected is not None and record.id != expected:
         raise CorruptRecordError(f"{name} holds the record of another trial, {record.id}")
     return record
+
+
+def _check_numbers(record: TrialRecord) -> None:
+    """Raise ValueError unless metrics, seconds and curves hold numbers, and null for those that are not finite."""
+    for name in ("metrics", "seconds", "curves"):
+        for key, value in getattr(record, name).items():
+            values = value if name == "curves" and isinstance(value, list) else [value]
+            for number in values:
+                if number is not None and not (isinstance(number, (int, float)) and math.isfinite(number)):
+                    raise ValueError(f"{name}.{key} must hold finite numbers, got {number!r:.40}")
 
 
 @functools.cache

@@ -353,5 +353,13 @@ class SweepConfig:
     report: ReportConfig = field(default_factory=ReportConfig)
 
     def __post_init__(self) -> None:
+        parts = self.name.replace("\\", "/").split("/")
+        _require(
+            bool(self.name.strip())
+            and not {"", ".", ".."} & set(parts)
+            and ":" not in self.name
+            and self.name.isprintable(),
+            f"name must be that of a folder below the results, such as alignment/rivals, got {self.name!r}",
+        )
         _require(self.seeds >= 1, f"seeds must be at least 1, got {self.seeds}")
         _require(bool(self.question), "question must say what the sweep is for")

@@ -118,6 +118,8 @@ class Store:
             content = path.read_bytes()
         except FileNotFoundError:
             return None
+        except OSError as error:  # a folder, among others
+            raise CorruptRecordError(f"{path.name} is not a record of a trial: {error.strerror}") from error
         return parse_record(content, path.name, trial)
 
     def write(self, record: TrialRecord) -> None:
@@ -179,7 +181,7 @@ class Store:
             return from_data(data)
         except FileNotFoundError:
             return None
-        except (ValueError, AttributeError) as error:
+        except (ValueError, AttributeError, TypeError, RecursionError, OSError) as error:
             raise StoreError(
                 f"{path} is damaged ({error}); delete it and start the sweep again, results stay"
             ) from error

@@ -52,7 +52,11 @@ def query_records(store: Store, sql: str) -> str:
     """
     _collect_if_older(store)
     with duckdb.connect() as connection:
-        trials = connection.read_parquet(str(store.parquet))
+        try:
+            trials = connection.read_parquet(str(store.parquet))
+        except duckdb.Error:  # damaged: the records hold all of it
+            write_parquet(store)
+            trials = connection.read_parquet(str(store.parquet))
         connection.register("trials", trials)
         try:
             return str(connection.sql(sql) or "")

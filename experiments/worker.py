@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import os
 import resource
 import sys
+import threading
 import time
 import traceback
 import warnings
@@ -27,6 +29,8 @@ THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"
 # A trial that ends its process this often in one session is told as failed.
 MAX_ATTEMPTS = 3
 _MAX_WARNINGS = 20
+# For the record of a trial that timed out to be written.
+_GRACE_SECONDS = 10.0
 _MEGABYTE = 2.0**20
 
 
@@ -44,6 +48,7 @@ class Job:
         threads: of the worker.
         accelerated: whether a GPU was set aside for it.
         retry: run it again if it failed or was skipped in another session.
+        timeout: seconds after which it is ended and recorded as failed; None waits for ever.
     """
 
     store: str
@@ -55,6 +60,7 @@ class Job:
     threads: int = 1
     accelerated: bool = False
     retry: bool = False
+    timeout: float | None = None
 
 
 @dataclass(frozen=True)
@@ -112,7 +118,11 @@ def execute(job: Job) -> Outcome:
             known = None
         if known is not None and finished(known, job.session, job.retry):
             return Outcome(job.id, "recorded", known.status, note=known.note)
-        record = _gave_up(job, attempt) if attempt > MAX_ATTEMPTS else _run(job, store, attempt)
+        if attempt > MAX_ATTEMPTS:
+            record = _gave_up(job, attempt)
+        else:
+            with _ended_after(job, store, attempt):
+                record = _run(job, store, attempt)
         store.write(record)
         return Outcome(job.id, "recorded", record.status, True, record.note)
 
@@ -168,6 +178,39 @@ def _run(job: Job, store: Store, attempt: int) -> TrialRecord:
     return replace(
         record, warnings=texts[:_MAX_WARNINGS], wall_seconds=wall, peak_memory_mb=peak[0], peak_gpu_memory_mb=peak[1]
     )
+
+
+@contextlib.contextmanager
+def _ended_after(job: Job, store: Store, attempt: int) -> Iterator[None]:
+    """Record a trial as failed, and end this process, unless the block is left before the trial's time is over.
+
+    The process is at the trial's mercy: only its end is sure to end the trial.
+    """
+    if job.timeout is None:
+        yield
+        return
+    # Of the record and the end of the process, one thread decides.
+    seconds, over = job.timeout, threading.Lock()
+
+    def end() -> None:
+        if over.acquire(blocking=False):
+            note = f"timed out after {seconds:g} s"
+            store.write(replace(_blank(job, attempt), status="failed", note=note, traceback=note, wall_seconds=seconds))
+            store.claim_path(job.id).unlink(missing_ok=True)
+            os._exit(1)
+
+    timer = threading.Timer(seconds, end)
+    timer.daemon = True
+    timer.start()
+    # Should the trial not let any other thread of Python run, it ends all the same, and counts as an attempt.
+    faulthandler.dump_traceback_later(seconds + _GRACE_SECONDS, exit=True)
+    try:
+        yield
+        if not over.acquire(blocking=False):
+            time.sleep(2 * _GRACE_SECONDS)  # the other thread ends the process
+    finally:
+        timer.cancel()
+        faulthandler.cancel_dump_traceback_later()
 
 
 def _device(job: Job) -> str:

@@ -13,6 +13,7 @@ from dataclasses import replace
 from multiprocessing.connection import wait as wait_for
 
 from experiments.engines.base import EngineConfig, share_code, visible_gpus
+from experiments.errors import ExperimentError
 from experiments.worker import Job, Outcome, execute, use_threads
 
 
@@ -66,7 +67,7 @@ class LocalEngine:
                 return pool.submit(execute, job)
             except BrokenProcessPool:
                 self._drop(slot)
-        raise BrokenProcessPool("processes die as soon as they start")
+        raise ExperimentError("processes die as soon as they start; see whether there is memory left")
 
     def _new_pool(self, slot: int) -> ProcessPoolExecutor:
         gpu = self.gpus[slot % len(self.gpus)] if self.gpus else None

@@ -12,6 +12,11 @@ from experiments.engines.base import EngineConfig, share_code
 from experiments.errors import ExperimentError
 from experiments.worker import Job, Outcome, execute
 
+_LOOPBACK = "127.0.0.1"
+# Between looks at whether the cluster lives.
+_POLL_SECONDS = 5.0
+_DEAD = "the Ray cluster died; finished trials are kept, the same command goes on with the others"
+
 
 class RayEngine:
     """One Ray task per trial. All machines must see the folder of results, and this code at the same path.
@@ -42,7 +47,12 @@ class RayEngine:
         share_code()
         address = os.environ.get("RAY_ADDRESS")
         # What is meant for Ray itself; a task counts as one core unless told otherwise.
-        options: dict[str, Any] = {"include_dashboard": False, "num_cpus": self.config.jobs * self.config.threads}
+        options: dict[str, Any] = {
+            "include_dashboard": False,
+            "num_cpus": self.config.jobs * self.config.threads,
+            # No other machine can reach what listens here; to use several, start the cluster, and name it by RAY_ADDRESS.
+            "_node_ip_address": _LOOPBACK,
+        }
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         try:
@@ -50,7 +60,7 @@ class RayEngine:
                 address=address, log_to_driver=False, logging_level="ERROR",
                 runtime_env={"env_vars": {"PYTHONPATH": os.environ["PYTHONPATH"]}}, **({} if address else options),
             )  # fmt: skip
-        except (ConnectionError, RuntimeError) as error:
+        except Exception as error:
             raise ExperimentError(f"no Ray cluster at {address or 'this machine'}: {error}") from error
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
@@ -61,7 +71,7 @@ class RayEngine:
             while waiting and len(running) < self.config.jobs:
                 job = waiting.popleft()
                 running[self._submit(job)] = job
-            for reference in ray.wait(list(running), num_returns=1)[0]:
+            for reference in self._ended(list(running)):
                 job = running.pop(reference)
                 try:
                     yield ray.get(reference)
@@ -69,6 +79,19 @@ class RayEngine:
                     raise error.cause from error
                 except ray.exceptions.RayError:
                     yield Outcome(job.id, "lost")
+
+    def _ended(self, running: list[Any]) -> list[Any]:
+        """Return a task that ended; ExperimentError if the cluster did."""
+        while True:
+            try:
+                ended: list[Any] = self._ray.wait(running, num_returns=1, timeout=_POLL_SECONDS)[0]
+                alive = ended or any(node["Alive"] for node in self._ray.nodes())
+            except (self._ray.exceptions.RayError, ConnectionError, RuntimeError, TimeoutError) as error:
+                raise ExperimentError(f"{_DEAD} ({error!s:.200})") from error
+            if not alive:
+                raise ExperimentError(_DEAD)
+            if ended:
+                return ended
 
     def _submit(self, job: Job) -> Any:
         gpus = (1.0 if self.config.gpus is None else self.config.gpus) if job.accelerated and self.gpus else 0.0

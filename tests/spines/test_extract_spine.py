@@ -261,7 +261,7 @@ def test_a_worker_that_is_killed_is_replaced_once(meshes, monkeypatch, tmp_path)
         return plain(mesh, config)
 
     monkeypatch.setattr(frame_skeletons, "skeletonize", always_dies)
-    with pytest.raises(SolverError, match="was killed twice.*pass workers=1"):
+    with pytest.raises(SolverError, match=r"was killed twice.*pass workers=1"):
         extract_spine(meshes, workers=2)
 
 
