@@ -1,4 +1,4 @@
-"""Work that is killed: sweeps of experiments on every engine, and a tracker, go on without losing or repeating anything.
+"""Work that is killed: sweeps on every engine, and a tracker, go on without losing or repeating anything.
 
 - local, slurm, ray: 24 trials; the driver, and now and then a worker, is ended by SIGKILL at random times, and the same
   command given again, until all is done. Lost: trials without a record. Repeated: trials that began again after
@@ -168,7 +168,8 @@ def run_track(folder: Path, kills: int, num_frames: int, draw: random.Random) ->
     equal = torch.equal(whole.poses, found.poses) and whole.statuses == found.statuses
     left = [path.name for path in folder.iterdir() if path.name.endswith((".part", ".lock"))]
     lost = len(whole.statuses) - len(found.statuses)
-    return f"track  {done:3d} kills; frames lost {lost}; bits {'equal' if equal else 'DIFFER'}; files left over: {left or 0}"
+    bits = "equal" if equal else "DIFFER"
+    return f"track  {done:3d} kills; frames lost {lost}; bits {bits}; files left over: {left or 0}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

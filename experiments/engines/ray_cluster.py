@@ -50,7 +50,7 @@ class RayEngine:
         options: dict[str, Any] = {
             "include_dashboard": False,
             "num_cpus": self.config.jobs * self.config.threads,
-            # No other machine can reach what listens here; to use several, start the cluster, and name it by RAY_ADDRESS.
+            # No other machine can reach what listens here; a cluster of several is named by RAY_ADDRESS.
             "_node_ip_address": _LOOPBACK,
         }
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")

@@ -257,3 +257,37 @@ def test_records_name_their_engine_and_can_be_read_by_hand(store, probe_sweep):
     run_sweep(probe_sweep(), store, lambda: make_engine("local", EngineConfig()), threads=1)
     for path in store.trials.glob("*.json"):
         assert parse_record(path.read_bytes(), path.name).engine == "local"
+
+
+def test_ray_listens_on_the_loopback_alone_and_its_death_is_an_error(monkeypatch):
+    """Ray itself is not started: what it is asked for, and what it answers, is."""
+    from experiments.engines import ray_cluster
+
+    asked, answers = {}, []
+
+    class Ray:
+        class exceptions:
+            RayError = type("RayError", (Exception,), {})
+
+        is_initialized = staticmethod(lambda: False)
+        cluster_resources = staticmethod(dict)
+        nodes = staticmethod(lambda: [{"Alive": False}])
+        init = staticmethod(lambda **options: asked.update(options))
+        remote = staticmethod(lambda **options: lambda function: function)
+        wait = staticmethod(lambda running, **options: answers.pop())
+
+    monkeypatch.setitem(sys.modules, "ray", Ray)
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    engine = ray_cluster.RayEngine(EngineConfig(jobs=2))
+    assert asked["_node_ip_address"] == "127.0.0.1"
+    assert asked["include_dashboard"] is False
+    answers[:] = [([], ["a"])]
+    with pytest.raises(ExperimentError, match="the Ray cluster died; finished trials are kept"):
+        engine._ended(["a"])
+
+    def fails(**options):
+        raise Exception("the current node timed out")
+
+    monkeypatch.setattr(Ray, "init", staticmethod(fails))
+    with pytest.raises(ExperimentError, match="no Ray cluster at this machine: the current node timed out"):
+        ray_cluster.RayEngine(EngineConfig())
