@@ -1,5 +1,7 @@
 """Range scans: normals and boundary against trimesh and known shapes, subsets, motions, depth images, bad input."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -426,3 +428,21 @@ def test_even_samples_that_were_asked_for_before_are_the_same_and_cannot_be_spoi
     drawn = scan.uniform_subsample(50, generator=torch.Generator().manual_seed(1))
     assert not torch.equal(drawn, expected)
     assert torch.equal(drawn, scan.uniform_subsample(50, generator=torch.Generator().manual_seed(1)))
+
+
+@pytest.mark.parametrize("first", [0, 3])
+def test_the_first_point_beside_a_cut_is_on_the_boundary_too(first):
+    """Of a fan around point 0, one triangle is cut away: both of its points that are left end at the cut."""
+    turns = torch.arange(6) * math.pi / 3
+    ring = torch.stack([turns.cos(), turns.sin(), 0.1 * turns.sin()], dim=-1)
+    points = torch.cat([torch.zeros(1, 3), ring])
+    order = torch.arange(7).roll(-first)
+    place = order.argsort()
+    faces = place[torch.tensor([[0, 1 + k, 1 + (k + 1) % 6] for k in range(6)])]
+    scan = RangeScan(points[order], faces, boundary=torch.zeros(7, dtype=torch.bool))
+    left = torch.ones(7, dtype=torch.bool)
+    left[place[4]] = False
+    cut = scan.subset(left, mark_cut=True)
+    kept = order[left]
+    assert {int(number) for number in kept[cut.boundary]} >= {0, 3, 5}
+    assert not bool(cut.boundary[(kept == 1).nonzero()[0, 0]])

@@ -136,3 +136,18 @@ def test_a_single_table_and_fewer_choices_than_asked_for():
     index, total = best_covers(uncovered, tables, costs, count=10)
     assert index.shape == (2, 3, 1)
     assert (total.diff(dim=1) >= 0).all()
+
+
+def test_a_pair_that_costs_the_limit_is_no_pair():
+    costs = torch.tensor([[1.0, 5.0], [5.0, 2.0]], dtype=torch.float64)
+    assert assign_within(costs, 2.0).tolist() == [0, -1]
+    assert assign_within(costs, 2.0 + 1e-12).tolist() == [0, 1]
+
+
+def test_costs_that_record_gradients_are_assigned_too():
+    costs = torch.eye(3).requires_grad_()
+    assert sorted(assign(costs).tolist()) == [0, 1, 2]
+    assert assign_within(costs, 0.5).tolist().count(-1) == 0
+    wide = torch.tensor([[3.0, 1.0, 2.0]])
+    assert assign(wide).tolist() == [1]
+    assert assign(wide.mT).tolist() == [-1, 0, -1]

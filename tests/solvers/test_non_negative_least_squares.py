@@ -352,3 +352,21 @@ def test_negative_starts_are_clamped_and_left_as_they_were():
     assert start.tolist() == [-1] * 12
     assert bool(result.converged)
     assert not result.x.requires_grad
+
+
+def test_the_default_tolerance_is_a_millionth():
+    """On a stretched bowl the last step, and with it what is left, goes by the tolerance."""
+    scales = torch.logspace(0, 3, 6, dtype=torch.float64)
+    target = torch.tensor([1.0, 0.5, 2.0, 0.1, 3.0, 0.2], dtype=torch.float64)
+
+    def cost(x):
+        return 0.5 * (scales * (x - target).square()).sum(-1)
+
+    found = projected_gradient(cost, torch.zeros(6, dtype=torch.float64), max_steps=5000)
+    same = projected_gradient(cost, torch.zeros(6, dtype=torch.float64), max_steps=5000, tol=1e-6)
+    rough = projected_gradient(cost, torch.zeros(6, dtype=torch.float64), max_steps=5000, tol=1e-3)
+    assert torch.equal(found.x, same.x)
+    assert rough.num_steps < found.num_steps
+    assert float((found.x - target).abs().max()) < 1e-2
+    stopped = projected_gradient(cost, torch.zeros(6, dtype=torch.float64))
+    assert stopped.num_steps == min(found.num_steps, 500)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.tracking import model_points
 from torchreg.tracking.model_points import next_model_points
 from torchreg.tracking.tracker import TrackConfig, Tracker
 
@@ -136,3 +137,15 @@ def test_data_on_a_rigged_surface_take_the_weights_of_its_nearest_points(arm):
     assert len(state.points) > 60
     expected = torch.nn.functional.one_hot((state.points[:, 0] > 0.06).long(), 2).double()
     assert ((state.weights - expected).abs().amax(-1) < 0.5).double().mean() > 0.9
+
+
+def test_as_many_data_as_a_pose_takes_are_enough(tracking, monkeypatch):
+    """With one datum less on the surface all points are kept; so is a datum at the very width."""
+    cloud = one_side(tracking)
+    fitter, state = tracking.fitter(), tracking.state(num_inliers=float(len(cloud)))
+    fit = fitter.fit_at(state, tracking.frame(cloud), tracking.pose, "tracked")
+    on_surface = int((fit.distance[0].abs() < model_points.WIDTHS.surface * fitter.size).sum())
+    monkeypatch.setattr(model_points, "MIN_DATA", on_surface)
+    assert len(next_model_points(fitter, state, fit)[0]) < len(fitter.skin)
+    monkeypatch.setattr(model_points, "MIN_DATA", on_surface + 1)
+    assert torch.equal(next_model_points(fitter, state, fit)[0], fitter.skin.points)

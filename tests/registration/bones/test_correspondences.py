@@ -184,3 +184,17 @@ def test_rows_give_the_squared_residuals(share):
     residuals = pairs.residual_rows() @ (moved - targets).unsqueeze(-1)
     squares = Correspondences(targets[None], normals[None], weights[None], share).squared_residuals(moved[None])[0]
     torch.testing.assert_close(residuals.square().sum((-1, -2)), squares)
+
+
+def test_distances_to_points_alone_take_no_normals():
+    moved, targets, normals, weights = matches()
+    with_normals, without = (ScanDistance(1.0)(moved, targets, given, weights) for given in (normals, None))
+    torch.testing.assert_close(with_normals, without)
+    with pytest.raises(InputError, match="normals are needed for point to plane"):
+        ScanDistance(1.0 - 1e-9)(moved, targets, None, weights)
+
+
+def test_compatible_points_take_finite_normals_only():
+    points = torch.randn(40, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    with pytest.raises(InputError, match="normals"):
+        RangeScan(points, normals=torch.full((40, 3), math.nan, dtype=torch.float64))

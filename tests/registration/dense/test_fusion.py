@@ -68,3 +68,12 @@ def test_of_one_hypothesis_alone_the_energy_is_that_of_the_choice(problem, halve
         judged = [judge(scans, "", option, config).energy for option in options]
         # Of the targets only some are looked at.
         torch.testing.assert_close(energy(labels), torch.tensor(judged).to(options), rtol=0.05, atol=0)
+
+
+def test_what_a_motion_leaves_uncovered_counts_once_however_far_it_is(problem, halves):
+    scans, options = problem[0], halves[1]
+    energy = _Energy.of(scans, options, CHOICE)
+    assert float(energy.cover.max()) <= 1
+    far = options.clone()
+    far[:, :, :3, 3] += 100
+    assert float(_Energy.of(scans, far, CHOICE).cover.min()) == 1
