@@ -144,7 +144,7 @@ class PoseInitializer(nn.Module):
         self.config = config or PoseInitializerConfig()
         self.shape = shape
         count = self.config.num_model_points
-        self.skin = sample_skin(shape, count) if model_points is None else check_skin(shape, model_points)
+        self.skin = check_skin(shape, sample_skin(shape, count) if model_points is None else model_points)
 
     def forward(self, points: Tensor, mask: Tensor | None = None, start: Tensor | None = None) -> InitialPose:
         """Return the poses of the shape in clouds.
