@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -70,18 +71,20 @@ class Articulation(PosedTree):
         to_parts = invert_rigid(transforms)
         if self.surface is not None:
             return mesh_points(self.surface, to_parts)
-        frames = transforms @ rigid_matrix(self.primitives.rotations, self.primitives.centers)
-        return fused_points(self.primitives, frames, self.adjacency, self.start_nu, to_parts)
+        # In the precision of files, so that a shape that comes back from one has the same samples.
+        solids = copy.deepcopy(self.primitives).float().double()
+        frames = transforms @ rigid_matrix(solids.rotations, solids.centers)
+        return fused_points(solids, frames, self.adjacency, self.start_nu, to_parts)
 
     @property
     def nu(self) -> float:
         """Fusion length, metres; `fusion_length` is the same with gradients."""
-        return float(self.fusion_length())
+        return float(self.fusion_length().detach())
 
     @property
     def sharpness(self) -> float:
         """Sharpness of the bending skin; `bending_sharpness` is the same with gradients."""
-        return float(self.bending_sharpness())
+        return float(self.bending_sharpness().detach())
 
     @property
     def faces(self) -> Tensor | None:
@@ -128,14 +131,24 @@ class Articulation(PosedTree):
 
         References: Dewaele et al. 2006, eqs. 1 to 3.
         """
-        transforms = self.part_transforms(pose)
-        nu = self.fusion_length()
-        points = self.surface_points(transforms, self._growth(), self.bending_sharpness() / nu)
-        if self.surface is None:
+        transforms, growth = self.part_transforms(pose), self._growth()
+        if self.surface is not None:
+            points = self.surface_points(transforms, growth)
+        else:
+            nu = self.fusion_length()
+            points = self.surface_points(transforms, growth, self._bending_shares(growth, nu))
             fuses = self.adjacency[self.surface_points.weights.argmax(-1)]
             frames = self._solid_frames(transforms)
             points = onto_fused(self.primitives, self._scaled_sizes(), frames, points, fuses, nu)
         return ShapeOutput(points, self.placed_keypoints(transforms), transforms)
+
+    def _bending_shares(self, growth: Tensor, nu: Tensor) -> Tensor:
+        """Return the shares (N,) of the neighbors in the motions of the surface's points, by the fields at rest."""
+        bound, transforms = self.surface_points, self.part_transforms(self.rest)
+        distances = self.placed_distances(bound(transforms, growth), transforms).mT
+        partners = bound.weights if bound.partners is None else bound.partners
+        gaps = ((partners - bound.weights) * distances).sum(-1)
+        return torch.sigmoid(-gaps * (self.bending_sharpness() / nu))
 
     @contextmanager
     def held_sizes(self) -> Iterator[None]:

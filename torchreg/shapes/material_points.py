@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.geometry.sampling import even_order
-from torchreg.shapes.primitives import PrimitiveSet, fuse_given
+from torchreg.shapes.primitives import BALL_FACTOR, PrimitiveSet, fuse_given
 from torchreg.shapes.spec import RigSurface
 
 
@@ -55,7 +55,6 @@ class MaterialPoints(nn.Module):
         to_parts: (P, 4, 4) ``T_part_world`` there.
         weights: (N, P), rows sum to one; under eq. 3 one for the dominating part.
         partners: (N, P) for the strongest neighbor of that part; None for the weights of a file.
-        gaps: (N,) distance to the partner's solid less that to the part's own, metres.
 
     References: Dewaele et al. 2006, eq. 3.
     """
@@ -64,49 +63,36 @@ class MaterialPoints(nn.Module):
     to_parts: Tensor
     weights: Tensor
     partners: Tensor | None
-    gaps: Tensor | None
 
-    def __init__(
-        self,
-        points: Tensor,
-        to_parts: Tensor,
-        weights: Tensor,
-        partners: Tensor | None = None,
-        gaps: Tensor | None = None,
-    ) -> None:
+    def __init__(self, points: Tensor, to_parts: Tensor, weights: Tensor, partners: Tensor | None = None) -> None:
         super().__init__()
         self.register_buffer("points", points)
         self.register_buffer("to_parts", to_parts)
         self.register_buffer("weights", weights)
         self.register_buffer("partners", partners)
-        self.register_buffer("gaps", gaps)
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def forward(self, transforms: Tensor, growth: Tensor, rate: Tensor) -> Tensor:
+    def forward(self, transforms: Tensor, growth: Tensor, shares: Tensor | None = None) -> Tensor:
         """Return the points of parts that moved and grew.
 
         Args:
             transforms: (..., P, 4, 4) ``T_world_part``.
             growth: (P, 4, 4) affine, how each part has grown in its own coordinates.
-            rate: sharpness of the bending skin over the fusion length, 1 / metres.
+            shares: (N,) of the partners in the motions of the points; none by default.
 
         Returns:
             (..., N, 3), metres.
 
         Differentiable: in all.
         """
+        weights = self.weights
+        if shares is not None and self.partners is not None:
+            weights = weights + shares.unsqueeze(-1) * (self.partners - weights)
         motions = transforms @ (growth @ self.to_parts)
-        blended = self._blend(rate) @ motions[..., :3, :].flatten(-2)
-        rows = blended.unflatten(-1, (3, 4))
+        rows = (weights @ motions[..., :3, :].flatten(-2)).unflatten(-1, (3, 4))
         return (rows[..., :3] @ self.points.unsqueeze(-1)).squeeze(-1) + rows[..., 3]
-
-    def _blend(self, rate: Tensor) -> Tensor:
-        if self.partners is None or self.gaps is None:
-            return self.weights
-        share = torch.sigmoid(-rate * self.gaps).unsqueeze(-1)
-        return self.weights + share * (self.partners - self.weights)
 
 
 def mesh_points(surface: RigSurface, to_parts: Tensor) -> MaterialPoints:
@@ -139,10 +125,14 @@ def fused_points(
         to_parts: (P, 4, 4) in the reference pose.
     """
     sizes = list(solids.sizes)
-    count = -(-_SAMPLING.oversampling * _SAMPLING.num_points // len(solids))
-    local = _on_solids(solids, sizes, count)
-    points = transform_points(frames, local).flatten(0, 1)
-    owners = torch.arange(len(solids)).repeat_interleave(count)
+    # As many candidates for each solid as its size asks for.
+    across, _, along = solids.half_extents(sizes).unbind(-1)
+    areas = across * (across + 2 * along)
+    counts = (_SAMPLING.oversampling * _SAMPLING.num_points * areas / areas.sum()).ceil().long()
+    local = _on_solids(solids, sizes, int(counts.max()))
+    order = torch.randperm(local.shape[1], generator=torch.Generator().manual_seed(0))
+    drawn = order < counts.unsqueeze(-1)
+    points, owners = transform_points(frames, local)[drawn], drawn.nonzero()[:, 0]
     # Those inside of another solid are not on the surface.
     points = points[_part_distances(solids, sizes, frames, points).argmin(-1) == owners]
     for step in range(_SAMPLING.newton_steps):
@@ -151,14 +141,11 @@ def fused_points(
         if step == 0:
             points = points[even_order(points, min(_SAMPLING.num_points, len(points)))]
     distances = _part_distances(solids, sizes, frames, points)
-    nearest, dominating = distances.min(-1)
+    dominating = distances.argmin(-1)
     others = neighbors[dominating].scatter(-1, dominating.unsqueeze(-1), False)
-    second, partner = distances.masked_fill(~others, torch.inf).min(-1)
-    alone = second.isinf()
+    partner = torch.where(others.any(-1), distances.masked_fill(~others, torch.inf).argmin(-1), dominating)
     identity = torch.eye(len(solids), dtype=points.dtype)
-    partner = torch.where(alone, dominating, partner)
-    gaps = torch.where(alone, 0.0, second - nearest)
-    return MaterialPoints(points, to_parts, identity[dominating], identity[partner], gaps)
+    return MaterialPoints(points, to_parts, identity[dominating], identity[partner])
 
 
 def onto_fused(
@@ -200,12 +187,12 @@ def onto_fused(
 
 
 def _on_solids(solids: PrimitiveSet, sizes: Sequence[Tensor], count: int) -> Tensor:
-    """Return points (P, count, 3) on every solid, in its frame: directions, stretched to its box, and Newton steps."""
+    """Return points (P, count, 3) on every solid, in its frame, by Newton steps from an ellipsoid around it."""
     number = torch.arange(count, dtype=torch.float64) + 0.5
     height, turn = 1 - 2 * number / count, number * (torch.pi * (5**0.5 - 1))
     radius = (1 - height.square()).sqrt()
     directions = torch.stack([radius * turn.cos(), radius * turn.sin(), height], dim=-1)
-    local = directions * solids.half_extents(sizes).unsqueeze(-2)
+    local = directions * (BALL_FACTOR * solids.half_extents(sizes)).unsqueeze(-2)
     for _ in range(_SAMPLING.newton_steps):
         x, y, z = local.unbind(-1)
         distance, planes = solids.plane_gradient((x, y, z), sizes)

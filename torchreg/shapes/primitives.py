@@ -110,7 +110,7 @@ class PrimitiveSet(nn.Module):
         return scaled
 
     def half_extents(self, sizes: Sequence[Tensor]) -> Tensor:
-        """Return half extents (P, 3) of a box around each solid: across it those of its largest radius."""
+        """Return half extents (P, 3) of each solid along x, y and z by its sizes: across it, its largest radius."""
         rows = []
         for kind, size in zip(self.kinds, sizes, strict=True):
             is_long, lengths = self.get_buffer(f"long_{kind}"), self.get_buffer(f"scalable_{kind}")
