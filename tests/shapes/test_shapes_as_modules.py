@@ -51,6 +51,18 @@ def rod(**options):
     return ArticulatedShape(tree, ["a", "b"], solids, nu=0.004, dtype=D, **options)
 
 
+def blocks():
+    """A box on a cone, and another box that hides inside of it."""
+    tree = KinematicTree((Joint("a", -1, at()), Joint("b", 0, at(z=0.1), "revolute", (1.0, 0.0, 0.0), -1.0, 1.0),
+                          Joint("c", 1, at(), "revolute", (0.0, 1.0, 0.0), -1.0, 1.0)))  # fmt: skip
+    solids = [
+        Primitive("cone", (0.05, 0.05, 0.02), at(z=0.05)),
+        Primitive("superquadric", (0.04, 0.02, 0.06, 0.3, 0.3), at(z=0.05)),
+        Primitive("superquadric", (0.01, 0.01, 0.02, 0.3, 0.3), at(z=0.05)),
+    ]
+    return ArticulatedShape(tree, ["a", "b", "c"], solids, nu=0.004, dtype=D)
+
+
 def perturbed(shape, seed=0, spread=0.1):
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
@@ -72,7 +84,9 @@ def test_a_forward_pass_is_points_keypoints_and_transforms(hand):
         hand(torch.zeros(9, dtype=D))
 
 
-@pytest.mark.parametrize("make", [lambda: Hand(dtype=D), lambda: Hand("left", scale=0.6, nu=0.002, dtype=D), rod])
+@pytest.mark.parametrize(
+    "make", [lambda: Hand(dtype=D), lambda: Hand("left", scale=0.6, nu=0.002, dtype=D), rod, blocks]
+)
 def test_points_cover_the_fused_surface_evenly_and_stay_on_it(make):
     shape = make()
     rest = shape(shape.rest_pose()).points

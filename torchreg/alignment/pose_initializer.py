@@ -123,7 +123,7 @@ class PoseInitializer(nn.Module):
     All is computed in the shape's dtype, whatever autocast says; the solve of the backward pass in float64.
 
     Args:
-        shape: the articulated shape, in metres. Call ``shape.requires_grad_(False)`` unless its sizes are learned.
+        shape: the articulated shape, in metres; its parameters get gradients where they require them.
         config: see `PoseInitializerConfig`.
         model_points: a skin of the shape to reuse; sampled on the surface by default.
 
