@@ -214,7 +214,7 @@ def _joint_precision(shape: Articulation, size: float, std: float | None) -> Ten
         joints = torch.where(shape.is_sliding[BASE_DOFS:], std * size, std)
         precision[BASE_DOFS:] = joints.square().reciprocal()
         # The three axes of a ball joint share the deviation of its one rotation.
-        balls = [BASE_DOFS + dof for dof, axes in enumerate(stack_sizes(shape.chain.tree)) if axes >= BALL_AXES]
+        balls = [BASE_DOFS + dof for dof, axes in enumerate(stack_sizes(shape.kinematics.tree)) if axes >= BALL_AXES]
         precision[balls] *= BALL_AXES
     return precision
 

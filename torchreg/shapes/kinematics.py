@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 _MAX_DEPTH = 300
 
 
-class KinematicChain(nn.Module):
+class ForwardKinematics(nn.Module):
     """Maps joint values to frame transforms, for any number of leading batch dimensions.
 
     Degrees of freedom are the joints that are neither fixed nor mimics, in the tree's order. Frames are as those of

@@ -15,7 +15,7 @@ from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh, concatenate, sample_surface
 from torchreg.geometry.rigid import transform_points
 from torchreg.io.urdf import UrdfPrimitive, UrdfRecord, load_urdf
-from torchreg.shapes.kinematics import KinematicChain
+from torchreg.shapes.kinematics import ForwardKinematics
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.spec import SOLID_CHOICES, RigSurface, ShapeSpec, fitted_solid, fusion_length, with_long_axis
 
@@ -174,8 +174,8 @@ def solid_mesh(solid: UrdfPrimitive) -> TriangleMesh:
 
 def _robot_surface(tree: KinematicTree, surfaces: Sequence[TriangleMesh | None], links: Sequence[int]) -> RigSurface:
     """Return the links' surfaces with every joint at zero, each vertex on the first part of its link."""
-    chain = KinematicChain(tree)
-    transforms = chain(torch.zeros(chain.num_dofs, dtype=torch.float64))
+    kinematics = ForwardKinematics(tree)
+    transforms = kinematics(torch.zeros(kinematics.num_dofs, dtype=torch.float64))
     part_of = {link: links.index(link) for link in dict.fromkeys(links)}
     found = [(part, transforms[link], mesh) for link, part in part_of.items() if (mesh := surfaces[link]) is not None]
     surface = concatenate(
