@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from torchreg.errors import InputError, ModelError
-from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.shapes.kinematics import ForwardKinematics, stack_sizes
+from torchreg.geometry.kinematic_tree import Joint, KinematicTree, stack_sizes
+from torchreg.shapes.kinematics import ForwardKinematics, build_chain
 
 ROBOT = """<?xml version="1.0"?>
 <robot name="sample">
@@ -124,12 +124,10 @@ def test_frames_equal_those_of_pytorch_kinematics_on_a_urdf(tmp_path):
 def test_frames_equal_those_of_pytorch_kinematics_on_any_tree(seed, count):
     tree = random_tree(seed, count)
     kinematics = ForwardKinematics(tree)
-    theirs = kinematics.to_pytorch_kinematics()
+    theirs = build_chain(tree, [joint.name for joint in tree.joints], torch.stack([j.offset for j in tree.joints]))
     values = torch.randn(3, kinematics.num_dofs, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-    by_name = {f"{index}": joint.name for index, joint in enumerate(tree.joints)}
-    names = [by_name[name] for name in theirs.get_joint_parameter_names()]
-    found = theirs.forward_kinematics_tensor(values[:, [kinematics.dof_names.index(name) for name in names]])
-    expected = found[[theirs.frame_to_idx[f"{index}"] for index in range(count)]].movedim(0, 1)
+    found = theirs.forward_kinematics({name: values[:, k] for k, name in enumerate(kinematics.dof_names)} or values)
+    expected = torch.stack([found[joint.name].get_matrix() for joint in tree.joints], 1)
     torch.testing.assert_close(kinematics(values), expected, atol=1e-11, rtol=0)
 
 

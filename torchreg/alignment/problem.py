@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
+from torchreg.geometry.kinematic_tree import stack_sizes
 from torchreg.shapes.articulation import Articulation
-from torchreg.shapes.kinematics import stack_sizes
 from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import FusedSurface, ShapeSurface, SkinSurface, dense_file_skin

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -13,8 +14,11 @@ from torchreg.errors import ModelError
 from torchreg.geometry.kinematic_tree import KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import left_jacobian, so3_exp, wrap_rotation_vector
-from torchreg.shapes.kinematics import ForwardKinematics, neighbor_matrix, offset_owners, part_parents
+from torchreg.shapes.kinematics import ForwardKinematics, build_chain, neighbor_matrix, offset_owners, part_parents
 from torchreg.shapes.pose_algebra import BASE_DOF_NAMES, BASE_DOFS, difference, retract
+
+if TYPE_CHECKING:
+    from torchreg.shapes.kinematics import Chain
 
 
 class PosedTree(nn.Module):
@@ -82,6 +86,26 @@ class PosedTree(nn.Module):
     def dof_names(self) -> tuple[str, ...]:
         """Names of the degrees of freedom, in the order of a pose."""
         return BASE_DOF_NAMES + self.kinematics.dof_names
+
+    @property
+    def chain(self) -> Chain:
+        """A new `pytorch_kinematics.Chain` of the tree with its present bone lengths, in the module's dtype and device.
+
+        ``chain.forward_kinematics(values)[part]`` is ``T_root_part``, in the coordinates that the base moves. Frames
+        that carry a part are called like the part, others as in the tree (with "_" where a part has that name). Joints
+        are called like the degrees of freedom, but come depth first: pass ``dict(zip(shape.dof_names[6:], pose[6:]))``.
+        A joint that mimics another moves by itself there and needs a value of its own.
+
+        Differentiable: its transforms, in the joint values; twice with ``forward_kinematics_tensor(values,
+        analytical_grad=False)``.
+        """
+        tree = self.kinematics.tree
+        names = dict(zip(self.part_index.tolist(), self.part_names, strict=True))
+        for index, joint in enumerate(tree.joints):
+            names.setdefault(index, f"{joint.name}_" if joint.name in self.part_names else joint.name)
+        offsets = torch.stack([joint.offset for joint in tree.joints]).to(self.rest)
+        offsets[:, :3, 3] *= self._offset_scales().detach().unsqueeze(-1)
+        return build_chain(tree, [names[index] for index in range(len(tree))], offsets)
 
     def rest_pose(self) -> Tensor:
         """Return the pose (num_dofs,) with every joint at zero, or at the limit nearest to zero."""
