@@ -16,7 +16,7 @@ from torchreg.geometry.skeleton import Skeleton
 from torchreg.result import Status
 from torchreg.spines.frame_skeletons import skeletonize_frames
 from torchreg.spines.labeled_tree import LimbGraph, most_frequent_splits, skeleton_splits
-from torchreg.spines.limb_transfer import transfer_missing_limbs, transported_frames
+from torchreg.spines.limb_transfer import complete_from_prior, transfer_missing_limbs, transported_frames
 from torchreg.spines.observed_limbs import (
     FrameLimbs,
     curve_topology,
@@ -25,6 +25,7 @@ from torchreg.spines.observed_limbs import (
     reject_odd_lengths,
     smooth_rough_limbs,
 )
+from torchreg.spines.prior import PriorSkeleton
 from torchreg.spines.results import SpineRecord, SpineSequence
 from torchreg.spines.skeletonize import SkeletonizeConfig
 from torchreg.spines.spine import Spine
@@ -54,6 +55,7 @@ class SpineConfig:
 def extract_spine(
     meshes: Sequence[TriangleMesh],
     *,
+    prior: Skeleton | SpineSequence | None = None,
     times: Tensor | None = None,
     config: SpineConfig | None = None,
     workers: int | None = None,
@@ -71,8 +73,13 @@ def extract_spine(
        around it: moved with the surface, then moved inside the body.
     5. Limbs are resampled at equal intervals.
 
+    A prior skeleton is forced on the data: its tree is the graph, its tips are the K, and tip k is what its k-th tip
+    fits, in the frame that it fits best. It may be of any size, anywhere and in another pose. Tips that it lacks are
+    left out; a limb that no frame shows is the prior's, moved with the others and into the body.
+
     Args:
         meshes: T surfaces, of any numbers of vertices, in one unit.
+        prior: a skeleton with all limbs, or another spine, whose names (numbers of tips) and graph are kept.
         times: (T,) of the frames, strictly increasing; 0, 1, 2, ... by default.
         config: see `SpineConfig`.
         workers: processes for the skeletons; by default one per core.
@@ -83,28 +90,33 @@ def extract_spine(
         A `SpineSequence`; `warnings` tell the irregularities frame by frame.
 
     Raises:
-        InputError: if there is no frame, one of them has no surface (names it), no frame shows ``num_tips`` limbs, or
-            ``times`` do not fit.
-        InputTypeError: if something else than meshes is given.
+        InputError: if there is no frame, one of them has no surface (names it), no frame shows ``num_tips`` limbs,
+            ``times`` do not fit, or the prior has fewer tips than most frames and ``num_tips`` does not say so.
+        InputTypeError: if something else than meshes is given, or another prior than a skeleton or a spine.
 
     Differentiable: no; `SpineSequence.model` is.
 
     Cost: about 1 s per frame of 15,000 vertices and CPU core; half a second more where limbs are transferred.
 
-    References: Brostow, Essa, Steedly and Kwatra 2004.
+    References: Brostow, Essa, Steedly and Kwatra 2004; a prior skeleton is its section 6's.
     """
     config = config or SpineConfig()
     meshes = _check_meshes(meshes)
     if workers is not None:
         check_count(workers, "workers", 1)
+    known = None if prior is None else PriorSkeleton.from_given(prior, config.num_tips)
     with torch.no_grad():
         # Section 4.1: the second factor of eq. 3, frame by frame.
         skeletons = skeletonize_frames(meshes, config.skeletons, workers=workers, on_step=on_step, progress=progress)
         skeletons = [smooth_rough_limbs(skeleton) for skeleton in skeletons]
-        labels, reference = track_tips(skeletons, config.num_tips)  # section 4.2, eqs. 6-8
-        graph = _most_frequent_graph(skeletons, labels)  # section 4.3: the first factor of eq. 3
+        if known is not None:
+            known = known.fitted(skeletons, config.num_tips)
+        labels, reference, graph = _named_tips(skeletons, config.num_tips, known)
         observed = _observed_limbs(skeletons, labels, graph, config.num_samples)  # section 4.3: G imposed
-        limbs = transfer_missing_limbs(observed, graph, meshes)
+        complete = observed
+        if known is not None:
+            complete = complete_from_prior(observed, graph, meshes, known.limbs(config.num_samples), reference)
+        limbs = transfer_missing_limbs(complete, graph, meshes)
         curves, radii = (torch.stack([getattr(frame, name) for frame in limbs]) for name in ("curves", "radii"))
         frames = transported_frames(curves, reference)
     like, topologies = meshes[0].vertices.detach(), tuple(curve_topology(graph, rows) for rows in curves)
@@ -143,6 +155,16 @@ def _check_meshes(meshes: Sequence[TriangleMesh]) -> list[TriangleMesh]:
         if not mesh.num_faces:
             raise InputError(f"meshes[{frame}] must have faces, got none; leave out frames without a surface")
     return meshes
+
+
+def _named_tips(
+    skeletons: Sequence[Skeleton], num_tips: int | None, prior: PriorSkeleton | None
+) -> tuple[Tensor, int, LimbGraph]:
+    """Return the labels (T, K) of the tips, the frame from which they were tracked, and the graph of the limbs."""
+    if prior is not None:
+        return *track_tips(skeletons, prior=prior.skeleton), prior.graph
+    labels, reference = track_tips(skeletons, num_tips)  # section 4.2, eqs. 6-8
+    return labels, reference, _most_frequent_graph(skeletons, labels)  # section 4.3: the first factor of eq. 3
 
 
 def _most_frequent_graph(skeletons: Sequence[Skeleton], labels: Tensor) -> LimbGraph:
