@@ -19,6 +19,7 @@ from torchreg.spines.labeled_tree import LimbGraph, most_frequent_splits, skelet
 from torchreg.spines.limb_transfer import complete_from_prior, transfer_missing_limbs, transported_frames
 from torchreg.spines.observed_limbs import (
     FrameLimbs,
+    accept_shared_paths,
     curve_topology,
     median_lengths,
     observe_limbs,
@@ -115,6 +116,7 @@ def extract_spine(
         observed = _observed_limbs(skeletons, labels, graph, config.num_samples)  # section 4.3: G imposed
         complete = observed
         if known is not None:
+            observed = accept_shared_paths(observed)
             complete = complete_from_prior(observed, graph, meshes, known.limbs(config.num_samples), reference)
         limbs = transfer_missing_limbs(complete, graph, meshes)
         curves, radii = (torch.stack([getattr(frame, name) for frame in limbs]) for name in ("curves", "radii"))

@@ -13,7 +13,7 @@ from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.geometry.skeleton import Skeleton
-from torchreg.spines.curves import align_frames, curve_frames, curve_lengths, tangents
+from torchreg.spines.curves import align_frames, curve_frames, tangents
 from torchreg.spines.depth_field import DepthField, move_inside
 from torchreg.spines.labeled_tree import LimbGraph, gather_nodes, number_nodes, path_lengths
 from torchreg.spines.local_icp import LOCAL_FITS, SurfacePoints, transfer_nodes
@@ -63,9 +63,9 @@ def transfer_missing_limbs(
 def complete_from_prior(
     frames: Sequence[FrameLimbs], graph: LimbGraph, meshes: Sequence[TriangleMesh], prior: FrameLimbs, reference: int
 ) -> list[FrameLimbs]:
-    """Return the frames; if none shows all limbs, the one that shows most is completed by those of a prior skeleton.
+    """Return the frames; if none shows all limbs, the one that shows most gets the others from a prior skeleton.
 
-    Limbs that run along others there count as shown. The prior's are moved rigidly with those, and then inside.
+    The prior's limbs are moved rigidly with those that are shown, and then inside.
 
     Args:
         frames: T frames.
@@ -79,22 +79,18 @@ def complete_from_prior(
     """
     if any(bool(frame.observed.all()) for frame in frames):
         return list(frames)
-    shown = torch.stack([curve_lengths(frame.curves) > 0 for frame in frames])
-    counts = shown.sum(-1).tolist()
+    counts = [int(frame.observed.sum()) for frame in frames]
     number = max(range(len(frames)), key=lambda frame: (counts[frame], -abs(frame - reference)))
     if counts[number] == 0:
         raise InputError(f"prior must fit the data: no frame shows any of its {len(graph.edges)} limbs")
-    frame = replace(frames[number], observed=shown[number])
-    completed = list(frames)
-    if not bool(frame.observed.all()):
-        completed[number] = frame
-        motion = fit_rigid(prior.curves[frame.observed].flatten(0, 1), frame.curves[frame.observed].flatten(0, 1))
-        curves = torch.where(frame.observed[:, None, None], frame.curves, transform_points(motion, prior.curves))
-        radii = torch.where(frame.observed[:, None], frame.radii, prior.radii)
-        sequence = _Sequence(completed, graph, meshes, {number: DepthField(meshes[number])})
-        frame = _joined_limbs(replace(frame, curves=curves, radii=radii), sequence, number)
-    completed[number] = replace(frame, observed=torch.ones_like(frame.observed))
-    return completed
+    frame = frames[number]
+    shown = frame.observed
+    motion = fit_rigid(prior.curves[shown].flatten(0, 1), frame.curves[shown].flatten(0, 1))
+    curves = torch.where(shown[:, None, None], frame.curves, transform_points(motion, prior.curves))
+    radii = torch.where(shown[:, None], frame.radii, prior.radii)
+    sequence = _Sequence(frames, graph, meshes, {number: DepthField(meshes[number])})
+    completed = _joined_limbs(replace(frame, curves=curves, radii=radii), sequence, number)
+    return [*frames[:number], replace(completed, observed=torch.ones_like(shown)), *frames[number + 1 :]]
 
 
 def _propagate(sequence: _Sequence, order: Sequence[int]) -> dict[int, FrameLimbs]:

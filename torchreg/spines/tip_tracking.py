@@ -137,7 +137,6 @@ class _TipTracker:
 
     def start_from(self, prior: Skeleton, candidates: Sequence[int]) -> int:
         """Name the tips of that candidate after those of a prior skeleton that it fits best; return its number."""
-        self.typical = [topology == prior.topology for topology in self.topologies]
         limbs = _tip_limbs(prior)
         self.limb_lengths = torch.stack([curve_lengths(limb) for limb in limbs])
         lengths = self.limb_lengths.unsqueeze(-1) * _TRACKING.shares
@@ -146,22 +145,23 @@ class _TipTracker:
         known = TipReference(points, paths)
         fits = [self._fit(known, frame) for frame in candidates]
         best = min(range(len(fits)), key=lambda row: fits[row][1])
-        frame = candidates[best]
+        frame, row = candidates[best], fits[best][0]
         self.references = sorted({*self.references, frame})
-        self.labels[frame] = fits[best][0]
+        self.labels[frame] = row
+        self.typical = [topology == self.topologies[frame] for topology in self.topologies]
+        own = torch.stack([curve_lengths(self.limbs[frame][k]) for k in row.clamp_min(0).tolist()])
+        self.limb_lengths = torch.where(row >= 0, own, self.limb_lengths)
         self.points[frame], self.paths[frame] = points, paths
         self._update(frame, frame, self._cut_limbs(frame))
         return frame
 
     def _fit(self, known: TipReference, frame: int) -> tuple[Tensor, float]:
         """Return the best mapping (K,) of known limbs, turned in any way, to those of a frame, and its cost."""
-        curves = self._cut_limbs(frame)
-        weights = _TRACKING.point_weights if self.typical[frame] else None
+        curves = self._cut_from_tips(frame)
         # Assignments start from few rotations: principal axes make them the same however the known limbs are turned.
         turns = _axis_alignments(known.tips.flatten(0, 1), curves.flatten(0, 2))
         fits = [
-            rank_mappings([replace(known, tips=known.tips @ turn.mT)], curves, self.lengths[frame], weights=weights)
-            for turn in turns
+            rank_mappings([replace(known, tips=known.tips @ turn.mT)], curves, self.lengths[frame]) for turn in turns
         ]
         maps, costs = min(fits, key=lambda fit: float(fit[1][0]))
         return maps[0], float(costs[0])
@@ -188,10 +188,14 @@ class _TipTracker:
         frame has other junctions than the reference, whose roots tell nothing.
         """
         if not self.typical[frame]:
-            lengths = self.limb_lengths.unsqueeze(-1) * _TRACKING.shares
-            return torch.stack([points_along(limb, lengths) for limb in self.limbs[frame]])
+            return self._cut_from_tips(frame)
         lengths = self.limb_lengths.unsqueeze(-1) * (1 - _TRACKING.shares)
         return torch.stack([points_along(limb.flip(0), lengths) for limb in self.limbs[frame]])
+
+    def _cut_from_tips(self, frame: int) -> Tensor:
+        """Return the limbs of a frame's tips as far inwards as each of the tracked ones, (M, K, S, 3)."""
+        lengths = self.limb_lengths.unsqueeze(-1) * _TRACKING.shares
+        return torch.stack([points_along(limb, lengths) for limb in self.limbs[frame]])
 
     def _predicted(self, frame: int, near: int) -> Tensor:
         """Return the points (K, S, 3) of the limbs in a frame if their motion around the nearest one goes on."""
