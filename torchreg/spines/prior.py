@@ -39,7 +39,7 @@ class PriorSkeleton:
         if not isinstance(prior, Skeleton):
             raise InputTypeError(f"prior must be a Skeleton or a SpineSequence, got {type(prior).__name__}")
         count = len(prior.tips)
-        if count < 2 or not _mean_distance(prior) > 0:
+        if count < 2 or not float((prior.nodes - prior.nodes[0]).abs().max()) > 0:
             raise InputError(f"prior must have two tips or more, apart from each other, got {count} tip(s)")
         if num_tips is not None and num_tips != count:
             raise InputError(f"num_tips must be that of the prior, {count}, got {num_tips}; leave it out")
@@ -85,4 +85,4 @@ class PriorSkeleton:
 def _mean_distance(skeleton: Skeleton) -> float:
     """Return the mean length of the paths from tip to tip; zero for a single node."""
     lengths: Tensor = path_lengths(skeleton, skeleton.tips)[:, skeleton.tips.cpu()]
-    return float(lengths.sum()) / max(1, len(lengths) * (len(lengths) - 1))
+    return float(lengths.sum()) / max(1, lengths.numel() - len(lengths))
