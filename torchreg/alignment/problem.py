@@ -55,8 +55,9 @@ class AlignProblem:
     Args:
         skin: the model points.
         surface: the surface that the surface fit fits.
-        data: (B, M, 3), metres.
+        data: (B, M, 3), metres, from the origin.
         valid: (B, M) False where padded.
+        origin: (B, 3) in the world.
         size: diagonal of the model in its rest pose, metres: the unit of all thresholds.
         lower: limits of the pose, (num_dofs,) or (B, num_dofs).
         upper: limits of the pose, (num_dofs,) or (B, num_dofs).
@@ -71,6 +72,7 @@ class AlignProblem:
     surface: ShapeSurface
     data: Tensor
     valid: Tensor
+    origin: Tensor
     size: float
     lower: Tensor
     upper: Tensor
@@ -86,6 +88,7 @@ class AlignProblem:
             self,
             data=self.data[index],
             valid=self.valid[index],
+            origin=self.origin[index],
             lower=_rows(self.lower, index),
             upper=_rows(self.upper, index),
             prior=replace(self.prior, mean=self.prior.mean[index]),
@@ -196,6 +199,7 @@ def centered_problem(
         surface=_surface(shape, skin),
         data=torch.where(valid.unsqueeze(-1), data - origin.unsqueeze(1), 0.0),
         valid=valid,
+        origin=origin,
         size=size,
         lower=lower,
         upper=upper,

@@ -26,7 +26,7 @@ class TipTracking:
     velocity_share: float = 0.5  # of the last displacement, by which limbs are predicted to move on
     num_points: int = 8  # of a limb that are compared
     extent: float = 0.85  # share of the limb that they cover, from the tip
-    prior_frames: int = 8  # of a sequence, evenly spaced, from which the one nearest to a prior is chosen
+    prior_frames: int = 32  # of a sequence, evenly spaced, that are compared with a prior: poses recur
     root_softening: float = 0.15  # added to distances from the root, in limb lengths, where errors count as angles
 
     @property
