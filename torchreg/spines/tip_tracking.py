@@ -13,7 +13,7 @@ from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.spines.curves import curve_lengths, points_along
 from torchreg.spines.labeled_tree import path_lengths
-from torchreg.spines.tip_matching import TipReference, rank_mappings
+from torchreg.spines.tip_matching import TipReference, rank_mappings, tries_all_mappings
 
 
 @dataclass(frozen=True)
@@ -158,8 +158,10 @@ class _TipTracker:
     def _fit(self, known: TipReference, frame: int) -> tuple[Tensor, float]:
         """Return the best mapping (K,) of known limbs, turned in any way, to those of a frame, and its cost."""
         curves = self._cut_from_tips(frame)
-        # Assignments start from few rotations: principal axes make them the same however the known limbs are turned.
-        turns = _axis_alignments(known.tips.flatten(0, 1), curves.flatten(0, 2))
+        turns = torch.eye(3, dtype=curves.dtype)[None]
+        if not tries_all_mappings(len(known.tips), len(curves)):
+            # Assignments start from few rotations, from principal axes the same however the known limbs are turned.
+            turns = _axis_alignments(known.tips.flatten(0, 1), curves.flatten(0, 2))
         fits = [
             rank_mappings([replace(known, tips=known.tips @ turn.mT)], curves, self.lengths[frame]) for turn in turns
         ]
