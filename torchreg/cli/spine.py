@@ -90,11 +90,10 @@ def spine(
     check_positive(fps, "--fps")
     glb = with_ending(output, (".glb",), add=True)
     result = glb.with_suffix(".safetensors")
-    swc = with_ending(swc, (".swc",))
-    npz = with_ending(npz, (".npz",))
+    swc, npz = with_ending(swc, (".swc",)), with_ending(npz, (".npz",))
     hulls = {"--calibration": calibration, "--screen": screen, "--resolution": resolution, "--seen": seen}
     check_used(silhouettes, "--silhouettes", hulls)
-    known = None if prior is None else _read_prior(prior)
+    known = _read_prior(prior)
     if silhouettes:
         source = _silhouettes(frames, calibration, bool(screen), resolution)
         count, names = len(source), source.names
@@ -128,13 +127,15 @@ def spine(
         typer.echo(_summary(found, glb))
 
 
-def _read_prior(path: Path) -> Skeleton | SpineSequence:
+def _read_prior(path: Path | None) -> Skeleton | SpineSequence | None:
     """Return the skeleton of a file, whose ends are numbered in the order of its lines, or the spine of a result."""
     from torchreg.errors import InputError
     from torchreg.io.swc import load_swc
     from torchreg.spines.results import SpineSequence
     from torchreg.storage import load
 
+    if path is None:
+        return None
     if path.suffix.lower() == ".swc":
         return load_swc(path)
     spine = load(path) if path.suffix.lower() == ".safetensors" else None

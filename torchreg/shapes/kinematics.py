@@ -252,7 +252,9 @@ def _read_joint(frame: Frame, parent: int, taken: set[str]) -> Joint:
         return Joint(_new_name(name, taken), parent, offset)
     lower, upper = (-math.inf, math.inf) if joint.limits is None else joint.limits
     x, y, z = joint.axis.detach().cpu().double().tolist()
-    return Joint(name, parent, offset, joint.joint_type, (x, y, z), float(lower), float(upper))
+    return Joint(
+        name, parent, offset, kind=joint.joint_type, axis=(x, y, z), lower=float(lower), upper=float(upper)
+    )  # fmt: skip
 
 
 def _read_geometry(frame: Frame) -> tuple[tuple[UrdfPrimitive, ...], bool]:

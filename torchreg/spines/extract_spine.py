@@ -110,15 +110,10 @@ def extract_spine(
         # Section 4.1: the second factor of eq. 3, frame by frame.
         skeletons = skeletonize_frames(meshes, config.skeletons, workers=workers, on_step=on_step, progress=progress)
         skeletons = [smooth_rough_limbs(skeleton) for skeleton in skeletons]
-        if known is not None:
-            known = known.fitted(skeletons, config.num_tips)
+        known = known and known.fitted(skeletons, config.num_tips)
         labels, reference, graph = _named_tips(skeletons, config.num_tips, known)
-        observed = _observed_limbs(skeletons, labels, graph, config.num_samples)  # section 4.3: G imposed
-        complete = observed
-        if known is not None:
-            observed = accept_shared_paths(observed)
-            complete = complete_from_prior(observed, graph, meshes, known.limbs(config.num_samples), reference)
-        limbs = transfer_missing_limbs(complete, graph, meshes)
+        observed = _observed_limbs(skeletons, labels, graph, config.num_samples, known)  # section 4.3: G imposed
+        limbs = _all_limbs(observed, graph, meshes, known, reference)
         curves, radii = (torch.stack([getattr(frame, name) for frame in limbs]) for name in ("curves", "radii"))
         frames = transported_frames(curves, reference)
     like, topologies = meshes[0].vertices.detach(), tuple(curve_topology(graph, rows) for rows in curves)
@@ -184,7 +179,7 @@ def _most_frequent_graph(skeletons: Sequence[Skeleton], labels: Tensor) -> LimbG
 
 
 def _observed_limbs(
-    skeletons: Sequence[Skeleton], labels: Tensor, graph: LimbGraph, num_samples: int
+    skeletons: Sequence[Skeleton], labels: Tensor, graph: LimbGraph, num_samples: int, prior: PriorSkeleton | None
 ) -> list[FrameLimbs]:
     """Return the limbs of the graph that each frame's own skeleton shows, at their usual length."""
     frames = [
@@ -197,7 +192,20 @@ def _observed_limbs(
         for frame, skeleton in zip(frames, skeletons, strict=True)
     ]
     # Should every frame have some odd limb, its limbs do change their lengths.
-    return trusted if any(bool(frame.observed.all()) for frame in trusted) else frames
+    observed = trusted if any(bool(frame.observed.all()) for frame in trusted) else frames
+    # The tree of a prior need not be that of any frame.
+    return observed if prior is None else accept_shared_paths(observed)
+
+
+def _all_limbs(
+    frames: Sequence[FrameLimbs], graph: LimbGraph, meshes: Sequence[TriangleMesh], prior: PriorSkeleton | None,
+    reference: int,
+) -> list[FrameLimbs]:  # fmt: skip
+    """Return the frames with the limbs that they lack transferred from the frames around, if need be from the prior."""
+    if prior is not None:
+        limbs = prior.limbs(frames[0].curves.shape[1])
+        frames = complete_from_prior(frames, graph, meshes, limbs, reference)
+    return transfer_missing_limbs(frames, graph, meshes)
 
 
 def _notes(skeleton: Skeleton, found: Tensor, observed: Tensor) -> list[str]:
