@@ -220,7 +220,9 @@ def test_unknown_results_are_neither_saved_nor_loaded(tmp_path):
 
 
 def test_fields_that_cannot_be_stored_are_named(tmp_path):
-    with pytest.raises(InputTypeError, match=r"sigma cannot be stored: list is not a tensor, record, tuple or number"):
+    with pytest.raises(
+        InputTypeError, match=r"sigma cannot be stored: list is not a tensor, record, tuple, dict or number"
+    ):
         save_result(replace(result(), sigma=[1.0]), tmp_path / "r.safetensors")
     with pytest.raises(InputTypeError, match=r"history\.1\.cost cannot be stored: set"):
         save_result(replace(result(), history=((), replace(record(0), cost={1}))), tmp_path / "r.safetensors")
