@@ -108,8 +108,8 @@ def reported_energies(pair: object, num_bones: int, resolution: int) -> tuple[tr
 
 def print_energies(smoke: bool) -> dict[str, list[float]]:
     """Print the energies of registrations; return their sums over the steps."""
-    sums = {}
-    for name, make in (("toy", jointed_toy), ("figure", walking_figure)):
+    sums, scenes = {}, {"toy": jointed_toy, "figure": walking_figure}
+    for name, make in list(scenes.items())[: 1 if smoke else 2]:
         pair = make(2, seed=2, scanner=DepthScanner(num_points=900 if smoke else 8000)).pair(0, 1)
         found, share = reported_energies(pair, 10 if smoke else 20, 30 if smoke else 50)
         sums[name] = [sum(record.energies.values()) for record in found.history]

@@ -206,7 +206,8 @@ class RegistrationEnergy(nn.Module):
 
         Differentiable: in ``points``, ``targets``, ``transforms``, and the weights and twists of the model.
 
-        Cost: 15 ms for 1,000 cells, 10 bones and 1,500 matches on one core, forward and backward.
+        Cost: 10 ms for 1,000 cells, 10 bones and 1,500 matches on one core, forward and backward; with the joint term
+            40 ms, and 0.3 s where all bones have weight everywhere.
 
         References: Chang and Zwicker 2009, eq. 2.
         """
