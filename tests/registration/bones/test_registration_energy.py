@@ -190,6 +190,17 @@ def test_it_is_a_module(bones):
     assert "joint=0.7" in repr(energy)
 
 
+def test_the_labels_stay_while_the_weights_are_learnt(bones):
+    model, *matches = scene(bones)
+    model.project_()
+    energies = [tr.RegistrationEnergy(model, label_weights=given, **ALL) for given in (None, model.weights)]
+    assert [energy.terms(*matches)["discontinuity"].item() for energy in energies] == pytest.approx([0, 0], abs=1e-20)
+    with torch.no_grad():
+        model.weights.add_(0.5)
+    for energy in energies:
+        assert energy.terms(*matches)["discontinuity"].item() == pytest.approx(0.3 * 0.25 * model.weights.numel())
+
+
 def test_a_new_term_is_a_function_and_a_row(bones, monkeypatch):
     model, *matches = scene(bones)
     before = tr.RegistrationEnergy(model)(*matches)

@@ -168,8 +168,9 @@ class RegistrationEnergy(nn.Module):
             raise InputTypeError(f"model must be a GridLBS, got {type(model).__name__}")
         check_share(point_to_point, "point_to_point")
         if label_weights is None:
-            label_weights = model.corner_weights().detach().clone()
-        label_weights = as_float_tensor(label_weights, "label_weights", like=model.weights).detach()
+            label_weights = model.corner_weights()
+        # A copy: those of the model may be learnt.
+        label_weights = as_float_tensor(label_weights, "label_weights", like=model.weights).detach().clone()
         check_shape(label_weights, "label_weights", tuple(model.weights.shape))
         check_finite(label_weights, "label_weights")
         self.model = model
