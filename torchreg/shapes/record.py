@@ -63,7 +63,7 @@ def record_shape(shape: ArticulatedShape) -> ShapeRecord:
     if type(shape) is Hand:
         spec = HandSpec(shape.side, shape.scale, shape.start_nu, shape.start_sharpness)
     elif type(shape) is ArticulatedShape:
-        tree = shape.chain.tree
+        tree = shape.kinematics.tree
         frames = tuple(tree.joints[index].name for index in shape.part_index.tolist())
         solids = tuple(_solids(shape.primitives))
         spec = ShapeSpec(
