@@ -170,12 +170,13 @@ def _read_mesh(path: Path, limits: FileLimits) -> TriangleMesh:
     try:
         content, unit = kind.prepare(content)
         # From memory and without a resolver, so that no material or texture file is opened.
-        scene = trimesh.load_scene(io.BytesIO(content), file_type=ending[1:], process=False, maintain_order=True)
-        pieces = [
-            _piece(geometry, scene.graph[node][0], unit)
-            for node in scene.graph.nodes_geometry
-            if isinstance(geometry := scene.geometry[scene.graph[node][1]], trimesh.Trimesh)
-        ]
+        with np.errstate(all="ignore"):  # what is not finite is refused with the triangles
+            scene = trimesh.load_scene(io.BytesIO(content), file_type=ending[1:], process=False, maintain_order=True)
+            pieces = [
+                _piece(geometry, scene.graph[node][0], unit)
+                for node in scene.graph.nodes_geometry
+                if isinstance(geometry := scene.geometry[scene.graph[node][1]], trimesh.Trimesh)
+            ]
     except errors as error:
         raise FormatError(f"{path}: not a readable {ending[1:]} mesh ({type(error).__name__}: {error})") from error
     pieces = [piece for piece in pieces if piece.num_faces]
