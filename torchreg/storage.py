@@ -122,7 +122,7 @@ def _pose_of_json(file: Path, shape: ArticulatedShape, limits: FileLimits) -> An
         return _pose_of_result(file.with_suffix(".safetensors"), shape, limits)
     entries = content.values() if isinstance(content, dict) else content
     if not isinstance(content, (dict, list)) or not all(
-        type(entry) in (int, float) and abs(entry) < 1e300 for entry in entries
+        type(entry) in (int, float) and not abs(entry) >= 1e300 for entry in entries
     ):
         raise FormatError(f"{file}: a pose is a list of {shape.num_dofs} numbers, or numbers by name")
     if isinstance(content, list):
