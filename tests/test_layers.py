@@ -55,6 +55,7 @@ OWNERS = {
     "safetensors": {"io"},
     "matplotlib": {"viz"},
     "viser": {"viz"},
+    "websockets": {"viz"},
     "plotly": {"viz"},
     "typer": {"cli"},
     "tqdm": {"cli"},
@@ -63,7 +64,7 @@ OWNERS = {
 MODULES_INSIDE = {"torchreg", "scipy", "scipy.sparse"}
 # What stands in backticks in the docstring of a system's package may be used outside it.
 DOORS = re.compile(r"`(\w+)`")
-LAZY = {"matplotlib", "viser", "plotly", "cv2", "PIL", "OpenEXR"}
+LAZY = {"matplotlib", "viser", "websockets", "plotly", "cv2", "PIL", "OpenEXR"}
 LOWEST_THIRD_PARTY = {"errors": set(), "metrics": {"torch"}, "_checks": {"torch"}, "_threads": {"torch"}}
 IMPORT_NAMES = {
     "pytorch-kinematics": "pytorch_kinematics",
