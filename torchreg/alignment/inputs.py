@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_shape
 from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning
-from torchreg.geometry.spread import SPREADS, spread_dimensions
+from torchreg.geometry.spread import SAME_SHARE, SPREADS, spread_dimensions
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
 
@@ -103,7 +103,7 @@ def warn_about_units(data: Tensor, valid: Tensor, size: float, *, stacklevel: in
     radius = torch.where(valid, data.norm(dim=-1), torch.nan).nanmedian(-1).values
     ratio = 2 * float(radius.nanmedian()) / size
     # Data at one place have no size in any unit.
-    if int(valid.sum(-1).max()) < UNITS.min_data or ratio == 0 or 1 / UNITS.ratio < ratio < UNITS.ratio:
+    if int(valid.sum(-1).max()) < UNITS.min_data or ratio < SAME_SHARE or 1 / UNITS.ratio < ratio < UNITS.ratio:
         return False
     warnings.warn(
         f"the data spread over {ratio:.3g} times the model's size of {size:.3g} m: are they in metres? "

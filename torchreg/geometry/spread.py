@@ -8,7 +8,7 @@ from torch import Tensor
 # A cloud thinner than this share of its longest side is flat: no limb is, and hardly a sensor measures, so thin.
 _FLAT_SHARE = 1e-3
 # Points within this share of the size of what they are measured on are one: no two units differ so much.
-_SAME_SHARE = 1e-6
+SAME_SHARE = 1e-6
 SPREADS = ("at one place", "on a line", "on a plane")
 
 
@@ -30,5 +30,5 @@ def spread_dimensions(points: Tensor, size: float | Tensor, valid: Tensor | None
     centered = points - (weights.unsqueeze(-1) * points).sum(-2, keepdim=True) / total
     covariance = (weights.unsqueeze(-1) * centered).mT @ centered / total
     deviations = torch.linalg.eigvalsh(covariance).clamp_min(0).sqrt()
-    least = _SAME_SHARE * torch.as_tensor(size).to(deviations)
+    least = SAME_SHARE * torch.as_tensor(size).to(deviations)
     return (deviations > torch.maximum(_FLAT_SHARE * deviations[..., -1:], least)).sum(-1)
