@@ -95,7 +95,7 @@ def read_obj(content: bytes, limits: FileLimits) -> RawCloud:
         raise FormatError(f"a vertex must be 3 numbers (with w 4, with a color 6 or 7), got {table.shape[1]}")
     colors = table[:, -3:] if table.shape[1] in (6, 7) else None
     counts = np.array(sizes, dtype=np.int64)
-    before = np.repeat(np.array(seen, dtype=np.int64).reshape(-1, 2), counts, axis=0)
+    before = np.repeat(np.array(seen, dtype=np.int32).reshape(-1, 2), counts, axis=0)
     indices = _resolve([corner.partition(b"/")[0] for corner in corners], before[:, 0], len(table), "vertex")
     vertex_normals = None
     if normals and len(normals) == len(table):
