@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from experiments.compose import known_configs, load_sweep
+from experiments.compose import known_configs, load_sweep, swept_fields
 from experiments.driver import OnOutcome, Summary, run_sweep
 from experiments.engines.base import EngineConfig
 from experiments.engines.by_name import make_engine
@@ -28,7 +28,10 @@ from experiments.worker import Job, Outcome, execute, measure, use_threads
 application = typer.Typer(help=__doc__, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
 Name = Annotated[str, typer.Argument(help="a configuration such as alignment/sigma_schedule, or a YAML file")]
-Overrides = Annotated[list[str] | None, typer.Argument(help="key=value, such as seeds=3 scene.outlier_ratio=0.4")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Argument(help="key=value, such as seeds=3; several values sweep a field: schedule.start=0.04,0.06"),
+]
 Results = Annotated[Path, typer.Option(help="folder of all results")]
 _RESULTS = Path("results")
 
@@ -43,6 +46,8 @@ def list_configs() -> None:
 @application.command()
 def run(config: Name, overrides: Overrides = None, threads: int = 1) -> None:
     """Run the single trial of a configuration, without its cases and its grid, and print its results."""
+    for key in swept_fields(overrides or []):
+        raise ConfigError(f"run takes one value of {key}; sweep takes several")
     plan = replace(load_sweep(config, overrides or []), grid={}, cases=(), seeds=1, picture_seeds=0)
     (trial,) = planned_trials(plan)
     accelerated = find_task(plan.task).accelerated
@@ -94,6 +99,10 @@ def sweep(
             plan, store, lambda: make_engine(engine, options), engine_name=engine, threads=threads,
             retry_failed=retry_failed, on_outcome=on_outcome, sinks=sinks,
         )  # fmt: skip
+    if summary.kept + summary.ran + summary.elsewhere:
+        from experiments.report.terminal import sweep_table
+
+        typer.echo(f"medians over seeds, means of shares, with 95 % confidence intervals\n{sweep_table(plan, store)}")
     _print_summary(summary, store)
     if summary.unfinished:
         raise typer.Exit(1)

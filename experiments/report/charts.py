@@ -10,6 +10,7 @@ from typing import Any
 from experiments.plan import PlannedTrial, axes_of
 from experiments.records import TrialRecord
 from experiments.report.cells import Cell, Spread, all_axes, label, short
+from experiments.report.intervals import confidence_interval
 from experiments.schema import SweepConfig
 
 _MAX_MAPS, _MAX_DOTS, _MAX_LINES = 6, 60, 12
@@ -104,6 +105,43 @@ def _whiskers(spreads: Sequence[Spread]) -> dict[str, Any]:
     return {"type": "data", "symmetric": False, "array": above, "arrayminus": below, "thickness": 1, "width": 3}
 
 
+def lines(sweep: SweepConfig, cells: Sequence[Cell], metric: str) -> list[str]:
+    """Return plots of a metric over each axis of numbers, a line per value of the axis that groups, with 95 % bands."""
+    axes = axes_of(sweep)
+    numeric = [name for name in all_axes(sweep) if len(axes[name]) > 1 and all(map(_is_number, axes[name]))]
+    return [_line_plot(sweep, cells, metric, axis) for axis in numeric]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _line_plot(sweep: SweepConfig, cells: Sequence[Cell], metric: str, axis: str) -> str:
+    import plotly.graph_objects as go
+
+    rest = [name for name in all_axes(sweep) if name != axis]
+    group = sweep.report.group if sweep.report.group in rest else next(iter(rest), "")
+    figure, mean = go.Figure(), metric in sweep.report.share
+    groups = dict.fromkeys(label(cell.axes[group]) if group else "" for cell in cells)
+    for value, color in zip(itertools.islice(groups, _MAX_LINES), itertools.cycle(_COLORS)):
+        mine = [cell for cell in cells if metric in cell.metrics and (not group or label(cell.axes[group]) == value)]
+        across = sorted({cell.axes[axis] for cell in mine})
+        pools = [[v for cell in mine if cell.axes[axis] == x for v in cell.metrics[metric].values] for x in across]
+        middle = [statistics.fmean(pool) if mean else statistics.median(pool) for pool in pools]
+        bands = [confidence_interval(pool, mean=mean) or (told, told) for pool, told in zip(pools, middle, strict=True)]
+        low, high = ([band[side] for band in bands] for side in (0, 1))
+        figure.add_scatter(
+            x=[*across, *across[::-1]], y=[*high, *low[::-1]], fill="toself", fillcolor=color, opacity=0.15,
+            mode="lines", line={"width": 0}, hoverinfo="skip", showlegend=False,
+        )  # fmt: skip
+        figure.add_scatter(x=across, y=middle, name=value or short(metric), mode="lines+markers", line={"color": color})
+    figure.update_xaxes(title=short(axis))
+    figure.update_yaxes(title=named(metric), rangemode="tozero")
+    figure.update_layout(legend_title_text=short(group), showlegend=bool(group))
+    kind = "mean" if mean else "median"
+    return _html(figure, f"{named(metric)} over {short(axis)}: {kind} over all others, 95 % confidence", _HEIGHT)
+
+
 def curve_names(sweep: SweepConfig, records: dict[str, TrialRecord]) -> list[str]:
     """Return the curves to draw."""
     found = dict.fromkeys(name for record in records.values() for name in record.curves)
@@ -171,6 +209,12 @@ def told(sweep: SweepConfig, cell: Cell, metric: str) -> float | None:
     if spread is None:
         return None
     return spread.mean if metric in sweep.report.share else spread.median
+
+
+def interval(sweep: SweepConfig, cell: Cell, metric: str) -> tuple[float, float] | None:
+    """Return the 95 % confidence interval of what `told` gives, None for fewer than two seeds."""
+    spread = cell.metrics.get(metric)
+    return None if spread is None else confidence_interval(spread.values, mean=metric in sweep.report.share)
 
 
 def named(metric: str) -> str:

@@ -91,6 +91,7 @@ def _page(
     drawn = [chart for metric in heat for chart in charts.heat_maps(sweep, cells, metric)]
     if not drawn:
         drawn = [chart for metric in metrics[:2] if (chart := charts.dots(sweep, cells, metric)) is not None]
+    drawn += [chart for metric in heat[:2] or metrics[:2] for chart in charts.lines(sweep, cells, metric)]
     lines = [charts.curves(sweep, rows, records, name) for name in charts.curve_names(sweep, records)]
     pictures, models = _figures(store, rows, records, output)
     return {

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 import torchreg as tr
+from experiments.library_settings import with_settings
 from experiments.registry import Bench, TrialOutcome
 from experiments.schema import AlignmentTrial, ScheduleConfig
 from experiments.tasks.peers import PACKAGES, moved_by
@@ -112,11 +113,18 @@ def align_config(hand: tr.Hand, scene: Scene, config: AlignmentTrial) -> tr.Alig
     with torch.no_grad():
         rest = scene.skin(hand.rest_pose())
     size = float((rest.amax(0) - rest.amin(0)).norm())
-    return tr.AlignConfig(
+    if solver.method == "paper":
+        printed = tr.AlignConfig.paper(
+            schedule=sigma_schedule(config.schedule, size), sharpness=solver.sharpness,
+            num_model_points=solver.num_model_points,
+        )  # fmt: skip
+        return with_settings(printed, config.config)
+    settings = tr.AlignConfig(
         schedule=sigma_schedule(config.schedule, size), em_steps=solver.em_steps, surface_steps=solver.surface_steps,
         search=solver.search, debias=solver.debias, prior_std=plain.prior_std if solver.prior else None,
         correspondence=solver.method, sharpness=solver.sharpness, num_model_points=solver.num_model_points,
     )  # fmt: skip
+    return with_settings(settings, config.config)
 
 
 def sigma_schedule(config: ScheduleConfig, size: float) -> tr.SigmaSchedule | None:

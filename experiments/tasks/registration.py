@@ -14,6 +14,7 @@ from torch import Tensor
 
 import torchreg as tr
 from experiments.errors import SkippedTrial
+from experiments.library_settings import with_settings
 from experiments.registry import Bench, TrialOutcome
 from experiments.schema import RegistrationTrial, ScanPairConfig
 from experiments.tasks.peers import PACKAGES, moved_by
@@ -67,10 +68,13 @@ def run(config: RegistrationTrial, bench: Bench) -> TrialOutcome:
 
 
 def _settings(config: RegistrationTrial) -> tr.RegisterConfig:
-    return tr.RegisterConfig(
+    if config.method == "paper":
+        return with_settings(tr.RegisterConfig.paper(), config.config)
+    settings = tr.RegisterConfig(
         joint_weight=(10 * config.joint_weight, config.joint_weight), reuse=config.reuse,
         refine_steps=config.refine_steps, num_samples=config.num_samples,
     )  # fmt: skip
+    return with_settings(settings, config.config)
 
 
 @functools.lru_cache(maxsize=2)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 import torchreg as tr
 from experiments.errors import SkippedTrial
+from experiments.library_settings import with_settings
 from experiments.registry import Bench, TrialOutcome
 from experiments.schema import SpineTrial
 from experiments.tasks.peers import peer
@@ -49,7 +50,8 @@ def run(config: SpineTrial, bench: Bench) -> TrialOutcome:
         counts = [_peer_tips(mesh) for mesh in sequence.meshes]
         seconds["total"] = time.perf_counter() - begin
         return TrialOutcome(_tip_metrics(counts, sequence), seconds, {"own_tips": [float(count) for count in counts]})
-    spine = tr.extract_spine(sequence.meshes, workers=1)
+    settings = tr.SpineConfig.paper() if config.method == "paper" else tr.SpineConfig()
+    spine = tr.extract_spine(sequence.meshes, config=with_settings(settings, config.config), workers=1)
     seconds["total"] = time.perf_counter() - begin
     counts = [count_tips(topology) for topology in spine.own_topologies]
     outcome = TrialOutcome(

@@ -105,7 +105,7 @@ def test_the_page_is_one_file_that_shows_everything(store, grid):
     ):
         assert text in reader.text
     page = (store.root / "report.html").read_text()
-    assert page.count('class="plotly-graph-div"') == 2  # a heat map and a curve
+    assert page.count('class="plotly-graph-div"') == 4  # a heat map, a line plot per axis of numbers, and a curve
     assert len(page) > 4_000_000  # Plotly itself lies in the page
 
 

@@ -62,7 +62,7 @@ class AlignProblem:
         upper: limits of the pose, (num_dofs,) or (B, num_dofs).
         prior: on the joints.
         pose_atol: largest change of a pose that counts as none.
-        outlier: "limit" or "volume".
+        outlier: "limit", "volume", or c.
         debias: share of the kernel's shrinkage that is taken out of the targets of the EM.
         correspondence: one of `CORRESPONDENCES`.
     """
@@ -76,7 +76,7 @@ class AlignProblem:
     upper: Tensor
     prior: GaussianPosePrior
     pose_atol: float
-    outlier: str = "limit"
+    outlier: str | float = "limit"
     debias: float = 0.0
     correspondence: str = "em"
 
@@ -168,7 +168,7 @@ def centered_problem(
     *,
     prior_std: float | None,
     pose_atol: float,
-    outlier: str = "limit",
+    outlier: str | float = "limit",
     debias: float = 0.0,
     correspondence: str = "em",
 ) -> AlignProblem:
@@ -182,7 +182,7 @@ def centered_problem(
         origin: (B, 3), as from `masked_mean`.
         prior_std: see `AlignConfig`, like the settings below.
         pose_atol: largest change of a pose that counts as none.
-        outlier: "limit" or "volume".
+        outlier: "limit", "volume", or c.
         debias: share of the kernel's shrinkage that is taken out of the targets of the EM.
         correspondence: one of `CORRESPONDENCES`.
     """

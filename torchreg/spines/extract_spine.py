@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,6 +26,7 @@ from torchreg.spines.observed_limbs import (
     reject_odd_lengths,
     smooth_rough_limbs,
 )
+from torchreg.spines.paper.rigid_tracking import track_tips_rigidly
 from torchreg.spines.results import SpineRecord, SpineSequence
 from torchreg.spines.skeletonize import SkeletonizeConfig
 from torchreg.spines.spine import Spine
@@ -39,16 +41,34 @@ class SpineConfig:
         num_tips: number K of tips; None: the most frequent one.
         num_samples: points along each limb, both ends included.
         skeletons: how each frame is skeletonized.
+        printed: tips are identified as in the paper, by rigid fits of their positions alone to a reference frame, see
+            `track_tips_rigidly`; by default also by turns, lengths and curves, from frame to frame.
     """
 
     num_tips: int | None = None
     num_samples: int = 24
     skeletons: SkeletonizeConfig = field(default_factory=SkeletonizeConfig)
+    printed: bool = False
 
     def __post_init__(self) -> None:
         if self.num_tips is not None:
             check_count(self.num_tips, "num_tips", 2)
         check_count(self.num_samples, "num_samples", 3)
+
+    @classmethod
+    def paper(cls, **changes: Any) -> SpineConfig:
+        """Return spines as printed, of which some fields may be changed.
+
+        Bins of vertices, 100 of them; trees merged from the tips inward; tips identified by eqs. 6-8 alone. The most
+        frequent tree is imposed on all frames as by default, and limbs that a frame hides are transferred, of which the
+        paper says nothing.
+
+        Args:
+            changes: fields by name.
+
+        References: Brostow, Essa, Steedly and Kwatra 2004, sections 4.1 and 4.2.
+        """
+        return replace(cls(skeletons=SkeletonizeConfig(printed=True), printed=True), **changes)
 
 
 def extract_spine(
@@ -101,7 +121,8 @@ def extract_spine(
         # Section 4.1: the second factor of eq. 3, frame by frame.
         skeletons = skeletonize_frames(meshes, config.skeletons, workers=workers, on_step=on_step, progress=progress)
         skeletons = [smooth_rough_limbs(skeleton) for skeleton in skeletons]
-        labels, reference = track_tips(skeletons, config.num_tips)  # section 4.2, eqs. 6-8
+        track = track_tips_rigidly if config.printed else track_tips
+        labels, reference = track(skeletons, config.num_tips)  # section 4.2, eqs. 6-8
         graph = _most_frequent_graph(skeletons, labels)  # section 4.3: the first factor of eq. 3
         observed = _observed_limbs(skeletons, labels, graph, config.num_samples)  # section 4.3: G imposed
         limbs = transfer_missing_limbs(observed, graph, meshes)

@@ -58,8 +58,8 @@ def track_tips(skeletons: Sequence[Skeleton], num_tips: int | None = None) -> tu
     """
     if num_tips is None:
         num_tips = most_frequent_count([len(skeleton.tips) for skeleton in skeletons])
-    runs = _runs(_clean_frames(skeletons, num_tips))
-    longest = max(runs, key=lambda run: (run[1] - run[0], -run[0]))
+    clean = _clean_frames(skeletons, num_tips)
+    runs, longest = _runs(clean), longest_run(clean)
     reference = (longest[0] + longest[1] - 1) // 2
     references = sorted({reference, *((a + b - 1) // 2 for a, b in runs if b - a >= _TRACKING.min_run)})
     tracker = _TipTracker(skeletons, num_tips, references, reference)
@@ -73,6 +73,11 @@ def most_frequent_count(counts: Sequence[int]) -> int:
     """Return the most frequent number of tips; of several, the largest: limbs hide more often than they grow."""
     frequency = Counter(counts)
     return max(frequency, key=lambda count: (frequency[count], count))
+
+
+def longest_run(flags: Sequence[bool]) -> tuple[int, int]:
+    """Return the first frame and the end of the longest run of True, the earliest of several."""
+    return max(_runs(flags), key=lambda run: (run[1] - run[0], -run[0]))
 
 
 def has_loops(skeleton: Skeleton) -> bool:
