@@ -1,6 +1,7 @@
 """Alignment with the printed settings, and the outlier constant as a number."""
 
 import math
+from itertools import pairwise
 
 import pytest
 import torch
