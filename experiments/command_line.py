@@ -109,6 +109,30 @@ def sweep(
 
 
 @application.command()
+def papers(
+    output: Annotated[Path, typer.Option("--output", "-o", help="folder of the page and of all results")],
+    smoke: Annotated[bool, typer.Option("--smoke", help="small and coarse, within three minutes on two cores")] = False,
+    pairs: Annotated[int, typer.Option(help="of each column of table 1, at most as many as the paper's")] = 60,
+    jobs: Annotated[int, typer.Option(help="trials at a time")] = 2,
+    seed: Annotated[int, typer.Option(help="of all that is made up")] = 0,
+) -> None:
+    """Make every figure and table of the three papers again, on one page. Repeat the command to go on after a stop."""
+    if pairs < 1:
+        raise ConfigError(f"--pairs must be at least 1, got {pairs}")
+    from experiments.papers.command import PapersRun, make_papers
+
+    run = PapersRun(output, pairs, smoke, seed)
+    options = EngineConfig(jobs, 1, None, {})
+    with contextlib.ExitStack() as bars:
+        page = make_papers(
+            run, lambda: make_engine("local", options), lambda plan: bars.enter_context(_progress(plan))
+        )  # fmt: skip
+    for line in page.with_suffix(".txt").read_text(encoding="utf-8").splitlines():
+        typer.echo(line)
+    typer.echo(page)
+
+
+@application.command()
 def collect(config: Name, results: Results = _RESULTS) -> None:
     """Put all records of a sweep into one Parquet file."""
     from experiments.tables import write_parquet

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.errors import ConfigError
-from experiments.schema import AlignmentTrial, NeuralTrial, ProbeTrial, RegistrationTrial, SpineTrial
+from experiments.schema import AlignmentTrial, NeuralTrial, PaperTrial, ProbeTrial, RegistrationTrial, SpineTrial
 
 
 @dataclass
@@ -95,6 +95,7 @@ _TASKS = (
     Task("registration", RegistrationTrial, "experiments.tasks.registration", settings="RegisterConfig"),
     Task("spine", SpineTrial, "experiments.tasks.spine", settings="SpineConfig"),
     Task("neural_init", NeuralTrial, "experiments.tasks.neural_init"),
+    Task("papers", PaperTrial, "experiments.papers.trial"),
     Task("probe", ProbeTrial, "experiments.tasks.probe"),
 )
 TASKS = {task.name: task for task in _TASKS}

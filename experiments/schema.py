@@ -128,17 +128,21 @@ class ScanPairConfig:
     """Two range scans.
 
     Args:
-        dataset: "figure" walks, "animal" trots, "toy" is a robot that lacks a part in one scan; "file" is the file
-            ``name`` of ``folder`` (NPZ: source_points, source_faces, target_points, target_faces, source_truth,
-            diagonal).
+        dataset: "figure" walks, "animal" trots, "toy" is a robot that lacks a part in one scan, "robot" has them all,
+            "car" is an excavator, "hand" bends its fingers; "file" is the file ``name`` of ``folder`` (NPZ:
+            source_points, source_faces, target_points, target_faces, source_truth, diagonal).
         apart: frames between the two; of "file" without meaning.
+        frame: number of the first of the two.
+        frames: length of the sequence; 0 for as many as the pair needs.
         num_points: of a scan.
         folder: of "file"; relative to where the experiment is run.
         name: of "file", without its ending.
     """
 
-    dataset: Literal["figure", "animal", "toy", "file"] = "figure"
+    dataset: Literal["figure", "animal", "toy", "robot", "car", "hand", "file"] = "figure"
     apart: int = 1
+    frame: int = 0
+    frames: int = 0
     num_points: int = 4500
     folder: str = ""
     name: str = ""
@@ -146,6 +150,9 @@ class ScanPairConfig:
     def __post_init__(self) -> None:
         _require(self.apart >= 1, f"apart must be at least 1, got {self.apart}")
         _require(self.dataset != "file" or bool(self.name), "name must be given with dataset file")
+        _require(self.frame >= 0, f"frame must not be negative, got {self.frame}")
+        last = self.frame + self.apart
+        _require(not self.frames or last < self.frames, f"frames must be above {last}, or 0, got {self.frames}")
 
 
 @dataclass(frozen=True)
@@ -163,6 +170,8 @@ class RegistrationTrial:
         reuse: whether lost labels are reborn.
         refine_steps: rounds of refining weights.
         num_samples: source points that are matched.
+        retries: times that "paper" tries again with other parameters where a pair was not registered, as the truth
+            tells.
         config: any fields of `torchreg.RegisterConfig`, by dotted name, that replace what these say.
         pictures: whether a picture and a glTF file are kept.
     """
@@ -176,6 +185,7 @@ class RegistrationTrial:
     reuse: bool = True
     refine_steps: int = 1
     num_samples: int = 4000
+    retries: int = 0
     config: dict[str, Any] = field(default_factory=dict)
     pictures: bool = False
 
@@ -183,7 +193,7 @@ class RegistrationTrial:
         for name in ("num_bones", "grid_resolution", "num_samples"):
             _require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
         _require(self.grid_resolution <= 256, f"grid_resolution must be at most 256, got {self.grid_resolution}")
-        for name in ("joint_weight", "refine_steps"):
+        for name in ("joint_weight", "refine_steps", "retries"):
             _require(getattr(self, name) >= 0, f"{name} must not be negative, got {getattr(self, name)}")
 
 
@@ -223,6 +233,21 @@ class SpineTrial:
         for name in ("frames", "noise"):
             _require(getattr(self, name) >= 0, f"{name} must not be negative, got {getattr(self, name)}")
         _require(self.resolution >= 8, f"resolution must be at least 8, got {self.resolution}")
+
+
+@dataclass(frozen=True)
+class PaperTrial:
+    """A figure or table of one of the three papers, made again.
+
+    Args:
+        seed: of what is made up.
+        block: its name, such as p2-fig-4; see experiments/papers/blocks.py.
+        smoke: small and coarse, in seconds.
+    """
+
+    seed: int = 0
+    block: str = ""
+    smoke: bool = False
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,9 @@ class RegisterConfig(BoneConfig):
         as a grid cell) and a rigid motion by RANSAC per region instead of the dense alignment; the integral of eq. 4
         from stiff joints to loose ones (1 to 0.05 in five rounds), angles between normals from 80 to 20 degrees,
         correspondences up to 20 sampling distances long; unused labels for random halves of the worst regions; and
-        continuous weights last. Of `BoneConfig` it uses ``num_samples``, ``motion_steps``, ``smoothness``, ``reuse``,
-        ``joint_weight``, ``max_angle``, ``normal_scale``, ``min_matched`` and ``refine``.
+        continuous weights last, unless ``refine_steps`` is zero. Of `BoneConfig` it also uses ``num_samples``,
+        ``motion_steps``, ``smoothness``, ``reuse``, ``joint_weight``, ``max_angle``, ``normal_scale``, ``min_matched``
+        and ``refine``.
 
         Read into the text: the distance is a sum over correspondences and every cell has a joint term of its own, as
         "specify the joint constraint separately for each cell" says; mu is 0.5 in squared cells.

@@ -99,9 +99,27 @@ def test_the_constants_are_those_that_are_printed():
     assert RegisterConfig().printed is None
 
 
+def test_weights_stay_labels_without_the_optional_last_step(pair):
+    found = register(pair.source, pair.target, 7, 50, RegisterConfig.paper(refine_steps=0))
+    assert {record.stage for record in found.history} == {"align"}
+
+
+def test_scans_near_each_other_may_start_from_closest_points(pair):
+    config = RegisterConfig.paper(printed=PaperConfig(first_matches="closest"))
+    found = register(pair.source, pair.source, 7, 50, config)
+    assert float((found.deformed - pair.source.points).norm(dim=-1).max()) < 0.02 * pair.source.diagonal
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("max_distance", 0.0), ("max_rounds", 0), ("annealing_rounds", 0), ("ransac_trials", 0), ("rtol", -1.0)],
+    [
+        ("first_matches", "random"),
+        ("max_distance", 0.0),
+        ("max_rounds", 0),
+        ("annealing_rounds", 0),
+        ("ransac_trials", 0),
+        ("rtol", -1.0),
+    ],
 )
 def test_what_is_out_of_range_is_refused_by_name(name, value):
     with pytest.raises(InputError, match=name):

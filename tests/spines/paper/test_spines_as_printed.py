@@ -52,8 +52,8 @@ def parts_of_bins(edges, bins):
 
 def test_bands_are_the_connected_parts_of_bins(dumbbell):
     mesh, _, values = dumbbell
-    found = vertex_level_sets(mesh, values, 0.1)
-    bins = (values / 0.1).floor().long().tolist()
+    found = vertex_level_sets(mesh, values, 0.25)
+    bins = (values / 0.25).floor().long().tolist()
     expected = parts_of_bins(mesh.edges, bins)
     pairs = set(zip(found.vertex_bands.tolist(), expected, strict=True))
     assert len(pairs) == found.num_bands == max(expected) + 1
@@ -69,6 +69,12 @@ def test_nodes_are_means_of_vertices_and_cost_by_equation_4(dumbbell):
         assert float(found.widths[ring]) ** 2 == pytest.approx(float((singular**2).sum()) / len(own))
         assert int(found.lower[ring]) != int(found.upper[ring])
     assert bool(values[found.vertex_bands == found.upper[0]].min() > 0)
+
+
+def test_bins_are_never_narrower_than_most_edges(dumbbell):
+    mesh, vertices, values = dumbbell
+    found = vertex_level_sets(mesh, values, 1e-6)
+    assert found.num_bands < len(vertices) / 4
 
 
 def random_tree(tips, generator):

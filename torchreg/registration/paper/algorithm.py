@@ -66,18 +66,22 @@ class PaperFit:
         self._progress = 0.0
 
     def start(self) -> None:
-        """Segment the grid at random and match spin images: lines 1 and 2."""
+        """Segment the grid at random and match spin images, or closest points: lines 1 and 2."""
         grid, points = self.data.grid, self._source.points
         seeds = points[best_candidates(points, self._num_bones, self._generator)]
         used, labels = nearest_seed(grid.cell_centers(), seeds).unique(return_inverse=True)
         corners = nearest_seed(grid.corner_points(), seeds[used])
-        weights = torch.nn.functional.one_hot(corners, len(used)).to(points)
+        self.labels = labels
+        self.model = GridLBS(grid, torch.nn.functional.one_hot(corners, len(used)).to(points))
+        if self._paper.first_matches == "closest":
+            self.model.set_transforms_(self.model.transforms.detach()[None])
+            self.update_correspondences()
+            return
         matches = spin_matches(
             self._source, self._index, self.matchers[0].target, labels[self.data.cell], len(used), self._paper,
             bin_size=grid.spacing, generator=self._generator,
         )  # fmt: skip
-        self.labels = labels
-        self.model = GridLBS(grid, weights, matches.motions[None])
+        self.model.set_transforms_(matches.motions[None])
         self.correspondences = Correspondences(
             matches.targets[None], matches.normals[None], matches.kept.to(points)[None], point_to_point=0.0
         )
@@ -103,7 +107,9 @@ class PaperFit:
         return False
 
     def refine(self) -> bool:
-        """Solve for continuous weights, eqs. 8 and 13: line 9; return whether the solver converged."""
+        """Solve for continuous weights, eqs. 8 and 13, the optional line 9; return whether the solver converged."""
+        if self.config.refine_steps == 0:
+            return True
         found = refine_weights(self.model, self._samples, self.correspondences, self.config.refine)
         self.model = GridLBS(self.data.grid, found.weights, self.model.transforms.detach())
         self.update_correspondences()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from torchreg._checks import check_count, check_positive
+from torchreg._checks import check_choice, check_count, check_positive
 
 
 @dataclass(frozen=True)
@@ -14,6 +14,8 @@ class PaperConfig:
 
     Args:
         max_distance: largest distance of a correspondence, in sampling distances of the source; 20 to 40 in table 1.
+        first_matches: "spin_images", cleaned per region, or "closest" points, for scans that are near to begin with, as
+            of the paper's hand.
         annealing_rounds: rounds over which stiffness of joints and largest angle fall from their first to their last
             values.
         max_rounds: most rounds of T-step and W-step; the paper's stopping criteria are not printed.
@@ -31,6 +33,7 @@ class PaperConfig:
     """
 
     max_distance: float = 20.0
+    first_matches: str = "spin_images"
     annealing_rounds: int = 5
     max_rounds: int = 15
     rtol: float = 0.02
@@ -41,6 +44,7 @@ class PaperConfig:
     reuse_error: float = 0.1
 
     def __post_init__(self) -> None:
+        check_choice(self.first_matches, "first_matches", ("spin_images", "closest"))
         for name in ("annealing_rounds", "max_rounds", "image_size", "ransac_trials"):
             check_count(getattr(self, name), name, 1)
         for name in ("max_distance", "support_angle", "ransac_threshold"):

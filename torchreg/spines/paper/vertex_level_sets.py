@@ -8,21 +8,26 @@ from torch import Tensor
 from torchreg.geometry.graphs import connected_components
 from torchreg.spines.level_sets import LevelSets, MeshEdges
 
+# Share of the edges that are shorter than a bin is wide.
+_MOST_EDGES = 0.95
+
 
 def vertex_level_sets(mesh: MeshEdges, values: Tensor, spacing: float) -> LevelSets:
     """Return the connected parts of the bins of vertices as bands, and a ring on the way from each band to a next one.
 
-    A ring stands for the band behind it: its center is the mean of that band's vertices, its covariance theirs.
+    A ring stands for the band behind it: its center is the mean of that band's vertices, its covariance theirs. Bins
+    narrower than edges would fall into single vertices: they are as wide as most edges are long at least.
 
     Args:
         mesh: the surface.
         values: (V,) at the vertices, float64, finite.
-        spacing: width of a bin, positive.
+        spacing: width of a bin, positive, where edges are shorter.
 
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1, figures 2 and 3A.
     """
-    bins = (values / spacing).floor().long()
     edges, vertices = torch.from_numpy(mesh.edges), torch.from_numpy(mesh.vertices)
+    lengths = (vertices[edges[:, 0]] - vertices[edges[:, 1]]).norm(dim=-1)
+    bins = (values / max(spacing, float(lengths.quantile(_MOST_EDGES)))).floor().long()
     inside = bins[edges[:, 0]] == bins[edges[:, 1]]
     band = connected_components(edges[inside], len(vertices))
     count = int(band.max()) + 1
