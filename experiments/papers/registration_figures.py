@@ -151,11 +151,9 @@ def _terms(bench: Bench, found: tr.ScanRegistration) -> str:
     """Plot the terms of eq. 2 over the iterations."""
     history = found.history
     lines = {
-        "distance, mean": [1e4 * record.distance for record in history],
-        "joints": [1e4 * record.joint for record in history],
-        "borders between labels / 1000": [1e-3 * record.smoothness for record in history],
+        name: [record.energies[name] for record in history] for name in ("distance", "joint", "smoothness", "norm")
     }
-    return line_plot(bench.file("terms.png"), lines, "iteration", "squared % of the diagonal")
+    return line_plot(bench.file("terms.png"), lines, "iteration", "terms of eq. 2")
 
 
 def _refinement(config: PaperTrial, bench: Bench) -> TrialOutcome:

@@ -89,7 +89,12 @@ def _curves(found: tr.ScanRegistration) -> dict[str, list[float]]:
         "distance_percent": [100 * math.sqrt(step.distance) for step in found.history],
         "labels": [float(step.num_labels) for step in found.history],
         "kept": [float(step.kept) for step in found.history],
+        **{name: [step.energies[name] for step in found.history] for name in _energy_names(found)},
     }
+
+
+def _energy_names(found: tr.ScanRegistration) -> list[str]:
+    return list(found.history[0].energies) if found.history else []
 
 
 def _settings(config: RegistrationTrial) -> tr.RegisterConfig:

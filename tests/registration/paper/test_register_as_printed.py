@@ -43,6 +43,14 @@ def test_a_pair_of_the_walking_figure_is_registered(pair, found):
     assert (found.seconds > 0).all()
 
 
+def test_the_terms_of_the_energy_are_told_and_fall(found):
+    totals = [sum(record.energies.values()) for record in found.history]
+    assert set(found.history[0].energies) == {"distance", "joint", "smoothness", "norm", "discontinuity"}
+    assert totals[-1] < totals[0]
+    # Labels keep the norm; only the last step moves weights away from them.
+    assert [record.energies["discontinuity"] > 1e-6 for record in found.history] == [False] * (len(totals) - 1) + [True]
+
+
 def test_weights_are_continuous_at_the_end(found):
     weights = found.model.corner_weights()
     assert torch.allclose(weights.sum(-1), torch.ones(len(weights)))

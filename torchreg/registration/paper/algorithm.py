@@ -17,6 +17,7 @@ from torchreg.registration.bones.joint_moments import NEGLIGIBLE, JointMoments
 from torchreg.registration.bones.labels import CellData, LabelCosts, relabel
 from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
 from torchreg.registration.bones.motions import fit_bones
+from torchreg.registration.bones.registration_energy import EnergyState, energy_terms, term_weights
 from torchreg.registration.bones.weights import refine_weights
 from torchreg.registration.paper.config import PaperConfig
 from torchreg.registration.paper.segmentation import best_candidates, nearest_seed, reuse_labels
@@ -64,6 +65,14 @@ class PaperFit:
         self.history: list[RegisterRecord] = []
         self._matches: CompatibleMatches | None = None
         self._progress = 0.0
+        self._edges = data.grid.edges()
+        # The same in all rounds, as in the default algorithm, so that their energies compare.
+        self._term_weights = term_weights(
+            distance=config.refine.distance,
+            smoothness=config.refine.smoothness,
+            norm=config.refine.normalization,
+            discontinuity=config.refine.closeness,
+        )
 
     def start(self) -> None:
         """Segment the grid at random and match spin images, or closest points: lines 1 and 2."""
@@ -198,15 +207,25 @@ class PaperFit:
     @torch.no_grad()
     def _report(self, stage: str, step: int, num_steps: int) -> None:
         matches, neighbors, weights = self._matches, self.data.neighbors, self.correspondences.weights
-        squares = self.correspondences.squared_residuals(self.model(self._samples))
+        labeled = GridLBS.from_labels(self.data.grid, self.labels, self.model.num_bones)
+        state = EnergyState(
+            model=self.model,
+            transforms=self.model.transforms,
+            points=self._samples,
+            correspondences=self.correspondences,
+            edges=self._edges,
+            label_weights=labeled.weights,
+        )
+        squares = self.correspondences.squared_residuals(state.moved)
         record = RegisterRecord(
             stage=stage,
             step=step,
             num_steps=num_steps,
             distance=float((weights * squares).sum() / weights.sum().clamp_min(1e-300)),
-            joint=float(JointEnergy()(self.model.transforms[0], self.model.joint_moments())),
+            joint=float(JointEnergy()(self.model.transforms[0], state.moments)),
             smoothness=int((self.labels[neighbors[:, 0]] != self.labels[neighbors[:, 1]]).sum()),
             num_labels=self.model.num_bones,
+            energies={name: float(term.mean()) for name, term in energy_terms(state, self._term_weights).items()},
             **{name: int(getattr(matches, name).sum()) for name in ("kept", "boundary", "far", "turned")},
         )
         self.history.append(record)
