@@ -14,13 +14,15 @@ from typing import Any
 
 import yaml
 
-from experiments.errors import ConfigError, ExperimentError
-from experiments.plan import planned_trials
-from experiments.registry import find_task
-from experiments.schema import SweepConfig
-from experiments.structure import beside, build, flatten, unknown_key
+from .errors import ConfigError, ExperimentError
+from .plan import planned_trials
+from .registry import find_task
+from .schema import SweepConfig
+from .structure import beside, build, flatten, unknown_key
 
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+# Beside the package in a checkout, inside it where it is installed.
+_INSTALLED = Path(__file__).resolve().parent / "configs"
+CONFIGS = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).resolve().parents[1] / "configs"
 _FIELDS = {item.name: item for item in dataclasses.fields(SweepConfig)}
 
 

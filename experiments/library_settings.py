@@ -6,9 +6,10 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar, cast
 
-from experiments.errors import ConfigError
-from experiments.structure import flatten, unknown_key
 from torchreg.errors import InputError, InputTypeError
+
+from .errors import ConfigError
+from .structure import flatten, unknown_key
 
 T = TypeVar("T")
 

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import torchreg
-from experiments.errors import ConfigError
-from experiments.registry import find_task
-from experiments.schema import SweepConfig
-from experiments.structure import flatten, plain, updated
+
+from .errors import ConfigError
+from .registry import find_task
+from .schema import SweepConfig
+from .structure import flatten, plain, updated
 
 CASE = "case"
 _ID_LENGTH = 16

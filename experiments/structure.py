@@ -10,7 +10,7 @@ import types
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-from experiments.errors import ConfigError
+from .errors import ConfigError
 
 T = TypeVar("T")
 

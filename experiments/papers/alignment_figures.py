@@ -11,13 +11,14 @@ import torch
 from torch import Tensor
 
 import torchreg as tr
-from experiments.papers.pictures import PANEL, Drawing, panels
-from experiments.registry import Bench, TrialOutcome
-from experiments.schema import AlignmentTrial, AlignSolver, HandScene, PaperTrial, ScheduleConfig
-from experiments.tasks import alignment
 from torchreg.datasets.hand import HandCloud, make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.datasets.sequences import hand_sequence
 from torchreg.viz.figures import bending_picture, draw_alignment, posed_mesh, watch
+
+from ..papers.pictures import PANEL, Drawing, panels
+from ..registry import Bench, TrialOutcome
+from ..schema import AlignmentTrial, AlignSolver, HandScene, PaperTrial, ScheduleConfig
+from ..tasks import alignment
 
 _SEQUENCES = ("rotation", "bending_palm", "bending_back")
 _TIPS = alignment.TIPS

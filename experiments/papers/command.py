@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.driver import OnOutcome, run_sweep
-from experiments.engines.base import Engine
-from experiments.papers.blocks import BLOCK_IDS, PAIR_SETS
-from experiments.papers.page import write_page
-from experiments.papers.table import COLUMNS, case_name, pair_trial
-from experiments.plan import planned_trials
-from experiments.records import TrialRecord
-from experiments.schema import PaperTrial, RegistrationTrial, SweepConfig
-from experiments.store import Store
-from experiments.structure import plain
+from ..driver import OnOutcome, run_sweep
+from ..engines.base import Engine
+from ..papers.blocks import BLOCK_IDS, PAIR_SETS
+from ..papers.page import write_page
+from ..papers.table import COLUMNS, case_name, pair_trial
+from ..plan import planned_trials
+from ..records import TrialRecord
+from ..schema import PaperTrial, RegistrationTrial, SweepConfig
+from ..store import Store
+from ..structure import plain
 
 # Further tries as printed of pairs that were not registered, with other reaches, grids and seeds.
 _RETRIES = 5

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.errors import ExperimentError
-from experiments.papers.blocks import BLOCKS, PAIR_SETS, PAPERS, Block
-from experiments.papers.table import table_rows
-from experiments.records import TrialRecord
-from experiments.report.cells import number
-from experiments.store import Store, explained
 from torchreg.io.atomic import write_atomic
+
+from ..errors import ExperimentError
+from ..papers.blocks import BLOCKS, PAIR_SETS, PAPERS, Block
+from ..papers.table import table_rows
+from ..records import TrialRecord
+from ..report.cells import number
+from ..store import Store, explained
 
 _TEMPLATES = Path(__file__).parent
 _TABLE = "p2-table-1"

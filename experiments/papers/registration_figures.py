@@ -9,17 +9,18 @@ import torch
 from torch import Tensor
 
 import torchreg as tr
-from experiments.library_settings import with_settings
-from experiments.papers.blocks import PAIR_SETS, PairSet
-from experiments.papers.pictures import SOURCE, TARGET, Drawing, line_plot, mesh_drawing, panels, square_view
-from experiments.papers.table import pair_trial
-from experiments.registry import Bench, TrialOutcome
-from experiments.schema import PaperTrial, ScanPairConfig
-from experiments.tasks.registration import NEAR, REGISTERED, Problem, make_problem
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.viz.bone_colors import bone_palette, error_colors, weight_colors
 from torchreg.viz.figures import show_pixels
+
+from ..library_settings import with_settings
+from ..papers.blocks import PAIR_SETS, PairSet
+from ..papers.pictures import SOURCE, TARGET, Drawing, line_plot, mesh_drawing, panels, square_view
+from ..papers.table import pair_trial
+from ..registry import Bench, TrialOutcome
+from ..schema import PaperTrial, ScanPairConfig
+from ..tasks.registration import NEAR, REGISTERED, Problem, make_problem
 
 _WALK = PAIR_SETS[0]
 # Distances from the closest point at the end of the colors of figure 8, % of the diagonal.

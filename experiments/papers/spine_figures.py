@@ -8,7 +8,11 @@ from collections.abc import Callable, Sequence
 import torch
 
 import torchreg as tr
-from experiments.papers.pictures import (
+from torchreg.geometry.geodesics import GeodesicGraph
+from torchreg.spines.results import SpineRecord
+from torchreg.viz.spines import draw_spine_frame, spine_view
+
+from ..papers.pictures import (
     PANEL,
     Drawing,
     distance_colors,
@@ -18,13 +22,10 @@ from experiments.papers.pictures import (
     panels,
     square_view,
 )
-from experiments.registry import Bench, TrialOutcome
-from experiments.schema import PaperTrial, SpineTrial
-from experiments.tasks.spine import Sequence as Creatures
-from experiments.tasks.spine import count_tips, make_sequence
-from torchreg.geometry.geodesics import GeodesicGraph
-from torchreg.spines.results import SpineRecord
-from torchreg.viz.spines import draw_spine_frame, spine_view
+from ..registry import Bench, TrialOutcome
+from ..schema import PaperTrial, SpineTrial
+from ..tasks.spine import Sequence as Creatures
+from ..tasks.spine import count_tips, make_sequence
 
 _GRAY = (0.8, 0.8, 0.8)
 _LEVELS = 100

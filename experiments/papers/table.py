@@ -6,10 +6,10 @@ import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from experiments.papers.blocks import PAIR_SETS, PairSet
-from experiments.records import TrialRecord
-from experiments.report.intervals import confidence_interval
-from experiments.schema import RegistrationTrial, ScanPairConfig
+from ..papers.blocks import PAIR_SETS, PairSet
+from ..records import TrialRecord
+from ..report.intervals import confidence_interval
+from ..schema import RegistrationTrial, ScanPairConfig
 
 COLUMNS = {"reduced": "default", "paper": "as printed"}
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from experiments.errors import SkippedTrial
-from experiments.papers import alignment_figures, registration_figures, spine_figures
-from experiments.papers.blocks import BLOCKS
-from experiments.registry import Bench, TrialOutcome
-from experiments.schema import PaperTrial
+from ..errors import SkippedTrial
+from ..papers import alignment_figures, registration_figures, spine_figures
+from ..papers.blocks import BLOCKS
+from ..registry import Bench, TrialOutcome
+from ..schema import PaperTrial
 
 MAKERS: dict[str, Callable[[PaperTrial, Bench], TrialOutcome]] = {
     **alignment_figures.MAKERS,

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from experiments.errors import ConfigError
-from experiments.plan import PlannedTrial, axes_of, canonical
-from experiments.records import TrialRecord
-from experiments.schema import SweepConfig
-from experiments.sinks import numbers_of
-from experiments.tables import duckdb, pa
+from ..errors import ConfigError
+from ..plan import PlannedTrial, axes_of, canonical
+from ..records import TrialRecord
+from ..schema import SweepConfig
+from ..sinks import numbers_of
+from ..tables import duckdb, pa
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from experiments.plan import planned_trials
-from experiments.report import charts
-from experiments.report.cells import Cell, all_axes, cells_of, known_metrics, label, number, short, shown_metrics
-from experiments.schema import SweepConfig
-from experiments.store import Store
+from ..plan import planned_trials
+from ..report import charts
+from ..report.cells import Cell, all_axes, cells_of, known_metrics, label, number, short, shown_metrics
+from ..schema import SweepConfig
+from ..store import Store
 
 _MAX_ROWS, _MAX_METRICS = 60, 6
 

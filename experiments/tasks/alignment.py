@@ -11,13 +11,14 @@ import torch
 from torch import Tensor
 
 import torchreg as tr
-from experiments.library_settings import with_settings
-from experiments.registry import Bench, TrialOutcome
-from experiments.schema import AlignmentTrial, ScheduleConfig
-from experiments.tasks.peers import PACKAGES, moved_by
 from torchreg.datasets.hand import HandCloud, make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.viz.figures import draw_alignment, new_figure, save_picture, watch
 from torchreg.viz.gltf import save_shape_animation
+
+from ..library_settings import with_settings
+from ..registry import Bench, TrialOutcome
+from ..schema import AlignmentTrial, ScheduleConfig
+from ..tasks.peers import PACKAGES, moved_by
 
 TIPS = [4, 8, 12, 16, 20]
 # An alignment has failed if the seen fingertips are off by more than this on average, metres.

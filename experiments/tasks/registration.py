@@ -13,11 +13,6 @@ import torch
 from torch import Tensor
 
 import torchreg as tr
-from experiments.errors import SkippedTrial
-from experiments.library_settings import with_settings
-from experiments.registry import Bench, TrialOutcome
-from experiments.schema import RegistrationTrial, ScanPairConfig
-from experiments.tasks.peers import PACKAGES, moved_by
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.hand import faces_of, hand_motion, surface_skin
 from torchreg.datasets.scan_sequences import ScanPair, ScanSequence, jointed_toy, walking_animal, walking_figure
@@ -25,6 +20,12 @@ from torchreg.datasets.toys import excavator, robot
 from torchreg.viz.bone_colors import error_colors
 from torchreg.viz.figures import draw_mesh, new_figure, save_picture, watch
 from torchreg.viz.scan_gltf import save_grid_animation
+
+from ..errors import SkippedTrial
+from ..library_settings import with_settings
+from ..registry import Bench, TrialOutcome
+from ..schema import RegistrationTrial, ScanPairConfig
+from ..tasks.peers import PACKAGES, moved_by
 
 # A point is near its true place within this share of the diagonal; a pair is registered if this share of them is near.
 NEAR, REGISTERED, JOINT = 0.025, 0.9, 0.05

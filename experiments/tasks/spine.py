@@ -12,15 +12,16 @@ import torch
 from torch import Tensor
 
 import torchreg as tr
-from experiments.errors import SkippedTrial
-from experiments.library_settings import with_settings
-from experiments.registry import Bench, TrialOutcome
-from experiments.schema import SpineTrial
-from experiments.tasks.peers import peer
 from torchreg.datasets.creatures import OCTOPUS, STARFISH, CreatureSequence, creature_sequence
 from torchreg.viz.figures import new_figure, save_picture
 from torchreg.viz.spine_gltf import save_spine_animation
 from torchreg.viz.spines import draw_spine_frame, spine_view
+
+from ..errors import SkippedTrial
+from ..library_settings import with_settings
+from ..registry import Bench, TrialOutcome
+from ..schema import SpineTrial
+from ..tasks.peers import peer
 
 PICTURE_PIXELS = (300, 300)
 

@@ -118,7 +118,7 @@ def test_overrides_reach_every_field(folder):
         ("seeds", "write key=value"),
         ("~trial.size=1", "write key=value"),
         ("trial.size=[1", "big.yaml cannot be read"),
-        ("task=sculpture", "unknown task 'sculpture'; known tasks: alignment, neural_init, probe, registration, spine"),
+        ("task=sculpture", "unknown task 'sculpture'; known tasks: alignment, neural_init, papers, probe"),
         ("report.colour=red", "unknown key report.colour; known keys of report: curve_log"),
     ],
 )
