@@ -12,7 +12,7 @@ from torchreg.io.atomic import write_atomic
 
 from ..errors import ExperimentError
 from ..papers.blocks import BLOCKS, PAIR_SETS, PAPERS, Block
-from ..papers.table import table_rows
+from ..papers.table import COLUMNS, table_rows
 from ..records import TrialRecord
 from ..report.cells import number
 from ..store import Store, explained
@@ -80,7 +80,8 @@ def as_text(shown: list[Shown], notes: list[str]) -> str:
 def _shown(block: Block, record: TrialRecord | None, pairs: Mapping[str, TrialRecord], store: Store) -> Shown:
     rows = table_rows(pairs) if block.id == _TABLE and pairs else _numbers(record)
     pictures = _pictures(record, store)
-    filled = bool(pictures) or len(rows) > 1
+    measured = any(row[1] in COLUMNS.values() for row in rows) if block.id == _TABLE else len(rows) > 1
+    filled = bool(pictures) or measured
     verdict = ("other data" if block.data else "reproduced") if filled else f"not: {_why_not(block, record)}"
     return Shown(block, verdict, filled, pictures, rows)
 
