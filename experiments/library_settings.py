@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, TypeVar, cast
 
-from torchreg.errors import InputError, InputTypeError
+import torchreg as tr
 
 from .errors import ConfigError
 from .structure import flatten, unknown_key
@@ -42,5 +42,5 @@ def _changed(config: T, names: list[str], value: Any, path: str) -> T:
         value = _changed(getattr(config, first), rest, value, f"{path}.{first}")
     try:
         return cast(T, dataclasses.replace(cast(Any, config), **{first: value}))
-    except (InputError, InputTypeError, TypeError) as error:
+    except (tr.errors.InputError, tr.errors.InputTypeError, TypeError) as error:
         raise ConfigError(f"{path}.{first}: {error}; known keys of {path}: {', '.join(sorted(fields))}") from error

@@ -10,13 +10,10 @@ import torch
 from torch import Tensor
 
 import torchreg as tr
-from torchreg.geometry.visibility import View
-from torchreg.viz.bone_colors import scale_colors
 from torchreg.viz.figures import draw_mesh, new_figure, save_picture, watch
 
 PANEL = 260
 SOURCE, TARGET = (0.85, 0.45, 0.40), (0.45, 0.55, 0.85)
-_DISTANCE_SCALE = ((0.15, 0.25, 0.6), (0.2, 0.65, 0.7), (0.95, 0.9, 0.4), (0.85, 0.25, 0.15))
 # What draws a panel.
 Drawing = Callable[[Any], object]
 
@@ -37,26 +34,15 @@ def panels(path: Path, drawings: Sequence[tuple[str, Drawing]], rows: int = 1) -
     return path.name
 
 
-def square_view(points: Tensor) -> View:
+def square_view(points: Tensor) -> Any:
     """Return the view of square panels that shows all points (N, 3)."""
     return watch(points[:: max(1, len(points) // 20000)], size=(PANEL, PANEL))
 
 
-def mesh_drawing(mesh: tr.TriangleMesh, view: View, color: tuple[float, float, float] | Tensor) -> Drawing:
+def mesh_drawing(mesh: tr.TriangleMesh, view: Any, color: tuple[float, float, float] | Tensor) -> Drawing:
     """Return what draws a surface in one color, or in colors (V, 3)."""
     paint = color if isinstance(color, Tensor) else torch.tensor(color).expand(mesh.num_vertices, 3)
     return lambda ax: draw_mesh(ax, mesh, view, paint)
-
-
-def distance_colors(values: Tensor) -> Tensor:
-    """Return colors (V, 3) of values (V,) from the least to the largest."""
-    return scale_colors((values / values.max().clamp_min(1e-12)).float(), _DISTANCE_SCALE)
-
-
-def level_colors(values: Tensor, levels: int) -> Tensor:
-    """Return colors (V, 3) of values (V,) in bins, every second one darker."""
-    bins = (levels * values / values.max().clamp_min(1e-12)).floor()
-    return distance_colors(bins) * torch.where(bins % 2 == 0, 1.0, 0.55)[:, None].float()
 
 
 def line_plot(path: Path, lines: Mapping[str, Sequence[float]], xlabel: str, ylabel: str) -> str:

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 
 import torchreg as tr
-from torchreg.geometry.geodesics import GeodesicGraph
-from torchreg.spines.results import SpineRecord
-from torchreg.viz.spines import draw_spine_frame, spine_view
+from torchreg.viz.spines import draw_spine_frame, draw_tip_distance, spine_view
 
 from ..papers.pictures import (
     PANEL,
     Drawing,
-    distance_colors,
-    level_colors,
     line_plot,
     mesh_drawing,
     panels,
@@ -65,13 +62,11 @@ def _spine_drawing(meshes: Sequence[tr.TriangleMesh], spine: tr.SpineSequence, f
 
 def _surface_steps(mesh: tr.TriangleMesh, skeleton: tr.Skeleton) -> list[tuple[str, Drawing]]:
     """Return the surface, the geodesic distance from a tip, and its level sets."""
-    view = square_view(mesh.vertices)
-    tip = (mesh.vertices - skeleton.nodes[skeleton.tips[0]]).norm(dim=-1).argmin()
-    distances = GeodesicGraph.from_mesh(mesh).distances(tip[None])[0]
+    view, tip = square_view(mesh.vertices), skeleton.nodes[skeleton.tips[0]]
     return [
         ("surface", mesh_drawing(mesh, view, _GRAY)),
-        ("distance from a tip", mesh_drawing(mesh, view, distance_colors(distances))),
-        ("level sets, every fourth", mesh_drawing(mesh, view, level_colors(distances, _LEVELS // 4))),
+        ("distance from a tip", lambda ax: draw_tip_distance(ax, mesh, tip, view=view)),
+        ("level sets, every fourth", lambda ax: draw_tip_distance(ax, mesh, tip, view=view, levels=_LEVELS // 4)),
     ]
 
 
@@ -163,7 +158,7 @@ def _timings(config: PaperTrial, bench: Bench) -> TrialOutcome:
     metrics = {"frames": float(len(sequence.meshes)), "vertices": float(sequence.meshes[0].num_vertices)}
     seconds = {}
     for name, settings in _configs().items():
-        records: list[SpineRecord] = []
+        records: list[Any] = []
         begin = time.perf_counter()
         spine = tr.extract_spine(sequence.meshes, config=settings, workers=1, on_step=records.append)
         total = time.perf_counter() - begin
