@@ -20,6 +20,7 @@ _NAMES = {
     "alignment.pose_initializer": "InitialPose PoseInitializer PoseInitializerConfig",
     "alignment.results": "AlignResult Calibration PoseStarts",
     "alignment.sigma_schedule": "SigmaSchedule",
+    "alignment.skeleton_source": "SpineLimbs",
     "capture.depth": "depth_scan fuse_scans load_depth_scan",
     "capture.silhouette_frames": "SilhouetteFrames",
     "capture.silhouettes": "visual_hull",

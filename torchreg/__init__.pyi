@@ -15,6 +15,7 @@ from torchreg.alignment.results import AlignResult as AlignResult
 from torchreg.alignment.results import Calibration as Calibration
 from torchreg.alignment.results import PoseStarts as PoseStarts
 from torchreg.alignment.sigma_schedule import SigmaSchedule as SigmaSchedule
+from torchreg.alignment.skeleton_source import SpineLimbs as SpineLimbs
 from torchreg.capture.depth import depth_scan as depth_scan
 from torchreg.capture.depth import fuse_scans as fuse_scans
 from torchreg.capture.depth import load_depth_scan as load_depth_scan
@@ -103,6 +104,7 @@ __all__ = [
     "SolvePoseConfig",
     "Spine",
     "SpineConfig",
+    "SpineLimbs",
     "SpineSequence",
     "Status",
     "StereoConfig",

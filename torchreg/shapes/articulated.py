@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -12,9 +12,12 @@ from torch import Tensor
 from torchreg.errors import InputError
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.rigs import spec_from_arrays, spec_from_gltf
-from torchreg.shapes.robots import spec_from_urdf
+from torchreg.shapes.robots import spec_from_chain, spec_from_urdf
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.spec import ShapeSpec
+
+if TYPE_CHECKING:
+    from torchreg.shapes.kinematics import Chain
 
 
 class ArticulatedShape(Articulation):
@@ -85,6 +88,39 @@ class ArticulatedShape(Articulation):
         """
         spec = spec_from_urdf(path, package_dirs=package_dirs, primitive=primitive, meshes=meshes)
         return cls.from_spec(spec, free_base=free_base, nu=nu, dtype=dtype)
+
+    @classmethod
+    def from_chain(
+        cls,
+        chain: Chain,
+        *,
+        free_base: bool = True,
+        nu: float | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> ArticulatedShape:
+        """Return the shape of a `pytorch_kinematics.Chain`: its tree, with the solids of its links or thin bones.
+
+        Boxes, cylinders and spheres that links carry (chains from URDF and SDF files do) are taken as they are. Where
+        a chain only names the geometry, as a mesh, and for every link of a chain without any, thin capsules run from
+        the frame to those attached to it, a tenth of a median bone wide; a last frame gets a ball. Where the file is at
+        hand, `from_urdf` keeps its meshes.
+
+        Args:
+            chain: of fixed, revolute and prismatic joints, such as ``pytorch_kinematics.build_chain_from_urdf`` gives.
+            free_base: False if the base is bolted to the origin.
+            nu: fusion length, metres; from the parts' thickness by default.
+            dtype: of the module; the default dtype if None.
+
+        Returns:
+            The shape. Degrees of freedom have the names, order and limits of the chain's joints; parts are called like
+            its frames, those of a frame's further solids FRAME_1, FRAME_2, ...
+
+        Raises:
+            InputTypeError: if something else is given.
+            ModelError: if a joint is of another type, frames or joints share names, a number is not finite, or there is
+                neither a solid nor two frames apart.
+        """
+        return cls.from_spec(spec_from_chain(chain), free_base=free_base, nu=nu, dtype=dtype)
 
     @classmethod
     def from_gltf(

@@ -158,7 +158,7 @@ class Articulation(PosedTree):
         local = torch.cat([linear, angular.expand_as(linear)], dim=-2) @ -solids[..., :3]
         moved = local.unflatten(-2, (2, -1)) * moves[:, None, :, None]
         twists = moved.movedim((-3, -1), (-4, -3)).flatten(-4, -2)
-        return twists @ self._couplings if self.chain.has_mimics else twists
+        return twists @ self._couplings if self.kinematics.has_mimics else twists
 
     def surface_mesh(self, pose: Tensor | None = None, spacing: float | None = None) -> TriangleMesh:
         """Return a mesh of the fused surface.

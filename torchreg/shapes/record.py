@@ -57,7 +57,7 @@ def record_shape(shape: ArticulatedShape) -> ShapeRecord:
     if type(shape) is Hand:
         spec = HandSpec(shape.side, shape.scale, shape.nu)
     elif type(shape) is ArticulatedShape:
-        tree = shape.chain.tree
+        tree = shape.kinematics.tree
         frames = tuple(tree.joints[index].name for index in shape.part_index.tolist())
         solids = tuple(_solids(shape.primitives))
         spec = ShapeSpec(

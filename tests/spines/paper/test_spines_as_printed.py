@@ -219,6 +219,12 @@ def test_a_number_of_tips_that_no_frame_has_is_refused():
         track_tips_rigidly([star(torch.eye(4, 3))], 7)
 
 
+def test_a_prior_has_no_place_in_it():
+    made = creature_sequence(STARFISH, 1, resolution=32, seed=0)
+    with pytest.raises(InputError, match=r"prior cannot be used by SpineConfig.paper\(\)"):
+        tr.extract_spine(made.meshes, prior=star(torch.eye(3)), config=tr.SpineConfig.paper())
+
+
 def test_a_starfish_has_five_arms_that_keep_their_names():
     made = creature_sequence(STARFISH, 4, resolution=48, seed=0)
     spine = tr.extract_spine(made.meshes, config=tr.SpineConfig.paper(), workers=1)
