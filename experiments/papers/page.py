@@ -97,6 +97,7 @@ def _numbers(record: TrialRecord | None) -> list[tuple[str, ...]]:
         return []
     rows = [(name, _told(value)) for name, value in record.metrics.items()]
     rows += [(f"{name}, s", _told(value)) for name, value in record.seconds.items() if name != "cpu"]
+    rows += [(name, ", ".join(map(_told, values))) for name, values in record.curves.items()]
     return [("", "measured"), *rows] if rows else []
 
 

@@ -45,14 +45,18 @@ def mesh_drawing(mesh: tr.TriangleMesh, view: Any, color: tuple[float, float, fl
     return lambda ax: draw_mesh(ax, mesh, view, paint)
 
 
-def line_plot(path: Path, lines: Mapping[str, Sequence[float]], xlabel: str, ylabel: str) -> str:
-    """Write a plot of numbers over steps from zero, and return the name of the file."""
+def line_plot(
+    path: Path, lines: Mapping[str, Sequence[float]], xlabel: str, ylabel: str, *, logarithmic: bool = False
+) -> str:
+    """Write a plot of numbers over steps, and return the name of the file; a logarithm leaves out zeros."""
     figure, _ = new_figure(640, 300, 0)
     ax = figure.add_axes((0.1, 0.17, 0.86, 0.76))
     for number, (name, values) in enumerate(lines.items()):
-        ax.plot(range(len(values)), values, "o-", markersize=4, linewidth=1.3, label=name, color=f"C{number}")
-    ax.set(xlabel=xlabel, ylabel=ylabel)
-    ax.set_ylim(bottom=0)
+        shown = [value if value > 0 or not logarithmic else float("nan") for value in values]
+        ax.plot(range(len(shown)), shown, "o-", markersize=4, linewidth=1.3, label=name, color=f"C{number}")
+    ax.set(xlabel=xlabel, ylabel=ylabel, yscale="log" if logarithmic else "linear")
+    if not logarithmic:
+        ax.set_ylim(bottom=0)
     ax.grid(alpha=0.3)
     ax.legend(frameon=False)
     save_picture(figure, path)

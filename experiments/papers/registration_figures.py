@@ -139,7 +139,10 @@ def _joint_term(config: PaperTrial, bench: Bench) -> TrialOutcome:
             scores[name].append(_score(problem, name, result)[f"{name}: points within 2.5 %, %"])
         if frame == frames[0]:
             outcome.artifacts["joints"] = panels(bench.file("joints.png"), _row(problem, found))
-            outcome.artifacts["terms of eq. 2"] = _terms(bench, found["as printed"])
+            outcome.curves = _terms(found["as printed"])
+            outcome.artifacts["terms of eq. 2"] = line_plot(
+                bench.file("terms.png"), outcome.curves, "iteration", "terms of eq. 2", logarithmic=True
+            )
     for name, shares in scores.items():
         outcome.metrics[f"{name}: registered of {len(frames)}"] = float(
             sum(share >= 100 * REGISTERED for share in shares)
@@ -148,13 +151,10 @@ def _joint_term(config: PaperTrial, bench: Bench) -> TrialOutcome:
     return outcome
 
 
-def _terms(bench: Bench, found: tr.ScanRegistration) -> str:
-    """Plot the terms of eq. 2 over the iterations."""
-    history = found.history
-    lines = {
-        name: [record.energies[name] for record in history] for name in ("distance", "joint", "smoothness", "norm")
-    }
-    return line_plot(bench.file("terms.png"), lines, "iteration", "terms of eq. 2")
+def _terms(found: tr.ScanRegistration) -> dict[str, list[float]]:
+    """Return the terms of eq. 2 over the iterations, weighed; the last one is the refinement's."""
+    names = ("distance", "joint", "smoothness", "norm")
+    return {f"eq. 2, {name}": [record.energies[name] for record in found.history] for name in names}
 
 
 def _refinement(config: PaperTrial, bench: Bench) -> TrialOutcome:
