@@ -43,6 +43,7 @@ _NAMES = {
     "result": "Status",
     "shapes.articulated": "ArticulatedShape",
     "shapes.hand": "Hand",
+    "shapes.material_points": "ShapeOutput",
     "shapes.pose_head": "PoseHead",
     "shapes.pose_prior": "PosePrior",
     "shapes.skin": "BendingSkin LinearBlendSkin sample_skin",

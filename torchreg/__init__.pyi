@@ -46,6 +46,7 @@ from torchreg.registration.solve_pose import solve_pose as solve_pose
 from torchreg.result import Status as Status
 from torchreg.shapes.articulated import ArticulatedShape as ArticulatedShape
 from torchreg.shapes.hand import Hand as Hand
+from torchreg.shapes.material_points import ShapeOutput as ShapeOutput
 from torchreg.shapes.pose_head import PoseHead as PoseHead
 from torchreg.shapes.pose_prior import PosePrior as PosePrior
 from torchreg.shapes.skin import BendingSkin as BendingSkin
@@ -97,6 +98,7 @@ __all__ = [
     "RegistrationEnergy",
     "ScanRegistration",
     "SequenceRegistration",
+    "ShapeOutput",
     "SigmaSchedule",
     "SilhouetteFrames",
     "Skeleton",

@@ -30,11 +30,16 @@ class ArticulatedShape(Articulation):
     The base moves the root of the tree: ``T_world_frame = T(translation) R(rotation vector) T_root_frame``, so it turns
     about the origin of the tree's coordinates (the file's origin), not about the root's frame.
 
+    ``shape(pose)`` is a `ShapeOutput`: points of the surface, keypoints and part transforms. Parameters, which the
+    state holds, are frozen until ``requires_grad_(True)``: `log_length_scales` and `log_radius_scales` (P,), zero for
+    the shape as it came, `log_nu` and `log_sharpness` (). A state is loaded into a shape that is made alike.
+
     Args:
         tree: the kinematic tree.
         part_frames: names of the frames that carry a solid, one per part.
         primitives: one `Primitive` per part.
         nu: fusion length of the field in metres; about a quarter of a part's thickness fuses smoothly.
+        sharpness: of the bending skin, a in eq. 3: 2 lets the skin slide and stretch, 10 is near rigid.
         part_names: names of the parts; the frame names by default.
         free_base: False pins the base at the origin (its six limits are zero).
         surface: mesh and skin weights of the file the shape came from, if any.
@@ -49,7 +54,8 @@ class ArticulatedShape(Articulation):
     @classmethod
     def from_spec(cls, spec: ShapeSpec, **options: Any) -> ArticulatedShape:
         """Return the shape of a `ShapeSpec` (tree, parts, solids, and the file's surface)."""
-        options = {"nu": spec.nu, **{key: value for key, value in options.items() if value is not None}}
+        given = {key: value for key, value in options.items() if value is not None}
+        options = {"nu": spec.nu, "sharpness": spec.sharpness, **given}
         return cls(
             spec.tree, spec.part_frames, spec.primitives, part_names=spec.part_names, surface=spec.surface, **options
         )

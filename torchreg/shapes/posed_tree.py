@@ -70,7 +70,7 @@ class PosedTree(nn.Module):
         }
         for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
-        self.log_length_scales = nn.Parameter(torch.zeros(len(frames), dtype=torch.float64))
+        self.log_length_scales = frozen(torch.zeros(len(frames), dtype=torch.float64))
 
     @property
     def num_dofs(self) -> int:
@@ -265,6 +265,11 @@ class PosedTree(nn.Module):
     def _offset_scales(self) -> Tensor:
         """Return the factors (F,) on the length of each frame's offset from its parent."""
         return nn.functional.pad(self.log_length_scales, (1, 0)).index_select(0, self._owners).exp()
+
+
+def frozen(value: Tensor) -> nn.Parameter:
+    """Return a parameter that takes no gradients until it is told to."""
+    return nn.Parameter(value, requires_grad=False)
 
 
 def _base_twists(pose: Tensor, chart: str) -> tuple[Tensor, Tensor]:

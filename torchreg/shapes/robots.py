@@ -230,7 +230,8 @@ def _robot_surface(tree: KinematicTree, surfaces: Sequence[TriangleMesh | None],
     owners = torch.cat([torch.full((mesh.num_vertices,), part) for part, _, mesh in found])
     # Robots' meshes are large and these weights zeros and ones, so that half the memory holds them exactly.
     weights = torch.zeros(len(owners), len(links), dtype=torch.float32)
-    return RigSurface(surface.vertices, surface.faces, weights.scatter_(1, owners.unsqueeze(-1), 1.0))
+    weights.scatter_(1, owners.unsqueeze(-1), 1.0)
+    return RigSurface(surface.vertices, surface.faces, weights, is_rigid=True)
 
 
 def _new_name(name: str, joints: Sequence[Joint]) -> str:
