@@ -17,6 +17,7 @@ from .driver import OnOutcome, Summary, run_sweep
 from .engines.base import EngineConfig
 from .engines.by_name import make_engine
 from .errors import ConfigError, ExperimentError
+from .papers.blocks import DEFAULT_PAIRS
 from .plan import planned_trials
 from .records import TrialRecord, parse_record
 from .registry import Bench, find_task
@@ -112,7 +113,9 @@ def sweep(
 def papers(
     output: Annotated[Path, typer.Option("--output", "-o", help="folder of the page and of all results")],
     smoke: Annotated[bool, typer.Option("--smoke", help="small and coarse, within three minutes on two cores")] = False,
-    pairs: Annotated[int, typer.Option(help="of each column of table 1, at most as many as the paper's")] = 60,
+    pairs: Annotated[
+        int, typer.Option(help="of each column of table 1, at most as many as the paper's")
+    ] = DEFAULT_PAIRS,
     jobs: Annotated[int, typer.Option(help="trials at a time")] = 2,
     seed: Annotated[int, typer.Option(help="of all that is made up")] = 0,
 ) -> None:

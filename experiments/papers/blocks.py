@@ -112,6 +112,8 @@ BLOCKS = (
         _CREATURE,
     ),
 )
+# Pairs of each column of table 1, spread over its sequence: with all else about an hour on two cores.
+DEFAULT_PAIRS = 100
 BLOCK_IDS = tuple(block.id for block in BLOCKS)
 
 

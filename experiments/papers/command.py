@@ -20,8 +20,6 @@ from ..structure import plain
 
 # Further tries as printed of pairs that were not registered, with other reaches, grids and seeds.
 _RETRIES = 5
-# Pairs of each column, spread over its sequence: half an hour to an hour and a half on two cores.
-DEFAULT_PAIRS = 60
 
 
 @dataclass(frozen=True)
