@@ -113,9 +113,7 @@ def sweep(
 def papers(
     output: Annotated[Path, typer.Option("--output", "-o", help="folder of the page and of all results")],
     smoke: Annotated[bool, typer.Option("--smoke", help="small and coarse, within three minutes on two cores")] = False,
-    pairs: Annotated[
-        int, typer.Option(help="of each column of table 1, at most as many as the paper's")
-    ] = DEFAULT_PAIRS,
+    pairs: Annotated[int, typer.Option(help="of each column of table 1, at most the paper's")] = DEFAULT_PAIRS,
     jobs: Annotated[int, typer.Option(help="trials at a time")] = 2,
     seed: Annotated[int, typer.Option(help="of all that is made up")] = 0,
 ) -> None:

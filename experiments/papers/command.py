@@ -9,7 +9,6 @@ from typing import Any
 
 from ..driver import OnOutcome, run_sweep
 from ..engines.base import Engine
-from ..papers.blocks import BLOCK_IDS, PAIR_SETS
 from ..papers.page import write_page
 from ..papers.table import COLUMNS, case_name, pair_trial
 from ..plan import planned_trials
@@ -17,6 +16,7 @@ from ..records import TrialRecord
 from ..schema import PaperTrial, RegistrationTrial, SweepConfig
 from ..store import Store
 from ..structure import plain
+from .blocks import BLOCK_IDS, DEFAULT_PAIRS, PAIR_SETS
 
 # Further tries as printed of pairs that were not registered, with other reaches, grids and seeds.
 _RETRIES = 5
