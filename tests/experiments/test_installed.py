@@ -1,5 +1,6 @@
 """Experiments inside an installation: all their files are packed, and they run under the library's name."""
 
+import ast
 import os
 import runpy
 import shutil
@@ -34,6 +35,15 @@ def test_every_package_and_configuration_is_packed_inside_the_library(packed):
     for path in (ROOT / "experiments").rglob("*.j2"):
         patterns = packed["package_data"]["torchreg.experiments"]
         assert f"{path.parent.name}/*.j2" in patterns
+
+
+def test_modules_import_each_other_by_relative_names():
+    """Installed, the package has another name."""
+    for path in (ROOT / "experiments").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            assert not [name for name in names if name.partition(".")[0] == "experiments"], f"{path}:{node.lineno}"
 
 
 def test_an_installation_sweeps_from_anywhere(tmp_path):
