@@ -17,7 +17,7 @@ from torchreg.registration.normalization import Normalization
 
 @dataclass(frozen=True)
 class TokenSizes:
-    """How a scan is cut into tokens; lengths are shares of its size, see `Normalization`. Weights are learnt for these."""
+    """How a scan is cut into tokens, for which weights are learnt; lengths are shares of its size, see `Normalization`."""
 
     num_points: int = 1536  # that are looked at, spread evenly over the scan
     num_tokens: int = 256  # 4 % of a person apart
@@ -67,19 +67,44 @@ class ScanTokens:
 
         Cost: 0.05 s.
         """
-        index = _looked_at(scan, generator)
+        if generator is None:
+            index = scan.uniform_subsample(min(SIZES.num_points, len(scan))).cpu()
+        else:
+            index = torch.randperm(len(scan), generator=generator)[: SIZES.num_points]
+        index = index[even_order(scan.points.detach().cpu()[index])]
+        points, normals = (values.detach().cpu()[index] for values in (scan.points, scan.normals))
+        return cls.from_even(points, normals, scan.boundary.cpu()[index], index, generator)
+
+    @classmethod
+    def from_even(
+        cls,
+        points: Tensor,
+        normals: Tensor,
+        boundary: Tensor,
+        index: Tensor | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Self:
+        """Return the tokens of samples of one scan: the first of them, B = 1.
+
+        Args:
+            points: (S, 3) samples, every first few of which cover the scan evenly, see `even_order`.
+            normals: (S, 3) unit vectors.
+            boundary: (S,) bool.
+            index: (S,) points of the scan; the samples' own numbers by default.
+            generator: draws the neighbors; None draws the same at every call.
+        """
+        count = min(SIZES.num_points, len(points))
+        index = torch.arange(count) if index is None else index[:count]
         draws = torch.Generator().manual_seed(0) if generator is None else generator
-        unit = Normalization.from_points(scan.points[index])
-        points = unit.normalize(scan.points[index])
-        order = even_order(points)
-        tokens = order[torch.arange(SIZES.num_tokens) % len(order)]
+        unit = Normalization.from_points(points[:count])
+        points = unit.normalize(points[:count])
+        tokens = torch.arange(SIZES.num_tokens) % count
         distances = torch.cdist(points[tokens], points)
-        pad = SIZES.num_points - len(index)
-        normals = scan.normals.detach().cpu()[index].float()
+        pad = SIZES.num_points - count
         return cls(
             points=torch.nn.functional.pad(points.float(), (0, 0, 0, pad))[None],
-            normals=torch.nn.functional.pad(normals, (0, 0, 0, pad))[None],
-            boundary=torch.nn.functional.pad(scan.boundary.cpu()[index], (0, pad))[None],
+            normals=torch.nn.functional.pad(normals[:count].float(), (0, 0, 0, pad))[None],
+            boundary=torch.nn.functional.pad(boundary[:count], (0, pad))[None],
             tokens=tokens[None],
             neighbors=torch.cat([_drawn_around(distances, tokens, radius, draws) for radius in SIZES.radii], 1)[None],
             geodesic=_geodesics(distances, points[tokens]).float()[None],
@@ -108,13 +133,6 @@ class ScanTokens:
     def token_index(self) -> Tensor:
         """(B, T) int64 points of the scan that are tokens."""
         return self.at_tokens(self.index)
-
-
-def _looked_at(scan: RangeScan, generator: torch.Generator | None) -> Tensor:
-    """Return the points (P',) of a scan that are looked at, P at most."""
-    if generator is None:
-        return scan.uniform_subsample(min(SIZES.num_points, len(scan))).cpu()
-    return torch.randperm(len(scan), generator=generator)[: SIZES.num_points]
 
 
 def _drawn_around(distances: Tensor, tokens: Tensor, radius: float, generator: torch.Generator) -> Tensor:
