@@ -33,6 +33,7 @@ _NAMES = {
     "io.calibration": "load_cameras",
     "io.points": "load_mesh load_points",
     "registration.bones.grid_lbs": "GridLBS",
+    "registration.bones.registration_energy": "RegistrationEnergy",
     "registration.config": "RegisterConfig",
     "registration.register": "register",
     "registration.register_sequence": "register_sequence",

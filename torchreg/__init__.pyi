@@ -33,6 +33,7 @@ from torchreg.io.calibration import load_cameras as load_cameras
 from torchreg.io.points import load_mesh as load_mesh
 from torchreg.io.points import load_points as load_points
 from torchreg.registration.bones.grid_lbs import GridLBS as GridLBS
+from torchreg.registration.bones.registration_energy import RegistrationEnergy as RegistrationEnergy
 from torchreg.registration.config import RegisterConfig as RegisterConfig
 from torchreg.registration.register import register as register
 from torchreg.registration.register_sequence import register_sequence as register_sequence
@@ -92,6 +93,7 @@ __all__ = [
     "PoseStarts",
     "RangeScan",
     "RegisterConfig",
+    "RegistrationEnergy",
     "ScanRegistration",
     "SequenceRegistration",
     "SigmaSchedule",
