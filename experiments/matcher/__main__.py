@@ -7,6 +7,7 @@ from pathlib import Path
 
 from experiments.matcher.shards import make_shards
 from experiments.matcher.train import TrainConfig, train
+from experiments.matcher.weights import export_weights
 
 
 def main() -> None:
@@ -29,6 +30,7 @@ def main() -> None:
     names = ("minutes", "rate", "batch", "processes", "every", "seed", "device")
     config = TrainConfig(**{name: getattr(options, name) for name in names})
     train(files, held_out, options.output, config, options.begin)
+    export_weights(options.output, options.output / "scan_matcher.safetensors")
 
 
 if __name__ == "__main__":

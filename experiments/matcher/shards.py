@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path
 
 import torch
+import typer
 from torch import Tensor
 
+from experiments.matcher.rigs import body_of_rig
 from torchreg.datasets.creature_kinds import HELD_OUT_KINDS, TRAINING_KINDS
 from torchreg.datasets.matching_pairs import MatchingPair, PosableBody, matching_pairs
 from torchreg.registration.dense.scan_tokens import SIZES, ScanTokens
@@ -43,6 +45,21 @@ class PairBatch:
     target_truth: Tensor
     target_visible: Tensor
     kinds: Tensor
+
+    def rows(self, rows: slice) -> PairBatch:
+        """Return some of the pairs."""
+        return self._with(lambda value: value[rows])
+
+    def to(self, device: str) -> PairBatch:
+        """Return the batch on another device."""
+        return self._with(lambda value: value.to(device))
+
+    def _with(self, change: Callable[[Tensor], Tensor]) -> PairBatch:
+        source, target = (
+            ScanTokens(*(change(getattr(tokens, field.name)) for field in fields(ScanTokens)))
+            for tokens in (self.source, self.target)
+        )
+        return PairBatch(source, target, *(change(getattr(self, field.name)) for field in fields(PairBatch)[2:]))
 
 
 def kind_names() -> list[str]:
@@ -86,7 +103,7 @@ def make_shards(
         jobs = [(files[number], seed, number, held_out, rigs) for number in missing]
         with multiprocessing.get_context("spawn").Pool(min(workers, len(jobs))) as pool:
             for done, _ in enumerate(pool.imap_unordered(_make_shard, jobs), 1):
-                print(f"{done} of {len(jobs)} files of pairs", flush=True)
+                typer.echo(f"{done} of {len(jobs)} files of pairs")
     return files
 
 
@@ -112,19 +129,14 @@ def _stream(seed: int, held_out: bool, rigs: Path | None) -> Iterator[MatchingPa
 @cache
 def rig_bodies(folder: Path) -> Mapping[str, PosableBody]:
     """Return the rigs of a folder as bodies that can be posed at random."""
-    from experiments.matcher.rigs import body_of_rig
-
     return {file.stem: body_of_rig(file) for file in sorted(folder.glob("*.glb"))}
 
 
 def stacked(batches: list[PairBatch]) -> PairBatch:
     """Return several batches as one."""
-    tensors = [field.name for field in fields(PairBatch) if field.name not in ("source", "target")]
-    return PairBatch(
-        source=ScanTokens.stack([batch.source for batch in batches]),
-        target=ScanTokens.stack([batch.target for batch in batches]),
-        **{name: torch.cat([getattr(batch, name) for batch in batches]) for name in tensors},
-    )
+    source, target = (ScanTokens.stack([getattr(batch, side) for batch in batches]) for side in ("source", "target"))
+    tensors = (torch.cat([getattr(batch, field.name) for batch in batches]) for field in fields(PairBatch)[2:])
+    return PairBatch(source, target, *tensors)
 
 
 def _packed(batch: PairBatch) -> dict[str, Tensor]:

@@ -7,11 +7,12 @@ import math
 import os
 import tempfile
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+import typer
 from torch import Tensor, distributed, nn
 
 from experiments.matcher.shards import PairBatch, PairStore
@@ -89,7 +90,7 @@ def validate(net: ScanMatcher, pairs: PairStore, device: str = "cpu", size: int 
     net.eval()
     rows: list[tuple[int, Tensor, float]] = []
     for first in range(0, len(pairs), size):
-        batch = to_device(pairs.batch(torch.arange(first, min(first + size, len(pairs)))), device)
+        batch = pairs.batch(torch.arange(first, min(first + size, len(pairs)))).to(device)
         logits = net(batch.source, batch.target)
         probability, hidden, _ = posterior(logits)
         places = batch.target.at_tokens(batch.target.points)
@@ -98,8 +99,7 @@ def validate(net: ScanMatcher, pairs: PairStore, device: str = "cpu", size: int 
         for index, kind in enumerate(batch.kinds.tolist()):
             visible, called = batch.source_visible[index], hidden[index] > 0.5
             counts = ((right[index] & visible), visible, (called & ~visible), ~visible, called)
-            one = replace_rows(batch, index)
-            loss = float(assignment_loss(logits[index : index + 1], one))
+            loss = float(assignment_loss(logits[index : index + 1], batch.rows(slice(index, index + 1))))
             rows.append((kind, torch.stack([count.sum() for count in counts]).double().cpu(), loss))
     net.train()
     found = {}
@@ -109,24 +109,6 @@ def validate(net: ScanMatcher, pairs: PairStore, device: str = "cpu", size: int 
         loss = sum(row[2] for row in chosen) / len(chosen)
         found[kind] = Scores(right / max(visible, 1), loss, hit / max(lost, 1), hit / max(called, 1))
     return found
-
-
-def replace_rows(batch: PairBatch, index: int) -> PairBatch:
-    """Return one pair of a batch."""
-    rows = slice(index, index + 1)
-    scans = {
-        side: type(tokens)(*(getattr(tokens, name)[rows] for name in tokens.__dataclass_fields__))
-        for side, tokens in (("source", batch.source), ("target", batch.target))
-    }
-    names = ("source_truth", "source_visible", "target_truth", "target_visible", "kinds")
-    return PairBatch(**scans, **{name: getattr(batch, name)[rows] for name in names})
-
-
-def to_device(batch: PairBatch, device: str) -> PairBatch:
-    """Return a batch on another device."""
-    names = ("source_truth", "source_visible", "target_truth", "target_visible")
-    moved = {name: getattr(batch, name).to(device) for name in names}
-    return replace(batch, source=batch.source.to(device), target=batch.target.to(device), **moved)
 
 
 def train(
@@ -223,7 +205,7 @@ def _work(
 
 def _step(run: _Run, batch: PairBatch) -> float:
     """Make one step of the optimizer; processes take the mean of their gradients."""
-    batch = to_device(batch, run.config.device)
+    batch = batch.to(run.config.device)
     loss = assignment_loss(run.net(batch.source, batch.target), batch)
     run.optimizer.zero_grad()
     loss.backward()
@@ -253,9 +235,8 @@ def _report(run: _Run, pairs: PairStore, loss: float, output: Path) -> None:
     row: dict[str, Any] = {"step": run.step, "seconds": round(run.seconds), "train_loss": loss, **asdict(scores)}
     with (output / "curve.jsonl").open("a", encoding="utf-8") as curve:
         curve.write(json.dumps(row) + "\n")
-    print(
+    typer.echo(
         f"step {run.step}  {run.seconds / 60:.1f} min  loss {loss:.3f}  held out: loss {scores.loss:.3f}, "
-        f"right {scores.right:.3f}, hidden found {scores.recall:.2f}, rightly {scores.precision:.2f}",
-        flush=True,
+        f"right {scores.right:.3f}, hidden found {scores.recall:.2f}, rightly {scores.precision:.2f}"
     )
     run.save()

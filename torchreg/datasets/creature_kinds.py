@@ -16,7 +16,7 @@ from torch import Tensor
 from torchreg.datasets.figures import Part
 from torchreg.datasets.solids import FlatCone, RoundBox, RoundCone, Solid
 
-# Sines and cosines of an elevation from the ground and an azimuth from forward (+z) to the left (+x), with y up.
+# Left (+x) and right, with y up and z forward.
 SIDES = (1.0, -1.0)
 
 
@@ -393,8 +393,8 @@ def plant(draw: Draw) -> Creature:
                 grow(parent, start, aside, length * u(0.5, 0.9), thick * u(0.6, 0.9), level + 1)
         if draw.chance(leafy) and parent < 28:
             aside = torch.nn.functional.normalize(direction, dim=0) + 0.4 * draw.normal(3)
-            body.add(parent, start, aside, u(0.1, 0.35), (u(0.05, 0.12), 0.02), flat=u(0.25, 0.5), normal=draw.normal(3),
-                     limit=50)  # fmt: skip
+            radii, flat = (u(0.05, 0.12), 0.02), u(0.25, 0.5)
+            body.add(parent, start, aside, u(0.1, 0.35), radii, flat=flat, normal=draw.normal(3), limit=50)
 
     grow(-1, _at(0, 0, 0), Y, u(0.25, 0.45), u(0.04, 0.1), 0)
     grow(0, _at(0, 0.15, 0), _at(u(-1, 1), 0.6, u(-1, 1)), u(0.2, 0.4), u(0.04, 0.07), 1)

@@ -243,13 +243,13 @@ def _two_scans(
             return None
         turn = _scan_turn(draw)
         motion = rigid_matrix(turn @ facing.mT, torch.zeros(3, dtype=torch.float64))
-        # The camera's coordinates are those of the posed surface, turned and shifted: both go, a turn of the scan stays.
+        # The turn and shift to before the camera go again; a turn of the scan stays.
         scans.append((replace(found, scan=found.scan.transformed(motion.to(found.scan.points))), turn))
     return scans
 
 
 def _scan(mesh: TriangleMesh, facing: Tensor, absent: Tensor | None, draw: Draw) -> SurfaceScan | None:
-    """Return the scan by a camera that a surface faces as it is turned, its points where the camera's rotation has them."""
+    """Return the scan by a camera before which a surface is turned, in the coordinates of the turned surface."""
     turned = mesh.vertices @ facing.mT
     lower, upper = turned.amin(0), turned.amax(0)
     middle = (lower + upper) / 2

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torchreg._checks import check_same_kind
 from torchreg.errors import InputTypeError
 from torchreg.geometry.range_scan import RangeScan
+from torchreg.io.tensors import load_tensors
 from torchreg.registration.dense.scan_tokens import SIZES, ScanTokens
 
 WEIGHTS = Path(__file__).with_name("scan_matcher.safetensors")
@@ -45,8 +46,8 @@ class ScanMatcher(nn.Module):
     """Tells which points of two partial scans of one moving thing are the same place on it.
 
     Each scan is cut into 256 tokens. What is around a token and how tokens lie to each other enters by distances and
-    angles alone, so that turns and shifts of a scan change nothing; one of the angles has a sign, which tells right from
-    left. Tokens attend to those of their own scan, by their relations, and to those of the other one, in turn; the
+    angles alone, so that turns and shifts of a scan change nothing; one of the angles has a sign, which tells right
+    from left. Tokens attend to those of their own scan, by their relations, and to those of the other one, in turn; the
     similarity of two tokens is the logit of a match, and one more class means that a token is hidden in the other scan.
 
     Args:
@@ -213,6 +214,4 @@ def _relations(points: Tensor, normals: Tensor, geodesic: Tensor) -> Tensor:
 
 
 def _pretrained_state() -> dict[str, Tensor]:
-    from safetensors.torch import load_file
-
-    return {name: value.float() for name, value in load_file(str(WEIGHTS)).items()}
+    return {name: value.float() for name, value in load_tensors(WEIGHTS)[0].items()}
