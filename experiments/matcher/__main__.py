@@ -20,14 +20,14 @@ def main() -> None:
     parser.add_argument("--begin", type=Path, help="weights to start from")
     for name in ("minutes", "rate"):
         parser.add_argument(f"--{name}", type=float, default=getattr(TrainConfig, name))
-    for name in ("batch", "processes", "every", "seed"):
+    for name in ("steps", "batch", "processes", "every", "seed"):
         parser.add_argument(f"--{name}", type=int, default=getattr(TrainConfig, name))
     parser.add_argument("--device", default=TrainConfig.device)
     options = parser.parse_args()
     workers = max(options.processes, 1)
     files = make_shards(options.output / "pairs", options.pairs, options.seed, workers, rigs=options.rigs)
     held_out = make_shards(options.output / "held_out", options.held_out, options.seed, workers, held_out=True)
-    names = ("minutes", "rate", "batch", "processes", "every", "seed", "device")
+    names = ("minutes", "steps", "rate", "batch", "processes", "every", "seed", "device")
     config = TrainConfig(**{name: getattr(options, name) for name in names})
     train(files, held_out, options.output, config, options.begin)
     export_weights(options.output, options.output / "scan_matcher.safetensors")

@@ -30,6 +30,7 @@ class TrainConfig:
 
     Args:
         minutes: of training, in which the rate falls to nothing; what was trained before counts.
+        steps: most of them; training ends with whatever comes first.
         batch: pairs per step, over all processes.
         rate: largest learning rate.
         processes: that share each step; one thread each.
@@ -39,6 +40,7 @@ class TrainConfig:
     """
 
     minutes: float = 40.0
+    steps: int = 1_000_000
     batch: int = 8
     rate: float = 1e-3
     processes: int = 2
@@ -158,10 +160,14 @@ class _Run:
         torch.save({**state, "step": self.step, "seconds": self.seconds}, part)
         os.replace(part, self.checkpoint)
 
+    @property
+    def share(self) -> float:
+        """Share of training that is over, up to 1."""
+        return min(1.0, max(self.seconds / (60 * self.config.minutes), self.step / self.config.steps))
+
     def set_rate(self) -> None:
-        """Set the learning rate by the share of the time that is over: a short rise, then half a cosine."""
-        share = min(1.0, self.seconds / (60 * self.config.minutes))
-        rate = self.config.rate * min(1.0, (self.step + 1) / 50) * (0.5 + 0.5 * math.cos(math.pi * share)) + 1e-6
+        """Set the learning rate by the share of training that is over: a short rise, then half a cosine."""
+        rate = self.config.rate * min(1.0, (self.step + 1) / 50) * (0.5 + 0.5 * math.cos(math.pi * self.share)) + 1e-6
         for group in self.optimizer.param_groups:
             group["lr"] = rate
 
@@ -193,7 +199,7 @@ def _work(
         losses.append(_step(run, pairs.batch(rows, torch.rand(count, generator=generator) < 0.5)))
         run.step += 1
         run.seconds = _agreed(run.seconds + time.monotonic() - begun, meeting)
-        over = run.seconds >= 60 * config.minutes
+        over = run.share >= 1
         if rank == 0 and (over or run.step % config.every == 0):
             _report(run, pairs if others is None else others, sum(losses) / len(losses), output)
             losses = []

@@ -17,7 +17,7 @@ from torchreg.registration.normalization import Normalization
 
 @dataclass(frozen=True)
 class TokenSizes:
-    """How a scan is cut into tokens, for which weights are learnt; lengths are shares of its size, see `Normalization`."""
+    """How a scan is cut into tokens, which weights are learnt for; lengths are shares of its size (`Normalization`)."""
 
     num_points: int = 1536  # that are looked at, spread evenly over the scan
     num_tokens: int = 256  # 4 % of a person apart
