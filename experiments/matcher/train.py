@@ -223,7 +223,7 @@ def _step(run: _Run, batch: PairBatch) -> float:
     nn.utils.clip_grad_norm_(parameters, 1.0)
     run.set_rate()
     run.optimizer.step()
-    return float(loss)
+    return float(loss.detach())
 
 
 def _agreed(seconds: float, meeting: str | None) -> float:
