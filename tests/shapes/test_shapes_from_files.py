@@ -327,7 +327,7 @@ def test_names_of_further_solids_avoid_those_that_are_taken(gripper):
     gripper.write_text(GRIPPER.replace('name="other"', 'name="open_1"'))
     shape = ArticulatedShape.from_urdf(gripper)
     assert shape.num_parts == 4
-    assert {joint.name for joint in shape.chain.tree.joints} >= {"open", "open_1", "open_1_"}
+    assert {joint.name for joint in shape.kinematics.tree.joints} >= {"open", "open_1", "open_1_"}
 
 
 @torch.no_grad()
