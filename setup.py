@@ -20,7 +20,7 @@ setup(
     ],
     package_dir={EXPERIMENTS: "experiments", **CONFIGS},
     package_data={
-        "torchreg": ["py.typed", "*.pyi", "registration/dense/learned_descriptors.*"],
+        "torchreg": ["py.typed", "*.pyi", "registration/dense/*.json", "registration/dense/*.safetensors"],
         EXPERIMENTS: ["report/*.j2", "papers/*.j2"],
         **{name: ["*.yaml"] for name in CONFIGS},
     },

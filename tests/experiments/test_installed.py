@@ -32,6 +32,9 @@ def test_every_package_and_configuration_is_packed_inside_the_library(packed):
         name = ".".join(("torchreg.experiments.configs", *path.parent.relative_to(ROOT / "configs").parts))
         assert packed["package_dir"][name] == path.parent.relative_to(ROOT).as_posix()
         assert packed["package_data"][name] == ["*.yaml"]
+    weights = [path.relative_to(ROOT / "torchreg") for path in (ROOT / "torchreg").rglob("*.safetensors")]
+    assert weights
+    assert all(any(path.match(pattern) for pattern in packed["package_data"]["torchreg"]) for path in weights)
     for path in (ROOT / "experiments").rglob("*.j2"):
         patterns = packed["package_data"]["torchreg.experiments"]
         assert f"{path.parent.name}/*.j2" in patterns
