@@ -1,6 +1,6 @@
 """``python -m experiments``."""
 
-from experiments.command_line import main
+from .command_line import main
 
 if __name__ == "__main__":
     main()

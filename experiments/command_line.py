@@ -13,23 +13,27 @@ from typing import Annotated
 
 import typer
 
-from experiments.compose import known_configs, load_sweep
-from experiments.driver import OnOutcome, Summary, run_sweep
-from experiments.engines.base import EngineConfig
-from experiments.engines.by_name import make_engine
-from experiments.errors import ConfigError, ExperimentError
-from experiments.plan import planned_trials
-from experiments.records import TrialRecord, parse_record
-from experiments.registry import Bench, find_task
-from experiments.schema import SweepConfig
-from experiments.sinks import make_sink
-from experiments.store import Store, same_sweep
-from experiments.worker import Job, Outcome, execute, measure, use_threads
+from .compose import known_configs, load_sweep, swept_fields
+from .driver import OnOutcome, Summary, run_sweep
+from .engines.base import EngineConfig
+from .engines.by_name import make_engine
+from .errors import ConfigError, ExperimentError
+from .papers.blocks import DEFAULT_PAIRS
+from .plan import planned_trials
+from .records import TrialRecord, parse_record
+from .registry import Bench, find_task
+from .schema import SweepConfig
+from .sinks import make_sink
+from .store import Store, same_sweep
+from .worker import Job, Outcome, execute, measure, use_threads
 
 application = typer.Typer(help=__doc__, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
 Name = Annotated[str, typer.Argument(help="a configuration such as alignment/sigma_schedule, or a YAML file")]
-Overrides = Annotated[list[str] | None, typer.Argument(help="key=value, such as seeds=3 scene.outlier_ratio=0.4")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Argument(help="key=value, such as seeds=3; several values sweep a field: schedule.start=0.04,0.06"),
+]
 Results = Annotated[Path, typer.Option(help="folder of all results")]
 _RESULTS = Path("results")
 
@@ -44,6 +48,8 @@ def list_configs() -> None:
 @application.command()
 def run(config: Name, overrides: Overrides = None, threads: int = 1) -> None:
     """Run the single trial of a configuration, without its cases and its grid, and print its results."""
+    for key in swept_fields(overrides or []):
+        raise ConfigError(f"run takes one value of {key}; sweep takes several")
     plan = replace(load_sweep(config, overrides or []), grid={}, cases=(), seeds=1, picture_seeds=0)
     (trial,) = planned_trials(plan)
     accelerated = find_task(plan.task).accelerated
@@ -98,15 +104,43 @@ def sweep(
             plan, store, lambda: make_engine(engine, options), engine_name=engine, threads=threads,
             retry_failed=retry_failed, timeout=timeout, on_outcome=on_outcome, sinks=sinks,
         )  # fmt: skip
+    if summary.kept + summary.ran + summary.elsewhere:
+        from .report.terminal import sweep_table
+
+        typer.echo(f"medians over seeds, means of shares, with 95 % confidence intervals\n{sweep_table(plan, store)}")
     _print_summary(summary, store)
     if summary.unfinished:
         raise typer.Exit(1)
 
 
 @application.command()
+def papers(
+    output: Annotated[Path, typer.Option("--output", "-o", help="folder of the page and of all results")],
+    smoke: Annotated[bool, typer.Option("--smoke", help="small and coarse, within three minutes on two cores")] = False,
+    pairs: Annotated[int, typer.Option(help="of each column of table 1, at most the paper's")] = DEFAULT_PAIRS,
+    jobs: Annotated[int, typer.Option(help="trials at a time")] = 2,
+    seed: Annotated[int, typer.Option(help="of all that is made up")] = 0,
+) -> None:
+    """Make every figure and table of the three papers again, on one page. Repeat the command to go on after a stop."""
+    if pairs < 1:
+        raise ConfigError(f"--pairs must be at least 1, got {pairs}")
+    from .papers.command import PapersRun, make_papers
+
+    run = PapersRun(output, pairs, smoke, seed)
+    options = EngineConfig(jobs, 1, None, {})
+    with contextlib.ExitStack() as bars:
+        page = make_papers(
+            run, lambda: make_engine("local", options), lambda plan: bars.enter_context(_progress(plan))
+        )  # fmt: skip
+    for line in page.with_suffix(".txt").read_text(encoding="utf-8").splitlines():
+        typer.echo(line)
+    typer.echo(page)
+
+
+@application.command()
 def collect(config: Name, results: Results = _RESULTS) -> None:
     """Put all records of a sweep into one Parquet file."""
-    from experiments.tables import write_parquet
+    from .tables import write_parquet
 
     store = Store(results / _sweep_of(config, results).name)
     count, bad = write_parquet(store)
@@ -118,7 +152,7 @@ def collect(config: Name, results: Results = _RESULTS) -> None:
 @application.command()
 def query(config: Name, sql: str, results: Results = _RESULTS) -> None:
     """Query the records of a sweep by DuckDB; the table is called trials."""
-    from experiments.tables import query_records
+    from .tables import query_records
 
     typer.echo(query_records(Store(results / _sweep_of(config, results).name), sql))
 
@@ -128,10 +162,11 @@ def report(
     config: Name,
     output: Annotated[Path | None, typer.Option(help="the page; by default report.html beside the records")] = None,
     picture: Annotated[Path | None, typer.Option(help="PNG of the page in headless Chromium")] = None,
+    plots: Annotated[Path | None, typer.Option(help="PNG or PDF of metrics over all axes of numbers")] = None,
     results: Results = _RESULTS,
 ) -> None:
     """Write the report of a sweep: one page that opens without a network."""
-    from experiments.report.page import write_report
+    from .report.page import write_report
 
     plan = _sweep_of(config, results)
     store = Store(results / plan.name)
@@ -144,8 +179,12 @@ def report(
             )
     page = write_report(plan, store, output or store.root / "report.html", notes)
     typer.echo(page)
+    if plots is not None:
+        from .report.plots import save_plots
+
+        typer.echo(save_plots(plan, store, plots) or "no axis of this sweep has several numbers: there are no plots")
     if picture is not None:
-        from experiments.report.browser import photograph
+        from .report.browser import photograph
 
         for told in photograph(page, picture):
             typer.echo(f"the browser's console: {told}", err=True)

@@ -8,17 +8,21 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from experiments.errors import ConfigError, ExperimentError
-from experiments.registry import find_task
-from experiments.schema import SweepConfig
-from experiments.structure import build, unknown_key
+from .errors import ConfigError, ExperimentError
+from .plan import planned_trials
+from .registry import find_task
+from .schema import SweepConfig
+from .structure import beside, build, flatten, unknown_key
 
-CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+# Beside the package in a checkout, inside it where it is installed.
+_INSTALLED = Path(__file__).resolve().parent / "configs"
+CONFIGS = _INSTALLED if _INSTALLED.is_dir() else Path(__file__).resolve().parents[1] / "configs"
 _FIELDS = {item.name: item for item in dataclasses.fields(SweepConfig)}
 
 
@@ -33,6 +37,7 @@ def load_sweep(name: str, overrides: Sequence[str] = (), root: Path = CONFIGS) -
     Args:
         name: of a file below ``root`` without its ending, or the path of a YAML file.
         overrides: each ``key=value`` in Hydra's grammar; keys that are no field of a `SweepConfig` are the trial's.
+            Several values, ``schedule.start=0.04,0.06``, are an axis of the grid, in place of the file's own.
         root: folder of the configurations.
 
     Raises:
@@ -42,10 +47,76 @@ def load_sweep(name: str, overrides: Sequence[str] = (), root: Path = CONFIGS) -
     path = Path(name) if name.endswith((".yaml", ".yml")) else root / f"{name}.yaml"
     if not path.is_file():
         raise ConfigError(f"unknown configuration {name!r}; known ones: {', '.join(known_configs(root))}")
-    data = _composed(path.resolve(), [_whole_key(text) for text in overrides])
+    axes = swept_fields(overrides)
+    single = [text for text in overrides if _trial_key(text) not in axes]
+    data = _composed(path.resolve(), [_whole_key(text) for text in single])
+    keys = [_trial_key(text) for text in overrides]
+    data["grid"] = _grid(data, axes, [key for key in keys if key not in axes])
     relative = path.resolve().relative_to(root.resolve()) if path.resolve().is_relative_to(root.resolve()) else path
     data.setdefault("name", relative.with_suffix("").as_posix() if relative != path else path.stem)
-    return from_data(data)
+    try:
+        sweep = from_data(data)
+        planned_trials(replace(sweep, grid={key: sweep.grid[key] for key in axes}, cases=(), seeds=1, picture_seeds=0))
+    except ConfigError as error:
+        raise _with_neighbors(error, data.get("task"), keys) from error
+    return sweep
+
+
+def swept_fields(overrides: Sequence[str]) -> dict[str, list[Any]]:
+    """Return the values of the trial's fields that are given several, ``schedule.start=0.04,0.06``, by dotted name.
+
+    Raises:
+        ConfigError: if a field is given no value, or is not the trial's.
+        ExperimentError: if Hydra is not installed.
+    """
+    axes = {}
+    for text in overrides:
+        values = _several_values(text)
+        if values is None:
+            continue
+        key = _trial_key(text)
+        if key.partition(".")[0] in _FIELDS:
+            raise ConfigError(f"{key} takes one value: it is a field of the sweep, only fields of the trial are swept")
+        axes[key] = values
+    return axes
+
+
+def _several_values(text: str) -> list[Any] | None:
+    """Return the values of an override in Hydra's grammar, None if it is one value or cannot be read."""
+    try:
+        from hydra.core.override_parser.overrides_parser import OverridesParser
+        from hydra.core.override_parser.types import QuotedString, Transformer
+        from hydra.errors import HydraException
+    except ImportError as error:
+        raise ExperimentError("hydra is not installed: pip install 'torchreg[experiments]'") from error
+    try:
+        parsed = OverridesParser.create().parse_override(_whole_key(text))
+    except HydraException:
+        return None
+    if not parsed.is_sweep_override():
+        return None
+    values = list(parsed.sweep_iterator(transformer=Transformer.identity))
+    return [value.text if isinstance(value, QuotedString) else value for value in values]
+
+
+def _grid(data: dict[str, Any], axes: dict[str, list[Any]], single: list[str]) -> dict[str, Any]:
+    """Return the file's grid with axes from the command line, and those that were given one value left with it."""
+    own = data.get("grid") or {}
+    if not isinstance(own, dict):
+        raise ConfigError(f"grid must be a mapping, got {type(own).__name__} {own!r}")
+    grid, trial = flatten(own), flatten(data.get("trial") or {})
+    return {**grid, **{key: [trial[key]] for key in single if key in grid and key in trial}, **axes}
+
+
+def _with_neighbors(error: ConfigError, task: Any, keys: Sequence[str]) -> ConfigError:
+    """Return an error about fields given on the command line that also tells the fields beside them."""
+    text = str(error)
+    for key in keys:
+        near = ".".join(["trial", *key.split(".")[:-1]])
+        if near in text and "known keys" not in text and isinstance(task, str):
+            names = ", ".join(beside(find_task(task).schema, key))
+            text += f"; {key} was given on the command line, known keys of {near}: {names}"
+    return ConfigError(text)
 
 
 def from_data(data: dict[str, Any]) -> SweepConfig:
@@ -68,9 +139,19 @@ def _whole_key(override: str) -> str:
     """Return an override of a key that may be new to the file, but not to the schema."""
     key, sign, value = override.partition("=")
     if not sign or not key or not key[0].isalpha():
-        raise ConfigError(f"write key=value, such as seeds=3 or scene.outlier_ratio=0.4; got {override!r}")
+        raise ConfigError(
+            f"write key=value, such as seeds=3 or scene.outlier_ratio=0.4, or several values to sweep a field, "
+            f"schedule.start=0.04,0.06; got {override!r}"
+        )
+    if not value.strip(" ,"):
+        raise ConfigError(f"{key} is given no value; write {key}=VALUE, or {key}=VALUE,VALUE to sweep it")
     first = key.partition(".")[0]
     return f"++{key if first in _FIELDS else 'trial.' + key}={value}"
+
+
+def _trial_key(override: str) -> str:
+    """Return the dotted name of an override's field, without the trial's own name before it."""
+    return override.partition("=")[0].removeprefix("trial.")
 
 
 def _composed(path: Path, overrides: list[str]) -> dict[str, Any]:

@@ -8,15 +8,15 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from experiments.engines.base import Engine
-from experiments.errors import CorruptRecordError
-from experiments.plan import PlannedTrial, planned_trials
-from experiments.records import TrialRecord
-from experiments.registry import find_task
-from experiments.schema import SweepConfig
-from experiments.sinks import Sink
-from experiments.store import Store
-from experiments.worker import Job, Outcome, finished
+from .engines.base import Engine
+from .errors import CorruptRecordError
+from .plan import PlannedTrial, planned_trials
+from .records import TrialRecord
+from .registry import find_task
+from .schema import SweepConfig
+from .sinks import Sink
+from .store import Store
+from .worker import Job, Outcome, finished
 
 # How long to wait before asking again for trials that another driver runs.
 _BUSY_SECONDS = 0.3

@@ -10,9 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import torchreg
-from experiments.errors import ConfigError
-from experiments.schema import SweepConfig
-from experiments.structure import flatten, plain, updated
+
+from .errors import ConfigError
+from .registry import find_task
+from .schema import SweepConfig
+from .structure import flatten, plain, updated
 
 CASE = "case"
 _ID_LENGTH = 16
@@ -76,7 +78,7 @@ def planned_trials(sweep: SweepConfig) -> list[PlannedTrial]:
 def _trials(sweep: SweepConfig) -> Iterator[PlannedTrial]:
     axes = axes_of(sweep)
     cases = dict(zip(axes.pop(CASE, [None]), sweep.cases or ({},), strict=True))
-    first = sweep.trial.seed
+    first, task = sweep.trial.seed, find_task(sweep.task)
     if "seed" in axes and sweep.seeds > 1:
         raise ConfigError("grid.seed and seeds > 1 say the same twice; give one of them")
     for number in range(sweep.seeds):
@@ -87,7 +89,9 @@ def _trials(sweep: SweepConfig) -> Iterator[PlannedTrial]:
                 changes.setdefault("seed", first + number)
                 if number < sweep.picture_seeds:
                     changes["pictures"] = True
-                config = plain(updated(sweep.trial, changes))
+                trial = updated(sweep.trial, changes)
+                task.check(trial)
+                config = plain(trial)
                 shown = ({CASE: name} if name is not None else {}) | point
                 yield PlannedTrial(trial_id(sweep.task, config), config, shown, int(config["seed"]))
 

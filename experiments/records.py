@@ -15,9 +15,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torchreg
-from experiments.errors import ConfigError, CorruptRecordError
-from experiments.plan import trial_id
-from experiments.structure import build, plain
+
+from .errors import ConfigError, CorruptRecordError
+from .plan import trial_id
+from .structure import build, plain
 
 Status = Literal["done", "failed", "skipped"]
 _LIBRARIES = ("torch", "numpy", "scipy")
@@ -133,6 +134,8 @@ def provenance() -> Mapping[str, Any]:
 
 
 def _commit() -> str:
+    if not (_ROOT / ".git").exists():
+        return ""  # installed, perhaps inside a repository of something else
     command = ["git", "-C", str(_ROOT), "describe", "--always", "--abbrev=12", "--dirty", "--exclude", "*"]
     try:
         found = subprocess.run(command, capture_output=True, text=True, timeout=20, check=False)

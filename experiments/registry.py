@@ -11,8 +11,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from experiments.errors import ConfigError
-from experiments.schema import AlignmentTrial, NeuralTrial, ProbeTrial, RegistrationTrial, SpineTrial
+from .errors import ConfigError
+from .schema import AlignmentTrial, NeuralTrial, PaperTrial, ProbeTrial, RegistrationTrial, SpineTrial
 
 
 @dataclass
@@ -60,27 +60,44 @@ class Task:
     Args:
         name: in configurations.
         schema: dataclass of a trial's settings.
-        module: that holds ``run(config, bench) -> TrialOutcome``.
+        module: in this package, that holds ``run(config, bench) -> TrialOutcome``.
         accelerated: whether a GPU is of use.
+        settings: name in torchreg of the class that a trial's ``config`` changes fields of; none if empty.
     """
 
     name: str
     schema: type
     module: str
     accelerated: bool = False
+    settings: str = ""
 
     def load(self) -> Run:
         """Return the function that runs one trial."""
-        run: Run = import_module(self.module).run
+        run: Run = import_module(self.module, __package__).run
         return run
+
+    def check(self, trial: Any) -> None:
+        """Raise ConfigError unless the library's settings have the fields that a trial changes, and take its values."""
+        if self.settings and trial.config:
+            import torchreg
+
+            from .library_settings import with_settings
+
+            kind = getattr(torchreg, self.settings)
+            with_settings(kind.paper() if _method_of(trial) == "paper" else kind(), trial.config)
+
+
+def _method_of(trial: Any) -> str:
+    return str(getattr(getattr(trial, "solver", trial), "method", ""))
 
 
 _TASKS = (
-    Task("alignment", AlignmentTrial, "experiments.tasks.alignment", accelerated=True),
-    Task("registration", RegistrationTrial, "experiments.tasks.registration"),
-    Task("spine", SpineTrial, "experiments.tasks.spine"),
-    Task("neural_init", NeuralTrial, "experiments.tasks.neural_init"),
-    Task("probe", ProbeTrial, "experiments.tasks.probe"),
+    Task("alignment", AlignmentTrial, ".tasks.alignment", accelerated=True, settings="AlignConfig"),
+    Task("registration", RegistrationTrial, ".tasks.registration", settings="RegisterConfig"),
+    Task("spine", SpineTrial, ".tasks.spine", settings="SpineConfig"),
+    Task("neural_init", NeuralTrial, ".tasks.neural_init"),
+    Task("papers", PaperTrial, ".papers.trial"),
+    Task("probe", ProbeTrial, ".tasks.probe"),
 )
 TASKS = {task.name: task for task in _TASKS}
 

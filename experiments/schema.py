@@ -73,7 +73,8 @@ class AlignSolver:
     """Settings of the alignment of a hand.
 
     Args:
-        method: of the library "em", "softassign", "closest" (ICP); of others "cpd" (pycpd, deformable) and "gicp"
+        method: of the library "em", "softassign", "closest" (ICP), or "paper", the alignment as printed, which keeps of
+            these settings the number of model points and the sharpness; of others "cpd" (pycpd, deformable) and "gicp"
             (small_gicp, rigid), which know nothing of hands.
         em_steps: iterations per sigma.
         surface_steps: of the surface fit after EM, at each width.
@@ -84,7 +85,7 @@ class AlignSolver:
         num_model_points: that are moved.
     """
 
-    method: Literal["em", "softassign", "closest", "cpd", "gicp"] = "em"
+    method: Literal["em", "softassign", "closest", "paper", "cpd", "gicp"] = "em"
     em_steps: int = 6
     surface_steps: int = 0
     search: Literal["auto", "always", "never"] = "never"
@@ -92,6 +93,13 @@ class AlignSolver:
     prior: bool = False
     sharpness: float = 2.0
     num_model_points: int = 500
+
+    def __post_init__(self) -> None:
+        for name in ("em_steps", "num_model_points"):
+            _require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("surface_steps", "debias"):
+            _require(getattr(self, name) >= 0, f"{name} must not be negative, got {getattr(self, name)}")
+        _require(self.sharpness > 0, f"sharpness must be positive, got {self.sharpness}")
 
 
 @dataclass(frozen=True)
@@ -103,6 +111,7 @@ class AlignmentTrial:
         scene: the cloud.
         schedule: the sigmas.
         solver: the method.
+        config: any fields of `torchreg.AlignConfig`, by dotted name, that replace what the solver says.
         pictures: whether a picture and a glTF file are kept.
     """
 
@@ -110,6 +119,7 @@ class AlignmentTrial:
     scene: HandScene = field(default_factory=HandScene)
     schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
     solver: AlignSolver = field(default_factory=AlignSolver)
+    config: dict[str, Any] = field(default_factory=dict)
     pictures: bool = False
 
 
@@ -118,17 +128,21 @@ class ScanPairConfig:
     """Two range scans.
 
     Args:
-        dataset: "figure" walks, "animal" trots, "toy" is a robot that lacks a part in one scan; "file" is the file
-            ``name`` of ``folder`` (NPZ: source_points, source_faces, target_points, target_faces, source_truth,
-            diagonal).
+        dataset: "figure" walks, "animal" trots, "toy" is a robot that lacks a part in one scan, "robot" has them all,
+            "car" is an excavator, "hand" bends its fingers; "file" is the file ``name`` of ``folder`` (NPZ:
+            source_points, source_faces, target_points, target_faces, source_truth, diagonal).
         apart: frames between the two; of "file" without meaning.
+        frame: number of the first of the two.
+        frames: length of the sequence; 0 for as many as the pair needs.
         num_points: of a scan.
         folder: of "file"; relative to where the experiment is run.
         name: of "file", without its ending.
     """
 
-    dataset: Literal["figure", "animal", "toy", "file"] = "figure"
+    dataset: Literal["figure", "animal", "toy", "robot", "car", "hand", "file"] = "figure"
     apart: int = 1
+    frame: int = 0
+    frames: int = 0
     num_points: int = 4500
     folder: str = ""
     name: str = ""
@@ -136,6 +150,9 @@ class ScanPairConfig:
     def __post_init__(self) -> None:
         _require(self.apart >= 1, f"apart must be at least 1, got {self.apart}")
         _require(self.dataset != "file" or bool(self.name), "name must be given with dataset file")
+        _require(self.frame >= 0, f"frame must not be negative, got {self.frame}")
+        last = self.frame + self.apart
+        _require(not self.frames or last < self.frames, f"frames must be above {last}, or 0, got {self.frames}")
 
 
 @dataclass(frozen=True)
@@ -145,26 +162,39 @@ class RegistrationTrial:
     Args:
         seed: of the motion and the scans.
         pair: the scans.
-        method: "reduced" is the library's; "cpd" (pycpd, deformable) and "gicp" (small_gicp, rigid) are others'.
+        method: "reduced" is the library's; "paper" the algorithm as printed, which takes of the following settings the
+            bones and the grid; "cpd" (pycpd, deformable) and "gicp" (small_gicp, rigid) are others'.
         num_bones: at most.
         grid_resolution: cells along the longest axis.
         joint_weight: of the joint term in the end, from ten times as much on; 0 leaves it out.
         reuse: whether lost labels are reborn.
         refine_steps: rounds of refining weights.
         num_samples: source points that are matched.
+        retries: times that "paper" tries again with other parameters where a pair was not registered, as the truth
+            tells.
+        config: any fields of `torchreg.RegisterConfig`, by dotted name, that replace what these say.
         pictures: whether a picture and a glTF file are kept.
     """
 
     seed: int = 0
     pair: ScanPairConfig = field(default_factory=ScanPairConfig)
-    method: Literal["reduced", "cpd", "gicp"] = "reduced"
+    method: Literal["reduced", "paper", "cpd", "gicp"] = "reduced"
     num_bones: int = 20
     grid_resolution: int = 50
     joint_weight: float = 0.001
     reuse: bool = True
     refine_steps: int = 1
     num_samples: int = 4000
+    retries: int = 0
+    config: dict[str, Any] = field(default_factory=dict)
     pictures: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("num_bones", "grid_resolution", "num_samples"):
+            _require(getattr(self, name) >= 1, f"{name} must be at least 1, got {getattr(self, name)}")
+        _require(self.grid_resolution <= 256, f"grid_resolution must be at most 256, got {self.grid_resolution}")
+        for name in ("joint_weight", "refine_steps", "retries"):
+            _require(getattr(self, name) >= 0, f"{name} must not be negative, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True)
@@ -180,7 +210,9 @@ class SpineTrial:
         resolution: voxels along the longest side.
         folder: of "file".
         name: of "file", without its ending.
-        method: "spine" is the library's. "skeletor" counts the tips of another program's skeletons.
+        method: "spine" is the library's; "paper" the algorithm as printed. "skeletor" counts the tips of another
+            program's skeletons.
+        config: any fields of `torchreg.SpineConfig`, by dotted name.
         pictures: whether a picture and a glTF file are kept.
     """
 
@@ -192,11 +224,30 @@ class SpineTrial:
     resolution: int = 96
     folder: str = ""
     name: str = ""
-    method: Literal["spine", "skeletor"] = "spine"
+    method: Literal["spine", "paper", "skeletor"] = "spine"
+    config: dict[str, Any] = field(default_factory=dict)
     pictures: bool = False
 
     def __post_init__(self) -> None:
         _require(self.creature != "file" or bool(self.name), "name must be given with creature file")
+        for name in ("frames", "noise"):
+            _require(getattr(self, name) >= 0, f"{name} must not be negative, got {getattr(self, name)}")
+        _require(self.resolution >= 8, f"resolution must be at least 8, got {self.resolution}")
+
+
+@dataclass(frozen=True)
+class PaperTrial:
+    """A figure or table of one of the three papers, made again.
+
+    Args:
+        seed: of what is made up.
+        block: its name, such as p2-fig-4; see experiments/papers/blocks.py.
+        smoke: small and coarse, in seconds.
+    """
+
+    seed: int = 0
+    block: str = ""
+    smoke: bool = False
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from experiments.errors import ConfigError, ExperimentError
-from experiments.records import TrialRecord
-from experiments.structure import flatten
+from .errors import ConfigError, ExperimentError
+from .records import TrialRecord
+from .structure import flatten
 
 
 class Sink(Protocol):

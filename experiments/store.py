@@ -22,14 +22,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.claims import is_claimed
-from experiments.compose import from_data
-from experiments.errors import CorruptRecordError, StoreError
-from experiments.plan import canonical
-from experiments.records import TrialRecord, parse_record
-from experiments.schema import SweepConfig
-from experiments.structure import plain
 from torchreg.io.atomic import write_atomic
+
+from .claims import is_claimed
+from .compose import from_data
+from .errors import CorruptRecordError, StoreError
+from .plan import canonical
+from .records import TrialRecord, parse_record
+from .schema import SweepConfig
+from .structure import plain
 
 _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FORBIDDEN = {errno.EROFS, errno.EACCES, errno.EPERM}

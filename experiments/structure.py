@@ -10,7 +10,7 @@ import types
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
-from experiments.errors import ConfigError
+from .errors import ConfigError
 
 T = TypeVar("T")
 
@@ -132,15 +132,36 @@ def updated(config: T, changes: Mapping[str, Any], path: str = "trial") -> T:
     data = plain(config)
     for key, value in changes.items():
         *parents, last = key.split(".")
-        place = data
+        place, kind = data, cast(Any, type(config))
         for depth, name in enumerate(parents):
-            if not isinstance(place, dict) or name not in place:
-                raise unknown_key(name, place if isinstance(place, dict) else {}, ".".join([path, *parents[:depth]]))
-            place = place[name]
-        if not isinstance(place, dict) or last not in place:
-            raise unknown_key(last, place if isinstance(place, dict) else {}, ".".join([path, *parents]))
+            _check_known(name, place, kind, ".".join([path, *parents[:depth]]))
+            place, kind = place.setdefault(name, {}), _kind_of(kind, name)
+        _check_known(last, place, kind, ".".join([path, *parents]))
         place[last] = value
     return build(type(config), data, path)
+
+
+def _check_known(key: str, place: Any, kind: Any, path: str) -> None:
+    """Raise ConfigError unless a key is there, or its mapping takes any."""
+    open_mapping = get_origin(kind) is dict or kind is dict
+    if not isinstance(place, dict) or (key not in place and not open_mapping):
+        raise unknown_key(key, place if isinstance(place, dict) else {}, path)
+
+
+def _kind_of(kind: Any, name: str) -> Any:
+    """Return the type of a field; of what lies in a mapping that takes any key, dict."""
+    return _schema(kind)[1].get(name) if dataclasses.is_dataclass(cast(object, kind)) else dict
+
+
+def beside(kind: type, key: str) -> list[str]:
+    """Return the names of the fields beside that of a dotted key, or as far as the key is known."""
+    found: Any = kind
+    for name in key.split(".")[:-1]:
+        inner = _schema(found)[1].get(name)
+        if not dataclasses.is_dataclass(inner):
+            break
+        found = inner
+    return sorted(_schema(found)[0])
 
 
 def _told(value: Any) -> str:

@@ -6,10 +6,10 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
-from experiments.errors import ConfigError, CorruptRecordError, ExperimentError
-from experiments.records import TrialRecord
-from experiments.store import Store, explained
-from experiments.structure import flatten
+from .errors import ConfigError, CorruptRecordError, ExperimentError
+from .records import TrialRecord
+from .store import Store, explained
+from .structure import flatten
 
 try:
     import duckdb

@@ -18,12 +18,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torchreg
-from experiments.claims import claimed
-from experiments.errors import CorruptRecordError, SkippedTrial, StoreError
-from experiments.records import TrialRecord, provenance
-from experiments.registry import Bench, Task, TrialOutcome, find_task
-from experiments.store import Store, explained
-from experiments.structure import build
+
+from .claims import claimed
+from .errors import CorruptRecordError, SkippedTrial, StoreError
+from .records import TrialRecord, provenance
+from .registry import Bench, Task, TrialOutcome, find_task
+from .store import Store, explained
+from .structure import build
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 # A trial that ends its process this often in one session is told as failed.
@@ -138,7 +139,7 @@ def _blank(job: Job, attempt: int) -> TrialRecord:
     return TrialRecord(
         job.id, job.task, torchreg.__version__, job.config, int(job.config.get("seed", 0)), "done",
         threads=job.threads, engine=job.engine, attempt=attempt, session=job.session,
-        started=datetime.now(UTC).isoformat(timespec="seconds"), rerun=f"python -m experiments rerun {path}",
+        started=datetime.now(UTC).isoformat(timespec="seconds"), rerun=f"python -m {__package__} rerun {path}",
         **provenance(),
     )  # fmt: skip
 

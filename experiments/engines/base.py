@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from experiments.errors import ConfigError
-from experiments.worker import Job, Outcome
+from ..errors import ConfigError
+from ..worker import Job, Outcome
 
 
 class Engine(Protocol):
@@ -72,7 +72,8 @@ def visible_gpus() -> list[str]:
 
 def share_code() -> None:
     """Give processes that start later the import path of this package."""
-    root = str(Path(__file__).resolve().parents[2])
+    # The folder that holds the outermost package: the checkout, or where the library is installed.
+    root = str(Path(__file__).resolve().parents[(__package__ or "").count(".") + 1])
     paths = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     if root not in paths:
         os.environ["PYTHONPATH"] = os.pathsep.join([root, *filter(None, paths)])

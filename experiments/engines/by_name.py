@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from experiments.engines.base import Engine, EngineConfig
-from experiments.errors import ConfigError
+from ..engines.base import Engine, EngineConfig
+from ..errors import ConfigError
 
 # The module and the class of each.
 _HOMES = {
-    "local": ("experiments.engines.local", "LocalEngine"),
-    "ray": ("experiments.engines.ray_cluster", "RayEngine"),
-    "slurm": ("experiments.engines.slurm", "SlurmEngine"),
+    "local": (".local", "LocalEngine"),
+    "ray": (".ray_cluster", "RayEngine"),
+    "slurm": (".slurm", "SlurmEngine"),
 }
 ENGINES = tuple(_HOMES)
 
@@ -26,5 +26,5 @@ def make_engine(name: str, config: EngineConfig) -> Engine:
     if name not in _HOMES:
         raise ConfigError(f"unknown engine {name!r}; known engines: {', '.join(ENGINES)}")
     module, kind = _HOMES[name]
-    engine: Engine = getattr(import_module(module), kind)(config)
+    engine: Engine = getattr(import_module(module, __package__), kind)(config)
     return engine

@@ -12,9 +12,9 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from multiprocessing.connection import wait as wait_for
 
-from experiments.engines.base import EngineConfig, share_code, visible_gpus
-from experiments.errors import ExperimentError
-from experiments.worker import Job, Outcome, execute, use_threads
+from ..engines.base import EngineConfig, share_code, visible_gpus
+from ..errors import ExperimentError
+from ..worker import Job, Outcome, execute, use_threads
 
 
 class LocalEngine:

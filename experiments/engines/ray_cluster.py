@@ -8,9 +8,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from experiments.engines.base import EngineConfig, share_code
-from experiments.errors import ExperimentError
-from experiments.worker import Job, Outcome, execute
+from ..engines.base import EngineConfig, share_code
+from ..errors import ExperimentError
+from ..worker import Job, Outcome, execute
 
 _LOOPBACK = "127.0.0.1"
 # Between looks at whether the cluster lives.

@@ -9,10 +9,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from experiments.engines.base import EngineConfig, share_code
-from experiments.errors import CorruptRecordError, ExperimentError, StoreError
-from experiments.store import Store
-from experiments.worker import Job, Outcome, execute, finished, use_threads
+from ..engines.base import EngineConfig, share_code
+from ..errors import CorruptRecordError, ExperimentError, StoreError
+from ..store import Store
+from ..worker import Job, Outcome, execute, finished, use_threads
 
 _POLL_SECONDS = 0.2
 # After the end of a job its files may take a moment to be seen.

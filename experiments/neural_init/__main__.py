@@ -2,7 +2,7 @@
 
 import sys
 
-from experiments.neural_init.summary import main
+from ..neural_init.summary import main
 
 if __name__ == "__main__":
     main(sys.argv[1:])

@@ -14,9 +14,10 @@ import torch
 from torch import Tensor
 
 import torchreg as tr
-from experiments.schema import CloudScene
 from torchreg.datasets.hand import make_hand_cloud, placed, surface_skin
 from torchreg.io.atomic import write_atomic
+
+from ..schema import CloudScene
 
 # Fingers up, palm to the camera at the origin, which looks along +z with -y up; half a metre away, up to 3 cm off.
 FACING, DISTANCE, SPREAD = (math.pi / 2, 0.0, 0.0), 0.5, 0.03

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 import torchreg as tr
-from experiments.neural_init.data import Clouds
+
+from ..neural_init.data import Clouds
 
 # The unit of places in the network, so that they are as large as rotations and joints: metres.
 UNIT = 0.1

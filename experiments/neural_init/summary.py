@@ -7,8 +7,8 @@ import statistics
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.records import TrialRecord
-from experiments.store import Store
+from ..records import TrialRecord
+from ..store import Store
 
 BASELINE, METRIC = "scratch", "tips_mm"
 # The baseline is also cut off at these shares of its steps: what help is worth depends on how long one trains.

@@ -10,9 +10,10 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 import torchreg as tr
-from experiments.neural_init.data import Clouds
-from experiments.neural_init.model import PoseRefiner, PoseRegressor
-from experiments.schema import NeuralTrial
+
+from ..neural_init.data import Clouds
+from ..neural_init.model import PoseRefiner, PoseRegressor
+from ..schema import NeuralTrial
 
 TIPS = [4, 8, 12, 16, 20]
 # Poses less sure than this say nothing of what hands do.

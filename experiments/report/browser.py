@@ -6,9 +6,10 @@ import shutil
 import time
 from pathlib import Path
 
-from experiments.errors import ExperimentError
-from experiments.store import explained
 from torchreg.io.atomic import write_atomic
+
+from ..errors import ExperimentError
+from ..store import explained
 
 _WIDTH, _MAX_HEIGHT, _SETTLE_SECONDS = 1250, 8000, 1.0
 _NAMES = ("chromium", "chromium-browser", "google-chrome")

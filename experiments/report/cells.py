@@ -6,23 +6,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from experiments.errors import ConfigError
-from experiments.plan import PlannedTrial, axes_of, canonical
-from experiments.records import TrialRecord
-from experiments.schema import SweepConfig
-from experiments.sinks import numbers_of
-from experiments.tables import duckdb, pa
+from ..errors import ConfigError
+from ..plan import PlannedTrial, axes_of, canonical
+from ..records import TrialRecord
+from ..schema import SweepConfig
+from ..sinks import numbers_of
+from ..tables import duckdb, pa
 
 
 @dataclass(frozen=True)
 class Spread:
-    """A metric over the seeds of a cell: count, median, quartiles and mean."""
+    """A metric over the seeds of a cell: count, median, quartiles, mean, and the values themselves."""
 
     count: int
     median: float
     low: float
     high: float
     mean: float
+    values: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -132,15 +133,19 @@ def _value(cell: Cell, metric: str, share: bool) -> float:
     return spread.mean if share else spread.median
 
 
-def _spreads(rows: list[tuple[int, str, float]]) -> dict[tuple[int, str], Spread]:
-    if not rows:
+def _spreads(found: list[tuple[int, str, float]]) -> dict[tuple[int, str], Spread]:
+    if not found:
         return {}
-    columns = list(zip(*rows, strict=True))
+    columns = list(zip(*found, strict=True))
     table = pa.table({"cell": columns[0], "metric": columns[1], "number": pa.array(columns[2], pa.float64())})
     ask = (
         "SELECT cell, metric, count(*), median(number), quantile_cont(number, 0.25), quantile_cont(number, 0.75), "
-        "avg(number) FROM numbers GROUP BY cell, metric"
+        "avg(number), list(number ORDER BY number) FROM numbers GROUP BY cell, metric"
     )
     with duckdb.connect() as connection:
         connection.register("numbers", table)
-        return {(cell, metric): Spread(*rest) for cell, metric, *rest in connection.execute(ask).fetchall()}
+        rows = connection.execute(ask).fetchall()
+    return {
+        (cell, metric): Spread(count, median, low, high, mean, tuple(values))
+        for cell, metric, count, median, low, high, mean, values in rows
+    }

@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 import statistics
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from experiments.plan import PlannedTrial, axes_of
-from experiments.records import TrialRecord
-from experiments.report.cells import Cell, Spread, all_axes, label, short
-from experiments.schema import SweepConfig
+from ..plan import PlannedTrial, axes_of
+from ..records import TrialRecord
+from ..report.cells import Cell, Spread, all_axes, label, short
+from ..report.intervals import confidence_interval
+from ..schema import SweepConfig
 
 _MAX_MAPS, _MAX_DOTS, _MAX_LINES = 6, 60, 12
 _HEIGHT, _CELL_PIXELS = 380, 46
@@ -104,6 +106,80 @@ def _whiskers(spreads: Sequence[Spread]) -> dict[str, Any]:
     return {"type": "data", "symmetric": False, "array": above, "arrayminus": below, "thickness": 1, "width": 3}
 
 
+@dataclass(frozen=True)
+class Line:
+    """A metric over an axis of numbers.
+
+    Args:
+        name: value of the axis that groups; empty if there is none.
+        across: values of the axis.
+        middle: median, or mean of a share, over all else.
+        low: end of its 95 % confidence interval.
+        high: the other end.
+    """
+
+    name: str
+    across: list[Any]
+    middle: list[float]
+    low: list[float]
+    high: list[float]
+
+
+def numeric_axes(sweep: SweepConfig) -> list[str]:
+    """Return the axes that have several values, all numbers."""
+    axes = axes_of(sweep)
+    return [name for name in all_axes(sweep) if len(axes[name]) > 1 and all(map(_is_number, axes[name]))]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def group_of(sweep: SweepConfig, axis: str) -> str:
+    """Return the axis by whose values lines over another axis are told apart; empty if there is none."""
+    rest = [name for name in all_axes(sweep) if name != axis]
+    return sweep.report.group if sweep.report.group in rest else next(iter(rest), "")
+
+
+def lines_over(sweep: SweepConfig, cells: Sequence[Cell], metric: str, axis: str) -> list[Line]:
+    """Return a metric over an axis of numbers, a line per value of the axis that groups, all else together."""
+    group, mean, found = group_of(sweep, axis), metric in sweep.report.share, []
+    for value in itertools.islice(
+        dict.fromkeys(label(cell.axes[group]) if group else "" for cell in cells), _MAX_LINES
+    ):
+        mine = [cell for cell in cells if metric in cell.metrics and (not group or label(cell.axes[group]) == value)]
+        across = sorted({cell.axes[axis] for cell in mine})
+        pools = [[v for cell in mine if cell.axes[axis] == x for v in cell.metrics[metric].values] for x in across]
+        middle = [statistics.fmean(pool) if mean else statistics.median(pool) for pool in pools]
+        ends = [confidence_interval(pool, mean=mean) or (at, at) for pool, at in zip(pools, middle, strict=True)]
+        found.append(Line(value, across, middle, [end[0] for end in ends], [end[1] for end in ends]))
+    return found
+
+
+def lines(sweep: SweepConfig, cells: Sequence[Cell], metric: str) -> list[str]:
+    """Return plots of a metric over each axis of numbers, with 95 % bands."""
+    return [_line_plot(sweep, cells, metric, axis) for axis in numeric_axes(sweep)]
+
+
+def _line_plot(sweep: SweepConfig, cells: Sequence[Cell], metric: str, axis: str) -> str:
+    import plotly.graph_objects as go
+
+    figure, group = go.Figure(), group_of(sweep, axis)
+    for line, color in zip(lines_over(sweep, cells, metric, axis), itertools.cycle(_COLORS)):
+        figure.add_scatter(
+            x=[*line.across, *line.across[::-1]], y=[*line.high, *line.low[::-1]], fill="toself", fillcolor=color,
+            opacity=0.15, mode="lines", line={"width": 0}, hoverinfo="skip", showlegend=False,
+        )  # fmt: skip
+        figure.add_scatter(
+            x=line.across, y=line.middle, name=line.name or short(metric), mode="lines+markers", line={"color": color}
+        )
+    figure.update_xaxes(title=short(axis))
+    figure.update_yaxes(title=named(metric), rangemode="tozero")
+    figure.update_layout(legend_title_text=short(group), showlegend=bool(group))
+    kind = "mean" if metric in sweep.report.share else "median"
+    return _html(figure, f"{named(metric)} over {short(axis)}: {kind} over all others, 95 % confidence", _HEIGHT)
+
+
 def curve_names(sweep: SweepConfig, records: dict[str, TrialRecord]) -> list[str]:
     """Return the curves to draw."""
     found = dict.fromkeys(name for record in records.values() for name in record.curves)
@@ -171,6 +247,12 @@ def told(sweep: SweepConfig, cell: Cell, metric: str) -> float | None:
     if spread is None:
         return None
     return spread.mean if metric in sweep.report.share else spread.median
+
+
+def interval(sweep: SweepConfig, cell: Cell, metric: str) -> tuple[float, float] | None:
+    """Return the 95 % confidence interval of what `told` gives, None for fewer than two seeds."""
+    spread = cell.metrics.get(metric)
+    return None if spread is None else confidence_interval(spread.values, mean=metric in sweep.report.share)
 
 
 def named(metric: str) -> str:

@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from experiments.errors import ExperimentError
-from experiments.plan import PlannedTrial, planned_trials
-from experiments.records import TrialRecord
-from experiments.report import charts
-from experiments.report.cells import (
+from torchreg.io.atomic import write_atomic
+
+from ..errors import ExperimentError
+from ..plan import PlannedTrial, planned_trials
+from ..records import TrialRecord
+from ..report import charts
+from ..report.cells import (
     Cell,
     all_axes,
     cells_of,
@@ -26,9 +28,8 @@ from experiments.report.cells import (
     short,
     shown_metrics,
 )
-from experiments.schema import SweepConfig
-from experiments.store import Store, explained
-from torchreg.io.atomic import write_atomic
+from ..schema import SweepConfig
+from ..store import Store, explained
 
 _MAX_FAILURES, _MAX_PICTURES, _MAX_ROWS = 50, 24, 1000
 _TEMPLATES = Path(__file__).parent
@@ -91,6 +92,7 @@ def _page(
     drawn = [chart for metric in heat for chart in charts.heat_maps(sweep, cells, metric)]
     if not drawn:
         drawn = [chart for metric in metrics[:2] if (chart := charts.dots(sweep, cells, metric)) is not None]
+    drawn += [chart for metric in heat[:2] or metrics[:2] for chart in charts.lines(sweep, cells, metric)]
     lines = [charts.curves(sweep, rows, records, name) for name in charts.curve_names(sweep, records)]
     pictures, models = _figures(store, rows, records, output)
     return {

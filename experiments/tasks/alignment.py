@@ -11,12 +11,14 @@ import torch
 from torch import Tensor
 
 import torchreg as tr
-from experiments.registry import Bench, TrialOutcome
-from experiments.schema import AlignmentTrial, ScheduleConfig
-from experiments.tasks.peers import PACKAGES, moved_by
 from torchreg.datasets.hand import HandCloud, make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.viz.figures import draw_alignment, new_figure, save_picture, watch
 from torchreg.viz.gltf import save_shape_animation
+
+from ..library_settings import with_settings
+from ..registry import Bench, TrialOutcome
+from ..schema import AlignmentTrial, ScheduleConfig
+from ..tasks.peers import PACKAGES, moved_by
 
 TIPS = [4, 8, 12, 16, 20]
 # An alignment has failed if the seen fingertips are off by more than this on average, metres.
@@ -112,11 +114,18 @@ def align_config(hand: tr.Hand, scene: Scene, config: AlignmentTrial) -> tr.Alig
     with torch.no_grad():
         rest = scene.skin(hand.rest_pose())
     size = float((rest.amax(0) - rest.amin(0)).norm())
-    return tr.AlignConfig(
+    if solver.method == "paper":
+        printed = tr.AlignConfig.paper(
+            schedule=sigma_schedule(config.schedule, size), sharpness=solver.sharpness,
+            num_model_points=solver.num_model_points,
+        )  # fmt: skip
+        return with_settings(printed, config.config)
+    settings = tr.AlignConfig(
         schedule=sigma_schedule(config.schedule, size), em_steps=solver.em_steps, surface_steps=solver.surface_steps,
         search=solver.search, debias=solver.debias, prior_std=plain.prior_std if solver.prior else None,
         correspondence=solver.method, sharpness=solver.sharpness, num_model_points=solver.num_model_points,
     )  # fmt: skip
+    return with_settings(settings, config.config)
 
 
 def sigma_schedule(config: ScheduleConfig, size: float) -> tr.SigmaSchedule | None:

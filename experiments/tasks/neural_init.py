@@ -9,10 +9,11 @@ from collections.abc import Iterator
 from torch import Tensor
 
 import torchreg as tr
-from experiments.neural_init.data import Clouds, load_clouds
-from experiments.neural_init.train import TIPS, errors_mm, train
-from experiments.registry import Bench, TrialOutcome
-from experiments.schema import CloudScene, NeuralTrial
+
+from ..neural_init.data import Clouds, load_clouds
+from ..neural_init.train import TIPS, errors_mm, train
+from ..registry import Bench, TrialOutcome
+from ..schema import CloudScene, NeuralTrial
 
 # A cloud is right if its fingertips are off by at most this on average.
 RIGHT_MM = 10.0

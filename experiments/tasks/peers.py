@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from experiments.errors import SkippedTrial
+from ..errors import SkippedTrial
 
 PACKAGES = {"cpd": "pycpd", "gicp": "small_gicp", "skeletor": "skeletor"}
 # Coherent Point Drift takes memory and time by the product of the numbers of points.

@@ -8,9 +8,9 @@ import time
 
 import numpy as np
 
-from experiments.errors import SkippedTrial
-from experiments.registry import Bench, TrialOutcome
-from experiments.schema import ProbeTrial
+from ..errors import SkippedTrial
+from ..registry import Bench, TrialOutcome
+from ..schema import ProbeTrial
 
 
 def run(config: ProbeTrial, bench: Bench) -> TrialOutcome:

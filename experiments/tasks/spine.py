@@ -12,14 +12,16 @@ import torch
 from torch import Tensor
 
 import torchreg as tr
-from experiments.errors import SkippedTrial
-from experiments.registry import Bench, TrialOutcome
-from experiments.schema import SpineTrial
-from experiments.tasks.peers import peer
 from torchreg.datasets.creatures import OCTOPUS, STARFISH, CreatureSequence, creature_sequence
 from torchreg.viz.figures import new_figure, save_picture
 from torchreg.viz.spine_gltf import save_spine_animation
 from torchreg.viz.spines import draw_spine_frame, spine_view
+
+from ..errors import SkippedTrial
+from ..library_settings import with_settings
+from ..registry import Bench, TrialOutcome
+from ..schema import SpineTrial
+from ..tasks.peers import peer
 
 PICTURE_PIXELS = (300, 300)
 
@@ -49,7 +51,8 @@ def run(config: SpineTrial, bench: Bench) -> TrialOutcome:
         counts = [_peer_tips(mesh) for mesh in sequence.meshes]
         seconds["total"] = time.perf_counter() - begin
         return TrialOutcome(_tip_metrics(counts, sequence), seconds, {"own_tips": [float(count) for count in counts]})
-    spine = tr.extract_spine(sequence.meshes, workers=1)
+    settings = tr.SpineConfig.paper() if config.method == "paper" else tr.SpineConfig()
+    spine = tr.extract_spine(sequence.meshes, config=with_settings(settings, config.config), workers=1)
     seconds["total"] = time.perf_counter() - begin
     counts = [count_tips(topology) for topology in spine.own_topologies]
     outcome = TrialOutcome(

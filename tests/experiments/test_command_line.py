@@ -6,6 +6,7 @@ from typer.testing import CliRunner
 
 from experiments import command_line
 from experiments.command_line import application, main
+from experiments.errors import ConfigError
 
 
 @pytest.fixture
@@ -61,6 +62,25 @@ def test_a_report_tells_that_its_configuration_was_edited(tmp_path, inline, monk
         "The configuration differs from the one that the sweep was last run with"
         in (tmp_path / "page.html").read_text()
     )
+
+
+def test_a_field_is_swept_in_plain_words_and_ends_with_a_table(sweep_file, tmp_path, inline):
+    results = ("--results", tmp_path)
+    code, told = command("sweep", sweep_file, "scale=2,5,7", "outcome=done", "seeds=3", *results)
+    assert code == 0
+    head, rule, *rows = told.splitlines()[1:6]
+    assert head.split()[:2] == ["scale", "done"]
+    assert set(rule) == {"-"}
+    assert [row.split()[:2] for row in rows] == [["2", "3/3"], ["5", "3/3"], ["7", "3/3"]]
+    assert all("[" in row for row in rows)
+    assert "9 trials: 9 run now" in told
+    command("report", sweep_file, *results)
+    assert "value over scale: median over all others" in (tmp_path / "mine/report.html").read_text()
+
+
+def test_one_trial_takes_one_value(sweep_file):
+    with pytest.raises(ConfigError, match="run takes one value of scale; sweep takes several"):
+        command("run", sweep_file, "scale=1,2")
 
 
 def test_one_trial_runs_and_prints_what_it_found(sweep_file):

@@ -21,6 +21,74 @@ def folder(tmp_path):
     return tmp_path
 
 
+def test_several_values_are_an_axis(folder):
+    found = load_sweep("probe/big", ["size=8,16", "trial.seconds=0.5,1", "seeds=2"], root=folder)
+    assert found.grid == {"scale": [1, 2], "rounds": [2, 4, 8], "size": [8, 16], "seconds": [0.5, 1]}
+    assert len(planned_trials(found)) == 2 * 3 * 2 * 2 * 2
+
+
+def test_values_on_the_command_line_replace_those_of_the_file(folder):
+    assert load_sweep("probe/big", ["scale=3,4,5"], root=folder).grid["scale"] == [3, 4, 5]
+    one = load_sweep("probe/big", ["scale=3"], root=folder)
+    assert one.grid["scale"] == [3]
+    assert {trial.config["scale"] for trial in planned_trials(one)} == {3.0}
+
+
+def test_values_are_read_by_hydras_grammar(folder):
+    found = load_sweep("probe/big", ["size=range(1,4)", "log='a,b',c", "outcome=done,failed"], root=folder)
+    assert (found.grid["size"], found.grid["log"], found.grid["outcome"]) == (
+        [1, 2, 3],
+        ["a,b", "c"],
+        ["done", "failed"],
+    )
+
+
+def test_nested_fields_and_the_librarys_own_settings_are_swept():
+    found = load_sweep("alignment/sigma_range_smoke", ["schedule.start=0.04,0.06", "config.outlier=1.0,limit"])
+    trials = planned_trials(found)
+    assert {trial.config["schedule"]["start"] for trial in trials} == {0.04, 0.06}
+    assert {trial.config["config"]["outlier"] for trial in trials} == {1.0, "limit"}
+    found = load_sweep(
+        "registration/grid_bones_smoke", ["grid_resolution=20,40,80", "config.refine.smoothness=0.1,0.5"]
+    )
+    assert {trial.config["grid_resolution"] for trial in planned_trials(found)} == {20, 40, 80}
+    assert {trial.config["config"]["refine"]["smoothness"] for trial in planned_trials(found)} == {0.1, 0.5}
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("schedule.strt=0.04,0.06", r"unknown key trial.schedule.strt; .* kappa, kind, start, steps, stop; did you"),
+        ("schedule.start=0.04,-1", "schedule.start was given on the command line, .*: kappa, kind, start, steps, stop"),
+        ("schedule.start=-1", "schedule.start was given on the command line, .*: kappa, kind, start, steps, stop"),
+        ("schedule.start=0.04,wide", "trial.schedule.start must be a number, got str 'wide'; .* kappa, kind, start"),
+        ("schedule.start=", "schedule.start is given no value; write schedule.start=VALUE, or .* to sweep it"),
+        ("schedule.start=,", "schedule.start is given no value"),
+        ("seeds=1,2", "seeds takes one value"),
+        ("schedule.start.more=1,2", "unknown key trial.schedule.start.more"),
+        ("config.outlir=1,2", "unknown key trial.config.outlir; known keys of trial.config: .*did you mean outlier"),
+        ("config.outlier=-1.0,2.0", "trial.config.outlier: outlier must be positive .*; known keys of"),
+        ("config.schedule.values=1,2", "unknown key trial.config.schedule.values"),
+    ],
+)  # fmt: skip
+def test_a_wrong_sweep_is_told_with_the_fields_beside_it(override, message):
+    with pytest.raises(ConfigError, match=message):
+        load_sweep("alignment/sigma_range_smoke", [override])
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("grid_resolution=20,1000", "grid_resolution must be at most 256, got 1000; .*: config, grid"),
+        ("num_bones=0,4", "num_bones must be at least 1, got 0"),
+        ("config.num_samples=0,4", "num_samples must be at least 1"),
+    ],
+)  # fmt: skip
+def test_values_out_of_range_are_told_before_anything_runs(override, message):
+    with pytest.raises(ConfigError, match=message):
+        load_sweep("registration/grid_bones_smoke", [override])
+
+
 def test_files_are_composed_and_checked(folder):
     big, small = load_sweep("probe/big", root=folder), load_sweep("probe/small", root=folder)
     assert (big.name, big.trial.size, big.seeds) == ("probe/big", 16, 5)
@@ -50,7 +118,7 @@ def test_overrides_reach_every_field(folder):
         ("seeds", "write key=value"),
         ("~trial.size=1", "write key=value"),
         ("trial.size=[1", "big.yaml cannot be read"),
-        ("task=sculpture", "unknown task 'sculpture'; known tasks: alignment, neural_init, probe, registration, spine"),
+        ("task=sculpture", "unknown task 'sculpture'; known tasks: alignment, neural_init, papers, probe"),
         ("report.colour=red", "unknown key report.colour; known keys of report: curve_log"),
     ],
 )

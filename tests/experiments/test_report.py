@@ -12,7 +12,9 @@ from experiments.plan import planned_trials
 from experiments.records import TrialRecord, provenance
 from experiments.report import charts
 from experiments.report.cells import cells_of, marginal
+from experiments.report.charts import lines_over
 from experiments.report.page import write_report
+from experiments.report.plots import save_plots
 from experiments.schema import ProbeTrial, ReportConfig
 
 PIXEL = base64.b64decode(
@@ -91,6 +93,18 @@ def test_cells_hold_medians_and_quartiles_over_seeds(store, grid):
     assert marginal(cells, "scale", "error_mm", share=False) == {"1": 14, "2": 24, "4": 44}
 
 
+def test_plots_over_axes_of_numbers_are_one_picture(store, grid, tmp_path):
+    fill(store, grid, lambda config: config["scale"] + config["rounds"])
+    path = save_plots(grid, store, tmp_path / "plots.png")
+    assert path.stat().st_size > 5000
+    records = {record.id: record for record in store.records()[0]}
+    found = lines_over(grid, cells_of(grid, planned_trials(grid), records), "error_mm", "scale")
+    assert all(
+        low <= at <= high for line in found for low, at, high in zip(line.low, line.middle, line.high, strict=True)
+    )
+    assert all(line.middle == sorted(line.middle) for line in found)
+
+
 def test_the_page_is_one_file_that_shows_everything(store, grid):
     fill(store, grid, lambda config: config["scale"] + config["rounds"])
     reader = read(write_report(grid, store, store.root / "report.html"))
@@ -105,7 +119,7 @@ def test_the_page_is_one_file_that_shows_everything(store, grid):
     ):
         assert text in reader.text
     page = (store.root / "report.html").read_text()
-    assert page.count('class="plotly-graph-div"') == 2  # a heat map and a curve
+    assert page.count('class="plotly-graph-div"') == 4  # a heat map, a line plot per axis of numbers, and a curve
     assert len(page) > 4_000_000  # Plotly itself lies in the page
 
 

@@ -4,6 +4,7 @@ import ast
 import importlib.util
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -137,6 +138,43 @@ def test_scans_from_a_file(tmp_path, bench):
         SkippedTrial, match=r"there is no file .*gone.npz; say where the data lie with pair.folder=FOLDER"
     ):
         registration.make_problem(replace(stored, name="gone"), 0)
+
+
+@pytest.mark.parametrize("dataset", ["robot", "car", "hand"])
+def test_pairs_of_the_papers_kinds_have_exact_truth(dataset):
+    pair = ScanPairConfig(dataset=dataset, num_points=700, frames=4, frame=2)
+    problem = registration.make_problem(pair, 0)
+    spacing = problem.target.spacing
+    # Of points that the target sees, most have a neighbor there; the others are hidden.
+    gaps = torch.cdist(problem.truth, problem.target.points).amin(1)
+    assert float(gaps.median()) < spacing
+    still = registration._accuracy(problem, problem.source.points)
+    assert registration._accuracy(problem, problem.truth)["error_percent"] == 0
+    assert still["motion_percent"] > 0.5
+    assert not torch.equal(registration.make_problem(replace(pair, frame=1), 0).source.points, problem.source.points)
+
+
+def test_pairs_that_are_not_registered_are_tried_again_with_other_parameters(monkeypatch):
+    problem, tried = registration.make_problem(ScanPairConfig(num_points=500), 0), []
+
+    def register(source, target, *, num_bones, config, grid_resolution, generator):
+        tried.append((config.printed.max_distance, grid_resolution, generator.initial_seed()))
+        return SimpleNamespace(deformed=problem.truth if len(tried) == 3 else source.points + source.diagonal)
+
+    monkeypatch.setattr(registration.tr, "register", register, raising=False)
+    trial = RegistrationTrial(method="paper", retries=5)
+    assert registration._registered(problem, trial)[1] == 3
+    assert len(set(tried)) == 3
+    assert tried[0] == (20.0, 50, 0)
+    tried.clear()
+    assert registration._registered(problem, replace(trial, retries=0))[1] == 1
+
+
+def test_settings_of_the_library_are_reached_by_their_names():
+    changed = registration._settings(RegistrationTrial(config={"refine": {"smoothness": 0.3}, "max_angle": [1.0, 0.4]}))
+    assert (changed.refine.smoothness, changed.max_angle) == (0.3, (1.0, 0.4))
+    printed = registration._settings(RegistrationTrial(method="paper", config={"printed.max_distance": 30.0}))
+    assert printed == tr.RegisterConfig.paper(printed=replace(tr.RegisterConfig.paper().printed, max_distance=30.0))
 
 
 def test_errors_of_scans_leave_out_parts_that_the_target_lacks():

@@ -14,6 +14,7 @@ from torchreg.viz.bone_colors import bone_palette
 from torchreg.viz.figures import new_figure
 from torchreg.viz.spines import (
     draw_spine_frame,
+    draw_tip_distance,
     save_skeleton_picture,
     save_spine_movie,
     save_spine_pictures,
@@ -77,3 +78,24 @@ def test_a_single_skeleton_is_drawn_in_its_surface(tmp_path):
 def test_every_frame_needs_its_surface(spine, tmp_path):
     with pytest.raises(InputError, match=r"one surface per frame \(2\), got 1"):
         save_spine_movie(tmp_path / "a.gif", spine, [SPHERE])
+
+
+def test_distances_from_a_tip_go_from_cold_to_warm_and_levels_alternate():
+    ball, tip = unit_sphere(4), torch.tensor([0.0, 0.0, 2.0])
+    view, pictures = spine_view([ball], size=(320, 320)), {}
+    for levels in (None, 6):
+        _, (ax,) = new_figure(160, 160)
+        draw_tip_distance(ax, ball, tip, view=view, levels=levels)
+        picture = np.asarray(ax.images[0].get_array())
+        solid = np.flatnonzero(picture[:, picture.shape[1] // 2, 3] > 0.95)
+        pictures[levels] = picture[solid[6] : solid[-6], picture.shape[1] // 2, :3]
+    # The picture shows +z above: blue near the tip, red far from it.
+    (red, _, blue), (far_red, _, far_blue) = pictures[None][0], pictures[None][-1]
+    assert blue > red
+    assert far_red > far_blue
+
+    def peaks(column):
+        smooth = np.convolve(column.sum(-1), np.ones(5) / 5, "valid")
+        return int(((smooth[1:-1] > smooth[:-2]) & (smooth[1:-1] > smooth[2:])).sum())
+
+    assert peaks(pictures[6]) > peaks(pictures[None])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -58,7 +59,7 @@ class AlignConfig:
         inlier_distance: data nearer to the fitted surface are inliers, metres; 2 % of the model's size by default.
         correspondence: rule that matches model points and data: "em", the posterior; for comparison "softassign", one
             to one, or "closest", the closest point as in ICP, trimmed at 1.5 sigma.
-        outlier: "limit" for c = 3 sqrt(pi / 2), "volume" for eq. 18 with the working volume.
+        outlier: "limit" for c = 3 sqrt(pi / 2), "volume" for eq. 18 with the working volume, or a positive c itself.
         debias: share of the shrinkage of the model by a wide kernel alone that is taken out of the EM's targets; 0 is
             the paper's EM, which shrinks the model while sigma is wide.
         prior_std: standard deviation of a weak prior that holds joints near the initial pose, radians (of the whole
@@ -79,7 +80,7 @@ class AlignConfig:
     search_rounds: int = 2
     inlier_distance: float | None = None
     correspondence: str = "em"
-    outlier: str = "limit"
+    outlier: str | float = "limit"
     debias: float = 0.8
     prior_std: float | None = 0.3
     num_model_points: int = 500
@@ -91,7 +92,10 @@ class AlignConfig:
     def __post_init__(self) -> None:
         check_choice(self.search, "search", ("auto", "always", "never"))
         check_choice(self.correspondence, "correspondence", tuple(CORRESPONDENCES))
-        check_choice(self.outlier, "outlier", ("limit", "volume"))
+        if isinstance(self.outlier, str):
+            check_choice(self.outlier, "outlier", ("limit", "volume"))
+        else:
+            check_positive(self.outlier, "outlier")
         check_choice(self.nan_policy, "nan_policy", ("raise", "omit"))
         for name in ("em_steps", "m_steps", "num_candidates", "search_rounds", "num_model_points"):
             check_count(getattr(self, name), name, 1)
@@ -103,6 +107,24 @@ class AlignConfig:
         for name in ("inlier_distance", "prior_std"):
             if getattr(self, name) is not None:
                 check_positive(getattr(self, name), name)
+
+    @classmethod
+    def paper(cls, **changes: Any) -> AlignConfig:
+        """Return the alignment as printed, of which some fields may be changed.
+
+        One EM iteration per sigma with its M-step solved, no correction of the kernel's shrinkage, no prior and no
+        search, then the surface fit; data within 5 mm are inliers, as of a hand. Start from the pose of the frame
+        before, as the paper does.
+
+        Args:
+            changes: fields by name.
+
+        References: Dewaele et al. 2006, section 3.
+        """
+        printed = cls(
+            em_steps=1, m_steps=10, surface_steps=5, search="never", inlier_distance=0.005, debias=0.0, prior_std=None
+        )
+        return replace(printed, **changes)
 
 
 def align(

@@ -151,9 +151,11 @@ def _tempered_prior(problem: AlignProblem, matches: EStep) -> GaussianPosePrior:
 
 
 def outlier_level(problem: AlignProblem, posed: Tensor, sigma: Tensor) -> Tensor | float:
-    """Return c of eq. 18 as the problem's settings have it: (B,) with the working volume, or its limit."""
+    """Return c of eq. 18 as the problem's settings have it: (B,) with the working volume, its limit, or a number."""
     if problem.outlier == "limit":
         return OUTLIER_CONSTANT
+    if not isinstance(problem.outlier, str):
+        return problem.outlier
     return outlier_constant(posed.shape[-2], sigma, working_volume(posed, problem.data, sigma, problem.valid))
 
 

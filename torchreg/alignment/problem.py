@@ -63,7 +63,7 @@ class AlignProblem:
         upper: limits of the pose, (num_dofs,) or (B, num_dofs).
         prior: on the joints.
         pose_atol: largest change of a pose that counts as none.
-        outlier: "limit" or "volume".
+        outlier: "limit", "volume", or c.
         debias: share of the kernel's shrinkage that is taken out of the targets of the EM.
         correspondence: one of `CORRESPONDENCES`.
     """
@@ -78,7 +78,7 @@ class AlignProblem:
     upper: Tensor
     prior: GaussianPosePrior
     pose_atol: float
-    outlier: str = "limit"
+    outlier: str | float = "limit"
     debias: float = 0.0
     correspondence: str = "em"
 
@@ -171,7 +171,7 @@ def centered_problem(
     *,
     prior_std: float | None,
     pose_atol: float,
-    outlier: str = "limit",
+    outlier: str | float = "limit",
     debias: float = 0.0,
     correspondence: str = "em",
 ) -> AlignProblem:
@@ -185,7 +185,7 @@ def centered_problem(
         origin: (B, 3), as from `masked_mean`.
         prior_std: see `AlignConfig`, like the settings below.
         pose_atol: largest change of a pose that counts as none.
-        outlier: "limit" or "volume".
+        outlier: "limit", "volume", or c.
         debias: share of the kernel's shrinkage that is taken out of the targets of the EM.
         correspondence: one of `CORRESPONDENCES`.
     """

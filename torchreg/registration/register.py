@@ -23,6 +23,7 @@ from torchreg.registration.bones.sparse_grid import MAX_RESOLUTION, SparseGrid
 from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.align_scans import align_scans
 from torchreg.registration.normalization import Normalization
+from torchreg.registration.paper.algorithm import PaperFit
 from torchreg.registration.results import RegisterRecord, ScanRegistration
 from torchreg.result import Status
 
@@ -47,7 +48,7 @@ def register(
     ``D(x) = sum_j w_j(x) (R_j x + t_j)``, the weights interpolated on a sparse grid around the source. Unlike the
     paper, which starts from a random segmentation and spin images, a dense alignment by a deformation graph comes
     first: see `align_scans`. Parts that move rigidly in it become the first bones; then motions, correspondences and
-    labels are solved in turn, and last continuous weights with the motions.
+    labels are solved in turn, and last continuous weights with the motions. `RegisterConfig.paper` is the paper's way.
 
     Units change nothing, and turns and shifts of both scans nothing beyond rounding. Computed in double precision on
     the CPU; the result has the dtype and device of the source.
@@ -69,7 +70,8 @@ def register(
         a `ScanRegistration`.
 
     Raises:
-        InputError: if a number is out of range or not finite, or a shape does not fit.
+        InputError: if a number is out of range or not finite, a shape does not fit, or the paper's way is given a start
+            or parts.
         InputTypeError: if a scan is none.
 
     Warns:
@@ -87,6 +89,8 @@ def register(
     degenerate = warn_about_degenerate((source, target), stacklevel=4)
     _check_start(source, start, confidence)
     parts = None if parts is None else _checked_parts(source, parts, num_bones)
+    if config.printed is not None:
+        _check_no_start(start, parts)
     clock = _Clock()
     index = source_samples(source, config, generator)
     normalization = Normalization.from_points(source.points[index])
@@ -95,6 +99,13 @@ def register(
     grid = SparseGrid.from_points(normalized_source.points, grid_resolution)
     data = CellData(grid, normalized_source.points[index], config.num_patches)
     clock.lap()
+    if config.printed is not None:
+        paper = PaperFit(
+            data, normalized_source, index, normalization.normalize_scan(target), config, config.printed,
+            num_bones=num_bones, generator=generator or torch.Generator().manual_seed(0), on_step=on_step,
+        )  # fmt: skip
+        converged = _fit_as_printed(paper, clock)
+        return _scan_registration(source, normalized_source, normalization, paper, converged, clock.seconds)
     # Line 2: a first alignment of all points.
     if start is None:
         aligned = align_scans(source, target, config.align, generator=generator, on_step=initial_records(on_step))
@@ -115,11 +126,22 @@ def register(
     return _scan_registration(source, normalized_source, normalization, fit, converged, degenerate, clock.seconds)
 
 
+def _fit_as_printed(fit: PaperFit, clock: _Clock) -> bool:
+    """Run algorithm 1, its stages timed, and return whether it converged."""
+    fit.start()
+    clock.lap()
+    converged = fit.fit_labels()
+    clock.lap()
+    converged = fit.refine() and converged
+    clock.lap()
+    return converged
+
+
 def _scan_registration(
     source: RangeScan,
     normalized_source: RangeScan,
     normalization: Normalization,
-    fit: ReducedFit,
+    fit: ReducedFit | PaperFit,
     converged: bool,
     degenerate: bool,
     seconds: Tensor,
@@ -235,6 +257,16 @@ def _checked_parts(source: RangeScan, parts: Any, num_bones: int) -> Tensor:
             f"parts must be from 0 to num_bones - 1 = {num_bones - 1}, got {int(parts.min())} to {int(parts.max())}"
         )
     return parts.detach().cpu().long()
+
+
+def _check_no_start(start: Any, parts: Any) -> None:
+    """Raise if the algorithm as printed is given what replaces its own first steps."""
+    for name, value in (("start", start), ("parts", parts)):
+        if value is not None:
+            raise InputError(
+                f"{name} cannot be used by RegisterConfig.paper(), which begins with a random segmentation and spin "
+                f"images; leave out {name}, or use RegisterConfig()"
+            )
 
 
 def _check_start(source: RangeScan, start: Any, confidence: Any) -> None:

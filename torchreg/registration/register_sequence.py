@@ -165,6 +165,11 @@ def register_sequence(
     References: Chang and Zwicker 2009, section 6, which asks for a simultaneous optimization.
     """
     config = RegisterConfig() if config is None else config
+    if config.printed is not None:
+        raise InputError(
+            "config must be a RegisterConfig without printed, got one of RegisterConfig.paper(), which registers pairs "
+            "only, as the paper does; call register for each pair"
+        )
     scans = tuple(scans)
     if len(scans) < 2:
         raise InputError(f"scans must hold at least two, got {len(scans)}")

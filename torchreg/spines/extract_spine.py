@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -26,6 +27,7 @@ from torchreg.spines.observed_limbs import (
     reject_odd_lengths,
     smooth_rough_limbs,
 )
+from torchreg.spines.paper.rigid_tracking import track_tips_rigidly
 from torchreg.spines.prior import PriorSkeleton
 from torchreg.spines.results import SpineRecord, SpineSequence
 from torchreg.spines.skeletonize import SkeletonizeConfig
@@ -41,16 +43,34 @@ class SpineConfig:
         num_tips: number K of tips; None: the most frequent one.
         num_samples: points along each limb, both ends included.
         skeletons: how each frame is skeletonized.
+        printed: tips are identified as in the paper, by rigid fits of their positions alone to a reference frame, see
+            `track_tips_rigidly`; by default also by turns, lengths and curves, from frame to frame.
     """
 
     num_tips: int | None = None
     num_samples: int = 24
     skeletons: SkeletonizeConfig = field(default_factory=SkeletonizeConfig)
+    printed: bool = False
 
     def __post_init__(self) -> None:
         if self.num_tips is not None:
             check_count(self.num_tips, "num_tips", 2)
         check_count(self.num_samples, "num_samples", 3)
+
+    @classmethod
+    def paper(cls, **changes: Any) -> SpineConfig:
+        """Return spines as printed, of which some fields may be changed.
+
+        Bins of vertices, 100 of them; trees merged from the tips inward; tips identified by eqs. 6-8 alone. The most
+        frequent tree is imposed on all frames as by default, and limbs that a frame hides are transferred, of which the
+        paper says nothing.
+
+        Args:
+            changes: fields by name.
+
+        References: Brostow, Essa, Steedly and Kwatra 2004, sections 4.1 and 4.2.
+        """
+        return replace(cls(skeletons=SkeletonizeConfig(printed=True), printed=True), **changes)
 
 
 def extract_spine(
@@ -92,7 +112,8 @@ def extract_spine(
 
     Raises:
         InputError: if there is no frame, one of them has no surface (names it), no frame shows ``num_tips`` limbs,
-            ``times`` do not fit, or the prior has fewer tips than most frames and ``num_tips`` does not say so.
+            ``times`` do not fit, the prior has fewer tips than most frames and ``num_tips`` does not say so, or a prior
+            is given to the paper's way.
         InputTypeError: if something else than meshes is given, or another prior than a skeleton or a spine.
         SolverError: if a worker process is killed twice.
 
@@ -106,6 +127,10 @@ def extract_spine(
     meshes = _check_meshes(meshes)
     if workers is not None:
         check_count(workers, "workers", 1)
+    if prior is not None and config.printed:
+        raise InputError(
+            "prior cannot be used by SpineConfig.paper(), which knows of none; leave it out, or use SpineConfig()"
+        )
     known = None if prior is None else PriorSkeleton.from_given(prior, config.num_tips)
     first = meshes[0].vertices
     warn_about_rounding(first, "meshes", float((first.amax(0) - first.amin(0)).norm()), stacklevel=2)
@@ -114,7 +139,7 @@ def extract_spine(
         skeletons = skeletonize_frames(meshes, config.skeletons, workers=workers, on_step=on_step, progress=progress)
         skeletons = [smooth_rough_limbs(skeleton) for skeleton in skeletons]
         known = known and known.fitted(skeletons, config.num_tips)
-        labels, reference, graph = _named_tips(skeletons, config.num_tips, known)
+        labels, reference, graph = _named_tips(skeletons, config, known)
         observed = _observed_limbs(skeletons, labels, graph, config.num_samples, known)  # section 4.3: G imposed
         limbs = _all_limbs(observed, graph, meshes, known, reference)
         curves, radii = (torch.stack([getattr(frame, name) for frame in limbs]) for name in ("curves", "radii"))
@@ -158,12 +183,13 @@ def _check_meshes(meshes: Sequence[TriangleMesh]) -> list[TriangleMesh]:
 
 
 def _named_tips(
-    skeletons: Sequence[Skeleton], num_tips: int | None, prior: PriorSkeleton | None
+    skeletons: Sequence[Skeleton], config: SpineConfig, prior: PriorSkeleton | None
 ) -> tuple[Tensor, int, LimbGraph]:
     """Return the labels (T, K) of the tips, the frame from which they were tracked, and the graph of the limbs."""
     if prior is not None:
         return *track_tips(skeletons, prior=prior.skeleton), prior.graph
-    labels, reference = track_tips(skeletons, num_tips)  # section 4.2, eqs. 6-8
+    track = track_tips_rigidly if config.printed else track_tips
+    labels, reference = track(skeletons, config.num_tips)  # section 4.2, eqs. 6-8
     return labels, reference, _most_frequent_graph(skeletons, labels)  # section 4.3: the first factor of eq. 3
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,12 +18,14 @@ from torchreg.geometry.surface_graph import PIECES, coarsened, one_piece
 from torchreg.spines.centering import centered_curves
 from torchreg.spines.curves import align_frames, tangents
 from torchreg.spines.labeled_tree import Tips
-from torchreg.spines.level_sets import MeshEdges, level_sets
-from torchreg.spines.limb_curves import JunctionBall, best_rings, largest_cost, limb_curve
+from torchreg.spines.level_sets import LevelSets, MeshEdges, level_sets
+from torchreg.spines.limb_curves import JunctionBall, Rings, best_rings, largest_cost, limb_curve
 from torchreg.spines.limb_placement import Interior
 from torchreg.spines.loops import OpenedLoops, open_loops
+from torchreg.spines.paper.metanodes import metanode_junctions
+from torchreg.spines.paper.vertex_level_sets import vertex_level_sets
 from torchreg.spines.protrusions import average_geodesic_distance, find_protrusions
-from torchreg.spines.tip_trees import TipTree, consensus_junctions, grow_tip_tree
+from torchreg.spines.tip_trees import TipTree, consensus_junctions, estimate_junction, grow_tip_tree
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,8 @@ class SkeletonizeConfig:
         overlap: junctions closer to each other than this times the sum of their widths are one.
         max_vertices: larger surfaces are coarsened first.
         pieces: for loose parts: keep the "largest", "bridge" the gaps, or raise an "error".
+        printed: as in the paper: bins of vertices instead of curves on the surface, trees merged from the tips inward
+            instead of by majority, nodes left at the centers of their bins.
 
     Raises:
         InputError: if a number is out of range or ``pieces`` is unknown.
@@ -48,6 +52,7 @@ class SkeletonizeConfig:
     overlap: float = 2 / 3
     max_vertices: int = 16_000
     pieces: str = "largest"
+    printed: bool = False
 
     def __post_init__(self) -> None:
         check_positive(self.min_protrusion, "min_protrusion")
@@ -101,9 +106,13 @@ def skeletonize(mesh: TriangleMesh, config: SkeletonizeConfig | None = None) -> 
     config = SkeletonizeConfig() if config is None else config
     body = _prepared(mesh, config)
     tips = _find_tips(body, config)  # section 4.1: maxima of the average geodesic distance
-    trees = _grow_trees(body, tips)  # "Growing Skeletons": rings of the distance from each tip
-    junctions = consensus_junctions(trees, config.overlap)  # "Merging Skeletons", figure 3B
+    # "Growing Skeletons": rings of the distance from each tip; "Merging Skeletons", figure 3B.
+    trees = _grow_trees(body, tips, vertex_level_sets if config.printed else level_sets)
+    junctions = metanode_junctions(trees) if config.printed else consensus_junctions(trees, config.overlap)
     interior = Interior(body.mesh)
+    if config.printed:
+        metanodes = [JunctionBall(estimate_junction(junction, trees)[0], 0.0) for junction in junctions]
+        return _assembled(_best_limbs(trees, junctions, metanodes, None, tips), interior, tips, mesh.vertices)
     balls = [interior.junction_ball(junction, trees) for junction in junctions]
     limbs = _best_limbs(trees, junctions, balls, interior, tips)  # eq. 4 and 5
     limbs = _centered_limbs(limbs, body.mesh, interior, tips)
@@ -205,11 +214,13 @@ def _farthest_pair(graph: GeodesicGraph, start: Tensor) -> Tensor:
     return torch.stack((far, graph.distances(far[None])[0].argmax()))
 
 
-def _grow_trees(body: _Body, tips: _SurfaceTips) -> list[TipTree]:
+def _grow_trees(
+    body: _Body, tips: _SurfaceTips, rings_of: Callable[[MeshEdges, Tensor, float], LevelSets]
+) -> list[TipTree]:
     """Return the tree of rings of each tip."""
     edges, trees = MeshEdges(body.mesh), []
     for root, distances in enumerate(tips.distances):
-        sets = level_sets(edges, distances, tips.spacing)
+        sets = rings_of(edges, distances, tips.spacing)
         trees.append(grow_tip_tree(sets, sets.vertex_bands[tips.vertices], root, sets.vertex_bands[body.bridges]))
     return trees
 
@@ -233,17 +244,25 @@ def _best_limbs(
     trees: Sequence[TipTree],
     junctions: Sequence[tuple[Tips, ...]],
     balls: Sequence[JunctionBall],
-    interior: Interior,
+    interior: Interior | None,
     tips: _SurfaceTips,
 ) -> list[_Limb]:
-    """Return every limb as a curve through the rings of the tree in which they are best."""
+    """Return every limb as a curve through the rings of the tree in which they are best.
+
+    Its ends are moved inside the body, if there is an interior.
+    """
+
+    def cap(tip: int, rings: Rings) -> tuple[Tensor, Rings]:
+        position = tips.positions[tip]
+        return (position, rings) if interior is None else interior.cap_limb(position, rings)
+
     num_tips, limbs, cost = len(trees), [], largest_cost(trees)
     for beyond, (near, far) in _limb_ends(junctions, num_tips).items():
         start, end = (None if junction is None else balls[junction] for junction in (near, far))
         rings = best_rings(beyond, trees, start, end, cost)
-        first, rings = interior.cap_limb(tips.positions[0], rings) if start is None else (start.center, rings)
+        first, rings = cap(0, rings) if start is None else (start.center, rings)
         rings = rings.flip()
-        last, rings = interior.cap_limb(tips.positions[min(beyond)], rings) if end is None else (end.center, rings)
+        last, rings = cap(min(beyond), rings) if end is None else (end.center, rings)
         points, frames = limb_curve(first, rings.flip(), last, tips.spacing)
         ends = (0 if near is None else num_tips + near, min(beyond) if far is None else num_tips + far)
         if far is None and near is not None:

@@ -67,8 +67,7 @@ def track_tips(
     elif num_tips is None:
         num_tips = most_frequent_count([len(skeleton.tips) for skeleton in skeletons])
     clean = _clean_frames(skeletons, num_tips, None if prior is None else prior.topology)
-    runs = _runs(clean)
-    longest = max(runs, key=lambda run: (run[1] - run[0], -run[0]))
+    runs, longest = _runs(clean), longest_run(clean)
     middles = [(a + b - 1) // 2 for a, b in runs if b - a >= _TRACKING.min_run]
     tracker = _TipTracker(skeletons, num_tips, middles)
     if prior is None:
@@ -86,6 +85,11 @@ def most_frequent_count(counts: Sequence[int]) -> int:
     """Return the most frequent number of tips; of several, the largest: limbs hide more often than they grow."""
     frequency = Counter(counts)
     return max(frequency, key=lambda count: (frequency[count], count))
+
+
+def longest_run(flags: Sequence[bool]) -> tuple[int, int]:
+    """Return the first frame and the end of the longest run of True, the earliest of several."""
+    return max(_runs(flags), key=lambda run: (run[1] - run[0], -run[0]))
 
 
 def has_loops(skeleton: Skeleton) -> bool:

@@ -57,6 +57,9 @@ class TipTree:
             branch = self.last_common([tip for tip in triple if tip != self.root])
         else:
             branch = min((self.last_common(pair) for pair in combinations(triple, 2)), key=lambda row: len(row.tips))
+        if not len(branch.rings):
+            # Paths that diverge within the root's own band meet before their first ring.
+            return int(next(row.rings[0] for row in self.branches if len(row.rings)))
         return int(branch.rings[-1])
 
     def junction_rings(self, junction: tuple[Tips, ...]) -> Tensor:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from typing import Any
 
 from torchreg._checks import check_choice, check_count, check_positive
 
@@ -57,3 +59,27 @@ class TrackConfig:
         if self.sharpness is not None:
             check_positive(self.sharpness, "sharpness")
         check_positive(self.debias, "debias", allow_zero=True)
+
+    @classmethod
+    def paper(cls, **changes: Any) -> TrackConfig:
+        """Return tracking as printed, of which some fields may be changed.
+
+        Model points are the data of the frame before that are within 5 mm of the surface, in the pose there, which is
+        also where each frame starts; one EM iteration per sigma, without prior, correction of the kernel's shrinkage or
+        recovery. The prior cannot be left out, but is as wide as a turn.
+
+        Args:
+            changes: fields by name.
+
+        References: Dewaele et al. 2006, sections 3 and 5.
+        """
+        printed = cls(
+            model_points="data",
+            prediction="none",
+            surface_steps=5,
+            prior_std=math.tau,
+            inlier_distance=0.005,
+            recovery="none",
+            debias=0.0,
+        )
+        return replace(printed, **changes)

@@ -11,13 +11,14 @@ import torch
 from torch import Tensor
 
 from torchreg.errors import InputError
+from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.geometry.visibility import View
 from torchreg.spines.results import SpineSequence
 from torchreg.viz.animation import save_animation
-from torchreg.viz.bone_colors import bone_palette
-from torchreg.viz.figures import draw_rendered, new_figure, picture_size, render_mesh, save_picture, watch
+from torchreg.viz.bone_colors import bone_palette, scale_colors
+from torchreg.viz.figures import draw_mesh, draw_rendered, new_figure, picture_size, render_mesh, save_picture, watch
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,6 +31,11 @@ class _SpinePicture:
     gray: float = 0.82  # of the surface, from 0 to 1
     opacity: float = 0.45  # of the surface
     num_samples: int = 64  # points per limb of a single skeleton
+    # Colors of geodesic distances from the tip to the farthest point.
+    distances: tuple[tuple[float, float, float], ...] = (
+        (0.15, 0.25, 0.6), (0.2, 0.65, 0.7), (0.95, 0.9, 0.4), (0.85, 0.25, 0.15),
+    )  # fmt: skip
+    dark: float = 0.55  # brightness of every second level set
 
 
 _STYLE = _SpinePicture()
@@ -60,6 +66,29 @@ def draw_spine_frame(
             x, y = pixels[0].tolist()
             ax.plot([x], [y], "o", color=color, markersize=6, zorder=3)
             ax.annotate(str(limb), (x, y), xytext=(4, -4), textcoords="offset points", fontsize=7, zorder=4)
+
+
+def draw_tip_distance(ax: Axes, mesh: TriangleMesh, tip: Tensor, *, view: View, levels: int | None = None) -> None:
+    """Draw a surface in the colors of the geodesic distance from a tip.
+
+    Args:
+        ax: matplotlib axes.
+        mesh: the surface.
+        tip: (3,) the vertex nearest to it is where distances begin.
+        view: see `spine_view`.
+        levels: number of level sets, drawn light and dark in turn; None draws the distance itself.
+
+    References: Brostow, Essa, Steedly and Kwatra 2004, figures 2 and 6.
+    """
+    start = (mesh.vertices - tip.to(mesh.vertices)).norm(dim=-1).argmin()
+    share = GeodesicGraph.from_mesh(mesh).distances(start[None])[0].float()
+    share = share / share.max().clamp_min(torch.finfo(share.dtype).tiny)
+    if levels is None:
+        draw_mesh(ax, mesh, view, scale_colors(share, _STYLE.distances))
+        return
+    level = (share * levels).floor().clamp(max=levels - 1)
+    shade = torch.where(level % 2 == 0, 1.0, _STYLE.dark)
+    draw_mesh(ax, mesh, view, shade[:, None] * scale_colors(level / levels, _STYLE.distances))
 
 
 def spine_view(

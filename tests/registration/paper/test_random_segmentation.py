@@ -1,0 +1,74 @@
+"""Seeds far apart, cells that follow the nearest one, and unused labels for halves of the worst regions."""
+
+import pytest
+import torch
+
+from torchreg.registration.bones.labels import CellData
+from torchreg.registration.bones.sparse_grid import SparseGrid
+from torchreg.registration.paper.segmentation import best_candidates, nearest_seed, reuse_labels
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+@pytest.fixture(scope="module")
+def sheet():
+    """A flat square of 20 x 20 cells, each with some samples."""
+    points = torch.rand(4000, 3, generator=generator(), dtype=torch.float64) * torch.tensor([1.0, 1.0, 0.02])
+    return CellData(SparseGrid.from_points(points, 20, frame="world"), points)
+
+
+def closest_pair(points):
+    return float((torch.cdist(points, points) + 10 * torch.eye(len(points))).min())
+
+
+def test_best_candidates_lie_farther_apart_than_random_points(sheet):
+    best = [closest_pair(sheet.points[best_candidates(sheet.points, 12, generator(seed))]) for seed in range(10)]
+    plain = [closest_pair(sheet.points[torch.randperm(4000, generator=generator(seed))[:12]]) for seed in range(10)]
+    assert min(best) > 0.12
+    assert sum(best) > 2 * sum(plain)
+
+
+def test_seeds_are_those_of_the_generator(sheet):
+    first, again, other = (best_candidates(sheet.points, 7, generator(seed)) for seed in (3, 3, 4))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+
+
+def test_fewer_points_than_seeds_give_as_many_seeds():
+    assert best_candidates(torch.zeros(2, 3), 5, generator()).shape == (5,)
+
+
+def test_the_nearest_seed_is_that_of_a_search_through_all(sheet):
+    seeds = sheet.points[:9]
+    found = nearest_seed(sheet.points[:50], seeds)
+    for point, label in zip(sheet.points[:50], found.tolist(), strict=True):
+        assert label == min(range(9), key=lambda seed: float((point - seeds[seed]).norm()))
+
+
+def split(sheet, squares, num_bones, least=0.01):
+    labels = (sheet.grid.cell_centers()[:, 0] > 0.5).long()
+    return labels, reuse_labels(sheet, squares, labels, num_bones, least_error=least, generator=generator())
+
+
+def test_the_region_with_the_largest_error_is_halved(sheet):
+    squares = torch.where(sheet.points[:, 0] > 0.5, 0.04, 0.0).double()
+    before, after = split(sheet, squares, 3)
+    new, old = after == 2, before == 1
+    assert torch.equal(after[~old], before[~old])
+    assert bool(old[new].all())
+    assert 0.2 < float(new.sum()) / float(old.sum()) < 0.8
+    # Halves of the nearest of two seeds are parted by a plane.
+    centers = sheet.grid.cell_centers()
+    normal = centers[new].mean(0) - centers[old & ~new].mean(0)
+    near, far = centers[old & ~new] @ normal, centers[new] @ normal
+    assert float((near > far.min()).float().mean()) < 0.25
+
+
+def test_labels_end_when_errors_are_small_or_all_are_used(sheet):
+    good = torch.full((4000,), 1e-5, dtype=torch.float64)
+    before, after = split(sheet, good, 6)
+    assert torch.equal(before, after)
+    _, after = split(sheet, torch.full((4000,), 0.04, dtype=torch.float64), 6)
+    assert after.unique().tolist() == list(range(6))

@@ -1,0 +1,233 @@
+"""Algorithm 1 of Chang and Zwicker 2009 as printed: random segmentation, spin images, T-steps and W-steps in turn."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.range_scan import RangeScan
+from torchreg.registration.annealing import geometric_at
+from torchreg.registration.bones.alternation import turned_normals
+from torchreg.registration.bones.closest_compatible import CompatibleMatcher, CompatibleMatches
+from torchreg.registration.bones.config import BoneConfig, OnRegisterStep
+from torchreg.registration.bones.correspondences import Correspondences
+from torchreg.registration.bones.grid_lbs import GridLBS
+from torchreg.registration.bones.grid_losses import JointEnergy
+from torchreg.registration.bones.joint_moments import NEGLIGIBLE, JointMoments
+from torchreg.registration.bones.labels import CellData, LabelCosts, relabel
+from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
+from torchreg.registration.bones.motions import fit_bones
+from torchreg.registration.bones.registration_energy import EnergyState, energy_terms, term_weights
+from torchreg.registration.bones.weights import refine_weights
+from torchreg.registration.paper.config import PaperConfig
+from torchreg.registration.paper.segmentation import best_candidates, nearest_seed, reuse_labels
+from torchreg.registration.paper.spin_matches import spin_matches
+from torchreg.registration.results import RegisterRecord
+
+
+class PaperFit:
+    """A registration under way, in units of the source's diagonal.
+
+    Args:
+        data: the grid and the samples in it.
+        source: the scan to be moved.
+        index: (n,) of its points that are matched.
+        target: the scan to be reached.
+        config: what the printed algorithm shares with the default one.
+        paper: what it does not share.
+        num_bones: B, also of the first segmentation.
+        generator: draws seeds, samples and halves.
+        on_step: called with a `RegisterRecord` after each round.
+
+    Attributes:
+        labels: (C,) bone of each cell, from 0 without gaps.
+        model: the bones and weights, one pose.
+        history: records so far.
+    """
+
+    def __init__(
+        self,
+        data: CellData,
+        source: RangeScan,
+        index: Tensor,
+        target: RangeScan,
+        config: BoneConfig,
+        paper: PaperConfig,
+        *,
+        num_bones: int,
+        generator: torch.Generator,
+        on_step: OnRegisterStep | None = None,
+    ) -> None:
+        self.data, self.config, self._paper = data, config, paper
+        self._source, self._index, self._generator = source, index, generator
+        self._num_bones, self._on_step = num_bones, on_step
+        self.matchers = [CompatibleMatcher(target, config.normal_scale)]
+        self.history: list[RegisterRecord] = []
+        self._matches: CompatibleMatches | None = None
+        self._progress = 0.0
+        self._edges = data.grid.edges()
+        # The same in all rounds, as in the default algorithm, so that their energies compare.
+        self._term_weights = term_weights(
+            distance=config.refine.distance,
+            smoothness=config.refine.smoothness,
+            norm=config.refine.normalization,
+            discontinuity=config.refine.closeness,
+        )
+
+    def start(self) -> None:
+        """Segment the grid at random and match spin images, or closest points: lines 1 and 2."""
+        grid, points = self.data.grid, self._source.points
+        seeds = points[best_candidates(points, self._num_bones, self._generator)]
+        used, labels = nearest_seed(grid.cell_centers(), seeds).unique(return_inverse=True)
+        corners = nearest_seed(grid.corner_points(), seeds[used])
+        self.labels = labels
+        self.model = GridLBS(grid, torch.nn.functional.one_hot(corners, len(used)).to(points))
+        if self._paper.first_matches == "closest":
+            self.model.set_transforms_(self.model.transforms.detach()[None])
+            self.update_correspondences()
+            return
+        matches = spin_matches(
+            self._source, self._index, self.matchers[0].target, labels[self.data.cell], len(used), self._paper,
+            bin_size=grid.spacing, generator=self._generator,
+        )  # fmt: skip
+        self.model.set_transforms_(matches.motions[None])
+        self.correspondences = Correspondences(
+            matches.targets[None], matches.normals[None], matches.kept.to(points)[None], point_to_point=0.0
+        )
+
+    def fit_labels(self) -> bool:
+        """Alternate T-steps and W-steps, each followed by new correspondences, and return whether they converged.
+
+        References: Chang and Zwicker 2009, algorithm 1, lines 3 to 8.
+        """
+        paper, lowest = self._paper, float("inf")
+        for step in range(paper.max_rounds):
+            self._progress = min(step / paper.annealing_rounds, 1.0)
+            self.solve_motions()  # line 4
+            self.update_correspondences()  # line 5
+            energy = self.solve_labels()  # line 6
+            self.update_correspondences()  # line 7
+            self._report("align", step, paper.max_rounds)
+            if step >= paper.annealing_rounds and energy >= (1 - paper.rtol) * lowest:
+                return True
+            if self.config.reuse and step + 1 < paper.max_rounds:
+                self._reuse_labels()
+            lowest = min(lowest, energy) if step >= paper.annealing_rounds else lowest
+        return False
+
+    def refine(self) -> bool:
+        """Solve for continuous weights, eqs. 8 and 13, the optional line 9; return whether the solver converged."""
+        if self.config.refine_steps == 0:
+            return True
+        found = refine_weights(self.model, self._samples, self.correspondences, self.config.refine)
+        self.model = GridLBS(self.data.grid, found.weights, self.model.transforms.detach())
+        self.update_correspondences()
+        self._report("refine", 0, 1)
+        return found.converged
+
+    def solve_motions(self) -> None:
+        """Fit the bones' motions to the correspondences while the joint integrals hold them together: eqs. 4 and 5."""
+        weights = self.model.weights_at(self._samples).detach()
+        moments = self.model.joint_moments()
+        problem = BoneProblem(
+            points=self._samples,
+            binding=Binding.from_weights(weights),
+            correspondences=self.correspondences,
+            bodies=BoneBodies.from_weights(self._samples, weights),
+            moments=moments,
+            joint_weight=self._stiffness,
+            pair_weights=self._shared_cells(moments),
+        )
+        fit = fit_bones(problem, self.model.transforms.detach(), max_steps=self.config.motion_steps)
+        self.model.set_transforms_(fit.transforms)
+
+    def update_correspondences(self) -> None:
+        """Match the moved samples with the closest compatible points of the target, under the angle of the round."""
+        (moved,), (normals,) = self.moved(self._samples, self._source.normals[self._index])
+        (matcher,) = self.matchers
+        self._matches = matcher.match(
+            moved,
+            normals,
+            max_distance=self._paper.max_distance * self._source.spacing,
+            max_angle=geometric_at(self.config.max_angle, self._progress),
+        )
+        self.correspondences = Correspondences(
+            self._matches.targets[None],
+            self._matches.normals[None],
+            self._matches.kept.to(moved)[None],
+            point_to_point=0.0,
+        )
+
+    def solve_labels(self) -> float:
+        """Label the cells anew: eqs. 11 and 12; drop bones without a cell, and return the energy."""
+        transforms = self.model.transforms.detach()
+        labels, energy = relabel(self.data, self.correspondences, transforms, self.labels, self._costs)
+        used, self.labels = labels.unique(return_inverse=True)
+        self.model = GridLBS.from_labels(self.data.grid, self.labels, len(used), transforms[:, used])
+        return energy
+
+    def _reuse_labels(self) -> None:
+        """Give unused labels to halves of the worst regions, which start from the motion of the whole."""
+        before, weights = self.labels, self.correspondences.weights[0]
+        squares = weights * self.correspondences.squared_residuals(self.model(self._samples))[0]
+        self.labels = reuse_labels(
+            self.data, squares, before, self._num_bones,
+            least_error=self._paper.reuse_error * self._source.spacing, generator=self._generator,
+        )  # fmt: skip
+        origin = torch.stack([before[self.labels == label][0] for label in range(int(self.labels.max()) + 1)])
+        transforms = self.model.transforms.detach()[:, origin]
+        self.model = GridLBS.from_labels(self.data.grid, self.labels, len(origin), transforms)
+
+    def moved(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+        """Return points (N, 3) and their unit normals moved, (1, N, 3) each."""
+        with torch.no_grad():
+            weights, transforms = self.model.weights_at(points), self.model.transforms
+            return self.model.move(points, weights), turned_normals(normals, weights, transforms)
+
+    @property
+    def _samples(self) -> Tensor:
+        return self.data.points
+
+    @property
+    def _stiffness(self) -> float:
+        """Beta over alpha n: the distance is a sum over correspondences as printed, and a mean in `BoneProblem`."""
+        return self.config.joint_weight_at(self._progress) / max(1.0, float(self.correspondences.weights.sum()))
+
+    def _shared_cells(self, moments: JointMoments) -> Tensor:
+        """Return the number (P,) of cells that both bones of each pair reach: each cell has a joint term of its own."""
+        reached = (self.model.weights.detach() > NEGLIGIBLE.weight)[self.data.grid.cell_corners].any(1)
+        first, second = (reached[:, bones].to(moments.mass) for bones in moments.pairs.unbind(-1))
+        return (first * second).sum(0)
+
+    @property
+    def _costs(self) -> LabelCosts:
+        cells = self._paper.max_distance * self._source.spacing / self.data.grid.spacing
+        return LabelCosts(smoothness=self.config.smoothness, label=0.0, truncation=cells)
+
+    @torch.no_grad()
+    def _report(self, stage: str, step: int, num_steps: int) -> None:
+        matches, neighbors, weights = self._matches, self.data.neighbors, self.correspondences.weights
+        labeled = GridLBS.from_labels(self.data.grid, self.labels, self.model.num_bones)
+        state = EnergyState(
+            model=self.model,
+            transforms=self.model.transforms,
+            points=self._samples,
+            correspondences=self.correspondences,
+            edges=self._edges,
+            label_weights=labeled.weights,
+        )
+        squares = self.correspondences.squared_residuals(state.moved)
+        record = RegisterRecord(
+            stage=stage,
+            step=step,
+            num_steps=num_steps,
+            distance=float((weights * squares).sum() / weights.sum().clamp_min(1e-300)),
+            joint=float(JointEnergy()(self.model.transforms[0], state.moments)),
+            smoothness=int((self.labels[neighbors[:, 0]] != self.labels[neighbors[:, 1]]).sum()),
+            num_labels=self.model.num_bones,
+            energies={name: float(term.mean()) for name, term in energy_terms(state, self._term_weights).items()},
+            **{name: int(getattr(matches, name).sum()) for name in ("kept", "boundary", "far", "turned")},
+        )
+        self.history.append(record)
+        if self._on_step is not None:
+            self._on_step(record)

@@ -1,0 +1,31 @@
+"""Trees of tips merged as printed: from supernodes at the tips inwards to metanodes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from torchreg.spines.labeled_tree import Tips, junctions_from_splits, without_tip_zero
+from torchreg.spines.tip_trees import TipTree
+
+
+def metanode_junctions(trees: Sequence[TipTree]) -> list[tuple[Tips, ...]]:
+    """Return the junctions of the tree to which all trees shrink when contradicting branch nodes are merged.
+
+    Walking inward from a tip, the next branch nodes of all trees are one supernode; supernodes that share a branch node
+    of any tree become one metanode, and the walk goes on from there. A limb between two junctions is left where every
+    tree has it: wherever one of them lacks it, both of its ends fall into one metanode.
+
+    References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1, figure 3B.
+    """
+    if len(trees) == 2:
+        return []
+    every = frozenset(range(len(trees)))
+    shown = [
+        {
+            without_tip_zero(branch.tips, every)
+            for branch in tree.branches
+            if 1 < len(branch.tips) < len(trees) - 1 and len(branch.rings) > 1
+        }
+        for tree in trees
+    ]
+    return junctions_from_splits(set.intersection(*shown), len(trees))
