@@ -105,7 +105,7 @@ def register(
             num_bones=num_bones, generator=generator or torch.Generator().manual_seed(0), on_step=on_step,
         )  # fmt: skip
         converged = _fit_as_printed(paper, clock)
-        return _scan_registration(source, normalized_source, normalization, paper, converged, clock.seconds)
+        return _scan_registration(source, normalized_source, normalization, paper, converged, degenerate, clock.seconds)
     # Line 2: a first alignment of all points.
     if start is None:
         aligned = align_scans(source, target, config.align, generator=generator, on_step=initial_records(on_step))
