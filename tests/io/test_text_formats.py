@@ -9,13 +9,13 @@ import trimesh
 from torchreg.errors import FormatError
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 from torchreg.io.raw_cloud import RawCloud
-from torchreg.io.text_formats import read_obj, read_xyz, write_xyz
+from torchreg.io.text_formats import read_obj, read_table, write_xyz
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 
 
 def xyz(text: str, limits: FileLimits = DEFAULT_LIMITS) -> RawCloud:
-    return read_xyz(text.encode(), limits)
+    return read_table(text.encode(), limits)
 
 
 def obj(text: str, limits: FileLimits = DEFAULT_LIMITS) -> RawCloud:
@@ -98,7 +98,7 @@ def test_numpy_reads_the_written_table_exactly(dtype, with_normals):
     assert table.shape == (20, 6 if with_normals else 3)
     if with_normals:
         np.testing.assert_array_equal(table[:, 3:], normals)
-    np.testing.assert_array_equal(read_xyz(content, DEFAULT_LIMITS).points.astype(dtype), points)
+    np.testing.assert_array_equal(read_table(content, DEFAULT_LIMITS).points.astype(dtype), points)
 
 
 def test_quads_and_larger_polygons_are_cut_into_fans():

@@ -20,7 +20,7 @@ def load_scan(
     viewpoint: Any = None,
     nan_policy: str = "raise",
     limits: FileLimits = DEFAULT_LIMITS,
-    dtype: torch.dtype = torch.float32,
+    dtype: torch.dtype | None = None,
 ) -> RangeScan:
     """Return the range scan of a file, with its faces and normals where it has them.
 
@@ -31,7 +31,7 @@ def load_scan(
         viewpoint: (3,) position of the camera, in the unit of the file; None if unknown.
         nan_policy: see `load_points`; ``"omit"`` drops the points of rays that measured nothing.
         limits: see `load_points`.
-        dtype: torch.float32 or torch.float64.
+        dtype: see `load_points`.
 
     Returns:
         The scan, on the CPU.
