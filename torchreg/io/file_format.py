@@ -46,7 +46,7 @@ class FileFormat:
     name: str
     kind: str
     endings: tuple[str, ...]
-    read: Callable[[bytes, Path, FileLimits], Any]
+    read: Callable[..., Any]
     holds: str
     loader: str
     sniff: Callable[[bytes], bool] | None = None

@@ -170,6 +170,8 @@ def load_points(
     nan_policy: str = "raise",
     limits: FileLimits = DEFAULT_LIMITS,
     dtype: torch.dtype | None = None,
+    time: float | None = None,
+    frame: int | None = None,
 ) -> PointCloud:
     """Return the points of a file, with normals, faces and colors where it has them.
 
@@ -184,6 +186,9 @@ def load_points(
         limits: bounds on size and counts, checked before memory is allocated.
         dtype: torch.float32 or torch.float64; None takes float32 unless the points lie so far from the origin, as in
             maps, that it would round them.
+        time: seconds of the animation of a glTF file at which it is shown; None shows it at rest, as viewers do before
+            they play it.
+        frame: number of the keyframe of the animation of a glTF file, instead of ``time``.
 
     Returns:
         The cloud, on the CPU, at least one point.
@@ -207,11 +212,20 @@ def load_points(
         kind = choose(FORMATS, content, file)
         try:
             with np.errstate(all="ignore"):  # overflowing numbers become infinite and are treated as such
-                return _checked_cloud(kind.read(content, file, limits), nan_policy, limits, dtype)
-        except FormatError:
+                raw = kind.read(content, file, limits, **_clip(kind, time, frame))
+                return _checked_cloud(raw, nan_policy, limits, dtype)
+        except (FormatError, InputError):
             raise
         except PARSER_ERRORS as error:
             raise FormatError(f"cannot be read as {kind.name} ({type(error).__name__}: {error})") from error
+
+
+def _clip(kind: FileFormat, time: float | None, frame: int | None) -> dict[str, Any]:
+    """Return the options of a reader that tell a time; InputError if it has none."""
+    given = {name: value for name, value in (("time", time), ("frame", frame)) if value is not None}
+    if given and kind.read is not read_gltf:
+        raise InputError(f"{' and '.join(given)} choose a moment of an animation, which {kind.name} files do not have")
+    return given
 
 
 def check_dtype(dtype: torch.dtype | None) -> None:
@@ -226,6 +240,8 @@ def load_mesh(
     nan_policy: str = "raise",
     limits: FileLimits = DEFAULT_LIMITS,
     dtype: torch.dtype | None = None,
+    time: float | None = None,
+    frame: int | None = None,
 ) -> TriangleMesh:
     """Return the triangle mesh of a file; polygons are cut into triangles.
 
@@ -234,6 +250,8 @@ def load_mesh(
         nan_policy: see ``load_points``.
         limits: see ``load_points``.
         dtype: see ``load_points``.
+        time: see ``load_points``.
+        frame: see ``load_points``.
 
     Returns:
         The mesh, on the CPU, at least one face.
@@ -241,7 +259,7 @@ def load_mesh(
     Raises:
         FormatError: if the file holds no faces, and as ``load_points``.
     """
-    cloud = load_points(path, nan_policy=nan_policy, limits=limits, dtype=dtype)
+    cloud = load_points(path, nan_policy=nan_policy, limits=limits, dtype=dtype, time=time, frame=frame)
     if cloud.faces is None or cloud.faces.shape[0] == 0:
         raise FormatError(f"{os.fspath(path)}: holds {len(cloud)} points but no faces; load_points reads it as a cloud")
     return cloud.to_mesh()
