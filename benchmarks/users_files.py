@@ -129,7 +129,7 @@ JUDGES: dict[str, Judge] = {
     "hint_register_nan": told(r"b\.ply|registered|converged", without="nan_policy="),
     "hint_two_skins": told("--skin", without="skin="),
     "hint_urdf_package": told("--package-dir", without="package_dirs=|meshes="),
-    "hint_usecols": told("line 3", without="usecols"),
+    "hint_usecols": told("line 3", without="`usecols`"),
     "hint_opencv_size": told("image_width", without="size="),
     "cause_xacro_comment": told("well-formed|not closed", without="macros"),
     "cause_lfs_pointer": told("lfs"),

@@ -8,8 +8,10 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Any, TextIO
 
+import click
 import typer
 
+from torchreg.cli.hints import in_options
 from torchreg.errors import TorchregError, TorchregWarning
 
 
@@ -36,7 +38,7 @@ def reporting(command: Callable[..., None]) -> Callable[..., None]:
             except BrokenPipeError:
                 raise
             except (TorchregError, OSError) as error:
-                typer.echo(f"torchreg: {_one_line(error)}", err=True)
+                typer.echo(f"torchreg: {in_options(_one_line(error), options_of_command())}", err=True)
                 raise typer.Exit(ExitCode.ERROR) from None
 
     return run
@@ -60,4 +62,11 @@ def show_warning(
 ) -> None:  # fmt: skip
     """Print a warning in one line, with file and line if it is not one of the library's."""
     origin = "" if issubclass(category, TorchregWarning) else f"{filename}:{lineno}: "
-    typer.echo(f"torchreg: warning: {origin}{' '.join(str(message).split())}", err=True)
+    told = in_options(str(message), options_of_command())
+    typer.echo(f"torchreg: warning: {origin}{told}", err=True)
+
+
+def options_of_command() -> list[str]:
+    """Return the options of the command that runs; none outside of one."""
+    context = click.get_current_context(silent=True)
+    return [] if context is None else [name for parameter in context.command.params for name in parameter.opts]

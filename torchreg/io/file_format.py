@@ -128,5 +128,6 @@ def naming(file: object) -> Iterator[None]:
             text = str(error)
             raise type(error)(text if text.startswith(str(file)) else f"{file}: {text}") from error
     for row in caught:
-        told = f"{file}: {row.message}" if issubclass(row.category, FileWarning) else row.message
-        warnings.warn(told, row.category, stacklevel=4)
+        text = str(row.message)
+        is_ours = issubclass(row.category, FileWarning) and not text.startswith(str(file))
+        warnings.warn(f"{file}: {text}" if is_ours else row.message, row.category, stacklevel=4)

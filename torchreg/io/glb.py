@@ -1,4 +1,4 @@
-"""glTF 2.0 surfaces (.glb, and .gltf with its buffers beside it): the triangles of the default scene as viewers show it."""
+"""glTF 2.0 surfaces (.glb, and .gltf with its buffers beside it): the default scene as viewers show it."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ class _Joints:
         self._found: dict[int, Array] = {}
 
     def matrices(self, skin: Any) -> Array:
-        """Return (J, 4, 4) from a mesh to the scene: joint transforms times inverse bind matrices; (0, 4, 4) if none."""
+        """Return (J, 4, 4) from a mesh to the scene: joint transforms times inverse bind matrices; J may be zero."""
         document = self._document
         if not document.items("skins"):
             return np.zeros((0, 4, 4))

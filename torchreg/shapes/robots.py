@@ -42,7 +42,7 @@ def spec_from_urdf(
     *,
     package_dirs: Sequence[str | Path] = (),
     primitive: str = "auto",
-    meshes: str = "require",
+    meshes: str = "warn",
 ) -> ShapeSpec:
     """Return the `ShapeSpec` of a URDF robot; see `ArticulatedShape.from_urdf`."""
     check_choice(primitive, "primitive", SOLID_CHOICES)
@@ -63,7 +63,7 @@ def spec_from_urdf(
             links.append(link)
             solids.append(solid)
     if not solids:
-        raise ModelError(f"no link of {path} has geometry: there is nothing to align")
+        raise ModelError(f"{path}: no link has geometry that can be read: there is nothing to align")
     return ShapeSpec(
         tree=KinematicTree(tuple(joints)),
         part_frames=tuple(part_frames),
