@@ -105,7 +105,7 @@ JUDGES: dict[str, Judge] = {
     "utm_register": registered,
     "utm_align": found_pose(0.15, 0.3),
     "utm_frames": near([0.1, 0.1, 0, 0.1, 0.1, 0], 1e-4),
-    "register_metres_to_mm": told("warning|torchreg:", "1000|larger|units"),
+    "register_metres_to_mm": told("warning", "times as large", r"--scale 0\.001"),
     "align_mm": lambda a: a.code == 1 and a.says(r"--scale 0\.001"),
     "skin_posed_by_nodes": lambda a: a.code == 0 and np.allclose(a.numbers[3:5], [1, 1.15], atol=0.2),
     "skin_armature_cm": near([0.3, 2, 0.3], 0.01),

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_choice, check_finite, check_shape
+from torchreg._checks import as_float_tensor, check_choice, check_finite, check_positive, check_shape
 from torchreg.errors import FileWarning, FormatError, InputError, InputTypeError
 from torchreg.io.atomic import write_atomic
 from torchreg.io.file_format import check_stand_in, ending_of
@@ -50,13 +50,14 @@ class Frames(Sequence[Tensor]):
         nan_policy: see `load_points`.
         limits: see `load_points`.
         dtype: of the tensors.
+        scale: see `load_points`.
     """
 
     def __init__(
         self, names: Sequence[str], sources: Sequence[Path | Array], nan_policy: str, limits: FileLimits,
-        dtype: torch.dtype | None,
+        dtype: torch.dtype | None, scale: float = 1.0,
     ) -> None:  # fmt: skip
-        self.names = tuple(names)
+        self.names, self._scale = tuple(names), scale
         self._sources, self._nan_policy, self._limits, self._dtype = tuple(sources), nan_policy, limits, dtype
 
     def __len__(self) -> int:
@@ -70,10 +71,12 @@ class Frames(Sequence[Tensor]):
 
     def __getitem__(self, index: int | slice) -> Tensor | Frames:
         if isinstance(index, slice):
-            return Frames(self.names[index], self._sources[index], self._nan_policy, self._limits, self._dtype)
+            sources = self._sources[index]
+            return Frames(self.names[index], sources, self._nan_policy, self._limits, self._dtype, self._scale)
         source = self._sources[index]
         if isinstance(source, Path):
-            return load_points(source, nan_policy=self._nan_policy, limits=self._limits, dtype=self._dtype).points
+            options = {"nan_policy": self._nan_policy, "limits": self._limits, "dtype": self._dtype}
+            return load_points(source, scale=self._scale, **options).points  # type: ignore[arg-type]
         return self._rows(self.names[index], source)
 
     def __iter__(self) -> Iterator[Tensor]:
@@ -81,7 +84,7 @@ class Frames(Sequence[Tensor]):
 
     def _rows(self, name: str, rows: Array) -> Tensor:
         with np.errstate(all="ignore"):  # what overflows becomes infinite and is judged as that
-            points = torch.from_numpy(rows.astype(np.float64))
+            points = torch.from_numpy(rows.astype(np.float64)) * self._scale
             points = points.to(self._dtype or needed_dtype(points))
         finite = torch.isfinite(points).all(dim=-1)
         bad = len(points) - int(finite.sum())
@@ -94,6 +97,7 @@ def load_frames(
     path: PathLike | Sequence[PathLike],
     *,
     sort: bool = True,
+    scale: float = 1.0,
     nan_policy: str = "raise",
     limits: FileLimits = DEFAULT_LIMITS,
     dtype: torch.dtype | None = None,
@@ -107,6 +111,7 @@ def load_frames(
             or T arrays (M, 3) called ``frame_0``, ``frame_1``, ... An archive is read at once, the rest is not.
         sort: order files by their paths with numbers counted as numbers, so that frame2 comes before frame10, as they
             rarely do where a shell wrote the list. False keeps the order of a list.
+        scale: see `load_points`.
         nan_policy: see `load_points`.
         limits: see `load_points`; they hold for every file and frame.
         dtype: see `load_points`; None decides frame by frame.
@@ -124,6 +129,7 @@ def load_frames(
     """
     check_choice(nan_policy, "nan_policy", ("raise", "omit"))
     check_dtype(dtype)
+    check_positive(scale, "scale")
     if isinstance(path, (str, os.PathLike)):
         target = local_path(path)
         files = _files_of(target) if target.is_dir() else _checked([target])
@@ -135,8 +141,8 @@ def load_frames(
         stacked = _read_archive(files[0], limits)
         if stacked is not None:
             names = [f"{files[0]}, frame {number}" for number in range(len(stacked))]
-            return Frames(names, stacked, nan_policy, limits, dtype)
-    return Frames([str(file) for file in files], files, nan_policy, limits, dtype)
+            return Frames(names, stacked, nan_policy, limits, dtype, scale)
+    return Frames([str(file) for file in files], files, nan_policy, limits, dtype, scale)
 
 
 def save_frames(path: PathLike, frames: Sequence[Any]) -> list[Path]:

@@ -76,17 +76,14 @@ class MeshFiles:
         if found is None:
             scheme, separator, _ = filename.partition("://")
             if separator and scheme not in ("file", *_PACKAGES):
-                return self._missing(
-                    FormatError(
-                        f"{what}: mesh {filename!r} is remote; save it beside the URDF and give a relative path"
-                    )
+                reason = f"mesh {filename!r} is remote; save it beside the URDF and give a relative path"
+            else:
+                places = ", ".join(map(str, dict.fromkeys(tried[:4])))
+                reason = (
+                    f"mesh file {filename!r} was not found (looked at {places}, ...); name its folder by package_dirs="
                 )
-            return self._missing(
-                FormatError(
-                    f"{what}: mesh file {filename!r} was not found (looked at {', '.join(map(str, tried[:3]))}, ...); "
-                    f"pass the folder that holds it as package_dirs="
-                )
-            )
+            self._missing(FormatError(f"{what}: {reason}"))
+            return None
         kind = _FORMATS.get(found.suffix.lower())
         if kind is not None and kind.module is not None and importlib.util.find_spec(kind.module[0]) is None:
             self._missing(

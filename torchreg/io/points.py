@@ -18,8 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_choice, check_finite, check_shape
+from torchreg._checks import as_float_tensor, check_choice, check_finite, check_positive, check_shape
 from torchreg.errors import FileWarning, FormatError, InputError, InputTypeError
+from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.io.atomic import write_atomic
 from torchreg.io.file_format import FileFormat, begins, choose, ending_of, naming, unpacked
@@ -167,6 +168,7 @@ class PointCloud:
 def load_points(
     path: str | os.PathLike[str],
     *,
+    scale: float = 1.0,
     nan_policy: str = "raise",
     limits: FileLimits = DEFAULT_LIMITS,
     dtype: torch.dtype | None = None,
@@ -181,6 +183,7 @@ def load_points(
 
     Args:
         path: a local file; addresses are refused.
+        scale: metres per unit of the file, or other units wanted; 0.001 for millimeters.
         nan_policy: ``"raise"`` refuses points that are not finite; ``"omit"`` drops them, those whose normals or colors
             are not finite, and the faces that use them.
         limits: bounds on size and counts, checked before memory is allocated.
@@ -197,7 +200,7 @@ def load_points(
         FileNotFoundError: if there is no such file.
         IsADirectoryError: if it is a folder.
         FormatError: if the file is damaged, cut off, too large, of unknown format, empty or not finite; names the file.
-        InputError: if ``nan_policy`` is neither of the two.
+        InputError: if ``nan_policy`` is neither of the two, or ``scale`` is not positive.
         InputTypeError: if ``dtype`` is neither of the two.
 
     Warns:
@@ -205,6 +208,7 @@ def load_points(
     """
     check_choice(nan_policy, "nan_policy", ("raise", "omit"))
     check_dtype(dtype)
+    check_positive(scale, "scale")
     file = local_path(path)
     content = read_bytes(file, limits)
     with naming(file):
@@ -213,7 +217,7 @@ def load_points(
         try:
             with np.errstate(all="ignore"):  # overflowing numbers become infinite and are treated as such
                 raw = kind.read(content, file, limits, **_clip(kind, time, frame))
-                return _checked_cloud(raw, nan_policy, limits, dtype)
+                return _checked_cloud(raw, scale, nan_policy, limits, dtype)
         except (FormatError, InputError):
             raise
         except PARSER_ERRORS as error:
@@ -237,6 +241,7 @@ def check_dtype(dtype: torch.dtype | None) -> None:
 def load_mesh(
     path: str | os.PathLike[str],
     *,
+    scale: float = 1.0,
     nan_policy: str = "raise",
     limits: FileLimits = DEFAULT_LIMITS,
     dtype: torch.dtype | None = None,
@@ -247,6 +252,7 @@ def load_mesh(
 
     Args:
         path: a local file; see ``load_points`` for the formats.
+        scale: see ``load_points``.
         nan_policy: see ``load_points``.
         limits: see ``load_points``.
         dtype: see ``load_points``.
@@ -259,14 +265,16 @@ def load_mesh(
     Raises:
         FormatError: if the file holds no faces, and as ``load_points``.
     """
-    cloud = load_points(path, nan_policy=nan_policy, limits=limits, dtype=dtype, time=time, frame=frame)
+    cloud = load_points(path, scale=scale, nan_policy=nan_policy, limits=limits, dtype=dtype, time=time, frame=frame)
     if cloud.faces is None or cloud.faces.shape[0] == 0:
         raise FormatError(f"{os.fspath(path)}: holds {len(cloud)} points but no faces; load_points reads it as a cloud")
     return cloud.to_mesh()
 
 
-def _checked_cloud(raw: RawCloud, nan_policy: str, limits: FileLimits, dtype: torch.dtype | None) -> PointCloud:
-    points = _rows(raw.points, "points", None)
+def _checked_cloud(
+    raw: RawCloud, scale: float, nan_policy: str, limits: FileLimits, dtype: torch.dtype | None
+) -> PointCloud:
+    points = _rows(raw.points, "points", None) * scale
     count = len(points)
     check_allowed(count, "points", limits)
     if count == 0:
@@ -304,26 +312,7 @@ def _checked_cloud(raw: RawCloud, nan_policy: str, limits: FileLimits, dtype: to
 
 def needed_dtype(points: Tensor) -> torch.dtype:
     """Return float64 where float32 would round points (N, 3), float64, by a noticeable share of their spread."""
-    step = max(1, len(points) // _FAR.sample)
-    sample = points[::step]
-    sample = sample[torch.isfinite(sample).all(-1)]
-    if not len(sample):
-        return torch.float32
-    middle = sample.median(0).values
-    spread = float((sample - middle).abs().median(0).values.norm())  # a few strays do not matter
-    spread = spread or float((sample.amax(0) - sample.amin(0)).norm())
-    return torch.float64 if spread and float(middle.abs().max()) > _FAR.ratio * spread else torch.float32
-
-
-@dataclass(frozen=True)
-class _Far:
-    """When points are far from the origin."""
-
-    ratio: float = 200.0  # distance over spread from which float32 rounds by more than 1e-5 of the spread
-    sample: int = 10_000  # points that tell
-
-
-_FAR = _Far()
+    return torch.float32 if far_origin(points) is None else torch.float64
 
 
 def _finite_normals(normals: Tensor, points: Tensor, faces: Tensor | None) -> Tensor | None:

@@ -260,7 +260,7 @@ def _build_joint(
     offset = _origin(element, what)
     if element.get("type") in _HELD:
         _warn(
-            f"joint {name!r} is {element.get('type')}; it is held fixed, as joints here turn about or slide along an axis"
+            f"joint {name!r} is {element.get('type')}; it is held fixed, as joints turn about or slide along one axis"
         )
     if _kind(joints, name, what) == "fixed":
         return Joint(name, parent, offset)

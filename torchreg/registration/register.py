@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
+import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,7 +14,8 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, as_tensor, check_count, check_finite, check_shape
 from torchreg._threads import one_thread
-from torchreg.errors import InputError, InputTypeError
+from torchreg.errors import InputError, InputTypeError, UnitsWarning
+from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.registration.bones.alternation import ReducedFit, Samples
@@ -70,6 +74,9 @@ def register(
         InputError: if a number is out of range or not finite, or a shape does not fit.
         InputTypeError: if a scan is none.
 
+    Warns:
+        UnitsWarning: if one scan is more than thirty times larger than the other.
+
     Differentiable: no; `GridLBS` is, for refining what was found.
 
     Cost: 1.3 to 3.5 s for scans of 8,000 points on one core, the alignment three quarters of it.
@@ -78,6 +85,12 @@ def register(
     """
     config = RegisterConfig() if config is None else config
     check_inputs((source, target), num_bones, grid_resolution)
+    origin = far_origin((source.points, target.points))
+    if origin is not None:
+        return register(
+            source.shifted(-origin), target.shifted(-origin), num_bones, grid_resolution, config, generator, on_step,
+            start=None if start is None else start - origin, confidence=confidence, parts=parts,
+        ).moved(origin)  # fmt: skip
     _check_start(source, start, confidence)
     parts = None if parts is None else _checked_parts(source, parts, num_bones)
     clock = _Clock()
@@ -194,10 +207,36 @@ def check_inputs(scans: tuple[Any, ...], num_bones: int, grid_resolution: int) -
             )
         if not scan.diagonal > 0:
             raise InputError(f"{name} must have points at different places")
+    _warn_about_units(scans[0], scans[-1])
     check_count(num_bones, "num_bones", 1)
     check_count(grid_resolution, "grid_resolution", 1)
     if grid_resolution > MAX_RESOLUTION:
         raise InputError(f"grid_resolution must be at most {MAX_RESOLUTION}, got {grid_resolution}")
+
+
+@dataclass(frozen=True)
+class _Units:
+    """When two scans of one thing seem to be in different units."""
+
+    ratio: float = 30.0  # of their sizes
+
+
+_UNITS = _Units()
+
+
+def _warn_about_units(source: RangeScan, target: RangeScan) -> None:
+    """Warn if one scan is so much larger than the other that no crop explains it."""
+    ratio = float(target.diagonal / source.diagonal)
+    if 1 / _UNITS.ratio < ratio < _UNITS.ratio:
+        return
+    larger, smaller = ("target", "source") if ratio > 1 else ("source", "target")
+    factor = 10.0 ** -round(abs(math.log10(ratio)))
+    warnings.warn(
+        f"{larger} is {max(ratio, 1 / ratio):.4g} times as large as {smaller}: are they in one unit? "
+        f"If not, load {larger} with scale={factor:g}",
+        UnitsWarning,
+        stacklevel=4,
+    )
 
 
 def _checked_parts(source: RangeScan, parts: Any, num_bones: int) -> Tensor:

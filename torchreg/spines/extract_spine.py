@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchreg._checks import check_count
 from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.result import Status
@@ -97,6 +98,12 @@ def extract_spine(
     meshes = _check_meshes(meshes)
     if workers is not None:
         check_count(workers, "workers", 1)
+    origin = far_origin([mesh.vertices for mesh in meshes])
+    if origin is not None:
+        near = [TriangleMesh(mesh.vertices - origin.to(mesh.vertices), mesh.faces) for mesh in meshes]
+        return extract_spine(
+            near, times=times, config=config, workers=workers, on_step=on_step, progress=progress
+        ).moved(origin)  # fmt: skip
     with torch.no_grad():
         # Section 4.1: the second factor of eq. 3, frame by frame.
         skeletons = skeletonize_frames(meshes, config.skeletons, workers=workers, on_step=on_step, progress=progress)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchreg._checks import check_choice, check_count, check_positive
 from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton, build_skeleton
@@ -98,6 +99,11 @@ def skeletonize(mesh: TriangleMesh, config: SkeletonizeConfig | None = None) -> 
     if not isinstance(mesh, TriangleMesh):
         raise InputTypeError(f"mesh must be a TriangleMesh, got {type(mesh).__name__}")
     config = SkeletonizeConfig() if config is None else config
+    origin = far_origin(mesh.vertices)
+    if origin is not None:
+        offset = origin.to(mesh.vertices)
+        found = skeletonize(TriangleMesh(mesh.vertices - offset, mesh.faces), config)
+        return replace(found, nodes=found.nodes + offset)
     body = _prepared(mesh, config)
     tips = _find_tips(body, config)  # section 4.1: maxima of the average geodesic distance
     trees = _grow_trees(body, tips)  # "Growing Skeletons": rings of the distance from each tip
