@@ -82,7 +82,9 @@ def align(
     package_dir: PackageDir = None,
     free_base: FreeBase = None,
     skin: Skin = None,
-    pose: Annotated[Path | None, typer.Option(help="Also write the pose by name of degree of freedom (.json).")] = None,
+    pose: Annotated[
+        Path | None, typer.Option(help="Also write the pose by name of degree of freedom (.json or .csv).")
+    ] = None,
     ply: Annotated[Path | None, typer.Option(help="Also write the registered model points (.ply).")] = None,
     picture: Annotated[Path | None, typer.Option(help="Also draw shape and data (.png, .pdf, .svg).")] = None,
     gltf: Annotated[
@@ -102,7 +104,7 @@ def align(
     Exit codes: 0; 1 if an alignment found too few inliers to mean anything; 2 for an error; 130 for Ctrl-C.
     """
     output = with_ending(output, (".safetensors",), add=True)
-    optional = with_ending(pose, (".json",)), with_ending(ply, (".ply",)), with_ending(picture, PICTURE_ENDINGS)
+    optional = with_ending(pose, (".json", ".csv")), with_ending(ply, (".ply",)), with_ending(picture, PICTURE_ENDINGS)
     count = len(clouds)
     files = [_Files(numbered(output, k, count), *(numbered(name, k, count) for name in optional)) for k in range(count)]
     check_outputs([*(path for entry in files for path in entry.all()), with_ending(gltf, (".glb",))], force)

@@ -60,11 +60,16 @@ def read_cloud(
 
 
 def write_pose(path: Path, shape: ArticulatedShape, pose: Tensor) -> None:
-    """Write a pose (num_dofs,) as JSON, by name of degree of freedom."""
+    """Write a pose (num_dofs,) by name of degree of freedom, as JSON or as a table of one row (.csv)."""
     import json
 
     from torchreg.io.atomic import write_atomic
 
+    if path.suffix.lower() == ".csv":
+        from torchreg.io.pose_table import save_pose_table
+
+        save_pose_table(path, shape.dof_names, [pose.tolist()])
+        return
     named = dict(zip(shape.dof_names, pose.tolist(), strict=True))
     write_atomic(path, (json.dumps(named, indent=2) + "\n").encode())
 

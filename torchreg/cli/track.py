@@ -22,7 +22,7 @@ from torchreg.cli.cameras import (
     stereo_job,
     stereo_source,
 )
-from torchreg.cli.outputs import Force, Quiet, shifted_to, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, shifted_to, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
 from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary, track_job
@@ -32,8 +32,9 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchreg.capture.stereo_frames import StereoFrames
+    from torchreg.shapes.articulated import ArticulatedShape
     from torchreg.shapes.skin import LinearBlendSkin
-    from torchreg.tracking.results import FrameResult
+    from torchreg.tracking.results import FrameResult, TrackResult
 
     OnFrame = Callable[[Tensor, FrameResult], object]
 
@@ -100,6 +101,10 @@ def track(
     ] = False,
     port: Port = 8080,
     browser: Browser = True,
+    poses: Annotated[
+        Path | None,
+        typer.Option(metavar="OUT.csv", help="Also write a table: frame, time, status, and the pose by name."),
+    ] = None,
     movie: Annotated[str, typer.Option(help="The moving picture: gif, mp4 (needs ffmpeg), or none.")] = "gif",
     gltf: Annotated[bool, typer.Option("--gltf/--no-gltf", help="Whether to write the moving shape.")] = True,
     save_every: Annotated[int, typer.Option(min=1, help="Frames after which RESULT.progress is written anew.")] = 50,
@@ -124,6 +129,8 @@ def track(
     from torchreg._checks import check_positive
 
     files, resumed = _files(output, movie, gltf, overlay, resume, force)
+    poses = with_ending(poses, (".csv",))
+    check_outputs([poses], force or resumed)
     check_positive(fps, "--fps")
     check_positive(scale, "--scale")
     views = {"--depth-range": depth_range, "--volume": volume, "--matcher": matcher, "--reach": reach, "--seen": seen}
@@ -156,7 +163,22 @@ def track(
         if view:
             run.live = _live_page(pages, port, browser, quiet)
         complete = _run(run, bar, resumed)
+    if poses is not None:
+        _write_poses(poses, model, run.located)
     _report_end(run, complete, quiet)
+
+
+def _write_poses(path: Path, shape: ArticulatedShape, result: TrackResult) -> None:
+    """Write one row per frame; frames without a pose have no numbers."""
+    from torchreg.io.pose_table import save_pose_table
+
+    rows = [
+        [frame, time, status.value, *(value if value == value else "" for value in pose)]  # NaN is not equal to itself
+        for frame, (time, status, pose) in enumerate(
+            zip(result.times.tolist(), result.statuses, result.poses.tolist(), strict=True)
+        )
+    ]
+    save_pose_table(path, ["frame", "time", "status", *shape.dof_names], rows)
 
 
 def _files(

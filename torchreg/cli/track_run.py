@@ -214,6 +214,12 @@ class TrackRun:
         self.parts[:] = [reduce(join_frames, self.parts)]
         return self.parts[0]
 
+    @property
+    def located(self) -> TrackResult:
+        """All frames done, in the coordinates of the files."""
+        origin = self.clouds.origin
+        return self.result if origin is None else self.result.moved(origin)
+
     @cached_property
     def surface(self) -> LinearBlendSkin:
         """What pictures show, meshed once."""
@@ -251,8 +257,7 @@ class TrackRun:
             complete = self.state.frame == end
             save_progress(self.files.progress, TrackProgress(self.result, self.state, self.job))
         self.clouds.on_drop = None
-        origin = self.clouds.origin
-        (self.result if origin is None else self.result.moved(origin)).save(self.files.result)
+        self.located.save(self.files.result)
         return complete
 
     def _part(self, numbers: range, overlays: Sequence[OnFrame]) -> None:

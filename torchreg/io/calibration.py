@@ -88,7 +88,7 @@ def _scaled(rig: CameraRig, scale: float) -> CameraRig:
 
 
 def _read_json(content: bytes, file: Path, limits: FileLimits) -> CameraRig:
-    document = _document(content, file)
+    document = json_object(content, file)
     if any(names[0] in document for names in PAIRS):
         return read_opencv_values(values_of(document), file)
     entries = document.get("cameras", document.get("parameters", [document]))
@@ -142,7 +142,7 @@ def load_depth_camera(
     """
     file = local_path(path)
     content = read_bytes(file, limits)
-    document = _document(content, file) if file.suffix.lower() == ".json" or _is_json(content) else {}
+    document = json_object(content, file) if file.suffix.lower() == ".json" or _is_json(content) else {}
     entries = document.get("cameras", [document])
     if not isinstance(entries, list) or len(entries) != 1:
         raise FormatError(f"{file}: must hold the one camera of the depth image")
@@ -202,7 +202,9 @@ def _entry(camera: Camera) -> dict[str, Any]:
     return named | size | numbers | distortion | {"world_to_camera": camera.world_to_camera.tolist()}
 
 
-def _document(content: bytes, file: Path) -> dict[str, Any]:
+def json_object(content: bytes, file: Path) -> dict[str, Any]:
+    """Return the object in the bytes of a JSON file; FormatError, which names the file, if there is none."""
+
     def refuse(constant: str) -> NoReturn:
         raise FormatError(f"{file}: numbers must be finite, got {constant}")
 

@@ -16,7 +16,8 @@ from torchreg.io.frames import load_frames
 from torchreg.io.gltf import load_rig
 from torchreg.io.images import ENDINGS as PICTURES
 from torchreg.io.images import load_depth, load_image, load_mask
-from torchreg.io.limits import FileLimits
+from torchreg.io.limits import FileLimits, read_bytes
+from torchreg.io.pose_table import load_pose_table
 from torchreg.io.swc import load_swc
 from torchreg.io.tensors import load_tensors
 from torchreg.io.urdf import load_urdf
@@ -35,6 +36,14 @@ def _row(
 
 def _colmap(path: Path, *, limits: FileLimits) -> Any:
     return load_colmap(path if path.is_dir() else path.parent, limits=limits)
+
+
+def _document(path: Path, *, limits: FileLimits) -> Any:
+    return calibration.json_object(read_bytes(path, limits), path)
+
+
+def _table(path: Path, *, limits: FileLimits) -> Any:
+    return load_pose_table(path, ("base_x",), limits=limits)
 
 
 FORMATS: tuple[FileFormat, ...] = (
@@ -77,6 +86,8 @@ FORMATS: tuple[FileFormat, ...] = (
         _colmap,
         "load_cameras",
     ),
+    _row("JSON", "poses", (".json",), "numbers, or numbers by name; also written", _document, "--start"),
+    _row("tables", "poses", (".csv",), "a row per pose below a line of names; also written", _table, "--start"),
     _row("SWC", "curves", (".swc",), "trees of nodes with radii; also written", load_swc, "load_swc"),
     _row("safetensors", "results", (".safetensors",), "with its JSON beside it; also written", load_tensors, "load"),
 )

@@ -32,7 +32,7 @@ from torchreg.io.pcd import read_pcd, write_pcd
 from torchreg.io.ply import read_ply, write_ply
 from torchreg.io.raw_cloud import Array, RawCloud
 from torchreg.io.stl import is_binary_stl, read_stl
-from torchreg.io.text_formats import looks_like_table, read_obj, read_table, write_xyz
+from torchreg.io.text_formats import looks_like_table, read_obj, read_table, write_csv, write_xyz
 
 # Exceptions that struct, json, zipfile and numpy's text and header readers raise on damaged bytes.
 PARSER_ERRORS = (
@@ -89,9 +89,13 @@ FORMATS: tuple[FileFormat, ...] = (
         write_pcd, ("normals", "colors"),
     ),
     FileFormat(
-        "XYZ and other tables", CLOUDS, (".xyz", ".txt", ".csv", ".pts", ".asc", ".xyzn", ".xyzrgb", ".tsv", ".dat"),
+        "XYZ and other tables", CLOUDS, (".xyz", ".txt", ".pts", ".asc", ".xyzn", ".xyzrgb", ".tsv", ".dat"),
         _read_text, "x y z, normals, colors, intensity, with or without names of columns", "load_points",
         looks_like_table, write_xyz, ("normals",),
+    ),
+    FileFormat(
+        "CSV", CLOUDS, (".csv",), _read_text, "the same tables; also those of pandas, CloudCompare and ParaView",
+        "load_points", None, write_csv, ("normals", "colors"),
     ),
     FileFormat(
         "OBJ", CLOUDS, (".obj",), _from_content(read_obj), "vertices, faces, normals, colors; no materials",
@@ -377,10 +381,10 @@ def save_points(
     """Write a point cloud; the file appears whole or not at all.
 
     Args:
-        path: a local file ending in .ply, .pcd, .xyz, .txt or .npz; an existing file is replaced.
+        path: a local file ending in .ply, .pcd, .xyz, .txt, .csv or .npz; an existing file is replaced.
         points: (N, 3) finite coordinates; their precision is kept.
         normals: (N, 3) or None.
-        colors: (N, 3) red, green, blue from 0 to 1, or None (.ply, .pcd, .npz); stored as bytes.
+        colors: (N, 3) red, green, blue from 0 to 1, or None (.ply, .pcd, .csv, .npz); stored as bytes.
         faces: (F, 3) vertex indices or None (.ply, .npz).
 
     Raises:

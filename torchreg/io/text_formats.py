@@ -164,6 +164,19 @@ def write_xyz(cloud: RawCloud) -> bytes:
     return head + "".join(row % tuple(values) + "\n" for values in table.tolist()).encode("ascii")
 
 
+def write_csv(cloud: RawCloud) -> bytes:
+    """Return a table with the names of its columns in the first line: x, y, z, nx, ny, nz, r, g, b."""
+    digits = 9 if cloud.points.dtype.itemsize <= 4 else 17
+    columns, formats, names = [cloud.points], [f"%.{digits}g"] * 3, ["x", "y", "z"]
+    if cloud.normals is not None:
+        columns, formats, names = [*columns, cloud.normals], formats * 2, [*names, "nx", "ny", "nz"]
+    if cloud.colors is not None:
+        columns, formats, names = [*columns, cloud.colors], [*formats, *["%d"] * 3], [*names, "r", "g", "b"]
+    row = ",".join(formats)
+    rows = np.concatenate([values.astype(np.float64) for values in columns], axis=-1).tolist()
+    return "\n".join([",".join(names), *(row % tuple(values) for values in rows)]).encode("ascii") + b"\n"
+
+
 def read_obj(content: bytes, limits: FileLimits) -> RawCloud:
     """Return the vertices and faces of an OBJ file, in the file's order and numbering, without materials.
 
