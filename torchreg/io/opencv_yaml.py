@@ -251,6 +251,8 @@ def _lens(values: Values, names: tuple[str, ...], path: Path) -> tuple[Tensor, T
     matrix, lens = values.get(names[0]), values.get(names[1], torch.zeros(0, dtype=torch.float64))
     if not isinstance(matrix, Tensor) or matrix.shape != (3, 3):
         raise FormatError(f"{path}: {names[0]} must be a 3 x 3 matrix")
+    if isinstance(lens, Tensor) and not bool(lens.any()):
+        lens = lens[:0]  # no distortion, however many zeros
     model = next((values[name] for name in ("distortion_model", "camera_model", "model") if name in values), "")
     if isinstance(lens, Tensor) and isinstance(model, str):
         check_lens_model(model, lens.numpy(), str(path))

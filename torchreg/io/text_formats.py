@@ -35,12 +35,13 @@ def read_table(content: bytes, limits: FileLimits, *, intensity_first: bool = Fa
     names = _names_in_comment(text)
     if b"#" in text or b"//" in text:
         text = _COMMENT.sub(b"", text)
-    claimed, before = None, 0
+    claimed, before, headed = None, 0, False
     while line := _first_line(text):
         words = _words(line)
         if claimed is None and len(words) == 1 and words[0].isdigit():
             claimed = int(words[0][:20])
-        elif _is_header(line) or _numbers_columns(line, text):
+        elif not headed and (_is_header(line) or _numbers_columns(line, text)):
+            headed = True
             names = [word.decode("utf-8", "replace").strip("\"'") for word in words]
         else:
             break
