@@ -27,7 +27,7 @@ COMMANDS = ("align", "demo", "figure", "formats", "info", "label", "pose", "regi
     [
         (
             ["--help"],
-            ("align", "demo", "figure", "formats", "info", "label", "pose", "register", "spine", "track", "view"),
+            COMMANDS,
         ),
         (["track", "--help"], ("--resume", "--overlay")),
     ],
@@ -40,19 +40,7 @@ def test_help_is_light(arguments, words):
 
 
 def test_every_command_explains_itself(run):
-    for command in (
-        "align",
-        "demo",
-        "figure",
-        "formats",
-        "info",
-        "label",
-        "pose",
-        "register",
-        "spine",
-        "track",
-        "view",
-    ):
+    for command in COMMANDS:
         assert "Usage:" in run(command, "--help").output
     assert "without one the shape is searched for" in " ".join(run("align", "--help").output.split())
     assert run("--version").output == f"torchreg {torchreg.__version__}\n"

@@ -208,7 +208,7 @@ def test_damaged_models_are_refused(model, cameras, images, message):
 
 def test_binary_and_missing_files(model, tmp_path):
     model()
-    (tmp_path / "images.txt").write_bytes(b"\xff\xfe\x00\x81")
+    (tmp_path / "images.txt").write_bytes(b"\x80\x81\x00\xff")
     with pytest.raises(FormatError, match="is no text"):
         load_colmap(tmp_path)
     (tmp_path / "images.txt").unlink()
@@ -333,6 +333,6 @@ def test_damaged_files_are_refused(tmp_path, text, message):
 
 
 def test_binary_files_are_refused(tmp_path):
-    (tmp_path / "c.yml").write_bytes(b"\xff\xfe\x00\x81")
+    (tmp_path / "c.yml").write_bytes(b"\x80\x81\x00\xff")
     with pytest.raises(FormatError, match="is no text"):
         load_opencv(tmp_path / "c.yml")

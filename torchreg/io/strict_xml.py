@@ -59,10 +59,46 @@ def parse_lenient_xml(content: bytes) -> ET.Element:
     mean nothing: prefixes are part of the names, those of the outermost element are left out everywhere.
     """
     text = plain_text(content).rstrip(b"\0 \t\r\n")
-    # As many lines as before, so that messages tell the right one.
-    text = _COMMENT.sub(lambda comment: b"\n" * comment.group().count(b"\n"), text)
-    if text is not content and content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
         text = _DECLARATION.sub(b"", text, count=1)  # says UTF-16, which it is no longer
+    try:
+        root = _parsed_names(_COMMENT.sub(_blank_lines, text))
+    except FormatError as error:
+        # Perhaps a block that holds comments was commented out.
+        whole = _without_nested_comments(text)
+        if whole is None:
+            raise
+        try:
+            root = _parsed_names(whole)
+        except FormatError:
+            raise error from None
+    prefix, colon, _ = root.tag.partition(":")
+    if colon:
+        for element in root.iter():
+            element.tag = element.tag.removeprefix(prefix + colon)
+    return root
+
+
+def _blank_lines(comment: re.Match[bytes]) -> bytes:
+    """Return as many lines as a comment has, so that messages tell the right one."""
+    return b"\n" * comment.group().count(b"\n")
+
+
+def _without_nested_comments(text: bytes) -> bytes | None:
+    """Return a document without its comments, which may hold comments; None if none does, or they are not closed."""
+    kept, depth, start, nested = list[bytes](), 0, 0, False
+    for mark in re.finditer(rb"<!--|-->", text):
+        opens = mark.group() == b"<!--"
+        if depth == 0 and opens:
+            kept.append(text[start : mark.start()])
+        nested = nested or (opens and depth > 0)
+        depth = depth + 1 if opens else max(depth - 1, 0)
+        start = mark.end() if depth == 0 else start
+    return None if depth or not nested else b"".join([*kept, text[start:]])
+
+
+def _parsed_names(text: bytes) -> ET.Element:
+    """Return the outermost element of a document whose prefixes are part of the names."""
     blank = len(text) - len(text.lstrip())
     builder, parser = _StrictBuilder(), expat.ParserCreate()
     parser.buffer_text = True
@@ -76,10 +112,6 @@ def parse_lenient_xml(content: bytes) -> ET.Element:
         if isinstance(error, FormatError):
             raise
         raise FormatError(_told(error, text[:blank].count(b"\n"))) from error
-    prefix, colon, _ = root.tag.partition(":")
-    if colon:
-        for element in root.iter():
-            element.tag = element.tag.removeprefix(prefix + colon)
     return root
 
 
