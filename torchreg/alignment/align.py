@@ -25,6 +25,7 @@ from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.errors import InputError, UnitsWarning
+from torchreg.geometry.loaded import points_of
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
@@ -123,7 +124,7 @@ def align(
 
     Args:
         shape: the articulated shape, in metres.
-        data: (M, 3), metres; or (B, M, 3) for a batch of clouds.
+        data: (M, 3), metres, or a cloud, scan or mesh as loaders return; or (B, M, 3) for a batch of clouds.
         initial_pose: (num_dofs,) start, moved inside the limits first; without one, `find_pose` looks for it.
             (B, num_dofs) with a batch of clouds. (S, num_dofs) with one cloud: several starts, of which the best
             alignment is returned.
@@ -150,7 +151,7 @@ def align(
 
     References: Dewaele et al. 2006, section 3.
     """
-    config = config or AlignConfig()
+    config, data = config or AlignConfig(), points_of(data)
     origin = floating_origin(shape, data)
     if origin is not None:
         return _align_about(origin, shape, data, initial_pose, model_points, mask, config, on_step)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import os
+import tokenize
 import zipfile
 from collections.abc import Mapping
 from typing import IO
@@ -116,7 +117,7 @@ def read_npy_header(stream: IO[bytes], what: str) -> tuple[tuple[int, ...], bool
             return np.lib.format.read_array_header_1_0(stream)
         if version == (2, 0):
             return np.lib.format.read_array_header_2_0(stream)
-    except (ValueError, EOFError) as error:
+    except (ValueError, EOFError, SyntaxError, TypeError, LookupError, tokenize.TokenError, MemoryError) as error:
         raise FormatError(f"{what} is no .npy file ({error})") from error
     raise FormatError(f"{what} has the unknown array format {version}")
 
@@ -130,12 +131,13 @@ def _read_real_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bo
 
 
 def _read_array(archive: zipfile.ZipFile, name: str) -> Array:
-    stream = io.BytesIO(archive.read(name))
+    content = archive.read(name)
+    stream = io.BytesIO(content)
     shape, fortran, dtype = _read_real_header(stream, name)
-    body = stream.read()
-    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != len(body):
-        raise FormatError(f"member {name!r} claims the shape {shape} of {dtype} but holds {len(body)} bytes")
-    return np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
+    held = len(content) - stream.tell()
+    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != held:
+        raise FormatError(f"member {name!r} claims the shape {shape} of {dtype} but holds {held} bytes")
+    return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")
 
 
 def write_npz(cloud: RawCloud) -> bytes:

@@ -150,7 +150,7 @@ def _written(name: str, matrix: Tensor) -> str:
 def _parsed(text: str, path: Path) -> Values:
     """Return the matrices, lists of numbers and other words of a file by their names."""
     marks = list(_KEY.finditer(text))
-    ends = [mark.start() for mark in marks[1:]] + [len(text)]
+    ends = [*(mark.start() for mark in marks[1:]), len(text)][: len(marks)]
     values: Values = {}
     for mark, end in zip(marks, ends, strict=True):
         name, first = mark.group(1), mark.group(2).strip()
@@ -170,7 +170,7 @@ def _squared(values: Tensor) -> Tensor:
 
 def _matrix(body: str, where: str) -> Tensor:
     marks = list(_FIELD.finditer(body))
-    ends = [mark.start() for mark in marks[1:]] + [len(body)]
+    ends = [*(mark.start() for mark in marks[1:]), len(body)][: len(marks)]
     fields = {mark.group(1): body[mark.end() : end] for mark, end in zip(marks, ends, strict=True)}
     rows, columns = (fields.get(side, "").strip() for side in ("rows", "cols"))
     if not rows.isdecimal() or not columns.isdecimal() or "data" not in fields:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_choice, check_finite, check_positive, check_shape
+from torchreg._checks import all_finite, as_float_tensor, check_choice, check_finite, check_positive, check_shape
 from torchreg.errors import FileWarning, FormatError, InputError, InputTypeError
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import TriangleMesh
@@ -278,7 +278,8 @@ def load_mesh(
 def _checked_cloud(
     raw: RawCloud, scale: float, nan_policy: str, limits: FileLimits, dtype: torch.dtype | None
 ) -> PointCloud:
-    points = _rows(raw.points, "points", None) * scale
+    points = _rows(raw.points, "points", None)
+    points = points if scale == 1 else points.double() * scale
     count = len(points)
     check_allowed(count, "points", limits)
     if count == 0:
@@ -289,7 +290,7 @@ def _checked_cloud(
     told = None if raw.colors is None else _unit_colors(raw.colors)
     colors = None if told is None else _rows(told, "colors", count).to(dtype)
     faces = None if raw.faces is None else _face_rows(raw.faces, count, limits)
-    finite = torch.isfinite(points).all(dim=-1)
+    finite = _finite_rows(points)
     if nan_policy == "omit":
         for values in (normals, colors):
             if values is not None:
@@ -312,6 +313,13 @@ def _checked_cloud(
         _warn(f"colors are left out: {damaged} of {len(colors)} are not finite")
         colors = None
     return PointCloud(points=points, normals=normals, faces=faces, colors=colors)
+
+
+def _finite_rows(values: Tensor) -> Tensor:
+    """Return which rows (N,) are finite, quickly where all are."""
+    if all_finite(values):
+        return torch.ones(len(values), dtype=torch.bool)
+    return torch.isfinite(values).all(dim=-1)
 
 
 def needed_dtype(points: Tensor) -> torch.dtype:
@@ -337,10 +345,11 @@ def _warn(message: str) -> None:
 
 
 def _rows(values: Array, what: str, count: int | None) -> Tensor:
-    """Return numbers as float64 (N, 3)."""
+    """Return numbers (N, 3) as float64, or float32 where they are that already."""
     if values.ndim != 2 or values.shape[1] != 3 or (count is not None and len(values) != count):
         raise FormatError(f"{what} must have shape ({count or 'N'}, 3), got {values.shape}")
-    return torch.from_numpy(np.array(values, dtype=np.float64))
+    kind = np.float32 if values.dtype in (np.float32, np.float16) else np.float64
+    return torch.from_numpy(np.array(values, dtype=kind))
 
 
 def _unit_colors(colors: Array) -> Array | None:

@@ -92,8 +92,8 @@ def _counts(text: bytes) -> Array:
     blank = letters <= 32
     starts = ~blank
     starts[1:] &= blank[:-1]
-    ends = np.flatnonzero(letters == 10)
-    return np.add.reduceat(starts, np.concatenate(([0], ends[:-1])), dtype=np.int64)
+    before = np.searchsorted(np.flatnonzero(starts), np.flatnonzero(letters == 10))
+    return np.diff(before, prepend=0)
 
 
 def _no_number(text: bytes, what: str, columns: int | None, unit: str, before: int) -> FormatError:

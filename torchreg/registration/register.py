@@ -16,6 +16,7 @@ from torchreg._checks import as_float_tensor, as_tensor, check_count, check_fini
 from torchreg._threads import one_thread
 from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.far_origin import far_origin
+from torchreg.geometry.loaded import scan_of
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.registration.bones.alternation import ReducedFit, Samples
@@ -32,8 +33,8 @@ from torchreg.result import Status
 @torch.no_grad()
 @one_thread()
 def register(
-    source: RangeScan,
-    target: RangeScan,
+    source: RangeScan | Any,
+    target: RangeScan | Any,
     num_bones: int = 20,
     grid_resolution: int = 50,
     config: RegisterConfig | None = None,
@@ -55,7 +56,7 @@ def register(
     the CPU; the result has the dtype and device of the source.
 
     Args:
-        source: the scan to be moved, N points.
+        source: the scan to be moved, N points; or what a loader returns, a cloud or a mesh.
         target: the scan to be reached, in the same frame and unit.
         num_bones: most bones; fewer where the motion needs no more, or the grid has fewer cells.
         grid_resolution: cells along the longest side of the source.
@@ -84,6 +85,7 @@ def register(
     References: Chang and Zwicker 2009, algorithm 1; Le and Deng 2012, for motions and weights in turn.
     """
     config = RegisterConfig() if config is None else config
+    source, target = scan_of(source, "source"), scan_of(target, "target")
     check_inputs((source, target), num_bones, grid_resolution)
     origin = far_origin((source.points, target.points))
     if origin is not None:
@@ -201,10 +203,6 @@ def initial_records(on_step: OnRegisterStep | None) -> Callable[[Any], None] | N
 def check_inputs(scans: tuple[Any, ...], num_bones: int, grid_resolution: int) -> None:
     """Raise unless there are scans with an extent, and numbers in range."""
     for name, scan in zip(("source", "target"), (scans[0], scans[-1]), strict=True):
-        if not isinstance(scan, RangeScan):
-            raise InputTypeError(
-                f"{name} must be a RangeScan, got {type(scan).__name__}; wrap points by RangeScan(...)"
-            )
         if not scan.diagonal > 0:
             raise InputError(f"{name} must have points at different places")
     _warn_about_units(scans[0], scans[-1])

@@ -12,6 +12,7 @@ from torchreg._checks import check_count
 from torchreg._threads import one_thread
 from torchreg.errors import InputError
 from torchreg.geometry.far_origin import far_origin
+from torchreg.geometry.loaded import scan_of
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.registration.bones.alternation import ReducedFit, Samples, turned_normals
@@ -156,7 +157,7 @@ def register_sequence(
     References: Chang and Zwicker 2009, section 6, which asks for a simultaneous optimization.
     """
     config = RegisterConfig() if config is None else config
-    scans = tuple(scans)
+    scans = tuple(scan_of(scan, f"scans[{number}]") for number, scan in enumerate(scans))
     if len(scans) < 2:
         raise InputError(f"scans must hold at least two, got {len(scans)}")
     for scan in scans:
