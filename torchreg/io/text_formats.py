@@ -124,6 +124,8 @@ def _names_in_comment(text: bytes) -> list[str] | None:
 
 def _separated(text: bytes) -> bytes:
     """Return a table whose numbers are separated by blanks and have decimal points."""
+    if not any(separator in text for separator in (b",", b";", b"\t")):
+        return text
     for separator in (b",", b";"):
         if separator * 2 in text:  # a missing value
             text = re.sub(separator + rb"(?=[ \t]*" + separator + rb")", separator + b"nan", text)
