@@ -193,6 +193,9 @@ def outputs(value: Any, name: str) -> Iterator[tuple[str, Tensor | str]]:
         for item in fields(value):
             if item.name not in CLOCKS:
                 yield from outputs(getattr(value, item.name), f"{name}.{item.name}")
+    elif isinstance(value, dict) and value:
+        for key, entry in value.items():
+            yield from outputs(entry, f"{name}.{key}")
     elif isinstance(value, (tuple, list)):
         for index, entry in enumerate(value):
             yield from outputs(entry, f"{name}.{index}")

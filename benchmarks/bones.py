@@ -107,7 +107,8 @@ def measure(bones: int, dtype: torch.dtype, scale: float, repeats: int) -> list[
     return rows + pose_rows(tube, repeats)
 
 
-def refinement_rows(tube: Tube, few: Tensor, repeats: int) -> list[tuple[str, str]]:
+def refinement_scene(tube: Tube, few: Tensor) -> tuple[tr.GridLBS, Tensor, Correspondences]:
+    """Return the bent tube labeled in parts, some of its points, and where smooth weights would take them."""
     model = tr.GridLBS(tube.model.grid, tube.model.weights, tube.pose(0.3))
     points = tube.points[few]
     share = torch.sigmoid(6 * (points[:, :1] - torch.arange(1, model.num_bones).to(points)))
@@ -115,7 +116,11 @@ def refinement_rows(tube: Tube, few: Tensor, repeats: int) -> list[tuple[str, st
     smooth = smooth - torch.cat([share, torch.zeros_like(share[:, :1])], dim=-1)
     moved = points @ model.transforms[:, :3, :3].mT + model.transforms[:, None, :3, 3]
     targets = (smooth.mT.unsqueeze(-1) * moved).sum(0).detach()
-    pairs = Correspondences(targets, tube.normals[few], torch.ones_like(targets[:, 0]), 0.0)
+    return model, points, Correspondences(targets, tube.normals[few], torch.ones_like(targets[:, 0]), 0.0)
+
+
+def refinement_rows(tube: Tube, few: Tensor, repeats: int) -> list[tuple[str, str]]:
+    model, points, pairs = refinement_scene(tube, few)
     rows, objectives = [], []
     for method in ("active_set", "gradient"):
         config = WeightsConfig(method=method)

@@ -94,7 +94,7 @@ class Outcome:
 
 def turning_joints(shape: tr.ArticulatedShape) -> Tensor:
     """Return (num_dofs - 6,) True where a degree of freedom is an angle."""
-    return shape.chain.couplings.abs().mT @ (1 - shape.chain.is_revolute) == 0
+    return shape.kinematics.couplings.abs().mT @ (1 - shape.kinematics.is_revolute) == 0
 
 
 def random_poses(shape: tr.ArticulatedShape, size: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:

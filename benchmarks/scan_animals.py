@@ -7,7 +7,7 @@ motion of an animal does that: spine, tail and toes move as far as legs. One dep
 about 7,500 points each. A pair counts as registered when at least 90 % of its source points end within 2.5 % of the
 diagonal of their true place, visible in the target or not.
 
-    python benchmarks/scan_animals.py
+    python benchmarks/scan_animals.py            # --smoke: one pair per animal and motion
 """
 
 from __future__ import annotations
@@ -132,6 +132,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--animals", type=Path, help="folder of dm_control, instead of the installed one")
     parser.add_argument("--pairs", type=int, default=6, help="per animal and motion")
     parser.add_argument("--seed", type=int, default=0, help="of poses and places of the camera")
+    parser.add_argument("--smoke", action="store_true", help="one pair per animal and motion, in a minute")
     options = parser.parse_args(arguments)
     folder = options.animals or animals_folder()
     with torch.no_grad():
@@ -139,7 +140,7 @@ def main(arguments: list[str] | None = None) -> int:
         if not found:
             print('skipped: no animals found; pip install "torchreg[benchmark]" brings them')
             return 0
-        print_rows(found, options.pairs, options.seed)
+        print_rows(found, 1 if options.smoke else options.pairs, options.seed)
     return 0
 
 

@@ -34,7 +34,6 @@ from torch import Tensor
 from tqdm import tqdm
 
 import torchreg as tr
-from torchreg.alignment.skeleton_source import SpineLimbs
 from torchreg.datasets.creatures import OCTOPUS, STARFISH, CreatureForm, CreatureSequence, creature_sequence
 from torchreg.geometry.mesh import concatenate, sample_surface, unit_sphere
 from torchreg.geometry.voxels import VoxelGrid, voxelize
@@ -197,7 +196,7 @@ def hands(count: int, seed: int) -> Tensor:
         row = []
         for with_spine in (True, False):
             start = time.process_time()
-            sources = {"sources": [SpineLimbs.of_surface(mesh, data)]} if with_spine else {}
+            sources = {"sources": [tr.SpineLimbs.of_surface(mesh)]} if with_spine else {}
             starts = tr.find_pose(hand, data, model_points=skin, **sources)
             seconds = time.process_time() - start
             error = (hand.keypoints(starts.best) - hand.keypoints(pose))[TIPS].norm(dim=-1).mean()

@@ -32,6 +32,14 @@ def test_a_hand_loads_no_library_that_it_does_not_use(tmp_path):
     assert run(code, tmp_path) == []
 
 
+def test_only_a_chain_brings_pytorch_kinematics(tmp_path):
+    code = (
+        "import sys, torchreg; hand = torchreg.Hand(); hand.keypoints(hand.rest_pose());"
+        "print('pytorch_kinematics' in sys.modules); hand.chain; print('pytorch_kinematics' in sys.modules)"
+    )
+    assert run(code, tmp_path) == ["False", "True"]
+
+
 def test_a_used_name_brings_torch(tmp_path):
     code = "import sys, torchreg; torchreg.metrics.chamfer; print('torch' in sys.modules)"
     assert run(code, tmp_path) == ["True"]

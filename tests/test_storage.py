@@ -220,7 +220,9 @@ def test_unknown_results_are_neither_saved_nor_loaded(tmp_path):
 
 
 def test_fields_that_cannot_be_stored_are_named(tmp_path):
-    with pytest.raises(InputTypeError, match=r"sigma cannot be stored: list is not a tensor, record, tuple or number"):
+    with pytest.raises(
+        InputTypeError, match=r"sigma cannot be stored: list is not a tensor, record, tuple, dict or number"
+    ):
         save_result(replace(result(), sigma=[1.0]), tmp_path / "r.safetensors")
     with pytest.raises(InputTypeError, match=r"history\.1\.cost cannot be stored: set"):
         save_result(replace(result(), history=((), replace(record(0), cost={1}))), tmp_path / "r.safetensors")
@@ -392,6 +394,31 @@ def test_models_on_grids_come_back_as_they_were(tmp_path):
     assert again.blend == "dual_quaternion"
     assert torch.equal(again.weights, model.weights)
     assert torch.equal(again(points), model(points))
+
+
+def test_energies_by_name_come_back_and_old_files_have_none(tmp_path):
+    """Also where records differ in the names they hold."""
+    path = Path(__file__).parent / "saved" / "0.1.0" / "ScanRegistration.safetensors"
+    old = load(path)
+    assert len(old.history) > 0
+    assert all(record.energies == {} for record in old.history)
+    energies = {"distance": 0.1, "joint": 1 / 3, "a new term": 2e-300}
+    saved = replace(old, history=(replace(old.history[0], energies=energies), *old.history))
+    saved.save(tmp_path / "m.safetensors")
+    assert load(tmp_path / "m.safetensors").history == saved.history
+    for wrong, message in (
+        ({"dict": 3}, "must be a dict"),
+        ({"dict": {"joint": "low"}}, "must not be of type dict"),
+        ([1.0], "must not be of type tuple"),
+        ({"dict": {"joint": {"tensor": "nothing"}}}, "names the tensor 'nothing', which is not there"),
+    ):
+        saved.save(tmp_path / "m.safetensors")
+        edit(
+            tmp_path / "m.json",
+            lambda m, w=wrong: m["fields"]["history"]["columns"]["energies"].__setitem__(0, w),
+        )
+        with pytest.raises(FormatError, match=message):
+            load(tmp_path / "m.safetensors")
 
 
 SAVED = sorted((Path(__file__).parent / "saved").glob("*/*.safetensors"))

@@ -15,6 +15,7 @@ from torchreg.alignment.results import AlignResult as AlignResult
 from torchreg.alignment.results import Calibration as Calibration
 from torchreg.alignment.results import PoseStarts as PoseStarts
 from torchreg.alignment.sigma_schedule import SigmaSchedule as SigmaSchedule
+from torchreg.alignment.skeleton_source import SpineLimbs as SpineLimbs
 from torchreg.capture.depth import depth_scan as depth_scan
 from torchreg.capture.depth import fuse_scans as fuse_scans
 from torchreg.capture.depth import load_depth_scan as load_depth_scan
@@ -36,6 +37,7 @@ from torchreg.io.points import load_mesh as load_mesh
 from torchreg.io.points import load_points as load_points
 from torchreg.io.scans import load_scan as load_scan
 from torchreg.registration.bones.grid_lbs import GridLBS as GridLBS
+from torchreg.registration.bones.registration_energy import RegistrationEnergy as RegistrationEnergy
 from torchreg.registration.config import RegisterConfig as RegisterConfig
 from torchreg.registration.register import register as register
 from torchreg.registration.register_sequence import register_sequence as register_sequence
@@ -47,6 +49,7 @@ from torchreg.registration.solve_pose import solve_pose as solve_pose
 from torchreg.result import Status as Status
 from torchreg.shapes.articulated import ArticulatedShape as ArticulatedShape
 from torchreg.shapes.hand import Hand as Hand
+from torchreg.shapes.material_points import ShapeOutput as ShapeOutput
 from torchreg.shapes.pose_head import PoseHead as PoseHead
 from torchreg.shapes.pose_prior import PosePrior as PosePrior
 from torchreg.shapes.skin import BendingSkin as BendingSkin
@@ -96,8 +99,10 @@ __all__ = [
     "PoseStarts",
     "RangeScan",
     "RegisterConfig",
+    "RegistrationEnergy",
     "ScanRegistration",
     "SequenceRegistration",
+    "ShapeOutput",
     "SigmaSchedule",
     "SilhouetteFrames",
     "Skeleton",
@@ -105,6 +110,7 @@ __all__ = [
     "SolvePoseConfig",
     "Spine",
     "SpineConfig",
+    "SpineLimbs",
     "SpineSequence",
     "Status",
     "StereoConfig",

@@ -235,11 +235,13 @@ def _encode(value: Any, name: str, known: Mapping[str, type], tensors: dict[str,
         return {"enum": kind, "value": value.value}
     if is_dataclass(value) and kind in known:
         return {"record": kind, "fields": _encode_fields(value, f"{name}.", known, tensors)}
+    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
+        return {"dict": {key: _encode(item, f"{name}.{key}", known, tensors) for key, item in value.items()}}
     if isinstance(value, tuple):
         if len(value) and is_dataclass(value[0]) and len({type(item) for item in value}) == 1:
             return _encode_table(value, name, known, tensors)
         return [_encode(item, f"{name}.{index}", known, tensors) for index, item in enumerate(value)]
-    raise InputTypeError(f"{name} cannot be stored: {kind} is not a tensor, record, tuple or number")
+    raise InputTypeError(f"{name} cannot be stored: {kind} is not a tensor, record, tuple, dict or number")
 
 
 def _encode_table(
@@ -286,6 +288,8 @@ class _Decoder:
             return value
         if isinstance(value, list):
             return tuple(self._decode(item, f"{where}[{index}]") for index, item in enumerate(value))
+        if "dict" in value:
+            return self._decode_dict(value["dict"], where)
         if "tensor" in value:
             return self._tensor(value["tensor"], where)
         if "enum" in value:
@@ -295,6 +299,11 @@ class _Decoder:
         if "table" in value:
             return self._decode_table(value, where)
         raise _WrongContentError(f"{where} holds entries {', '.join(value)}")
+
+    def _decode_dict(self, value: Any, where: str) -> dict[str, Any]:
+        if not isinstance(value, dict):
+            raise _WrongContentError(f"{where} must be a dict")
+        return {key: self._decode(item, f"{where}.{key}") for key, item in value.items()}
 
     def _decode_table(self, value: Mapping[str, Any], where: str) -> tuple[Any, ...]:
         kind, columns = self._kind(value["table"], where), value.get("columns")
@@ -341,7 +350,11 @@ def _make(kind: type, values: dict[str, Any], where: str) -> Any:
     declared = {item.name: item for item in fields(kind)}
     names = {item.metadata["formerly"]: name for name, item in declared.items() if "formerly" in item.metadata}
     values = {names.get(name, name): value for name, value in values.items()}
-    missing = [name for name, item in declared.items() if name not in values and item.default is MISSING]
+    missing = [
+        name
+        for name, item in declared.items()
+        if name not in values and item.default is MISSING and item.default_factory is MISSING
+    ]
     unknown = [name for name in values if name not in declared]
     if missing or unknown:
         raise _WrongContentError(f"{where} lacks or does not know {', '.join(missing + unknown)}")
@@ -363,4 +376,8 @@ def _fits(value: Any, hint: Any) -> bool:
     if origin is tuple:
         each = inner[:1] * len(value) if isinstance(value, tuple) and inner[1:] == (...,) else inner
         return isinstance(value, tuple) and len(value) == len(each) and all(map(_fits, value, each))
+    if origin is dict:
+        return isinstance(value, dict) and all(
+            _fits(key, inner[0]) and _fits(item, inner[1]) for key, item in value.items()
+        )
     return isinstance(value, (int, float) if hint is float else hint)

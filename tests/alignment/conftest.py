@@ -51,6 +51,7 @@ def make_problem():
             surface=FusedSurface(shape),
             data=data,
             valid=torch.ones(data.shape[:2], dtype=torch.bool),
+            origin=torch.zeros_like(data[:, 0]),
             size=model_size(skin),
             lower=shape.lower,
             upper=shape.upper,

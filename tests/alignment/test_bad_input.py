@@ -8,7 +8,6 @@ import torch
 import torchreg as tr
 from torchreg.alignment.pseudo_labels import label_frames
 from torchreg.alignment.rough_poses import PrincipalAxes
-from torchreg.alignment.skeleton_source import SpineLimbs
 from torchreg.errors import InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.skeleton import Skeleton
 
@@ -167,11 +166,9 @@ def test_bad_skeletons_and_labels(plain_hand, plain_hand_skin):
     single = Skeleton(torch.zeros(1, 3), torch.zeros(0, 2).long(), torch.ones(1))
     initializer = tr.PoseInitializer(plain_hand, model_points=plain_hand_skin)
     for call, error, message in (
-        (lambda: SpineLimbs("skeleton", torch.zeros(3)), InputTypeError, "skeleton must be a Skeleton"),
-        (lambda: SpineLimbs(single, torch.zeros(3)), InputError, "skeleton must have a limb"),
-        (lambda: SpineLimbs(chain, torch.zeros(2)), InputError, "middle must have shape"),
-        (lambda: SpineLimbs(chain, torch.zeros(3), 0), InputError, "count must be at least 1"),
-        (lambda: SpineLimbs.of_surface(None, torch.zeros(0, 3)), InputError, "data must hold at least 1"),
+        (lambda: tr.SpineLimbs("skeleton"), InputTypeError, "skeleton must be a Skeleton"),
+        (lambda: tr.SpineLimbs(single), InputError, "skeleton must have a limb"),
+        (lambda: tr.SpineLimbs(chain, 0), InputError, "count must be at least 1"),
         (lambda: next(label_frames(initializer, [], trusted=-1.0)), InputError, "trusted must be zero or positive"),
     ):
         with pytest.raises(error, match=message):

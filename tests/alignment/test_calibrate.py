@@ -133,10 +133,12 @@ def test_the_given_shape_is_not_changed(arm_found, arm_frames, arm_starts):
     assert float(shape.log_length_scales.detach().abs().max()) == 0.0
     assert found.shape is not shape
     assert found.shape.part_names == shape.part_names
-    assert found.shape.log_length_scales.requires_grad
-    frozen = make_arm().requires_grad_(False)
-    copied = calibrate(frozen, arm_frames[:1], arm_starts[:1], config=ARM_CONFIG).shape
-    assert not any(parameter.requires_grad for parameter in copied.parameters())
+    assert not any(parameter.requires_grad for parameter in found.shape.parameters())
+    learning = make_arm()
+    learning.log_length_scales.requires_grad_(True)
+    copied = calibrate(learning, arm_frames[:1], arm_starts[:1], config=ARM_CONFIG).shape
+    learnt = [name for name, parameter in copied.named_parameters() if parameter.requires_grad]
+    assert learnt == ["log_length_scales"]
 
 
 def test_records_tell_how_the_kernel_narrows(arm_found):

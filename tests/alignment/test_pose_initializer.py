@@ -117,7 +117,7 @@ def test_gradients_are_those_of_finite_differences(shape, skin, points, start, w
 
 
 def test_gradients_in_the_sizes_of_the_shape(points, start):
-    shape = finger()
+    shape = finger().requires_grad_(True)
     layer = PoseInitializer(shape, EXACT, model_points=sample_skin(shape, 60))
     scales = torch.nn.ParameterList([shape.log_length_scales, shape.log_radius_scales])
     gradients = torch.autograd.grad(loss_of(layer(points[2:], start=start[2:])), list(scales))

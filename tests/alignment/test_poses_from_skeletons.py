@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+import torchreg as tr
 from torchreg.alignment.find_pose import find_pose
-from torchreg.alignment.skeleton_source import SpineLimbs
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import build_skeleton
 
@@ -38,7 +38,7 @@ def hand_skeleton(hand, pose, *, forearm=True):
 def test_the_pose_is_found_from_the_limbs_alone(plain_hand, plain_hand_skin, plain_hand_surface, seed, forearm):
     pose = bent_pose(plain_hand, seed)
     data = plain_hand_surface(pose)[::7]
-    source = SpineLimbs(hand_skeleton(plain_hand, pose, forearm=forearm), data.mean(0))
+    source = tr.SpineLimbs(hand_skeleton(plain_hand, pose, forearm=forearm))
     starts = find_pose(plain_hand, data, sources=[source], model_points=plain_hand_skin)
     error = (plain_hand.keypoints(starts.best) - plain_hand.keypoints(pose))[TIPS].norm(dim=-1)
     assert float(error.mean()) < 0.003
@@ -48,8 +48,21 @@ def test_the_skeleton_of_a_surface_will_do(plain_hand, plain_hand_skin, plain_ha
     pose = bent_pose(plain_hand, 4)
     data = plain_hand_surface(pose)[::7]
     mesh = TriangleMesh(plain_hand_surface(pose), plain_hand_surface.faces)
-    source = SpineLimbs.of_surface(mesh, data, count=1)
+    source = tr.SpineLimbs.of_surface(mesh, count=1)
     assert len(source.skeleton.tips) == 6
     starts = find_pose(plain_hand, data, sources=[source], model_points=plain_hand_skin)
     error = (plain_hand.keypoints(starts.best) - plain_hand.keypoints(pose))[TIPS].norm(dim=-1)
     assert float(error.mean()) < 0.003
+
+
+def test_a_batch_of_clouds_shares_the_skeleton(plain_hand, plain_hand_skin, plain_hand_surface, make_problem):
+    pose = bent_pose(plain_hand, 1)
+    cloud = plain_hand_surface(pose)[::7]
+    origin = torch.stack([cloud.mean(0), cloud[200:].mean(0) + 0.1])
+    source = tr.SpineLimbs(hand_skeleton(plain_hand, pose), count=1)
+    problem = make_problem(plain_hand_skin, cloud[:400] - origin[:, None], origin=origin)
+    poses = source(problem, torch.Generator())
+    assert poses.shape == (2, 1, plain_hand.num_dofs)
+    for row, middle in zip(poses[:, 0], origin, strict=True):
+        tips = plain_hand.keypoints(row)[TIPS] + middle
+        assert float((tips - plain_hand.keypoints(pose)[TIPS]).norm(dim=-1).mean()) < 0.01

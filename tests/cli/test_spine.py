@@ -93,3 +93,19 @@ def test_masks_of_several_cameras_become_a_spine(run, error_of, masks, tmp_path)
     assert "no meaning without --silhouettes" in error_of("spine", *folders, "--resolution", 64, *out)
     assert "holds pictures" in error_of(*command, *out, "--seen", tmp_path / "s_seen")
     assert "folders must be one per camera" in error_of("spine", "--silhouettes", tmp_path, *command[-4:], *out)
+
+
+def test_a_prior_gives_the_names(run, frames, tmp_path):
+    kept = ("--progress", tmp_path / "kept", "-o")
+    assert run("spine", frames, *kept, tmp_path / "a.glb", "--swc", tmp_path / "a.swc").exit_code == 0
+    spine = load(tmp_path / "a.safetensors")
+    assert run("spine", frames, *kept, tmp_path / "b.glb", "--prior", tmp_path / "a.safetensors").exit_code == 0
+    np.testing.assert_allclose(load(tmp_path / "b.safetensors").curves, spine.curves, atol=1e-5)
+    prior = load_swc(tmp_path / "a_2.swc")
+    assert run("spine", frames, *kept, tmp_path / "c.glb", "--prior", tmp_path / "a_2.swc").exit_code == 0
+    distance = load(tmp_path / "c.safetensors").tips[1] - prior.nodes[prior.tips]
+    assert float(distance.norm(dim=-1).max()) < 0.1
+    for name in ("a.glb", "a.json"):
+        answer = run("spine", frames, *kept, tmp_path / "d.glb", "--prior", tmp_path / name)
+        assert answer.exit_code == 2
+        assert "--prior must be a spine (.safetensors) or a skeleton (.swc)" in " ".join(answer.output.split())

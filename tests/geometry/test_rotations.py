@@ -15,6 +15,7 @@ from torch.func import jacfwd, jacrev
 from torchreg.geometry.rotation import (
     compose_rotation_vectors,
     left_jacobian,
+    rotation_between,
     skew,
     so3_exp,
     so3_log,
@@ -286,3 +287,21 @@ def test_batches_of_any_shape_and_float32():
     torch.testing.assert_close(batch[1, 2], rotation_vector_from_6d(columns[1, 2]))
     torch.testing.assert_close(rotation_vector_from_6d(columns.float()).double(), batch, atol=1e-5, rtol=0)
     assert quaternion_from_rotation(rotation_from_6d(columns)).shape == (2, 3, 4)
+
+
+def test_the_smallest_rotation_takes_one_vector_to_the_other():
+    vectors = torch.randn(2, 50, 3, generator=torch.Generator().manual_seed(1), dtype=D)
+    start, end = torch.nn.functional.normalize(vectors, dim=-1)
+    turn = rotation_between(start, end)
+    torch.testing.assert_close((turn @ start.unsqueeze(-1)).squeeze(-1), end)
+    cosine = 0.5 * (turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
+    torch.testing.assert_close(cosine, (start * end).sum(-1))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_opposite_vectors_are_half_a_turn_apart(axis):
+    start = torch.eye(3, dtype=D)[axis]
+    turn = rotation_between(start, -start)
+    torch.testing.assert_close(turn @ start, -start)
+    torch.testing.assert_close(torch.linalg.det(turn), torch.tensor(1.0, dtype=D))
+    torch.testing.assert_close(rotation_between(start, start), torch.eye(3, dtype=D))

@@ -4,10 +4,11 @@ import pytest
 import torch
 from torch import nn
 from torch.export import Dim, export
-from torch.func import jacfwd, jacrev, vmap
+from torch.func import functional_call, jacfwd, jacrev, vmap
 
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.bones.sparse_grid import SparseGrid
+from torchreg.shapes.hand import Hand
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 
@@ -43,6 +44,11 @@ def grid_model(points, blend):
     return GridLBS(grid, weights, transforms, blend=blend).to(torch.float32)
 
 
+def assert_same(found, expected):
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
+
+
 def compiled(layer):
     """Return a layer captured as one graph, without a compiler of C++."""
     return torch.compile(layer, fullgraph=True, backend="aot_eager")
@@ -58,6 +64,38 @@ def test_skins_and_distances_are_compiled_as_one_graph(plain_hand, plain_hand_sk
     torch.testing.assert_close(compiled(plain_hand_skin)(poses), plain_hand_skin(poses))
     layer = Distance(plain_hand)
     torch.testing.assert_close(compiled(layer)(points, poses[0]), layer(points, poses[0]))
+
+
+def test_the_forward_pass_of_a_shape_is_compiled_as_one_graph_and_trained(poses):
+    hand = Hand().requires_grad_(True)
+    assert_same(compiled(hand)(poses), hand(poses))
+    gradients = []
+    for layer in (compiled(hand), hand):
+        hand.zero_grad()
+        layer(poses).points.square().sum().backward()
+        gradients.append([value.grad.clone() for value in hand.parameters()])
+    torch.testing.assert_close(*gradients)
+
+
+def test_exported_shapes_take_any_number_of_poses(plain_hand, poses):
+    program = export(plain_hand, (poses,), dynamic_shapes=({0: Dim.AUTO},)).module()
+    for count in (3, 2):
+        assert_same(program(poses[:count]), plain_hand(poses[:count]))
+
+
+def test_the_forward_pass_of_a_shape_is_mapped_and_differentiated(plain_hand, poses):
+    assert_same(vmap(plain_hand)(poses), plain_hand(poses))
+    forward, reverse = jacfwd(plain_hand)(poses[0]), jacrev(plain_hand)(poses[0])
+    assert_same(forward, reverse)
+    assert reverse.points.shape == (len(plain_hand.surface_points), 3, 27)
+    states = {
+        name: value.expand(3, *value.shape) + 0.05 * torch.arange(3.0).view(3, *[1] * value.ndim)
+        for name, value in plain_hand.named_parameters()
+    }
+    mapped = vmap(lambda state, pose: functional_call(plain_hand, state, (pose,)))(states, poses)
+    for row, pose in enumerate(poses):
+        own = functional_call(plain_hand, {name: value[row] for name, value in states.items()}, (pose,))
+        assert_same(tuple(field[row] for field in mapped), own)
 
 
 @pytest.mark.parametrize("blend", ["linear", "dual_quaternion"])

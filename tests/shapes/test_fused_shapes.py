@@ -267,7 +267,7 @@ def test_longer_parts_carry_the_frames_below_them_away():
 
 
 def test_held_sizes_change_nothing_and_are_let_go():
-    shape, points = crane(), cloud()
+    shape, points = crane().requires_grad_(True), cloud()
     expected = shape.distance_jacobian(points, pose_with())
     with torch.no_grad(), shape.held_sizes():
         found = shape.distance_jacobian(points, pose_with())
@@ -298,14 +298,18 @@ def test_moving_to_another_dtype_moves_everything():
     assert crane(torch.float32).rest_pose().dtype == torch.float32
 
 
-def test_the_state_holds_parameters_only_and_loads():
+def test_the_state_holds_parameters_and_what_they_multiply_and_loads():
     shape, other = crane(), crane()
-    assert set(shape.state_dict()) == {name for name, _ in shape.named_parameters()}
+    names = {"log_length_scales", "log_radius_scales", "log_nu", "log_sharpness"}
+    assert {name for name, _ in shape.named_parameters()} == names
+    solids = {"primitives.centers", *(f"primitives.sizes.{kind}" for kind in range(4))}
+    assert {name for name in shape.state_dict() if not name.startswith("surface_points.")} == names | solids
     with torch.no_grad():
-        for parameter in shape.parameters():
-            parameter.mul_(1.1)
+        for value in shape.state_dict().values():
+            value.mul_(1.1)
     other.load_state_dict(shape.state_dict())
     assert torch.equal(other.distance(cloud(), pose_with()), shape.distance(cloud(), pose_with()))
+    assert torch.equal(other(pose_with()).points, shape(pose_with()).points)
 
 
 def test_the_mesh_lies_on_the_surface_in_any_pose():

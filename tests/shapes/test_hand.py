@@ -173,7 +173,7 @@ def test_sizes_follow_the_parameters(hand):
     moved = (own.keypoints(own.rest_pose()) - hand.keypoints(hand.rest_pose())).norm(dim=-1)
     torch.testing.assert_close(moved[6:9], 0.1 * hand.bone_lengths[4].expand(3))
     assert bool((moved[:6] == 0).all())
-    own.keypoints(own.rest_pose()).sum().backward()
+    own.requires_grad_(True).keypoints(own.rest_pose()).sum().backward()
     assert own.log_length_scales.grad is not None
 
 

@@ -148,11 +148,72 @@ def test_normals_turn_with_their_parts(hand):
 
 
 @torch.no_grad()
-def test_moving_a_skin_moves_its_shape_and_keeps_the_state_to_parameters():
+def test_moving_a_skin_moves_its_shape():
     skin = BendingSkin(Hand(dtype=torch.float64), torch.zeros(2, 3), faces=torch.zeros(1, 3, dtype=torch.int32))
-    assert all(name.startswith("shape.") for name in skin.state_dict())
     assert skin.faces.dtype == torch.int64
     assert skin.to(torch.float32)(torch.zeros(27)).dtype == torch.float32
+
+
+@torch.no_grad()
+def test_the_state_of_a_skin_makes_a_fresh_one_the_same(hand):
+    pose, normals = random_pose(hand, 1), torch.eye(3, dtype=torch.float64).repeat(4, 1)
+    faces = torch.tensor([[0, 1, 2]])
+    skin = BendingSkin(hand, near_surface(hand, hand.rest_pose(), 12), pose, 4.0, normals=normals, faces=faces)
+    assert {"points", "weights", "basis", "reference_pose"} <= set(skin.state_dict())
+    fresh = BendingSkin(Hand(dtype=torch.float64), torch.zeros(12, 3), normals=-normals, faces=0 * faces)
+    fresh.load_state_dict(skin.state_dict())
+    other = random_pose(hand, 2)
+    assert torch.equal(fresh(other), skin(other))
+    assert torch.equal(fresh.posed_normals(other), skin.posed_normals(other))
+    assert torch.equal(fresh.faces, faces)
+
+
+def test_skins_of_shapes_that_learn_follow_them(hand):
+    shape = Hand(dtype=torch.float64).requires_grad_(True)
+    points, reference, pose = near_surface(hand, hand.rest_pose(), 6), random_pose(hand, 1), random_pose(hand, 2)
+    skin = BendingSkin(shape, points, reference, normals=torch.eye(3).repeat(2, 1))
+    assert skin.follows_shape
+    torch.testing.assert_close(skin(pose), BendingSkin(hand, points, reference)(pose))
+    with torch.no_grad():
+        for number, value in enumerate(shape.parameters()):
+            value.add_(0.1 * torch.randn(value.shape, generator=torch.Generator().manual_seed(number)))
+    with torch.no_grad():
+        rebuilt = BendingSkin(shape, points, reference, normals=skin.normals)
+        frozen = skin.frozen()
+        for other in (rebuilt, frozen):
+            assert not other.follows_shape
+            torch.testing.assert_close(skin(pose), other(pose))
+            torch.testing.assert_close(skin.posed_normals(pose), other.posed_normals(pose))
+            torch.testing.assert_close(skin.jacobian(pose), other.jacobian(pose))
+        shape.log_nu.add_(0.1)
+        assert not torch.allclose(skin(pose), frozen(pose))
+    for _ in range(2):
+        skin(pose).square().sum().backward()
+    assert all(float(value.grad.abs().max()) > 0 for value in shape.parameters())
+
+
+def test_the_gradients_of_a_following_skin_are_those_of_all_parameters(hand):
+    shape = Hand(dtype=torch.float64).requires_grad_(True)
+    skin = BendingSkin(shape, near_surface(hand, hand.rest_pose(), 3), random_pose(hand, 1))
+    names = [name for name, _ in shape.named_parameters()]
+
+    def posed(*values):
+        state = {f"shape.{name}": value for name, value in zip(names, values, strict=True)}
+        return torch.func.functional_call(skin, state, (random_pose(hand, 2),))
+
+    assert torch.autograd.gradcheck(
+        posed, tuple(value.detach().clone().requires_grad_() for value in shape.parameters())
+    )
+
+
+def test_the_sharpness_of_a_skin_is_that_of_its_shape_unless_another_is_given(hand):
+    points, pose = near_surface(hand, hand.rest_pose(), 20), random_pose(hand, 2)
+    sharp = Hand(sharpness=7.0, dtype=torch.float64)
+    assert BendingSkin(sharp, points).sharpness == sharp.sharpness == 7.0
+    assert torch.equal(BendingSkin(sharp, points)(pose), BendingSkin(hand, points, sharpness=7.0)(pose))
+    assert torch.equal(BendingSkin(sharp, points, sharpness=2.0)(pose), BendingSkin(hand, points)(pose))
+    with pytest.raises(InputError, match="sharpness must be positive and finite, got -1"):
+        Hand(sharpness=-1.0)
 
 
 @torch.no_grad()

@@ -13,7 +13,6 @@ from torchreg.spines.curves import (
     curve_lengths,
     moving_average,
     points_along,
-    rotation_between,
     tangents,
 )
 
@@ -56,23 +55,6 @@ def test_frames_are_rotations_along_the_curve_without_twist():
     # Around a plane curve the normal of the plane stays where it is in the frame.
     local = frames[:60].mT @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     torch.testing.assert_close(local, local[:1].expand(60, 3))
-
-
-def test_the_smallest_rotation_takes_one_vector_to_the_other():
-    start, end = (torch.nn.functional.normalize(random(50, 3, seed=seed), dim=-1) for seed in (1, 2))
-    turn = rotation_between(start, end)
-    torch.testing.assert_close((turn @ start.unsqueeze(-1)).squeeze(-1), end)
-    cosine = 0.5 * (turn.diagonal(dim1=-2, dim2=-1).sum(-1) - 1)
-    torch.testing.assert_close(cosine, (start * end).sum(-1))
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_opposite_vectors_are_half_a_turn_apart(axis):
-    start = torch.eye(3, dtype=torch.float64)[axis]
-    turn = rotation_between(start, -start)
-    torch.testing.assert_close(turn @ start, -start)
-    torch.testing.assert_close(torch.linalg.det(turn), torch.tensor(1.0, dtype=torch.float64))
-    torch.testing.assert_close(rotation_between(start, start), torch.eye(3, dtype=torch.float64))
 
 
 def test_aligned_frames_keep_what_lies_on_the_axis_of_rotation():

@@ -67,7 +67,7 @@ class AlignConfig:
         prior_std: standard deviation of a weak prior that holds joints near the initial pose, radians (of the whole
             rotation of a ball joint; sliding joints: as a share of the model's size); None for no prior.
         num_model_points: points sampled on the shape when none are given.
-        sharpness: of the bending skin.
+        sharpness: of the bending skin; the shape's own by default.
         pose_atol: a pose that changes by no more than this is final, radians (metres: as a share of the model's size).
         nan_policy: "raise", or "omit" to leave out non-finite data.
         seed: of the search.
@@ -86,7 +86,7 @@ class AlignConfig:
     debias: float = 0.8
     prior_std: float | None = 0.3
     num_model_points: int = 500
-    sharpness: float = 2.0
+    sharpness: float | None = None
     pose_atol: float = 3e-3
     nan_policy: str = "raise"
     seed: int = 0
@@ -99,7 +99,8 @@ class AlignConfig:
         for name in ("em_steps", "m_steps", "num_candidates", "search_rounds", "num_model_points"):
             check_count(getattr(self, name), name, 1)
         check_count(self.surface_steps, "surface_steps", 0)
-        check_positive(self.sharpness, "sharpness")
+        if self.sharpness is not None:
+            check_positive(self.sharpness, "sharpness")
         check_positive(self.pose_atol, "pose_atol", allow_zero=True)
         check_positive(self.debias, "debias", allow_zero=True)
         for name in ("inlier_distance", "prior_std"):

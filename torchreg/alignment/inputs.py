@@ -95,7 +95,7 @@ def floating_origin(shape: ArticulatedShape, clouds: Tensor) -> Tensor | None:
 
 
 def check_skin(shape: ArticulatedShape, skin: LinearBlendSkin) -> LinearBlendSkin:
-    """Return model points given as a skin.
+    """Return model points given as a skin, with constant weights.
 
     Raises:
         InputError: if the skin is of another shape.
@@ -107,7 +107,7 @@ def check_skin(shape: ArticulatedShape, skin: LinearBlendSkin) -> LinearBlendSki
         )
     if skin.shape is not shape:
         raise InputError("model_points is a skin of another shape; build it from the shape itself")
-    return skin
+    return skin.frozen()
 
 
 def warn_about_units(data: Tensor, valid: Tensor, size: float, *, stacklevel: int) -> bool:

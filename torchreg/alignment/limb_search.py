@@ -119,7 +119,7 @@ class LimbSearch:
         bodies = [body for limb in self.limbs for body in limb.bodies]
         self.samples = {body: self._sample(body) for body in bodies}
         # Mimic joints of a body follow joints elsewhere, so its samples do not determine its transforms.
-        self.relative = {} if shape.chain.has_mimics else {body: self._sampled_transforms(body) for body in bodies}
+        self.relative = {} if shape.kinematics.has_mimics else {body: self._sampled_transforms(body) for body in bodies}
 
     def __call__(self, problem: AlignProblem, poses: Tensor, effort: Effort, generator: torch.Generator) -> Tensor:
         """Return the best combinations of limb configurations, best first.
@@ -146,10 +146,10 @@ class LimbSearch:
 
     def _leader(self, follower: Limb) -> Limb:
         """Return the limb whose degrees of freedom move the first body of one that has none."""
-        chain, first = self.shape.chain, follower.bodies[0]
-        moves = chain.moves[self.shape.part_index]
+        kinematics, first = self.shape.kinematics, follower.bodies[0]
+        moves = kinematics.moves[self.shape.part_index]
         joints = moves[first.parts[0]] - moves[first.parent] if first.parent >= 0 else moves[first.parts[0]]
-        driven = joints.to(chain.couplings) @ chain.couplings.abs() > 0
+        driven = joints.to(kinematics.couplings) @ kinematics.couplings.abs() > 0
         return max(self.limbs, key=lambda limb: int(driven[[dof - BASE_DOFS for dof in limb.dofs]].sum()))
 
     def _sample(self, body: Body) -> Tensor:

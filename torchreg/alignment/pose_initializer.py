@@ -122,7 +122,7 @@ class PoseInitializer(nn.Module):
     All is computed in the shape's dtype, whatever autocast says; the solve of the backward pass in float64.
 
     Args:
-        shape: the articulated shape, in metres. Call ``shape.requires_grad_(False)`` unless its sizes are learned.
+        shape: the articulated shape, in metres; its parameters get gradients where they require them.
         config: see `PoseInitializerConfig`.
         model_points: a skin of the shape to reuse; sampled on the surface by default.
 
@@ -143,7 +143,7 @@ class PoseInitializer(nn.Module):
         self.config = config or PoseInitializerConfig()
         self.shape = shape
         count = self.config.num_model_points
-        self.skin = sample_skin(shape, count) if model_points is None else check_skin(shape, model_points)
+        self.skin = check_skin(shape, sample_skin(shape, count) if model_points is None else model_points)
 
     def forward(self, points: Tensor, mask: Tensor | None = None, start: Tensor | None = None) -> InitialPose:
         """Return the poses of the shape in clouds.

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
+from torchreg.geometry.kinematic_tree import stack_sizes
 from torchreg.shapes.articulation import Articulation
-from torchreg.shapes.kinematics import stack_sizes
 from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import FusedSurface, ShapeSurface, SkinSurface, dense_file_skin
@@ -55,8 +55,9 @@ class AlignProblem:
     Args:
         skin: the model points.
         surface: the surface that the surface fit fits.
-        data: (B, M, 3), metres.
+        data: (B, M, 3), metres, from the origin.
         valid: (B, M) False where padded.
+        origin: (B, 3) in the world.
         size: diagonal of the model in its rest pose, metres: the unit of all thresholds.
         lower: limits of the pose, (num_dofs,) or (B, num_dofs).
         upper: limits of the pose, (num_dofs,) or (B, num_dofs).
@@ -71,6 +72,7 @@ class AlignProblem:
     surface: ShapeSurface
     data: Tensor
     valid: Tensor
+    origin: Tensor
     size: float
     lower: Tensor
     upper: Tensor
@@ -86,6 +88,7 @@ class AlignProblem:
             self,
             data=self.data[index],
             valid=self.valid[index],
+            origin=self.origin[index],
             lower=_rows(self.lower, index),
             upper=_rows(self.upper, index),
             prior=replace(self.prior, mean=self.prior.mean[index]),
@@ -191,6 +194,7 @@ def centered_problem(
         surface=_surface(shape, skin),
         data=torch.where(valid.unsqueeze(-1), data - origin.unsqueeze(1), 0.0),
         valid=valid,
+        origin=origin,
         size=size,
         lower=lower,
         upper=upper,
@@ -209,7 +213,7 @@ def _joint_precision(shape: Articulation, size: float, std: float | None) -> Ten
         joints = torch.where(shape.is_sliding[BASE_DOFS:], std * size, std)
         precision[BASE_DOFS:] = joints.square().reciprocal()
         # The three axes of a ball joint share the deviation of its one rotation.
-        balls = [BASE_DOFS + dof for dof, axes in enumerate(stack_sizes(shape.chain.tree)) if axes >= BALL_AXES]
+        balls = [BASE_DOFS + dof for dof, axes in enumerate(stack_sizes(shape.kinematics.tree)) if axes >= BALL_AXES]
         precision[balls] *= BALL_AXES
     return precision
 

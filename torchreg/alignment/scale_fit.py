@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import torch
@@ -108,7 +110,6 @@ class ScaleProblem:
         max_points: int,
     ) -> None:
         self.shape, self.size = shape, size
-        shape.log_length_scales.requires_grad_()
         # Strides rather than draws: frames are in no order that matters, and the result is the same every time.
         stride = -(-data.shape[1] // max_points)
         data, valid = data[:, ::stride], valid[:, ::stride]
@@ -183,7 +184,7 @@ def scale_jacobian(shape: ArticulatedShape, points: Tensor, poses: Tensor) -> Te
     """Return the Jacobian of the fused distance with respect to the logarithms of all lengths and radii.
 
     Args:
-        shape: the articulated shape; its `log_length_scales` must require gradients.
+        shape: the articulated shape.
         points: (T, M, 3), metres.
         poses: (T, num_dofs).
 
@@ -213,13 +214,24 @@ def scale_jacobian(shape: ArticulatedShape, points: Tensor, poses: Tensor) -> Te
     return torch.cat([by_length - force @ moves.flatten(1, 2), by_radius], dim=-1).detach()
 
 
+@contextmanager
+def _learning(parameter: Tensor) -> Iterator[None]:
+    """Let a parameter take gradients in a ``with`` block, whether or not it does otherwise."""
+    before = parameter.requires_grad
+    parameter.requires_grad_(True)
+    try:
+        yield
+    finally:
+        parameter.requires_grad_(before)
+
+
 def _solid_motions(shape: ArticulatedShape, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return centers (T, P, 3) and rotations (T, P, 3, 3) of the solids, and motions of the centers (T, P, 3, P).
 
     The motions, by the logarithms of all lengths, are in each solid's own frame.
     """
     lengths = shape.log_length_scales
-    with torch.enable_grad():
+    with torch.enable_grad(), _learning(lengths):
         transforms = shape.part_transforms(poses)
         scaled = shape.primitives.centers.detach() * lengths.exp().unsqueeze(-1)
         centers = transforms[..., :3, 3] + (transforms[..., :3, :3] @ scaled.unsqueeze(-1)).squeeze(-1)

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from torchreg._checks import as_float_tensor, check_count, check_finite, check_points, check_shape
-from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem
+from torchreg._checks import check_count
+from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem, shifted
 from torchreg.alignment.rough_poses import typical_poses
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import TriangleMesh
@@ -49,8 +49,8 @@ class SpineLimbs:
     its bones from the tip, and the pose is fitted to all targets within the limits.
 
     Args:
-        skeleton: of the cloud, such as one frame of a spine or the result of `skeletonize`.
-        middle: (3,) mean of the data that are given to `find_pose`, in the coordinates of the skeleton.
+        skeleton: of the cloud and in its coordinates, such as ``spine.model.skeleton(t)`` or the result of
+            `skeletonize`.
         count: poses proposed.
 
     Raises:
@@ -58,7 +58,6 @@ class SpineLimbs:
     """
 
     skeleton: Skeleton
-    middle: Tensor
     count: int = 2
 
     def __post_init__(self) -> None:
@@ -66,33 +65,27 @@ class SpineLimbs:
             raise InputTypeError(f"skeleton must be a Skeleton, got {type(self.skeleton).__name__}")
         if not self.skeleton.limbs:
             raise InputError("skeleton must have a limb, got a single node")
-        middle = as_float_tensor(self.middle, "middle")
-        check_shape(middle, "middle", (3,))
-        check_finite(middle, "middle")
         check_count(self.count, "count", 1)
 
     @classmethod
-    def of_surface(cls, mesh: TriangleMesh, data: Tensor, count: int = 2) -> SpineLimbs:
+    def of_surface(cls, mesh: TriangleMesh, count: int = 2) -> SpineLimbs:
         """Return the source of the skeleton of a surface, of which few vertices are taken: limbs need no more.
 
         Args:
-            mesh: the surface of the shape.
-            data: (M, 3) the data given to `find_pose`, such as points of that surface.
+            mesh: the surface of which the data of `find_pose` are points.
             count: poses proposed.
 
         Raises:
-            InputError: as `skeletonize`, or if the data are empty or not finite.
+            InputError: as `skeletonize`.
         """
-        data = as_float_tensor(data, "data")
-        check_points(data, "data", batch=False)
         skeleton = skeletonize(mesh, SkeletonizeConfig(max_vertices=_CHAIN_FIT.num_vertices))
-        return cls(skeleton=skeleton, middle=data.mean(0), count=count)
+        return cls(skeleton=skeleton, count=count)
 
     def __call__(self, problem: AlignProblem, generator: torch.Generator) -> Tensor:
         """Return (B, K, num_dofs) poses, see `PoseSource`; every cloud of a batch is taken for the skeleton's."""
         shape = problem.skin.shape
         chains = _Chains.from_skin(problem.skin)
-        limbs = self._limb_points(chains.lengths).to(problem.data)
+        limbs = self._limb_points(chains.lengths, problem.origin[0]).to(problem.data)
         starts, targets = [], []
         for typical in typical_poses(shape):
             known = chains.positions(shape, typical.unsqueeze(0))[0]
@@ -103,12 +96,13 @@ class SpineLimbs:
                 targets.append(target)
         poses, costs = _fit_chains(problem, chains, torch.stack(starts), torch.stack(targets))
         best = poses[costs.argsort()[: self.count]]
-        return best.expand(len(problem.data), *best.shape)
+        every = best.expand(len(problem.data), *best.shape)
+        return shifted(every, (problem.origin[0] - problem.origin).unsqueeze(1).expand(*every.shape[:2], 3))
 
-    def _limb_points(self, lengths: Tensor) -> Tensor:
-        """Return points (M, K, S, 3) of each limb at the lengths (K, S) of each chain from the tip, centered."""
+    def _limb_points(self, lengths: Tensor, origin: Tensor) -> Tensor:
+        """Return points (M, K, S, 3) of each limb, at the lengths (K, S) of each chain from the tip, from an origin."""
         skeleton = self.skeleton
-        nodes = skeleton.nodes.detach().cpu().double() - self.middle.detach().cpu().double()
+        nodes = skeleton.nodes.detach().cpu().double() - origin.cpu().double()
         tips = skeleton.tips.tolist()
         # On beyond the junction, towards the farthest tip: the first joint of a finger may lie in the palm.
         paths = [max((skeleton.path(tip, end) for end in tips if end != tip), key=len) for tip in tips]

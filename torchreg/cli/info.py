@@ -20,7 +20,7 @@ def info(
     size = float((rest.amax(0) - rest.amin(0)).norm())
     surface = "the file's mesh" if model.surface is not None else "fused solids"
     typer.echo(f"{shape}: {model.num_parts} parts, {model.num_dofs} degrees of freedom, {surface}, {size:.3f} m across")
-    sliding = {joint.name for joint in model.chain.tree.joints if joint.kind == "prismatic"}
+    sliding = {joint.name for joint in model.kinematics.tree.joints if joint.kind == "prismatic"}
     width = max(len(name) for name in (*model.dof_names, *model.part_names))
     typer.echo("\ndegrees of freedom")
     limits = zip(model.dof_names, model.lower.tolist(), model.upper.tolist(), strict=True)

@@ -16,6 +16,7 @@ from torchreg.cli.reporting import reporting
 if TYPE_CHECKING:
     from torchreg.capture.silhouette_frames import SilhouetteFrames
     from torchreg.geometry.mesh import TriangleMesh
+    from torchreg.geometry.skeleton import Skeleton
     from torchreg.spines.results import SpineSequence
 
 
@@ -58,6 +59,13 @@ def spine(
     pictures: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Also draw each frame (frame_0000.png).")
     ] = None,
+    prior: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="A result of this command (.safetensors) or a skeleton (.swc) whose limbs and names are kept.",
+        ),
+    ] = None,
     tips: Annotated[int | None, typer.Option(min=2, help="Number of tips; without it the most frequent one.")] = None,
     samples: Annotated[int, typer.Option(min=3, help="Points along each limb.")] = 24,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,
@@ -85,10 +93,10 @@ def spine(
     check_positive(fps, "--fps")
     glb = with_ending(output, (".glb",), add=True)
     result = glb.with_suffix(".safetensors")
-    swc = with_ending(swc, (".swc",))
-    npz = with_ending(npz, (".npz",))
+    swc, npz = with_ending(swc, (".swc",)), with_ending(npz, (".npz",))
     hulls = {"--calibration": calibration, "--screen": screen, "--resolution": resolution, "--seen": seen}
     check_used(silhouettes, "--silhouettes", hulls)
+    known = _read_prior(prior)
     if silhouettes:
         source = _silhouettes(frames, calibration, bool(screen), resolution, scale)
         count, names = len(source), source.names
@@ -110,7 +118,9 @@ def spine(
 
     with tqdm(total=len(meshes), unit="frame", desc="skeletons", leave=False, disable=quiet) as bar:
         config = SpineConfig(num_tips=tips, num_samples=samples)
-        found = extract_spine(meshes, config=config, workers=workers, on_step=lambda _: bar.update(), progress=progress)
+        found = extract_spine(
+            meshes, prior=known, config=config, workers=workers, on_step=lambda _: bar.update(), progress=progress
+        )
     found.save(result)
     _write(found, meshes, glb, curves, npz, fps)
     _draw(found, meshes, movie, pictures, fps)
@@ -118,6 +128,23 @@ def spine(
         for warning in found.warnings:
             typer.echo(f"torchreg: warning: {_named(warning, names)}", err=True)
         typer.echo(_summary(found, glb))
+
+
+def _read_prior(path: Path | None) -> Skeleton | SpineSequence | None:
+    """Return the skeleton of a file, whose ends are numbered in the order of its lines, or the spine of a result."""
+    from torchreg.errors import InputError
+    from torchreg.io.swc import load_swc
+    from torchreg.spines.results import SpineSequence
+    from torchreg.storage import load
+
+    if path is None:
+        return None
+    if path.suffix.lower() == ".swc":
+        return load_swc(path)
+    spine = load(path) if path.suffix.lower() == ".safetensors" else None
+    if not isinstance(spine, SpineSequence):
+        raise InputError(f"--prior must be a spine (.safetensors) or a skeleton (.swc), got {path}")
+    return spine
 
 
 def _read(frames: list[Path], scale: float, nan_policy: str) -> tuple[list[TriangleMesh], tuple[str, ...]]:

@@ -79,13 +79,15 @@ class HandCloud:
         return self.part_counts >= MIN_SEEN_POINTS
 
 
-def surface_skin(shape: ArticulatedShape, *, spacing: float | None = None, sharpness: float = 2.0) -> LinearBlendSkin:
+def surface_skin(
+    shape: ArticulatedShape, *, spacing: float | None = None, sharpness: float | None = None
+) -> LinearBlendSkin:
     """Return the shape's whole surface as a skin with faces: the mesh of its file, else its fused surface at rest.
 
     Args:
         shape: the articulated shape.
         spacing: edge length of the fused surface's grid, metres; see `ArticulatedShape.surface_mesh`.
-        sharpness: a of the bending skin.
+        sharpness: a of the bending skin; the shape's own by default.
 
     Returns:
         The skin, with faces: `shape.file_skin()` or a `BendingSkin`.

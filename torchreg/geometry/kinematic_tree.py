@@ -77,6 +77,24 @@ class KinematicTree:
         raise KeyError(f"no frame is called {name!r}; known: {', '.join(joint.name for joint in self.joints)}")
 
 
+def stack_sizes(tree: KinematicTree) -> list[int]:
+    """Return, per degree of freedom, the number of coincident revolute frames in its joint: three for a ball joint."""
+    stacks: list[list[int]] = []
+    stack_of: dict[int, int] = {}
+    identity = torch.eye(4, dtype=torch.float64)
+    for index, joint in enumerate(tree.joints):
+        if joint.kind != "revolute":
+            continue
+        if joint.parent in stack_of and torch.equal(joint.offset.double(), identity):
+            stack_of[index] = stack_of[joint.parent]
+            stacks[stack_of[index]].append(index)
+        else:
+            stack_of[index] = len(stacks)
+            stacks.append([index])
+    free = [index for index, joint in enumerate(tree.joints) if joint.kind != "fixed" and joint.mimic is None]
+    return [len(stacks[stack_of[index]]) if index in stack_of else 1 for index in free]
+
+
 def _check_joint(index: int, joint: Joint, count: int) -> None:
     if (index == 0) != (joint.parent == -1):
         problem = "is a second root: the tree is disconnected" if joint.parent == -1 else "must be the root (parent -1)"

@@ -9,6 +9,8 @@ from torch import Tensor
 
 # Squared angle, radians^2, below which series to fourth order are exact to float64 rounding.
 SMALL_SQUARED_ANGLE = 1e-4
+# 1 + cosine below which two directions are opposite.
+_OPPOSITE = 1e-6
 
 
 def skew(vector: Tensor) -> Tensor:
@@ -114,6 +116,25 @@ def wrap_rotation_vector(rotation_vector: Tensor) -> Tensor:
     """
     scalar, vector = _exp_quaternion(rotation_vector)
     return _quaternion_log(scalar, vector)
+
+
+def rotation_between(start: Tensor, end: Tensor) -> Tensor:
+    """Return the rotations (..., 3, 3) of smallest angle that take unit vectors ``start`` (..., 3) to ``end`` (..., 3).
+
+    Opposite vectors are turned about an axis perpendicular to them that is otherwise arbitrary.
+
+    Differentiable: in both, away from opposite vectors.
+    """
+    start, end = torch.broadcast_tensors(start, end)
+    cosine = (start * end).sum(-1, keepdim=True).unsqueeze(-1)
+    opposite = cosine < _OPPOSITE - 1
+    cross = skew(torch.linalg.cross(start, end, dim=-1))
+    identity = torch.eye(3, dtype=start.dtype, device=start.device)
+    rotation = identity + cross + cross @ cross / torch.where(opposite, 1.0, 1 + cosine)
+    smallest = torch.nn.functional.one_hot(start.detach().abs().argmin(-1), 3).to(start)
+    axis = torch.linalg.cross(start, smallest, dim=-1)
+    axis = axis / axis.norm(dim=-1, keepdim=True)
+    return torch.where(opposite, 2 * axis.unsqueeze(-1) * axis.unsqueeze(-2) - identity, rotation)
 
 
 def _exp_quaternion(rotation_vector: Tensor) -> tuple[Tensor, Tensor]:

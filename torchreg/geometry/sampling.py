@@ -33,27 +33,28 @@ def farthest_points(points: Tensor, count: int, start: int = 0) -> Tensor:
     return chosen
 
 
-def even_order(points: Tensor) -> Tensor:
-    """Return all points in an order of which every beginning covers the cloud evenly.
+def even_order(points: Tensor, count: int | None = None) -> Tensor:
+    """Return points in an order of which every beginning covers the cloud evenly.
 
     The first is the farthest from the centroid, each next one the farthest from those before, as by `farthest_points`.
 
     Args:
         points: (N, 3) finite, at least one, any unit.
+        count: number of points, 1 to N; all by default.
 
     Returns:
-        Indices (N,) int64; the order of equally far points is not defined.
+        Indices (count,) int64; the order of equally far points is not defined.
 
-    Cost: O(N^2); 40 ms for 2,500 points.
+    Cost: O(N count); 40 ms for 2,500 points.
 
     References: Gonzalez 1985.
     """
     centered = points.detach().cpu().double().numpy()
     centered = centered - centered.mean(axis=0)
     squares = (centered**2).sum(axis=1)
-    order = np.empty(len(centered), dtype=np.int64)
+    order = np.empty(len(centered) if count is None else count, dtype=np.int64)
     order[0], nearest = squares.argmax(), np.full(len(centered), np.inf)
-    for index in range(1, len(centered)):
+    for index in range(1, len(order)):
         last = order[index - 1]
         np.minimum(nearest, squares - centered @ (2 * centered[last]) + squares[last], out=nearest)
         # Below every distance, rounding included, so that no point is chosen twice among duplicates.

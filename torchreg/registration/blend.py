@@ -122,6 +122,13 @@ def blend_dual_quaternion_jacobian(points: Tensor, weights: Tensor, transforms: 
     return product * share.unsqueeze(-3)
 
 
+# The blends by name, each with its derivatives by the bones' twists. States hold their numbers: new ones come last.
+BLENDS = {
+    "linear": (blend_linear, blend_linear_jacobian),
+    "dual_quaternion": (blend_dual_quaternion, blend_dual_quaternion_jacobian),
+}
+
+
 def _signed_quaternions(weights: Tensor, transforms: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return real and dual parts (..., B, 4) of the bones, and the sign (..., N, B) that each takes at each point."""
     real = quaternion_from_rotation(transforms[..., :3, :3])

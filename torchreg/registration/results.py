@@ -32,6 +32,9 @@ class RegisterRecord:
         boundary: matches dropped because the target is on a boundary.
         far: matches dropped because of their distance.
         turned: matches dropped because normals differ.
+        energies: what each term of the paper's eqs. 2 and 8 adds to the energy, by name, as in `RegistrationEnergy`;
+            their sum is the energy. Weights of the terms are the same in all steps: those of the refinement, and the
+            last one of the joints in the paper. Means over the frames; empty in the initialization, which has no bones.
     """
 
     stage: str
@@ -45,6 +48,7 @@ class RegisterRecord:
     boundary: int = 0
     far: int = 0
     turned: int = 0
+    energies: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -12,9 +12,12 @@ from torch import Tensor
 from torchreg.errors import InputError
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.rigs import spec_from_arrays, spec_from_gltf
-from torchreg.shapes.robots import spec_from_urdf
+from torchreg.shapes.robots import spec_from_chain, spec_from_urdf
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.spec import ShapeSpec
+
+if TYPE_CHECKING:
+    from torchreg.shapes.kinematics import Chain
 
 
 class ArticulatedShape(Articulation):
@@ -27,11 +30,16 @@ class ArticulatedShape(Articulation):
     The base moves the root of the tree: ``T_world_frame = T(translation) R(rotation vector) T_root_frame``, so it turns
     about the origin of the tree's coordinates (the file's origin), not about the root's frame.
 
+    ``shape(pose)`` is a `ShapeOutput`: points of the surface, keypoints and part transforms. Parameters, which the
+    state holds, are frozen until ``requires_grad_(True)``: `log_length_scales` and `log_radius_scales` (P,), zero for
+    the shape as it came, `log_nu` and `log_sharpness` (). A state is loaded into a shape that is made alike.
+
     Args:
         tree: the kinematic tree.
         part_frames: names of the frames that carry a solid, one per part.
         primitives: one `Primitive` per part.
         nu: fusion length of the field in metres; about a quarter of a part's thickness fuses smoothly.
+        sharpness: of the bending skin, a in eq. 3: 2 lets the skin slide and stretch, 10 is near rigid.
         part_names: names of the parts; the frame names by default.
         free_base: False pins the base at the origin (its six limits are zero).
         surface: mesh and skin weights of the file the shape came from, if any.
@@ -46,7 +54,8 @@ class ArticulatedShape(Articulation):
     @classmethod
     def from_spec(cls, spec: ShapeSpec, **options: Any) -> ArticulatedShape:
         """Return the shape of a `ShapeSpec` (tree, parts, solids, and the file's surface)."""
-        options = {"nu": spec.nu, **{key: value for key, value in options.items() if value is not None}}
+        given = {key: value for key, value in options.items() if value is not None}
+        options = {"nu": spec.nu, "sharpness": spec.sharpness, **given}
         return cls(
             spec.tree, spec.part_frames, spec.primitives, part_names=spec.part_names, surface=spec.surface, **options
         )
@@ -89,6 +98,39 @@ class ArticulatedShape(Articulation):
         """
         spec = spec_from_urdf(path, package_dirs=package_dirs, primitive=primitive, meshes=meshes)
         return cls.from_spec(spec, free_base=free_base, nu=nu, dtype=dtype)
+
+    @classmethod
+    def from_chain(
+        cls,
+        chain: Chain,
+        *,
+        free_base: bool = True,
+        nu: float | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> ArticulatedShape:
+        """Return the shape of a `pytorch_kinematics.Chain`: its tree, with the solids of its links or thin bones.
+
+        Boxes, cylinders and spheres that links carry (chains from URDF and SDF files do) are taken as they are. Where
+        a chain only names the geometry, as a mesh, and for every link of a chain without any, thin capsules run from
+        the frame to those attached to it, a tenth of a median bone wide; a last frame gets a ball. Where the file is at
+        hand, `from_urdf` keeps its meshes.
+
+        Args:
+            chain: of fixed, revolute and prismatic joints, such as ``pytorch_kinematics.build_chain_from_urdf`` gives.
+            free_base: False if the base is bolted to the origin.
+            nu: fusion length, metres; from the parts' thickness by default.
+            dtype: of the module; the default dtype if None.
+
+        Returns:
+            The shape. Degrees of freedom have the names, order and limits of the chain's joints; parts are called like
+            its frames, those of a frame's further solids FRAME_1, FRAME_2, ...
+
+        Raises:
+            InputTypeError: if something else is given.
+            ModelError: if a joint is of another type, frames or joints share names, a number is not finite, or there is
+                neither a solid nor two frames apart.
+        """
+        return cls.from_spec(spec_from_chain(chain), free_base=free_base, nu=nu, dtype=dtype)
 
     @classmethod
     def from_gltf(

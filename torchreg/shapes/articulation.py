@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import copy
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchreg._checks import check_finite, check_positive, check_shape
 from torchreg.errors import InputError, ModelError
@@ -15,8 +17,9 @@ from torchreg.geometry.isosurface import isosurface
 from torchreg.geometry.kinematic_tree import KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.primitives import Planes
-from torchreg.geometry.rigid import rigid_matrix
-from torchreg.shapes.posed_tree import PosedTree
+from torchreg.geometry.rigid import invert_rigid, rigid_matrix
+from torchreg.shapes.material_points import MaterialPoints, ShapeOutput, fused_points, mesh_points, onto_fused
+from torchreg.shapes.posed_tree import PosedTree, frozen
 from torchreg.shapes.primitives import Primitive, PrimitiveSet, fuse
 from torchreg.shapes.spec import RigSurface
 
@@ -24,8 +27,10 @@ from torchreg.shapes.spec import RigSurface
 class Articulation(PosedTree):
     """Parts on a kinematic tree and their fused surface, in any pose: the basis of skins and of shapes from files.
 
-    See `ArticulatedShape`, which is made from files as well, for conventions and arguments.
+    See `ArticulatedShape`, which is made from files as well, for conventions, arguments and parameters.
     """
+
+    _started: Tensor
 
     def __init__(
         self,
@@ -34,23 +39,116 @@ class Articulation(PosedTree):
         primitives: Sequence[Primitive],
         *,
         nu: float = 0.003,
+        sharpness: float = 2.0,
         part_names: Sequence[str] | None = None,
         free_base: bool = True,
         surface: RigSurface | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
         check_positive(nu, "nu")
+        check_positive(sharpness, "sharpness")
         if not part_frames or len(part_frames) != len(primitives):
             raise ModelError(
                 f"a shape needs one primitive per part, got {len(primitives)} for {len(part_frames)} part frames"
             )
         super().__init__(tree, part_frames, part_names, free_base)
-        self.nu = float(nu)
         self.primitives = PrimitiveSet(primitives)
         self.surface = surface
-        self.log_radius_scales = nn.Parameter(torch.zeros(len(primitives), dtype=torch.float64))
-        self._held: tuple[Tensor, list[Tensor], Tensor] | None = None
+        self.log_radius_scales = frozen(torch.zeros(len(primitives), dtype=torch.float64))
+        self.log_nu = frozen(torch.tensor(math.log(nu), dtype=torch.float64))
+        self.log_sharpness = frozen(torch.tensor(math.log(sharpness), dtype=torch.float64))
+        # What they were at first: until they change, the numbers themselves count, without the rounding of logarithms.
+        self.start_nu, self.start_sharpness = float(nu), float(sharpness)
+        self.register_buffer("_started", torch.stack([self.log_nu, self.log_sharpness]), persistent=False)
+        self._held: tuple[Tensor, list[Tensor], Tensor, Tensor] | None = None
+        self.surface_points = self._bound_points()
         self.to(dtype or torch.get_default_dtype())
+
+    def _bound_points(self) -> MaterialPoints:
+        """Return the points of the surface as it came: of the file's mesh, where there is one, else of the solids."""
+        reference = self.rest if self.surface is None else torch.zeros_like(self.rest)
+        transforms = self.part_transforms(reference)
+        to_parts = invert_rigid(transforms)
+        if self.surface is not None:
+            return mesh_points(self.surface, to_parts)
+        # In the precision of files, so that a shape that comes back from one has the same samples.
+        solids = copy.deepcopy(self.primitives).float().double()
+        frames = transforms @ rigid_matrix(solids.rotations, solids.centers)
+        return fused_points(solids, frames, self.adjacency, self.start_nu, to_parts)
+
+    @property
+    def nu(self) -> float:
+        """Fusion length, metres; `fusion_length` is the same with gradients."""
+        return float(self.fusion_length().detach())
+
+    @property
+    def sharpness(self) -> float:
+        """Sharpness of the bending skin; `bending_sharpness` is the same with gradients."""
+        return float(self.bending_sharpness().detach())
+
+    @property
+    def faces(self) -> Tensor | None:
+        """Triangles (F, 3) over the points of `forward`; None where these are samples."""
+        if self.surface is None or self.surface.is_rigid:
+            return None
+        return self.surface.faces.to(self.rest.device)
+
+    def fusion_length(self) -> Tensor:
+        """Return nu (), float64, metres.
+
+        Differentiable: in `log_nu`.
+        """
+        if self._held is not None:
+            return self._held[3]
+        return (self.log_nu - self._started[0]).double().exp() * self.start_nu
+
+    def bending_sharpness(self) -> Tensor:
+        """Return the sharpness of the bending skin (), float64.
+
+        Differentiable: in `log_sharpness`.
+        """
+        return (self.log_sharpness - self._started[1]).double().exp() * self.start_sharpness
+
+    def forward(self, pose: Tensor) -> ShapeOutput:
+        """Return the shape in a pose: points of its surface, keypoints and part transforms.
+
+        The points are always the same ones: the vertices of the file's mesh, in their order, with `faces`; samples of
+        a robot's meshes; or samples of the fused surface as it came, which its bending skin (eq. 3) moves and one
+        Newton step puts back onto the surface ``d = 0`` of eq. 2. With a part's scales its points grow along and
+        across its solid.
+
+        Args:
+            pose: (..., num_dofs).
+
+        Returns:
+            A `ShapeOutput`: points (..., N, 3), keypoints (..., K, 3), metres, and transforms (..., P, 4, 4).
+
+        Raises:
+            InputError: if the pose has the wrong size.
+
+        Differentiable: in ``pose`` and all parameters, in reverse and forward mode; of fused surfaces also in `log_nu`
+        and `log_sharpness`, which meshes do not depend on.
+
+        References: Dewaele et al. 2006, eqs. 1 to 3.
+        """
+        transforms, growth = self.part_transforms(pose), self._growth()
+        if self.surface is not None:
+            points = self.surface_points(transforms, growth)
+        else:
+            nu = self.fusion_length()
+            points = self.surface_points(transforms, growth, self._bending_shares(growth, nu))
+            fuses = self.adjacency[self.surface_points.weights.argmax(-1)]
+            frames = self._solid_frames(transforms)
+            points = onto_fused(self.primitives, self._scaled_sizes(), frames, points, fuses, nu)
+        return ShapeOutput(points, self.placed_keypoints(transforms), transforms)
+
+    def _bending_shares(self, growth: Tensor, nu: Tensor) -> Tensor:
+        """Return the shares (N,) of the neighbors in the motions of the surface's points, by the fields at rest."""
+        bound, transforms = self.surface_points, self.part_transforms(self.rest)
+        distances = self.placed_distances(bound(transforms, growth), transforms).mT
+        partners = bound.weights if bound.partners is None else bound.partners
+        gaps = ((partners - bound.weights) * distances).sum(-1)
+        return torch.sigmoid(-gaps * (self.bending_sharpness() / nu))
 
     @contextmanager
     def held_sizes(self) -> Iterator[None]:
@@ -59,7 +157,7 @@ class Articulation(PosedTree):
         Poses of few points take a fifth less time.
         """
         before, self._held = self._held, None
-        self._held = self._offset_scales(), self._scaled_sizes(), self._solid_poses()
+        self._held = self._offset_scales(), self._scaled_sizes(), self._solid_poses(), self.fusion_length()
         try:
             yield
         finally:
@@ -119,7 +217,9 @@ class Articulation(PosedTree):
         transforms = self.part_transforms(pose)
         if parts is not None:
             transforms = transforms[..., list(parts), :, :]
-        return fuse(self.placed_distances(points, transforms, parts).mT, self._neighbors(parts), self.nu)[0]
+        return fuse(self.placed_distances(points, transforms, parts).mT, self._neighbors(parts), self.fusion_length())[
+            0
+        ]
 
     def distance_jacobian(
         self, points: Tensor, pose: Tensor, *, chart: str = "pose", parts: Sequence[int] | None = None
@@ -144,7 +244,7 @@ class Articulation(PosedTree):
         solids = self._solid_frames(transforms, parts)
         local = x, y, z = self._local_planes(points, solids)
         distances, gradient = self.primitives.plane_gradient(local, self._scaled_sizes(), parts)
-        fused, shares = fuse(distances.mT, self._neighbors(parts), self.nu)
+        fused, shares = fuse(distances.mT, self._neighbors(parts), self.fusion_length())
         # A fixed point moves backwards relative to a solid that moves by a twist; the wrench is in the solid's frame.
         fx, fy, fz = (plane * shares.mT for plane in gradient)
         moment = (_minor(y, fz, z, fy), _minor(z, fx, x, fz), _minor(x, fy, y, fx))
@@ -158,7 +258,7 @@ class Articulation(PosedTree):
         local = torch.cat([linear, angular.expand_as(linear)], dim=-2) @ -solids[..., :3]
         moved = local.unflatten(-2, (2, -1)) * moves[:, None, :, None]
         twists = moved.movedim((-3, -1), (-4, -3)).flatten(-4, -2)
-        return twists @ self._couplings if self.chain.has_mimics else twists
+        return twists @ self._couplings if self.kinematics.has_mimics else twists
 
     def surface_mesh(self, pose: Tensor | None = None, spacing: float | None = None) -> TriangleMesh:
         """Return a mesh of the fused surface.
@@ -203,6 +303,15 @@ class Articulation(PosedTree):
         """Return ``[R | t]`` (..., P, 3, 4) of every solid in the world, or of those of given parts."""
         poses = self._solid_poses()
         return transforms[..., :3, :] @ (poses if parts is None else poses[list(parts)])
+
+    def _growth(self) -> Tensor:
+        """Return the affine map (P, 4, 4) of each part in its coordinates: its solid becomes its scaled solid."""
+        lengths, radii = self.log_length_scales.exp(), self.log_radius_scales.exp()
+        rotations, centers = self.primitives.rotations, self.primitives.centers
+        stretch = torch.stack([radii, radii, lengths], dim=-1) - 1
+        linear = (rotations * stretch.unsqueeze(-2)) @ rotations.mT + torch.eye(3).to(rotations)
+        shift = centers * lengths.unsqueeze(-1) - (linear @ centers.unsqueeze(-1)).squeeze(-1)
+        return rigid_matrix(linear, shift)
 
     def _solid_poses(self) -> Tensor:
         """Return the pose (P, 4, 4) of each solid in its part."""

@@ -89,23 +89,29 @@ class Hand(ArticulatedShape):
     At the zero pose the wrist is at the origin, the fingers point along +z, the back of the hand faces +y and the thumb
     of a right hand lies on +x. Positive flexion closes the hand, positive abduction moves towards the thumb side.
 
-    Bone lengths and radii are learnable: ``log_length_scales`` and ``log_radius_scales``, one per part, give
-    `bone_lengths` and `radii`.
+    The logarithms of scales, one per part, give `bone_lengths` and `radii`; see `ArticulatedShape` for all parameters.
 
     Args:
         side: "right" or "left".
         scale: overall size; 1 is an adult hand, 0.197 m from the wrist to the tip of the middle finger.
         nu: fusion length, metres.
+        sharpness: of the bending skin, a in eq. 3.
         dtype: of all parameters and buffers; the default dtype if None.
 
     Raises:
-        InputError: if ``side`` is unknown, or ``scale`` or ``nu`` not positive.
+        InputError: if ``side`` is unknown, or ``scale``, ``nu`` or ``sharpness`` not positive.
 
     References: Dewaele et al. 2006, section 2.
     """
 
     def __init__(
-        self, side: str = "right", *, scale: float = 1.0, nu: float = 0.003, dtype: torch.dtype | None = None
+        self,
+        side: str = "right",
+        *,
+        scale: float = 1.0,
+        nu: float = 0.003,
+        sharpness: float = 2.0,
+        dtype: torch.dtype | None = None,
     ) -> None:
         check_choice(side, "side", ("right", "left"))
         check_positive(scale, "scale")
@@ -122,8 +128,9 @@ class Hand(ArticulatedShape):
             bones += [length * unit for length in finger.lengths_mm]
         part_names = ["palm"] + [f"{name}_{segment}" for name, f in _FINGERS.items() for segment in f.segments]
         super().__init__(
-            KinematicTree(tuple(joints)), part_frames, primitives, nu=nu, part_names=part_names, dtype=dtype
-        )
+            KinematicTree(tuple(joints)), part_frames, primitives,
+            nu=nu, sharpness=sharpness, part_names=part_names, dtype=dtype,
+        )  # fmt: skip
         self.register_buffer("_bones", torch.tensor(bones, dtype=self.rest.dtype), persistent=False)
 
     _bones: Tensor
@@ -140,7 +147,7 @@ class Hand(ArticulatedShape):
     def radii(self) -> Tensor:
         """Radii (16, 3) of each part's ellipsoid along its x, y and z (the bone's) axis, metres.
 
-        Differentiable: in the sizes, `log_length_scales` and `log_radius_scales`.
+        Differentiable: in `log_length_scales` and `log_radius_scales`.
         """
         return self._scaled_sizes()[0]
 

@@ -1,7 +1,8 @@
-"""Forward kinematics of a tree, the twists of its joints, and the adapter to pytorch-kinematics."""
+"""Forward kinematics of a tree, the twists of its joints, and trees from and to chains of pytorch-kinematics."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -9,22 +10,24 @@ import torch
 from torch import Tensor, nn
 
 from torchreg._checks import check_shape
-from torchreg.errors import ModelError
-from torchreg.geometry.kinematic_tree import Joint, KinematicTree
+from torchreg.errors import InputTypeError, ModelError
+from torchreg.geometry.kinematic_tree import JOINT_TYPES, Joint, KinematicTree
 from torchreg.geometry.rotation import skew
+from torchreg.io.urdf import UrdfPrimitive, UrdfRecord
 
 if TYPE_CHECKING:
-    import pytorch_kinematics as pk
+    from pytorch_kinematics import Chain
+    from pytorch_kinematics.frame import Frame
 
 # Deepest tree: pytorch-kinematics walks it recursively when it builds a chain.
 _MAX_DEPTH = 300
 
 
-class KinematicChain(nn.Module):
+class ForwardKinematics(nn.Module):
     """Maps joint values to frame transforms, for any number of leading batch dimensions.
 
     Degrees of freedom are the joints that are neither fixed nor mimics, in the tree's order. Frames are as those of
-    `to_pytorch_kinematics`, in a third of its time: the transform of a frame in its parent is linear in sine, cosine
+    pytorch-kinematics, in a third of its time: the transform of a frame in its parent is linear in sine, cosine
     and value of its joint, and each round of products doubles the number of generations between a frame and the
     ancestor that it is given in.
 
@@ -90,25 +93,6 @@ class KinematicChain(nn.Module):
         for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
 
-    def to_pytorch_kinematics(self) -> pk.Chain:
-        """Return the tree as a `pytorch_kinematics.Chain` in float64; frames and joints are called by their index."""
-        import pytorch_kinematics as pk
-
-        frames: list[pk.Frame] = []
-        for index, joint in enumerate(self.tree.joints):
-            offset = pk.Transform3d(matrix=joint.offset.double().unsqueeze(0), dtype=torch.float64)
-            # Indices as names: pytorch-kinematics strips and compares names, which may hold any character.
-            name = str(index)
-            frame = pk.Frame(name, link=pk.Link(name))
-            frame.joint = pk.Joint(
-                name, offset=offset, joint_type=joint.kind, axis=tuple(joint.axis), dtype=torch.float64,
-                limits=(joint.lower, joint.upper),
-            )  # fmt: skip
-            if joint.parent >= 0:
-                frames[joint.parent].add_child(frame)
-            frames.append(frame)
-        return pk.Chain(frames[0], dtype=torch.float64)
-
     def forward(self, joint_values: Tensor, offset_scales: Tensor | None = None) -> Tensor:
         """Return the transform of every frame in the coordinates of the tree's root.
 
@@ -173,6 +157,128 @@ class KinematicChain(nn.Module):
         return torch.cat([linear, angular], dim=-1), self.moves
 
 
+def build_chain(tree: KinematicTree, names: Sequence[str], offsets: Tensor) -> Chain:
+    """Return a tree as a `pytorch_kinematics.Chain`; a joint that mimics another moves by itself there.
+
+    Args:
+        tree: the kinematic tree, whose joints keep their names.
+        names: of the frames, all different; line breaks at their ends, which pytorch-kinematics drops, are left out.
+        offsets: (F, 4, 4) of the frames from their parents; the chain has their dtype and device.
+    """
+    import pytorch_kinematics as pk
+
+    kind = {"dtype": offsets.dtype, "device": offsets.device}
+    frames: list[Frame] = []
+    taken: set[str] = set()
+    for joint, name, offset in zip(tree.joints, names, offsets.detach(), strict=True):
+        name = _new_name(name.strip("\n"), taken)
+        frame = pk.Frame(name, link=pk.Link(name))
+        frame.joint = pk.Joint(
+            joint.name, offset=pk.Transform3d(matrix=offset.unsqueeze(0), **kind), joint_type=joint.kind,
+            axis=tuple(joint.axis), limits=(joint.lower, joint.upper), **kind,
+        )  # fmt: skip
+        if joint.parent >= 0:
+            frames[joint.parent].add_child(frame)
+        frames.append(frame)
+    return pk.Chain(frames[0], **kind)
+
+
+def read_chain(chain: Chain) -> tuple[UrdfRecord, frozenset[int]]:
+    """Return the tree and the solids of a `pytorch_kinematics.Chain`, in float64, depth first as its joint values.
+
+    Args:
+        chain: as pytorch-kinematics builds it from a URDF, SDF or MJCF file, or as built by hand.
+
+    Returns:
+        The record, without meshes, and the links with geometry that the chain only names: meshes, kinds not known.
+
+    Raises:
+        InputTypeError: if it is no such chain.
+        ModelError: if a joint is neither fixed nor revolute nor prismatic, names are doubled or numbers not finite.
+    """
+    import pytorch_kinematics as pk
+
+    if not isinstance(chain, pk.Chain):
+        raise InputTypeError(f"chain must be a pytorch_kinematics.Chain, got {type(chain).__name__}")
+    frames, parents = _frames_depth_first(chain)
+    names = [frame.name for frame in frames]
+    doubled = sorted({name for name in names if names.count(name) > 1})
+    if doubled:
+        raise ModelError(f"chain must have frames of different names, several are called {', '.join(doubled[:5])}")
+    taken = {_joint_name(frame) for frame in frames if frame.joint.joint_type != "fixed"}
+    joints = [_read_joint(frame, parent, taken) for frame, parent in zip(frames, parents, strict=True)]
+    geometry = [_read_geometry(frame) for frame in frames]
+    record = UrdfRecord(
+        name=names[0],
+        tree=KinematicTree(tuple(joints)),
+        link_names=tuple(names),
+        link_meshes=(None,) * len(names),
+        link_primitives=tuple(solids for solids, _ in geometry),
+    )
+    return record, frozenset(link for link, (_, complete) in enumerate(geometry) if not complete)
+
+
+def _frames_depth_first(chain: Chain) -> tuple[list[Frame], list[int]]:
+    """Return the frames of a chain, parents first, and the index of each one's parent, -1 for the root."""
+    root = chain.find_frame(chain.get_frame_names(exclude_fixed=False)[0])
+    frames: list[Frame] = []
+    parents: list[int] = []
+    waiting = [(root, -1)]
+    while waiting:
+        frame, parent = waiting.pop()
+        frames.append(frame)
+        parents.append(parent)
+        waiting += [(child, len(frames) - 1) for child in reversed(frame.children)]
+    return frames, parents
+
+
+def _joint_name(frame: Frame) -> str:
+    return str(frame.name if frame.joint.name is None else frame.joint.name)
+
+
+def _read_joint(frame: Frame, parent: int, taken: set[str]) -> Joint:
+    """Return the joint of a frame; names of fixed ones, which are no degrees of freedom, avoid those ``taken``."""
+    name, joint = _joint_name(frame), frame.joint
+    if joint.joint_type not in JOINT_TYPES:
+        raise ModelError(
+            f"chain has joint {name!r} of type {joint.joint_type!r}; supported: {', '.join(JOINT_TYPES)}; "
+            f"stack several frames for a joint of several degrees of freedom"
+        )
+    offset = torch.eye(4, dtype=torch.float64)
+    for part in (frame.link.offset, joint.offset):
+        if part is not None:
+            offset = offset @ part.get_matrix()[0].detach().cpu().double()
+    if joint.joint_type == "fixed":
+        return Joint(_new_name(name, taken), parent, offset)
+    lower, upper = (-math.inf, math.inf) if joint.limits is None else joint.limits
+    x, y, z = joint.axis.detach().cpu().double().tolist()
+    return Joint(
+        name, parent, offset, kind=joint.joint_type, axis=(x, y, z), lower=float(lower), upper=float(upper)
+    )  # fmt: skip
+
+
+def _read_geometry(frame: Frame) -> tuple[tuple[UrdfPrimitive, ...], bool]:
+    """Return the solids of a frame's link, and whether that is all its geometry: no mesh, no unknown kind."""
+    visuals = [visual for visual in frame.link.visuals or () if visual.geom_type is not None]
+    known = [visual for visual in visuals if str(visual.geom_type) in ("box", "cylinder", "capsule", "sphere")]
+    solids = []
+    for visual in known:
+        size = torch.as_tensor(visual.geom_param, dtype=torch.float64).reshape(-1)
+        origin = torch.eye(4, dtype=torch.float64)
+        if visual.offset is not None:
+            origin = visual.offset.get_matrix()[0].detach().cpu().double()
+        solids.append(UrdfPrimitive(visual.geom_type, tuple(size.tolist()), origin))
+    return tuple(solids), len(known) == len(visuals)
+
+
+def _new_name(name: str, taken: set[str]) -> str:
+    """Return the name, lengthened while it is among those taken, which it joins."""
+    while name in taken:
+        name += "_"
+    taken.add(name)
+    return name
+
+
 def part_parents(tree: KinematicTree, frames: Sequence[int]) -> list[int]:
     """Return, per part, the next part above it in the tree, -1 for none.
 
@@ -231,24 +337,6 @@ def _check_depth(tree: KinematicTree) -> None:
 def _axis_of(joint: Joint) -> Tensor:
     axis = torch.tensor(joint.axis, dtype=torch.float64)
     return axis / axis.norm()
-
-
-def stack_sizes(tree: KinematicTree) -> list[int]:
-    """Return, per degree of freedom, the number of coincident revolute frames in its joint: three for a ball joint."""
-    stacks: list[list[int]] = []
-    stack_of: dict[int, int] = {}
-    identity = torch.eye(4, dtype=torch.float64)
-    for index, joint in enumerate(tree.joints):
-        if joint.kind != "revolute":
-            continue
-        if joint.parent in stack_of and torch.equal(joint.offset.double(), identity):
-            stack_of[index] = stack_of[joint.parent]
-            stacks[stack_of[index]].append(index)
-        else:
-            stack_of[index] = len(stacks)
-            stacks.append([index])
-    free = [index for index, joint in enumerate(tree.joints) if joint.kind != "fixed" and joint.mimic is None]
-    return [len(stacks[stack_of[index]]) if index in stack_of else 1 for index in free]
 
 
 def _local_tables(offsets: Tensor, moving: list[int], axes: Tensor, is_revolute: Tensor) -> dict[str, Tensor]:

@@ -58,7 +58,7 @@ def find_limbs(shape: Articulation) -> tuple[list[Limb], list[int]]:
     bodies = _find_bodies(shape)
     owner = {part: number for number, body in enumerate(bodies) for part in body.parts}
     above = [owner[body.parent] if body.parent >= 0 else -1 for body in bodies]
-    moved = shape.chain.moves[shape.part_index].any(-1).tolist()
+    moved = shape.kinematics.moves[shape.part_index].any(-1).tolist()
     trunk = [part for part in range(shape.num_parts) if not moved[part]]
     limb_of: dict[int, int] = {}
     chains: list[list[int]] = []
@@ -80,8 +80,8 @@ def find_limbs(shape: Articulation) -> tuple[list[Limb], list[int]]:
 
 def _find_bodies(shape: Articulation) -> list[Body]:
     """Return the bodies of a shape, parents before children: parts below the same joints."""
-    joints: Tensor = shape.chain.moves[shape.part_index] > 0
-    drives = shape.chain.couplings != 0
+    joints: Tensor = shape.kinematics.moves[shape.part_index] > 0
+    drives = shape.kinematics.couplings != 0
     rows = [tuple(row) for row in joints.tolist()]
     groups: dict[tuple[bool, ...], list[int]] = {}
     for part, row in enumerate(rows):

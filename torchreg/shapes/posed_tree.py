@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -13,8 +14,11 @@ from torchreg.errors import ModelError
 from torchreg.geometry.kinematic_tree import KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import left_jacobian, so3_exp, wrap_rotation_vector
-from torchreg.shapes.kinematics import KinematicChain, neighbor_matrix, offset_owners, part_parents
+from torchreg.shapes.kinematics import ForwardKinematics, build_chain, neighbor_matrix, offset_owners, part_parents
 from torchreg.shapes.pose_algebra import BASE_DOF_NAMES, BASE_DOFS, difference, retract
+
+if TYPE_CHECKING:
+    from torchreg.shapes.kinematics import Chain
 
 
 class PosedTree(nn.Module):
@@ -44,21 +48,21 @@ class PosedTree(nn.Module):
         names = tuple(part_frames if part_names is None else part_names)
         if len(names) != len(part_frames) or len(set(names)) != len(names):
             raise ModelError(f"{len(part_frames)} parts need {len(part_frames)} different names, got {len(set(names))}")
-        self.chain = KinematicChain(tree)
+        self.kinematics = ForwardKinematics(tree)
         self.part_names = names
         frames = [tree.index(name) for name in part_frames]
         self.part_parents = tuple(part_parents(tree, frames))
-        moves = nn.functional.pad(self.chain.moves[frames], (BASE_DOFS, 0), value=1.0)
-        slides = self.chain.couplings.abs().mT @ (1 - self.chain.is_revolute) > 0
+        moves = nn.functional.pad(self.kinematics.moves[frames], (BASE_DOFS, 0), value=1.0)
+        slides = self.kinematics.couplings.abs().mT @ (1 - self.kinematics.is_revolute) > 0
         limit = torch.full((BASE_DOFS,), math.inf if free_base else 0.0, dtype=torch.float64)
-        lower, upper = torch.cat([-limit, self.chain.lower]), torch.cat([limit, self.chain.upper])
+        lower, upper = torch.cat([-limit, self.kinematics.lower]), torch.cat([limit, self.kinematics.upper])
         buffers = {
             "part_index": torch.tensor(frames),
             "adjacency": neighbor_matrix(self.part_parents),
             "_owners": torch.tensor(offset_owners(tree, frames)),
             "_part_moves": moves,
             "_row_moves": moves.repeat_interleave(4, 0).unsqueeze(-2),
-            "_couplings": torch.block_diag(torch.eye(BASE_DOFS, dtype=torch.float64), self.chain.couplings),
+            "_couplings": torch.block_diag(torch.eye(BASE_DOFS, dtype=torch.float64), self.kinematics.couplings),
             "is_sliding": torch.cat([torch.arange(BASE_DOFS) < 3, slides]),
             "lower": lower,
             "upper": upper,
@@ -66,12 +70,12 @@ class PosedTree(nn.Module):
         }
         for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
-        self.log_length_scales = nn.Parameter(torch.zeros(len(frames), dtype=torch.float64))
+        self.log_length_scales = frozen(torch.zeros(len(frames), dtype=torch.float64))
 
     @property
     def num_dofs(self) -> int:
         """Number of degrees of freedom: 6 of the base, then the joints."""
-        return BASE_DOFS + self.chain.num_dofs
+        return BASE_DOFS + self.kinematics.num_dofs
 
     @property
     def num_parts(self) -> int:
@@ -81,7 +85,27 @@ class PosedTree(nn.Module):
     @property
     def dof_names(self) -> tuple[str, ...]:
         """Names of the degrees of freedom, in the order of a pose."""
-        return BASE_DOF_NAMES + self.chain.dof_names
+        return BASE_DOF_NAMES + self.kinematics.dof_names
+
+    @property
+    def chain(self) -> Chain:
+        """A new `pytorch_kinematics.Chain` of the tree with its present bone lengths, in the module's dtype and device.
+
+        ``chain.forward_kinematics(values)[part]`` is ``T_root_part``, in the coordinates that the base moves. Frames
+        that carry a part are called like the part, others as in the tree (with "_" where a part has that name). Joints
+        are called like the degrees of freedom, but come depth first: pass ``dict(zip(shape.dof_names[6:], pose[6:]))``.
+        A joint that mimics another moves by itself there and needs a value of its own.
+
+        Differentiable: its transforms, in the joint values; twice with ``forward_kinematics_tensor(values,
+        analytical_grad=False)``.
+        """
+        tree = self.kinematics.tree
+        names = dict(zip(self.part_index.tolist(), self.part_names, strict=True))
+        for index, joint in enumerate(tree.joints):
+            names.setdefault(index, f"{joint.name}_" if joint.name in self.part_names else joint.name)
+        offsets = torch.stack([joint.offset for joint in tree.joints]).to(self.rest)
+        offsets[:, :3, 3] *= self._offset_scales().detach().unsqueeze(-1)
+        return build_chain(tree, [names[index] for index in range(len(tree))], offsets)
 
     def rest_pose(self) -> Tensor:
         """Return the pose (num_dofs,) with every joint at zero, or at the limit nearest to zero."""
@@ -142,7 +166,7 @@ class PosedTree(nn.Module):
         """
         check_shape(pose, "pose", (self.num_dofs,), batch=True)
         base = rigid_matrix(so3_exp(pose[..., 3:6]), pose[..., :3])
-        return base.unsqueeze(-3) @ self.chain(pose[..., 6:], self._offset_scales())
+        return base.unsqueeze(-3) @ self.kinematics(pose[..., 6:], self._offset_scales())
 
     def part_transforms(self, pose: Tensor) -> Tensor:
         """Return ``T_world_part`` of every part, ``p_world = T_world_part @ p_part``.
@@ -205,12 +229,12 @@ class PosedTree(nn.Module):
         """
         transforms, linear, angular = self._twists(pose, chart)
         twists = torch.cat([linear, angular], dim=-1).unsqueeze(-3) * self._part_moves.unsqueeze(-1)
-        return transforms, self._couplings.mT @ twists if self.chain.has_mimics else twists
+        return transforms, self._couplings.mT @ twists if self.kinematics.has_mimics else twists
 
     def _twists(self, pose: Tensor, chart: str) -> tuple[Tensor, Tensor, Tensor]:
         """Return part transforms and the twists of base and moving joints: linear and angular (..., 6 + J, 3)."""
         frames = self.frame_transforms(pose)
-        joints = self.chain.joint_twists(frames)[0]
+        joints = self.kinematics.joint_twists(frames)[0]
         linear, angular = _base_twists(pose, chart)
         linear = torch.cat([linear, joints[..., :3]], dim=-2)
         return frames.index_select(-3, self.part_index), linear, torch.cat([angular, joints[..., 3:]], dim=-2)
@@ -235,12 +259,17 @@ class PosedTree(nn.Module):
         turns = torch.linalg.cross(angular, identity.expand(*angular.shape[:-3], 3, 1, 3))
         motions = torch.cat([turns, linear.unsqueeze(-3)], dim=-3).mT.flatten(-2)
         derivative = (rows.flatten(-3, -2) @ motions).unflatten(-1, (3, -1)) * self._row_moves
-        derivative = derivative @ self._couplings if self.chain.has_mimics else derivative
+        derivative = derivative @ self._couplings if self.kinematics.has_mimics else derivative
         return rows[..., :3].flatten(-3, -2), derivative
 
     def _offset_scales(self) -> Tensor:
         """Return the factors (F,) on the length of each frame's offset from its parent."""
         return nn.functional.pad(self.log_length_scales, (1, 0)).index_select(0, self._owners).exp()
+
+
+def frozen(value: Tensor) -> nn.Parameter:
+    """Return a parameter that takes no gradients until it is told to."""
+    return nn.Parameter(value, requires_grad=False)
 
 
 def _base_twists(pose: Tensor, chart: str) -> tuple[Tensor, Tensor]:

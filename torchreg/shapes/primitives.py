@@ -1,9 +1,9 @@
-"""The solids of an articulated shape, one per part, with learnable sizes."""
+"""The solids of an articulated shape, one per part, with sizes that can be scaled."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -34,6 +34,24 @@ class Primitive:
     pose: Tensor
 
 
+class _SizeTables(nn.Module):
+    """The sizes (P_kind, S_kind) of the solids of each kind, as buffers."""
+
+    def __init__(self, tables: Sequence[Sequence[Sequence[float]]]) -> None:
+        super().__init__()
+        for number, table in enumerate(tables):
+            self.register_buffer(str(number), torch.tensor(table, dtype=torch.float64))
+
+    def __getitem__(self, number: int) -> Tensor:
+        return self.get_buffer(str(number))
+
+    def __len__(self) -> int:
+        return len(self._buffers)
+
+    def __iter__(self) -> Iterator[Tensor]:
+        return (self[number] for number in range(len(self)))
+
+
 class PrimitiveSet(nn.Module):
     """The solids of all parts: signed distances and their gradients, evaluated kind by kind.
 
@@ -45,6 +63,7 @@ class PrimitiveSet(nn.Module):
     """
 
     rotations: Tensor
+    centers: Tensor
     kind_order: Tensor
 
     def __init__(self, primitives: Sequence[Primitive]) -> None:
@@ -63,10 +82,8 @@ class PrimitiveSet(nn.Module):
             self.register_buffer(f"scalable_{name}", torch.tensor([size.is_length for size in sizes]), persistent=False)
         poses = torch.stack([primitive.pose.double() for primitive in primitives])
         self.register_buffer("rotations", poses[:, :3, :3].clone(), persistent=False)
-        self.centers = nn.Parameter(poses[:, :3, 3].clone())
-        self.sizes = nn.ParameterList(
-            nn.Parameter(torch.tensor([primitives[i].sizes for i in group], dtype=torch.float64)) for group in members
-        )
+        self.register_buffer("centers", poses[:, :3, 3].clone())
+        self.sizes = _SizeTables([[primitives[i].sizes for i in group] for group in members])
 
     def __len__(self) -> int:
         return len(self.part_kinds)
@@ -91,6 +108,15 @@ class PrimitiveSet(nn.Module):
                 factors = torch.where(self.get_buffer(f"scalable_{name}"), factors, 1.0)
             scaled.append(sizes * factors)
         return scaled
+
+    def half_extents(self, sizes: Sequence[Tensor]) -> Tensor:
+        """Return half extents (P, 3) of each solid along x, y and z by its sizes: across it, its largest radius."""
+        rows = []
+        for kind, size in zip(self.kinds, sizes, strict=True):
+            is_long, lengths = self.get_buffer(f"long_{kind}"), self.get_buffer(f"scalable_{kind}")
+            across = torch.where(lengths & ~is_long, size, 0.0).amax(-1)
+            rows.append(torch.stack([across, across, torch.where(is_long, size, 0.0).amax(-1)], dim=-1))
+        return torch.cat(rows)[self.kind_order]
 
     def reaches(self, sizes: Sequence[Tensor]) -> Tensor:
         """Return the radius (P,) of a ball around each solid's center that holds the solid, metres."""
@@ -189,7 +215,7 @@ def _in_order(groups: Sequence[_KindRows], planes: Sequence[Tensor]) -> Tensor:
     return torch.cat(list(planes), dim=-2).index_select(-2, order)
 
 
-def fuse(distances: Tensor, neighbors: Tensor, nu: float) -> tuple[Tensor, Tensor]:
+def fuse(distances: Tensor, neighbors: Tensor, nu: float | Tensor) -> tuple[Tensor, Tensor]:
     """Return the distance to the fused surface, ``-nu log phi``, and the weights of the solids in its gradient.
 
     phi sums the fields ``exp(-d_q / nu)`` of the dominating solid and its neighbors only, in the log domain.
@@ -202,7 +228,7 @@ def fuse(distances: Tensor, neighbors: Tensor, nu: float) -> tuple[Tensor, Tenso
     Returns:
         Distances (...), metres, and weights (..., P), which sum to one.
 
-    Differentiable: in ``distances``, where the dominating solid is unique.
+    Differentiable: in ``distances`` and ``nu``, where the dominating solid is unique.
 
     References: Dewaele et al. 2006, eqs. 1 and 2.
     """
@@ -210,6 +236,19 @@ def fuse(distances: Tensor, neighbors: Tensor, nu: float) -> tuple[Tensor, Tenso
     # Zero or one per point and solid; in the memory order of distances of planes.
     fuses = neighbors.to(distances.dtype).index_select(-1, dominating.flatten())
     fuses = fuses.unflatten(-1, dominating.shape[:-1]).movedim(0, -1)
+    return _summed(distances, nearest, fuses, nu)
+
+
+def fuse_given(distances: Tensor, fuses: Tensor, nu: float | Tensor) -> tuple[Tensor, Tensor]:
+    """Return what `fuse` does, of solids (N, P) that are given for each point whichever dominates.
+
+    Differentiable: in ``distances`` and ``nu``.
+    """
+    nearest = distances.masked_fill(~fuses, torch.inf).amin(-1, keepdim=True)
+    return _summed(torch.where(fuses, distances, nearest), nearest, fuses.to(distances.dtype), nu)
+
+
+def _summed(distances: Tensor, nearest: Tensor, fuses: Tensor, nu: float | Tensor) -> tuple[Tensor, Tensor]:
     # A power of two costs a quarter of exp() on a CPU, unless it underflows.
     fields = ((nearest - distances) * (math.log2(math.e) / nu)).clamp_min(_MIN_EXPONENT).exp2() * fuses
     total = fields.sum(-1, keepdim=True)

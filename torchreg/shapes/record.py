@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchreg.errors import InputTypeError, ModelError
 from torchreg.geometry.rigid import rigid_matrix
@@ -13,6 +13,9 @@ from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.primitives import Primitive, PrimitiveSet
 from torchreg.shapes.spec import ShapeSpec
+
+# Tensors of a record that earlier releases did not have: nu and sharpness.
+_NUM_NEW = 2
 
 
 @dataclass(frozen=True)
@@ -23,11 +26,13 @@ class HandSpec:
         side: "right" or "left".
         scale: overall size, 1 for an adult.
         nu: fusion length, metres.
+        sharpness: of the bending skin.
     """
 
     side: str
     scale: float
     nu: float
+    sharpness: float = 2.0
 
 
 @dataclass(frozen=True)
@@ -37,7 +42,8 @@ class ShapeRecord:
     Args:
         spec: the tree, parts and solids that it is built from.
         free_base: whether its base moves.
-        parameters: values of all parameters, in the order of the module's.
+        parameters: what is learnt and what it multiplies: logarithms of lengths and radii, centers and sizes of the
+            solids, logarithms of nu and of the sharpness. Earlier releases left the last two out.
         learnable: which of them require gradients.
     """
 
@@ -55,26 +61,27 @@ def record_shape(shape: ArticulatedShape) -> ShapeRecord:
     """
     spec: ShapeSpec | HandSpec
     if type(shape) is Hand:
-        spec = HandSpec(shape.side, shape.scale, shape.nu)
+        spec = HandSpec(shape.side, shape.scale, shape.start_nu, shape.start_sharpness)
     elif type(shape) is ArticulatedShape:
-        tree = shape.chain.tree
+        tree = shape.kinematics.tree
         frames = tuple(tree.joints[index].name for index in shape.part_index.tolist())
         solids = tuple(_solids(shape.primitives))
         spec = ShapeSpec(
             tree=tree,
             part_frames=frames,
             primitives=solids,
-            nu=shape.nu,
+            nu=shape.start_nu,
             part_names=shape.part_names,
             surface=shape.surface,
+            sharpness=shape.start_sharpness,
         )
     else:
         raise InputTypeError(
             f"only an ArticulatedShape or a Hand can be stored, got {type(shape).__name__}; store its state_dict"
         )
-    parameters = tuple(shape.parameters())
-    values = tuple(parameter.detach().cpu().clone() for parameter in parameters)
-    learnable = tuple(parameter.requires_grad for parameter in parameters)
+    tensors = _tensors(shape)
+    values = tuple(tensor.detach().cpu().clone() for tensor in tensors)
+    learnable = tuple(tensor.requires_grad for tensor in tensors)
     return ShapeRecord(spec, bool(shape.upper[0] > 0), values, learnable)
 
 
@@ -94,19 +101,30 @@ def build_shape(record: ShapeRecord) -> ArticulatedShape:
         if unknown:
             raise ModelError(f"parts are on frames that the tree does not have: {', '.join(sorted(unknown)[:5])}")
     shape = (
-        Hand(spec.side, scale=spec.scale, nu=spec.nu, dtype=dtype)
+        Hand(spec.side, scale=spec.scale, nu=spec.nu, sharpness=spec.sharpness, dtype=dtype)
         if isinstance(spec, HandSpec)
         else ArticulatedShape.from_spec(spec, free_base=record.free_base, dtype=dtype)
     )
-    parameters = tuple(shape.parameters())
-    wanted, found = ([tuple(value.shape) for value in values] for values in (parameters, record.parameters))
-    if wanted != found or len(record.learnable) != len(parameters):
+    tensors = _tensors(shape)
+    is_early = len(record.parameters) == len(tensors) - _NUM_NEW
+    tensors = tensors[:-_NUM_NEW] if is_early else tensors
+    wanted, found = ([tuple(value.shape) for value in values] for values in (tensors, record.parameters))
+    if wanted != found or len(record.learnable) != len(tensors):
         raise ModelError(f"the shape needs parameters of shapes {wanted}, got {found}")
     with torch.no_grad():
-        for parameter, value, learnable in zip(parameters, record.parameters, record.learnable, strict=True):
-            parameter.copy_(value)
-            parameter.requires_grad_(learnable)
+        for tensor, value, learnable in zip(tensors, record.parameters, record.learnable, strict=True):
+            tensor.copy_(value)
+            # In earlier releases everything required gradients unless it was told not to.
+            if isinstance(tensor, nn.Parameter) and not is_early:
+                tensor.requires_grad_(learnable)
     return shape
+
+
+def _tensors(shape: ArticulatedShape) -> list[Tensor]:
+    """Return the tensors of a shape that a record holds, in its order."""
+    solids = shape.primitives
+    scales = shape.log_length_scales, shape.log_radius_scales
+    return [*scales, solids.centers, *solids.sizes, shape.log_nu, shape.log_sharpness]
 
 
 def _solids(primitives: PrimitiveSet) -> list[Primitive]:

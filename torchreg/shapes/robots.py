@@ -1,10 +1,11 @@
-"""Specifications of shapes from robot descriptions."""
+"""Specifications of shapes from robot descriptions and from chains of pytorch-kinematics."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,11 +14,15 @@ from torchreg._checks import check_choice
 from torchreg.errors import ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh, concatenate, sample_surface
-from torchreg.geometry.rigid import transform_points
+from torchreg.geometry.rigid import rigid_matrix, transform_points
+from torchreg.geometry.rotation import rotation_between
 from torchreg.io.urdf import UrdfPrimitive, UrdfRecord, load_urdf
-from torchreg.shapes.kinematics import KinematicChain
+from torchreg.shapes.kinematics import ForwardKinematics, read_chain
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.spec import SOLID_CHOICES, RigSurface, ShapeSpec, fitted_solid, fusion_length, with_long_axis
+
+if TYPE_CHECKING:
+    from torchreg.shapes.kinematics import Chain
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,8 @@ class _RobotFit:
     box_exponent: float = 0.1
     # Facets around the axis of round solids.
     segments: int = 24
+    # Radius of the capsules that stand for links without geometry, in median distances between frames: a finger's.
+    radius_per_bone: float = 0.1
 
 
 _FIT = _RobotFit()
@@ -47,6 +54,45 @@ def spec_from_urdf(
     """Return the `ShapeSpec` of a URDF robot; see `ArticulatedShape.from_urdf`."""
     check_choice(primitive, "primitive", SOLID_CHOICES)
     record = load_urdf(path, package_dirs=[Path(folder) for folder in package_dirs], meshes=meshes)
+    return _spec_of(record, primitive, f"{path}: no link has geometry that can be read: there is nothing to align")
+
+
+def spec_from_chain(chain: Chain) -> ShapeSpec:
+    """Return the `ShapeSpec` of a pytorch-kinematics chain; see `ArticulatedShape.from_chain`."""
+    record, unread = read_chain(chain)
+    bare = unread if unread or any(record.link_primitives) else range(len(record.link_names))
+    bones = _bones(record.tree, bare)
+    solids = tuple((*own, *bones.get(link, ())) for link, own in enumerate(record.link_primitives))
+    empty = "chain has no link with geometry and no two frames apart: there is nothing to align"
+    return _spec_of(replace(record, link_primitives=solids), "auto", empty)
+
+
+def _bones(tree: KinematicTree, links: Collection[int]) -> dict[int, tuple[UrdfPrimitive, ...]]:
+    """Return thin capsules from the links to the frames on them, and balls for links that carry no other."""
+    ends: dict[int, list[Tensor]] = {link: [] for link in links}
+    for joint in tree.joints:
+        if joint.parent in ends:
+            ends[joint.parent].append(joint.offset[:3, 3].double())
+    lengths = torch.stack([joint.offset[:3, 3].norm() for joint in tree.joints[1:]] or [torch.zeros(())]).double()
+    if not bool((lengths > 0).any()):
+        return {}
+    radius = _FIT.radius_per_bone * float(lengths[lengths > 0].median())
+    ball = UrdfPrimitive("sphere", (radius,), torch.eye(4, dtype=torch.float64))
+    return {
+        link: tuple(_bone(end, radius) for end in rows if float(end.norm()) > 0) if rows else (ball,)
+        for link, rows in ends.items()
+    }
+
+
+def _bone(end: Tensor, radius: float) -> UrdfPrimitive:
+    """Return the capsule from the origin to a point (3,)."""
+    length = end.norm()
+    turn = rotation_between(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), end / length)
+    return UrdfPrimitive("capsule", (radius, float(length)), rigid_matrix(turn, 0.5 * end))
+
+
+def _spec_of(record: UrdfRecord, primitive: str, empty: str) -> ShapeSpec:
+    """Return the `ShapeSpec` of a robot with solids of a kind; ``empty`` is the error's message if it has none."""
     surfaces = [_link_surface(record, link) for link in range(len(record.link_names))]
     joints, part_frames, part_names, links, solids = list(record.tree.joints), [], [], [], []
     for link, surface in enumerate(surfaces):
@@ -63,7 +109,7 @@ def spec_from_urdf(
             links.append(link)
             solids.append(solid)
     if not solids:
-        raise ModelError(f"{path}: no link has geometry that can be read: there is nothing to align")
+        raise ModelError(empty)
     return ShapeSpec(
         tree=KinematicTree(tuple(joints)),
         part_frames=tuple(part_frames),
@@ -174,8 +220,8 @@ def solid_mesh(solid: UrdfPrimitive) -> TriangleMesh:
 
 def _robot_surface(tree: KinematicTree, surfaces: Sequence[TriangleMesh | None], links: Sequence[int]) -> RigSurface:
     """Return the links' surfaces with every joint at zero, each vertex on the first part of its link."""
-    chain = KinematicChain(tree)
-    transforms = chain(torch.zeros(chain.num_dofs, dtype=torch.float64))
+    kinematics = ForwardKinematics(tree)
+    transforms = kinematics(torch.zeros(kinematics.num_dofs, dtype=torch.float64))
     part_of = {link: links.index(link) for link in dict.fromkeys(links)}
     found = [(part, transforms[link], mesh) for link, part in part_of.items() if (mesh := surfaces[link]) is not None]
     surface = concatenate(
@@ -184,7 +230,8 @@ def _robot_surface(tree: KinematicTree, surfaces: Sequence[TriangleMesh | None],
     owners = torch.cat([torch.full((mesh.num_vertices,), part) for part, _, mesh in found])
     # Robots' meshes are large and these weights zeros and ones, so that half the memory holds them exactly.
     weights = torch.zeros(len(owners), len(links), dtype=torch.float32)
-    return RigSurface(surface.vertices, surface.faces, weights.scatter_(1, owners.unsqueeze(-1), 1.0))
+    weights.scatter_(1, owners.unsqueeze(-1), 1.0)
+    return RigSurface(surface.vertices, surface.faces, weights, is_rigid=True)
 
 
 def _new_name(name: str, joints: Sequence[Joint]) -> str:

@@ -68,19 +68,15 @@ class LinearBlendSkin(nn.Module):
             faces = TriangleMesh(points, faces).faces
         reference_pose = shape.check_pose(reference_pose, "reference_pose").detach()
         check_shape(reference_pose, "reference_pose", (shape.num_dofs,))
-        self.register_buffer("reference_pose", reference_pose, persistent=False)
-        self.register_buffer("points", points, persistent=False)
-        self.register_buffer("weights", weights, persistent=False)
-        self.register_buffer("normals", normals, persistent=False)
-        self.register_buffer("faces", faces, persistent=False)
+        self.register_buffer("reference_pose", reference_pose)
+        self.register_buffer("points", points)
+        self.register_buffer("weights", weights)
+        self.register_buffer("normals", normals)
+        self.register_buffer("faces", faces)
         with torch.no_grad():
-            inverse = invert_rigid(shape.part_transforms(reference_pose))
-            local = transform_points(inverse, points.expand(shape.num_parts, -1, -1)).transpose(0, 1)
-            local_normals = None if normals is None else (normals @ inverse[:, :3, :3].mT).transpose(0, 1)
-        self.register_buffer("basis", _weighted(local, weights, 1.0), persistent=False)
-        # Bone lengths rotate no part, so that the normals in the parts' frames are the same for all lengths.
-        normal_basis = None if local_normals is None else _weighted(local_normals, weights, 0.0)
-        self.register_buffer("normal_basis", normal_basis, persistent=False)
+            basis, normal_basis = _bases(shape, points, weights, reference_pose, normals)
+        self.register_buffer("basis", basis)
+        self.register_buffer("normal_basis", normal_basis)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -112,7 +108,15 @@ class LinearBlendSkin(nn.Module):
         Differentiable: in ``rows``.
         """
         # The product with the three coordinates as the short left side takes a fifth of the time or less.
-        return nn.functional.linear(rows.mT, self.basis).mT
+        return nn.functional.linear(rows.mT, self.bases()[0]).mT
+
+    def bases(self) -> tuple[Tensor, Tensor | None]:
+        """Return the matrices (N, 4 P) that take part transforms to points and to normals, if there are any."""
+        return self.basis, self.normal_basis
+
+    def frozen(self) -> LinearBlendSkin:
+        """Return the skin as it is now, with constant weights: itself, unless it follows its shape."""
+        return self
 
     def jacobian(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
         """Return the posed points and their analytic Jacobian with respect to all degrees of freedom.
@@ -127,7 +131,7 @@ class LinearBlendSkin(nn.Module):
         Differentiable: in ``pose``.
         """
         rows, derivative = self.shape.transform_jacobian(pose, chart=chart)
-        jacobian = self.basis @ derivative.flatten(-2)
+        jacobian = self.bases()[0] @ derivative.flatten(-2)
         return self.place(rows), jacobian.unflatten(-1, derivative.shape[-2:])
 
     def posed_normals(self, pose: Tensor) -> Tensor:
@@ -150,15 +154,29 @@ class LinearBlendSkin(nn.Module):
         Raises:
             InputError: if the skin has no normals.
         """
-        if self.normal_basis is None:
+        normal_basis = self.bases()[1]
+        if normal_basis is None:
             raise InputError("this skin has no normals; pass normals= when building it")
-        rotated = nn.functional.linear(rows.mT, self.normal_basis)
+        rotated = nn.functional.linear(rows.mT, normal_basis)
         return nn.functional.normalize(rotated, dim=-2).mT
 
 
 def stacked_rows(transforms: Tensor) -> Tensor:
     """Return part transforms (..., P, 4, 4) as the rows (..., 4 P, 3) that skins are linear in."""
     return transforms[..., :3, :].mT.flatten(-3, -2)
+
+
+def _bases(
+    shape: Articulation, points: Tensor, weights: Tensor, reference_pose: Tensor, normals: Tensor | None
+) -> tuple[Tensor, Tensor | None]:
+    """Return the matrices (N, 4 P) by which part transforms give points (N, 3) and normals."""
+    inverse = invert_rigid(shape.part_transforms(reference_pose))
+    local = transform_points(inverse, points.expand(shape.num_parts, -1, -1)).transpose(0, 1)
+    if normals is None:
+        return _weighted(local, weights, 1.0), None
+    # Bone lengths rotate no part, so that the normals in the parts' frames are the same for all lengths.
+    local_normals = (normals @ inverse[:, :3, :3].mT).transpose(0, 1)
+    return _weighted(local, weights, 1.0), _weighted(local_normals, weights, 0.0)
 
 
 def _weighted(local: Tensor, weights: Tensor, last: float) -> Tensor:
@@ -176,7 +194,7 @@ class BendingSkin(LinearBlendSkin):
         shape: the articulated shape that carries the points.
         points: (N, 3) in the reference pose, metres.
         reference_pose: (num_dofs,); the rest pose by default.
-        sharpness: a; 2 lets the skin slide and stretch, 10 is near rigid.
+        sharpness: a; 2 lets the skin slide and stretch, 10 is near rigid; the shape's own by default.
         normals: (N, 3) unit normals in the reference pose, if known.
         faces: (F, 3) triangles over the points, if any.
 
@@ -191,12 +209,13 @@ class BendingSkin(LinearBlendSkin):
         shape: Articulation,
         points: Tensor,
         reference_pose: Tensor | None = None,
-        sharpness: float = 2.0,
+        sharpness: float | None = None,
         *,
         normals: Tensor | None = None,
         faces: Tensor | None = None,
     ) -> None:
-        check_positive(sharpness, "sharpness")
+        if sharpness is not None:
+            check_positive(sharpness, "sharpness")
         reference_pose = shape.rest_pose() if reference_pose is None else reference_pose
         points = as_float_tensor(points, "points", like=shape.rest).detach()
         check_points(points, "points", batch=False)
@@ -205,34 +224,64 @@ class BendingSkin(LinearBlendSkin):
             check_shape(pose, "reference_pose", (shape.num_dofs,))
             weights = bending_weights(shape, points, pose, sharpness)
         super().__init__(shape, points, weights, reference_pose, normals=normals, faces=faces)
-        self.sharpness = sharpness
+        self._given_sharpness = sharpness
+        self.follows_shape = torch.is_grad_enabled() and any(value.requires_grad for value in shape.parameters())
+
+    @property
+    def sharpness(self) -> float:
+        """The exponent a: the one given, or that of the shape."""
+        return self.shape.sharpness if self._given_sharpness is None else self._given_sharpness
+
+    def bases(self) -> tuple[Tensor, Tensor | None]:
+        """Return the matrices (N, 4 P) that take part transforms to points and to normals, if there are any."""
+        if not self.follows_shape:
+            return super().bases()
+        weights = bending_weights(self.shape, self.points, self.reference_pose, self._given_sharpness)
+        return _bases(self.shape, self.points, weights, self.reference_pose, self.normals)
+
+    @torch.no_grad()
+    def frozen(self) -> LinearBlendSkin:
+        """Return the skin as it is now, with constant weights: itself, unless it follows its shape."""
+        if not self.follows_shape:
+            return self
+        return BendingSkin(
+            self.shape, self.points, self.reference_pose, self._given_sharpness, normals=self.normals, faces=self.faces
+        )
 
 
-def bending_weights(shape: Articulation, points: Tensor, pose: Tensor, sharpness: float) -> Tensor:
+def bending_weights(shape: Articulation, points: Tensor, pose: Tensor, sharpness: float | None = None) -> Tensor:
     """Return the weights (N, P) of eq. 3, shared by the dominating part and its strongest neighbor.
 
     Args:
         shape: the articulated shape.
         points: (N, 3), metres.
         pose: (num_dofs,) the pose in which the fields are evaluated.
-        sharpness: a.
+        sharpness: a; the shape's own by default.
 
     Returns:
         Weights (N, P), rows sum to one, at most two entries per row.
+
+    Differentiable: in ``points``, ``pose`` and all parameters of the shape.
 
     References: Dewaele et al. 2006, eq. 3.
     """
     distances = shape.part_distances(points, pose)
     nearest, dominating = distances.min(-1)
     neighbors = shape.adjacency[dominating].scatter(-1, dominating.unsqueeze(-1), False)
+    alone = ~neighbors.any(-1)
     second, neighbor = distances.masked_fill(~neighbors, torch.inf).min(-1)
-    share = torch.sigmoid(sharpness * (second - nearest) / shape.nu)
+    # Without a neighbor the share is one, and a gap without an infinity keeps its gradient from being no number.
+    gap = torch.where(alone, 0.0, second - nearest)
+    exponent = shape.bending_sharpness() if sharpness is None else sharpness
+    share = torch.where(alone, 1.0, torch.sigmoid(exponent * gap / shape.fusion_length()))
     weights = torch.zeros_like(distances)
-    weights.scatter_(-1, neighbor.unsqueeze(-1), (1 - share).unsqueeze(-1))
-    return weights.scatter_(-1, dominating.unsqueeze(-1), share.unsqueeze(-1))
+    weights = weights.scatter(-1, neighbor.unsqueeze(-1), (1 - share).unsqueeze(-1))
+    return weights.scatter(-1, dominating.unsqueeze(-1), share.unsqueeze(-1))
 
 
-def sample_skin(shape: Articulation, count: int = 500, *, sharpness: float = 2.0, seed: int = 0) -> LinearBlendSkin:
+def sample_skin(
+    shape: Articulation, count: int = 500, *, sharpness: float | None = None, seed: int = 0
+) -> LinearBlendSkin:
     """Return model points that cover the shape's surface evenly, in the rest pose, with normals.
 
     A shape read from a file with a mesh gives points of that mesh under the file's weights; any other gives points of
@@ -241,7 +290,7 @@ def sample_skin(shape: Articulation, count: int = 500, *, sharpness: float = 2.0
     Args:
         shape: the articulated shape.
         count: number of points.
-        sharpness: a of the bending skin.
+        sharpness: a of the bending skin; the shape's own by default.
         seed: of the candidates among which the points are chosen.
 
     Returns:

@@ -25,11 +25,13 @@ class RigSurface:
         vertices: (V, 3), metres.
         faces: (F, 3) int64.
         weights: (V, P) over the parts, rows sum to one.
+        is_rigid: whether it is made of rigid links, whose vertices are few or many wherever their makers liked.
     """
 
     vertices: Tensor
     faces: Tensor
     weights: Tensor
+    is_rigid: bool = False
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ class ShapeSpec:
         nu: fusion length, metres.
         part_names: names of the parts.
         surface: mesh and weights of the file, in the pose of all zeros.
+        sharpness: of the bending skin.
     """
 
     tree: KinematicTree
@@ -51,6 +54,7 @@ class ShapeSpec:
     nu: float
     part_names: tuple[str, ...]
     surface: RigSurface | None = None
+    sharpness: float = 2.0
 
 
 def fitted_solid(points: Tensor, kind: str) -> Primitive:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchreg.geometry.rotation import skew
+from torchreg.geometry.rotation import rotation_between
 
-# Relative size below which a step has no direction, and 1 + cosine below which two directions are opposite.
+# Relative size below which a step has no direction.
 _DEGENERATE = 1e-6
 
 
@@ -98,25 +98,6 @@ def tangents(curves: Tensor) -> Tensor:
     x_axis[..., 0] = 1.0
     fallback = torch.where(extent > 0, chord / torch.where(extent > 0, extent, 1.0), x_axis)
     return torch.where(degenerate, fallback, central / torch.where(degenerate, 1.0, length.unsqueeze(-1)))
-
-
-def rotation_between(start: Tensor, end: Tensor) -> Tensor:
-    """Return the rotations (..., 3, 3) of smallest angle that take unit vectors ``start`` (..., 3) to ``end`` (..., 3).
-
-    Opposite vectors are turned about an axis perpendicular to them that is otherwise arbitrary.
-
-    Differentiable: in both, away from opposite vectors.
-    """
-    start, end = torch.broadcast_tensors(start, end)
-    cosine = (start * end).sum(-1, keepdim=True).unsqueeze(-1)
-    opposite = cosine < _DEGENERATE - 1
-    cross = skew(torch.linalg.cross(start, end, dim=-1))
-    identity = torch.eye(3, dtype=start.dtype, device=start.device)
-    rotation = identity + cross + cross @ cross / torch.where(opposite, 1.0, 1 + cosine)
-    smallest = torch.nn.functional.one_hot(start.detach().abs().argmin(-1), 3).to(start)
-    axis = torch.linalg.cross(start, smallest, dim=-1)
-    axis = axis / axis.norm(dim=-1, keepdim=True)
-    return torch.where(opposite, 2 * axis.unsqueeze(-1) * axis.unsqueeze(-2) - identity, rotation)
 
 
 def align_frames(frames: Tensor, directions: Tensor) -> Tensor:

@@ -18,15 +18,17 @@ from torchreg.geometry.skeleton import Skeleton
 from torchreg.result import Status
 from torchreg.spines.frame_skeletons import skeletonize_frames
 from torchreg.spines.labeled_tree import LimbGraph, most_frequent_splits, skeleton_splits
-from torchreg.spines.limb_transfer import transfer_missing_limbs, transported_frames
+from torchreg.spines.limb_transfer import complete_from_prior, transfer_missing_limbs, transported_frames
 from torchreg.spines.observed_limbs import (
     FrameLimbs,
+    accept_shared_paths,
     curve_topology,
     median_lengths,
     observe_limbs,
     reject_odd_lengths,
     smooth_rough_limbs,
 )
+from torchreg.spines.prior import PriorSkeleton
 from torchreg.spines.results import SpineRecord, SpineSequence
 from torchreg.spines.skeletonize import SkeletonizeConfig
 from torchreg.spines.spine import Spine
@@ -56,6 +58,7 @@ class SpineConfig:
 def extract_spine(
     meshes: Sequence[TriangleMesh],
     *,
+    prior: Skeleton | SpineSequence | None = None,
     times: Tensor | None = None,
     config: SpineConfig | None = None,
     workers: int | None = None,
@@ -73,8 +76,13 @@ def extract_spine(
        around it: moved with the surface, then moved inside the body.
     5. Limbs are resampled at equal intervals.
 
+    A prior skeleton is forced on the data: its tree is the graph, its tips are the K, and tip k is what its k-th tip
+    fits, in the frame that it fits best. It may be of any size, anywhere and in another pose. Tips that it lacks are
+    left out; a limb that no frame shows is the prior's, moved with the others and into the body.
+
     Args:
         meshes: T surfaces, of any numbers of vertices, in one unit.
+        prior: a skeleton with all limbs, or another spine, whose names (numbers of tips) and graph are kept.
         times: (T,) of the frames, strictly increasing; 0, 1, 2, ... by default.
         config: see `SpineConfig`.
         workers: processes for the skeletons; by default one per core.
@@ -85,15 +93,15 @@ def extract_spine(
         A `SpineSequence`; `warnings` tell the irregularities frame by frame.
 
     Raises:
-        InputError: if there is no frame, one of them has no surface (names it), no frame shows ``num_tips`` limbs, or
-            ``times`` do not fit.
-        InputTypeError: if something else than meshes is given.
+        InputError: if there is no frame, one of them has no surface (names it), no frame shows ``num_tips`` limbs,
+            ``times`` do not fit, or the prior has fewer tips than most frames and ``num_tips`` does not say so.
+        InputTypeError: if something else than meshes is given, or another prior than a skeleton or a spine.
 
     Differentiable: no; `SpineSequence.model` is.
 
     Cost: about 1 s per frame of 15,000 vertices and CPU core; half a second more where limbs are transferred.
 
-    References: Brostow, Essa, Steedly and Kwatra 2004.
+    References: Brostow, Essa, Steedly and Kwatra 2004; a prior skeleton is its section 6's.
     """
     config = config or SpineConfig()
     meshes = _check_meshes(meshes)
@@ -103,16 +111,18 @@ def extract_spine(
     if origin is not None:
         near = [TriangleMesh(mesh.vertices - origin.to(mesh.vertices), mesh.faces) for mesh in meshes]
         return extract_spine(
-            near, times=times, config=config, workers=workers, on_step=on_step, progress=progress
+            near, times=times, prior=prior, config=config, workers=workers, on_step=on_step,
+            progress=progress,
         ).moved(origin)  # fmt: skip
+    known = None if prior is None else PriorSkeleton.from_given(prior, config.num_tips)
     with torch.no_grad():
         # Section 4.1: the second factor of eq. 3, frame by frame.
         skeletons = skeletonize_frames(meshes, config.skeletons, workers=workers, on_step=on_step, progress=progress)
         skeletons = [smooth_rough_limbs(skeleton) for skeleton in skeletons]
-        labels, reference = track_tips(skeletons, config.num_tips)  # section 4.2, eqs. 6-8
-        graph = _most_frequent_graph(skeletons, labels)  # section 4.3: the first factor of eq. 3
-        observed = _observed_limbs(skeletons, labels, graph, config.num_samples)  # section 4.3: G imposed
-        limbs = transfer_missing_limbs(observed, graph, meshes)
+        known = known and known.fitted(skeletons, config.num_tips)
+        labels, reference, graph = _named_tips(skeletons, config.num_tips, known)
+        observed = _observed_limbs(skeletons, labels, graph, config.num_samples, known)  # section 4.3: G imposed
+        limbs = _all_limbs(observed, graph, meshes, known, reference)
         curves, radii = (torch.stack([getattr(frame, name) for frame in limbs]) for name in ("curves", "radii"))
         frames = transported_frames(curves, reference)
     like, topologies = meshes[0].vertices.detach(), tuple(curve_topology(graph, rows) for rows in curves)
@@ -151,6 +161,16 @@ def _check_meshes(meshes: Sequence[TriangleMesh]) -> list[TriangleMesh]:
     return meshes
 
 
+def _named_tips(
+    skeletons: Sequence[Skeleton], num_tips: int | None, prior: PriorSkeleton | None
+) -> tuple[Tensor, int, LimbGraph]:
+    """Return the labels (T, K) of the tips, the frame from which they were tracked, and the graph of the limbs."""
+    if prior is not None:
+        return *track_tips(skeletons, prior=prior.skeleton), prior.graph
+    labels, reference = track_tips(skeletons, num_tips)  # section 4.2, eqs. 6-8
+    return labels, reference, _most_frequent_graph(skeletons, labels)  # section 4.3: the first factor of eq. 3
+
+
 def _most_frequent_graph(skeletons: Sequence[Skeleton], labels: Tensor) -> LimbGraph:
     """Return the most frequent tree of the frames in which all tips were found."""
     splits = [
@@ -166,7 +186,7 @@ def _most_frequent_graph(skeletons: Sequence[Skeleton], labels: Tensor) -> LimbG
 
 
 def _observed_limbs(
-    skeletons: Sequence[Skeleton], labels: Tensor, graph: LimbGraph, num_samples: int
+    skeletons: Sequence[Skeleton], labels: Tensor, graph: LimbGraph, num_samples: int, prior: PriorSkeleton | None
 ) -> list[FrameLimbs]:
     """Return the limbs of the graph that each frame's own skeleton shows, at their usual length."""
     frames = [
@@ -179,7 +199,20 @@ def _observed_limbs(
         for frame, skeleton in zip(frames, skeletons, strict=True)
     ]
     # Should every frame have some odd limb, its limbs do change their lengths.
-    return trusted if any(bool(frame.observed.all()) for frame in trusted) else frames
+    observed = trusted if any(bool(frame.observed.all()) for frame in trusted) else frames
+    # The tree of a prior need not be that of any frame.
+    return observed if prior is None else accept_shared_paths(observed)
+
+
+def _all_limbs(
+    frames: Sequence[FrameLimbs], graph: LimbGraph, meshes: Sequence[TriangleMesh], prior: PriorSkeleton | None,
+    reference: int,
+) -> list[FrameLimbs]:  # fmt: skip
+    """Return the frames with the limbs that they lack transferred from the frames around, if need be from the prior."""
+    if prior is not None:
+        limbs = prior.limbs(frames[0].curves.shape[1])
+        frames = complete_from_prior(frames, graph, meshes, limbs, reference)
+    return transfer_missing_limbs(frames, graph, meshes)
 
 
 def _notes(skeleton: Skeleton, found: Tensor, observed: Tensor) -> list[str]:

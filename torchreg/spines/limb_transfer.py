@@ -9,8 +9,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
-from torchreg.geometry.rigid import fit_rigid
+from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.spines.curves import align_frames, curve_frames, tangents
 from torchreg.spines.depth_field import DepthField, move_inside
@@ -57,6 +58,39 @@ def transfer_missing_limbs(
         _interpolated_limbs(sequence, number, forward, backward) if number in sequence.fields else frame
         for number, frame in enumerate(frames)
     ]
+
+
+def complete_from_prior(
+    frames: Sequence[FrameLimbs], graph: LimbGraph, meshes: Sequence[TriangleMesh], prior: FrameLimbs, reference: int
+) -> list[FrameLimbs]:
+    """Return the frames; if none shows all limbs, the one that shows most gets the others from a prior skeleton.
+
+    The prior's limbs are moved rigidly with those that are shown, and then inside.
+
+    Args:
+        frames: T frames.
+        graph: their graph.
+        meshes: the surfaces of the frames.
+        prior: all limbs, of the size of the frames.
+        reference: of several frames that show most, the nearest to it is taken.
+
+    Raises:
+        InputError: if no frame shows a limb.
+    """
+    if any(bool(frame.observed.all()) for frame in frames):
+        return list(frames)
+    counts = [int(frame.observed.sum()) for frame in frames]
+    number = max(range(len(frames)), key=lambda frame: (counts[frame], -abs(frame - reference)))
+    if counts[number] == 0:
+        raise InputError(f"prior must fit the data: no frame shows any of its {len(graph.edges)} limbs")
+    frame = frames[number]
+    shown = frame.observed
+    motion = fit_rigid(prior.curves[shown].flatten(0, 1), frame.curves[shown].flatten(0, 1))
+    curves = torch.where(shown[:, None, None], frame.curves, transform_points(motion, prior.curves))
+    radii = torch.where(shown[:, None], frame.radii, prior.radii)
+    sequence = _Sequence(frames, graph, meshes, {number: DepthField(meshes[number])})
+    completed = _joined_limbs(replace(frame, curves=curves, radii=radii), sequence, number)
+    return [*frames[:number], replace(completed, observed=torch.ones_like(shown)), *frames[number + 1 :]]
 
 
 def _propagate(sequence: _Sequence, order: Sequence[int]) -> dict[int, FrameLimbs]:

@@ -149,6 +149,13 @@ def reject_odd_lengths(frame: FrameLimbs, median: Tensor, graph: LimbGraph, *, t
     return replace(frame, observed=frame.observed & ~odd, node_observed=node_observed)
 
 
+def accept_shared_paths(frames: Sequence[FrameLimbs]) -> list[FrameLimbs]:
+    """Return the frames; if none shows all limbs, those that run along others in their frame count as shown, too."""
+    if any(bool(frame.observed.all()) for frame in frames):
+        return list(frames)
+    return [replace(frame, observed=curve_lengths(frame.curves) > 0) for frame in frames]
+
+
 def curve_topology(graph: LimbGraph, curves: Tensor) -> str:
     """Return the topology of a graph's curves (L, S, 3): limbs between junctions without length are none."""
     lengths = curve_lengths(curves)

@@ -212,6 +212,11 @@ def _assigned_mappings(costs: _MappingCosts) -> Tensor:
     return torch.stack([costs.assigned(rotation.to(costs.tips)) for rotation in rotations]).unique(dim=0)
 
 
+def tries_all_mappings(num_known: int, num_tips: int) -> bool:
+    """Return whether `rank_mappings` tries all mappings, so that no rotation it starts from matters."""
+    return _all_mappings(num_known, num_tips) is not None
+
+
 @cache
 def _all_mappings(num_known: int, num_tips: int) -> Tensor | None:
     """Return all mappings (P, K) of known tips to given ones or none (-1); None if they are too many."""

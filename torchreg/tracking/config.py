@@ -24,7 +24,7 @@ class TrackConfig:
         recovery: what a doubtful or lost frame may cost: "full", "starts" (tens of milliseconds, around known poses),
             or "none".
         max_points: most data that a frame is aligned with; more are subsampled.
-        sharpness: of the bending skin.
+        sharpness: of the bending skin; the shape's own by default.
         debias: see `AlignConfig`.
         nan_policy: "omit" leaves out data that are not finite; "raise" refuses them.
         seed: of all random draws.
@@ -39,7 +39,7 @@ class TrackConfig:
     inlier_distance: float | None = None
     recovery: str = "full"
     max_points: int = 1500
-    sharpness: float = 2.0
+    sharpness: float | None = None
     debias: float = 0.8
     nan_policy: str = "omit"
     seed: int = 0
@@ -54,5 +54,6 @@ class TrackConfig:
         for name in ("prior_std", "inlier_distance"):
             if getattr(self, name) is not None:
                 check_positive(getattr(self, name), name)
-        check_positive(self.sharpness, "sharpness")
+        if self.sharpness is not None:
+            check_positive(self.sharpness, "sharpness")
         check_positive(self.debias, "debias", allow_zero=True)

@@ -81,7 +81,7 @@ def combine_limbs(problem: AlignProblem, poses: Tensor, best: int, limbs: Sequen
     limb_losses, limb_costs = [], []
     for limb in limbs:
         neighbors = shape.adjacency[limb.parts][:, limb.parts]
-        limb_distances = fuse(distances[:, limb.parts].mT, neighbors, shape.nu)[0]
+        limb_distances = fuse(distances[:, limb.parts].mT, neighbors, shape.fusion_length())[0]
         limb_losses.append(welsch_loss((limb_distances / width).square())[None])
         limb_costs.append(dof_costs[:, limb.dofs].sum(-1)[None])
     moved = {part for limb in limbs for part in limb.parts}

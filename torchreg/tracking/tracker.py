@@ -75,7 +75,7 @@ class Tracker:
     ) -> None:
         self.shape, self.config = shape, config or TrackConfig()
         if model_points is not None:
-            check_skin(shape, model_points)
+            model_points = check_skin(shape, model_points)
         with torch.no_grad():
             self._fitter = FrameFitter(shape, self.config, model_points)
             self._recover = Recovery(self._fitter)

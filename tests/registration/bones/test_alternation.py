@@ -1,6 +1,7 @@
 """The steps of scan registration: errors fall, records tell of them, several frames at once, joints that hold."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.registration.bones import alternation
 from torchreg.registration.bones.alternation import ReducedFit, Samples
 from torchreg.registration.bones.labels import CellData
+from torchreg.registration.bones.registration_energy import RegistrationEnergy
 from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.registration.config import RegisterConfig
 
@@ -61,6 +63,35 @@ def test_labels_then_weights_come_nearer_to_the_truth(toy):
         assert record.num_labels <= 8
         assert record.smoothness > 0
     assert records[-1].distance < records[0].distance
+    energies = [sum(record.energies.values()) for record in records]
+    assert energies[-1] < 0.7 * energies[0]
+    assert max(later / before for before, later in pairwise(energies)) < 1.05
+
+
+def test_records_hold_the_energy_of_the_paper_by_terms(toy):
+    """That of eqs. 2 and 8 at the weights and matches of the step, however many frames."""
+    for pairs in (toy[1][:1], toy[1]):
+        reduced, _ = fit(pairs, noise=0.005, config=RegisterConfig(label_steps=1, settle_steps=0))
+        reduced.fit_labels()
+        labels = reduced.model.weights.detach()
+        (first,) = reduced.history
+        assert first.energies["norm"] == pytest.approx(0, abs=1e-20)
+        assert first.energies["discontinuity"] == 0
+        reduced.refine()
+        refine, matches = reduced.config.refine, reduced.correspondences
+        energy = RegistrationEnergy(
+            reduced.model,
+            label_weights=labels,
+            point_to_point=matches.point_to_point,
+            smoothness=refine.smoothness,
+            discontinuity=refine.closeness,
+        )
+        terms = energy.terms(reduced.samples.points, matches.targets, matches.normals, matches.weights)
+        assert list(reduced.history[-1].energies) == list(terms)
+        for name, value in reduced.history[-1].energies.items():
+            assert value == pytest.approx(terms[name].mean().item(), rel=1e-9, abs=1e-20), name
+        assert reduced.history[-1].energies["discontinuity"] > 0
+        assert reduced.history[-1].energies["smoothness"] < first.energies["smoothness"]
 
 
 @pytest.mark.parametrize("weight", [(0.001, 0.001), (0.01, 0.01), RegisterConfig().joint_weight])

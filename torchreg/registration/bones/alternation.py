@@ -22,6 +22,7 @@ from torchreg.registration.bones.labels import CellData, LabelCosts, first_label
 from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
 from torchreg.registration.bones.motions import BoneFit, fit_bones
 from torchreg.registration.bones.motions_and_joints import JointFit, fit_bones_and_joints
+from torchreg.registration.bones.registration_energy import EnergyState, energy_terms, term_weights
 from torchreg.registration.bones.weights import refine_weights
 from torchreg.registration.results import RegisterRecord
 
@@ -76,6 +77,8 @@ class ReducedFit:
     labels: Tensor
     model: GridLBS
     moments: JointMoments
+    _label_weights: Tensor
+    _shared: JointMoments
 
     def __init__(
         self,
@@ -91,6 +94,14 @@ class ReducedFit:
         self.data, self.samples, self.config = data, samples, config
         self._num_bones, self._on_step = num_bones, on_step
         self.history: list[RegisterRecord] = []
+        self._edges = data.grid.edges()
+        # The same in all steps, so that their energies compare.
+        self._term_weights = term_weights(
+            distance=config.refine.distance,
+            smoothness=config.refine.smoothness,
+            norm=config.refine.normalization,
+            discontinuity=config.refine.closeness,
+        )
         self.matchers = [CompatibleMatcher(target, config.normal_scale) for target in targets]
         self._matches: list[CompatibleMatches] = []
         self._costs = LabelCosts(
@@ -144,13 +155,14 @@ class ReducedFit:
 
     def _refine_weights(self, rounds: int) -> bool:
         """Refine weights in the first of so many rounds, and return whether the energy converged."""
-        label_weights, steps = self.model.weights.detach(), self.config.refine_steps
+        steps = self.config.refine_steps
         energy = self.solve_motions()
         for step in range(steps):
             transforms = self.model.transforms.detach()
-            labeled = GridLBS(self.data.grid, label_weights, transforms)
+            labeled = GridLBS(self.data.grid, self._label_weights, transforms)
             weights = refine_weights(labeled, self.samples.points, self.correspondences, self.config.refine).weights
             self.model = GridLBS(self.data.grid, weights, transforms, blend=self.config.blend)
+            self._shared = self.model.joint_moments()
             before, energy = energy, self.solve_motions()
             self.update_correspondences(0.5 + 0.5 * (step + 1) / steps)
             self._report("refine", step, rounds)
@@ -246,7 +258,8 @@ class ReducedFit:
         """Follow labels (C,) from 0 without gaps, with motions (F, B, 4, 4)."""
         self.labels, count = labels, transforms.shape[-3]
         self.model = GridLBS.from_labels(self.data.grid, labels, count, transforms, blend=self.config.blend)
-        self.moments = self.model.joint_moments()
+        self.moments = self._shared = self.model.joint_moments()
+        self._label_weights = self.model.weights.detach()
 
     def _joints(self) -> Joints | None:
         """Return the joints of the motions, or None where there are none or they do not count."""
@@ -254,9 +267,22 @@ class ReducedFit:
             return None
         return find_joints(self.moments, self.model.transforms.detach(), regularization=REGULARIZATION.fitted)
 
+    def _energy_state(self) -> EnergyState:
+        """Return what the terms of the energy depend on."""
+        return EnergyState(
+            model=self.model,
+            transforms=self.model.transforms,
+            points=self.samples.points,
+            correspondences=self.correspondences,
+            edges=self._edges,
+            label_weights=self._label_weights,
+            known_moments=self._shared,
+        )
+
     @torch.no_grad()
     def _report(self, stage: str, step: int, num_steps: int) -> None:
-        squares = self.correspondences.squared_residuals(self.model(self.samples.points))
+        state = self._energy_state()
+        squares = self.correspondences.squared_residuals(state.moved)
         weights, neighbors = self.correspondences.weights, self.data.neighbors
         joints = self._joints()
         record = RegisterRecord(
@@ -267,6 +293,7 @@ class ReducedFit:
             joint=0.0 if joints is None else float(joints.gaps.square().sum(-1).mean()),
             smoothness=int((self.labels[neighbors[:, 0]] != self.labels[neighbors[:, 1]]).sum()),
             num_labels=self.model.num_bones,
+            energies={name: float(term.mean()) for name, term in energy_terms(state, self._term_weights).items()},
             **{
                 name: sum(int(getattr(matches, name).sum()) for matches in self._matches)
                 for name in ("kept", "boundary", "far", "turned")

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from torchreg._checks import check_choice, check_count, check_positive
 from torchreg.errors import InputError
 from torchreg.registration.annealing import check_ends, geometric_at
+from torchreg.registration.blend import BLENDS
 from torchreg.registration.bones.correspondences import check_share
-from torchreg.registration.bones.grid_lbs import BLENDS
 from torchreg.registration.bones.weights import WeightsConfig
 from torchreg.registration.results import RegisterRecord
 
@@ -119,7 +119,7 @@ class BoneConfig:
             raise InputError(f"joint_weight must be positive first and last, or zero, got {self.joint_weight}")
         if max(self.max_angle) > 3.1416:
             raise InputError(f"max_angle must be at most pi radians, got {max(self.max_angle)}")
-        check_choice(self.blend, "blend", BLENDS)
+        check_choice(self.blend, "blend", tuple(BLENDS))
 
     def joint_weight_at(self, progress: float) -> float:
         """Return beta at a progress from 0 to 1 through the rounds of labels, and its last value after."""

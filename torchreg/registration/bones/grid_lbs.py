@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor, nn
@@ -18,56 +18,27 @@ from torchreg._checks import (
 )
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.rigid import rescale_motions, transform_points
-from torchreg.registration.blend import (
-    blend_dual_quaternion,
-    blend_dual_quaternion_jacobian,
-    blend_linear,
-    blend_linear_jacobian,
-    check_rigid_motions,
-    turn_about,
-)
+from torchreg.registration.blend import BLENDS, check_rigid_motions, turn_about
+from torchreg.registration.bones.grid_lbs_record import GridLBSRecord
+from torchreg.registration.bones.grid_module import GridModule, check_state, grid_of_state
 from torchreg.registration.bones.joint_moments import NEGLIGIBLE, JointMoments, joint_moments
 from torchreg.registration.bones.joints import REGULARIZATION, BoneTree, Joints, bone_tree, bridged, find_joints
-from torchreg.registration.bones.sparse_grid import SparseGrid, locate_in_cells
+from torchreg.registration.bones.sparse_grid import SparseGrid
+from torchreg.solvers.simplex import nearest_on_simplex
 
-# The blends by name, and their derivatives by the bones' twists.
-_BLENDS = {
-    "linear": (blend_linear, blend_linear_jacobian),
-    "dual_quaternion": (blend_dual_quaternion, blend_dual_quaternion_jacobian),
-}
-BLENDS = tuple(_BLENDS)
-
-
-@dataclass(frozen=True)
-class GridLBSRecord:
-    """A `GridLBS` as plain data.
-
-    Args:
-        cells: of the grid, see `SparseGrid`.
-        shape: of the grid.
-        origin: of the grid.
-        axes: of the grid.
-        spacing: of the grid.
-        weights: (K, B) before rows are divided by their sums.
-        transforms: (..., B, 4, 4).
-        blend: see `GridLBS`.
-    """
-
-    cells: Tensor
-    shape: tuple[int, int, int]
-    origin: Tensor
-    axes: Tensor
-    spacing: float
-    weights: Tensor
-    transforms: Tensor
-    blend: str
+# The entries of a model's state: what is learnt or set, then what tells the grid and the blend.
+_STATE = (
+    "weights", "twists", "middles", "base_transforms",
+    "grid_cells", "grid_shape", "grid_origin", "grid_axes", "grid_spacing", "blend_number",
+)  # fmt: skip
 
 
-class GridLBS(nn.Module):
+class GridLBS(GridModule):
     """Space that follows bones: ``D(x) = sum_j w_j(x) (R_j x + t_j)``, the weights interpolated on a sparse grid.
 
     Space without a cell has the weights of the nearest one, so that any point can be moved. Weights may take any
-    values that are not negative: every row is divided by its sum where it is used.
+    values that are not negative: every row is divided by its sum where it is used. What an optimizer made of them,
+    `project_` puts back on the simplex; see `RegistrationEnergy` for what to minimize.
 
     The bones' motions are stored as rigid matrices times twists about the bones' own middles. The twists are what an
     optimizer moves; they are zero after `set_transforms_`, so that no rotation is special.
@@ -93,33 +64,18 @@ class GridLBS(nn.Module):
     twists: Tensor
     base_transforms: Tensor
     middles: Tensor
-    _origin: Tensor
-    _axes: Tensor
-    _cells: Tensor
-    _cell_corners: Tensor
-    _nearest: Tensor
 
     def __init__(
         self, grid: SparseGrid, weights: Tensor, transforms: Tensor | None = None, *, blend: str = "linear"
     ) -> None:
-        super().__init__()
-        check_choice(blend, "blend", BLENDS)
+        super().__init__(grid)
+        check_choice(blend, "blend", tuple(BLENDS))
         weights = as_float_tensor(weights, "weights", like=grid.origin).detach()
         check_shape(weights, "weights", (grid.num_corners, "B"))
         check_finite(weights, "weights")
         if weights.shape[1] < 1 or bool((weights < 0).any()) or bool((weights.sum(-1) <= 0).any()):
             raise InputError("weights must not be negative, and every row must have a positive entry")
         self.blend = blend
-        self._shape, self._spacing = grid.shape, grid.spacing
-        tables = {
-            "_origin": grid.origin,
-            "_axes": grid.axes,
-            "_cells": grid.cells,
-            "_cell_corners": grid.cell_corners,
-            "_nearest": grid.nearest,
-        }
-        for name, value in tables.items():
-            self.register_buffer(name, value.detach().clone(), persistent=False)
         self.weights = nn.Parameter(weights.clone())
         self.register_buffer("middles", self._weighted_middles(grid), persistent=True)
         self.register_buffer("base_transforms", torch.eye(4).to(weights).repeat(weights.shape[1], 1, 1))
@@ -192,6 +148,38 @@ class GridLBS(nn.Module):
             blend=self.blend,
         )
 
+    @classmethod
+    def from_state_dict(cls, state: Mapping[str, Tensor]) -> GridLBS:
+        """Return the model of a ``state_dict()``, on its device and in its dtype; it moves points to the same bits.
+
+        Args:
+            state: of a `GridLBS`, whole; ``load_state_dict`` reads it into a model of the same grid.
+
+        Raises:
+            InputError: if an entry is missing, unknown, not finite or of a shape that does not fit.
+            InputTypeError: if the state is no mapping, or an entry no tensor.
+        """
+        check_state(state, _STATE, "GridLBS")
+        weights, motions = state["weights"], state["base_transforms"]
+        check_shape(weights, "weights", ("K", "B"))
+        check_shape(state["twists"], "twists", (*motions.shape[:-2], 6))
+        check_shape(state["middles"], "middles", (weights.shape[1], 3))
+        check_shape(state["blend_number"], "blend_number", ())
+        number, names = int(state["blend_number"]), tuple(BLENDS)
+        if number not in range(len(names)):
+            raise InputError(f"blend_number must be from 0 to {len(names) - 1}, got {number}; is the state newer?")
+        # Weights that are being optimized may be negative for a while: only their shape is checked.
+        model = cls(grid_of_state(state), torch.ones_like(weights), motions, blend=names[number])
+        model.load_state_dict(state)
+        return model
+
+    def _numbers(self) -> dict[str, Tensor]:
+        return super()._numbers() | {"blend_number": torch.tensor(tuple(BLENDS).index(self.blend))}
+
+    def _set_numbers(self, numbers: Mapping[str, Tensor]) -> None:
+        super()._set_numbers(numbers)
+        self.blend = tuple(BLENDS)[int(numbers["blend_number"])]
+
     def rescaled(self, scale: float, origin: Tensor) -> GridLBS:
         """Return the same model, without gradients, in the coordinates ``x' = origin + scale x``.
 
@@ -205,17 +193,12 @@ class GridLBS(nn.Module):
 
     def extra_repr(self) -> str:
         """Return the settings for the module's printed form."""
-        return f"{self.num_bones} bones, {len(self._cells)} cells of {self._spacing:.4g}, blend={self.blend!r}"
+        return f"{self.num_bones} bones, {len(self.grid_cells)} cells of {self._spacing:.4g}, blend={self.blend!r}"
 
     @property
     def num_bones(self) -> int:
         """B."""
         return self.weights.shape[1]
-
-    @property
-    def grid(self) -> SparseGrid:
-        """The grid, on the device and in the dtype of the model."""
-        return SparseGrid(self._cells, self._shape, self._origin, self._axes, self._spacing)
 
     @property
     def transforms(self) -> Tensor:
@@ -240,6 +223,20 @@ class GridLBS(nn.Module):
         self.twists.zero_()
         return self
 
+    @torch.no_grad()
+    def project_(self) -> GridLBS:
+        """Put every row of the weights on the simplex, at the nearest point of it, and return the model.
+
+        ``v_c <- argmin_{x >= 0, sum x = 1} |x - v_c|^2``, non-negative least squares, also for rows that are zero,
+        negative or large. With this after every step, an optimizer moves the weights by projected gradients.
+
+        Raises:
+            InputError: if a weight is not finite.
+        """
+        check_finite(self.weights, "weights", "take smaller steps, and look at what the loss holds")
+        self.weights.copy_(nearest_on_simplex(self.weights))
+        return self
+
     def forward(self, points: Tensor, transforms: Tensor | None = None) -> Tensor:
         """Return points (..., N, 3) of the space moved by the bones.
 
@@ -261,7 +258,7 @@ class GridLBS(nn.Module):
 
         Differentiable: in all, and ``twists``.
         """
-        blend, _ = _BLENDS[self.blend]
+        blend, _ = BLENDS[self.blend]
         return blend(points, weights, self.transforms if transforms is None else transforms)
 
     def weights_at(self, points: Tensor) -> Tensor:
@@ -269,8 +266,7 @@ class GridLBS(nn.Module):
 
         Differentiable: in ``points`` within cells, and ``weights``.
         """
-        coordinates = ((points - self._origin) @ self._axes) / self._spacing
-        location = locate_in_cells(coordinates, self._shape, self._cells, self._nearest)
+        location = self.locate(points)
         index = self._cell_corners[location.cell]
         # Three times as fast as indexing.
         corner = self.corner_weights().index_select(0, index.flatten()).unflatten(0, index.shape)
@@ -314,7 +310,7 @@ class GridLBS(nn.Module):
         """
         transforms = self.transforms if transforms is None else transforms
         weights = self.weights_at(points)
-        blend, jacobian = _BLENDS[self.blend]
+        blend, jacobian = BLENDS[self.blend]
         return blend(points, weights, transforms), jacobian(points, weights, transforms, self._centers(transforms))
 
     def joint_moments(self, *, min_mass: float = NEGLIGIBLE.mass, pairs: Tensor | None = None) -> JointMoments:
@@ -358,7 +354,7 @@ class GridLBS(nn.Module):
 
         Differentiable: no.
         """
-        transforms = self._pose(transforms)
+        transforms = self.pose(transforms)
         check_positive(regularization, "regularization")
         moments, corners = self.joint_moments(min_mass=min_mass), self.grid.corner_points()
         return bridged(moments, corners, self.corner_weights(), transforms, regularization=regularization)
@@ -368,7 +364,7 @@ class GridLBS(nn.Module):
     ) -> Joints:
         """Return the joints of moments that are known already; arguments else as of `joints`."""
         check_positive(regularization, "regularization")
-        return find_joints(moments, self._pose(transforms), regularization=regularization)
+        return find_joints(moments, self.pose(transforms), regularization=regularization)
 
     @torch.no_grad()
     def skeleton(self, transforms: Tensor | None = None, *, min_mass: float = NEGLIGIBLE.mass) -> BoneTree:
@@ -381,7 +377,7 @@ class GridLBS(nn.Module):
         joints = self.joints(transforms, min_mass=min_mass)
         return bone_tree(joints, self._weighted_middles(self.grid), self.corner_weights().sum(0))
 
-    def _pose(self, transforms: Tensor | None) -> Tensor:
+    def pose(self, transforms: Tensor | None) -> Tensor:
         """Return given motions (..., B, 4, 4), or the model's own."""
         if transforms is None:
             return self.transforms

@@ -1,0 +1,240 @@
+"""The energy of scan registration: each term by its definition, what the steps minimize, gradients, weights learnt."""
+
+import pytest
+import torch
+
+import torchreg as tr
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.rigid import se3_exp, transform_points
+from torchreg.registration.bones.correspondences import Correspondences
+from torchreg.registration.bones.registration_energy import TERMS, EnergyTerm
+from torchreg.registration.bones.sparse_grid import SparseGrid
+from torchreg.registration.bones.weights import WeightsConfig, refine_weights
+
+ALL = {"distance": 2.0, "joint": 0.7, "smoothness": 0.4, "norm": 0.9, "discontinuity": 0.3}
+
+
+def scene(bones, resolution=6, count=60, batch=()):
+    """A limb with random weights and motions, and matches of its points."""
+    points, _ = bones.limb(count)
+    grid = SparseGrid.from_points(points, resolution, frame="world")
+    weights = bones.draw(grid.num_corners, 3, seed=1).abs()
+    model = tr.GridLBS(grid, weights, se3_exp(0.3 * bones.draw(*batch, 3, 6, seed=2)))
+    targets = points + 0.1 * bones.draw(*batch, count, 3, seed=3)
+    normals = torch.nn.functional.normalize(bones.draw(*batch, count, 3, seed=4), dim=-1)
+    return model, points, targets, normals, bones.draw(*batch, count, seed=5).clamp_min(0)
+
+
+def test_terms_are_those_of_their_definitions(bones):
+    model, points, targets, normals, kept = scene(bones)
+    labels = torch.nn.functional.one_hot(model.weights.argmax(-1), 3).double()
+    energy = tr.RegistrationEnergy(model, label_weights=labels, **ALL)
+    with torch.no_grad():
+        terms = energy.terms(points, targets, normals, kept)
+        total = energy(points, targets, normals, kept)
+        moved = model(points)
+    grid, raw = model.grid, model.weights.detach()
+    squares = [float((x - y) @ n) ** 2 for x, y, n in zip(moved, targets, normals, strict=True)]
+    mean = sum(float(b) * square for b, square in zip(kept, squares, strict=True)) / float(kept.sum())
+    expected = {
+        "distance": grid.num_cells * mean / grid.spacing**2,
+        "joint": sampled_joint_energy(model) / grid.spacing**2,
+        "smoothness": sum(float((raw[c] - raw[d]).square().sum()) for c, d in grid.edges().tolist()),
+        "norm": sum((1 - float(row.sum())) ** 2 for row in raw),
+        "discontinuity": sum(float((row - label).square().sum()) for row, label in zip(raw, labels, strict=True)),
+    }
+    assert list(terms) == list(expected) == list(TERMS)
+    for name, value in expected.items():
+        assert float(terms[name]) == pytest.approx(ALL[name] * value, rel=0.02 if name == "joint" else 1e-9), name
+    assert float(total) == pytest.approx(sum(float(term) for term in terms.values()))
+
+
+def sampled_joint_energy(model, per_side=6):
+    """Eq. 4 by the same number of points in every cell, each pair once."""
+    grid, transforms = model.grid, model.transforms.detach()
+    side = (torch.arange(per_side, dtype=torch.float64) + 0.5) / per_side
+    local = torch.cartesian_prod(side, side, side)
+    points = (grid.origin + grid.spacing * (grid.cells[:, None] + local) @ grid.axes.mT).reshape(-1, 3)
+    shares = model.weights_at(points).detach()
+    images, total = transform_points(transforms, points.expand(3, -1, 3)), 0.0
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        product = shares[:, i] * shares[:, j]
+        total += float((product * (images[i] - images[j]).square().sum(-1)).sum() / product.sum())
+    return total
+
+
+def test_equation_2_has_no_labels_and_its_weights_are_the_papers(bones):
+    model, *matches = scene(bones)
+    terms = tr.RegistrationEnergy(model).terms(*matches)
+    assert float(terms["discontinuity"]) == 0
+    alone = {name: tr.RegistrationEnergy(model, **{n: float(n == name) for n in TERMS})(*matches) for name in TERMS}
+    for name, weight in (("distance", 1.0), ("joint", 0.05), ("smoothness", 0.5), ("norm", 1.0)):
+        torch.testing.assert_close(terms[name], weight * alone[name])
+
+
+def test_it_is_what_the_motions_minimize(bones):
+    """Of motions, the energy of a T-step times cells and squared cells, for weights of no rounding."""
+    model, points, targets, normals, kept = scene(bones)
+    cells, spacing = model.grid.num_cells, model.grid.spacing
+    energy = tr.RegistrationEnergy(model, joint=0.2 * cells, smoothness=0.0, norm=0.0, point_to_point=0.1)
+    weights = model.weights_at(points).detach()
+    problem = bones.problem_of(
+        points, weights, targets, normals, kept, 0.1, moments=model.joint_moments(), joint_weight=0.2
+    )
+    for seed in (6, 7):
+        motions = se3_exp(0.3 * bones.draw(3, 6, seed=seed))
+        found = energy(points, targets, normals, kept, motions).detach()
+        torch.testing.assert_close(found, cells / spacing**2 * problem.energy(motions).detach())
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_it_is_what_the_direct_solve_of_the_weights_minimizes(bones, share):
+    points, ring = bones.limb(200)
+    model = bones.model_of(points, resolution=10)
+    model.set_transforms_(bones.bent(0.4))
+    targets, kept = points + 0.1, torch.ones(200, dtype=torch.float64)
+    targets = model(points).detach() + 0.02 * bones.draw(200, 3)
+    config = WeightsConfig(normalization=1e8)  # so that the rows of the solution add up to one
+    direct = refine_weights(model, points, Correspondences(targets, ring, kept, share), config)
+    assert direct.converged
+    labels = model.corner_weights().detach().clone()
+    with torch.no_grad():
+        model.weights.copy_(direct.weights)
+        energy = tr.RegistrationEnergy(
+            model, label_weights=labels, joint=0.0, discontinuity=config.closeness, point_to_point=share
+        )
+        assert float(energy(points, targets, ring)) == pytest.approx(direct.objective, rel=1e-4)
+
+
+def test_learnt_weights_reach_the_objective_of_the_direct_solve(bones):
+    points, normals = bones.limb(400)
+    model = bones.model_of(points, resolution=10)
+    model.set_transforms_(bones.bent(0.5))
+    share = torch.sigmoid(4 * (points[:, :1] - torch.tensor([1.0, 2.0]).double()))
+    smooth = torch.cat([1 - share[:, :1], share[:, :1] - share[:, 1:], share[:, 1:]], dim=-1)
+    targets = model.move(points, smooth).detach()
+    matches = Correspondences(targets, normals, torch.ones_like(targets[:, 0]), 0.0)
+    direct = refine_weights(model, points, matches, WeightsConfig(reach=100)).objective
+    energy = tr.RegistrationEnergy(model, joint=0.0, discontinuity=WeightsConfig().closeness)
+    optimizer = torch.optim.Adam([model.weights], lr=0.01)
+    values = []
+    for _ in range(150):
+        optimizer.zero_grad()
+        value = energy(points, targets, normals)
+        value.backward()
+        optimizer.step()
+        model.project_()
+        values.append(value.item())
+    assert direct * 0.999 < values[-1] < 1.01 * direct < 0.8 * values[0]
+
+
+def test_gradients_in_motions_and_weights(bones):
+    model, points, targets, normals, kept = scene(bones, resolution=2, count=8)
+    labels = model.corner_weights().detach()
+    with torch.no_grad():
+        # A bone without weight in some corners has the right gradient there too.
+        model.weights[::3, 0] = 0.0
+        model.twists.add_(0.1 * bones.draw(3, 6, seed=9))
+    energy = tr.RegistrationEnergy(model, label_weights=labels, **ALL)
+
+    def of(transforms, weights, twists, targets):
+        values = {"model.weights": weights, "model.twists": twists}
+        given = (points, targets, normals, kept)
+        own = torch.func.functional_call(energy, values, given)
+        return own + torch.func.functional_call(energy, values, (*given, transforms))
+
+    inputs = (model.transforms, model.weights, model.twists, targets)
+    inputs = tuple(value.detach().clone().requires_grad_() for value in inputs)
+    assert torch.autograd.gradcheck(of, inputs)
+
+
+def test_poses_come_in_batches(bones):
+    model, points, targets, normals, kept = scene(bones, batch=(2,))
+    energy = tr.RegistrationEnergy(model, **ALL)
+    found, terms = energy(points, targets, normals, kept), energy.terms(points, targets, normals, kept)
+    assert found.shape == terms["joint"].shape == (2,)
+    assert terms["smoothness"].shape == ()
+    for k in range(2):
+        one = energy(points, targets[k], normals[k], kept[k], model.transforms[k])
+        torch.testing.assert_close(found[k], one)
+
+
+def test_units_and_common_motions_change_nothing(bones):
+    model, points, targets, normals, kept = scene(bones)
+    expected = tr.RegistrationEnergy(model, **ALL)(points, targets, normals, kept)
+    motion = se3_exp(bones.draw(6, seed=8))
+    turned = transform_points(motion, targets), normals @ motion[:3, :3].mT, kept, motion @ model.transforms
+    torch.testing.assert_close(tr.RegistrationEnergy(model, **ALL)(points, *turned), expected)
+    wide = model.rescaled(100.0, torch.zeros(3, dtype=torch.float64))
+    torch.testing.assert_close(tr.RegistrationEnergy(wide, **ALL)(100 * points, 100 * targets, normals, kept), expected)
+
+
+def test_dropped_matches_and_points_without_normals(bones):
+    model, points, targets, _, kept = scene(bones)
+    energy = tr.RegistrationEnergy(model, point_to_point=1.0)
+    expected = energy(points, targets, None, kept)
+    targets[kept == 0] = torch.nan
+    torch.testing.assert_close(energy(points, targets, match_weights=kept), expected)
+
+
+def test_it_is_a_module(bones):
+    model, *matches = scene(bones)
+    energy = tr.RegistrationEnergy(model, **ALL)
+    assert [name for name, _ in energy.named_parameters()] == ["model.weights", "model.twists"]
+    other = tr.RegistrationEnergy(scene(bones)[0], label_weights=torch.zeros_like(model.weights), **ALL)
+    other.load_state_dict(energy.state_dict())
+    assert torch.equal(other(*matches), energy(*matches))
+    single = other.float()(*(value.float() for value in matches))
+    assert single.dtype == torch.float32
+    torch.testing.assert_close(single.double(), energy(*matches), rtol=1e-4, atol=0)
+    assert "joint=0.7" in repr(energy)
+
+
+def test_the_labels_stay_while_the_weights_are_learnt(bones):
+    model, *matches = scene(bones)
+    model.project_()
+    energies = [tr.RegistrationEnergy(model, label_weights=given, **ALL) for given in (None, model.weights)]
+    assert [energy.terms(*matches)["discontinuity"].item() for energy in energies] == pytest.approx([0, 0], abs=1e-20)
+    with torch.no_grad():
+        model.weights.add_(0.5)
+    for energy in energies:
+        assert energy.terms(*matches)["discontinuity"].item() == pytest.approx(0.3 * 0.25 * model.weights.numel())
+
+
+def test_a_new_term_is_a_function_and_a_row(bones, monkeypatch):
+    model, *matches = scene(bones)
+    before = tr.RegistrationEnergy(model)(*matches)
+    monkeypatch.setitem(TERMS, "spread", EnergyTerm(lambda state: state.model.weights.square().sum(), 0.5))
+    energy = tr.RegistrationEnergy(model)
+    added = 0.5 * model.weights.square().sum()
+    torch.testing.assert_close(energy.terms(*matches)["spread"], added)
+    torch.testing.assert_close(energy(*matches), before + added)
+    torch.testing.assert_close(tr.RegistrationEnergy(model, spread=0.0)(*matches), before)
+
+
+def test_bad_input_is_named(bones):
+    model, points, targets, normals, kept = scene(bones)
+    for change, error, message in (
+        ({"stiffness": 1.0}, InputError, "no energy term 'stiffness'; known: distance, joint, smoothness, norm, disc"),
+        ({"joint": -1.0}, InputError, "joint must be zero or positive"),
+        ({"norm": "1"}, InputTypeError, "norm must be a number"),
+        ({"point_to_point": 2.0}, InputError, "point_to_point must be from 0 to 1"),
+        ({"label_weights": torch.ones(2, 3)}, InputError, "label_weights must have shape"),
+        ({"label_weights": torch.nan * model.weights}, InputError, "label_weights must be finite"),
+    ):
+        with pytest.raises(error, match=message):
+            tr.RegistrationEnergy(model, **change)
+    with pytest.raises(InputTypeError, match="model must be a GridLBS, got Linear"):
+        tr.RegistrationEnergy(torch.nn.Linear(2, 2))
+    energy = tr.RegistrationEnergy(model)
+    for given, error, message in (
+        ((points, targets), InputError, "normals are needed"),
+        ((points[:, :2], targets, normals), InputError, "points must have shape"),
+        ((points, targets[1:], normals), InputError, "targets must have shape"),
+        ((points, targets, normals, kept[1:]), InputError, "match_weights must have shape"),
+        ((points, targets, normals, kept, torch.eye(4)), InputError, "transforms must have shape"),
+        ((points.float(), targets, normals), InputTypeError, "points is torch.float32 on cpu but model is"),
+        ((points, targets.float(), normals), InputTypeError, "targets is"),
+    ):
+        with pytest.raises(error, match=message):
+            energy(*given)

@@ -1,0 +1,182 @@
+"""The grid's bones as a module to train: projected weights, and a state that holds all of the model."""
+
+import copy
+
+import pytest
+import safetensors.torch
+import torch
+
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.rigid import se3_exp
+from torchreg.registration.bones.grid_lbs import GridLBS
+from torchreg.registration.bones.sparse_grid import SparseGrid
+
+BLENDS = pytest.mark.parametrize("blend", ["linear", "dual_quaternion"])
+GRID = ("grid_cells", "grid_shape", "grid_origin", "grid_axes", "grid_spacing", "blend_number")
+
+
+def draw(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def cloud(seed=0):
+    return draw(200, 3, seed=seed) * torch.tensor([3.0, 0.5, 0.4])
+
+
+def random_model(blend="linear", batch=(2,), seed=0, resolution=7):
+    grid = SparseGrid.from_points(cloud(seed), resolution)
+    model = GridLBS(grid, draw(grid.num_corners, 3).abs(), se3_exp(0.7 * draw(*batch, 3, 6)), blend=blend)
+    with torch.no_grad():
+        model.twists.add_(0.2 * draw(*batch, 3, 6, seed=1))
+    return model
+
+
+def simplex_distances(weights, rows):
+    """Squared distances (n, K) from rows (K, B) to many points (n, K, B) of the simplex."""
+    return (weights - rows).square().sum(-1)
+
+
+@pytest.mark.parametrize("change", [lambda w: w, lambda w: 0 * w, lambda w: -w - 1, lambda w: 1e4 * w, lambda w: 1 - w])
+def test_projected_rows_are_the_nearest_of_the_simplex(change):
+    model = random_model()
+    with torch.no_grad():
+        model.weights.copy_(change(draw(*model.weights.shape, seed=2)))
+    rows, parameter = model.weights.detach().clone(), model.weights
+    assert model.project_() is model
+    assert model.weights is parameter
+    found = model.weights.detach()
+    assert bool((found >= 0).all())
+    torch.testing.assert_close(found.sum(-1), torch.ones(len(found), dtype=torch.float64))
+    others = torch.distributions.Dirichlet(torch.full((3,), 0.3, dtype=torch.float64)).sample((500, len(rows)))
+    near = found + 0.01 * (others - found)
+    assert bool((simplex_distances(found, rows) <= simplex_distances(torch.cat([others, near]), rows) + 1e-9).all())
+    assert bool(model(cloud()[:20]).isfinite().all())
+
+
+def test_weights_that_are_not_finite_are_refused():
+    model = random_model()
+    with torch.no_grad():
+        model.weights[3, 1] = torch.nan
+        model.weights[5] = torch.inf
+    with pytest.raises(InputError, match=r"weights must be finite, got 4 non-finite of .*; take smaller steps"):
+        model.project_()
+    assert bool(model.weights[3, 1].isnan())
+
+
+@BLENDS
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_state_gives_the_model_back(tmp_path, blend, dtype):
+    model, points = random_model(blend).to(dtype), cloud(1).to(dtype)
+    assert [name for name, value in model.named_parameters()] == ["weights", "twists"]
+    safetensors.torch.save_file(model.state_dict(), tmp_path / "model.safetensors")
+    for state in (model.state_dict(), safetensors.torch.load_file(tmp_path / "model.safetensors")):
+        again = GridLBS.from_state_dict(state)
+        assert again.blend == blend
+        assert again.weights.dtype == dtype
+        assert torch.equal(again(points), model(points))
+        for name, value in model.state_dict().items():
+            assert torch.equal(again.state_dict()[name], value), name
+        assert again.grid.shape == model.grid.shape
+        assert again.grid.spacing == model.grid.spacing
+        assert torch.equal(again.jacobian(points[:3])[1], model.jacobian(points[:3])[1])
+    with torch.no_grad():
+        again.weights.zero_()
+    assert bool((model.weights > 0).any())
+
+
+def test_a_state_in_the_middle_of_an_optimization_is_one_too():
+    model = random_model()
+    with torch.no_grad():
+        model.weights[0] = torch.tensor([-1.0, 0.0, 0.5])
+        model.weights[1] = 0.0
+    assert torch.equal(GridLBS.from_state_dict(model.state_dict()).weights, model.weights)
+
+
+def test_an_object_of_the_same_grid_takes_a_state_over():
+    model, points = random_model("dual_quaternion"), cloud(1)
+    fresh = GridLBS(model.grid, torch.ones_like(model.weights), torch.eye(4).double().repeat(2, 3, 1, 1))
+    fresh.load_state_dict(model.state_dict())
+    assert torch.equal(fresh(points), model(points))
+    assert fresh.blend == "dual_quaternion"
+    moved = random_model()
+    with torch.no_grad():
+        moved.grid_origin.add_(0.5)
+    fresh.load_state_dict(moved.state_dict())
+    assert torch.equal(fresh(points), moved(points))
+    assert not torch.equal(fresh(points), random_model()(points))
+
+
+def test_a_state_within_a_larger_module():
+    model = random_model()
+    larger = torch.nn.ModuleDict({"scan": copy.deepcopy(model), "head": torch.nn.Linear(2, 2)})
+    with torch.no_grad():
+        larger["scan"].weights.zero_()
+    other = torch.nn.ModuleDict({"scan": model, "head": torch.nn.Linear(2, 2)})
+    larger.load_state_dict(other.state_dict())
+    assert torch.equal(larger["scan"](cloud(1)), model(cloud(1)))
+    with pytest.raises(InputError, match=r"lacks weights, .* has scan\.weights, .*without their prefix"):
+        GridLBS.from_state_dict(other.state_dict())
+
+
+def test_states_from_before_grids_were_part_of_them_are_taken():
+    model = random_model()
+    former = {name: value for name, value in model.state_dict().items() if name not in GRID}
+    assert len(former) == 4
+    fresh = GridLBS(model.grid, torch.ones_like(model.weights), model.transforms)
+    fresh.load_state_dict(former)
+    assert torch.equal(fresh(cloud(1)), model(cloud(1)))
+    with pytest.raises(InputError, match="lacks grid_cells, grid_shape, grid_origin, grid_axes, grid_spacing, blend"):
+        GridLBS.from_state_dict(former)
+
+
+def test_states_of_other_grids_are_refused():
+    model, other = random_model(), random_model(seed=5)
+    before = model.weights.detach().clone()
+    with pytest.raises(RuntimeError, match="grid_cells are of another grid; use GridLBS"):
+        model.load_state_dict(other.state_dict())
+    partial = model.state_dict()
+    del partial["grid_spacing"], partial["grid_axes"]
+    with pytest.raises(RuntimeError, match=r'Missing key\(s\) in state_dict: "grid_spacing", "grid_axes"'):
+        model.load_state_dict(partial)
+    assert torch.equal(model.weights, before)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (lambda s: s.pop("twists"), InputError, "lacks twists; of a larger module"),
+        (lambda s: s.update(bias=torch.ones(1)), InputError, "has bias"),
+        (lambda s: s.update(weights=[1.0]), InputTypeError, "state must hold tensors, got list as weights"),
+        (lambda s: s.update(weights=torch.tensor(1.0)), InputError, "weights must have shape"),
+        (lambda s: s.update(weights=s["weights"][1:]), InputError, "weights must have shape"),
+        (lambda s: s.update(weights=torch.nan * s["weights"]), InputError, "weights must be finite"),
+        (lambda s: s.update(twists=s["twists"][0]), InputError, r"twists must have shape \(2, 3, 6\)"),
+        (lambda s: s.update(middles=s["middles"][:2]), InputError, r"middles must have shape \(3, 3\)"),
+        (lambda s: s["base_transforms"].mul_(2), InputError, "rigid motions"),
+        (lambda s: s.update(grid_shape=torch.ones(2)), InputError, r"grid_shape must have shape \(3\)"),
+        (lambda s: s.update(grid_shape=torch.ones(3).long()), InputError, "cells must lie in the box"),
+        (lambda s: s.update(grid_cells=s["grid_cells"].double()), InputTypeError, "cells must hold integers"),
+        (lambda s: s["grid_axes"].mul_(2), InputError, "axes must be a rotation"),
+        (lambda s: s["grid_spacing"].mul_(-1), InputError, "spacing must be positive"),
+        (lambda s: s.update(blend_number=torch.tensor(7)), InputError, "blend_number must be from 0 to 1, got 7"),
+    ],
+)
+def test_foreign_states_are_refused_by_name(change, error, message):
+    state = {name: value.detach().clone() for name, value in random_model().state_dict().items()}
+    change(state)
+    with pytest.raises(error, match=message):
+        GridLBS.from_state_dict(state)
+
+
+def test_what_is_no_state_is_refused():
+    with pytest.raises(InputTypeError, match=r"state must be the state_dict\(\) of a GridLBS, got GridLBS"):
+        GridLBS.from_state_dict(random_model())
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_on_a_graphics_card():
+    model = random_model().to("cuda")
+    numbers = {"grid_shape", "grid_spacing", "blend_number"}
+    assert {name for name, value in model.state_dict().items() if not value.is_cuda} == numbers
+    assert torch.equal(model.project_().weights.cpu(), random_model().project_().weights)
+    assert GridLBS.from_state_dict(model.state_dict()).weights.is_cuda
