@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchreg._checks import check_count
-from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem, shifted
+from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem
 from torchreg.alignment.rough_poses import typical_poses
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import TriangleMesh
