@@ -18,7 +18,7 @@ from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.limbs import find_limbs
-from torchreg.shapes.pose_algebra import BASE_DOFS
+from torchreg.shapes.pose_algebra import BASE_DOFS, shifted
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
 from torchreg.spines.curves import points_along
