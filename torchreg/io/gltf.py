@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from torchreg.errors import FileWarning, FormatError, ModelError
-from torchreg.geometry.neighbors import NeighborTree
 from torchreg.io.file_format import naming
 from torchreg.io.gltf_document import GltfDocument, Mode, parents_first, triangles
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
@@ -425,6 +424,8 @@ def _weighted_rows(weights: Array, vertices: Array) -> Array:
     _warn(
         f"{int(empty.sum())} of {len(weights)} vertices have no skin weight and follow the nearest vertex that has some"
     )
+    from torchreg.geometry.neighbors import NeighborTree  # scipy is slow to load, and few rigs need it
+
     weighted = np.flatnonzero(~empty)
     nearest, _ = NeighborTree(torch.from_numpy(vertices[weighted])).nearest(torch.from_numpy(vertices[empty]))
     weights[empty] = weights[weighted[nearest.numpy()]]
