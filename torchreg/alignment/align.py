@@ -207,7 +207,7 @@ def _found_pose(
 ) -> Tensor:
     """Return the best pose that a search without a start finds, (num_dofs,) or (B, num_dofs)."""
     if model_points is not None and not isinstance(model_points, LinearBlendSkin):
-        raise InputError("model_points given as a tensor are those of an initial_pose; give both")
+        raise InputError("model_points given as a tensor need a single initial_pose, that they are in; give both")
     search = FindPoseConfig(num_model_points=config.num_model_points, nan_policy=config.nan_policy, seed=config.seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnitsWarning)  # the alignment tells it
