@@ -1,0 +1,88 @@
+import itertools
+
+import pytest
+import torch
+
+from torchreg.datasets.creature_kinds import HELD_OUT_KINDS, TRAINING_KINDS, Draw
+from torchreg.datasets.figures import bending_figure, jointed_figure
+from torchreg.datasets.matching_pairs import PosableBody, matching_pairs
+from torchreg.datasets.solids import FlatCone, RoundCone
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    return list(itertools.islice(matching_pairs(0), 8))
+
+
+def test_the_truth_lies_on_the_other_scan_where_it_is_visible(pairs):
+    for pair in pairs:
+        for truth, visible, scan in (
+            (pair.source_truth, pair.source_visible, pair.target),
+            (pair.target_truth, pair.target_visible, pair.source),
+        ):
+            apart = torch.cdist(truth[visible], scan.points).amin(1) / scan.diagonal
+            assert float(apart.max()) <= 0.03
+            assert float(apart.median()) < 0.012
+        assert float(pair.source_visible.double().mean()) >= 0.25
+
+
+def test_the_truth_of_the_truth_is_where_a_point_was(pairs):
+    for pair in pairs:
+        visible = pair.source_visible
+        nearest = torch.cdist(pair.source_truth[visible], pair.target.points).argmin(1)
+        back = pair.target_truth[nearest]
+        apart = (back - pair.source.points[visible]).norm(dim=-1) / pair.source.diagonal
+        assert float(apart.median()) < 0.02
+
+
+def test_a_seed_gives_the_same_stream_and_another_one_another(pairs):
+    again, other = next(matching_pairs(0)), next(matching_pairs(1))
+    assert torch.equal(again.source.points, pairs[0].source.points)
+    assert len(other.source) != len(pairs[0].source) or not torch.equal(other.source.points, pairs[0].source.points)
+
+
+@pytest.mark.parametrize("name", [*TRAINING_KINDS, *HELD_OUT_KINDS])
+def test_every_kind_is_one_tree_of_parts_and_differs_at_every_draw(name):
+    kind = {**TRAINING_KINDS, **HELD_OUT_KINDS}[name][0]
+    draw = Draw(torch.Generator().manual_seed(0))
+    creatures = [kind(draw) for _ in range(3)]
+    for creature in creatures:
+        names = [part.name for part in creature.parts]
+        assert creature.parts[0].parent is None
+        assert all(part.parent in names[:index] for index, part in enumerate(creature.parts) if index)
+        assert len(creature.limits) == len(creature.parts) > 2
+        assert all(0 < limit < 2.2 for limit in creature.limits)
+    assert creatures[0].parts != creatures[1].parts
+
+
+def test_no_kind_is_both_trained_on_and_held_out():
+    assert not {*TRAINING_KINDS} & {*HELD_OUT_KINDS}
+    assert not {kind for kind, _ in TRAINING_KINDS.values()} & {kind for kind, _ in HELD_OUT_KINDS.values()}
+    assert sum(share for _, share in TRAINING_KINDS.values()) == pytest.approx(1.0)
+
+
+def test_bodies_of_a_user_are_drawn_too():
+    draw = Draw(torch.Generator().manual_seed(1))
+    creature = TRAINING_KINDS["snake"][0](draw)
+    figure = bending_figure(creature.parts, spacing=0.05, blend=0.01, softness=0.02)
+    body = PosableBody(figure, torch.tensor(creature.limits, dtype=torch.float64))
+    kinds = {pair.kind for pair in itertools.islice(matching_pairs(2, bodies={"mine": body}, body_share=1.0), 2)}
+    assert kinds == {"mine"}
+
+
+def test_rigid_pieces_stay_rigid():
+    draw = Draw(torch.Generator().manual_seed(4))
+    creature = HELD_OUT_KINDS["crane"][0](draw)
+    figure = jointed_figure(creature.parts, spacing=0.05)
+    assert creature.rigid
+    assert bool(((figure.weights == 0) | (figure.weights == 1)).all())
+
+
+def test_a_flat_cone_is_flat_and_its_distances_are_bounds():
+    cone = RoundCone((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.2, 0.2)
+    flat = FlatCone(cone, (0.0, 0.0, 1.0), 0.5)
+    surface = torch.tensor([[0.5, 0.2, 0.0], [0.5, 0.0, 0.1], [1.2, 0.0, 0.0]], dtype=torch.float64)
+    torch.testing.assert_close(flat.distance(surface), torch.zeros(3, dtype=torch.float64), atol=1e-12, rtol=0)
+    around = torch.rand(200, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 2 - 0.5
+    steps = around + 1e-4 * torch.nn.functional.normalize(torch.rand_like(around), dim=1)
+    assert bool(((flat.distance(steps) - flat.distance(around)).abs() <= 1.0001e-4).all())

@@ -1,0 +1,136 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+import torchreg as tr
+from torchreg.datasets.creature_kinds import HELD_OUT_KINDS, Draw
+from torchreg.datasets.matching_pairs import matching_pairs
+from torchreg.geometry.rigid import rigid_matrix
+from torchreg.geometry.rotation import so3_exp
+from torchreg.registration.dense.scan_matcher import ScanMatcher, posterior
+from torchreg.registration.dense.scan_tokens import SIZES, ScanTokens
+
+
+@pytest.fixture(scope="module")
+def pair():
+    return next(matching_pairs(3, {"bird": HELD_OUT_KINDS["bird"]}))
+
+
+@pytest.fixture(scope="module")
+def matcher():
+    return ScanMatcher()
+
+
+def turned(scan, seed=0):
+    axis = Draw(torch.Generator().manual_seed(seed)).direction()
+    return scan.transformed(rigid_matrix(so3_exp(2.0 * axis), torch.tensor([3.0, -1.0, 7.0])).to(scan.points))
+
+
+def mirrored(scan):
+    flip = torch.tensor([-1.0, 1.0, 1.0]).to(scan.points)
+    faces = None if scan.faces is None else scan.faces.flip(1)
+    return tr.RangeScan(scan.points * flip, faces, scan.normals * flip)
+
+
+def test_most_visible_points_of_a_kind_never_trained_on_are_found(matcher, pair):
+    found = matcher.match(pair.source, pair.target)
+    truth, visible = (values[found.source_index] for values in (pair.source_truth, pair.source_visible))
+    places = pair.target.points[found.target_index]
+    right = (places[found.probability.argmax(1)] - truth).norm(dim=-1) < 0.05 * pair.target.diagonal
+    anything = (places[0] - truth).norm(dim=-1) < 0.05 * pair.target.diagonal
+    assert float(right[visible].double().mean()) > 0.6
+    assert float(anything[visible].double().mean()) < 0.3
+
+
+def test_turns_shifts_and_size_of_either_scan_change_nothing(matcher, pair):
+    alone = matcher.match(pair.source, pair.target)
+    double = pair.target.transformed(torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0])))
+    moved = matcher.match(turned(pair.source), turned(double, 1))
+    assert torch.equal(moved.source_index, alone.source_index)
+    torch.testing.assert_close(moved.probability, alone.probability, atol=2e-3, rtol=0)
+
+
+def test_right_is_told_from_left(matcher, pair):
+    alone = ScanTokens.from_scan(pair.source)
+    flipped = ScanTokens.from_scan(mirrored(pair.source))
+    states = [matcher._embedded(tokens)[0].detach() for tokens in (alone, flipped)]
+    assert float((states[0] - states[1]).abs().mean()) > 1e-3 * float(states[0].abs().mean())
+
+
+def test_source_and_target_are_alike(matcher, pair):
+    one, other = matcher.match(pair.source, pair.target), matcher.match(pair.target, pair.source)
+    torch.testing.assert_close(one.probability, other.probability.mT, atol=1e-4, rtol=0)
+    torch.testing.assert_close(one.hidden, other.target_hidden, atol=1e-4, rtol=0)
+
+
+def test_a_batch_gives_what_its_pairs_give_alone(matcher, pair):
+    tokens = [ScanTokens.from_scan(scan) for scan in (pair.source, pair.target)]
+    single = matcher(*tokens)
+    double = matcher(ScanTokens.stack(tokens), ScanTokens.stack(tokens[::-1]))
+    torch.testing.assert_close(double[:1], single, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(double[1:], single.mT, atol=1e-4, rtol=1e-4)
+
+
+def test_probabilities_are_some():
+    logits = torch.randn(2, 5, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    probability, hidden, target_hidden = posterior(logits)
+    assert probability.shape == (2, 4, 6)
+    rows = torch.softmax(logits[:, :-1], 2)
+    torch.testing.assert_close(rows[..., -1], hidden)
+    torch.testing.assert_close(torch.softmax(logits[:, :, :-1], 1)[:, -1], target_hidden)
+    assert bool((probability.sum(2) + hidden <= 1 + 1e-12).all())
+    assert bool((probability.sum(1) + target_hidden <= 1 + 1e-12).all())
+
+
+def test_gradients_reach_every_parameter(pair):
+    matcher = ScanMatcher(pretrained=False)
+    tokens = [ScanTokens.from_scan(scan) for scan in (pair.source, pair.target)]
+    matcher(*tokens).log_softmax(2)[:, :-1].mean().backward()
+    assert all(
+        parameter.grad is not None and bool(parameter.grad.isfinite().all()) for parameter in matcher.parameters()
+    )
+
+
+def test_tokens_of_a_small_scan_repeat_and_stay_finite(matcher):
+    grid = torch.cartesian_prod(torch.linspace(0, 1, 7), torch.linspace(0, 1, 7))
+    plane = tr.RangeScan(torch.cat((grid, torch.zeros(49, 1)), 1), viewpoint=(0.5, 0.5, 3.0))
+    found = matcher.match(plane, plane)
+    assert bool(found.probability.isfinite().all())
+    assert bool(((found.hidden >= 0) & (found.hidden <= 1)).all())
+    assert found.source_index.unique().numel() == 49
+
+
+def test_distances_of_tokens_lead_along_the_surface():
+    # A strip bent to a U: its ends are near in space and far along it.
+    angle = torch.linspace(0, 3.1, 120)
+    arc = torch.stack((angle.cos(), angle.sin(), 0 * angle), 1)
+    points = torch.cat([arc + torch.tensor([0.0, 0.0, z]) for z in torch.linspace(0, 0.2, 8)])
+    arms = torch.cat([torch.stack((torch.full((60,), x), -torch.linspace(0, 2.5, 60), torch.full((60,), z)), 1)
+                      for x in (-1.0, 1.0) for z in torch.linspace(0, 0.2, 8).tolist()])  # fmt: skip
+    tokens = ScanTokens.from_scan(tr.RangeScan(torch.cat((points, arms))))
+    places = tokens.at_tokens(tokens.points)[0].double() * float(tokens.scale)
+    apart, ways = torch.cdist(places, places), tokens.geodesic[0].double() * float(tokens.scale)
+    assert bool((ways >= apart - 1e-3).all())
+    ends = [int((places - places.new_tensor([x, -1.9, 0])).norm(dim=1).argmin()) for x in (-1, 1)]
+    assert float(ways[ends[0], ends[1]]) > 2 * float(apart[ends[0], ends[1]])
+
+
+def test_neighbors_lie_within_their_radius(pair):
+    tokens = ScanTokens.from_scan(pair.source)
+    places = tokens.at_tokens(tokens.points)[0]
+    for radius, index in zip(SIZES.radii, tokens.neighbors[0].chunk(2, 1), strict=True):
+        assert float((tokens.points[0][index] - places[:, None]).norm(dim=-1).max()) <= radius + 1e-6
+
+
+def test_the_weights_are_small():
+    import torchreg.registration.dense.scan_matcher as module
+
+    assert Path(module.WEIGHTS).stat().st_size < 3_000_000
+
+
+@pytest.mark.parametrize("name", ["source", "target"])
+def test_what_is_no_scan_is_refused(matcher, pair, name):
+    scans = {"source": pair.source, "target": pair.target, name: pair.source.points}
+    with pytest.raises(tr.errors.InputTypeError, match=f"{name} must be a RangeScan"):
+        matcher.match(**scans)
