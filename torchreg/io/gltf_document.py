@@ -242,13 +242,10 @@ class GltfDocument:
         if node.get("matrix") is not None:
             return self._numbers(node, "matrix", [0.0] * 16, what).reshape(4, 4).T
         quaternion = self._numbers(node, "rotation", [0.0, 0.0, 0.0, 1.0], what)
-        length = np.linalg.norm(quaternion)
-        if not length > 0:
+        if not np.linalg.norm(quaternion) > 0:
             raise ModelError(f"the rotation {what} is a zero quaternion")
-        axis, w = quaternion[:3] / length, quaternion[3] / length
-        cross = np.cross(np.eye(3), axis)
         transform = np.eye(4)
-        transform[:3, :3] = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+        transform[:3, :3] = rotation_matrices(quaternion[None])[0]
         transform[:3, :3] *= self._numbers(node, "scale", [1.0, 1.0, 1.0], what)
         transform[:3, 3] = self._numbers(node, "translation", [0.0, 0.0, 0.0], what)
         return transform
@@ -308,6 +305,14 @@ def parents_first(parents: Sequence[int]) -> list[int]:
     for index in order:
         order.extend(children.get(index, []))
     return order
+
+
+def rotation_matrices(quaternions: Array) -> Array:
+    """Return the rotations (N, 3, 3) of quaternions (N, 4), x y z w, of any length but zero."""
+    length = np.linalg.norm(quaternions, axis=-1, keepdims=True)
+    unit = quaternions / np.where(length > 0, length, 1.0)
+    cross = np.cross(np.eye(3), unit[:, None, :3])
+    return np.eye(3) + 2 * unit[:, 3, None, None] * cross + 2 * cross @ cross
 
 
 def triangles(mode: int, corners: Array, what: str) -> Array:
