@@ -309,7 +309,18 @@ def test_joints_that_are_not_named_stay_at_rest(tmp_path, hand):
         ("p.json", b'{"base_x": true}', FormatError, "a pose is a list"),
         ("p.json", b"{", FormatError, "cannot be read as JSON"),
         ("p.npz", b"PK", FormatError, r"p\.npz: is not a readable zip"),
-        ("p.csv", b"0,1", FormatError, r"has the ending '\.csv'; a pose is read from \.safetensors, \.json, \.npz"),
+        (
+            "p.csv",
+            b"0,1",
+            FormatError,
+            "must hold a line of names, such as base_x, base_y, base_z, base_rx, and a line",
+        ),
+        (
+            "p.xml",
+            b"0,1",
+            FormatError,
+            r"has the ending '\.xml'; a pose is read from \.safetensors, \.json, \.npz, \.csv",
+        ),
     ],
 )
 def test_files_without_a_pose_are_refused(tmp_path, hand, name, content, error, message):

@@ -31,8 +31,11 @@ from torchreg.geometry.mesh import TriangleMesh as TriangleMesh
 from torchreg.geometry.range_scan import RangeScan as RangeScan
 from torchreg.geometry.skeleton import Skeleton as Skeleton
 from torchreg.io.calibration import load_cameras as load_cameras
+from torchreg.io.frames import load_frames as load_frames
+from torchreg.io.points import PointCloud as PointCloud
 from torchreg.io.points import load_mesh as load_mesh
 from torchreg.io.points import load_points as load_points
+from torchreg.io.scans import load_scan as load_scan
 from torchreg.registration.bones.grid_lbs import GridLBS as GridLBS
 from torchreg.registration.bones.registration_energy import RegistrationEnergy as RegistrationEnergy
 from torchreg.registration.config import RegisterConfig as RegisterConfig
@@ -87,6 +90,7 @@ __all__ = [
     "Hand",
     "InitialPose",
     "LinearBlendSkin",
+    "PointCloud",
     "PoseHead",
     "PoseInitializer",
     "PoseInitializerConfig",
@@ -128,8 +132,10 @@ __all__ = [
     "load",
     "load_cameras",
     "load_depth_scan",
+    "load_frames",
     "load_mesh",
     "load_points",
+    "load_scan",
     "metrics",
     "register",
     "register_sequence",

@@ -64,11 +64,18 @@ def check_shape(value: Tensor, name: str, expected: Sequence[int | str | None], 
 
 def check_finite(value: Tensor, name: str, hint: str = "") -> None:
     """Raise InputError with their number if ``value`` holds NaN or infinity."""
+    if all_finite(value):
+        return
     bad = int((~torch.isfinite(value)).sum())
     if bad:
         raise InputError(
             f"{name} must be finite, got {bad} non-finite of {value.numel()} numbers{'; ' + hint if hint else ''}"
         )
+
+
+def all_finite(value: Tensor) -> bool:
+    """Return whether no number is NaN or infinite: their sum is, where one is, and takes one pass over memory."""
+    return bool(torch.isfinite(value.detach().sum())) or bool(torch.isfinite(value).all())
 
 
 def check_points(value: Tensor, name: str, *, min_count: int = 1, batch: bool = True) -> None:

@@ -43,3 +43,7 @@ class PrecisionWarning(TorchregWarning):
 
 class UnitsWarning(TorchregWarning):
     """The sizes of data and model differ so much that the units probably do too."""
+
+
+class FileWarning(TorchregWarning):
+    """Part of a file was left out, or read otherwise than it says; the message names the file and counts."""

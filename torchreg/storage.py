@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, fields, is_dataclass
@@ -25,6 +26,7 @@ from torchreg.alignment.results import AlignResult
 from torchreg.errors import FormatError, InputError, InputTypeError, ModelError
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, open_zip, read_bytes
 from torchreg.io.points import PARSER_ERRORS
+from torchreg.io.pose_table import load_pose_table
 from torchreg.io.tensors import FORMAT, load_tensors, save_tensors
 from torchreg.result import Result, public
 from torchreg.shapes.articulated import ArticulatedShape
@@ -76,13 +78,15 @@ def load_pose(path: str | os.PathLike[str], shape: ArticulatedShape, *, limits: 
 
     Args:
         path: a saved `AlignResult`, or `TrackResult` for its last pose (.safetensors or its .json); or .json with a
-            list of num_dofs numbers, or with values by name of degree of freedom, the others at rest; or .npz with an
-            array ``pose``, or a single array.
+            list of num_dofs numbers, or with values by name of degree of freedom, the others at rest; or .csv with a
+            line of such names, of which the last row that is complete counts; or .npz with an array ``pose``, or a
+            single array.
         shape: of the pose.
         limits: on the size of the file.
 
     Returns:
-        The pose, metres and radians, in the shape's dtype and on its device.
+        The pose, metres and radians, on the shape's device, and in its dtype unless that would round it noticeably, far
+        from the origin.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -90,14 +94,32 @@ def load_pose(path: str | os.PathLike[str], shape: ArticulatedShape, *, limits: 
         InputError: if the pose is not finite or does not fit the shape; names the file.
     """
     file = local_path(path)
-    readers = {".safetensors": _pose_of_result, ".json": _pose_of_json, ".npz": _pose_of_npz}
+    readers = {
+        ".safetensors": _pose_of_result, ".json": _pose_of_json, ".npz": _pose_of_npz, ".csv": _pose_of_table,
+    }  # fmt: skip
     if file.suffix.lower() not in readers:
         file.stat()  # a missing file is reported first
         raise FormatError(f"{file} has the ending {file.suffix!r}; a pose is read from {', '.join(readers)}")
     values = readers[file.suffix.lower()](file, shape, limits)
+    exact = torch.as_tensor(values, dtype=torch.float64, device=shape.rest.device)
     pose = as_float_tensor(values, f"the pose in {file}", like=shape.rest)
     check_shape(pose, f"the pose in {file}", (shape.num_dofs,))
     check_finite(pose, f"the pose in {file}")
+    return exact if bool(((exact - pose.double()).abs() > _ROUNDING).any()) else pose
+
+
+# Metres, or radians, by which a pose may be rounded unnoticed.
+_ROUNDING = 1e-5
+
+
+def _pose_of_table(file: Path, shape: ArticulatedShape, limits: FileLimits) -> Tensor:
+    rows = load_pose_table(file, shape.dof_names, limits=limits)
+    complete = [row for row in rows if all(math.isfinite(value) for value in row.values())]
+    if not complete:
+        raise FormatError(f"{file}: none of its {len(rows)} rows is a pose, without empty entries")
+    pose = shape.rest_pose().double()
+    for name, value in complete[-1].items():
+        pose[shape.dof_names.index(name)] = value
     return pose
 
 

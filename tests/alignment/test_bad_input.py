@@ -115,7 +115,7 @@ def test_bad_starts_and_model_points_of_align(plain_hand, plain_hand_skin, optio
     with pytest.raises(error, match=message):
         align(plain_hand, plain_hand_skin, torch.zeros(2, 20, 3), **options)
     with pytest.raises(InputError, match="points must have shape"):
-        align(plain_hand, torch.zeros(4, 2), torch.zeros(20, 3))
+        align(plain_hand, torch.zeros(4, 2), torch.zeros(20, 3), initial_pose=plain_hand.rest_pose())
 
 
 @pytest.mark.parametrize(

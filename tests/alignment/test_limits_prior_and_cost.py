@@ -6,17 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchreg.alignment.problem import (
-    INLIER_SHARE,
-    PRIOR_SHARE,
-    alignment_cost,
-    centered_problem,
-    masked_mean,
-    shifted,
-)
+from torchreg.alignment.problem import INLIER_SHARE, PRIOR_SHARE, alignment_cost, centered_problem, masked_mean
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
+from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.skin import sample_skin
 from torchreg.shapes.spec import RigSurface

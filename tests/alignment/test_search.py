@@ -9,9 +9,10 @@ from torchreg.alignment import local_search
 from torchreg.alignment.clusters import clustered_data, leaves_clusters
 from torchreg.alignment.local_search import explore, needs_search
 from torchreg.alignment.pose_search import PoseSearch, fit_candidates, mean_distances, score_candidates
-from torchreg.alignment.problem import PRIOR_SHARE, centered_problem, masked_mean, shifted
+from torchreg.alignment.problem import PRIOR_SHARE, centered_problem, masked_mean
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.skin import sample_skin
 from torchreg.shapes.surface import FusedSurface

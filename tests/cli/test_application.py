@@ -19,10 +19,16 @@ finally:
 """
 
 
+COMMANDS = ("align", "demo", "figure", "formats", "info", "label", "pose", "register", "spine", "track", "view")
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--help"], ("align", "demo", "figure", "info", "label", "pose", "register", "spine", "track", "view")),
+        (
+            ["--help"],
+            COMMANDS,
+        ),
         (["track", "--help"], ("--resume", "--overlay")),
     ],
 )
@@ -34,9 +40,9 @@ def test_help_is_light(arguments, words):
 
 
 def test_every_command_explains_itself(run):
-    for command in ("align", "demo", "figure", "info", "label", "pose", "register", "spine", "track", "view"):
+    for command in COMMANDS:
         assert "Usage:" in run(command, "--help").output
-    assert "poses are not searched" in " ".join(run("align", "--help").output.split())
+    assert "without one the shape is searched for" in " ".join(run("align", "--help").output.split())
     assert run("--version").output == f"torchreg {torchreg.__version__}\n"
     assert run("algin").exit_code == 2
 

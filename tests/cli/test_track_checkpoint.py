@@ -104,7 +104,7 @@ def test_what_does_not_belong_together_is_refused(progress, tmp_path):
 
 def test_parts_make_the_whole(progress):
     whole = progress.result
-    rest = type(whole)(**{item.name: getattr(whole, item.name)[1:] for item in fields(whole)})
+    rest = type(whole)(**{item.name: getattr(whole, item.name)[1:] for item in fields(whole) if item.name != "origin"})
     assert same(join_frames(first_frames(whole, 1), rest), whole)
     assert first_frames(whole, 0).poses.shape == (0, 27)
     assert same(join_frames(first_frames(whole, 0), whole), whole)

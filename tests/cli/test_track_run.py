@@ -36,12 +36,12 @@ def test_outputs_lie_beside_the_result(tmp_path):
         bare.check(force=False)
 
 
-def test_clouds_are_scaled_and_those_that_cannot_be_read_are_empty():
-    clouds = Clouds(Frames([torch.ones(4, 3)] * 3), 0.001)
+def test_clouds_that_cannot_be_read_are_empty():
+    clouds = Clouds(Frames([torch.ones(4, 3)] * 3))
     told = []
     clouds.on_drop = lambda number, reason: told.append((number, reason))
     assert (len(clouds), clouds.names) == (3, ("a", "b", "c"))
-    assert torch.allclose(clouds[0], torch.full((4, 3), 0.001))
+    assert torch.allclose(clouds[0], torch.ones(4, 3))
     assert clouds[1].shape == (0, 3)
     assert told == [(1, "b: is cut off")]
 

@@ -67,7 +67,6 @@ def test_wrong_use_takes_one_line(error_of, command, pictures, tmp_path):
     assert "left and right pictures are swapped" in error_of(*command(*FAST, sides=("right", "left")))
     assert "--stereo takes --calibration" in error_of("track", "hand", "--stereo", place / "left", place / "right")
     assert "no meaning without --stereo" in error_of("track", "hand", place / "left", "--reach", 0.1)
-    assert "--scale has no meaning with --stereo" in error_of(*command(*FAST, "--scale", 0.001))
     save_cameras(tmp_path / "one.json", CameraRig((stereo_cameras().left,)))
     folders = (place / "left", place / "right")
     one = ("track", "hand", "--stereo", *folders, "--calibration", tmp_path / "one.json", "-o", tmp_path / "x")

@@ -53,6 +53,13 @@ def test_files_and_commands_that_a_page_names_exist(page):
             assert command in COMMANDS, f"{page.name} runs torchreg {command}, which does not exist"
 
 
+def test_the_page_of_formats_is_made_from_the_readers():
+    spec = importlib.util.spec_from_file_location("formats", DOCS / "formats.py")
+    formats = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(formats)
+    assert formats.PAGE.read_text(encoding="utf-8") == formats.page(), "run: python docs/formats.py"
+
+
 def test_the_gallery_is_drawn_by_one_command(tmp_path, capsys):
     spec = importlib.util.spec_from_file_location("gallery", DOCS / "gallery.py")
     gallery = importlib.util.module_from_spec(spec)

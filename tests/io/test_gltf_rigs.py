@@ -240,7 +240,7 @@ def test_several_skins_need_a_choice(tmp_path: Path) -> None:
     builder.json["skins"].append({"name": "second", "joints": [2]})
     builder.json["nodes"].append({"mesh": 0, "skin": 1})
     path = builder.glb(tmp_path / "rig.glb")
-    with pytest.raises(ModelError, match=r"choose one with skin=: 0 \('rig'\), 1 \('second'\)"):
+    with pytest.raises(ModelError, match=r"choose one with skin=NAME: 0 \('rig'\), 1 \('second'\)"):
         load_rig(path)
     assert load_rig(path, skin="rig").name == "rig"
     builder.json["skins"].append({"name": "idle", "joints": [2]})
@@ -362,7 +362,6 @@ def test_impossible_rigs(tmp_path: Path, edit: Any, message: str) -> None:
     ("edit", "message"),
     [
         (change("accessors.0.count", 10**12), "12|elements"),
-        (change("accessors.0.count", 0), "POSITION of primitive 0 of mesh 'body' has 0 elements"),
         (change("accessors.0.count", 5), r"POSITION of primitive 0 of mesh 'body' reaches beyond its buffer"),
         (change("accessors.0.count", 3), "float or normalized weights for each of its 3 vertices"),
         (change("accessors.0.byteOffset", -4), "byteOffset of POSITION"),
@@ -412,8 +411,8 @@ def test_numbers_that_are_refused(tmp_path: Path) -> None:
 
     with pytest.raises(ModelError, match="POSITION of primitive 0 of mesh 'body' holds non-finite"):
         load_rig(build(points=POINTS * np.float32("nan")))
-    with pytest.raises(ModelError, match="1 of 4 vertices have no skin weight"):
-        load_rig(build(weights=WEIGHTS * np.float32([[1], [0], [1], [1]])))
+    with pytest.raises(ModelError, match="none of 4 vertices has a skin weight"):
+        load_rig(build(weights=0 * WEIGHTS))
     with pytest.raises(ModelError, match="negative skin weights"):
         load_rig(build(weights=-WEIGHTS))
     with pytest.raises(ModelError, match="joint 'tip' is singular"):

@@ -33,12 +33,12 @@ def test_depth_pictures(tmp_path, name, values, scale):
 @pytest.mark.parametrize("dtype", [np.uint16, np.float16, np.float32, np.float64])
 def test_depth_arrays(tmp_path, dtype):
     np.save(tmp_path / "d.npy", STEPS.astype(dtype))
-    assert torch.allclose(load_depth(tmp_path / "d.npy", 0.5), torch.from_numpy(STEPS.astype(np.float32)) * 0.5)
+    assert torch.allclose(load_depth(tmp_path / "d.npy", 5e-4), torch.from_numpy(STEPS.astype(np.float32)) * 5e-4)
 
 
 def test_depth_exr(tmp_path):
     exr = pytest.importorskip("OpenEXR")
-    values = STEPS.astype(np.float32)
+    values = STEPS.astype(np.float32) / 1000
     for name in ("Z", "Y"):
         header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
         with exr.File(header, {name: values}) as file:
@@ -133,6 +133,9 @@ def test_pictures_and_masks_have_the_same_limits(tmp_path, load):
             with pytest.raises(FormatError, match=name):
                 load(tmp_path / name)
     Image.fromarray(STEPS).save(tmp_path / "c.png")
+    if load is load_mask:
+        assert torch.equal(load(tmp_path / "c.png"), torch.from_numpy(STEPS >= 5500))
+        return
     with pytest.raises(FormatError, match="8 bits per channel"):
         load(tmp_path / "c.png")
     Image.fromarray(STEPS.astype(np.float32) * np.float32("nan")).save(tmp_path / "n.tif")

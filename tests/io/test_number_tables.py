@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchreg.errors import FormatError
+from torchreg.errors import FileWarning, FormatError
 from torchreg.io.raw_cloud import RawCloud, as_indices, as_integers, fan_triangles, parse_table, stack_columns
 
 
@@ -35,8 +35,9 @@ def test_tables_keep_two_axes():
         ([b"1 2 3", b""], 3, "each point must hold 3 numbers"),
         ([b"1 2 three"], 3, "a point is not a row of 3 numbers"),
         ([b"1 2 0x10"], 3, "a point is not a row of 3 numbers"),
-        ([b"1 2 # 3"], 3, "a point is not a row of 3 numbers"),
-        ([b"1,2,3"], 3, "a point is not a row of 3 numbers"),
+        ([b"1 2 #3"], 3, "a point is not a row of 3 numbers: row 1 holds '#3'"),
+        ([b"1 2 # 3"], 3, "each point must hold 3 numbers, got 4"),
+        ([b"1,2,3"], 3, "each point must hold 3 numbers, got 1"),
         ([b"1 2 \xd9\xa3"], 3, "a point is not a row of 3 numbers"),
     ],
 )
@@ -118,9 +119,10 @@ def test_a_fan_covers_a_convex_polygon_once():
 
 
 @pytest.mark.parametrize("few", [0, 1, 2])
-def test_polygons_need_three_corners(few):
-    with pytest.raises(FormatError, match=f"a face must have at least 3 corners, got {few}"):
-        fan_triangles(np.array([4, few]), np.arange(4 + few))
+def test_polygons_of_fewer_than_three_corners_are_left_out(few):
+    with pytest.warns(FileWarning, match="1 of 3 faces are left out: they have fewer than 3 corners"):
+        triangles = fan_triangles(np.array([4, few, 3]), np.arange(7 + few))
+    assert triangles.tolist() == [[0, 1, 2], [0, 2, 3], [4 + few, 5 + few, 6 + few]]
 
 
 def test_the_record_has_points_alone_unless_told():

@@ -159,9 +159,8 @@ def test_xyz_dialects(tmp_path):
         ("3\n1 2 3\n4 5 6\n", "the first line says 3 points, the file holds 2"),
         ("1 2 3\n4 5\n", "not a row of equally many numbers"),
         ("1 2 3\n4 five 6\n", "not a row of equally many numbers"),
-        ("1 2 3 4\n", r"3 numbers \(x y z\) or 6 \(x y z nx ny nz\), got 4"),
-        ("1 2 3 255 0 9\n", "columns 4 to 6 must be unit normals, got components up to 255"),
-        ("x y intensity\n1 2 3\n", "the columns must be x y z"),
+        ("1 2\n", r"a row of 3 numbers or more \(x y z first\), got 2"),
+        ("x y intensity\n1 2 3\n", "the columns must name x, y and z"),
         ("", "holds no points"),
         ("# nothing\n", "holds no points"),
         ("1 2 3\n\xff", "not a row"),
@@ -180,7 +179,6 @@ def test_bad_xyz_is_refused(tmp_path, text, words):
         ("v 1 2 3\nf 1 1 2\n", "a face names a vertex outside 1 to 1"),
         ("v 1 2 3\nf 1 0 1\n", "a face names a vertex outside 1 to 1"),
         ("v 1 2 3\nf 1 -2 1\n", "a face names a vertex outside 1 to 1"),
-        ("v 1 2 3\nf 1 1\n", "a face must have at least 3 corners, got 2"),
         ("v 1 2 3\nf 1 1.5 1\n", "vertex indices must be whole numbers"),
         ("v 1 2 3\nf a b c\n", "a vertex index is not a row"),
         ("f 1 2 3\n", "outside 1 to 0"),
@@ -329,8 +327,8 @@ def test_what_is_not_a_readable_file(tmp_path):
     (tmp_path / "folder.ply").mkdir()
     with pytest.raises(IsADirectoryError):
         load_points(tmp_path / "folder.ply")
-    with pytest.raises(FormatError, match=r"unknown ending '\.docx'; known: \.ply, \.pcd"):
-        load_points(put(tmp_path, "a.docx", "1 2 3"))
+    with pytest.raises(FormatError, match=r"unknown ending '\.docx', .* known: \.ply, \.pcd"):
+        load_points(put(tmp_path, "a.docx", "a letter"))
     path = put(tmp_path, "a.xyz", "1 2 3")
     with pytest.raises(InputError, match="nan_policy must be one of raise, omit"):
         load_points(path, nan_policy="drop")

@@ -43,7 +43,7 @@ def test_names_are_places_addresses_or_packages(folder, tmp_path):
     for place in (folder, folder / "other"):
         assert width(files(elsewhere, [place]).read("package://other/box.stl", "a")) == 2
     with pytest.raises(FormatError, match="is remote; save it beside the URDF"):
-        found.read("https://example.org/box.stl", "a")
+        found.read("https://example.org/ball.stl", "a")
 
 
 def test_given_folders_come_before_those_above_of_the_same_name(folder, tmp_path):

@@ -9,13 +9,13 @@ import trimesh
 from torchreg.errors import FormatError
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 from torchreg.io.raw_cloud import RawCloud
-from torchreg.io.text_formats import read_obj, read_xyz, write_xyz
+from torchreg.io.text_formats import read_obj, read_table, write_xyz
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 
 
 def xyz(text: str, limits: FileLimits = DEFAULT_LIMITS) -> RawCloud:
-    return read_xyz(text.encode(), limits)
+    return read_table(text.encode(), limits)
 
 
 def obj(text: str, limits: FileLimits = DEFAULT_LIMITS) -> RawCloud:
@@ -58,11 +58,10 @@ def test_tables_without_rows_are_empty(text):
     assert xyz(text).points.shape == (0, 3)
 
 
-@pytest.mark.parametrize("columns", [2, 4, 5, 7, 9])
-def test_other_column_counts_are_refused(columns):
-    words = rf"must be a row of 3 numbers \(x y z\) or 6 \(x y z nx ny nz\), got {columns}; drop the other columns"
-    with pytest.raises(FormatError, match=words):
-        xyz(" ".join(["0"] * columns) + "\n")
+@pytest.mark.parametrize("columns", [1, 2])
+def test_fewer_than_three_columns_are_refused(columns):
+    with pytest.raises(FormatError, match=rf"a row of 3 numbers or more \(x y z first\), got {columns}"):
+        xyz(" ".join(["0.5"] * columns) + "\n")
 
 
 @pytest.mark.parametrize(
@@ -74,10 +73,8 @@ def test_other_column_counts_are_refused(columns):
         ("7\n", "the first line says 7 points, the file holds 0: it is cut off"),
         ("1\n0 0 0\n1 1 1\n", "the first line says 1 points, the file holds 2"),
         ("1\nx y z\n0 0 0\n1 1 1\n", "the first line says 1 points, the file holds 2"),
-        ("y x z\n0 0 0\n", "the columns must be x y z or x y z nx ny nz, got y x z"),
-        ("x y z r g b\n0 0 0 1 1 1\n", "the columns must be .*, got x y z r g b"),
-        ("0 0 0 0 0 1\n0 0 0 0 -1.5 0\n", r"unit normals, got components up to 1\.5; drop them, or if .* colors"),
-        ("ply\nformat ascii 1.0\n", "the columns must be x y z"),
+        ("y x\n0 0\n", "the columns must name x, y and z, got y x"),
+        ("ply\nformat ascii 1.0\n", "the columns must name x, y and z, got ply"),
     ],
 )
 def test_damaged_tables_are_refused(text, words):
@@ -98,7 +95,7 @@ def test_numpy_reads_the_written_table_exactly(dtype, with_normals):
     assert table.shape == (20, 6 if with_normals else 3)
     if with_normals:
         np.testing.assert_array_equal(table[:, 3:], normals)
-    np.testing.assert_array_equal(read_xyz(content, DEFAULT_LIMITS).points.astype(dtype), points)
+    np.testing.assert_array_equal(read_table(content, DEFAULT_LIMITS).points.astype(dtype), points)
 
 
 def test_quads_and_larger_polygons_are_cut_into_fans():
@@ -164,15 +161,13 @@ def test_vertices_with_weights_and_colors(rows, colors):
         (SQUARE + "f 1 2 5\n", "a face names a vertex outside 1 to 4: the file is cut off or damaged"),
         ("v 0 0 0\nf -2 -1 -1\nv 1 0 0\n", "a face names a vertex outside 1 to 2"),
         (SQUARE + "f 1/1 /2 3/3\n", "each vertex index must hold 1 numbers|a vertex index is not a row"),
-        (SQUARE + "f 1 2 3 # 4\nf 1 # 2 3\n", "a face must have at least 3 corners, got 1"),
-        (SQUARE + "f\n", "a face must have at least 3 corners, got 0"),
         (SQUARE + "f 1 2 1e300\n", "vertex indices are out of range"),
         (SQUARE + "f 1 2 nan\n", "vertex indices must be whole numbers"),
         ("v 0 0 0\nvn 0 0 1\nf 1//2 1//1 1//1\n", "a face names a normal outside 1 to 1"),
         ("v 0 0 0\nvn 0 0 1\nf 1//0 1//1 1//1\n", "a face names a normal outside 1 to 1"),
         ("v 0 0 0\nvn 0 1\nf 1//1 1//1 1//1\n", "each normal must hold 3 numbers, got 2"),
         ("v 0 0 0 0 0\n", r"a vertex must be 3 numbers \(with w 4, with a color 6 or 7\), got 5"),
-        ("v 0 0 0\nv 0 0 0 1 1 1\n", "a vertex is not a row of equally many numbers"),
+        ("v 0 0 0\nv 0 0 0 1 1\n", "a vertex is not a row of equally many numbers: row 2 holds 5"),
         ("v 0 0 0\nv\n", "each vertex must hold"),
     ],
 )

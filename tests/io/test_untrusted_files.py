@@ -7,6 +7,7 @@ import socket
 import struct
 import time
 import tracemalloc
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import pytest
 import torch
 import trimesh
 
-from torchreg.errors import FormatError, InputError, InputTypeError
+from torchreg.errors import FileWarning, FormatError, InputError, InputTypeError
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, open_zip, read_bytes
 from torchreg.io.points import load_points, save_points
@@ -217,7 +218,8 @@ def files(tmp_path_factory):
 
 def outcome(path, content: bytes) -> int:
     path.write_bytes(content)
-    with contextlib.suppress(FormatError):
+    with contextlib.suppress(FormatError), warnings.catch_warnings():
+        warnings.simplefilter("ignore", FileWarning)
         return len(load_points(path, nan_policy="omit"))
     return 0
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from torchreg.errors import FormatError, InputError, ModelError
+from torchreg.errors import FileWarning, FormatError, InputError, ModelError
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.gltf import load_rig
 from torchreg.io.urdf import UrdfPrimitive
@@ -346,14 +346,16 @@ def test_a_link_mesh_gets_a_fitted_solid(tmp_path):
     np.testing.assert_allclose(shape.primitives.sizes[0][0].numpy(), [0.1, 0.1, 0.3], rtol=0.05)
     path.write_text(f'<robot name="egg"><link name="egg">{visual.replace("egg.obj", "none.obj")}{ball}</link></robot>')
     with pytest.raises(FormatError, match=r"none.obj.* was not found"):
-        ArticulatedShape.from_urdf(path)
+        ArticulatedShape.from_urdf(path, meshes="require")
+    with pytest.warns(FileWarning, match=r"none.obj.* was not found"):
+        assert ArticulatedShape.from_urdf(path).part_names == ("egg",)
     assert ArticulatedShape.from_urdf(path, meshes="skip").part_names == ("egg",)
 
 
 def test_robots_without_geometry_are_refused(tmp_path):
     path = tmp_path / "bare.urdf"
     path.write_text('<robot name="bare"><link name="only"/></robot>')
-    with pytest.raises(ModelError, match=r"no link of .*bare.urdf has geometry: there is nothing to align"):
+    with pytest.raises(ModelError, match=r"bare\.urdf: no link has geometry that can be read"):
         ArticulatedShape.from_urdf(path)
     with pytest.raises(InputError, match="primitive must be one of auto, ellipsoid"):
         ArticulatedShape.from_urdf(path, primitive="cube")

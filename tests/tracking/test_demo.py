@@ -7,7 +7,6 @@ import torchreg.tracking.demo as demo
 from torchreg.datasets.sequences import hand_sequence
 from torchreg.errors import InputError
 from torchreg.shapes.hand import Hand
-from torchreg.shapes.skin import sample_skin
 from torchreg.storage import load
 from torchreg.tracking.tracker import TrackConfig, Tracker
 
@@ -82,17 +81,6 @@ def test_an_interruption_before_the_first_frame_leaves_nothing(monkeypatch):
     stop_at(monkeypatch, 0)
     with pytest.raises(KeyboardInterrupt):
         demo.run_demo(2)
-
-
-def test_a_pose_moves_to_the_mean_of_a_cloud_and_keeps_its_rotation():
-    hand = Hand()
-    skin = sample_skin(hand, 50)
-    pose = hand.rest_pose()
-    pose[3:6] = torch.tensor([0.3, -1.0, 2.0])
-    cloud = torch.randn(40, 3, generator=torch.Generator().manual_seed(0)) + 5
-    moved = demo.moved_to_mean(skin, pose, cloud)
-    assert torch.equal(moved[3:], pose[3:])
-    assert torch.allclose(skin(moved).mean(0), cloud.mean(0), atol=1e-5)
 
 
 def test_there_is_at_least_one_frame():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -11,7 +12,8 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_choice, check_count, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.alignment.annealed_em import ANNEALING, CORRESPONDENCES, OnStep, StageResult, anneal, outlier_level
-from torchreg.alignment.inputs import check_clouds, check_skin, warn_about_degenerate, warn_about_units
+from torchreg.alignment.find_pose import FindPoseConfig, find_pose
+from torchreg.alignment.inputs import check_clouds, check_skin, floating_origin, warn_about_degenerate, warn_about_units
 from torchreg.alignment.local_search import explore, needs_search
 from torchreg.alignment.problem import (
     INLIER_SHARE,
@@ -19,14 +21,15 @@ from torchreg.alignment.problem import (
     alignment_cost,
     centered_problem,
     masked_mean,
-    shifted,
 )
 from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
-from torchreg.errors import InputError
+from torchreg.errors import InputError, UnitsWarning
+from torchreg.geometry.loaded import points_of
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import BendingSkin, LinearBlendSkin, sample_skin
 from torchreg.solvers.e_step import expectation
 
@@ -144,9 +147,10 @@ def align(
 
     Args:
         shape: the articulated shape, in metres.
-        data: (M, 3), metres; or (B, M, 3) for a batch of clouds.
-        initial_pose: (num_dofs,) start, the rest pose by default; moved inside the limits first. (B, num_dofs) with a
-            batch of clouds. (S, num_dofs) with one cloud: several starts, of which the best alignment is returned.
+        data: (M, 3), metres, or a cloud, scan or mesh as loaders return; or (B, M, 3) for a batch of clouds.
+        initial_pose: (num_dofs,) start, moved inside the limits first; without one, `find_pose` looks for it.
+            (B, num_dofs) with a batch of clouds. (S, num_dofs) with one cloud: several starts, of which the best
+            alignment is returned.
         model_points: a skin of the shape (see `sample_skin`; reuse it when aligning many clouds), or (N, 3) points in
             the initial pose; sampled on the surface by default.
         mask: (M,) or (B, M), False where data are padding.
@@ -154,7 +158,8 @@ def align(
         on_step: called with an `AlignRecord` after each iteration.
 
     Returns:
-        an `AlignResult`; with a batch of clouds every tensor has a leading dimension B and the status is a tuple.
+        an `AlignResult`; with a batch of clouds every tensor has a leading dimension B and the status is a tuple. Data
+        in float64 far from the origin, as in maps, are aligned about an origin near them, which the result tells.
 
     Raises:
         InputError: if the data are empty, not finite, or do not fit the pose.
@@ -166,11 +171,16 @@ def align(
 
     Differentiable: no; use `EMLoss` for gradients.
 
-    Cost: O(N M) per EM iteration, in bounded memory.
+    Cost: O(N M) per EM iteration, in bounded memory; that of `find_pose` beside, without a start.
 
     References: Dewaele et al. 2006, section 3.
     """
-    config = config or AlignConfig()
+    config, data = config or AlignConfig(), points_of(data)
+    origin = floating_origin(shape, data)
+    if origin is not None:
+        return _align_about(origin, shape, data, initial_pose, model_points, mask, config, on_step)
+    if initial_pose is None:
+        initial_pose = _found_pose(shape, data, model_points, mask, config)
     # A sixth faster than without gradients alone, as most of the time goes to small operations.
     with torch.inference_mode():
         clouds, valid = check_clouds(shape, data, mask, config.nan_policy)
@@ -186,6 +196,46 @@ def align(
             found = _search_where_needed(batch, found, config)
         result = _result(batch, found, config)  # inliers by eq. 2, the posterior by eq. 17
         return normal_copy(_unbatched(result) if clouds.ndim == 2 else result)
+
+
+def _align_about(
+    origin: Tensor,
+    shape: ArticulatedShape,
+    data: Tensor,
+    initial_pose: Tensor | None,
+    model_points: Tensor | LinearBlendSkin | None,
+    mask: Tensor | None,
+    config: AlignConfig,
+    on_step: OnStep | None,
+) -> AlignResult:
+    """Return the alignment to data far from the origin of coordinates, computed about an origin (3,) near them."""
+
+    def moved_step(step: AlignRecord) -> None:
+        if on_step is not None:
+            on_step(replace(step, pose=shifted(step.pose.double(), origin.to(step.pose.device))))
+
+    near = data - origin.to(data.device)
+    start = None if initial_pose is None else shifted(torch.as_tensor(initial_pose).double(), -origin)
+    points = model_points - origin if isinstance(model_points, Tensor) else model_points
+    return align(
+        shape, near, start, model_points=points, mask=mask, config=config, on_step=moved_step
+    ).moved(origin)  # fmt: skip
+
+
+def _found_pose(
+    shape: ArticulatedShape,
+    data: Tensor,
+    model_points: Tensor | LinearBlendSkin | None,
+    mask: Tensor | None,
+    config: AlignConfig,
+) -> Tensor:
+    """Return the best pose that a search without a start finds, (num_dofs,) or (B, num_dofs)."""
+    if model_points is not None and not isinstance(model_points, LinearBlendSkin):
+        raise InputError("model_points given as a tensor need a single initial_pose, that they are in; give both")
+    search = FindPoseConfig(num_model_points=config.num_model_points, nan_policy=config.nan_policy, seed=config.seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UnitsWarning)  # the alignment tells it
+        return find_pose(shape, data, num_starts=1, mask=mask, model_points=model_points, config=search).best
 
 
 @dataclass(frozen=True)
@@ -345,5 +395,7 @@ def _status(num_inliers: int, num_data: int, converged: bool, degenerate: bool) 
 
 def _unbatched(result: AlignResult) -> AlignResult:
     """Return the result of the single problem of a batch."""
-    first = {item.name: getattr(result, item.name)[0] for item in fields(result) if item.name != "history"}
+    first = {
+        item.name: getattr(result, item.name)[0] for item in fields(result) if item.name not in ("history", "origin")
+    }
     return replace(result, **first)

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchreg._checks import check_choice, check_count, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.alignment.confidence import is_misfit, pose_confidence
-from torchreg.alignment.inputs import check_clouds, check_skin, warn_about_degenerate, warn_about_units
+from torchreg.alignment.inputs import check_clouds, check_skin, floating_origin, warn_about_degenerate, warn_about_units
 from torchreg.alignment.limb_search import distinct_first, take_rows
 from torchreg.alignment.pose_search import PoseSearch, mean_distances
 from torchreg.alignment.problem import (
@@ -19,13 +19,14 @@ from torchreg.alignment.problem import (
     alignment_cost,
     centered_problem,
     masked_mean,
-    shifted,
 )
 from torchreg.alignment.results import PoseStarts
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource, bent_pose, register_rigidly
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.errors import InputError
+from torchreg.geometry.loaded import points_of
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 
@@ -119,10 +120,17 @@ def find_pose(
 
     Cost: 1 to 2 s for a hand on one CPU core, whatever the number of data.
     """
-    config = config or FindPoseConfig()
+    config, data = config or FindPoseConfig(), points_of(data)
     check_count(num_starts, "num_starts", 1)
     if not sources:
         raise InputError("sources must hold at least one source of rough poses, got none")
+    far = floating_origin(shape, data)
+    if far is not None:
+        near = data - far.to(data.device)
+        starts = find_pose(
+            shape, near, num_starts=num_starts, mask=mask, sources=sources, model_points=model_points, config=config
+        )
+        return replace(starts, poses=shifted(starts.poses.double(), far.to(starts.poses.device)))
     with torch.no_grad():
         clouds, valid = check_clouds(shape, data, mask, config.nan_policy)
         batch, batch_valid = (clouds, valid) if clouds.ndim == 3 else (clouds[None], valid[None])

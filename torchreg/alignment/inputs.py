@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_shape
 from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning
+from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.spread import SAME_SHARE, SPREADS, spread_dimensions
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
@@ -21,6 +24,7 @@ class UnitsCheck:
 
     ratio: float = 30.0  # of their sizes: no pose and no crop explains more
     min_data: int = 10  # with a reliable size
+    factors: ClassVar[dict[str, float]] = {"millimeters": 0.001, "centimeters": 0.01, "kilometers": 1000.0}
 
 
 UNITS = UnitsCheck()
@@ -75,6 +79,22 @@ def check_clouds(
     return torch.where(valid.unsqueeze(-1), clouds, 0.0), valid
 
 
+def _remedy(ratio: float) -> str:
+    """Return what to do about data that spread over some sizes of the model; those in metres do over about one."""
+    unit, factor = min(UNITS.factors.items(), key=lambda item: abs(math.log(max(ratio, 1e-30) * item[1])))
+    return f"If they are in {unit}, load them with scale={factor:g}"
+
+
+def floating_origin(shape: ArticulatedShape, clouds: Tensor) -> Tensor | None:
+    """Return the origin (3,) about which clouds far from that of coordinates are aligned; None for others.
+
+    A shape whose base is bolted down stays where it is.
+    """
+    if not isinstance(clouds, Tensor) or clouds.ndim < 2 or clouds.shape[-1] != 3:
+        return None
+    return far_origin(clouds) if bool(torch.isinf(shape.lower[:3]).all()) else None
+
+
 def check_skin(shape: ArticulatedShape, skin: LinearBlendSkin) -> LinearBlendSkin:
     """Return model points given as a skin, with constant weights.
 
@@ -107,7 +127,7 @@ def warn_about_units(data: Tensor, valid: Tensor, size: float, *, stacklevel: in
         return False
     warnings.warn(
         f"the data spread over {ratio:.3g} times the model's size of {size:.3g} m: are they in metres? "
-        f"Scale them, by 0.001 if they are in millimeters",
+        f"{_remedy(ratio)}",
         UnitsWarning,
         stacklevel=stacklevel + 1,
     )

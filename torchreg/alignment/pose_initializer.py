@@ -21,14 +21,13 @@ from torchreg.alignment.problem import (
     AlignProblem,
     centered_problem,
     masked_mean,
-    shifted,
     soft_inliers,
 )
 from torchreg.alignment.rough_poses import typical_poses
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface, residual_noise, surface_objective
 from torchreg.errors import InputError
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.pose_algebra import BASE_DOFS
+from torchreg.shapes.pose_algebra import BASE_DOFS, shifted
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 from torchreg.shapes.surface import FusedSurface
 

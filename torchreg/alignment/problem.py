@@ -152,11 +152,6 @@ def masked_mean(data: Tensor, valid: Tensor) -> Tensor:
     return (data * valid.unsqueeze(-1)).sum(-2) / valid.sum(-1, keepdim=True).clamp_min(1)
 
 
-def shifted(pose: Tensor, offset: Tensor) -> Tensor:
-    """Return poses (..., num_dofs) with the base moved by offsets (..., 3)."""
-    return torch.cat([pose[..., :3] + offset, pose[..., 3:]], dim=-1)
-
-
 def model_size(skin: LinearBlendSkin) -> float:
     """Return the diagonal of the bounding box of model points in their reference pose, metres."""
     return float((skin.points.amax(0) - skin.points.amin(0)).norm())

@@ -8,9 +8,11 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_positive
+from torchreg.alignment.inputs import floating_origin
 from torchreg.alignment.pose_initializer import InitialPose, PoseInitializer
 from torchreg.alignment.problem import INLIER_SHARE, model_size
 from torchreg.datasets.pose_labels import PoseLabel
+from torchreg.shapes.pose_algebra import shifted
 
 
 def label_frames(
@@ -28,7 +30,8 @@ def label_frames(
         start: (num_dofs,) of the first frame, if known.
 
     Yields:
-        a `PoseLabel` per frame.
+        a `PoseLabel` per frame, in the coordinates of the clouds; in float64 where those of the first are far from the
+        origin.
 
     Raises:
         InputError: if ``trusted`` is negative or a cloud is empty or not finite.
@@ -36,15 +39,20 @@ def label_frames(
     Differentiable: no.
     """
     check_positive(trusted, "trusted", allow_zero=True)
+    origin, is_first = None, True
     for frame in frames:
-        points = frame.to(initializer.shape.rest)
+        if is_first:
+            origin, is_first = floating_origin(initializer.shape, frame), False
+            start = start if start is None or origin is None else shifted(start.double(), -origin)
+        points = (frame if origin is None else frame.double() - origin).to(initializer.shape.rest)
         with torch.no_grad():
             found = _pose_of(initializer, points, start, trusted)
             parts = _part_labels(initializer, points, found.pose)
         start = found.pose if float(found.confidence) >= trusted else None
-        yield PoseLabel(
+        label = PoseLabel(
             points=points, pose=found.pose, keypoints=found.keypoints, parts=parts, confidence=found.confidence
         )
+        yield label if origin is None else label.moved(origin)
 
 
 def _pose_of(initializer: PoseInitializer, points: Tensor, start: Tensor | None, trusted: float) -> InitialPose:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import ClassVar
+from dataclasses import dataclass, field, replace
+from typing import ClassVar, Self
 
 from torch import Tensor
 
 from torchreg.result import Result, Status, stored_as
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.record import build_shape, record_shape
 
 
@@ -51,6 +52,8 @@ class AlignResult(Result):
         cost: objective that ranks alignments of the same data, lower is better.
         status: of the alignment at its end; a tuple with one entry per problem for a batch.
         history: one `AlignRecord` per step.
+        origin: (3,) float64 about which it was computed, where the data lie so far from that of coordinates that the
+            shape's precision would round them; pose, registered points and keypoints are float64 then. None elsewhere.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -68,6 +71,28 @@ class AlignResult(Result):
     cost: Tensor
     status: Status | tuple[Status, ...]
     history: tuple[AlignRecord, ...] = ()
+    origin: Tensor | None = None
+
+    def moved(self, origin: Tensor) -> Self:
+        """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
+        offset = origin.to(self.pose.device)
+        return replace(
+            self,
+            pose=shifted(self.pose.double(), offset),
+            registered=self.registered.double() + offset,
+            keypoints=self.keypoints.double() + offset,
+            history=tuple(replace(row, pose=shifted(row.pose.double(), offset)) for row in self.history),
+            origin=origin,
+        )
+
+    def local(self, like: Tensor) -> Self:
+        """Return the result in coordinates that begin at its origin, in the dtype of ``like``; itself without one."""
+        if self.origin is None:
+            return self
+        found = replace(self.moved(-self.origin), origin=None)
+        return replace(
+            found, pose=found.pose.to(like), registered=found.registered.to(like), keypoints=found.keypoints.to(like)
+        )
 
     @property
     def statuses(self) -> tuple[Status, ...]:

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.pose_search import PoseSearch
-from torchreg.alignment.problem import AlignProblem, shifted
+from torchreg.alignment.problem import AlignProblem
 from torchreg.geometry.rigid import fit_rigid, rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.sampling import farthest_points
 from torchreg.shapes.articulation import Articulation
-from torchreg.shapes.pose_algebra import BASE_DOFS
+from torchreg.shapes.pose_algebra import BASE_DOFS, shifted
 from torchreg.solvers.e_step import OUTLIER_CONSTANT, expectation
 
 

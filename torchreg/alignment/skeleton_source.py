@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchreg._checks import check_count
-from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem, shifted
+from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem
 from torchreg.alignment.rough_poses import typical_poses
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import TriangleMesh
@@ -18,7 +18,7 @@ from torchreg.geometry.rotation import so3_exp, so3_log
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.limbs import find_limbs
-from torchreg.shapes.pose_algebra import BASE_DOFS
+from torchreg.shapes.pose_algebra import BASE_DOFS, shifted
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
 from torchreg.spines.curves import points_along

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchreg.cli.align_options import (
+    Frame,
     NanPolicy,
     Outlier,
     Scale,
     Search,
     Sigma,
+    Time,
     alignment_summary,
     read_cloud,
     read_schedule,
@@ -23,7 +25,7 @@ from torchreg.cli.align_options import (
 )
 from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
-from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, load_shape
+from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -55,8 +57,8 @@ def align(
         list[Path],
         typer.Argument(
             metavar="CLOUD",
-            help="Point clouds (.ply, .pcd, .xyz, .txt, .obj, .stl, .glb, .npz), metres; several are taken for the "
-            "frames of a motion, and each starts from the pose before.",
+            help="Point clouds, metres, of any format that `torchreg formats` shows; several are taken for the frames "
+            "of a motion, and each starts from the pose before.",
         ),
     ],
     output: Annotated[
@@ -65,8 +67,8 @@ def align(
     start: Annotated[
         Path | None,
         typer.Option(
-            help="Pose to start from: a result, or .json with numbers or {degree of freedom: number}, or .npz. By "
-            "default the rest pose is moved to the mean of the cloud and not turned: poses are not searched for yet."
+            help="Pose to start from: a result, or .json with numbers or {degree of freedom: number}, .csv or .npz; "
+            "without one the shape is searched for."
         ),
     ] = None,
     sigma: Sigma = None,
@@ -74,10 +76,15 @@ def align(
     search: Search = "auto",
     nan_policy: NanPolicy = "raise",
     scale: Scale = 1.0,
+    time: Time = None,
+    frame: Frame = None,
     parents: Parents = None,
     package_dir: PackageDir = None,
     free_base: FreeBase = None,
-    pose: Annotated[Path | None, typer.Option(help="Also write the pose by name of degree of freedom (.json).")] = None,
+    skin: Skin = None,
+    pose: Annotated[
+        Path | None, typer.Option(help="Also write the pose by name of degree of freedom (.json or .csv).")
+    ] = None,
     ply: Annotated[Path | None, typer.Option(help="Also write the registered model points (.ply).")] = None,
     picture: Annotated[Path | None, typer.Option(help="Also draw shape and data (.png, .pdf, .svg).")] = None,
     gltf: Annotated[
@@ -91,10 +98,13 @@ def align(
     With several clouds, the names of the outputs are numbered: RESULT_1, RESULT_2, ... Ctrl-C leaves those of the
     finished clouds on disk.
 
+    Coordinates far from the origin, as in maps, keep their digits; pictures and the .glb file, which has single
+    precision, begin at an origin near the clouds that the result tells.
+
     Exit codes: 0; 1 if an alignment found too few inliers to mean anything; 2 for an error; 130 for Ctrl-C.
     """
     output = with_ending(output, (".safetensors",), add=True)
-    optional = with_ending(pose, (".json",)), with_ending(ply, (".ply",)), with_ending(picture, PICTURE_ENDINGS)
+    optional = with_ending(pose, (".json", ".csv")), with_ending(ply, (".ply",)), with_ending(picture, PICTURE_ENDINGS)
     count = len(clouds)
     files = [_Files(numbered(output, k, count), *(numbered(name, k, count) for name in optional)) for k in range(count)]
     check_outputs([*(path for entry in files for path in entry.all()), with_ending(gltf, (".glb",))], force)
@@ -104,15 +114,15 @@ def align(
     from tqdm import tqdm
 
     with tqdm(total=count, unit="cloud", desc="reading", leave=False, disable=quiet) as bar:
-        model = load_shape(shape, parents, package_dir, free_base)
+        model = load_shape(shape, parents, package_dir, free_base, skin)
         from torchreg.alignment.align import AlignConfig
         from torchreg.shapes.skin import sample_skin
         from torchreg.storage import load_pose
 
         config = AlignConfig(schedule=read_schedule(sigma), outlier=outlier, search=search, nan_policy=nan_policy)
         first = None if start is None else load_pose(start, model)
-        skin = sample_skin(model, config.num_model_points, sharpness=config.sharpness)
-        run = _AlignRun(model, config, skin, scale, first)
+        points = sample_skin(model, config.num_model_points, sharpness=config.sharpness)
+        run = _AlignRun(model, config, points, scale, time, frame, first)
         interrupted = False
         try:
             for path, entry in zip(clouds, files, strict=True):
@@ -144,6 +154,8 @@ class _AlignRun:
     config: AlignConfig
     skin: LinearBlendSkin
     scale: float
+    time: float | None
+    frame: int | None
     start: Tensor | None
     results: list[AlignResult] = field(default_factory=list)
 
@@ -157,11 +169,9 @@ class _AlignRun:
     def align(self, path: Path, files: _Files, on_step: Callable[[Any], None]) -> AlignResult:
         """Return the alignment to one cloud, after writing it."""
         from torchreg.alignment.align import align
-        from torchreg.tracking.demo import moved_to_mean
 
-        data = read_cloud(path, self.scale, self.config.nan_policy)
-        start = moved_to_mean(self.skin, self.shape.rest_pose(), data) if self.start is None else self.start
-        result = align(self.shape, data, start, model_points=self.skin, config=self.config, on_step=on_step)
+        data = read_cloud(path, self.scale, self.config.nan_policy, self.time, self.frame)
+        result = align(self.shape, data, self.start, model_points=self.skin, config=self.config, on_step=on_step)
         self._write(result, data, files)
         self.results.append(result)
         if result.statuses[0].usable:
@@ -178,7 +188,9 @@ class _AlignRun:
         if files.picture is not None:
             from torchreg.viz.figures import draw_alignment, save_picture
 
-            ax = draw_alignment(None, self.shape, result.pose, data, result.inliers, skin=self.surface)
+            shown = result.local(self.shape.rest)
+            near = data if result.origin is None else (data - result.origin).to(self.shape.rest)
+            ax = draw_alignment(None, self.shape, shown.pose, near, result.inliers, skin=self.surface)
             save_picture(ax.get_figure(), files.picture)  # type: ignore[arg-type]
         # The result is written last: if it exists, all others do.
         result.save(files.result)
@@ -187,7 +199,10 @@ class _AlignRun:
         """Write all poses found as an animation."""
         import torch
 
+        from torchreg.cli.outputs import shifted_to, tell_origin
         from torchreg.viz.gltf import save_shape_animation
 
-        poses = torch.stack([result.pose for result in self.results])
+        origin = self.results[0].origin
+        poses = torch.stack([shifted_to(origin, result.pose) for result in self.results])
         save_shape_animation(path, self.shape, poses, skin=self.surface)
+        tell_origin(path, origin)

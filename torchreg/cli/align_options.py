@@ -22,7 +22,16 @@ Sigma = Annotated[
 Outlier = Annotated[str, typer.Option(help="Outlier class: limit, or volume for eq. 18 of the paper.")]
 Search = Annotated[str, typer.Option(help="Look for better poses around the start: auto, always or never.")]
 NanPolicy = Annotated[str, typer.Option(help="Non-finite points: raise, or omit.")]
-Scale = Annotated[float, typer.Option(help="Unit of the clouds in metres; 0.001 for millimeters.")]
+Time = Annotated[
+    float | None,
+    typer.Option(help="Seconds of the animation of a .glb or .gltf file at which it is read; by default at rest."),
+]
+Frame = Annotated[
+    int | None, typer.Option(help="Number of the keyframe of the animation of a .glb or .gltf file, for --time.")
+]
+Scale = Annotated[
+    float, typer.Option(help="Metres per unit of the files (clouds, meshes, calibrations); 0.001 for millimeters.")
+]
 
 
 def read_schedule(text: str | None) -> SigmaSchedule | None:
@@ -39,21 +48,28 @@ def read_schedule(text: str | None) -> SigmaSchedule | None:
     return SigmaSchedule.geometric(*values)
 
 
-def read_cloud(path: Path, scale: float, nan_policy: str) -> Tensor:
+def read_cloud(
+    path: Path, scale: float, nan_policy: str, time: float | None = None, frame: int | None = None
+) -> Tensor:
     """Return the points (M, 3) of a file, metres."""
     from torchreg._checks import check_positive
     from torchreg.io.points import load_points
 
     check_positive(scale, "--scale")
-    return load_points(path, nan_policy=nan_policy).points * scale
+    return load_points(path, scale=scale, nan_policy=nan_policy, time=time, frame=frame).points
 
 
 def write_pose(path: Path, shape: ArticulatedShape, pose: Tensor) -> None:
-    """Write a pose (num_dofs,) as JSON, by name of degree of freedom."""
+    """Write a pose (num_dofs,) by name of degree of freedom, as JSON or as a table of one row (.csv)."""
     import json
 
     from torchreg.io.atomic import write_atomic
 
+    if path.suffix.lower() == ".csv":
+        from torchreg.io.pose_table import save_pose_table
+
+        save_pose_table(path, shape.dof_names, [pose.tolist()])
+        return
     named = dict(zip(shape.dof_names, pose.tolist(), strict=True))
     write_atomic(path, (json.dumps(named, indent=2) + "\n").encode())
 

@@ -11,6 +11,7 @@ from torchreg import __version__
 from torchreg.cli.align import align
 from torchreg.cli.demo import demo
 from torchreg.cli.figure import figure
+from torchreg.cli.formats import formats
 from torchreg.cli.info import info
 from torchreg.cli.label import label
 from torchreg.cli.pose import pose
@@ -57,6 +58,7 @@ def _options(
 app.command(short_help="Align a shape to point clouds.")(align)
 app.command(short_help="Run the main job on built-in data.")(demo)
 app.command(short_help="Draw the bending skin, or the picture of the README.")(figure)
+app.command(short_help="Show the formats of files that are read.")(formats)
 app.command(short_help="Show the degrees of freedom and the parts of a shape.")(info)
 app.command(short_help="Label point clouds with poses, to train networks on.")(label)
 app.command(short_help="Extract the moving skeleton of a sequence of meshes.")(spine)

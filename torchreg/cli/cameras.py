@@ -62,13 +62,13 @@ def seen_folder(seen: Path | None, result: Path, force: bool) -> Path:
     return folder
 
 
-def load_calibration(calibration: Path | None, flag: str) -> CameraRig:
-    """Return the cameras of a calibration, which a flag requires."""
+def load_calibration(calibration: Path | None, flag: str, scale: float = 1.0) -> CameraRig:
+    """Return the cameras of a calibration in some unit in metres, which a flag requires."""
     from torchreg.io.calibration import load_cameras
 
     if calibration is None:
         raise InputError(f"{flag} takes --calibration FILE with the cameras")
-    return load_cameras(calibration)
+    return load_cameras(calibration, scale=scale)
 
 
 def stereo_source(
@@ -79,6 +79,7 @@ def stereo_source(
     volume: tuple[float, ...] | None,
     matcher: str | None,
     reach: float | None,
+    scale: float = 1.0,
 ) -> StereoFrames:
     """Return the clouds of stereo pictures, after a check of the first pair for swapped cameras."""
     from importlib.util import find_spec
@@ -93,7 +94,7 @@ def stereo_source(
         raise InputError(
             f"--stereo takes two folders as FRAMES, the left pictures and the right ones; got {len(folders)}"
         )
-    rig = load_calibration(calibration, "--stereo")
+    rig = load_calibration(calibration, "--stereo", scale)
     if len(rig) != 2:
         raise InputError(f"--calibration must hold the left and the right camera, in this order; got {len(rig)}")
     method = matcher or ("opencv" if find_spec("cv2") else "semi-global")

@@ -7,13 +7,15 @@ import math
 import typer
 
 from torchreg.cli.reporting import reporting
-from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, load_shape
+from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
 
 
 @reporting
-def info(shape: Shape, parents: Parents = None, package_dir: PackageDir = None, free_base: FreeBase = None) -> None:
+def info(
+    shape: Shape, parents: Parents = None, package_dir: PackageDir = None, free_base: FreeBase = None, skin: Skin = None
+) -> None:
     """Show the degrees of freedom of a shape with their limits, and its parts."""
-    model = load_shape(shape, parents, package_dir, free_base)
+    model = load_shape(shape, parents, package_dir, free_base, skin)
     rest = model.surface.vertices if model.surface is not None else model.surface_mesh().vertices
     size = float((rest.amax(0) - rest.amin(0)).norm())
     surface = "the file's mesh" if model.surface is not None else "fused solids"

@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from torchreg.cli.align_options import NanPolicy, Scale, read_cloud
+from torchreg.cli.align_options import NanPolicy, Scale
 from torchreg.cli.outputs import Force, Quiet, check_outputs
 from torchreg.cli.reporting import interruption, reporting
-from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, load_shape
+from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
 
 
 @reporting
@@ -18,7 +18,11 @@ def label(
     shape: Shape,
     frames: Annotated[
         list[Path],
-        typer.Argument(metavar="FRAME", help="Point clouds, metres, in the order of the motion; the formats of align."),
+        typer.Argument(
+            metavar="FRAMES",
+            help="The clouds, metres: files, which are put in the order of the numbers in their names, one folder of "
+            "them, or one .npz of frames.",
+        ),
     ],
     output: Annotated[
         Path,
@@ -35,6 +39,7 @@ def label(
     parents: Parents = None,
     package_dir: PackageDir = None,
     free_base: FreeBase = None,
+    skin: Skin = None,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
@@ -46,27 +51,29 @@ def label(
     """
     from tqdm import tqdm
 
-    with tqdm(total=len(frames), unit="frame", desc="reading", leave=False, disable=quiet) as bar:
-        for path in frames:
-            path.stat()  # a missing file is reported before the first is labeled
+    from torchreg._checks import check_positive
+    from torchreg.io.frames import load_frames
+
+    check_positive(scale, "--scale")
+    sequence = load_frames(frames[0] if len(frames) == 1 else frames, scale=scale, nan_policy=nan_policy)
+    with tqdm(total=len(sequence), unit="frame", desc="reading", leave=False, disable=quiet) as bar:
         from torchreg.alignment.pose_initializer import PoseInitializer
         from torchreg.alignment.pseudo_labels import label_frames
         from torchreg.datasets.pose_labels import label_path
         from torchreg.storage import load_pose
 
         output.mkdir(exist_ok=True)
-        paths = [label_path(output, number) for number in range(len(frames))]
+        paths = [label_path(output, number) for number in range(len(sequence))]
         check_outputs([path.with_suffix(ending) for path in paths for ending in (".safetensors", ".json")], force)
-        model = load_shape(shape, parents, package_dir, free_base)
+        model = load_shape(shape, parents, package_dir, free_base, skin)
         first = None if start is None else load_pose(start, model)
-        clouds = (read_cloud(path, scale, nan_policy) for path in frames)
         done = 0
         try:
-            for found in label_frames(PoseInitializer(model), clouds, trusted=trusted, start=first):
+            for found in label_frames(PoseInitializer(model), sequence, trusted=trusted, start=first):
                 written = found.save(output, done)
                 if not quiet:
-                    bar.write(f"{frames[done]}: confidence {float(found.confidence):.2f} -> {written}")
+                    bar.write(f"{sequence.names[done]}: confidence {float(found.confidence):.2f} -> {written}")
                 done += 1
                 bar.update()
         except KeyboardInterrupt:
-            raise interruption(f"{done} of {len(frames)} frames are labeled") from None
+            raise interruption(f"{done} of {len(sequence)} frames are labeled") from None

@@ -8,11 +8,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, overload
+from typing import TYPE_CHECKING, Annotated, overload
 
 import typer
 
 from torchreg.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 fcntl: ModuleType | None
 try:
@@ -54,6 +57,20 @@ def numbered(path: Path | None, index: int, count: int) -> Path | None:
     if path is None or count == 1:
         return path
     return path.with_name(f"{path.stem}_{index + 1:0{len(str(count))}}{path.suffix}")
+
+
+def shifted_to(origin: Tensor | None, pose: Tensor) -> Tensor:
+    """Return a pose (num_dofs,) in coordinates that begin at an origin (3,), where there is one."""
+    from torchreg.shapes.pose_algebra import shifted
+
+    return pose if origin is None else shifted(pose.double(), -origin)
+
+
+def tell_origin(path: Path, origin: Tensor | None) -> None:
+    """Tell where the coordinates of a file in single precision begin, if not at zero."""
+    if origin is not None:
+        place = " ".join(f"{value:g}" if abs(value) < 1e5 else f"{value:.0f}" for value in origin.tolist())
+        typer.echo(f"torchreg: {path} holds coordinates from {place} on: it has single precision only", err=True)
 
 
 @contextmanager

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
+from torchreg.cli.align_options import NanPolicy
 from torchreg.cli.cameras import DepthRange, Seen, check_used, seen_folder
-from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, tell_origin, with_ending
 from torchreg.cli.reporting import ExitCode, reporting
 from torchreg.errors import InputError
 
@@ -52,6 +53,18 @@ def register(
         float | None, typer.Option(min=0, help="Noise of depths at one metre, metres; depths are smoothed by it.")
     ] = None,
     seen: Seen = None,
+    scale: Annotated[
+        list[float] | None,
+        typer.Option(help="Metres, or another unit, per unit of the scans; twice for source and target."),
+    ] = None,
+    nan_policy: NanPolicy = "raise",
+    time: Annotated[
+        list[float] | None,
+        typer.Option(help="Seconds of the animation of a .glb file at which a scan is read; twice for both."),
+    ] = None,
+    frame: Annotated[
+        list[int] | None, typer.Option(help="Number of the keyframe of a .glb file's animation; twice for both.")
+    ] = None,
     weights: Annotated[Path | None, typer.Option(help="Also write the moved source, colored by bones (.ply).")] = None,
     errors: Annotated[
         Path | None, typer.Option(help="Also write the moved source, colored by its distance from the target (.ply).")
@@ -87,7 +100,11 @@ def register(
             image.scan(depth_range, smoothing or 0.0, folder / name) for image, name in zip(images, _KEPT, strict=True)
         )
     else:
-        first, second = load_scan(source), load_scan(target)
+        units, times, frames = _pair(scale, 1.0, "--scale"), _pair(time, None, "--time"), _pair(frame, None, "--frame")
+        first, second = (
+            load_scan(path, scale=units[k], nan_policy=nan_policy, time=times[k], frame=frames[k])
+            for k, path in enumerate((source, target))
+        )
     if scene is not None and first.faces is None:
         raise InputError(f"{source} has no triangles, which a .glb needs; name an output that ends in .safetensors")
     with tqdm(desc="initialize", unit="step", leave=False, disable=quiet) as bar:
@@ -156,11 +173,23 @@ def _cameras(intrinsics: list[Path] | None) -> tuple[Path, Path]:
     return intrinsics[0], intrinsics[-1]
 
 
+Given = TypeVar("Given")
+
+
+def _pair(given: list[Given] | None, default: Any, option: str) -> tuple[Any, Any]:
+    """Return what an option that may be given once or twice says about source and target."""
+    if given is not None and len(given) > 2:
+        raise InputError(f"{option} is given once for both scans, or twice, got {len(given)}")
+    return (given[0], given[-1]) if given else (default, default)
+
+
 def _write(found: ScanRegistration, scene: Path | None, weights: Path | None, errors: Path | None) -> None:
     if scene is not None and found.faces is not None:
         from torchreg.viz.scan_gltf import save_grid_animation
 
-        save_grid_animation(scene, found.model, found.points, found.faces)
+        near = found.local()
+        save_grid_animation(scene, near.model, near.points, found.faces)
+        tell_origin(scene, found.origin)
     if weights is not None or errors is not None:
         from torchreg.viz.bone_colors import save_error_ply, save_weight_ply
 

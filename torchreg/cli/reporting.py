@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import warnings
 from collections.abc import Callable
+from contextvars import ContextVar
 from enum import IntEnum
 from typing import Any, TextIO
 
 import typer
+from typer.models import OptionInfo
 
+from torchreg.cli.hints import in_options
 from torchreg.errors import TorchregError, TorchregWarning
+
+# The options of the command that runs, for hints.
+_options: ContextVar[tuple[str, ...]] = ContextVar("options", default=())
 
 
 class ExitCode(IntEnum):
@@ -26,6 +33,7 @@ def reporting(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> None:
+        _options.set(options_of(command))
         with warnings.catch_warnings():
             warnings.simplefilter("always", TorchregWarning)
             warnings.showwarning = show_warning
@@ -36,7 +44,7 @@ def reporting(command: Callable[..., None]) -> Callable[..., None]:
             except BrokenPipeError:
                 raise
             except (TorchregError, OSError) as error:
-                typer.echo(f"torchreg: {_one_line(error)}", err=True)
+                typer.echo(f"torchreg: {in_options(_one_line(error), _options.get())}", err=True)
                 raise typer.Exit(ExitCode.ERROR) from None
 
     return run
@@ -60,4 +68,17 @@ def show_warning(
 ) -> None:  # fmt: skip
     """Print a warning in one line, with file and line if it is not one of the library's."""
     origin = "" if issubclass(category, TorchregWarning) else f"{filename}:{lineno}: "
-    typer.echo(f"torchreg: warning: {origin}{' '.join(str(message).split())}", err=True)
+    told = in_options(str(message), _options.get())
+    typer.echo(f"torchreg: warning: {origin}{told}", err=True)
+
+
+def options_of(command: Callable[..., None]) -> tuple[str, ...]:
+    """Return the options of a command, as in ``--nan-policy``."""
+    found = list[str]()
+    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
+        declared = [item for item in getattr(parameter.annotation, "__metadata__", ()) if isinstance(item, OptionInfo)]
+        for item in declared:
+            found += [word for word in item.param_decls or () if word.startswith("--")] or [
+                "--" + name.replace("_", "-")
+            ]
+    return tuple(found)

@@ -23,6 +23,9 @@ Parents = Annotated[
     typer.Option(help="JSON file {joint: parent or null}, for glTF files whose hierarchy of nodes is flat."),
 ]
 PackageDir = Annotated[list[Path] | None, typer.Option(help="Folder in which a URDF's package:// names are looked up.")]
+Skin = Annotated[
+    str | None, typer.Option(metavar="NAME", help="Name or number of the skin, for glTF files that hold several.")
+]
 FreeBase = Annotated[
     bool | None, typer.Option("--free-base/--fixed-base", help="Whether the base of a URDF moves; by default it does.")
 ]
@@ -33,11 +36,16 @@ def load_shape(
     parents: Path | None = None,
     package_dirs: Sequence[Path] | None = None,
     free_base: bool | None = None,
+    skin: str | None = None,
 ) -> ArticulatedShape:
     """Return the shape of a name or file; InputError if an option has no meaning for its kind."""
     ending = Path(name).suffix.lower()
-    uses = {".urdf": {"--package-dir", "--free-base/--fixed-base"}, ".glb": {"--parents"}, ".gltf": {"--parents"}}
-    given = {"--parents": parents, "--package-dir": package_dirs or None, "--free-base/--fixed-base": free_base}
+    rigs = {"--parents", "--skin"}
+    uses = {".urdf": {"--package-dir", "--free-base/--fixed-base"}, ".glb": rigs, ".gltf": rigs}
+    given = {
+        "--parents": parents, "--package-dir": package_dirs or None, "--free-base/--fixed-base": free_base,
+        "--skin": skin,
+    }  # fmt: skip
     if name not in _HANDS and ending not in uses:
         raise InputError(f"SHAPE must be hand, hand-left or a file ending in .urdf, .glb or .gltf; got {name!r}")
     for option, value in given.items():
@@ -51,7 +59,8 @@ def load_shape(
 
     if ending == ".urdf":
         return ArticulatedShape.from_urdf(name, package_dirs=package_dirs or (), free_base=free_base is not False)
-    return ArticulatedShape.from_gltf(name, parents=None if parents is None else _read_parents(parents))
+    chosen = int(skin) if skin is not None and skin.isdecimal() else skin
+    return ArticulatedShape.from_gltf(name, parents=None if parents is None else _read_parents(parents), skin=chosen)
 
 
 def _read_parents(path: Path) -> dict[str, str | None]:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from torchreg.cli.align_options import NanPolicy, Scale
 from torchreg.cli.cameras import Calibration, Seen, check_used, load_calibration, seen_folder
-from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, numbered, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, numbered, tell_origin, with_ending
 from torchreg.cli.reporting import interruption, reporting
 
 if TYPE_CHECKING:
@@ -46,6 +47,8 @@ def spine(
         int | None, typer.Option(min=8, help="Voxels along the longest side of a hull; 128 by default.")
     ] = None,
     seen: Seen = None,
+    scale: Scale = 1.0,
+    nan_policy: NanPolicy = "raise",
     swc: Annotated[
         Path | None, typer.Option(metavar="OUT.swc", help="Also write the curves as SWC, one numbered file per frame.")
     ] = None,
@@ -97,10 +100,10 @@ def spine(
     check_used(silhouettes, "--silhouettes", hulls)
     known = _read_prior(prior)
     if silhouettes:
-        source = _silhouettes(frames, calibration, bool(screen), resolution)
+        source = _silhouettes(frames, calibration, bool(screen), resolution, scale)
         count, names = len(source), source.names
     else:
-        meshes, names = _read(frames)
+        meshes, names = _read(frames, scale, nan_policy)
         count = len(meshes)
     curves = [numbered(swc, frame, count) for frame in range(count)] if swc is not None else []
     check_outputs([glb, result, result.with_suffix(".json"), npz, movie, *curves], force)
@@ -172,7 +175,7 @@ def _read_prior(path: Path | None) -> Skeleton | SpineSequence | None:
     return spine
 
 
-def _read(frames: list[Path]) -> tuple[list[TriangleMesh], tuple[str, ...]]:
+def _read(frames: list[Path], scale: float, nan_policy: str) -> tuple[list[TriangleMesh], tuple[str, ...]]:
     """Return the meshes in the order of time, and their names."""
     from torchreg.errors import InputError
     from torchreg.io.frames import load_frames
@@ -181,15 +184,15 @@ def _read(frames: list[Path]) -> tuple[list[TriangleMesh], tuple[str, ...]]:
     if any(frame.suffix.lower() == ".npz" for frame in frames):
         raise InputError("FRAMES must be files of meshes, not of arrays; give a folder, or files such as *.ply")
     names = load_frames(frames[0] if len(frames) == 1 else frames).names
-    return [load_mesh(name) for name in names], names
+    return [load_mesh(name, scale=scale, nan_policy=nan_policy) for name in names], names
 
 
 def _silhouettes(
-    folders: list[Path], calibration: Path | None, screen: bool, resolution: int | None
+    folders: list[Path], calibration: Path | None, screen: bool, resolution: int | None, scale: float
 ) -> SilhouetteFrames:
     from torchreg.capture.silhouette_frames import SilhouetteFrames
 
-    rig = load_calibration(calibration, "--silhouettes")
+    rig = load_calibration(calibration, "--silhouettes", scale)
     return SilhouetteFrames(folders, rig, screen=screen, resolution=resolution or 128)
 
 
@@ -211,11 +214,16 @@ def _write(
     found: SpineSequence, meshes: list[TriangleMesh], glb: Path, swc: Sequence[Path | None], npz: Path | None,
     fps: float,
 ) -> None:  # fmt: skip
+    from torchreg.geometry.mesh import TriangleMesh
     from torchreg.io.npz import save_arrays
     from torchreg.io.swc import save_swc
     from torchreg.viz.spine_gltf import save_spine_animation
 
-    save_spine_animation(glb, found.model, meshes[found.reference], found.reference, fps=fps)
+    near, mesh = found.local(), meshes[found.reference]
+    if found.origin is not None:
+        mesh = TriangleMesh(mesh.vertices - found.origin, mesh.faces)
+    save_spine_animation(glb, near.model, mesh, found.reference, fps=fps)
+    tell_origin(glb, found.origin)
     for frame, path in enumerate(swc):
         if path is not None:
             save_swc(path, found.model.skeleton(float(found.times[frame])), f"frame {frame}")

@@ -22,19 +22,19 @@ from torchreg.cli.cameras import (
     stereo_job,
     stereo_source,
 )
-from torchreg.cli.outputs import Force, Quiet, claimed, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, shifted_to, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
-from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, load_shape
+from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
 from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary, track_job
 from torchreg.cli.view import Browser, Port, tell_url
-from torchreg.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from torchreg.capture.stereo_frames import StereoFrames
+    from torchreg.shapes.articulated import ArticulatedShape
     from torchreg.shapes.skin import LinearBlendSkin
-    from torchreg.tracking.results import FrameResult
+    from torchreg.tracking.results import FrameResult, TrackResult
 
     OnFrame = Callable[[Tensor, FrameResult], object]
 
@@ -92,6 +92,7 @@ def track(
     parents: Parents = None,
     package_dir: PackageDir = None,
     free_base: FreeBase = None,
+    skin: Skin = None,
     overlay: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Also draw each frame as soon as it is done (frame_0000.png).")
     ] = None,
@@ -100,6 +101,10 @@ def track(
     ] = False,
     port: Port = 8080,
     browser: Browser = True,
+    poses: Annotated[
+        Path | None,
+        typer.Option(metavar="OUT.csv", help="Also write a table: frame, time, status, and the pose by name."),
+    ] = None,
     movie: Annotated[str, typer.Option(help="The moving picture: gif, mp4 (needs ffmpeg), or none.")] = "gif",
     gltf: Annotated[bool, typer.Option("--gltf/--no-gltf", help="Whether to write the moving shape.")] = True,
     save_every: Annotated[int, typer.Option(min=1, help="Frames after which RESULT.progress is written anew.")] = 50,
@@ -124,18 +129,18 @@ def track(
     from torchreg._checks import check_positive
 
     files, resumed = _files(output, movie, gltf, overlay, resume, force)
+    poses = with_ending(poses, (".csv",))
+    check_outputs([poses], force or resumed)
     check_positive(fps, "--fps")
     check_positive(scale, "--scale")
     views = {"--depth-range": depth_range, "--volume": volume, "--matcher": matcher, "--reach": reach, "--seen": seen}
     check_used(stereo, "--stereo", {"--calibration": calibration, **views})
-    options = parents, package_dir, free_base
+    options = parents, package_dir, free_base, skin
     pictures = None
     if stereo:
-        if scale != 1:
-            raise InputError("--scale has no meaning with --stereo: calibrations are in metres; leave it out")
         model = load_shape(shape, *options)
-        pictures = stereo_source(frames, calibration, model, depth_range, volume, matcher, reach)
-        clouds, folder = Clouds(pictures, 1.0), seen_folder(seen, files.result, force or resumed)
+        pictures = stereo_source(frames, calibration, model, depth_range, volume, matcher, reach, scale)
+        clouds, folder = Clouds(pictures, floating=False), seen_folder(seen, files.result, force or resumed)
     else:
         clouds, model = _clouds(frames, scale, nan_policy), load_shape(shape, *options)
 
@@ -145,7 +150,7 @@ def track(
     config = TrackConfig(
         model_points=model_points, num_model_points=points, prediction=prediction, recovery=recovery, seed=seed
     )
-    first = None if start is None else load_pose(start, model)
+    first = None if start is None else shifted_to(clouds.origin, load_pose(start, model))
     job = track_job(shape, options, first, config, fps, scale, nan_policy, clouds)
     with claimed(files.result), ExitStack() as pages, _progress_bar(len(clouds), quiet) as bar:
         tracker, report = Tracker(model, first, config=config), Report(bar, clouds, quiet)
@@ -158,7 +163,22 @@ def track(
         if view:
             run.live = _live_page(pages, port, browser, quiet)
         complete = _run(run, bar, resumed)
+    if poses is not None:
+        _write_poses(poses, model, run.located)
     _report_end(run, complete, quiet)
+
+
+def _write_poses(path: Path, shape: ArticulatedShape, result: TrackResult) -> None:
+    """Write one row per frame; frames without a pose have no numbers."""
+    from torchreg.io.pose_table import save_pose_table
+
+    rows = [
+        [frame, time, status.value, *(value if value == value else "" for value in pose)]  # NaN is not equal to itself
+        for frame, (time, status, pose) in enumerate(
+            zip(result.times.tolist(), result.statuses, result.poses.tolist(), strict=True)
+        )
+    ]
+    save_pose_table(path, ["frame", "time", "status", *shape.dof_names], rows)
 
 
 def _files(
@@ -177,7 +197,8 @@ def _files(
 def _clouds(frames: list[Path], scale: float, nan_policy: str) -> Clouds:
     from torchreg.io.frames import load_frames
 
-    return Clouds(load_frames(frames[0] if len(frames) == 1 else frames, nan_policy=nan_policy), scale)
+    sequence = load_frames(frames[0] if len(frames) == 1 else frames, scale=scale, nan_policy=nan_policy)
+    return Clouds(sequence)
 
 
 def _progress_bar(count: int, quiet: bool) -> Any:

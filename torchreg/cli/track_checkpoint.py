@@ -108,7 +108,9 @@ def first_frames(result: TrackResult, count: int) -> TrackResult:
     """
     if not 0 <= count <= len(result.statuses):
         raise InputError(f"count must be from 0 to {len(result.statuses)}, got {count}")
-    return TrackResult(**{item.name: getattr(result, item.name)[:count] for item in fields(result)})
+    values = {item.name: getattr(result, item.name) for item in fields(result)}
+    cut = {name: value[:count] for name, value in values.items() if name != "origin"}
+    return TrackResult(**cut, origin=result.origin)
 
 
 def join_frames(first: TrackResult, second: TrackResult) -> TrackResult:
@@ -126,6 +128,6 @@ def join_frames(first: TrackResult, second: TrackResult) -> TrackResult:
     def joined(one: Any, other: Any) -> Any:
         return torch.cat([one, other]) if isinstance(one, Tensor) else one + other
 
-    return TrackResult(
-        **{item.name: joined(getattr(first, item.name), getattr(second, item.name)) for item in fields(first)}
-    )
+    names = [item.name for item in fields(first) if item.name != "origin"]
+    parts = {name: joined(getattr(first, name), getattr(second, name)) for name in names}
+    return TrackResult(**parts, origin=second.origin)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
-from torchreg.cli.outputs import check_outputs
+from torchreg.cli.outputs import check_outputs, tell_origin
 from torchreg.cli.reporting import show_warning
 from torchreg.errors import FormatError, InputError, UnitsWarning
 
@@ -71,13 +71,15 @@ class TrackFiles:
 class Clouds(Sequence["Tensor"]):
     """The clouds (M, 3) in metres; those that cannot be read have no points.
 
+    Coordinates far from the origin, as in maps, begin at one near the first cloud: see `origin`.
+
     Args:
         frames: the sequence.
-        scale: its unit in metres.
+        floating: whether an origin may be chosen.
     """
 
-    def __init__(self, frames: Frames | StereoFrames, scale: float) -> None:
-        self.names, self._frames, self._scale = frames.names, frames, scale
+    def __init__(self, frames: Frames | StereoFrames, floating: bool = True) -> None:
+        self.names, self._frames, self._floating = frames.names, frames, floating
         self.on_drop: Callable[[int, str], None] | None = None
         self._contents: dict[int, str] = {}
 
@@ -92,13 +94,28 @@ class Clouds(Sequence["Tensor"]):
 
     def __getitem__(self, index: Any) -> Any:
         try:
-            return self._frames[index] * self._scale
+            points = self._frames[index]
+            return points if self.origin is None else points.double() - self.origin
         except (FormatError, OSError) as error:
             if self.on_drop is not None:
                 self.on_drop(index, " ".join(str(error).split()))
         import torch
 
         return torch.zeros(0, 3)
+
+    @cached_property
+    def origin(self) -> Tensor | None:
+        """Where coordinates begin (3,), float64; None at zero."""
+        from torchreg.geometry.far_origin import far_origin
+
+        for index in range(len(self) if self._floating else 0):
+            try:
+                first = self._frames[index]
+            except (FormatError, OSError):
+                continue
+            if len(first):
+                return far_origin(first)
+        return None
 
 
 def track_job(
@@ -204,6 +221,12 @@ class TrackRun:
         self.parts[:] = [reduce(join_frames, self.parts)]
         return self.parts[0]
 
+    @property
+    def located(self) -> TrackResult:
+        """All frames done, in the coordinates of the files."""
+        origin = self.clouds.origin
+        return self.result if origin is None else self.result.moved(origin)
+
     @cached_property
     def surface(self) -> LinearBlendSkin:
         """What pictures show, meshed once."""
@@ -250,7 +273,7 @@ class TrackRun:
             contents = [self.clouds.content(number) for number in range(self.state.frame)]
             save_progress(self.files.progress, TrackProgress(self.result, self.state, self.job, contents))
         self.clouds.on_drop = None
-        self.result.save(self.files.result)
+        self.located.save(self.files.result)
         return complete
 
     def _part(self, numbers: range, overlays: Sequence[OnFrame]) -> None:
@@ -293,6 +316,7 @@ class TrackRun:
         result, shape = self.result, self.tracker.shape
         if self.files.gltf is not None and bool(result.poses.isfinite().all(-1).any()):
             save_track_gltf(self.files.gltf, shape, result)
+            tell_origin(self.files.gltf, self.clouds.origin)
         if self.files.movie is not None:
             animate_track(
                 self.files.movie, shape, result, self.clouds, fps=self.fps, skin=self.surface, on_frame=on_frame

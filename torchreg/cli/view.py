@@ -10,7 +10,7 @@ import typer
 
 from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
 from torchreg.cli.reporting import reporting
-from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, load_shape
+from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Skin, load_shape
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ def view(
     parents: Parents = None,
     package_dir: PackageDir = None,
     free_base: FreeBase = None,
+    skin: Skin = None,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
@@ -63,8 +64,8 @@ def view(
     html = with_ending(html, (".html",))
     check_outputs([html], force)
     up_direction = check_up(up)
-    if shape is None and (parents or package_dir or free_base is not None):
-        raise InputError("--parents, --package-dir and --free-base are about a --shape, which was not given")
+    if shape is None and (parents or package_dir or skin or free_base is not None):
+        raise InputError("--parents, --package-dir, --skin and --free-base are about a --shape, which was not given")
     from torchreg.storage import load
     from torchreg.viz.result_scenes import result_scene
     from torchreg.viz.viewer import scene_html
@@ -72,7 +73,7 @@ def view(
 
     import_viser()
     found = load(result if result.suffix else result.with_suffix(".safetensors"))
-    model = None if shape is None else load_shape(shape, parents, package_dir, free_base)
+    model = None if shape is None else load_shape(shape, parents, package_dir, free_base, skin)
     scene = with_up(result_scene(found, shape=model, data=_read(data or [])), up_direction)
     if html is not None:
         scene_html(html, scene)

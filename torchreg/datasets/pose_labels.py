@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import torch
@@ -13,6 +13,7 @@ from torch.utils.data import Dataset
 from torchreg.errors import FormatError, InputError
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path
 from torchreg.io.tensors import load_tensors, save_tensors
+from torchreg.shapes.pose_algebra import shifted
 
 _KIND, _STEM = "PoseLabel", "label_"
 
@@ -34,6 +35,13 @@ class PoseLabel:
     keypoints: Tensor
     parts: Tensor
     confidence: Tensor
+
+    def moved(self, origin: Tensor) -> PoseLabel:
+        """Return the label, whose coordinates begin at an origin (3,), in those in which the origin is given."""
+        return replace(
+            self, points=self.points.double() + origin, pose=shifted(self.pose.double(), origin),
+            keypoints=self.keypoints.double() + origin,
+        )  # fmt: skip
 
     def save(self, folder: str | os.PathLike[str], number: int) -> Path:
         """Write the label to a folder, as safetensors and JSON, and return the path; see `PoseLabels`.

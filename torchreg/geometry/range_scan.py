@@ -22,6 +22,7 @@ from torchreg._checks import (
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.boundary import BOUNDARY, boundary_of_faces, boundary_of_points
 from torchreg.geometry.depth_image import unproject
+from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import TriangleMesh, distinct_faces
 from torchreg.geometry.neighbors import distinct_positions, k_nearest_others, nearest_neighbor, sampling_distance
 from torchreg.geometry.normals import (
@@ -105,7 +106,10 @@ class RangeScan:
             check_finite(normals, "normals", "pass normals=None to have them estimated")
         camera = None if viewpoint is None else _as_viewpoint(viewpoint)
         with torch.no_grad():
-            normals, boundary, spacing = _measure(points, faces, normals, camera)
+            origin = far_origin(points)  # products of large coordinates lose digits
+            near = points if origin is None else points - origin.to(points)
+            seen_from = camera if camera is None or origin is None else camera - origin.to(camera)
+            normals, boundary, spacing = _measure(near, faces, normals, seen_from)
         self._set(
             points=points,
             faces=faces,
@@ -172,6 +176,11 @@ class RangeScan:
             normals = TriangleMesh(points, faces).vertex_normals()
             points, normals = transform_points(motion, points), normals @ motion[:3, :3].mT
         return cls(points, faces, normals, viewpoint=motion[:3, 3])
+
+    def shifted(self, offset: Tensor) -> RangeScan:
+        """Return the scan moved by an offset (3,)."""
+        viewpoint = None if self.viewpoint is None else self.viewpoint + offset.to(self.viewpoint)
+        return self._with(points=self.points + offset.to(self.points), viewpoint=viewpoint)
 
     def __len__(self) -> int:
         return self.points.shape[0]

@@ -1,4 +1,4 @@
-r"""Calibrations from files: torchreg's own JSON, COLMAP's text folders and OpenCV's YAML.
+r"""Calibrations from files: JSON of torchreg and other programs, COLMAP's folders, OpenCV's and ROS's YAML.
 
 The JSON is one object::
 
@@ -11,58 +11,87 @@ The JSON is one object::
 or one of those cameras alone. Pixels are OpenCV's: whole numbers are the middles of pixels. The motion is in metres and
 maps world coordinates to camera coordinates (right, down, forward); ``camera_to_world`` may give its inverse instead,
 and without either the camera is at the origin. Name and distortion (0, 4, 5 or 8 numbers, see `Camera`) may be missing.
-The camera of a depth image also has ``depth_scale``, metres per unit of the file's numbers: 0.001 by default.
+The camera of a depth image may have ``depth_scale``, metres per unit of the file's numbers; see `load_depth` for those
+without. `own_entry` tells which programs' files are understood beside these.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
 import torch
 
+from torchreg._checks import check_positive
 from torchreg.errors import FormatError, InputError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.rigid import invert_rigid
 from torchreg.io.atomic import write_atomic
+from torchreg.io.camera_entries import check_baseline, check_principal_point, own_entry
 from torchreg.io.colmap import load_colmap
+from torchreg.io.file_format import FileFormat, begins, check_stand_in, choose, naming, plain_text
 from torchreg.io.images import MILLIMETER
 from torchreg.io.limits import DEFAULT_LIMITS, FILE_BUDGET, FileLimits, check_budget, local_path, read_bytes
-from torchreg.io.opencv_yaml import load_opencv
+from torchreg.io.opencv_yaml import PAIRS, read_opencv, read_opencv_values, values_of
 
 FORMAT = "torchreg-cameras"
 _VERSION = 1
 _NUMBERS = ("fx", "fy", "cx", "cy")
-_KNOWN = {"name", "width", "height", *_NUMBERS, "distortion", "world_to_camera", "camera_to_world", "depth_scale"}
 
 
-def load_cameras(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> CameraRig:
+CAMERAS = "cameras"
+
+
+def load_cameras(path: str | os.PathLike[str], *, scale: float = 1.0, limits: FileLimits = DEFAULT_LIMITS) -> CameraRig:
     """Return the cameras of a calibration file, float64.
 
     Args:
-        path: a ``.json`` file as above, a ``.yml`` or ``.yaml`` file of OpenCV's (see `load_opencv` for lengths in
-            other units), or a folder with COLMAP's ``cameras.txt`` and ``images.txt``.
+        path: a ``.json`` file as above or of another program, a ``.yml`` or ``.yaml`` file of OpenCV's or ROS's, or a
+            folder with COLMAP's ``cameras.txt`` and ``images.txt``.
+        scale: metres per unit of the lengths in the file, such as 0.001 where the board was measured in millimeters.
         limits: ``max_bytes`` applies.
 
     Raises:
         FormatError: if the file is cut off, lacks an entry, or does not describe a camera; names the file.
         FileNotFoundError: if there is no such file.
+        InputError: if ``scale`` is not positive.
+
+    Warns:
+        FileWarning: if the numbers are unlikely: those of pictures of another size, or lengths in millimeters.
     """
+    check_positive(scale, "scale")
     file = local_path(path)
-    loader = _LOADERS.get(_FOLDER if file.is_dir() else file.suffix.lower())
-    if loader is None:
-        raise FormatError(f"{file}: calibrations are .json, .yml or .yaml files or a COLMAP folder")
-    return loader(file, limits=limits)
+    if file.is_dir():
+        rig = load_colmap(file, limits=limits)
+    else:
+        content = read_bytes(file, limits)
+        with naming(file):
+            rig = choose(FORMATS, content, file).read(content, file, limits)
+    rig = rig if scale == 1 else _scaled(rig, scale)
+    for number, camera in enumerate(rig):
+        check_principal_point(camera, f"{file}: camera {camera.name or number}")
+    if len(rig) == 2 and {camera.name for camera in rig} == {"left", "right"}:
+        check_baseline(float((rig[0].camera_to_world[:3, 3] - rig[1].camera_to_world[:3, 3]).norm()), str(file))
+    return rig
 
 
-def _load_json(file: Path, *, limits: FileLimits) -> CameraRig:
-    document = _document(file, limits)
-    entries = document.get("cameras", [document])
+def _scaled(rig: CameraRig, scale: float) -> CameraRig:
+    """Return cameras with their positions in another unit."""
+    motions = [camera.world_to_camera.clone() for camera in rig]
+    for motion in motions:
+        motion[:3, 3] *= scale
+    return CameraRig(tuple(replace(camera, world_to_camera=m) for camera, m in zip(rig, motions, strict=True)))
+
+
+def _read_json(content: bytes, file: Path, limits: FileLimits) -> CameraRig:
+    document = json_object(content, file)
+    if any(names[0] in document for names in PAIRS):
+        return read_opencv_values(values_of(document), file)
+    entries = document.get("cameras", document.get("parameters", [document]))
     if "cameras" in document and (document.get("format"), document.get("version")) != (FORMAT, _VERSION):
         raise FormatError(
             f'{file}: must hold "format": "{FORMAT}" and "version": {_VERSION}, got {document.get("format")!r} and '
@@ -85,37 +114,58 @@ def _check_number(count: int, file: Path) -> None:
         raise FormatError(f"{file}: {error}") from error
 
 
-# Loaders by the ending of the file; a folder has a key that is no ending. A new format is one more row.
-_FOLDER = "folder"
-_LOADERS: dict[str, Callable[..., CameraRig]] = {
-    _FOLDER: load_colmap,
-    ".json": _load_json,
-    ".yml": load_opencv,
-    ".yaml": load_opencv,
-}
+def _is_json(content: bytes) -> bool:
+    return content.removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"{"
 
 
-def load_depth_camera(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> tuple[Camera, float]:
-    """Return the camera of a depth image, float64, and its scale in metres per unit of the image.
+# Beside folders of COLMAP's. A new format is one more row.
+FORMATS: tuple[FileFormat, ...] = (
+    FileFormat(
+        "torchreg JSON", CAMERAS, (".json",), _read_json,
+        "also of Open3D, RealSense, Azure Kinect, Polycam, Record3D, ROS camera_info, K and D as lists", "load_cameras",
+        _is_json,
+    ),
+    FileFormat(
+        "OpenCV YAML", CAMERAS, (".yml", ".yaml"), read_opencv, "one camera or a pair; also of ROS's calibrator and "
+        "camera_info", "load_cameras", begins(b"%YAML"),
+    ),
+)  # fmt: skip
+
+
+def load_depth_camera(
+    path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS
+) -> tuple[Camera, float | None]:
+    """Return the camera of a depth image, float64, and its scale in metres per unit, None where the file has none.
 
     Args:
-        path: a ``.json`` file with width, height, fx, fy, cx, cy and maybe depth_scale and camera_to_world, see above.
+        path: a file of one camera, see `load_cameras`; its JSON may have depth_scale.
         limits: ``max_bytes`` applies.
 
     Raises:
         FormatError: as `load_cameras`, and if there are several cameras.
         FileNotFoundError: if there is no such file.
+
+    Warns:
+        FileWarning: as `load_cameras`.
     """
     file = local_path(path)
-    document = _document(file, limits)
+    content = read_bytes(file, limits)
+    document = json_object(content, file) if file.suffix.lower() == ".json" or _is_json(content) else {}
     entries = document.get("cameras", [document])
     if not isinstance(entries, list) or len(entries) != 1:
         raise FormatError(f"{file}: must hold the one camera of the depth image")
-    camera = _camera(entries[0], str(file))
-    scale = _number(entries[0].get("depth_scale", MILLIMETER), "depth_scale", str(file))
+    rig = load_cameras(file, limits=limits) if not document else CameraRig((_camera(entries[0], str(file)),))
+    if len(rig) != 1:
+        raise FormatError(f"{file}: must hold the one camera of the depth image, got {len(rig)}")
+    if document:
+        check_principal_point(rig[0], str(file))
+    entry = own_entry(entries[0], str(file)) if document else {}
+    if "depth_scale" not in entry:
+        return rig[0], None
+    scale = _number(entry["depth_scale"], "depth_scale", str(file))
     if scale <= 0:
         raise FormatError(f"{file}: depth_scale must be positive, got {scale}")
-    return camera, scale
+    return rig[0], scale
 
 
 def save_cameras(path: str | os.PathLike[str], cameras: CameraRig) -> None:
@@ -160,13 +210,15 @@ def _entry(camera: Camera) -> dict[str, Any]:
     return named | size | numbers | distortion | {"world_to_camera": camera.world_to_camera.tolist()}
 
 
-def _document(file: os.PathLike[str], limits: FileLimits) -> dict[str, Any]:
+def json_object(content: bytes, file: Path) -> dict[str, Any]:
+    """Return the object in the bytes of a JSON file; FormatError, which names the file, if there is none."""
+
     def refuse(constant: str) -> NoReturn:
         raise FormatError(f"{file}: numbers must be finite, got {constant}")
 
-    content = read_bytes(file, limits)
+    check_stand_in(content)
     try:
-        document = json.loads(content.decode("utf-8-sig"), parse_constant=refuse)
+        document = json.loads(plain_text(content).decode("utf-8"), parse_constant=refuse)
     except (ValueError, RecursionError) as error:  # also numbers of thousands of digits
         raise FormatError(f"{file}: is cut off or no JSON ({error})") from error
     if not isinstance(document, dict):
@@ -174,15 +226,13 @@ def _document(file: os.PathLike[str], limits: FileLimits) -> dict[str, Any]:
     return document
 
 
-def _camera(entry: Any, where: str) -> Camera:
-    if not isinstance(entry, dict):
-        raise FormatError(f"{where} must be a JSON object, got {type(entry).__name__}")
+def _camera(given: Any, where: str) -> Camera:
+    if not isinstance(given, dict):
+        raise FormatError(f"{where} must be a JSON object, got {type(given).__name__}")
+    entry = own_entry(given, where)
     missing = [key for key in ("width", "height", *_NUMBERS) if key not in entry]
     if missing:
         raise FormatError(f"{where} lacks {', '.join(missing)}")
-    unknown = sorted(set(entry) - _KNOWN)
-    if unknown:
-        raise FormatError(f"{where} holds {', '.join(unknown)}, which no camera has")
     if "world_to_camera" in entry and "camera_to_world" in entry:
         raise FormatError(f"{where} holds both world_to_camera and camera_to_world; keep one")
     name = entry.get("name", "")

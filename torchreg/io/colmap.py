@@ -48,12 +48,11 @@ def load_colmap(folder: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_
     directory = local_path(folder)
     lenses = _lenses(directory / "cameras.txt", limits)
     path = directory / "images.txt"
-    # Every image has a second line, of its points; it may be empty.
-    lines = [(number, line) for number, line in _lines(path, limits) if not line.startswith("#")]
-    lines = lines[next((row for row, (_, line) in enumerate(lines) if line), len(lines)) :]
+    # Every image has a second line, of its points, which may be empty or missing.
+    lines = [(number, line) for number, line in _lines(path, limits) if line and not line.startswith("#")]
     if len(lines) > 2 * FILE_BUDGET.cameras:
         raise FormatError(f"{path}: holds {len(lines) // 2} images, at most {FILE_BUDGET.cameras} are read")
-    cameras = tuple(_placed(line, lenses, f"{path}, line {number}") for number, line in lines[::2] if line)
+    cameras = tuple(_placed(line, lenses, f"{path}, line {number}") for number, line in _images(lines))
     try:
         return CameraRig(cameras)
     except InputError as error:
@@ -142,6 +141,33 @@ def _placed(line: str, lenses: dict[str, tuple[int, int, list[float]]], where: s
         return Camera(width, height, numbers[:4], motion, numbers[4:], words[9])
     except InputError as error:
         raise FormatError(f"{where}: {error}") from error
+
+
+def _images(lines: list[tuple[int, str]]) -> list[tuple[int, str]]:
+    """Return the lines of images among the lines that are not empty, which may be those of points."""
+    found, after_image = list[tuple[int, str]](), False
+    for number, line in lines:
+        after_image = after_image and not _is_image(line)
+        if not after_image:
+            found.append((number, line))
+        after_image = not after_image
+    return found
+
+
+def _is_image(line: str) -> bool:
+    """Return whether a line tells of an image: two whole numbers at their places, and not points in triples."""
+    words = line.split()
+    if len(words) < 10 or not (words[0].isdecimal() and words[8].isdecimal()):
+        return False
+    return len(words) % 3 != 0 or not all(_is_number(word) for word in words)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _values(words: list[str], where: str) -> list[float]:

@@ -7,9 +7,12 @@ import io
 import math
 import os
 import re
+import warnings
 import zipfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Any, overload
 
@@ -17,9 +20,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_choice, check_finite, check_shape
-from torchreg.errors import FormatError, InputError, InputTypeError
+from torchreg._checks import as_float_tensor, check_choice, check_finite, check_positive, check_shape
+from torchreg.errors import FileWarning, FormatError, InputError, InputTypeError
 from torchreg.io.atomic import write_atomic
+from torchreg.io.file_format import check_stand_in, ending_of
 from torchreg.io.limits import (
     DEFAULT_LIMITS,
     FILE_BUDGET,
@@ -30,13 +34,16 @@ from torchreg.io.limits import (
     open_zip,
     read_bytes,
 )
-from torchreg.io.npz import read_npy_header
-from torchreg.io.points import FORMATS, PARSER_ERRORS, load_points, save_points
+from torchreg.io.npz import array_of, read_npy_header
+from torchreg.io.points import ENDINGS, PARSER_ERRORS, check_dtype, load_points, needed_dtype, save_points
 from torchreg.io.raw_cloud import Array, as_indices
 
-ENDINGS = tuple(FORMATS)
-_DIGITS = re.compile(r"(\d+)")
+# A number in a name: with a decimal point, or a sign that is no hyphen between words.
+_NUMBER = re.compile(r"((?:(?<![^\W_])-)?\d+(?:\.\d+)*)")
+# Beside meshes and clouds in one folder, files of these endings tell of them: times, poses, notes.
+_NOTES = (".csv", ".txt", ".dat", ".tsv", ".npy", ".asc")
 _NUMBERED = re.compile(r"frame_?(\d+)")
+_ARRAY = b"\x93NUMPY"
 PathLike = str | os.PathLike[str]
 
 
@@ -53,13 +60,14 @@ class Frames(Sequence[Tensor]):
         nan_policy: see `load_points`.
         limits: see `load_points`.
         dtype: of the tensors.
+        scale: see `load_points`.
     """
 
     def __init__(
         self, names: Sequence[str], sources: Sequence[Path | Array], nan_policy: str, limits: FileLimits,
-        dtype: torch.dtype,
+        dtype: torch.dtype | None, scale: float = 1.0,
     ) -> None:  # fmt: skip
-        self.names = tuple(names)
+        self.names, self._scale = tuple(names), scale
         self._sources, self._nan_policy, self._limits, self._dtype = tuple(sources), nan_policy, limits, dtype
 
     def __len__(self) -> int:
@@ -73,10 +81,12 @@ class Frames(Sequence[Tensor]):
 
     def __getitem__(self, index: int | slice) -> Tensor | Frames:
         if isinstance(index, slice):
-            return Frames(self.names[index], self._sources[index], self._nan_policy, self._limits, self._dtype)
+            sources = self._sources[index]
+            return Frames(self.names[index], sources, self._nan_policy, self._limits, self._dtype, self._scale)
         source = self._sources[index]
         if isinstance(source, Path):
-            return load_points(source, nan_policy=self._nan_policy, limits=self._limits, dtype=self._dtype).points
+            options = {"nan_policy": self._nan_policy, "limits": self._limits, "dtype": self._dtype}
+            return load_points(source, scale=self._scale, **options).points  # type: ignore[arg-type]
         return self._rows(self.names[index], source)
 
     def __iter__(self) -> Iterator[Tensor]:
@@ -89,7 +99,8 @@ class Frames(Sequence[Tensor]):
 
     def _rows(self, name: str, rows: Array) -> Tensor:
         with np.errstate(all="ignore"):  # what overflows becomes infinite and is judged as that
-            points = torch.from_numpy(rows.astype(np.float64 if self._dtype == torch.float64 else np.float32))
+            points = torch.from_numpy(rows.astype(np.float64)) * self._scale
+            points = points.to(self._dtype or needed_dtype(points))
         finite = torch.isfinite(points).all(dim=-1)
         bad = len(points) - int(finite.sum())
         if bad and self._nan_policy == "raise":
@@ -101,22 +112,24 @@ def load_frames(
     path: PathLike | Sequence[PathLike],
     *,
     sort: bool = True,
+    scale: float = 1.0,
     nan_policy: str = "raise",
     limits: FileLimits = DEFAULT_LIMITS,
-    dtype: torch.dtype = torch.float32,
+    dtype: torch.dtype | None = None,
 ) -> Frames:
     """Return the clouds of a sequence, read one by one on request.
 
     Args:
-        path: a folder whose files are frames, all of one format; a list of files; one file; or one NPZ of frames: an
-            array ``points`` (or ``vertices``, or the only one of three dimensions) of shape (T, M, 3), with ``counts``
-            (T,), the rows of each frame that count, or ``mask`` (T, M), or neither; or T arrays (M, 3) called
-            ``frame_0``, ``frame_1``, ... An archive is read at once, the rest is not.
+        path: a folder whose files are frames, all of one format; a list of files; one file; one NPY of shape
+            (T, M, 3); or one NPZ of frames: an array ``points`` (or ``vertices``, or the only one of three dimensions)
+            of shape (T, M, 3), with ``counts`` (T,), the rows of each frame that count, or ``mask`` (T, M), or neither;
+            or T arrays (M, 3) called ``frame_0``, ``frame_1``, ... An archive is read at once, the rest is not.
         sort: order files by their paths with numbers counted as numbers, so that frame2 comes before frame10, as they
             rarely do where a shell wrote the list. False keeps the order of a list.
+        scale: see `load_points`.
         nan_policy: see `load_points`.
         limits: see `load_points`; they hold for every file and frame.
-        dtype: torch.float32 or torch.float64.
+        dtype: see `load_points`; None decides frame by frame.
 
     Returns:
         The sequence, at least one frame; points keep the order and the unit of the file.
@@ -130,21 +143,21 @@ def load_frames(
         InputTypeError: if ``path`` or ``dtype`` is of another type.
     """
     check_choice(nan_policy, "nan_policy", ("raise", "omit"))
-    if dtype not in (torch.float32, torch.float64):
-        raise InputTypeError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+    check_dtype(dtype)
+    check_positive(scale, "scale")
     if isinstance(path, (str, os.PathLike)):
         target = local_path(path)
         files = _files_of(target) if target.is_dir() else _checked([target])
     else:
         files = _listed(path)
     if sort:
-        files = sorted(files, key=natural_key)
-    if len(files) == 1 and files[0].suffix.lower() == ".npz":
+        files = natural_sorted(files)
+    if len(files) == 1 and files[0].suffix.lower() in (".npz", ".npy"):
         stacked = _read_archive(files[0], limits)
         if stacked is not None:
             names = [f"{files[0]}, frame {number}" for number in range(len(stacked))]
-            return Frames(names, stacked, nan_policy, limits, dtype)
-    return Frames([str(file) for file in files], files, nan_policy, limits, dtype)
+            return Frames(names, stacked, nan_policy, limits, dtype, scale)
+    return Frames([str(file) for file in files], files, nan_policy, limits, dtype, scale)
 
 
 def save_frames(path: PathLike, frames: Sequence[Any]) -> list[Path]:
@@ -194,18 +207,50 @@ def _digest(*contents: bytes) -> str:
     return digest.hexdigest()
 
 
-def natural_key(path: PathLike) -> list[tuple[int, int | str, str]]:
-    """Return a key that sorts paths with the numbers in them as numbers: frame2 before frame10."""
-    pieces = _DIGITS.split(os.fspath(path))
-    # Digits of other scripts and leading zeros are distinguished by the text itself.
-    return [(0, int(piece), piece) if number % 2 else (1, piece, piece) for number, piece in enumerate(pieces)]
+def natural_sorted(paths: Iterable[Path]) -> list[Path]:
+    """Return paths in the order of the numbers in their names: frame2 before frame10, 1.25 before 1.5.
+
+    Where two names would be one number, as 1.1 and 1.10, the point separates two counters.
+    """
+    files = list(paths)
+    values = [tuple((kind, value) for kind, value, _ in natural_key(file)) for file in files]
+    return sorted(files, key=natural_key if len(set(values)) == len(files) else partial(natural_key, decimals=False))
+
+
+def natural_key(path: PathLike, *, decimals: bool = True) -> list[tuple[int, Any, str]]:
+    """Return a key that sorts paths with the numbers in them as numbers: frame2 before frame10, 1.25 before 1.5.
+
+    Args:
+        path: of a file.
+        decimals: whether one point between digits is a decimal point; several, as in dates, never are.
+    """
+    key = list[tuple[int, Any, str]]()
+    for number, piece in enumerate(_NUMBER.split(os.fspath(path))):
+        # Digits of other scripts and leading zeros are distinguished by the text itself.
+        if number % 2 == 0:
+            key.append((1, piece, piece))
+        elif decimals and piece.count(".") == 1:
+            key.append((0, Decimal(piece), piece))
+        else:
+            key += [(0, Decimal(part), part) for part in piece.split(".")]
+    return key
 
 
 def _files_of(folder: Path) -> list[Path]:
-    files = [file for file in folder.iterdir() if file.suffix.lower() in ENDINGS and not file.name.startswith(".")]
-    kinds = Counter(file.suffix.lower() for file in files)
+    files = [file for file in folder.iterdir() if ending_of(file) in ENDINGS and not file.name.startswith(".")]
+    kinds = Counter(ending_of(file) for file in files)
     if not files:
         raise FormatError(f"{folder} holds no frames: no file ends in one of {', '.join(ENDINGS)}")
+    geometry = [kind for kind in kinds if kind not in _NOTES]
+    if len(kinds) > 1 and len(geometry) == 1:
+        beside = sorted(file.name for file in files if ending_of(file) != geometry[0])
+        warnings.warn(
+            f"{folder}: its {kinds[geometry[0]]} {geometry[0]} files are the frames; {', '.join(beside[:3])} "
+            f"{'and others ' if len(beside) > 3 else ''}beside them are passed over",
+            FileWarning,
+            stacklevel=3,
+        )
+        return [file for file in files if ending_of(file) == geometry[0]]
     if len(kinds) > 1:
         found = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
         raise FormatError(f"{folder} holds files of several formats ({found}); pass a list of those that are frames")
@@ -227,7 +272,7 @@ def _checked(files: list[Path]) -> list[Path]:
         file.stat()  # a missing file is reported first
         if file.is_dir():
             raise IsADirectoryError(f"{file} is a folder; pass it alone, or the files in it")
-        if file.suffix.lower() not in ENDINGS:
+        if ending_of(file) not in ENDINGS:
             raise FormatError(f"{file} has the unknown ending {file.suffix!r}; known: {', '.join(ENDINGS)}")
     return files
 
@@ -236,12 +281,24 @@ def _read_archive(file: Path, limits: FileLimits) -> list[Array] | None:
     """Return the rows of each frame of an archive, None if it does not hold frames."""
     content = read_bytes(file, limits)
     try:
+        if content.startswith(_ARRAY):
+            return _frames_of(content, limits)
+        check_stand_in(content)
         with open_zip(content, limits) as archive:
             return _frames_in(archive, limits)
     except FormatError as error:
         raise FormatError(f"{file}: {error}") from error
     except PARSER_ERRORS as error:
         raise FormatError(f"{file}: cannot be read as NPZ ({type(error).__name__}: {error})") from error
+
+
+def _frames_of(content: bytes, limits: FileLimits) -> list[Array] | None:
+    """Return the frames of an array (T, M, 3), None if it is one of another shape."""
+    array = array_of(content, "the array")
+    if array.ndim != 3 or array.shape[2] != 3 or array.dtype.names is not None or not len(array):
+        return None
+    check_allowed(array.shape[1], "points", limits)
+    return list(array)
 
 
 def _frames_in(archive: zipfile.ZipFile, limits: FileLimits) -> list[Array] | None:
@@ -329,7 +386,7 @@ def _save_folder(folder: Path, clouds: list[Tensor]) -> list[Path]:
             raise InputError(f"frames[{number}] has no points, which PLY files must have; write an archive (.npz)")
     folder.mkdir(exist_ok=True)
     files = [folder / f"frame_{number:04d}.ply" for number in range(len(clouds))]
-    unlisted = {file for file in folder.iterdir() if file.suffix.lower() in ENDINGS} - set(files)
+    unlisted = {file for file in folder.iterdir() if ending_of(file) in ENDINGS} - set(files)
     if unlisted:
         raise InputError(
             f"path {folder} holds {len(unlisted)} other point files, such as {min(unlisted).name}, which would be "

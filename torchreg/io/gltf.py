@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchreg.errors import FormatError, ModelError
+from torchreg.errors import FileWarning, FormatError, ModelError
+from torchreg.io.file_format import naming
 from torchreg.io.gltf_document import GltfDocument, Mode, parents_first, triangles
 from torchreg.io.limits import DEFAULT_LIMITS, FILE_BUDGET, FileLimits, local_path, read_bytes
 from torchreg.io.raw_cloud import Array
@@ -22,6 +24,7 @@ class _RigLimits:
     """Largest rigs that are read."""
 
     max_scale: float = 1e6  # of the skeleton on the skin, and its inverse
+    identity: float = 1e-6  # a matrix that differs less from the identity is it
     scale_tolerance: float = 1e-3  # relative differences of scales below this are rounding
 
 
@@ -88,13 +91,16 @@ def load_rig(
     Raises:
         FormatError: if the file is damaged, oversized, compressed or refers outside its folder.
         ModelError: if there is no rig in it, or the rig is cyclic, non-finite, sheared or without weights.
+
+    Warns:
+        FileWarning: if something was left out or put right: primitives without positions or skin, vertices without
+            weight (they follow the nearest vertex that has some), joints that move nothing and were stored without a
+            place (they stand where their node does).
     """
     source = local_path(path)
     content = read_bytes(source, limits)
-    try:
+    with naming(source):
         return _read_rig(GltfDocument(content, source, limits), source.stem, mesh, skin, parents or {}, limits)
-    except (FormatError, ModelError) as error:
-        raise type(error)(f"{source}: {error}") from error
 
 
 def _read_rig(
@@ -118,23 +124,27 @@ def _read_rig(
     names = _unique_names([nodes[joint].get("name") for joint in joints])
     node_parents = document.node_parents()
     world = document.node_globals(node_parents)[joints]
+    vertices, faces, normals, weights = _read_meshes(document, meshes, len(joints), limits)
+    weights = _normalized_rows(_weighted_rows(weights, vertices))
+    all_parents = _joint_parents(joints, node_parents, names, parents)
     inverse_bind = chosen.get("inverseBindMatrices")
-    bind = world if inverse_bind is None else _bind_transforms(document, inverse_bind, names)
+    bind = (
+        world if inverse_bind is None else _bind_transforms(document, inverse_bind, names, weights, world, all_parents)
+    )
     joint_transforms = _strip_scale(bind, names, "bind")
     rest_transforms = _strip_scale(world, names, "rest")
     scale = _skin_scale(world, bind, names)
-    vertices, faces, normals, weights = _read_meshes(document, meshes, len(joints), limits)
     joint_transforms[:, :3, 3] *= scale
     return RigRecord(
         name=str(chosen.get("name") or name),
         joint_names=tuple(names),
-        parents=_joint_parents(joints, node_parents, names, parents),
+        parents=all_parents,
         joint_transforms=torch.from_numpy(joint_transforms),
         rest_transforms=torch.from_numpy(rest_transforms),
         vertices=torch.from_numpy(vertices * scale),
         faces=torch.from_numpy(faces),
         normals=None if normals is None else torch.from_numpy(normals),
-        weights=torch.from_numpy(_normalized_rows(weights)),
+        weights=torch.from_numpy(weights),
         scale=scale,
     )
 
@@ -168,7 +178,7 @@ def _choose(document: GltfDocument, mesh: str | int | None, skin: str | int | No
         raise ModelError(f"no node carries both a mesh and a skin{asked}: there is no rig to read")
     if len(skins) > 1:
         known = ", ".join(f"{index} ({document.item('skins', index).get('name')!r})" for index in skins[:10])
-        raise ModelError(f"several skins move meshes, choose one with skin=: {known}")
+        raise ModelError(f"several skins move meshes, choose one with skin=NAME: {known}")
     return skins[0], sorted(mesh_index for _, mesh_index in pairs)
 
 
@@ -188,7 +198,18 @@ def _unique_names(names: Sequence[Any]) -> list[str]:
     return unique
 
 
-def _bind_transforms(document: GltfDocument, inverse_bind: Any, names: Sequence[str]) -> Array:
+def _bind_transforms(
+    document: GltfDocument,
+    inverse_bind: Any,
+    names: Sequence[str],
+    weights: Array,
+    world: Array,
+    parents: Sequence[int],
+) -> Array:
+    """Return the joints' transforms (J, 4, 4) in the bind pose.
+
+    Exporters write the identity, or zeros, for joints that move nothing: those stand to their parent as nodes do.
+    """
     stored = _numbers(document, inverse_bind, "inverseBindMatrices", "MAT4").astype(np.float64)
     if len(stored) < len(names):
         raise FormatError(f"{len(names)} joints but {len(stored)} inverse bind matrices")
@@ -196,9 +217,20 @@ def _bind_transforms(document: GltfDocument, inverse_bind: Any, names: Sequence[
     with np.errstate(all="ignore"):
         determinants = np.stack([np.abs(np.linalg.det(m)) for m in (matrices[:, :3, :3], matrices)])
     flat = ~((determinants > 1e-30) & (determinants < np.inf)).all(0)
-    if flat.any():
-        raise ModelError(f"the inverse bind matrix of joint {names[int(flat.argmax())]!r} is singular")
-    return np.linalg.inv(matrices)
+    identity = np.abs(matrices - np.eye(4)).max((1, 2)) < _LIMITS.identity
+    elsewhere = np.abs(world - np.eye(4)).max((1, 2)) > _LIMITS.identity
+    empty = (weights.max(0) == 0) & (np.array(parents) >= 0) & (flat | (identity & elsewhere))
+    if (flat & ~empty).any():
+        raise ModelError(f"the inverse bind matrix of joint {names[int((flat & ~empty).argmax())]!r} is singular")
+    bind = np.linalg.inv(np.where(empty[:, None, None], np.eye(4), matrices))
+    for index in parents_first(parents):
+        if empty[index]:
+            above = parents[index]
+            bind[index] = bind[above] @ np.linalg.solve(world[above], world[index])
+    if empty.any():
+        listed = ", ".join(names[index] for index in np.flatnonzero(empty)[:5])
+        _warn(f"{int(empty.sum())} joints that move nothing have no bind pose and stand where their nodes do: {listed}")
+    return bind
 
 
 def _strip_scale(matrices: Array, names: Sequence[str], pose: str) -> Array:
@@ -268,7 +300,7 @@ def _read_meshes(
     blocks: list[tuple[Array, Array | None, Array]] = []
     faces: list[Array] = []
     begins: dict[str, tuple[int, int]] = {}
-    total = 0
+    total, left_out = 0, list[str]()
     for index in meshes:
         mesh = document.item("meshes", index)
         for number, primitive in enumerate(document.entry(mesh, "primitives", list)):
@@ -279,6 +311,10 @@ def _read_meshes(
             if mode not in set(Mode):
                 continue
             attributes = document.entry(primitive, "attributes", dict)
+            missing = _missing(document, primitive, attributes)
+            if missing:
+                left_out.append(f"{what} has no {missing}")
+                continue
             # Primitives often share their vertices and differ in indices and material only.
             key = repr(sorted(attributes.items(), key=str))
             if key not in begins:
@@ -288,11 +324,28 @@ def _read_meshes(
             begin, size = begins[key]
             faces.append(_read_faces(document, primitive, mode, what, size) + begin)
     if not faces:
-        raise ModelError("the skinned mesh has no triangles")
+        reason = f": {left_out[0]}" if left_out else ""
+        raise ModelError(f"the skinned mesh has no triangles that a skin moves{reason}")
+    if left_out:
+        _warn(f"{len(left_out)} primitives are left out: {'; '.join(left_out[:3])}")
     vertices, normals, weights = zip(*blocks, strict=True)
     known = [block for block in normals if block is not None]
     all_normals = np.concatenate(known) if len(known) == len(blocks) else None
     return np.concatenate(vertices), np.concatenate(faces), all_normals, np.concatenate(weights)
+
+
+def _missing(document: GltfDocument, primitive: dict[str, Any], attributes: dict[str, Any]) -> str:
+    """Return what a primitive lacks to be part of a rig; empty if nothing."""
+    if attributes.get("POSITION") is None or document.accessor_count(attributes["POSITION"], "POSITION") == 0:
+        return "positions"
+    if attributes.get("JOINTS_0") is None:
+        return "JOINTS_0 and WEIGHTS_0: it is not skinned"
+    corners = primitive.get("indices")
+    return "triangles" if corners is not None and document.accessor_count(corners, "the indices") == 0 else ""
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, FileWarning, stacklevel=2)
 
 
 def _read_vertices(
@@ -308,20 +361,20 @@ def _read_vertices(
     points = _numbers(document, attributes.get("POSITION"), f"POSITION of {what}", "VEC3").astype(np.float64)
     normals = None
     if attributes.get("NORMAL") is not None:
-        normals = _numbers(document, attributes["NORMAL"], f"NORMAL of {what}", "VEC3").astype(np.float64)
+        normals = document.accessor(attributes["NORMAL"], f"NORMAL of {what}", ("VEC3",)).astype(np.float64)
         if len(normals) != len(points):
             raise FormatError(f"{what} has {len(points)} positions but {len(normals)} normals")
+        if not np.isfinite(normals).all():
+            _warn(f"the normals of {what} are left out: some are not finite")
+            normals = None
     weights = np.zeros((len(points), num_joints))
     number = 0
     while attributes.get(f"JOINTS_{number}") is not None:
-        joints, values = (
-            _numbers(document, attributes.get(name), f"{name} of {what}", "VEC4")
-            for name in (f"JOINTS_{number}", f"WEIGHTS_{number}")
-        )
-        _add_weights(weights, joints, values, what)
+        joints = _numbers(document, attributes[f"JOINTS_{number}"], f"JOINTS_{number} of {what}", "VEC4")
+        name = f"WEIGHTS_{number}"
+        values = document.accessor(attributes.get(name), f"{name} of {what}", ("VEC4",))
+        _add_weights(weights, joints, np.nan_to_num(values, posinf=0.0, neginf=0.0), what)
         number += 1
-    if number == 0:
-        raise ModelError(f"{what} has no JOINTS_0 and WEIGHTS_0: it is not skinned")
     return points, normals, weights
 
 
@@ -360,9 +413,23 @@ def _read_faces(document: GltfDocument, primitive: dict[str, Any], mode: int, wh
     return triangles(mode, corners.astype(np.int64), what)
 
 
+def _weighted_rows(weights: Array, vertices: Array) -> Array:
+    """Return weights (V, J) in which vertices without any have those of the nearest vertex (V, 3) that has some."""
+    empty = weights.sum(1) <= 0
+    if not empty.any():
+        return weights
+    if empty.all():
+        raise ModelError(f"none of {len(weights)} vertices has a skin weight; assign every vertex to a joint")
+    _warn(
+        f"{int(empty.sum())} of {len(weights)} vertices have no skin weight and follow the nearest vertex that has some"
+    )
+    from torchreg.geometry.neighbors import NeighborTree  # scipy is slow to load, and few rigs need it
+
+    weighted = np.flatnonzero(~empty)
+    nearest, _ = NeighborTree(torch.from_numpy(vertices[weighted])).nearest(torch.from_numpy(vertices[empty]))
+    weights[empty] = weights[weighted[nearest.numpy()]]
+    return weights
+
+
 def _normalized_rows(weights: Array) -> Array:
-    total = weights.sum(1, keepdims=True)
-    empty = int((total <= 0).sum())
-    if empty:
-        raise ModelError(f"{empty} of {len(weights)} vertices have no skin weight; assign every vertex to a joint")
-    return weights / total
+    return weights / weights.sum(1, keepdims=True)

@@ -359,6 +359,14 @@ def parents_first(parents: Sequence[int]) -> list[int]:
     return order
 
 
+def rotation_matrices(quaternions: Array) -> Array:
+    """Return the rotations (N, 3, 3) of quaternions (N, 4), x y z w, of any length but zero."""
+    length = np.linalg.norm(quaternions, axis=-1, keepdims=True)
+    unit = quaternions / np.where(length > 0, length, 1.0)
+    cross = np.cross(np.eye(3), unit[:, None, :3])
+    return np.eye(3) + 2 * unit[:, 3, None, None] * cross + 2 * cross @ cross
+
+
 def triangles(mode: int, corners: Array, what: str) -> Array:
     """Return the (F, 3) triangles of a primitive, none where ``mode`` draws points or lines.
 

@@ -6,22 +6,27 @@ import io
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchreg.errors import FormatError, MissingExtraError
+from torchreg.errors import FileWarning, FormatError, MissingExtraError
 from torchreg.geometry.budget import BUDGET
 from torchreg.geometry.camera import Camera
 from torchreg.io.atomic import write_atomic
-from torchreg.io.frames import natural_key
+from torchreg.io.file_format import check_stand_in, naming
+from torchreg.io.frames import natural_sorted
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
+from torchreg.io.masks import mask_of_numbers, mask_of_picture
 from torchreg.io.npz import read_npy_header
 
+Found = TypeVar("Found")
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 # Metres per unit of most depth images.
 MILLIMETER = 1e-3
@@ -49,7 +54,7 @@ def list_pictures(folder: str | os.PathLike[str]) -> list[Path]:
     files = [file for file in directory.iterdir() if file.suffix.lower() in ENDINGS and not file.name.startswith(".")]
     if not files:
         raise FormatError(f"{directory} holds no pictures: no file ends in one of {', '.join(ENDINGS)}")
-    return sorted(files, key=natural_key)
+    return natural_sorted(files)
 
 
 def list_frames(folders: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, ...]]:
@@ -72,9 +77,9 @@ def list_frames(folders: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, .
     return list(zip(*files, strict=True))
 
 
-def _last_number(file: Path) -> int | None:
-    digits = re.findall(r"\d+", file.stem)
-    return int(digits[-1]) if digits else None
+def _last_number(file: Path) -> Decimal | None:
+    digits = re.findall(r"\d+(?:\.\d+)?", file.stem)
+    return Decimal(digits[-1]) if digits else None
 
 
 def load_image(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Tensor:
@@ -101,61 +106,132 @@ def _read_pixels(file: Path, limits: FileLimits) -> Any:
 
 
 def load_mask(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Tensor:
-    """Return a mask (H, W), bool: pixels at least half as bright as white, or in ``.npy`` not zero.
+    """Return a mask (H, W), bool.
+
+    Transparency that varies is the mask. Otherwise the brighter of two values is set, whatever they are; in a picture
+    of labels all but black or zero; elsewhere what is at least half as bright as the picture's own white.
+
+    Args:
+        path: a PNG, JPEG, TIFF or BMP file of any bit depth, also with a palette, or a ``.npy`` array (H, W).
+        limits: ``max_bytes`` applies; pictures have at most 64 megapixels.
 
     Raises:
         FormatError: as `load_image`.
         FileNotFoundError: if there is no such file.
+
+    Warns:
+        FileWarning: if the mask keeps all or nothing, or the file holds several labels.
     """
     file = local_path(path)
-    if file.suffix.lower() == ".npy":
-        values = _read_npy(read_bytes(file, limits), file)
-        if values.dtype.kind not in "biuf":
-            raise FormatError(f"{file}: masks are truth values or real numbers, got {values.dtype}")
-        return torch.from_numpy(values != 0)
-    pixels = torch.from_numpy(_read_pixels(file, limits))
-    return (pixels if pixels.ndim == 2 else pixels.amax(-1)) >= _HALF_WHITE
+    content = read_bytes(file, limits)
+    with naming(file):
+        check_stand_in(content)
+        if file.suffix.lower() == ".npy":
+            return torch.from_numpy(mask_of_numbers(_read_npy(content, file)))
+        return torch.from_numpy(_opened(content, file, mask_of_picture))
 
 
 def load_depth(
     path: str | os.PathLike[str],
-    scale: float = MILLIMETER,
+    scale: float | None = None,
     *,
     camera: Camera | None = None,
     limits: FileLimits = DEFAULT_LIMITS,
 ) -> Tensor:
     """Return a depth image (H, W) in metres, float32, zero where nothing was measured.
 
+    Zero, negative numbers, what is not finite, and the largest numbers that formats have (65535, 65504, 1e9 and more)
+    say that nothing was measured.
+
     Args:
         path: a PNG or TIFF file of 16 bits, a TIFF or EXR file of floating-point numbers, or a ``.npy`` array (H, W) of
             16-bit integers or floating-point numbers.
-        scale: metres per unit of the file.
+        scale: metres per unit of the file. None: whole numbers are millimeters, floating-point numbers metres, or
+            millimeters where no camera would see that far.
         camera: its picture must have that size.
         limits: ``max_bytes`` applies; pictures have at most 64 megapixels.
 
     Raises:
-        FormatError: if it is cut off, too large, of another size or bit depth, or without any depth; names the file.
+        FormatError: if it is cut off, too large, of another size or bit depth, without any depth, or in a unit in which
+            no camera sees; names the file.
         FileNotFoundError: if there is no such file.
         MissingExtraError: if it is an EXR file and the extra ``exr`` is not installed.
+
+    Warns:
+        FileWarning: if the depths are unlikely in their unit; names them.
     """
     file = local_path(path)
     content = read_bytes(file, limits)
-    values = _DEPTH_READERS.get(file.suffix.lower(), _decoded_depth)(content, file)
-    if values.dtype.kind not in "fiu" or values.dtype.itemsize < 2:
-        raise FormatError(f"{file}: depth takes 16 bits or floating-point numbers, got {values.dtype}")
-    if camera is not None and values.shape != (camera.height, camera.width):
+    with naming(file):
+        check_stand_in(content)
+        values = _DEPTH_READERS.get(file.suffix.lower(), _decoded_depth)(content, file)
+        if values.dtype.kind not in "fiu" or values.dtype.itemsize < 2:
+            raise FormatError(f"depth takes 16 bits or floating-point numbers, got {values.dtype}")
+        if camera is not None and values.shape != (camera.height, camera.width):
+            raise FormatError(
+                f"is {values.shape[1]} x {values.shape[0]} pixels, the camera's pictures are "
+                f"{camera.width} x {camera.height}"
+            )
+        measured = _measured(values)
+        if not measured.any():
+            raise FormatError(f"holds no depth, all of {values.size} pixels are zero, negative or not finite")
+        scale = _unit(values[measured], scale)
+        depth = np.where(measured, values, 0).astype(np.float32) * np.float32(scale)
+        return torch.from_numpy(depth)
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """What depth cameras see, by the median of a picture, metres."""
+
+    least: float = 5e-3
+    most: float = 100.0  # beyond is unlikely
+    impossible: float = 10_000.0
+
+
+_SIGHT = _Sight()
+# Numbers that say that nothing was measured: the largest of 16 bits, of half precision, and Blender's horizon.
+_NOTHING = (65535, 65504.0, 1e9)
+
+
+def _measured(values: Any) -> Any:
+    """Return where numbers (H, W) are depths."""
+    marks = values.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        known = np.isfinite(marks) & (marks > 0) & (marks < _NOTHING[2])
+    if values.dtype.kind in "iu":
+        return known & (values != _NOTHING[0])
+    return known & (marks != _NOTHING[1]) if values.dtype == np.float16 else known
+
+
+def _unit(values: Any, scale: float | None) -> float:
+    """Return the metres per unit of measured numbers; raise or warn if no camera sees such depths."""
+    middle = float(np.median(values))
+    if scale is None:
+        if values.dtype.kind != "f":
+            scale = MILLIMETER
+        elif middle <= _SIGHT.most:
+            scale = 1.0
+        else:
+            _warn(f"numbers around {middle:.4g} are taken for millimeters; the camera's depth_scale says otherwise")
+            scale = MILLIMETER
+    depth = middle * scale
+    if depth > _SIGHT.impossible:
         raise FormatError(
-            f"{file}: is {values.shape[1]} x {values.shape[0]} pixels, the camera's pictures are "
-            f"{camera.width} x {camera.height}"
+            f"depths around {depth:.3g} m are none of a camera: depth_scale is metres per unit, got {scale:g}; "
+            f"if it is units per metre write {1 / scale:g}"
         )
-    with np.errstate(all="ignore"):
-        depth = values.astype(np.float32)
-        depth *= np.float32(scale)
-        # Sensors mark what they did not measure by zero, NaN, infinity or a negative number.
-        depth[~(np.isfinite(depth) & (depth > 0))] = 0
-    if not depth.any():
-        raise FormatError(f"{file}: holds no depth, all of {depth.size} pixels are zero, negative or not finite")
-    return torch.from_numpy(depth)
+    if not _SIGHT.least <= depth <= _SIGHT.most:
+        factor = "0.001" if depth > _SIGHT.most else "1"
+        _warn(
+            f"depths around {depth:.3g} m are unlikely: with depth_scale {scale:g} the file's {middle:.4g} is in other "
+            f"units; write depth_scale {factor} if they are {'millimeters' if depth > _SIGHT.most else 'metres'}"
+        )
+    return scale
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, FileWarning, stacklevel=2)
 
 
 def save_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = MILLIMETER) -> None:
@@ -163,7 +239,7 @@ def save_depth(path: str | os.PathLike[str], depth: Tensor, scale: float = MILLI
     from PIL import Image
 
     steps = (depth.detach().cpu().double() / scale).round().nan_to_num(0, 0, 0)
-    steps = torch.where((steps > 0) & (steps <= 65535), steps, 0.0)
+    steps = torch.where((steps > 0) & (steps < _NOTHING[0]), steps, 0.0)
     _save_png(path, Image.fromarray(steps.numpy().astype(np.uint16)))
 
 
@@ -193,17 +269,26 @@ def _check_pixels(shape: tuple[int, ...], file: Path) -> None:
 
 def _decoded(content: bytes, file: Path) -> tuple[str, Any]:
     """Return the PIL mode of a picture, and its pixels."""
+
+    def pixels(image: Any) -> tuple[str, Any]:
+        kind = str(image.mode)
+        return kind, np.array(image.convert(_COLOR_KINDS[kind]) if kind in _COLOR_KINDS else image)
+
+    return _opened(content, file, pixels)
+
+
+def _opened(content: bytes, file: Path, use: Callable[[Any], Found]) -> Found:
+    """Return what ``use`` makes of the open picture."""
     from PIL import Image, UnidentifiedImageError
 
     try:
         with warnings.catch_warnings():
             # The size is checked here, before anything is decoded; damage raises.
             warnings.simplefilter("ignore")
+            warnings.simplefilter("always", FileWarning)
             with Image.open(io.BytesIO(content), formats=("PNG", "TIFF", "JPEG", "BMP")) as image:
                 _check_pixels(image.size, file)
-                kind = str(image.mode)
-                plain = image.convert(_COLOR_KINDS[kind]) if kind in _COLOR_KINDS else image
-                return kind, np.array(plain)
+                return use(image)
     except FormatError:
         raise
     except Image.DecompressionBombError as error:

@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import io
 import struct
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,8 +17,9 @@ from urllib.parse import unquote
 import numpy as np
 import torch
 
-from torchreg.errors import FormatError, MissingExtraError
+from torchreg.errors import FileWarning, FormatError, MissingExtraError
 from torchreg.geometry.mesh import TriangleMesh, concatenate
+from torchreg.io.file_format import check_stand_in
 from torchreg.io.limits import FileLimits, read_bytes
 from torchreg.io.raw_cloud import Array
 from torchreg.io.stl import is_binary_stl
@@ -53,10 +55,13 @@ class MeshFiles:
             searched as well.
         require: whether it is an error if a file is missing or needs a reader that is not installed.
         limits: largest size of a file.
+        warn: whether such files are told of where they are not required.
     """
 
-    def __init__(self, path: Path, package_dirs: Sequence[Path], require: bool, limits: FileLimits) -> None:
-        self._path, self._require, self._limits = path, require, limits
+    def __init__(
+        self, path: Path, package_dirs: Sequence[Path], require: bool, limits: FileLimits, *, warn: bool = False
+    ) -> None:
+        self._path, self._require, self._limits, self._warn = path, require, limits, warn
         self._folders = [*package_dirs, *path.resolve().parents]
         self._cache: dict[Path, TriangleMesh] = {}
 
@@ -64,42 +69,79 @@ class MeshFiles:
         """Return the triangles of a mesh file, float64; None if it cannot be read and is not required.
 
         Args:
-            filename: relative to the folder of the description, or ``file://``, ``package://``, ``model://``.
+            filename: relative to the folder of the description or one above, or ``file://``, ``package://``,
+                ``model://``; backslashes are slashes.
             what: the name of the mesh in messages.
         """
-        tried = self._candidates(filename, what)
-        found = next((path for path in tried if _is_file(path)), None)
+        tried = self._candidates(filename.replace("\\", "/"))
+        found = next((file for path in tried if (file := _found(path)) is not None), None)
         if found is None:
-            if not self._require:
-                return None
-            raise FormatError(
-                f"{what}: mesh file {filename!r} was not found (looked at {', '.join(map(str, tried[:3]))}, ...); pass "
-                f"package_dirs=, or meshes='skip' to go without"
-            )
+            scheme, separator, _ = filename.partition("://")
+            if separator and scheme not in ("file", *_PACKAGES):
+                reason = f"mesh {filename!r} is remote; save it beside the URDF and give a relative path"
+            else:
+                places = ", ".join(map(str, dict.fromkeys(tried[:4])))
+                reason = (
+                    f"mesh file {filename!r} was not found (looked at {places}, ...); name its folder by package_dirs="
+                )
+            self._missing(FormatError(f"{what}: {reason}"))
+            return None
         kind = _FORMATS.get(found.suffix.lower())
         if kind is not None and kind.module is not None and importlib.util.find_spec(kind.module[0]) is None:
-            if not self._require:
-                return None
-            raise MissingExtraError(
-                f"{what}: reading COLLADA mesh {found} needs pycollada; install torchreg[urdf], or pass meshes='skip'"
+            self._missing(
+                MissingExtraError(f"{what}: reading COLLADA mesh {found} needs pycollada; install torchreg[urdf]")
             )
+            return None
         if found not in self._cache:
-            self._cache[found] = _read_mesh(found, self._limits)
+            content = read_bytes(found, self._limits)
+            try:
+                check_stand_in(content)
+            except FormatError as error:
+                self._missing(FormatError(f"{what}: {found} {error}"))
+                return None
+            self._cache[found] = _read_mesh(found, content)
         return self._cache[found]
 
-    def _candidates(self, filename: str, what: str) -> list[Path]:
+    def _missing(self, error: FormatError | MissingExtraError) -> None:
+        """Raise the error about a file that is not there, or tell it, as was asked for."""
+        if self._require:
+            raise error
+        if self._warn:
+            warnings.warn(f"{error}; it is left out", FileWarning, stacklevel=2)
+
+    def _candidates(self, filename: str) -> list[Path]:
         """Return the possible paths of a mesh, most likely first."""
         scheme, separator, rest = filename.partition("://")
-        if not separator:
-            return [self._path.parent / filename]
-        if scheme == "file":
-            return [self._path.parent / unquote(rest)]
-        if scheme not in ("package", "model"):
-            raise FormatError(f"{what}: mesh {filename!r} is remote; save it beside the URDF and give a relative path")
-        package, _, inner = rest.partition("/")
-        paths = [folder / package / inner for folder in self._folders]
-        named = [folder / inner for folder in self._folders if folder.name == package]
-        return [*named, *paths]
+        if separator and scheme in _PACKAGES:
+            package, _, inner = rest.partition("/")
+            named = [folder / inner for folder in self._folders if folder.name == package]
+            return [*named, *(folder / package / inner for folder in self._folders), *self._below(inner)]
+        name = unquote(rest) if scheme == "file" else rest if separator else filename
+        place = self._path.parent / name
+        # A path of another machine, or of Windows, ends as that of this one.
+        return [place, *self._below(name)]
+
+    def _below(self, name: str) -> list[Path]:
+        """Return the places of a path, or of its end, below the folders that are searched."""
+        parts = [part for part in name.split("/") if part not in ("", ".", "..")]
+        ends = ["/".join(parts[k:]) for k in range(min(len(parts), _DEEPEST))]
+        return [folder / end for end in ends for folder in self._folders]
+
+
+_PACKAGES = ("package", "model")
+# Folders of a path that are left out, at most, to find its end elsewhere.
+_DEEPEST = 12
+
+
+def _found(path: Path) -> Path | None:
+    """Return the file of a path, also where only upper and lower case differ, as they may on Windows."""
+    if _is_file(path):
+        return path
+    try:
+        same = [file for file in path.parent.iterdir() if file.name.lower() == path.name.lower()]
+    except OSError:
+        return None
+    return same[0] if len(same) == 1 and _is_file(same[0]) else None
 
 
 def _is_file(path: Path) -> bool:
@@ -155,12 +197,12 @@ _FORMATS = {
 }
 
 
-def _read_mesh(path: Path, limits: FileLimits) -> TriangleMesh:
+def _read_mesh(path: Path, content: bytes) -> TriangleMesh:
     """Return the triangles of a mesh file, in metres where the file has a unit."""
     ending = path.suffix.lower()
     if ending not in _FORMATS:
         raise FormatError(f"{path}: meshes of kind {ending!r} are not read; known: {', '.join(_FORMATS)}")
-    content, kind = read_bytes(path, limits), _FORMATS[ending]
+    kind = _FORMATS[ending]
     import trimesh
     from trimesh.exchange.stl import HeaderError
 

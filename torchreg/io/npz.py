@@ -1,4 +1,4 @@
-"""NPZ: numpy archives without pickled objects."""
+"""NPY and NPZ: arrays and archives of numpy without pickled objects."""
 
 from __future__ import annotations
 
@@ -15,8 +15,60 @@ from torch import Tensor
 
 from torchreg.errors import FormatError, InputError
 from torchreg.io.atomic import write_atomic
+from torchreg.io.columns import cloud_of_columns
 from torchreg.io.limits import FileLimits, check_allowed, local_path, open_zip
 from torchreg.io.raw_cloud import Array, RawCloud, as_indices
+
+
+def read_npy(content: bytes, limits: FileLimits) -> RawCloud:
+    """Return the cloud of an array: (N, 3), or more columns as in a table of text, or (H, W, 3) row by row.
+
+    A structured array is read by the names of its fields, x, y, z among them.
+    """
+    array = array_of(content, "the array")
+    if array.dtype.names is not None:
+        plain = [name for name in array.dtype.names if array.dtype[name].kind in "iuf" and not array.dtype[name].shape]
+        columns = [array[name].reshape(-1).astype(np.float64) for name in plain]
+        if not columns:
+            raise FormatError("the array has no fields of numbers")
+        check_allowed(len(columns[0]), "points", limits)
+        return cloud_of_columns(np.stack(columns, axis=-1), plain)
+    if array.ndim not in (2, 3) or array.shape[-1] < 3:
+        raise FormatError(f"the array must have shape (N, 3) or more columns, got {array.shape}{_transposed(array)}")
+    if array.ndim == 3 and array.shape[-1] != 3:
+        raise FormatError(f"the array must have shape (N, 3), or (H, W, 3) for an organized cloud, got {array.shape}")
+    rows = array.reshape(-1, array.shape[-1])
+    check_allowed(len(rows), "points", limits)
+    return _with_columns(rows)
+
+
+def _transposed(array: Array) -> str:
+    return "; transpose it" if array.ndim == 2 and array.shape[0] == 3 else ""
+
+
+def _with_columns(rows: Array) -> RawCloud:
+    """Return the cloud of rows (N, 3), which may have columns of normals and colors."""
+    if rows.shape[1] == 3:
+        return RawCloud(rows if rows.dtype.kind == "f" else rows.astype(np.float64))
+    return cloud_of_columns(rows.astype(np.float64))
+
+
+def array_of(content: bytes, what: str) -> Array:
+    """Return the array in the bytes of a .npy file: real numbers, or a structured array of them.
+
+    Raises:
+        FormatError: if it claims another size than it has, or holds objects; names ``what``.
+    """
+    stream = io.BytesIO(content)
+    shape, fortran, dtype = read_npy_header(stream, what)
+    if dtype.hasobject or (dtype.names is None and dtype.kind not in "iufb"):
+        raise FormatError(f"{what} must hold real numbers, got {dtype}; pickled objects are never loaded")
+    held = len(content) - stream.tell()
+    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != held:
+        raise FormatError(
+            f"{what} claims the shape {shape} of {dtype} but holds {held} bytes: it is cut off or damaged"
+        )
+    return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")
 
 
 def read_npz(content: bytes, limits: FileLimits) -> RawCloud:
@@ -33,11 +85,13 @@ def read_npz(content: bytes, limits: FileLimits) -> RawCloud:
         arrays = {name: _read_array(archive, names[name]) for name in wanted}
     points = arrays[key]
     check_allowed(len(points) if points.ndim else 0, "points", limits)
+    told = _with_columns(points) if points.ndim == 2 and points.shape[1] > 3 else RawCloud(points)
     faces = arrays.get("faces")
     if faces is not None:
         check_allowed(len(faces) if faces.ndim else 0, "faces", limits)
         faces = as_indices(faces, "faces")
-    return RawCloud(points, arrays.get("normals"), arrays.get("colors"), faces)
+    normals, colors = arrays.get("normals", told.normals), arrays.get("colors", told.colors)
+    return RawCloud(told.points, normals, colors, faces)
 
 
 def _only_points(archive: zipfile.ZipFile, names: dict[str, str]) -> str:
@@ -92,12 +146,13 @@ def _read_real_header(stream: IO[bytes], name: str) -> tuple[tuple[int, ...], bo
 
 
 def _read_array(archive: zipfile.ZipFile, name: str) -> Array:
-    with archive.open(name) as stream:
-        shape, fortran, dtype = _read_real_header(stream, name)
-        body = stream.read()
-    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != len(body):
-        raise FormatError(f"member {name!r} claims the shape {shape} of {dtype} but holds {len(body)} bytes")
-    return np.frombuffer(body, dtype).reshape(shape, order="F" if fortran else "C")
+    content = archive.read(name)
+    stream = io.BytesIO(content)
+    shape, fortran, dtype = _read_real_header(stream, name)
+    held = len(content) - stream.tell()
+    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != held:
+        raise FormatError(f"member {name!r} claims the shape {shape} of {dtype} but holds {held} bytes")
+    return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")
 
 
 def write_npz(cloud: RawCloud) -> bytes:

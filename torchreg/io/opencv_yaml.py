@@ -1,12 +1,15 @@
-"""OpenCV's calibration files: the YAML that its FileStorage writes, for one camera or a stereo pair."""
+"""OpenCV's calibration files, for one camera or a stereo pair, and ROS's, which are alike."""
 
 from __future__ import annotations
 
 import math
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,13 +19,18 @@ from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
 from torchreg.io.atomic import write_atomic
+from torchreg.io.camera_entries import check_lens_model
+from torchreg.io.file_format import plain_text
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 
 _KEY = re.compile(r"^([A-Za-z_]\w*):[ \t]*(.*)$", re.MULTILINE)
 _FIELD = re.compile(r"^[ \t]+(rows|cols|dt|data):[ \t]*", re.MULTILINE)
 # Names of the same entries in calibrations of different origin.
-_SINGLE = (("camera_matrix", "distortion_coefficients"), ("cameraMatrix", "distCoeffs"), ("K", "D"), ("M", "D"))
-_PAIR = (
+_SINGLE = (
+    ("camera_matrix", "distortion_coefficients"), ("camera_matrix", "dist_coeffs"), ("cameraMatrix", "distCoeffs"),
+    ("K", "D"), ("k", "d"), ("M", "D"), ("mtx", "dist"),
+)  # fmt: skip
+PAIRS = (
     ("M1", "D1", "M2", "D2"),
     ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"),
     ("K1", "D1", "K2", "D2"),
@@ -43,7 +51,8 @@ def load_opencv(
 
     A pair has ``M1 D1 M2 D2 R T`` (or ``cameraMatrix1 distCoeffs1 ...``, ``K1 ...``), where R and T map coordinates of
     the left camera to the right one; the left one is at the origin. One camera has ``camera_matrix`` and
-    ``distortion_coefficients`` (or ``cameraMatrix distCoeffs``, ``K D``), and maybe R and T from the world.
+    ``distortion_coefficients`` (or ``cameraMatrix distCoeffs``, ``K D``), and maybe R and T from the world. ROS's files
+    have ``K D R P``, whose R straightens pictures and is let be.
 
     Args:
         path: the file.
@@ -55,26 +64,56 @@ def load_opencv(
         The cameras, float64.
 
     Raises:
-        FormatError: if the file is cut off, a matrix has another size, a number is not finite, an entry is missing, or
-            the cameras of a pair are swapped; names the file.
+        FormatError: if the file is cut off, a matrix has another size, a number is not finite, an entry is missing,
+            the lens is a fisheye, or the cameras of a pair are swapped; names the file.
         FileNotFoundError: if there is no such file.
         InputError: if ``unit`` is not positive.
     """
     if not (math.isfinite(unit) and unit > 0):
         raise InputError(f"unit must be positive and finite, got {unit}")
     file = local_path(path)
+    return read_opencv(read_bytes(file, limits), file, limits, size=size, unit=unit)
+
+
+def read_opencv(
+    content: bytes, file: Path, _: FileLimits, *, size: tuple[int, int] | None = None, unit: float = 1.0
+) -> CameraRig:
+    """Return the cameras in the bytes of a file; see `load_opencv`."""
     try:
-        text = read_bytes(file, limits).decode("utf-8-sig")
+        text = plain_text(content).decode("utf-8")
     except UnicodeDecodeError as error:
         raise FormatError(f"{file}: is no text ({error})") from error
-    if not text.startswith("%YAML"):
-        raise FormatError(f"{file}: must begin with %YAML, as OpenCV's FileStorage writes it")
-    values = _parsed(text, file)
+    if not text.startswith("%YAML") and not _KEY.search(text):
+        raise FormatError(
+            f"{file}: must begin with %YAML, as OpenCV's FileStorage writes it, or hold `name: value` lines"
+        )
+    return read_opencv_values(_parsed(text, file), file, size=size, unit=unit)
+
+
+def read_opencv_values(
+    values: Values, file: Path, *, size: tuple[int, int] | None = None, unit: float = 1.0
+) -> CameraRig:
+    """Return the cameras of named matrices."""
     width, height = _picture_size(values, size, file)
     try:
         return CameraRig(tuple(_cameras(values, width, height, unit, file)))
     except InputError as error:
         raise FormatError(f"{file}: {error}") from error
+
+
+def values_of(document: Mapping[str, Any]) -> Values:
+    """Return the matrices, lists of numbers and words of a JSON object."""
+    values: Values = {}
+    for name, value in document.items():
+        data = value.get("data") if isinstance(value, Mapping) else value
+        if isinstance(data, list):
+            numbers = np.array(data, dtype=np.float64)
+            shaped = isinstance(value, Mapping) and numbers.size == value.get("rows", 0) * value.get("cols", 0)
+            numbers = numbers.reshape(value["rows"], value["cols"]) if shaped else numbers
+            values[name] = torch.from_numpy(numbers.reshape(3, 3) if numbers.size == 9 else numbers)
+        elif isinstance(data, str | int | float):
+            values[name] = str(data)
+    return values
 
 
 def save_opencv(path: str | os.PathLike[str], cameras: CameraRig) -> None:
@@ -91,7 +130,7 @@ def save_opencv(path: str | os.PathLike[str], cameras: CameraRig) -> None:
     if len(cameras) > 2 or len({(camera.width, camera.height) for camera in cameras}) > 1:
         raise InputError(f"OpenCV files hold one or two cameras with pictures of one size, got {len(cameras)}")
     first, last = cameras[0], cameras[len(cameras) - 1]
-    names = _PAIR[0] if len(cameras) == 2 else _SINGLE[0]
+    names = PAIRS[0] if len(cameras) == 2 else _SINGLE[0]
     parts = [part for camera in cameras for part in (camera.matrix, camera.distortion.unsqueeze(0))]
     motion = last.world_to_camera.double()
     if len(cameras) == 2:
@@ -111,26 +150,27 @@ def _written(name: str, matrix: Tensor) -> str:
 def _parsed(text: str, path: Path) -> Values:
     """Return the matrices, lists of numbers and other words of a file by their names."""
     marks = list(_KEY.finditer(text))
-    if not marks:
-        raise FormatError(f"{path}: holds no entry NAME: VALUE")
-    ends = [mark.start() for mark in marks[1:]] + [len(text)]
+    ends = [*(mark.start() for mark in marks[1:]), len(text)][: len(marks)]
     values: Values = {}
     for mark, end in zip(marks, ends, strict=True):
         name, first = mark.group(1), mark.group(2).strip()
         body = text[mark.start(2) : end]
-        if "opencv-matrix" in first:
+        if "opencv-matrix" in first or (not first and re.search(r"^[ \t]+data:", body, re.MULTILINE)):
             values[name] = _matrix(body, f"{path}: {name}")
-        elif first.startswith("["):
-            values[name] = _listed(body, f"{path}: {name}")
+        elif first.startswith("[") or (not first and re.match(r"\s*-\s", body)):
+            values[name] = _squared(_listed(body, f"{path}: {name}"))
         else:
-            values[name] = first.strip('"')
+            values[name] = first.strip("\"'")
     return values
+
+
+def _squared(values: Tensor) -> Tensor:
+    return values.reshape(3, 3) if values.numel() == 9 else values
 
 
 def _matrix(body: str, where: str) -> Tensor:
     marks = list(_FIELD.finditer(body))
-    # Without any field, it lacks them all.
-    ends = [mark.start() for mark in marks[1:]] + [len(body)] * bool(marks)
+    ends = [*(mark.start() for mark in marks[1:]), len(body)][: len(marks)]
     fields = {mark.group(1): body[mark.end() : end] for mark, end in zip(marks, ends, strict=True)}
     rows, columns = (fields.get(side, "").strip() for side in ("rows", "cols"))
     if not _is_count(rows) or not _is_count(columns) or "data" not in fields:
@@ -147,10 +187,18 @@ def _is_count(word: str) -> bool:
 
 
 def _listed(body: str, where: str) -> Tensor:
-    inner = re.match(r"\s*\[([^\]]*)\]", body)
-    if inner is None:
+    """Return the numbers of a list in brackets, which may hold lists, or of one with a hyphen before each entry."""
+    inner = body.strip()
+    if inner.startswith("["):
+        opened = [inner[:k].count("[") - inner[:k].count("]") for k in _after_brackets(inner)]
+        if 0 not in opened:
+            raise FormatError(f"{where} has no closing bracket: the file is cut off")
+        inner = inner[: _after_brackets(inner)[opened.index(0)]]
+    elif re.match(r"-\s", inner):
+        inner = re.sub(r"^\s*(-\s+)+", " ", inner, flags=re.MULTILINE).partition("---")[0]
+    else:
         raise FormatError(f"{where} has no closing bracket: the file is cut off")
-    words = [word for word in re.split(r"[,\s]+", inner.group(1)) if word]
+    words = [word for word in re.split(r"[\[\],\s]+", inner) if word]
     try:
         # FileStorage writes .Nan and .Inf.
         values = torch.tensor(
@@ -163,6 +211,11 @@ def _listed(body: str, where: str) -> Tensor:
     return values
 
 
+def _after_brackets(text: str) -> list[int]:
+    """Return the positions behind closing brackets."""
+    return [mark.end() for mark in re.finditer(r"\]", text)]
+
+
 def _picture_size(values: Values, size: tuple[int, int] | None, path: Path) -> tuple[int, int]:
     pair = next((values[name] for name in _SIZES if name in values), None)
     if isinstance(pair, Tensor) and pair.numel() == 2:
@@ -171,13 +224,16 @@ def _picture_size(values: Values, size: tuple[int, int] | None, path: Path) -> t
     if all(isinstance(side, str) and _is_count(side) for side in sides):
         return int(str(sides[0])), int(str(sides[1]))
     if size is None:
-        raise FormatError(f"{path}: lacks image_width and image_height; pass size=(width, height) to load_opencv")
+        raise FormatError(
+            f"{path}: lacks image_width and image_height; write them into the file, as in `image_width: 640` and "
+            f"`image_height: 480`, below its first lines"
+        )
     return size
 
 
 def _cameras(values: Values, width: int, height: int, unit: float, path: Path) -> list[Camera]:
     motion = _motion(values, unit, path)
-    for names in _PAIR:
+    for names in PAIRS:
         if names[0] in values:
             if motion is None:
                 raise FormatError(f"{path}: lacks R and T of the stereo pair, which OpenCV keeps in extrinsics.yml")
@@ -186,10 +242,12 @@ def _cameras(values: Values, width: int, height: int, unit: float, path: Path) -
             rig = CameraRig((left, Camera(width, height, second[0], motion, second[1], "right")))
             rig.stereo()  # refuses swapped cameras
             return list(rig)
-    for single in _SINGLE:
+    for single in sorted(_SINGLE, key=lambda names: names[1] not in values):
         if single[0] in values:
             intrinsics, lens = _lens(values, single, path)
-            return [Camera(width, height, intrinsics, torch.eye(4) if motion is None else motion, lens)]
+            name = values.get("camera_name", "")
+            pose = torch.eye(4) if motion is None else motion
+            return [Camera(width, height, intrinsics, pose, lens, name if isinstance(name, str) else "")]
     raise FormatError(f"{path}: holds neither camera_matrix nor M1 and M2, but {', '.join(values) or 'nothing'}")
 
 
@@ -198,6 +256,15 @@ def _lens(values: Values, names: tuple[str, ...], path: Path) -> tuple[Tensor, T
     matrix, lens = values.get(names[0]), values.get(names[1], torch.zeros(0, dtype=torch.float64))
     if not isinstance(matrix, Tensor) or matrix.shape != (3, 3):
         raise FormatError(f"{path}: {names[0]} must be a 3 x 3 matrix")
+    if isinstance(lens, Tensor) and not bool(lens.any()):
+        lens = lens[:0]  # no distortion, however many zeros
+    model = next((values[name] for name in ("distortion_model", "camera_model", "model") if name in values), "")
+    if isinstance(lens, Tensor) and isinstance(model, str):
+        check_lens_model(model, lens.numpy(), str(path))
+    if "xi" in values:
+        raise FormatError(
+            f"{path}: holds xi, of an omnidirectional camera, which is not supported; undistort the pictures"
+        )
     if not isinstance(lens, Tensor) or lens.numel() not in (0, 1, 4, 5, 8, 12, 14) or bool(lens.flatten()[8:].any()):
         raise FormatError(
             f"{path}: {names[1]} must hold 4, 5 or 8 numbers; prisms and tilted sensors are not supported"
@@ -209,7 +276,8 @@ def _lens(values: Values, names: tuple[str, ...], path: Path) -> tuple[Tensor, T
 
 
 def _motion(values: Values, unit: float, path: Path) -> Tensor | None:
-    if "R" not in values and "T" not in values:
+    # ROS's R straightens the picture of one camera, and says nothing of the world.
+    if "T" not in values and ("R" not in values or "P" in values):
         return None
     turn, step = values.get("R"), values.get("T")
     if not isinstance(turn, Tensor) or not isinstance(step, Tensor) or step.numel() != 3 or turn.numel() not in (3, 9):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 import tokenize
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -16,18 +18,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_choice, check_finite, check_shape
-from torchreg.errors import FormatError, InputError, InputTypeError
+from torchreg._checks import all_finite, as_float_tensor, check_choice, check_finite, check_positive, check_shape
+from torchreg.errors import FileWarning, FormatError, InputError, InputTypeError
+from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.io.atomic import write_atomic
+from torchreg.io.file_format import FileFormat, begins, choose, ending_of, naming, unpacked
 from torchreg.io.glb import read_gltf
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, read_bytes
-from torchreg.io.npz import read_npz, write_npz
+from torchreg.io.npz import read_npy, read_npz, write_npz
+from torchreg.io.off import read_off
 from torchreg.io.pcd import read_pcd, write_pcd
 from torchreg.io.ply import read_ply, write_ply
 from torchreg.io.raw_cloud import Array, RawCloud
-from torchreg.io.stl import read_stl
-from torchreg.io.text_formats import read_obj, read_xyz, write_xyz
+from torchreg.io.stl import is_binary_stl, read_stl
+from torchreg.io.text_formats import looks_like_table, read_obj, read_table, write_csv, write_xyz
 
 # Exceptions that struct, json, zipfile and numpy's text and header readers raise on damaged bytes.
 PARSER_ERRORS = (
@@ -36,43 +41,89 @@ PARSER_ERRORS = (
     zlib.error,
 )  # fmt: skip
 
-Reader = Callable[[bytes, Path, FileLimits], RawCloud]
+CLOUDS = "point clouds and meshes"
+_OBJ_START = re.compile(rb"(\s*#[^\n]*\n|\s*\n|\s*(mtllib|usemtl|o|g|s)\s[^\n]*\n)*\s*vn?\s+[-+.\d]")
 
 
-@dataclass(frozen=True)
-class CloudFormat:
-    """A file format of clouds and meshes.
-
-    Args:
-        read: the content of a file; the path is that of files beside it.
-        write: a cloud; None for formats that are read only.
-        colors: whether `write` keeps them.
-        faces: whether `write` keeps them.
-    """
-
-    read: Reader
-    write: Callable[[RawCloud], bytes] | None = None
-    colors: bool = False
-    faces: bool = False
-
-
-def _from_content(read: Callable[[bytes, FileLimits], RawCloud]) -> Reader:
+def _from_content(read: Callable[[bytes, FileLimits], RawCloud]) -> Callable[[bytes, Path, FileLimits], RawCloud]:
     """Return a reader that needs no path."""
     return lambda content, _, limits: read(content, limits)
 
 
-# By ending. A new format is one more row.
-FORMATS = {
-    ".ply": CloudFormat(_from_content(read_ply), write_ply, colors=True, faces=True),
-    ".pcd": CloudFormat(_from_content(read_pcd), write_pcd, colors=True),
-    ".xyz": CloudFormat(_from_content(read_xyz), write_xyz),
-    ".txt": CloudFormat(_from_content(read_xyz), write_xyz),
-    ".obj": CloudFormat(_from_content(read_obj)),
-    ".stl": CloudFormat(_from_content(read_stl)),
-    ".npz": CloudFormat(_from_content(read_npz), write_npz, colors=True, faces=True),
-    ".glb": CloudFormat(read_gltf),
-    ".gltf": CloudFormat(read_gltf),
-}
+def _read_text(content: bytes, path: Path, limits: FileLimits) -> RawCloud:
+    """Return the points of a table of text."""
+    return read_table(content, limits, intensity_first=ending_of(path) == ".pts")
+
+
+def _is_obj(content: bytes) -> bool:
+    """Return whether the first line of a text that is no comment is one of Wavefront's."""
+    return (
+        re.match(rb"(\s*#[^\n]*\n|\s*\n|\s*(mtllib|usemtl|o|g|s)\s[^\n]*\n)*\s*vn?\s+[-+.\d]", content[:4096])
+        is not None
+    )
+
+
+def _is_glb(content: bytes) -> bool:
+    return content.startswith(b"glTF") or (
+        content.lstrip()[:1] == b"{" and b'"asset"' in content and b'"meshes"' in content
+    )
+
+
+def _is_pcd(content: bytes) -> bool:
+    return re.match(rb"\s*(#[^\n]*\n\s*)*VERSION\s+\S+\s+FIELDS\s", content[:4096]) is not None
+
+
+def _is_stl(content: bytes) -> bool:
+    start = content[:1024].lstrip().lower()
+    return is_binary_stl(content) or (start.startswith(b"solid") and b"facet" in start)
+
+
+# Told by content in this order, after the row of the ending. A new format is one more row.
+FORMATS: tuple[FileFormat, ...] = (
+    FileFormat(
+        "PLY", CLOUDS, (".ply",), _from_content(read_ply), "ASCII, binary of both byte orders; polygons are cut",
+        "load_points", begins(b"ply\n", b"ply\r", b"ply "), write_ply, ("normals", "colors", "faces"),
+    ),
+    FileFormat(
+        "PCD", CLOUDS, (".pcd",), _from_content(read_pcd), "ASCII, binary, binary_compressed", "load_points", _is_pcd,
+        write_pcd, ("normals", "colors"),
+    ),
+    FileFormat(
+        "XYZ and other tables", CLOUDS, (".xyz", ".txt", ".pts", ".asc", ".xyzn", ".xyzrgb", ".tsv", ".dat"),
+        _read_text, "x y z, normals, colors, intensity, with or without names of columns", "load_points",
+        looks_like_table, write_xyz, ("normals",),
+    ),
+    FileFormat(
+        "CSV", CLOUDS, (".csv",), _read_text, "the same tables; also those of pandas, CloudCompare and ParaView",
+        "load_points", None, write_csv, ("normals", "colors"),
+    ),
+    FileFormat(
+        "OBJ", CLOUDS, (".obj",), _from_content(read_obj), "vertices, faces, normals, colors; no materials",
+        "load_points", _is_obj,
+    ),
+    FileFormat(
+        "STL", CLOUDS, (".stl",), _from_content(read_stl), "binary, ASCII; corners at one place become one vertex",
+        "load_points", _is_stl,
+    ),
+    FileFormat(
+        "OFF", CLOUDS, (".off",), _from_content(read_off), "vertices and faces", "load_points",
+        begins(b"OFF", b"COFF", b"NOFF", b"CNOFF"),
+    ),
+    FileFormat(
+        "glTF", CLOUDS, (".glb", ".gltf"), read_gltf, "the default scene as viewers show it, skins and clips posed",
+        "load_points", _is_glb,
+    ),
+    FileFormat(
+        "NPZ", CLOUDS, (".npz",), _from_content(read_npz), "points (or vertices), normals, colors, faces",
+        "load_points",
+        begins(b"PK\x03\x04"), write_npz, ("normals", "colors", "faces"),
+    ),
+    FileFormat(
+        "NPY", CLOUDS, (".npy",), _from_content(read_npy), "(N, 3) or more columns, (H, W, 3), fields x y z",
+        "load_points", begins(b"\x93NUMPY"),
+    ),
+)  # fmt: skip
+ENDINGS = tuple(ending for row in FORMATS for ending in row.endings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,23 +172,30 @@ class PointCloud:
 def load_points(
     path: str | os.PathLike[str],
     *,
+    scale: float = 1.0,
     nan_policy: str = "raise",
     limits: FileLimits = DEFAULT_LIMITS,
-    dtype: torch.dtype = torch.float32,
+    dtype: torch.dtype | None = None,
+    time: float | None = None,
+    frame: int | None = None,
 ) -> PointCloud:
     """Return the points of a file, with normals, faces and colors where it has them.
 
-    Formats, by the ending: PLY (ASCII, binary of both byte orders), PCD (ASCII, binary, binary_compressed), XYZ and TXT
-    (x y z, or x y z nx ny nz), OBJ, STL (corners at one position become one vertex), GLB and glTF (default scene, world
-    coordinates, bind pose) and NPZ (array ``points`` or the only (N, 3) array). Points keep the order and the unit of
-    the file.
+    The format is told by the content, and by the ending where content does not tell; ``torchreg formats`` lists them.
+    Files may be packed by gzip. Points keep the order and the unit of the file. What cannot be used - normals that are
+    not finite, faces of two corners, colors of some vertices only - is left out with a warning that counts it.
 
     Args:
         path: a local file; addresses are refused.
-        nan_policy: ``"raise"`` refuses non-finite numbers; ``"omit"`` drops the points that have any, also in normals
-            or colors, and the faces that use them.
+        scale: metres per unit of the file, or other units wanted; 0.001 for millimeters.
+        nan_policy: ``"raise"`` refuses points that are not finite; ``"omit"`` drops them, those whose normals or colors
+            are not finite, and the faces that use them.
         limits: bounds on size and counts, checked before memory is allocated.
-        dtype: torch.float32 or torch.float64; double properties keep their full precision in the latter.
+        dtype: torch.float32 or torch.float64; None takes float32 unless the points lie so far from the origin, as in
+            maps, that it would round them.
+        time: seconds of the animation of a glTF file at which it is shown; None shows it at rest, as viewers do before
+            they play it.
+        frame: number of the keyframe of the animation of a glTF file, instead of ``time``.
 
     Returns:
         The cloud, on the CPU, at least one point.
@@ -146,42 +204,64 @@ def load_points(
         FileNotFoundError: if there is no such file.
         IsADirectoryError: if it is a folder.
         FormatError: if the file is damaged, cut off, too large, of unknown format, empty or not finite; names the file.
-        InputError: if ``nan_policy`` is neither of the two.
+        InputError: if ``nan_policy`` is neither of the two, or ``scale`` is not positive.
         InputTypeError: if ``dtype`` is neither of the two.
+
+    Warns:
+        FileWarning: if part of the file was left out; names the file.
     """
     check_choice(nan_policy, "nan_policy", ("raise", "omit"))
-    if dtype not in (torch.float32, torch.float64):
-        raise InputTypeError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+    check_dtype(dtype)
+    check_positive(scale, "scale")
     file = local_path(path)
-    kind = FORMATS.get(file.suffix.lower())
-    if kind is None:
-        file.stat()  # a missing file is reported first
-        raise FormatError(f"{file} has the unknown ending {file.suffix!r}; known: {', '.join(FORMATS)}")
     content = read_bytes(file, limits)
-    try:
-        with np.errstate(all="ignore"):  # overflowing numbers become infinite and are treated as such
-            return _checked_cloud(kind.read(content, file, limits), nan_policy, limits, dtype)
-    except FormatError as error:
-        raise FormatError(f"{file}: {error}") from error
-    except PARSER_ERRORS as error:
-        name = file.suffix[1:].upper()
-        raise FormatError(f"{file}: cannot be read as {name} ({type(error).__name__}: {error})") from error
+    with naming(file):
+        content = unpacked(content, limits)
+        kind = choose(FORMATS, content, file)
+        try:
+            with np.errstate(all="ignore"):  # overflowing numbers become infinite and are treated as such
+                raw = kind.read(content, file, limits, **_clip(kind, time, frame))
+                return _checked_cloud(raw, scale, nan_policy, limits, dtype)
+        except (FormatError, InputError):
+            raise
+        except PARSER_ERRORS as error:
+            raise FormatError(f"cannot be read as {kind.name} ({type(error).__name__}: {error})") from error
+
+
+def _clip(kind: FileFormat, time: float | None, frame: int | None) -> dict[str, Any]:
+    """Return the options of a reader that tell a time; InputError if it has none."""
+    given = {name: value for name, value in (("time", time), ("frame", frame)) if value is not None}
+    if given and kind.read is not read_gltf:
+        raise InputError(f"{' and '.join(given)} choose a moment of an animation, which {kind.name} files do not have")
+    return given
+
+
+def check_dtype(dtype: torch.dtype | None) -> None:
+    """Raise InputTypeError unless a dtype is None or one that points are read in."""
+    if dtype not in (None, torch.float32, torch.float64):
+        raise InputTypeError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
 
 
 def load_mesh(
     path: str | os.PathLike[str],
     *,
+    scale: float = 1.0,
     nan_policy: str = "raise",
     limits: FileLimits = DEFAULT_LIMITS,
-    dtype: torch.dtype = torch.float32,
+    dtype: torch.dtype | None = None,
+    time: float | None = None,
+    frame: int | None = None,
 ) -> TriangleMesh:
     """Return the triangle mesh of a file; polygons are cut into triangles.
 
     Args:
         path: a local file; see ``load_points`` for the formats.
+        scale: see ``load_points``.
         nan_policy: see ``load_points``.
         limits: see ``load_points``.
         dtype: see ``load_points``.
+        time: see ``load_points``.
+        frame: see ``load_points``.
 
     Returns:
         The mesh, on the CPU, at least one face.
@@ -189,25 +269,32 @@ def load_mesh(
     Raises:
         FormatError: if the file holds no faces, and as ``load_points``.
     """
-    cloud = load_points(path, nan_policy=nan_policy, limits=limits, dtype=dtype)
+    cloud = load_points(path, scale=scale, nan_policy=nan_policy, limits=limits, dtype=dtype, time=time, frame=frame)
     if cloud.faces is None or cloud.faces.shape[0] == 0:
         raise FormatError(f"{os.fspath(path)}: holds {len(cloud)} points but no faces; load_points reads it as a cloud")
     return cloud.to_mesh()
 
 
-def _checked_cloud(raw: RawCloud, nan_policy: str, limits: FileLimits, dtype: torch.dtype) -> PointCloud:
-    points = _rows(raw.points, "points", None, dtype)
+def _checked_cloud(
+    raw: RawCloud, scale: float, nan_policy: str, limits: FileLimits, dtype: torch.dtype | None
+) -> PointCloud:
+    points = _rows(raw.points, "points", None)
+    points = points if scale == 1 else points.double() * scale
     count = len(points)
     check_allowed(count, "points", limits)
     if count == 0:
         raise FormatError("holds no points")
-    normals = None if raw.normals is None else _rows(raw.normals, "normals", count, dtype)
-    colors = None if raw.colors is None else _rows(_to_unit_range(raw.colors), "colors", count, dtype)
+    dtype = dtype or needed_dtype(points)
+    points = points.to(dtype)
+    normals = None if raw.normals is None else _rows(raw.normals, "normals", count).to(dtype)
+    told = None if raw.colors is None else _unit_colors(raw.colors)
+    colors = None if told is None else _rows(told, "colors", count).to(dtype)
     faces = None if raw.faces is None else _face_rows(raw.faces, count, limits)
-    finite = torch.ones(count, dtype=torch.bool)
-    for values in (points, normals, colors):
-        if values is not None:
-            finite &= torch.isfinite(values).all(dim=-1)
+    finite = _finite_rows(points)
+    if nan_policy == "omit":
+        for values in (normals, colors):
+            if values is not None:
+                finite &= torch.isfinite(values).all(dim=-1)
     bad = count - int(finite.sum())
     if bad and nan_policy == "raise":
         raise FormatError(
@@ -220,18 +307,67 @@ def _checked_cloud(raw: RawCloud, nan_policy: str, limits: FileLimits, dtype: to
         faces = None if faces is None else (torch.cumsum(finite, 0) - 1)[faces[finite[faces].all(dim=-1)]]
         points = points[finite]
         normals, colors = (None if values is None else values[finite] for values in (normals, colors))
+    normals = None if normals is None else _finite_normals(normals, points, faces)
+    if colors is not None and not bool(colors.isfinite().all()):
+        damaged = int((~colors.isfinite()).any(-1).sum())
+        _warn(f"colors are left out: {damaged} of {len(colors)} are not finite")
+        colors = None
     return PointCloud(points=points, normals=normals, faces=faces, colors=colors)
 
 
-def _rows(values: Array, what: str, count: int | None, dtype: torch.dtype) -> Tensor:
+def _finite_rows(values: Tensor) -> Tensor:
+    """Return which rows (N,) are finite, quickly where all are."""
+    if all_finite(values):
+        return torch.ones(len(values), dtype=torch.bool)
+    return torch.isfinite(values).all(dim=-1)
+
+
+def needed_dtype(points: Tensor) -> torch.dtype:
+    """Return float64 where float32 would round points (N, 3), float64, by a noticeable share of their spread."""
+    return torch.float32 if far_origin(points) is None else torch.float64
+
+
+def _finite_normals(normals: Tensor, points: Tensor, faces: Tensor | None) -> Tensor | None:
+    """Return normals (N, 3); those that are not finite come from the faces, or all are left out."""
+    bad = ~normals.isfinite().all(-1)
+    if not bool(bad.any()):
+        return normals
+    count = f"{int(bad.sum())} of {len(normals)} normals are not finite"
+    if faces is None or not len(faces):
+        _warn(f"normals are left out: {count}")
+        return None
+    _warn(f"{count}; they are computed from the faces")
+    return torch.where(bad.unsqueeze(-1), TriangleMesh(points, faces).vertex_normals(), normals)
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, FileWarning, stacklevel=2)
+
+
+def _rows(values: Array, what: str, count: int | None) -> Tensor:
+    """Return numbers (N, 3) as float64, or float32 where they are that already."""
     if values.ndim != 2 or values.shape[1] != 3 or (count is not None and len(values) != count):
         raise FormatError(f"{what} must have shape ({count or 'N'}, 3), got {values.shape}")
+    kind = np.float32 if values.dtype in (np.float32, np.float16) else np.float64
     with np.errstate(over="ignore"):  # what becomes infinite is counted
-        return torch.from_numpy(np.array(values, dtype=np.float64 if dtype == torch.float64 else np.float32))
+        return torch.from_numpy(np.array(values, dtype=kind))
 
 
-def _to_unit_range(colors: Array) -> Array:
-    return colors if colors.dtype.kind == "f" else colors.astype(np.float64) / np.iinfo(colors.dtype).max
+def _unit_colors(colors: Array) -> Array | None:
+    """Return colors from 0 to 1; None, with a warning, if the numbers can be none.
+
+    Bytes are bytes. Other numbers are told by their range, as many programs write bytes as floats or wide integers.
+    """
+    if colors.dtype == np.uint8:
+        return colors / 255.0
+    known = colors[np.isfinite(colors)] if colors.dtype.kind == "f" else colors
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    if low < 0 or high > 65535:
+        _warn(f"colors are left out: they run from {low:g} to {high:g}, not from 0 to 1 or 255")
+        return None
+    if colors.dtype.kind == "f" and high <= 1 + 1e-6:
+        return np.clip(colors, 0.0, 1.0)
+    return colors.astype(np.float64) / (255.0 if high <= 255 else 65535.0)
 
 
 def _face_rows(faces: Array, count: int, limits: FileLimits) -> Tensor:
@@ -255,10 +391,10 @@ def save_points(
     """Write a point cloud; the file appears whole or not at all.
 
     Args:
-        path: a local file ending in .ply, .pcd, .xyz, .txt or .npz; an existing file is replaced.
+        path: a local file ending in .ply, .pcd, .xyz, .txt, .csv or .npz; an existing file is replaced.
         points: (N, 3) finite coordinates; their precision is kept.
         normals: (N, 3) or None.
-        colors: (N, 3) red, green, blue from 0 to 1, or None (.ply, .pcd, .npz); stored as bytes.
+        colors: (N, 3) red, green, blue from 0 to 1, or None (.ply, .pcd, .csv, .npz); stored as bytes.
         faces: (F, 3) vertex indices or None (.ply, .npz).
 
     Raises:
@@ -268,12 +404,12 @@ def save_points(
     """
     file = local_path(path)
     ending = file.suffix.lower()
-    writable = {known: kind for known, kind in FORMATS.items() if kind.write is not None}
+    writable = {known: row for row in FORMATS if row.write is not None for known in row.endings}
     write = None if ending not in writable else writable[ending].write
     if write is None:
         raise FormatError(f"{file} has the ending {file.suffix!r}; points are written as {', '.join(writable)}")
     for name, value in (("colors", colors), ("faces", faces)):
-        able = [known for known, kind in writable.items() if getattr(kind, name)]
+        able = [known for known, row in writable.items() if name in row.written]
         if value is not None and ending not in able:
             raise InputError(f"{name} cannot be held by {ending}; use one of {', '.join(able)}")
     cloud = PointCloud(points, normals, faces, colors)

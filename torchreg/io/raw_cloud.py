@@ -5,6 +5,7 @@ Readers raise FormatError without the name of the file, which their callers add.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchreg.errors import FormatError
+from torchreg.errors import FileWarning, FormatError
 
 Array = NDArray[Any]
 
@@ -46,13 +47,69 @@ def parse_table(lines: Sequence[bytes], columns: int | None, what: str) -> Array
         return np.zeros((0, columns or 0))
     if not all(line.strip() for line in lines):
         raise FormatError(f"each {what} must hold {columns or 'equally many'} numbers, got a blank row")
-    try:
-        table = np.loadtxt((line.decode("ascii") for line in lines), dtype=np.float64, comments=None, ndmin=2)
-    except ValueError as error:  # also what is not ASCII
-        raise FormatError(f"a {what} is not a row of {columns or 'equally many'} numbers ({error})") from error
-    if len(table) != len(lines) or (columns is not None and table.shape[1] != columns):
-        raise FormatError(f"each {what} must hold {columns} numbers, got {table.shape[1]}")
-    return table
+    return parse_numbers(b"\n".join(lines), columns, what, unit="row")
+
+
+def parse_numbers(text: bytes, columns: int | None, what: str, *, unit: str = "line", before: int = 0) -> Array:
+    """Return the numbers of a text as a float64 (rows, columns) table; blank lines are passed over.
+
+    Args:
+        text: numbers separated by blanks, one row a line.
+        columns: numbers per line; None takes the number of the first line.
+        what: name of a row, for messages.
+        unit: name of a line, for messages.
+        before: lines of the file before the text.
+    """
+    counts = _counts(text)
+    rows = counts.nonzero()[0]
+    if not len(rows):
+        return np.zeros((0, columns or 0))
+    width = int(columns or counts[rows[0]])
+    uneven = rows[counts[rows] != width]
+    if columns and len(uneven) == len(rows) and len(set(counts[rows])) == 1:
+        raise FormatError(f"each {what} must hold {columns} numbers, got {counts[rows[0]]}")
+    if len(uneven):
+        number = int(uneven[0])
+        line = _shown(text.split(b"\n", number + 1)[number])
+        raise FormatError(
+            f"a {what} is not a row of {columns or 'equally many'} numbers: {unit} {before + number + 1} holds "
+            f"{counts[number]} ({line!r}), {'they must be' if columns else 'the first row'} {width}"
+        )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # text that is no number ends the reading: see below
+        try:
+            values = np.fromstring(text, sep=" ") if text.isascii() else np.zeros(0)
+        except ValueError:  # where numpy, or the caller, makes an error of it
+            values = np.zeros(0)
+    if len(values) != width * len(rows):
+        raise _no_number(text, what, columns, unit, before)
+    return values.reshape(-1, width)
+
+
+def _counts(text: bytes) -> Array:
+    """Return the number of words in every line."""
+    letters = np.frombuffer(text + b"\n", np.uint8)
+    blank = letters <= 32
+    starts = ~blank
+    starts[1:] &= blank[:-1]
+    before = np.searchsorted(np.flatnonzero(starts), np.flatnonzero(letters == 10))
+    return np.diff(before, prepend=0)
+
+
+def _no_number(text: bytes, what: str, columns: int | None, unit: str, before: int) -> FormatError:
+    """Return the error that names the first word that is no number."""
+    row = f"a {what} is not a row of {columns or 'equally many'} numbers"
+    for number, line in enumerate(text.split(b"\n"), start=before + 1):
+        for word in line.split():
+            try:
+                float(word)
+            except ValueError:
+                return FormatError(f"{row}: {unit} {number} holds {_shown(word)!r}")
+    return FormatError(f"{row}: a word in it is no number")
+
+
+def _shown(line: bytes) -> str:
+    return line.strip().decode("utf-8", "replace")[:60]
 
 
 def as_indices(values: Array, what: str) -> Array:
@@ -90,26 +147,30 @@ _POLYGONS = 4096
 def fan_triangles(counts: Array, indices: Array) -> Array:
     """Return the (F, 3) triangles of polygons, each cut as a fan from its first corner.
 
+    Polygons of fewer than three corners are left out, with a warning that counts them.
+
     Args:
         counts: (P,) corners of each polygon, int64.
         indices: (sum of counts,) vertex indices of all polygons, one after the other.
     """
-    if counts.size and counts.min() < 3:
-        raise FormatError(f"a face must have at least 3 corners, got {int(counts.min())}")
-    ends = np.cumsum(counts - 2)
+    small = int(np.count_nonzero(counts < 3))
+    if small:
+        warnings.warn(
+            f"{small} of {len(counts)} faces are left out: they have fewer than 3 corners", FileWarning, stacklevel=2
+        )
+    ends, corners = np.cumsum(np.maximum(counts - 2, 0)), np.cumsum(counts)
     result = np.empty((int(ends[-1]) if len(ends) else 0, 3), indices.dtype)
     # A part after the other, as numbers of corners take more memory than corners.
     for first in range(0, len(counts), _POLYGONS):
-        part = counts[first : first + _POLYGONS]
-        before = int(ends[first - 1]) if first else 0
-        numbers = _fan_corners(part) + before + 2 * first
+        before, start = (int(sums[first - 1]) if first else 0 for sums in (ends, corners))
+        numbers = _fan_corners(counts[first : first + _POLYGONS]) + start
         result[before : before + len(numbers)] = indices[numbers]
     return result
 
 
 def _fan_corners(counts: Array) -> Array:
     """Return the (F, 3) numbers of the corners of the triangles of polygons with counts (P,) of corners."""
-    triangles = counts - 2
+    triangles = np.maximum(counts - 2, 0)
     start = np.repeat(np.cumsum(counts) - counts, triangles)
     step = np.arange(int(triangles.sum())) - np.repeat(np.cumsum(triangles) - triangles, triangles)
     return np.stack((start, start + step + 1, start + step + 2), axis=-1)

@@ -18,9 +18,12 @@ def load_scan(
     path: str | os.PathLike[str],
     *,
     viewpoint: Any = None,
+    scale: float = 1.0,
     nan_policy: str = "raise",
     limits: FileLimits = DEFAULT_LIMITS,
-    dtype: torch.dtype = torch.float32,
+    dtype: torch.dtype | None = None,
+    time: float | None = None,
+    frame: int | None = None,
 ) -> RangeScan:
     """Return the range scan of a file, with its faces and normals where it has them.
 
@@ -29,9 +32,12 @@ def load_scan(
     Args:
         path: a local file; see `load_points` for the formats.
         viewpoint: (3,) position of the camera, in the unit of the file; None if unknown.
+        scale: see `load_points`.
         nan_policy: see `load_points`; ``"omit"`` drops the points of rays that measured nothing.
         limits: see `load_points`.
-        dtype: torch.float32 or torch.float64.
+        dtype: see `load_points`.
+        time: see `load_points`.
+        frame: see `load_points`.
 
     Returns:
         The scan, on the CPU.
@@ -41,7 +47,7 @@ def load_scan(
         FileNotFoundError: if there is no such file.
         InputError: if the viewpoint is not three finite numbers.
     """
-    cloud = load_points(path, nan_policy=nan_policy, limits=limits, dtype=dtype)
+    cloud = load_points(path, scale=scale, nan_policy=nan_policy, limits=limits, dtype=dtype, time=time, frame=frame)
     if int(weld(cloud.points).max()) < 2:
         raise FormatError(f"{os.fspath(path)}: a scan needs points at 3 places or more, it holds {len(cloud)} points")
     return RangeScan(cloud.points, cloud.faces, cloud.normals, viewpoint=viewpoint)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,16 +13,19 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_choice
-from torchreg.errors import FormatError, ModelError
+from torchreg.errors import FileWarning, FormatError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh, concatenate
+from torchreg.io.file_format import check_stand_in, naming
 from torchreg.io.limits import DEFAULT_LIMITS, FILE_BUDGET, FileLimits, check_allowed, local_path, read_bytes
 from torchreg.io.mesh_files import MeshFiles
-from torchreg.io.strict_xml import parse_xml
+from torchreg.io.strict_xml import parse_lenient_xml
 
 # Attributes of a mimic joint: added to its multiple of the other.
 _MIMIC = ("offset", "multiplier")
 _KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": "fixed"}
+# Joints of several degrees of freedom.
+_HELD = ("floating", "planar")
 # Attributes of each kind of solid, with the count of their numbers.
 _PRIMITIVES = {
     "box": {"size": 3},
@@ -29,6 +33,17 @@ _PRIMITIVES = {
     "capsule": {"radius": 1, "length": 1},
     "sphere": {"radius": 1},
 }
+
+
+@dataclass(frozen=True)
+class _Plausible:
+    """Angles that are radians; larger ones seem to be degrees."""
+
+    turns: float = 4 * math.pi
+    degrees: float = 720.0  # limits beyond stand for none
+
+
+_PLAUSIBLE = _Plausible()
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +85,7 @@ def load_urdf(
     path: str | Path,
     *,
     package_dirs: Sequence[str | Path] = (),
-    meshes: str = "require",
+    meshes: str = "warn",
     limits: FileLimits = DEFAULT_LIMITS,
 ) -> UrdfRecord:
     """Return the kinematic tree and the geometry of a URDF file, with all numbers in float64.
@@ -78,28 +93,41 @@ def load_urdf(
     Frames come parents first, each branch in the file's order. A mimic joint that follows another mimic joint is
     rewritten to follow the first one. A joint without ``<limit>`` (or without both bounds) is unlimited.
 
+    The file is read as ROS's tools read it: namespaces mean nothing, comments may stand anywhere, and what cannot be
+    used of a link is left out with a warning. Floating and planar joints are held fixed, with a warning.
+
     Args:
         path: the .urdf file.
-        package_dirs: folders to search for ``package://NAME/...`` and ``model://NAME/...``: such a folder holds NAME
-            or is called NAME. The folders above the file are searched the same way.
-        meshes: "require" every mesh file, or "skip" those that are missing or need a reader that is not installed.
+        package_dirs: folders to search for meshes: of ``package://NAME/...`` and ``model://NAME/...`` such a folder
+            holds NAME or is called NAME. The folder of the file and those above are searched as well.
+        meshes: what becomes of mesh files that are missing or need a reader that is not installed: "warn" leaves them
+            out with a warning each, "skip" without, "require" raises.
         limits: largest sizes accepted; a robot may have 2000 links.
 
     Returns:
         The robot. A link without readable visual geometry has its collision geometry.
 
     Raises:
-        FormatError: if the XML or a mesh is damaged, oversized, unexpanded xacro, or a mesh file is missing.
-        ModelError: if links and joints do not form one finite tree of revolute, prismatic and fixed joints.
-        MissingExtraError: if a COLLADA (.dae) mesh is needed and pycollada is not installed.
+        FormatError: if the XML or a mesh is damaged, oversized or unexpanded xacro, or a required mesh is missing.
+        ModelError: if links and joints do not form one finite tree.
+        MissingExtraError: if a COLLADA (.dae) mesh is required and pycollada is not installed.
+
+    Warns:
+        FileWarning: if something is left out or held fixed, an element has two origins, or angles seem to be degrees.
     """
-    check_choice(meshes, "meshes", ("require", "skip"))
+    check_choice(meshes, "meshes", ("warn", "require", "skip"))
     source = local_path(path)
+    with naming(source):
+        return _read_robot(source, [Path(folder) for folder in package_dirs], meshes, limits)
+
+
+def _read_robot(source: Path, package_dirs: Sequence[Path], meshes: str, limits: FileLimits) -> UrdfRecord:
     robot = _parse(source, limits)
     links = _named(source, robot, "link")
     joints = _named(source, robot, "joint")
     order = _ordered(source, links, joints)
-    geometry = _Geometry(source, [Path(folder) for folder in package_dirs], meshes == "require", limits)
+    files = MeshFiles(source, package_dirs, meshes == "require", limits, warn=meshes == "warn")
+    geometry = _Geometry(source, files, limits)
     shapes = [geometry.of_link(name, links[name]) for name, _ in order]
     return UrdfRecord(
         name=robot.get("name") or source.stem,
@@ -116,9 +144,10 @@ def _parse(path: Path, limits: FileLimits) -> ET.Element:
         raise FormatError(f"{path}: {len(content)} bytes of XML, at most {FILE_BUDGET.xml_bytes} are read")
     expand = f"{path}: holds xacro macros; expand them first with `xacro {path.name} > robot.urdf`"
     try:
-        robot = parse_xml(content)
+        check_stand_in(content)
+        robot = parse_lenient_xml(content)
     except FormatError as error:
-        raise FormatError(expand if b"<xacro:" in content else f"{path}: {error}") from error
+        raise FormatError(f"{path}: {error}") from error
     if robot.tag != "robot":
         raise FormatError(f"{path}: the outermost element must be <robot>, got <{robot.tag}>; convert the file to URDF")
     for element in (inner for part in robot if part.tag != "gazebo" for inner in part.iter()):
@@ -156,21 +185,40 @@ def _ordered(
         carrier[child] = name
         children[parent].append(child)
     roots = [name for name in links if name not in carrier]
-    if len(roots) > 1:
-        raise ModelError(
-            f"{path}: the robot is disconnected, {len(roots)} links have no parent: {', '.join(roots[:5])}"
+    trees = [_tree_of(root, children, carrier) for root in roots]
+    if sum(map(len, trees)) < len(links):
+        reached = {name for tree in trees for name, _ in tree}
+        stuck = [name for name in links if name not in reached]
+        raise ModelError(f"{path}: the joints form a cycle through links {', '.join(stuck[:5])}")
+    largest = max(trees, key=len)
+    if len(trees) > 1:
+        others = [root for root, tree in zip(roots, trees, strict=True) if tree is not largest]
+        if len(largest) < 2:
+            raise ModelError(
+                f"{path}: the robot is disconnected, {len(roots)} links have no parent: {', '.join(roots[:5])}"
+            )
+        _warn(
+            f"the robot is disconnected: {len(links) - len(largest)} of {len(links)} links are left out, as no joint "
+            f"ties them to the largest tree: {', '.join(others[:5])}"
         )
+    return largest
+
+
+def _tree_of(
+    root: str, children: Mapping[str, Sequence[str]], carrier: Mapping[str, str]
+) -> list[tuple[str, tuple[str, int] | None]]:
+    """Return (link, (its joint, index of the parent link)) of the tree on a root, parents first."""
     order: list[tuple[str, tuple[str, int] | None]] = []
-    waiting: list[tuple[str, int]] = [(root, -1) for root in roots]
+    waiting: list[tuple[str, int]] = [(root, -1)]
     while waiting:
         name, above = waiting.pop()
         waiting.extend((child, len(order)) for child in reversed(children[name]))
         order.append((name, (carrier[name], above) if above >= 0 else None))
-    if len(order) < len(links):
-        reached = {name for name, _ in order}
-        stuck = [name for name in links if name not in reached]
-        raise ModelError(f"{path}: the joints form a cycle through links {', '.join(stuck[:5])}")
     return order
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, FileWarning, stacklevel=2)
 
 
 def _link_of(path: Path, joint: ET.Element, name: str, role: str, links: Mapping[str, ET.Element]) -> str:
@@ -207,6 +255,10 @@ def _build_joint(
 ) -> Joint:
     element, what = joints[name], f"{path}: joint {name!r}"
     offset = _origin(element, what)
+    if element.get("type") in _HELD:
+        _warn(
+            f"joint {name!r} is {element.get('type')}; it is held fixed, as joints turn about or slide along one axis"
+        )
     if _kind(joints, name, what) == "fixed":
         return Joint(name, parent, offset)
     axis = _floats(element.find("axis"), "xyz", 3, (1.0, 0.0, 0.0), what)
@@ -231,6 +283,8 @@ def _kind(joints: Mapping[str, ET.Element], name: str, what: str) -> str:
     given = joints[name].get("type")
     if given in _KINDS:
         return _KINDS[given]
+    if given in _HELD:
+        return "fixed"
     raise ModelError(f"{what} is of type {given!r}; supported: {', '.join(_KINDS)}")
 
 
@@ -240,7 +294,14 @@ def _limits(element: ET.Element, what: str) -> tuple[float, float]:
     if element.get("type") == "continuous" or given is None or given == (None, None):
         return -math.inf, math.inf
     # A missing bound is zero by the format's definition.
-    return _floats(limit, "lower", 1, (0.0,), what)[0], _floats(limit, "upper", 1, (0.0,), what)[0]
+    lower, upper = (_floats(limit, bound, 1, (0.0,), what)[0] for bound in ("lower", "upper"))
+    widest = max(abs(lower), abs(upper))
+    if element.get("type") == "revolute" and _PLAUSIBLE.turns < widest <= _PLAUSIBLE.degrees:
+        _warn(
+            f"joint {element.get('name')!r} has limits {lower:g} to {upper:g}, which are radians; if they are degrees "
+            f"write {math.radians(lower):.4g} to {math.radians(upper):.4g}"
+        )
+    return lower, upper
 
 
 def _mimics(path: Path, joints: Mapping[str, ET.Element]) -> dict[str, tuple[str, float, float]]:
@@ -300,6 +361,10 @@ def _origin(element: ET.Element, what: str) -> Tensor:
     origin = element.find("origin")
     translation = _floats(origin, "xyz", 3, (0.0, 0.0, 0.0), what)
     roll, pitch, yaw = _floats(origin, "rpy", 3, (0.0, 0.0, 0.0), what)
+    if len(element.findall("origin")) > 1:
+        _warn(f"{what} has {len(element.findall('origin'))} origins; the first counts, as in ROS")
+    if max(map(abs, (roll, pitch, yaw))) > _PLAUSIBLE.turns:
+        _warn(f"{what} is turned by rpy {roll:g} {pitch:g} {yaw:g}, which are radians; are they degrees?")
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (math.cos, math.sin))
     return torch.tensor(
         [
@@ -315,9 +380,8 @@ def _origin(element: ET.Element, what: str) -> Tensor:
 class _Geometry:
     """Reads the geometry of links."""
 
-    def __init__(self, path: Path, package_dirs: Sequence[Path], require: bool, limits: FileLimits) -> None:
-        self._path, self._limits = path, limits
-        self._files = MeshFiles(path, package_dirs, require, limits)
+    def __init__(self, path: Path, files: MeshFiles, limits: FileLimits) -> None:
+        self._path, self._files, self._limits = path, files, limits
         self._total = 0
 
     def of_link(self, name: str, link: ET.Element) -> tuple[TriangleMesh | None, tuple[UrdfPrimitive, ...]]:
@@ -333,7 +397,8 @@ class _Geometry:
                     if shape.tag == "mesh":
                         meshes.extend(self._placed_mesh(shape, _origin(element, what), what))
                     else:
-                        primitives.append(_primitive(shape, _origin(element, what), what))
+                        solid = _primitive(shape, _origin(element, what), what)
+                        primitives.extend([] if solid is None else [solid])
             if meshes or primitives:
                 break
         return (concatenate(meshes) if meshes else None), tuple(primitives)
@@ -341,10 +406,12 @@ class _Geometry:
     def _placed_mesh(self, shape: ET.Element, origin: Tensor, what: str) -> list[TriangleMesh]:
         filename = shape.get("filename")
         if not filename:
-            raise ModelError(f"{what} has a <mesh> without a filename")
+            _warn(f"{what} is left out: its <mesh> has no filename")
+            return []
         scale = torch.tensor(_floats(shape, "scale", 3, (1.0, 1.0, 1.0), what), dtype=torch.float64)
         if bool((scale == 0).any()):
-            raise ModelError(f"{what} has a mesh scale of zero")
+            _warn(f"{what} is left out: its mesh has a scale of zero")
+            return []
         mesh = self._files.read(filename, what)
         if mesh is None:
             return []
@@ -358,12 +425,15 @@ class _Geometry:
         return [TriangleMesh(vertices, mesh.faces.flip(1) if float(scale.prod()) < 0 else mesh.faces)]
 
 
-def _primitive(shape: ET.Element, origin: Tensor, what: str) -> UrdfPrimitive:
+def _primitive(shape: ET.Element, origin: Tensor, what: str) -> UrdfPrimitive | None:
+    """Return a solid; None, with a warning, if it is of another kind or has no size."""
     if shape.tag not in _PRIMITIVES:
-        raise ModelError(f"{what} has geometry <{shape.tag}>; known: mesh, {', '.join(_PRIMITIVES)}")
+        _warn(f"{what} is left out: its geometry <{shape.tag}> is none of mesh, {', '.join(_PRIMITIVES)}")
+        return None
     attributes, size = _PRIMITIVES[shape.tag], tuple[float, ...]()
     for attribute, count in attributes.items():
         size += _floats(shape, attribute, count, (), what)
     if len(size) < sum(attributes.values()) or min(size) <= 0:
-        raise ModelError(f"{what}: <{shape.tag}> needs a positive {' and '.join(attributes)}, got {size}")
+        _warn(f"{what} is left out: <{shape.tag}> needs a positive {' and '.join(attributes)}, got {size}")
+        return None
     return UrdfPrimitive(shape.tag, size, origin)

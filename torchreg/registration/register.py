@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -12,7 +14,9 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, as_tensor, check_count, check_finite, check_shape, warn_about_rounding
 from torchreg._threads import one_thread
-from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError
+from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning
+from torchreg.geometry.far_origin import far_origin
+from torchreg.geometry.loaded import scan_of
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.spread import SPREADS, spread_dimensions
@@ -31,8 +35,8 @@ from torchreg.result import Status
 @torch.no_grad()
 @one_thread()
 def register(
-    source: RangeScan,
-    target: RangeScan,
+    source: RangeScan | Any,
+    target: RangeScan | Any,
     num_bones: int = 20,
     grid_resolution: int = 50,
     config: RegisterConfig | None = None,
@@ -54,7 +58,7 @@ def register(
     the CPU; the result has the dtype and device of the source.
 
     Args:
-        source: the scan to be moved, N points.
+        source: the scan to be moved, N points; or what a loader returns, a cloud or a mesh.
         target: the scan to be reached, in the same frame and unit.
         num_bones: most bones; fewer where the motion needs no more, or the grid has fewer cells.
         grid_resolution: cells along the longest side of the source.
@@ -76,6 +80,7 @@ def register(
 
     Warns:
         DegenerateDataWarning: if a scan lies on a line or on a plane; the status is DEGENERATE.
+        UnitsWarning: if one scan is more than thirty times larger than the other.
 
     Differentiable: no; `GridLBS` is, for refining what was found.
 
@@ -84,8 +89,15 @@ def register(
     References: Chang and Zwicker 2009, algorithm 1; Le and Deng 2012, for motions and weights in turn.
     """
     config = RegisterConfig() if config is None else config
+    source, target = scan_of(source, "source"), scan_of(target, "target")
     check_inputs((source, target), num_bones, grid_resolution)
     warn_about_rounding(source.points, "points of source", source.diagonal, stacklevel=4)
+    origin = far_origin((source.points, target.points))
+    if origin is not None:
+        return register(
+            source.shifted(-origin), target.shifted(-origin), num_bones, grid_resolution, config, generator, on_step,
+            start=None if start is None else start - origin, confidence=confidence, parts=parts,
+        ).moved(origin)  # fmt: skip
     degenerate = warn_about_degenerate((source, target), stacklevel=4)
     _check_start(source, start, confidence)
     parts = None if parts is None else _checked_parts(source, parts, num_bones)
@@ -220,12 +232,9 @@ def initial_records(on_step: OnRegisterStep | None) -> Callable[[Any], None] | N
 def check_inputs(scans: tuple[Any, ...], num_bones: int, grid_resolution: int) -> None:
     """Raise unless there are scans with an extent, and numbers in range."""
     for name, scan in zip(("source", "target"), (scans[0], scans[-1]), strict=True):
-        if not isinstance(scan, RangeScan):
-            raise InputTypeError(
-                f"{name} must be a RangeScan, got {type(scan).__name__}; wrap points by RangeScan(...)"
-            )
         if not scan.diagonal > 0:
             raise InputError(f"{name} must have points at different places")
+    _warn_about_units(scans[0], scans[-1])
     check_count(num_bones, "num_bones", 1)
     check_count(grid_resolution, "grid_resolution", 1)
     if grid_resolution > MAX_RESOLUTION:
@@ -244,6 +253,31 @@ def warn_about_degenerate(scans: Sequence[RangeScan], *, stacklevel: int) -> boo
         stacklevel=stacklevel + 1,
     )
     return True
+
+
+@dataclass(frozen=True)
+class _Units:
+    """When two scans of one thing seem to be in different units."""
+
+    ratio: float = 30.0  # of their sizes
+
+
+_UNITS = _Units()
+
+
+def _warn_about_units(source: RangeScan, target: RangeScan) -> None:
+    """Warn if one scan is so much larger than the other that no crop explains it."""
+    ratio = float(target.diagonal / source.diagonal)
+    if 1 / _UNITS.ratio < ratio < _UNITS.ratio:
+        return
+    larger, smaller = ("target", "source") if ratio > 1 else ("source", "target")
+    factor = 10.0 ** -round(abs(math.log10(ratio)))
+    warnings.warn(
+        f"{larger} is {max(ratio, 1 / ratio):.4g} times as large as {smaller}: are they in one unit? "
+        f"If not, load {larger} with scale={factor:g}",
+        UnitsWarning,
+        stacklevel=4,
+    )
 
 
 def _checked_parts(source: RangeScan, parts: Any, num_bones: int) -> Tensor:

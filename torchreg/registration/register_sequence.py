@@ -11,6 +11,8 @@ from torch import Tensor
 from torchreg._checks import check_count, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.errors import InputError
+from torchreg.geometry.far_origin import far_origin
+from torchreg.geometry.loaded import scan_of
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.registration.bones.alternation import ReducedFit, Samples, turned_normals
@@ -170,16 +172,22 @@ def register_sequence(
             "config must be a RegisterConfig without printed, got one of RegisterConfig.paper(), which registers pairs "
             "only, as the paper does; call register for each pair"
         )
-    scans = tuple(scans)
+    scans = tuple(scan_of(scan, f"scans[{number}]") for number, scan in enumerate(scans))
     if len(scans) < 2:
         raise InputError(f"scans must hold at least two, got {len(scans)}")
     for scan in scans:
         check_inputs((scan, scan), num_bones, grid_resolution)
     warn_about_rounding(scans[0].points, "points of scans", scans[0].diagonal, stacklevel=4)
-    degenerate = warn_about_degenerate(scans, stacklevel=4)
     check_count(reference, "reference", 0)
     if reference >= len(scans):
         raise InputError(f"reference must be below the number of scans {len(scans)}, got {reference}")
+    origin = far_origin([scan.points for scan in scans])
+    if origin is not None:
+        near = [scan.shifted(-origin) for scan in scans]
+        return register_sequence(
+            near, num_bones, grid_resolution, config, generator, on_step, reference=reference
+        ).moved(origin)  # fmt: skip
+    degenerate = warn_about_degenerate(scans, stacklevel=4)
     source = scans[reference]
     index = source_samples(source, config, generator)
     normalization = Normalization.from_points(source.points[index])

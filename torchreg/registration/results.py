@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import torch
@@ -70,6 +70,8 @@ class ScanRegistration(Result):
         status: how the registration ended.
         seconds: (4,) setup, initialization, alignment, refinement.
         history: one `RegisterRecord` per step of the last two stages.
+        origin: (3,) float64 about which it was computed, where the scans, in float64, lie far from that of coordinates;
+            None elsewhere.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -89,6 +91,19 @@ class ScanRegistration(Result):
     status: Status
     seconds: Tensor
     history: tuple[RegisterRecord, ...] = ()
+    origin: Tensor | None = None
+
+    def moved(self, origin: Tensor) -> ScanRegistration:
+        """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
+        model = self.model.double().rescaled(1.0, origin)
+        points, deformed = self.points.double() + origin, self.deformed.double() + origin
+        return replace(
+            self, model=model, points=points, deformed=deformed, transforms=model.transforms.detach(), origin=origin
+        )
+
+    def local(self) -> ScanRegistration:
+        """Return the result in coordinates that begin at its origin; itself without one."""
+        return self if self.origin is None else replace(self.moved(-self.origin), origin=None)
 
     def parts(self, tolerance: float = 0.01) -> Tensor:
         """Return labels (N,) int64 in which neighboring bones that moved as one are one part, numbered from 0.
@@ -147,6 +162,7 @@ class SequenceRegistration(Result):
         reference: number of the scan that is moved.
         status: how the registration ended.
         history: one `RegisterRecord` per step of the joint fit.
+        origin: see `ScanRegistration`.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -167,6 +183,16 @@ class SequenceRegistration(Result):
     reference: int
     status: Status
     history: tuple[RegisterRecord, ...] = ()
+    origin: Tensor | None = None
+
+    def moved(self, origin: Tensor) -> SequenceRegistration:
+        """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
+        model = self.model.double().rescaled(1.0, origin)
+        points, deformed, fused = (values.double() + origin for values in (self.points, self.deformed, self.fused))
+        return replace(
+            self, model=model, points=points, deformed=deformed, fused=fused,
+            transforms=model.transforms.detach(), origin=origin,
+        )  # fmt: skip
 
     def parts(self, tolerance: float = 0.01) -> Tensor:
         """Return labels (N,) int64 of parts, as `ScanRegistration.parts` does: bones that moved as one in every frame.

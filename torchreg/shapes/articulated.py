@@ -67,7 +67,7 @@ class ArticulatedShape(Articulation):
         *,
         package_dirs: Sequence[str | Path] = (),
         primitive: str = "auto",
-        meshes: str = "require",
+        meshes: str = "warn",
         free_base: bool = True,
         nu: float | None = None,
         dtype: torch.dtype | None = None,
@@ -76,10 +76,11 @@ class ArticulatedShape(Articulation):
 
         Args:
             path: the URDF file.
-            package_dirs: folders in which ``package://`` names are looked up.
+            package_dirs: folders in which meshes are looked up, beside the file's folder and those above.
             primitive: "auto" (the file's own solids, and for meshes the kind nearest to them) or the kind fitted to
                 every link.
-            meshes: "require" every mesh file, or "skip" those that are missing or need a reader not installed.
+            meshes: what becomes of mesh files that are missing or need a reader that is not installed: "warn" leaves
+                them out with a warning each, "skip" without, "require" raises.
             free_base: False if the robot's base is bolted to the origin.
             nu: fusion length, metres; from the parts' thickness by default.
             dtype: of the module; the default dtype if None.
@@ -89,8 +90,11 @@ class ArticulatedShape(Articulation):
             frames but not parts, and the further solids of a link with several are parts LINK_1, LINK_2, ...
 
         Raises:
-            FormatError: if a file is missing, damaged or oversized.
-            ModelError: if the tree is cyclic, disconnected or non-finite, or no link has geometry.
+            FormatError: if a file is damaged or oversized, or a required mesh is missing.
+            ModelError: if the tree is cyclic or non-finite, or no link has geometry.
+
+        Warns:
+            FileWarning: if something is left out or held fixed, see `load_urdf`.
         """
         spec = spec_from_urdf(path, package_dirs=package_dirs, primitive=primitive, meshes=meshes)
         return cls.from_spec(spec, free_base=free_base, nu=nu, dtype=dtype)
@@ -139,13 +143,14 @@ class ArticulatedShape(Articulation):
         primitive: str = "ellipsoid",
         nu: float | None = None,
         dtype: torch.dtype | None = None,
+        skin: str | int | None = None,
     ) -> ArticulatedShape:
         """Return the shape of a rigged glTF: its skeleton as tree, with solids fitted to the vertices of each joint.
 
         The rest pose (zeros) is the file's bind pose.
 
         Args:
-            path: a .glb or .gltf file with one skin.
+            path: a .glb or .gltf file.
             parents: parent name of each joint (None: root), for files whose node hierarchy is flat.
             axes: rotation axes of each joint as "x", "y", "z" or unit vectors in joint coordinates; an empty list
                 makes the joint rigid. Joints not named are balls: x, y, z in this order.
@@ -153,15 +158,19 @@ class ArticulatedShape(Articulation):
             primitive: kind of the fitted solids.
             nu: fusion length, metres; from the parts' thickness by default.
             dtype: of the module; the default dtype if None.
+            skin: name or number of the skin, where the file has several.
 
         Returns:
             The shape; `file_skin` gives the file's own skin.
 
         Raises:
             FormatError: if the file is damaged, oversized, or has no skin.
-            ModelError: if the hierarchy is cyclic or disconnected, or a name is unknown.
+            ModelError: if the hierarchy is cyclic or flat, or a name is unknown.
+
+        Warns:
+            FileWarning: if part of the file was left out or put right; several roots hang on one.
         """
-        spec = spec_from_gltf(path, parents=parents, axes=axes, limits=limits, primitive=primitive)
+        spec = spec_from_gltf(path, parents=parents, axes=axes, limits=limits, primitive=primitive, skin=skin)
         return cls.from_spec(spec, nu=nu, dtype=dtype)
 
     @classmethod

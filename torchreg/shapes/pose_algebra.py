@@ -46,3 +46,8 @@ def difference(start: Tensor, end: Tensor) -> Tensor:
     """
     rotated = compose_rotation_vectors(end[..., 3:6], -start[..., 3:6])
     return torch.cat([end[..., :3] - start[..., :3], rotated, end[..., 6:] - start[..., 6:]], dim=-1)
+
+
+def shifted(pose: Tensor, offset: Tensor) -> Tensor:
+    """Return poses (..., num_dofs) with the base moved by offsets (..., 3)."""
+    return torch.cat([pose[..., :3] + offset, pose[..., 3:]], dim=-1)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from torchreg.geometry.primitives import PRIMITIVE_KINDS
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
 from torchreg.shapes.primitives import BALL_FACTOR, Primitive, PrimitiveSet, fuse
@@ -108,22 +109,63 @@ class _RefinementProblem:
         return torch.cat([centers, rotated, rows[:, 6:] + change[:, 6:]], dim=-1).view(1, -1)
 
     def linearize(self, state: Tensor) -> Linearization:
-        """Return cost, gradient and Gauss-Newton Hessian at a state (1, D)."""
+        """Return cost, gradient and Gauss-Newton Hessian at a state (1, D).
+
+        A point's residuals depend on the solids that fuse where it is and on its own, a few of many: points with the
+        same nearest solid are taken together, and only their solids' columns.
+        """
         rotations, centers, sizes = self.solids_at(state)
         local = ((self.points.unsqueeze(-2) - centers).unsqueeze(-2) @ rotations).squeeze(-2)
-        distances, gradients = self.solids.distance_and_gradient(local, sizes)
-        moments = -torch.linalg.cross(local, gradients)
-        motions = torch.cat([-gradients, moments, self._size_gradients(local, sizes)], dim=-1)
+        distances = self.solids(local, sizes)
         cost, gradient, hessian = self._prior(state, rotations)
-        scale = _REFINEMENT.robust_scale * self.nu
-        for residual, shares, weight in self._residuals(distances):
+        scale, rows, shares = _REFINEMENT.robust_scale * self.nu, list[Tensor](), list[Tensor]()
+        for residual, weights, weight in self._residuals(distances):
             scaled = (residual / scale).square()
-            weights = weight * cauchy_weight(scaled)
-            jacobian = (motions * shares.unsqueeze(-1)).flatten(1)
             cost = cost + 0.5 * weight * scale**2 * cauchy_loss(scaled).sum()
-            gradient = gradient + jacobian.mT @ (weights * residual)
-            hessian = hessian + jacobian.mT @ (weights.unsqueeze(-1) * jacobian)
+            root = (weight * cauchy_weight(scaled)).sqrt()
+            rows.append(root * residual)
+            shares.append(root.unsqueeze(-1) * weights)
+        nearest = distances.argmin(-1)
+        order, columns = nearest.argsort(), self._columns(nearest)
+        points, parts = columns[nearest[order]].nonzero().unbind(-1)
+        points = order[points]
+        motions = self._motions(local[points, parts], parts, sizes)
+        jacobians = motions.unsqueeze(-1) * torch.stack(shares, -1)[points, parts].unsqueeze(-2)
+        residuals = torch.stack(rows, -1)[order]
+        self._add_groups(jacobians, residuals, columns, nearest.bincount(minlength=len(columns)), gradient, hessian)
         return Linearization(cost.view(1), gradient.view(1, -1), hessian.unsqueeze(0))
+
+    def _columns(self, nearest: Tensor) -> Tensor:
+        """Return (P, P): the solids that residuals of points depend on, by the solid that is nearest to them."""
+        columns = self.neighbors.bool().clone()
+        columns[nearest, self.owners] = True
+        return columns
+
+    @staticmethod
+    def _add_groups(
+        jacobians: Tensor, residuals: Tensor, columns: Tensor, counts: Tensor, gradient: Tensor, hessian: Tensor
+    ) -> None:
+        """Add the terms of all points to the gradient (D,) and the Hessian (D, D).
+
+        Args:
+            jacobians: (M, width, 3) of the pairs of points and solids, those of one nearest solid after the other.
+            residuals: (N, 3) in the same order.
+            columns: (P, P) see `_columns`.
+            counts: (P,) points by their nearest solid.
+            gradient: changed in place.
+            hessian: changed in place.
+        """
+        width, pair, point = jacobians.shape[1], 0, 0
+        within = torch.arange(width)
+        for part, count in enumerate(counts.tolist()):
+            if not count:
+                continue
+            solids = columns[part].nonzero()
+            rows = jacobians[pair : pair + count * len(solids)].reshape(count, -1, 3).permute(1, 0, 2).flatten(1)
+            entries = (solids * width + within).flatten()
+            gradient[entries] += rows @ residuals[point : point + count].flatten()
+            hessian[entries[:, None], entries] += rows @ rows.mT
+            pair, point = pair + count * len(solids), point + count
 
     def _residuals(self, distances: Tensor) -> list[tuple[Tensor, Tensor, float]]:
         """Return the residuals (N,), the solids' weights (N, P) in them, and the weight of each of the three terms."""
@@ -137,18 +179,29 @@ class _RefinementProblem:
             (owned - nearest, owner - dominating, _REFINEMENT.excess_weight),
         ]
 
-    def _size_gradients(self, local: Tensor, sizes: Sequence[Tensor]) -> Tensor:
-        """Return (N, P, width - 6): derivatives of the distances by the logarithms of sizes, zero for exponents."""
-        with torch.enable_grad():
-            leaves = [size.expand(len(local), *size.shape).clone().requires_grad_() for size in sizes]
-            found = torch.autograd.grad(self.solids(local, leaves).sum(), leaves)
-        columns = [
-            nn.functional.pad(
-                gradient * size * self.solids.get_buffer(f"scalable_{kind}"), (0, self.width - 6 - size.shape[-1])
-            )
-            for kind, gradient, size in zip(self.solids.kinds, found, sizes, strict=True)
-        ]
-        return torch.cat(columns, dim=-2)[:, self.solids.kind_order]
+    def _motions(self, local: Tensor, parts: Tensor, sizes: Sequence[Tensor]) -> Tensor:
+        """Return (M, width): derivatives of distances by the motion and the logarithms of sizes of their solids.
+
+        Args:
+            local: (M, 3) points, each in the frame of its solid.
+            parts: (M,) numbers of the solids.
+            sizes: of all solids, kind by kind.
+        """
+        found = torch.zeros(len(parts), self.width, dtype=torch.float64)
+        for kind, size in zip(self.solids.kinds, sizes, strict=True):
+            members = self.solids.get_buffer(f"members_{kind}")
+            rows = torch.isin(parts, members).nonzero()[:, 0]
+            own = size[torch.searchsorted(members, parts[rows])]
+            points = local[rows]
+            _, gradients = PRIMITIVE_KINDS[kind].gradient(points, own)
+            found[rows, :3] = -gradients
+            found[rows, 3:6] = -torch.linalg.cross(points, gradients)
+            with torch.enable_grad():
+                leaf = own.clone().requires_grad_()
+                (by_size,) = torch.autograd.grad(PRIMITIVE_KINDS[kind].distance(points, leaf).sum(), leaf)
+            # Exponents stay.
+            found[rows, 6 : 6 + size.shape[-1]] = by_size * own * self.solids.get_buffer(f"scalable_{kind}")
+        return found
 
     def _prior(self, state: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return cost, gradient and Hessian of the prior at the start."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,11 +11,13 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_choice, check_finite, check_shape
-from torchreg.errors import InputError, ModelError
+from torchreg.errors import FileWarning, InputError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import RIGID_TOLERANCE, invert_rigid, rigid_matrix, transform_points
+from torchreg.io.file_format import naming
 from torchreg.io.gltf import load_rig
+from torchreg.io.gltf_document import parents_first
 from torchreg.shapes.kinematics import neighbor_matrix, part_parents
 from torchreg.shapes.primitive_refinement import refine_primitives
 from torchreg.shapes.primitives import Primitive
@@ -34,6 +37,8 @@ class _RigFit:
     nu_per_thickness: float = 0.25
     # Vertices of a solid; joints that own fewer get the vertices that follow them most.
     min_owned: int = 8
+    # Roots of a hierarchy that is not taken for a flat one, whatever the number of joints.
+    most_roots: int = 2
     # Vertices, spread over the mesh, on which solids are refined together.
     refined_points: int = 4000
 
@@ -48,13 +53,40 @@ def spec_from_gltf(
     axes: Axes | None = None,
     limits: Limits | None = None,
     primitive: str = "ellipsoid",
+    skin: str | int | None = None,
 ) -> ShapeSpec:
     """Return the `ShapeSpec` of a rigged glTF file; see `ArticulatedShape.from_gltf`."""
-    rig = load_rig(path, parents=parents)
-    return spec_from_arrays(
-        rig.vertices, rig.faces, rig.weights, rig.joint_transforms, rig.parents,
-        joint_names=rig.joint_names, axes=axes, limits=limits, primitive=primitive,
-    )  # fmt: skip
+    rig = load_rig(path, parents=parents, skin=skin)
+    with naming(path):
+        return spec_from_arrays(
+            rig.vertices, rig.faces, rig.weights, rig.joint_transforms, _one_tree(rig.parents, rig.joint_names),
+            joint_names=rig.joint_names, axes=axes, limits=limits, primitive=primitive,
+        )  # fmt: skip
+
+
+def _one_tree(parents: Sequence[int], names: Sequence[str]) -> list[int]:
+    """Return parents in which every tree of joints hangs on the root of the largest.
+
+    A hierarchy that is flat, all joints side by side, stays as it is: its joints do have parents, but the file does not
+    tell them.
+    """
+    joined, roots = list(parents), [index for index, parent in enumerate(parents) if parent == -1]
+    if len(roots) < 2 or len(roots) > max(_FIT.most_roots, len(parents) // 2):
+        return joined
+    tops = list(range(len(parents)))
+    for index in parents_first(parents):
+        tops[index] = index if parents[index] < 0 else tops[parents[index]]
+    main = max(roots, key=tops.count)
+    for root in roots:
+        joined[root] = -1 if root == main else main
+    others = ", ".join(repr(names[root]) for root in roots[:6] if root != main)
+    warnings.warn(
+        f"the skeleton has {len(roots)} roots: {others} hang on {names[main]!r}, the root of most joints; "
+        f"parents= says otherwise",
+        FileWarning,
+        stacklevel=2,
+    )
+    return joined
 
 
 def spec_from_arrays(
@@ -86,7 +118,8 @@ def spec_from_arrays(
     tree, last_frame = _ball_joint_tree(order, parent_list, names, frames, used, axes=axes or {}, limits=limits or {})
     parts = [index for index in order if bool(weights[:, index].max() > 0)]
     part_frames = tuple(last_frame[index] for index in parts)
-    solids = [fitted_solid(_owned_vertices(vertices, weights, index), primitive) for index in parts]
+    owners = weights.argmax(-1)
+    solids = [fitted_solid(_owned_vertices(vertices, weights[:, index], owners == index), primitive) for index in parts]
     nu = fusion_length(solids, _FIT.nu_per_thickness)
     neighbors = neighbor_matrix(part_parents(tree, [tree.index(name) for name in part_frames]))
     spread = torch.linspace(0, len(vertices) - 1, min(len(vertices), _FIT.refined_points)).long()
@@ -222,12 +255,11 @@ def _as_unit_axis(axis: str | Sequence[float], name: str) -> tuple[float, float,
     return (x, y, z)
 
 
-def _owned_vertices(vertices: Tensor, weights: Tensor, joint: int) -> Tensor:
-    """Return the vertices (N, 3) that follow a joint most; if they are few, those with the largest weights."""
-    owned = vertices[weights.argmax(-1) == joint]
-    if len(owned) < _FIT.min_owned:
-        owned = vertices[weights[:, joint].topk(min(_FIT.min_owned, len(vertices))).indices]
-    return owned
+def _owned_vertices(vertices: Tensor, weights: Tensor, owned: Tensor) -> Tensor:
+    """Return the vertices (N, 3) that follow a joint most; if they are few, those with the largest weights (V,)."""
+    if int(owned.sum()) < _FIT.min_owned:
+        return vertices[weights.topk(min(_FIT.min_owned, len(vertices))).indices]
+    return vertices[owned]
 
 
 def _in_joint_frame(solid: Primitive, joint: int, frames: Tensor, parents: Sequence[int]) -> Primitive:

@@ -49,12 +49,12 @@ def spec_from_urdf(
     *,
     package_dirs: Sequence[str | Path] = (),
     primitive: str = "auto",
-    meshes: str = "require",
+    meshes: str = "warn",
 ) -> ShapeSpec:
     """Return the `ShapeSpec` of a URDF robot; see `ArticulatedShape.from_urdf`."""
     check_choice(primitive, "primitive", SOLID_CHOICES)
     record = load_urdf(path, package_dirs=[Path(folder) for folder in package_dirs], meshes=meshes)
-    return _spec_of(record, primitive, f"no link of {path} has geometry: there is nothing to align")
+    return _spec_of(record, primitive, f"{path}: no link has geometry that can be read: there is nothing to align")
 
 
 def spec_from_chain(chain: Chain) -> ShapeSpec:

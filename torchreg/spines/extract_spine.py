@@ -12,6 +12,8 @@ from torch import Tensor
 
 from torchreg._checks import check_count, warn_about_rounding
 from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.far_origin import far_origin
+from torchreg.geometry.loaded import mesh_of
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.result import Status
@@ -131,6 +133,13 @@ def extract_spine(
         raise InputError(
             "prior cannot be used by SpineConfig.paper(), which knows of none; leave it out, or use SpineConfig()"
         )
+    origin = far_origin([mesh.vertices for mesh in meshes])
+    if origin is not None:
+        near = [TriangleMesh(mesh.vertices - origin.to(mesh.vertices), mesh.faces) for mesh in meshes]
+        return extract_spine(
+            near, times=times, prior=prior, config=config, workers=workers, on_step=on_step,
+            progress=progress,
+        ).moved(origin)  # fmt: skip
     known = None if prior is None else PriorSkeleton.from_given(prior, config.num_tips)
     first = meshes[0].vertices
     warn_about_rounding(first, "meshes", float((first.amax(0) - first.amin(0)).norm()), stacklevel=2)
@@ -171,12 +180,10 @@ def _check_meshes(meshes: Sequence[TriangleMesh]) -> list[TriangleMesh]:
     """Return the frames as a list; raise InputError or InputTypeError unless each is a mesh with faces."""
     if isinstance(meshes, TriangleMesh):
         raise InputTypeError("meshes must be a sequence of TriangleMesh, got one mesh; put it into a list")
-    meshes = list(meshes)
+    meshes = [mesh_of(mesh, f"meshes[{frame}]") for frame, mesh in enumerate(meshes)]
     if not meshes:
         raise InputError("meshes must hold at least one frame, got none")
     for frame, mesh in enumerate(meshes):
-        if not isinstance(mesh, TriangleMesh):
-            raise InputTypeError(f"meshes[{frame}] must be a TriangleMesh, got {type(mesh).__name__}")
         if not mesh.num_faces:
             raise InputError(f"meshes[{frame}] must have faces, got none; leave out frames without a surface")
     return meshes

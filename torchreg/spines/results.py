@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 from torch import Tensor
@@ -54,6 +54,8 @@ class SpineSequence(Result):
         statuses: per frame.
         status: WITH_WARNINGS if any frame's is, else CONVERGED.
         warnings: irregularities, with the number of the frame.
+        origin: (3,) float64 about which it was computed, where the surfaces, in float64, lie far from that of
+            coordinates; None elsewhere.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -75,6 +77,18 @@ class SpineSequence(Result):
     statuses: tuple[Status, ...]
     status: Status
     warnings: tuple[str, ...]
+    origin: Tensor | None = None
+
+    def moved(self, origin: Tensor) -> SpineSequence:
+        """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
+        curves = self.curves.double() + origin
+        radii, frames = self.radii.double(), self.frames.double()
+        model = Spine(curves, self.graph, radii=radii, frames=frames, times=self.times.double())
+        return replace(self, model=model, curves=curves, radii=radii, frames=frames, origin=origin)
+
+    def local(self) -> SpineSequence:
+        """Return the result in coordinates that begin at its origin; itself without one."""
+        return self if self.origin is None else replace(self.moved(-self.origin), origin=None)
 
     @property
     def num_tips(self) -> int:

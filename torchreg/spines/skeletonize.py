@@ -9,8 +9,10 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_choice, check_count, check_positive
-from torchreg.errors import InputError, InputTypeError
+from torchreg.errors import InputError
+from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.geodesics import GeodesicGraph
+from torchreg.geometry.loaded import mesh_of
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton, build_skeleton
 from torchreg.geometry.spread import SPREADS, spread_dimensions
@@ -101,9 +103,13 @@ def skeletonize(mesh: TriangleMesh, config: SkeletonizeConfig | None = None) -> 
 
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1, eq. 4 and 5.
     """
-    if not isinstance(mesh, TriangleMesh):
-        raise InputTypeError(f"mesh must be a TriangleMesh, got {type(mesh).__name__}")
+    mesh = mesh_of(mesh, "mesh")
     config = SkeletonizeConfig() if config is None else config
+    origin = far_origin(mesh.vertices)
+    if origin is not None:
+        offset = origin.to(mesh.vertices)
+        found = skeletonize(TriangleMesh(mesh.vertices - offset, mesh.faces), config)
+        return replace(found, nodes=found.nodes + offset)
     body = _prepared(mesh, config)
     tips = _find_tips(body, config)  # section 4.1: maxima of the average geodesic distance
     # "Growing Skeletons": rings of the distance from each tip; "Merging Skeletons", figure 3B.

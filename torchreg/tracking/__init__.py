@@ -1,4 +1,4 @@
 """The pose of a shape over time.
 
-Besides the public names, the command line may use `run_demo`, `moved_to_mean` and `DEMO_FPS`.
+Besides the public names, the command line may use `run_demo` and `DEMO_FPS`.
 """

@@ -10,7 +10,6 @@ from torch import Tensor
 from torchreg.datasets.hand import HandCloud
 from torchreg.datasets.sequences import hand_sequence
 from torchreg.shapes.hand import Hand
-from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.tracking.results import DemoResult, FrameResult, TrackResult
 from torchreg.tracking.tracker import TrackConfig, Tracker
 
@@ -59,13 +58,6 @@ def run_demo(
     times = [frame / DEMO_FPS for frame in range(len(clouds))]
     track = Tracker(hand, config=config).run([cloud.points for cloud in clouds], keep_inliers, times=times)
     return _with_truth(hand, track, clouds[: len(track.poses)], inliers, seed)
-
-
-def moved_to_mean(skin: LinearBlendSkin, pose: Tensor, cloud: Tensor) -> Tensor:
-    """Return a pose (num_dofs,) translated so that the mean of the posed skin is the mean of a cloud (M, 3), metres."""
-    with torch.no_grad():
-        offset = cloud.to(pose).mean(0) - skin(pose).mean(0)
-    return torch.cat([pose[:3] + offset, pose[3:]])
 
 
 def _with_truth(

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from torchreg.alignment.annealed_em import ANNEALING
 from torchreg.alignment.inputs import UNITS
-from torchreg.alignment.problem import AlignProblem, shifted
+from torchreg.alignment.problem import AlignProblem
 from torchreg.alignment.surface_fit import SURFACE_FIT
+from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import stacked_rows
 from torchreg.tracking.results import TrackState
 

@@ -12,11 +12,12 @@ from torch import Tensor
 from torchreg.alignment.align import AlignConfig
 from torchreg.alignment.annealed_em import anneal
 from torchreg.alignment.objectives import GaussianPosePrior
-from torchreg.alignment.problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem, shifted
+from torchreg.alignment.problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, SurfaceResult, pose_covariance, refine_surface, surface_noise
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.limbs import find_limbs
+from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin, stacked_rows
 from torchreg.solvers.robust import welsch_weight
 from torchreg.tracking.config import TrackConfig

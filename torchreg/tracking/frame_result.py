@@ -81,4 +81,5 @@ def track_result(results: Sequence[FrameResult], seconds: Sequence[float]) -> Tr
         seconds=torch.tensor(list(seconds), dtype=torch.float64),
         statuses=tuple(result.statuses[0] for result in results),
         acquired=tuple(result.acquired for result in results),
+        origin=results[-1].origin,
     )

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 from torch import Tensor
 
 from torchreg.alignment.results import AlignResult
 from torchreg.result import Result, Status, formerly
+from torchreg.shapes.pose_algebra import shifted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +60,7 @@ class TrackResult(Result):
         seconds: (T,) that each frame took.
         statuses: how each frame ended.
         acquired: what led to each pose, see `FrameResult`.
+        origin: see `AlignResult`.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -75,6 +77,12 @@ class TrackResult(Result):
     seconds: Tensor
     statuses: tuple[Status, ...]
     acquired: tuple[str, ...]
+    origin: Tensor | None = None
+
+    def moved(self, origin: Tensor) -> TrackResult:
+        """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
+        poses, keypoints = shifted(self.poses.double(), origin), self.keypoints.double() + origin
+        return replace(self, poses=poses, keypoints=keypoints, origin=origin)
 
 
 @dataclass(frozen=True)
@@ -105,6 +113,7 @@ class TrackState(Result):
         failed_searches: searches in a row after which the fit was still doubtful.
         pending_checks: how often a pose found by a search everywhere is still to be compared with another search.
         seed: of all that is drawn.
+        origin: (3,) float64 about which all this is, where clouds lie far from that of coordinates; None elsewhere.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -134,6 +143,7 @@ class TrackState(Result):
     failed_searches: int = field(metadata=formerly("fails"))
     pending_checks: int = field(metadata=formerly("unsure"))
     seed: int
+    origin: Tensor | None = None
 
     @property
     def found(self) -> bool:

@@ -13,10 +13,12 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_finite, check_shape, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.alignment.align import AlignConfig, align
-from torchreg.alignment.inputs import check_skin, warn_about_degenerate, warn_about_units
+from torchreg.alignment.inputs import check_skin, floating_origin, warn_about_degenerate, warn_about_units
 from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.loaded import points_of
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.tracking.config import TrackConfig
 from torchreg.tracking.evidence import deviates_far, is_doubtful, is_supported, is_unreliable, update_means
@@ -77,7 +79,10 @@ class Tracker:
         with torch.no_grad():
             self._fitter = FrameFitter(shape, self.config, model_points)
             self._recover = Recovery(self._fitter)
-            self._state = self._initial_state(self._checked_pose(initial_pose))
+            pose = self._checked_pose(initial_pose)
+            # In full precision, for clouds far from the origin.
+            self._start = pose if initial_pose is None else torch.as_tensor(initial_pose, dtype=torch.float64)
+            self._state = self._initial_state(pose)
 
     @property
     def state(self) -> TrackState:
@@ -122,8 +127,10 @@ class Tracker:
 
         Differentiable: no.
         """
-        cloud = self._checked_points(points)
+        points = points_of(points)
         self._check_time(time)
+        self._place_origin(points)
+        cloud = self._checked_points(points)
         state, elapsed = advance_clock(self._state, time)
         # A tenth faster than without gradients alone, as most of the time goes to small operations.
         with torch.inference_mode(), one_thread(), self.shape.held_sizes():
@@ -142,7 +149,8 @@ class Tracker:
                 fit, state = self._recover.cross_check(state, frame, fit)
                 result, state = self._accept(state, frame, fit)
             self._state = normal_copy(state)
-            return normal_copy(result)
+            found = normal_copy(result)
+        return found if state.origin is None else found.moved(state.origin)
 
     def run(
         self, frames: Iterable[Tensor], on_frame: OnFrame | None = None, *, times: Sequence[float] | None = None
@@ -187,7 +195,18 @@ class Tracker:
         check_finite(pose, "initial_pose")
         return self.shape.clamp(pose)
 
+    def _place_origin(self, points: Tensor) -> None:
+        """Track about an origin near the first cloud where that lies far from the origin of coordinates."""
+        if self._state.frame > 0 or self._state.origin is not None:
+            return
+        origin = floating_origin(self.shape, points)
+        if origin is not None:
+            start = shifted(self._start.double(), -origin).to(self.shape.rest)
+            self._state = replace(self._state, origin=origin, pose=start)
+
     def _checked_points(self, points: Tensor) -> Tensor:
+        if self._state.origin is not None:
+            points = as_float_tensor(points, "points").double() - self._state.origin
         cloud = as_float_tensor(points, "points", like=self.shape.rest)
         check_shape(cloud, "points", ("M", 3))
         if self.config.nan_policy == "raise":

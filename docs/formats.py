@@ -1,0 +1,60 @@
+"""Writes the page of file formats from the table of readers: `python docs/formats.py`."""
+
+from pathlib import Path
+
+from torchreg.io.formats import KINDS, table_rows
+
+PAGE = Path(__file__).with_name("formats.md")
+HEAD = """# File formats
+
+`torchreg formats` prints this table, which is made from the readers themselves (`python docs/formats.py`).
+
+A format is told by what a file holds; where that does not tell, by its ending. So a PLY file that is called
+`scan.obj` is read as what it is. Clouds, meshes and tables may be packed by gzip (`scan.ply.gz`). Byte order marks
+do no harm, nor does text that Windows wrote in UTF-16.
+
+"""
+TAIL = """
+## What is read out of tables
+
+The first line of a table of points may name its columns (`X,Y,Z,R,G,B`, `x [m];y [m];z [m]`, `Points:0,...`, also
+behind `//` or `#`), or hold the number of points alone. Without names x, y, z come first, and what follows is told
+by its numbers: unit vectors are normals; whole numbers up to 255 or 65535, or numbers from 0 to 1, are colors; the
+rest is passed over, as intensity and time are. Numbers may have decimal commas where semicolons, tabs or blanks
+stand between the columns.
+
+## What is put right, and what is told
+
+* Coordinates far from the origin, as in maps, are read in double precision, and every system computes about an
+  origin near them, which results tell as `origin`. What they return is in the coordinates of the file.
+* `scale=0.001` (`--scale 0.001`) reads millimeters as metres. Data and shape, or two scans, whose sizes differ by
+  more than thirtyfold give a warning that names the factor.
+* A skinned glTF mesh stands as viewers show it: in the pose of its nodes, or at `time=` or `frame=` of its
+  animation.
+* Files sort by the numbers in their names: `0.5, 1.25, 1.5, 10`.
+* In a mask the brighter of two values is set, whatever they are; transparency that varies is the mask; in a picture
+  of labels all but zero is set.
+* Whole numbers in depth images are millimeters, floating-point ones metres, unless `depth_scale` says otherwise;
+  65535 is no depth.
+* A piece of a file that cannot be used is left out with a warning that counts it: faces of two corners, normals
+  that are not finite, vertices without skin weight, links whose mesh is missing.
+"""
+
+
+def page() -> str:
+    """Return the text of the page."""
+    parts = []
+    for kind in KINDS:
+        rows = [
+            f"| {name} | {' '.join(f'`{ending}`' for ending in endings.split())} | {holds} | `{loader}` |"
+            for row_kind, name, endings, holds, loader in table_rows()
+            if row_kind == kind
+        ]
+        parts.append(
+            f"## {kind.capitalize()}\n\n| format | endings | what is read | by |\n|---|---|---|---|\n" + "\n".join(rows)
+        )
+    return HEAD + "\n\n".join(parts) + "\n" + TAIL
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

@@ -1,0 +1,157 @@
+"""Cameras as other programs write them, and numbers that cannot be what they are taken for."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from torchreg.errors import FileWarning, FormatError
+from torchreg.io.calibration import load_cameras, load_depth_camera
+
+WANTED = [60.0, 61.0, 31.5, 23.5]
+ROWS = [60.0, 0.0, 31.5, 0.0, 61.0, 23.5, 0.0, 0.0, 1.0]
+COLUMNS = np.array(ROWS).reshape(3, 3).T.reshape(-1).tolist()
+SIZE = {"width": 64, "height": 48}
+PLAIN = SIZE | dict(zip(("fx", "fy", "cx", "cy"), WANTED, strict=True))
+POSE = np.array([[0.0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3]])
+CAMERA_INFO = "\n".join([
+    "header:", "  frame_id: camera", "height: 48", "width: 64", "distortion_model: plumb_bob",
+    "d:", *["- 0.0"] * 5, "k:", *[f"- {v}" for v in ROWS], "r:", *[f"- {v}" for v in np.eye(3).reshape(-1)],
+    "p:", *[f"- {v}" for v in [*ROWS[:3], 0.0, *ROWS[3:6], 0.0, *ROWS[6:], 0.0]], "binning_x: 0", "---", "",
+])  # fmt: skip
+CALIBRATOR = (
+    "image_width: 64\nimage_height: 48\ncamera_name: head\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
+    f"  data: {ROWS}\ndistortion_model: plumb_bob\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n"
+    "  data: [0.01, -0.02, 0.0, 0.0, 0.0]\nrectification_matrix:\n  rows: 3\n  cols: 3\n"
+    "  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nprojection_matrix:\n  rows: 3\n  cols: 4\n"
+    "  data: [60, 0, 31.5, 0, 0, 61, 23.5, 0, 0, 0, 1, 0]\n"
+)
+
+
+def saved(tmp_path, content, name="camera.json"):
+    path = tmp_path / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        SIZE | {"intrinsic_matrix": COLUMNS},
+        SIZE | {"intrinsic_matrix": COLUMNS, "color_mode": "MJPG_720P", "serial_number_": "1", "stream_length_usec": 9},
+        {"class_name": "PinholeCameraParameters", "intrinsic": SIZE | {"intrinsic_matrix": COLUMNS}},
+        SIZE | {"ppx": 31.5, "ppy": 23.5, "fx": 60.0, "fy": 61.0, "model": "distortion.inverse_brown_conrady",
+                "coeffs": [0.0] * 5},
+        PLAIN | {"blur_score": 71.2, "timestamp": 1234567, "neighbors": [1, 2], "center_depth": 1.0},
+        {"w": 64, "h": 48, "K": COLUMNS, "fps": 30},
+        {"w": 64.0, "h": 48.0, "fl_x": 60.0, "fl_y": 61.0, "cx": 31.5, "cy": 23.5, "camera_angle_x": 0.98},
+        {"image_width": 64, "image_height": 48, "K": ROWS, "D": [0.0] * 5, "distortion_model": "plumb_bob",
+         "R": [1, 0, 0, 0, 1, 0, 0, 0, 1], "P": [*ROWS, 0, 0, 0]},
+        {"image_size": [64, 48], "K": np.array(ROWS).reshape(3, 3).tolist(), "dist": [[0.0] * 5]},
+        SIZE | {"camera_matrix": np.array(ROWS).reshape(3, 3).tolist(), "dist_coeffs": []},
+        SIZE | {"intrinsics": WANTED},
+        SIZE | {"camera_matrix": {"rows": 3, "cols": 3, "data": ROWS}, "distortion_coefficients": {"data": [0.0] * 5}},
+    ],
+)  # fmt: skip
+def test_json_of_other_programs(tmp_path, entry):
+    path = saved(tmp_path, entry)
+    camera, scale = load_depth_camera(path)
+    assert (camera.width, camera.height) == (64, 48)
+    assert camera.intrinsics.tolist() == WANTED
+    assert not camera.is_distorted
+    assert scale is None
+    assert load_cameras(path)[0].intrinsics.tolist() == WANTED
+
+
+@pytest.mark.parametrize("name", ["ost.yaml", "head.yml", "calibration"])
+@pytest.mark.parametrize("text", [CAMERA_INFO, CALIBRATOR, f"# by hand\nwidth: 64\nheight: 48\nK: {ROWS}\nD: [0, 0]\n"])
+def test_yaml_of_ros(tmp_path, name, text):
+    if name == "calibration":
+        with pytest.raises(FormatError, match="has the unknown ending"):
+            load_cameras(saved(tmp_path, text, name))
+        return
+    (camera,) = load_cameras(saved(tmp_path, text, name))
+    assert (camera.width, camera.height, camera.intrinsics.tolist()) == (64, 48, WANTED)
+    assert torch.equal(camera.world_to_camera, torch.eye(4, dtype=torch.float64))
+    assert load_depth_camera(tmp_path / name)[0].intrinsics.tolist() == WANTED
+
+
+def test_lenses_are_kept(tmp_path):
+    lens = [0.1, -0.2, 0.01, 0.02, 0.3]
+    by_name = dict(zip(("k1", "k2", "p1", "p2", "k3"), lens, strict=True))
+    for entry in (PLAIN | {"coeffs": lens, "model": "brown_conrady"}, PLAIN | by_name, PLAIN | {"D": [lens]}):
+        assert load_cameras(saved(tmp_path, entry))[0].distortion.tolist() == [*lens, 0, 0, 0]
+
+
+def test_poses_of_polycam_and_open3d(tmp_path):
+    entries = {f"t_{row}{column}": POSE[row, column] for row in range(3) for column in range(4)}
+    camera = load_depth_camera(saved(tmp_path, PLAIN | entries))[0]
+    # Polycam's cameras look along -z, y up: its third column is backwards.
+    np.testing.assert_allclose(camera.camera_to_world[:3], POSE * [1, -1, -1, 1], atol=1e-12)
+    whole = np.vstack([POSE, [0, 0, 0, 1]])
+    trajectory = {
+        "class_name": "PinholeCameraTrajectory",
+        "parameters": [{"extrinsic": whole.T.reshape(-1).tolist(), "intrinsic": SIZE | {"intrinsic_matrix": COLUMNS}}],
+    }
+    np.testing.assert_allclose(load_cameras(saved(tmp_path, trajectory))[0].world_to_camera, whole)
+
+
+@pytest.mark.parametrize("model", ["equidistant", "fisheye", "distortion.kannala_brandt4", "inverse_brown_conrady"])
+def test_lenses_of_other_kinds_are_refused(tmp_path, model):
+    lens = [0.2, -0.1, 0.05, -0.02]
+    with pytest.raises(FormatError, match=rf"camera\.json.*'{model}' is not a pinhole camera's"):
+        load_cameras(saved(tmp_path, PLAIN | {"distortion_model": model, "D": lens}))
+    yaml = f"width: 64\nheight: 48\ndistortion_model: {model}\nK: {ROWS}\nD: {lens}\n"
+    with pytest.raises(FormatError, match=rf"camera\.yml: .*'{model}' is not a pinhole camera's"):
+        load_cameras(saved(tmp_path, yaml, "camera.yml"))
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        (PLAIN | {"distorsion": [0.1, 0, 0, 0]}, "holds distorsion, which no camera has; is it distortion?"),
+        (PLAIN | {"depthscale": 0.001}, "is it depth_scale?"),
+        (SIZE | {"K": [1, 2, 3]}, r"K must hold 3 x 3 numbers \(or fx, fy, cx, cy\), got 3"),
+        (SIZE | {"K": [60, 5, 31.5, 0, 61, 23.5, 0, 0, 1]}, "K must be fx 0 cx, 0 fy cy, 0 0 1"),
+        (SIZE | {"K": ["a"] * 9}, "K must hold numbers, got"),
+        ({"K": ROWS}, "lacks width, height"),
+    ],
+)
+def test_what_is_no_camera_is_told(tmp_path, entry, words):
+    with pytest.raises(FormatError, match=words):
+        load_cameras(saved(tmp_path, entry))
+
+
+def pair(step):
+    lines = ["%YAML:1.0", "---", "image_width: 64", "image_height: 48"]
+    for name, values, columns in (
+        ("M1", ROWS, 3), ("D1", [0.0] * 5, 5), ("M2", ROWS, 3), ("D2", [0.0] * 5, 5),
+        ("R", np.eye(3).reshape(-1).tolist(), 3), ("T", [step, 0.3, 0.1], 1),
+    ):  # fmt: skip
+        lines.append(f"{name}: !!opencv-matrix\n   rows: {len(values) // columns}\n   cols: {columns}\n   dt: d")
+        lines.append(f"   data: {values}")
+    return "\n".join(lines) + "\n"
+
+
+def test_a_baseline_in_millimeters_is_told_and_scaled(tmp_path):
+    path = saved(tmp_path, pair(-60.02), "stereo.yml")
+    with pytest.warns(FileWarning, match=r"stereo\.yml: the cameras of the pair are 60\.02 m apart.*scale=0\.001"):
+        load_cameras(path)
+    rig = load_cameras(path, scale=0.001)
+    assert float(rig[1].world_to_camera[:3, 3].norm()) == pytest.approx(0.06002, abs=1e-5)
+
+
+def test_images_of_colmap_are_told_by_what_their_lines_hold(tmp_path):
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 64 48 60 60 32 24\n")
+    image = "{} 1 0 0 0 0 0 {} 1 {}.png"
+    points = "1.5 2.5 -1 3.5 4.5 7"
+    lines = [image.format(k, k, name) for k, name in enumerate("abcd", start=1)]
+    for text in (
+        lines,
+        [lines[0], points, lines[1], lines[2], "", lines[3], points],
+        [lines[0], "", *lines[1:]],
+        ["", "# comment", lines[0], points, *lines[1:]],
+    ):
+        (tmp_path / "images.txt").write_text("\n".join(text) + "\n")
+        assert [camera.name for camera in load_cameras(tmp_path)] == ["a.png", "b.png", "c.png", "d.png"]

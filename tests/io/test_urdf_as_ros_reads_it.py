@@ -1,0 +1,169 @@
+"""Robot descriptions as ROS's tools read them: XML that is not strict, meshes that are elsewhere or missing."""
+
+import pytest
+import trimesh
+
+from torchreg.errors import FileWarning, FormatError, ModelError
+from torchreg.io.urdf import load_urdf
+from torchreg.shapes.articulated import ArticulatedShape
+
+BOX = "<box size='0.1 0.08 0.4'/>"
+
+
+def link(name, shape=BOX, tag="visual", origin="<origin xyz='0 0 0.2'/>"):
+    return f"<link name='{name}'><{tag}>{origin}<geometry>{shape}</geometry></{tag}></link>"
+
+
+def joint(child, kind="revolute", limits="<limit lower='-2.2' upper='2.2'/>", parent="base"):
+    return (
+        f"<joint name='to_{child}' type='{kind}'><parent link='{parent}'/><child link='{child}'/>"
+        f"<origin xyz='0 0 0.4'/><axis xyz='0 1 0'/>{limits}</joint>"
+    )
+
+
+def robot(*parts, head="<robot name='arm'>", end="</robot>"):
+    return head + "\n" + "\n".join(parts) + "\n" + end + "\n"
+
+
+ARM = robot(link("base"), link("tip"), joint("tip"))
+
+
+def saved(tmp_path, content, name="arm.urdf"):
+    path = tmp_path / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        ARM.replace("<robot name", "<robot xmlns='http://www.ros.org' name"),
+        ARM.replace("<robot name", "<robot xmlns:xi='http://www.w3.org/2001/XInclude' name"),
+        ARM.replace("</robot>", "<sensor:camera name='eye'><rate>30</rate></sensor:camera></robot>"),
+        ARM.replace("<", "<u:").replace("<u:/", "</u:").replace("<u:robot", "<u:robot xmlns:u='http://ros.org'"),
+        "<!-- generated -->\n<?xml version='1.0'?>\n" + ARM,
+        "<!-- a -->\n<!-- b -->\n\n<?xml version='1.0' encoding='UTF-8'?>\n" + ARM,
+        ARM.replace("</robot>", "<!-- <link name='old'/> -- kept for later --></robot>"),
+        ARM.replace("</robot>", "<!-- <link name='old'><!-- inner --></link> --></robot>"),
+        ARM + "\0\0\n",
+        b"\xef\xbb\xbf" + ARM.encode(),
+        ("<?xml version='1.0' encoding='utf-16'?>" + ARM).encode("utf-16"),
+        b"\r\n \n<?xml version='1.0'?>" + ARM.replace("\n", "\r\n").encode(),
+    ],
+)
+def test_xml_that_is_not_strict(tmp_path, content):
+    record = load_urdf(saved(tmp_path, content))
+    assert record.link_names == ("base", "tip")
+    assert [len(solids) for solids in record.link_primitives] == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (
+            "<!-- from <xacro:include/> -->\n" + robot(link("base"), end=""),
+            "it ends at line . before an element is closed",
+        ),
+        (robot(link("base"), "<link name='b'></joint>"), r"mismatched tag: line 3, column"),
+        (robot("<xacro:macro name='m'/>"), "holds xacro macros"),
+        ("version https://git-lfs.github.com/spec/v1\nsize 1\n", "is a Git LFS pointer"),
+    ],
+)
+def test_the_true_cause_is_told(tmp_path, content, words):
+    with pytest.raises(FormatError, match=rf"arm\.urdf: .*{words}"):
+        load_urdf(saved(tmp_path, content))
+
+
+@pytest.mark.parametrize("kind", ["floating", "planar"])
+def test_joints_of_several_degrees_of_freedom_are_held(tmp_path, kind):
+    with pytest.warns(FileWarning, match=f"joint 'to_tip' is {kind}; it is held fixed"):
+        record = load_urdf(saved(tmp_path, robot(link("base"), link("tip"), joint("tip", kind, ""))))
+    assert [frame.kind for frame in record.tree.joints] == ["fixed", "fixed"]
+    assert record.tree.joints[1].offset[:3, 3].tolist() == [0, 0, 0.4]
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        (
+            "<box size='0 0 0'/>",
+            r"visual of link 'tip' is left out: <box> needs a positive size, got \(0\.0",
+        ),
+        ("<cylinder radius='1'/>", "<cylinder> needs a positive radius and length"),
+        ("<plane normal='0 0 1'/>", "its geometry <plane> is none of mesh, box"),
+        ("<mesh/>", "its <mesh> has no filename"),
+    ],
+)
+def test_geometry_that_is_none_is_left_out(tmp_path, shape, words):
+    path = saved(tmp_path, robot(link("base"), link("tip", shape), joint("tip")))
+    with pytest.warns(FileWarning, match=rf"arm\.urdf: .*{words}"):
+        assert ArticulatedShape.from_urdf(path).part_names == ("base",)
+
+
+def test_a_robot_without_any_geometry_is_refused(tmp_path):
+    told = pytest.warns(FileWarning, match="is left out")
+    with told, pytest.raises(ModelError, match=r"arm\.urdf: no link has geometry that can be read"):
+        ArticulatedShape.from_urdf(saved(tmp_path, robot(link("base", "<mesh/>"))))
+
+
+def test_links_beside_the_largest_tree_are_left_out(tmp_path):
+    path = saved(tmp_path, robot(link("base"), link("tip"), joint("tip"), link("table")))
+    with pytest.warns(FileWarning, match="1 of 3 links are left out, as no joint ties them to the largest tree: table"):
+        assert load_urdf(path).link_names == ("base", "tip")
+
+
+def test_limits_and_turns_in_degrees_and_doubled_origins_are_told(tmp_path):
+    limits = "<limit lower='-180' upper='180'/>"
+    with pytest.warns(FileWarning, match=r"'to_tip' has limits -180 to 180, .* write -3\.142 to 3\.142"):
+        load_urdf(saved(tmp_path, robot(link("base"), link("tip"), joint("tip", limits=limits))))
+    turned = link("base", origin="<origin rpy='0 0 90'/>")
+    with pytest.warns(FileWarning, match="visual of link 'base' is turned by rpy 0 0 90, which are radians"):
+        load_urdf(saved(tmp_path, robot(turned)))
+    twice = link("base", origin="<origin xyz='1 0 0'/><origin xyz='2 0 0'/>")
+    with pytest.warns(FileWarning, match="visual of link 'base' has 2 origins; the first counts"):
+        record = load_urdf(saved(tmp_path, robot(twice)))
+    assert record.link_primitives[0][0].origin[0, 3] == 1
+    for limits in ("<limit lower='-6.3' upper='6.3'/>", "<limit lower='-1e16' upper='1e16'/>"):
+        load_urdf(saved(tmp_path, robot(link("base"), link("tip"), joint("tip", limits=limits))))
+
+
+@pytest.fixture
+def meshes(tmp_path):
+    """A package with a description in its folder urdf and a mesh in its folder meshes."""
+    package = tmp_path / "src" / "arm_description"
+    (package / "urdf").mkdir(parents=True)
+    (package / "meshes").mkdir()
+    trimesh.creation.box(extents=(2, 1, 1)).export(package / "meshes" / "Box.STL")
+    return package
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../meshes/Box.STL", "meshes/Box.STL", "package://arm_description/meshes/Box.STL",
+        "package://renamed/meshes/Box.STL", r"..\meshes\Box.STL", r"package://arm_description\meshes\Box.STL",
+        "../meshes/box.stl", "file:///home/someone/ws/src/arm_description/meshes/Box.STL",
+        r"C:\robots\arm_description\meshes\box.stl",
+    ],
+)  # fmt: skip
+def test_meshes_are_found_from_the_file_above_it_and_as_on_other_machines(meshes, name):
+    path = saved(meshes / "urdf", robot(link("base", f"<mesh filename='{name}'/>", origin="")))
+    (mesh,) = load_urdf(path, meshes="require").link_meshes
+    assert mesh.bounds()[1].tolist() == [1, 0.5, 0.5]
+
+
+def test_meshes_are_found_in_given_folders(meshes, tmp_path):
+    path = saved(tmp_path, robot(link("base", "<mesh filename='Box.STL'/>")))
+    assert load_urdf(path, package_dirs=[meshes / "meshes"], meshes="require").link_meshes[0] is not None
+
+
+def test_a_missing_visual_mesh_gives_way_to_other_geometry(tmp_path):
+    visual = "<visual><geometry><mesh filename='gone.stl'/></geometry></visual>"
+    collision = f"<collision><geometry>{BOX}</geometry></collision>"
+    path = saved(tmp_path, robot(f"<link name='base'>{visual}{collision}</link>"))
+    with pytest.warns(FileWarning, match=r"arm\.urdf: visual of link 'base': mesh file 'gone\.stl' was not found"):
+        record = load_urdf(path)
+    assert [solid.kind for solid in record.link_primitives[0]] == ["box"]
+    (tmp_path / "gone.stl").write_text("version https://git-lfs.github.com/spec/v1\nsize 1\n")
+    with pytest.warns(FileWarning, match=r"gone\.stl is a Git LFS pointer.*it is left out"):
+        assert [solid.kind for solid in load_urdf(path).link_primitives[0]] == ["box"]

@@ -1,0 +1,42 @@
+"""What loaders return, every system takes: clouds, scans, meshes, frames."""
+
+import pytest
+import torch
+
+import torchreg as tr
+from torchreg.errors import InputTypeError
+from torchreg.geometry.loaded import mesh_of, points_of, scan_of
+from torchreg.io.points import save_points
+
+
+@pytest.fixture
+def loaded(tmp_path, arm):
+    mesh = arm.surface_mesh()
+    path = tmp_path / "arm.ply"
+    save_points(path, mesh.vertices, faces=mesh.faces)
+    return tr.load_points(path), tr.load_mesh(path), tr.load_scan(path), tr.load_frames(path)[0]
+
+
+def test_points_scans_and_meshes_of_what_was_loaded(loaded):
+    cloud, mesh, scan, points = loaded
+    for value in loaded:
+        assert torch.equal(points_of(value), points)
+    for value in (cloud, mesh, scan):
+        assert torch.equal(scan_of(value, "source").points, points)
+        assert torch.equal(mesh_of(value, "mesh").faces, mesh.faces)
+    with pytest.raises(InputTypeError, match=r"source must be a RangeScan, got Tensor; .* load a file"):
+        scan_of(points, "source")
+    with pytest.raises(InputTypeError, match="mesh must be a TriangleMesh, got Tensor; load a file with load_mesh"):
+        mesh_of(points, "mesh")
+
+
+def test_systems_take_them(loaded, arm):
+    cloud, mesh, scan, points = loaded
+    start = arm.rest_pose()
+    wanted = tr.align(arm, points, start).pose
+    for value in (cloud, mesh, scan):
+        assert torch.equal(tr.align(arm, value, start).pose, wanted)
+    tracked = tr.Tracker(arm, start).run([cloud, mesh])
+    assert tracked.poses.shape == (2, arm.num_dofs)
+    assert torch.equal(tr.skeletonize(cloud).nodes, tr.skeletonize(mesh).nodes)
+    assert torch.equal(tr.register(cloud, mesh, 2, 8).deformed, tr.register(scan, scan, 2, 8).deformed)

@@ -1,0 +1,46 @@
+"""Coordinates far from the origin, as those of maps, which single precision rounds to decimetres."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class _Far:
+    """When points are far from the origin."""
+
+    ratio: float = 200.0  # distance over spread from which float32 rounds by more than 1e-5 of the spread
+    sample: int = 10_000  # points that tell
+
+
+_FAR = _Far()
+
+
+def far_origin(points: Tensor | Sequence[Tensor]) -> Tensor | None:
+    """Return an origin (3,), float64 on the CPU, near double-precision points that lie far from that of coordinates.
+
+    Its coordinates are whole numbers. None for points that float32 holds well, and for those in it already.
+
+    Args:
+        points: (..., 3), or several such tensors that share their coordinates.
+    """
+    tensors = [points] if isinstance(points, Tensor) else list(points)
+    if not tensors or any(tensor.dtype != torch.float64 for tensor in tensors):
+        return None
+    middle, spread = _middle(torch.cat([tensor.detach().reshape(-1, tensor.shape[-1]) for tensor in tensors]))
+    return middle.round() if middle is not None and float(middle.abs().max()) > _FAR.ratio * spread > 0 else None
+
+
+def _middle(points: Tensor) -> tuple[Tensor | None, float]:
+    """Return the median (3,) of points (N, 3) and their spread, neither of which a few strays change much."""
+    sample = points[:: max(1, len(points) // _FAR.sample)].cpu()
+    sample = sample[torch.isfinite(sample).all(-1)]
+    if not len(sample):
+        return None, 0.0
+    middle = sample.median(0).values
+    spread = float((sample - middle).abs().median(0).values.norm())
+    return middle, spread or float((sample.amax(0) - sample.amin(0)).norm())

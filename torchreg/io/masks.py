@@ -1,0 +1,93 @@
+"""Masks from pictures as programs write them: two values of any kind, labels, soft edges, transparency, palettes."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from torchreg.errors import FileWarning
+from torchreg.io.raw_cloud import Array
+
+
+@dataclass(frozen=True)
+class _Labels:
+    """How pictures of labels are told from masks with soft edges."""
+
+    interior: float = 0.5  # share of the pixels between dark and bright whose four neighbors are equal to them
+
+
+_LABELS = _Labels()
+
+
+def mask_of_picture(image: Any) -> Array:
+    """Return the mask (H, W) of an open picture of PIL.
+
+    Transparency that varies is the mask. Otherwise the brighter of two values is set, whatever they are; in a picture
+    of labels all but black or zero; elsewhere what is at least as bright as half between the darkest and the brightest
+    pixel.
+    """
+    kind = str(image.mode)
+    if kind in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
+        alpha = np.array(image.convert("RGBA"))[..., 3]
+        if alpha.min() < alpha.max():
+            return mask_of_numbers(alpha)
+    if kind in ("P", "PA") or kind in ("RGBA", "RGBa", "CMYK", "YCbCr", "LAB", "HSV"):
+        image = image.convert("RGB")
+    elif kind in ("LA", "La"):
+        image = image.convert("L")
+    return mask_of_numbers(np.array(image))
+
+
+def mask_of_numbers(values: Array) -> Array:
+    """Return the mask (H, W) of numbers (H, W), or colors (H, W, 3); see `mask_of_picture`. NaN is not set."""
+    if values.dtype == bool:
+        return _told(values)
+    values = _brightness(values) if values.ndim == 3 else values
+    known = np.isfinite(values) if values.dtype.kind == "f" else np.ones(values.shape, bool)
+    if not known.any():
+        return _told(known)
+    low, high = (float(f(values[known])) for f in (np.min, np.max))
+    if low == high:
+        return _told(known & (values != 0))
+    ends = known & ((values == low) | (values == high))
+    if ends.sum() == known.sum():
+        return _told(known & (values == high))
+    if values.dtype.kind != "f" and low == 0 and _has_labels(values, ~ends):
+        count = len(np.unique(values)) - 1
+        warnings.warn(f"holds {count} labels: all but 0 are set", FileWarning, stacklevel=2)
+        return values != 0
+    if values.dtype.kind == "f" and low < 0:  # scores whose sign decides
+        return _told(known & (values > 0))
+    with np.errstate(invalid="ignore"):
+        return _told(known & (values >= 0.5 * (low + high)))
+
+
+def _brightness(colors: Array) -> Array:
+    """Return the largest channel (H, W); the sum of all where two colors share it."""
+    colors = colors[..., :3].astype(np.int64)
+    largest = colors.max(-1)
+    return largest if largest.min() < largest.max() else colors.sum(-1)
+
+
+def _has_labels(values: Array, between: Array) -> bool:
+    """Return whether pixels (H, W) between the extremes lie in regions of one value, not along edges."""
+    same = np.ones(values.shape, bool)
+    for axis in (0, 1):
+        step = np.diff(values.astype(np.int64), axis=axis) == 0
+        border = np.ones_like(step[:1] if axis == 0 else step[:, :1])
+        same &= np.concatenate((step, border), axis) & np.concatenate((border, step), axis)
+    return bool((same & between).sum() > _LABELS.interior * between.sum())
+
+
+def _told(mask: Array) -> Array:
+    """Return a mask, after a warning if it keeps all or nothing."""
+    if mask.all() or not mask.any():
+        warnings.warn(
+            f"the mask {'keeps all' if mask.all() else 'keeps none'} of its {mask.size} pixels; is it the right file?",
+            FileWarning,
+            stacklevel=2,
+        )
+    return mask
