@@ -110,7 +110,8 @@ class Result:
         return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
 
     def _summaries(self) -> list[tuple[str, str]]:
-        return [(item.name, _field_summary(getattr(self, item.name))) for item in fields(self)]  # type: ignore[arg-type]
+        values = ((item.name, getattr(self, item.name)) for item in fields(self))  # type: ignore[arg-type]
+        return [(name, _field_summary(value)) for name, value in values if value is not None]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result to ``path``, which ends in .safetensors, and a JSON file beside it.

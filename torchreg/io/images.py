@@ -127,7 +127,7 @@ def load_mask(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMI
     with naming(file):
         check_stand_in(content)
         if file.suffix.lower() == ".npy":
-            return torch.from_numpy(mask_of_numbers(_read_npy(content, file)))
+            return torch.from_numpy(mask_of_numbers(_read_npy(content, file)).copy())
         return torch.from_numpy(_opened(content, file, mask_of_picture))
 
 
