@@ -42,7 +42,8 @@ PARSER_ERRORS = (
 )  # fmt: skip
 
 CLOUDS = "point clouds and meshes"
-_OBJ_START = re.compile(rb"(\s*#[^\n]*\n|\s*\n|\s*(mtllib|usemtl|o|g|s)\s[^\n]*\n)*\s*vn?\s+[-+.\d]")
+# Of Wavefront's lines, those that may come before the first vertex.
+_OBJ_NAMES = (b"mtllib", b"usemtl", b"o", b"g", b"s")
 
 
 def _from_content(read: Callable[[bytes, FileLimits], RawCloud]) -> Callable[[bytes, Path, FileLimits], RawCloud]:
@@ -56,11 +57,13 @@ def _read_text(content: bytes, path: Path, limits: FileLimits) -> RawCloud:
 
 
 def _is_obj(content: bytes) -> bool:
-    """Return whether the first line of a text that is no comment is one of Wavefront's."""
-    return (
-        re.match(rb"(\s*#[^\n]*\n|\s*\n|\s*(mtllib|usemtl|o|g|s)\s[^\n]*\n)*\s*vn?\s+[-+.\d]", content[:4096])
-        is not None
-    )
+    """Return whether the first line of a text that is no comment and no name is one of Wavefront's."""
+    for line in content[:4096].splitlines():
+        words = line.split(None, 2)
+        if not words or words[0].startswith(b"#") or words[0] in _OBJ_NAMES:
+            continue
+        return len(words) > 1 and words[0] in (b"v", b"vn") and words[1][:1] in b"-+.0123456789"
+    return False
 
 
 def _is_glb(content: bytes) -> bool:
