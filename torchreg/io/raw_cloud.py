@@ -158,13 +158,15 @@ def fan_triangles(counts: Array, indices: Array) -> Array:
         warnings.warn(
             f"{small} of {len(counts)} faces are left out: they have fewer than 3 corners", FileWarning, stacklevel=2
         )
-    ends, corners = np.cumsum(np.maximum(counts - 2, 0)), np.cumsum(counts)
-    result = np.empty((int(ends[-1]) if len(ends) else 0, 3), indices.dtype)
+    before = start = 0
+    result = np.empty((int(np.maximum(counts - 2, 0).sum()), 3), indices.dtype)
     # A part after the other, as numbers of corners take more memory than corners.
     for first in range(0, len(counts), _POLYGONS):
-        before, start = (int(sums[first - 1]) if first else 0 for sums in (ends, corners))
-        numbers = _fan_corners(counts[first : first + _POLYGONS]) + start
-        result[before : before + len(numbers)] = indices[numbers]
+        part = counts[first : first + _POLYGONS]
+        numbers = _fan_corners(part)
+        numbers += start
+        np.take(indices, numbers, out=result[before : before + len(numbers)], mode="clip")  # without a copy
+        before, start = before + len(numbers), start + int(part.sum())
     return result
 
 

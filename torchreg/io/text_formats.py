@@ -190,10 +190,10 @@ def read_obj(content: bytes, limits: FileLimits) -> RawCloud:
     Vertex colors after the coordinates are read, and normals if every vertex has exactly one, of its own number.
     Polygons are cut into fans.
     """
-    content = plain_text(content).replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
     vertices, normals, corners = list[bytes](), list[bytes](), list[bytes]()
     sizes, seen = list[int](), list[tuple[int, int]]()
-    for line in content.replace(b"\t", b" ").splitlines():
+    joined = plain_text(content).replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    for line in joined.replace(b"\t", b" ").splitlines():
         key, _, rest = line.strip().partition(b" ")
         if key == b"v":
             vertices.append(rest.partition(b"#")[0])
@@ -204,6 +204,7 @@ def read_obj(content: bytes, limits: FileLimits) -> RawCloud:
             corners += words
             sizes.append(len(words))
             seen.append((len(vertices), len(normals)))
+    del joined
     check_allowed(len(vertices), "points", limits)
     check_allowed(len(sizes), "faces", limits)
     table = _vertex_table(vertices)
@@ -243,8 +244,11 @@ def _resolve(words: list[bytes], before: Array, count: int, what: str) -> Array:
     values = _whole_numbers(words)
     if values is None:
         values = as_indices(parse_table(words, 1, f"{what} index")[:, 0], f"{what} indices")
-    indices = np.where(values < 0, before + values, values - 1)
-    if np.any(values == 0) or np.any(indices < 0) or np.any(indices >= count):
+    # In place: as many numbers as a file may hold.
+    behind, lost = np.flatnonzero(values < 0), bool(np.any(values == 0))
+    values[behind] += before[behind] + 1
+    indices = np.subtract(values, 1, out=values)
+    if lost or np.any(indices < 0) or np.any(indices >= count):
         raise FormatError(f"a face names a {what} outside 1 to {count}: the file is cut off or damaged")
     return indices
 
