@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--rounds", type=int, default=20)
     parser.add_argument("--smoke", action="store_true", help="a version of seconds")
     options = parser.parse_args(arguments)
-    rounds = 2 if options.smoke else options.rounds
+    rounds = 1 if options.smoke else options.rounds
     hand = tr.Hand()
     pairs = [make_calls(seed, hand, 4, 500 if options.smoke else 1000) for seed in (0, 1)]
     begin = time.perf_counter()

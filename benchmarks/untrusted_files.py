@@ -12,6 +12,7 @@ import ctypes
 import faulthandler
 import gc
 import random
+import sys
 import tempfile
 import time
 import traceback
@@ -225,7 +226,9 @@ def fuzz(path: Path, read: Read, other: bytes, count: int, seconds: float, draw:
                 break
             path.write_bytes(damaged(content, other, draw))
             started = time.perf_counter()
-            faulthandler.dump_traceback_later(60, exit=True)  # what hangs ends the run, and tells where
+            faulthandler.dump_traceback_later(
+                60, exit=True, file=sys.__stderr__
+            )  # what hangs ends the run, and tells where
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("error")
@@ -253,7 +256,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--smoke", action="store_true", help="a version of seconds")
     options = parser.parse_args(arguments)
-    count, seconds = (40, 1.0) if options.smoke else (options.count, options.seconds)
+    count, seconds = (8, 1.0) if options.smoke else (options.count, options.seconds)
     with tempfile.TemporaryDirectory() as name:
         if _RESET.exists():
             (Path(name) / "crafted").mkdir()

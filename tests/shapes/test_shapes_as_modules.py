@@ -91,7 +91,7 @@ def test_points_cover_the_fused_surface_evenly_and_stay_on_it(make):
     shape = make()
     rest = shape(shape.rest_pose()).points
     assert float(shape.distance(rest, shape.rest_pose()).abs().max()) < 1e-2 * shape.nu
-    mesh = shape.surface_mesh(spacing=0.5 * shape.nu)
+    mesh = shape.surface_mesh(spacing=shape.nu)
     gaps = torch.cdist(rest, rest).fill_diagonal_(torch.inf).amin(-1)
     # Everything on the surface is nearer to a point than twice their usual spacing.
     assert float(torch.cdist(mesh.vertices, rest).amin(-1).max()) < 2 * float(gaps.mean())
@@ -147,9 +147,8 @@ def call(shape, pose, *values):
 @pytest.mark.parametrize("make", [rod, lambda: Hand(dtype=D)])
 def test_gradients_in_the_pose_and_all_parameters(make):
     shape = perturbed(make())
-    if isinstance(shape, Hand):
-        for name in ("points", "weights", "partners"):
-            shape.surface_points.register_buffer(name, getattr(shape.surface_points, name)[::40])
+    for name in ("points", "weights", "partners"):
+        shape.surface_points.register_buffer(name, getattr(shape.surface_points, name)[::40])
     inputs = (random_poses(shape, 1), *(value.detach().clone() for value in shape.parameters()))
     inputs = tuple(value.requires_grad_() for value in inputs)
     assert torch.autograd.gradcheck(lambda *values: tuple(call(shape, *values)), inputs, atol=1e-6)
