@@ -3,7 +3,8 @@ import itertools
 import pytest
 import torch
 
-from torchreg.datasets.creature_kinds import HELD_OUT_KINDS, TRAINING_KINDS, Draw
+from torchreg.datasets.creature_kinds import HELD_OUT_KINDS, TRAINING_KINDS
+from torchreg.datasets.creature_parts import Draw
 from torchreg.datasets.figures import bending_figure, jointed_figure
 from torchreg.datasets.matching_pairs import PosableBody, matching_pairs
 from torchreg.datasets.solids import FlatCone, RoundCone

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
@@ -16,10 +17,11 @@ from torchreg.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
+    from tqdm import tqdm
 
     from torchreg.geometry.camera import Camera
     from torchreg.geometry.range_scan import RangeScan
-    from torchreg.registration.results import ScanRegistration
+    from torchreg.registration.results import RegisterRecord, ScanRegistration
 
 # Pictures of the depth of source and target that was kept.
 _KEPT = ("source.png", "target.png")
@@ -96,24 +98,20 @@ def register(
     if depth:
         folder = seen_folder(seen, output, force)
         images = [_DepthImage.read(*pair) for pair in zip((source, target), _cameras(intrinsics), strict=True)]
+        kept = [folder / name for name in _KEPT]
         first, second = (
-            image.scan(depth_range, smoothing or 0.0, folder / name) for image, name in zip(images, _KEPT, strict=True)
+            image.scan(depth_range, smoothing or 0.0, path) for image, path in zip(images, kept, strict=True)
         )
     else:
-        units, times, frames = _pair(scale, 1.0, "--scale"), _pair(time, None, "--time"), _pair(frame, None, "--frame")
+        pairs = _pair(scale, 1.0, "--scale"), _pair(time, None, "--time"), _pair(frame, None, "--frame")
         first, second = (
-            load_scan(path, scale=units[k], nan_policy=nan_policy, time=times[k], frame=frames[k])
-            for k, path in enumerate((source, target))
+            load_scan(path, scale=unit, nan_policy=nan_policy, time=seconds, frame=number)
+            for path, unit, seconds, number in zip((source, target), *pairs, strict=True)
         )
     if scene is not None and first.faces is None:
         raise InputError(f"{source} has no triangles, which a .glb needs; name an output that ends in .safetensors")
     with tqdm(desc="initialize", unit="step", leave=False, disable=quiet) as bar:
-
-        def show(record: object) -> None:
-            bar.set_description(getattr(record, "stage", ""))
-            bar.update()
-
-        found = run(first, second, bones, grid, on_step=show)
+        found = run(first, second, bones, grid, on_step=partial(_show, bar))
     _write(found, scene, weights, errors)
     if depth:
         images[1].draw_over(found, folder / "registered.png")
@@ -122,6 +120,12 @@ def register(
         typer.echo(f"{_summary(found)} -> {scene or result}")
     if not found.status.usable:
         raise typer.Exit(ExitCode.UNUSABLE)
+
+
+def _show(bar: tqdm, record: RegisterRecord) -> None:
+    """Show a step on a progress bar."""
+    bar.set_description(record.stage)
+    bar.update()
 
 
 @dataclass(frozen=True, eq=False)

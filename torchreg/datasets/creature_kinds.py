@@ -7,185 +7,13 @@ A kind draws the parts of one creature from a generator; a further kind is one f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from torchreg.datasets.figures import Part
-from torchreg.datasets.solids import FlatCone, RoundBox, RoundCone, Solid
-
-# Left (+x) and right, with y up and z forward.
-SIDES = (1.0, -1.0)
-
-
-class Draw:
-    """Random numbers of a seeded generator, as plain floats.
-
-    Args:
-        generator: their source.
-    """
-
-    def __init__(self, generator: torch.Generator) -> None:
-        self.generator = generator
-
-    def uniform(self, low: float, high: float) -> float:
-        """Return a number drawn evenly between two."""
-        return low + (high - low) * float(torch.rand((), generator=self.generator, dtype=torch.float64))
-
-    def chance(self, probability: float) -> bool:
-        """Return True with a probability."""
-        return self.uniform(0, 1) < probability
-
-    def count(self, low: int, high: int) -> int:
-        """Return an integer from ``low`` to ``high``, both included."""
-        return int(torch.randint(low, high + 1, (), generator=self.generator))
-
-    def log_uniform(self, low: float, high: float) -> float:
-        """Return a number whose logarithm is drawn evenly."""
-        return math.exp(self.uniform(math.log(low), math.log(high)))
-
-    def normal(self, *shape: int) -> Tensor:
-        """Return standard normal numbers, float64."""
-        return torch.randn(*shape, generator=self.generator, dtype=torch.float64)
-
-    def direction(self) -> Tensor:
-        """Return a unit vector (3,) drawn evenly."""
-        return torch.nn.functional.normalize(self.normal(3), dim=0)
-
-
-@dataclass(frozen=True)
-class Creature:
-    """The parts of one creature in its rest pose, and how far their joints turn.
-
-    Args:
-        parts: P parts, parents before children; y up, z forward, about a metre long.
-        limits: P largest angles of the joints, radians.
-        rigid: whether its parts are rigid pieces rather than one bending skin.
-    """
-
-    parts: tuple[Part, ...]
-    limits: tuple[float, ...]
-    rigid: bool = False
-
-
-def towards(elevation: float, azimuth: float = 0.0) -> Tensor:
-    """Return the unit vector (3,) at an elevation and an azimuth from forward to the left, degrees."""
-    rise, turn = math.radians(elevation), math.radians(azimuth)
-    return torch.tensor(
-        [math.cos(rise) * math.sin(turn), math.sin(rise), math.cos(rise) * math.cos(turn)], dtype=torch.float64
-    )
-
-
-@dataclass
-class Builder:
-    """Collects the parts of a creature.
-
-    Args:
-        draw: source of randomness.
-        rigid: see `Creature`.
-    """
-
-    draw: Draw
-    rigid: bool = False
-    _solids: list[list[Solid]] = field(default_factory=list)
-    _rows: list[tuple[int, Tensor, float]] = field(default_factory=list)
-
-    def add(
-        self,
-        parent: int,
-        start: Tensor,
-        direction: Tensor,
-        length: float,
-        radii: tuple[float, float],
-        *,
-        flat: float = 1.0,
-        normal: Tensor | None = None,
-        limit: float = 80.0,
-    ) -> tuple[int, Tensor]:
-        """Add a part that is a cone from its joint on; return its number and where it ends (3,).
-
-        Args:
-            parent: number of the part that it hangs on, -1 for the first.
-            start: (3,) its joint.
-            direction: (3,) of any length.
-            length: of the cone, metres.
-            radii: at both ends, metres.
-            flat: see `FlatCone`.
-            normal: (3,) along which it is flat.
-            limit: of its joint, degrees.
-        """
-        axis = torch.nn.functional.normalize(direction.double(), dim=0)
-        end = start + length * axis
-        self._rows.append((parent, start, limit))
-        self._solids.append([_cone(start, end, radii, flat, normal)])
-        return len(self._rows) - 1, end
-
-    def chain(
-        self,
-        parent: int,
-        start: Tensor,
-        directions: Sequence[Tensor],
-        lengths: Sequence[float],
-        radii: Sequence[float],
-        *,
-        limit: float = 80.0,
-        flat: float = 1.0,
-        normal: Tensor | None = None,
-    ) -> tuple[list[int], Tensor]:
-        """Add parts one after the other, radii (K + 1) at their ends; return their numbers and the last end."""
-        numbers = []
-        for index, (direction, length) in enumerate(zip(directions, lengths, strict=True)):
-            parent, start = self.add(
-                parent,
-                start,
-                direction,
-                length,
-                (radii[index], radii[index + 1]),
-                limit=limit,
-                flat=flat,
-                normal=normal,
-            )
-            numbers.append(parent)
-        return numbers, start
-
-    def attach(self, part: int, solid: Solid) -> None:
-        """Add a solid to a part."""
-        self._solids[part].append(solid)
-
-    def blob(self, part: int, center: Tensor, radius: float) -> None:
-        """Add a ball to a part."""
-        self.attach(part, RoundCone(_tuple(center), _tuple(center), radius, radius))
-
-    def finish(self) -> Creature:
-        """Return the creature."""
-        parts = tuple(
-            Part(f"part {number}", None if parent < 0 else f"part {parent}", _tuple(joint), tuple(solids))
-            for number, ((parent, joint, _), solids) in enumerate(zip(self._rows, self._solids, strict=True))
-        )
-        return Creature(parts, tuple(math.radians(limit) for _, _, limit in self._rows), self.rigid)
-
-
-def _cone(start: Tensor, end: Tensor, radii: tuple[float, float], flat: float, normal: Tensor | None) -> Solid:
-    cone = RoundCone(_tuple(start), _tuple(end), *radii)
-    if flat >= 1 or normal is None:
-        return cone
-    axis = torch.nn.functional.normalize(end - start, dim=0)
-    across = normal.double() - (normal.double() @ axis) * axis
-    if float(across.norm()) < 1e-3:
-        return cone
-    return FlatCone(cone, _tuple(torch.nn.functional.normalize(across, dim=0)), flat)
-
-
-def _tuple(vector: Tensor) -> tuple[float, float, float]:
-    x, y, z = vector.tolist()
-    return x, y, z
-
-
-def _at(x: float, y: float, z: float) -> Tensor:
-    return torch.tensor([x, y, z], dtype=torch.float64)
-
+from torchreg.datasets.creature_parts import SIDES, Builder, Creature, Draw, as_tuple, at, cone_of, towards
+from torchreg.datasets.solids import RoundBox, RoundCone
 
 X, Y, Z = torch.eye(3, dtype=torch.float64)
 
@@ -194,18 +22,18 @@ def quadruped(draw: Draw) -> Creature:
     """Draw a four-legged animal: anything between a mouse, a giraffe and an elephant."""
     u, body = draw.uniform, Builder(draw)
     length, girth, fat = u(0.6, 1.2), u(0.1, 0.25), u(0.8, 1.3)
-    rump, middle = body.add(-1, _at(0, 0, -length / 2), Z, length / 2, (girth, girth * fat), limit=20)
+    rump, middle = body.add(-1, at(0, 0, -length / 2), Z, length / 2, (girth, girth * fat), limit=20)
     chest, front = body.add(rump, middle, towards(u(-12, 17)), length / 2, (girth * fat, girth * u(0.8, 1.2)), limit=30)
     if draw.chance(0.25):  # a hump or a loose belly
-        body.blob(rump, middle + _at(0, draw.uniform(-0.8, 0.8) * girth, 0), girth * u(0.7, 1.1))
+        body.blob(rump, middle + at(0, draw.uniform(-0.8, 0.8) * girth, 0), girth * u(0.7, 1.1))
     _neck_and_head(draw, body, chest, front, girth)
-    _tail(draw, body, rump, _at(0, 0.5 * girth, -length / 2))
+    _tail(draw, body, rump, at(0, 0.5 * girth, -length / 2))
     height, thick, foot = u(0.3, 1.0), u(0.04, 0.13), u(0.05, 0.18)
     for part, z in ((rump, -length / 2 * u(0.7, 1.0)), (chest, length / 2 * u(0.7, 1.0))):
         bend, split, width = u(-25, 25), u(0.4, 0.6), thick * u(0.8, 1.3)
         hoof = draw.chance(0.4)
         for side in SIDES:
-            hip = _at(side * 0.75 * girth, -0.3 * girth, z)
+            hip = at(side * 0.75 * girth, -0.3 * girth, z)
             steps = [towards(-90 + bend, side * 5), towards(-90 - bend), towards(-60 if hoof else -9)]
             body.chain(part, hip, steps, [height * split, height * (1 - split), foot],
                        [1.4 * width, 0.8 * width, 0.6 * width, 0.6 * width])  # fmt: skip
@@ -236,18 +64,18 @@ def _pairs_on_head(draw: Draw, body: Builder, head: int, nape: Tensor, size: flo
     u = draw.uniform
     rise, out, length, width, flat = u(10, 100), u(30, 90), u(0.05, 0.3), u(0.025, 0.09), u(0.25, 1)
     for side in SIDES:
-        base = nape + _at(side * 0.6 * size, 0.5 * size, 0)
+        base = nape + at(side * 0.6 * size, 0.5 * size, 0)
         body.add(
             head, base, towards(rise, side * out), length, (width, width * u(0.3, 1)), flat=flat, normal=Z, limit=40
         )
     if draw.chance(0.3):
         rise, length, width, bend = u(40, 90), u(0.08, 0.3), u(0.02, 0.045), u(-60, 60)
         for side in SIDES:
-            base = nape + _at(side * 0.35 * size, 0.8 * size, 0.3 * size)
+            base = nape + at(side * 0.35 * size, 0.8 * size, 0.3 * size)
             tip = base + length * towards(rise, side * 40)
-            body.attach(head, RoundCone(_tuple(base), _tuple(tip), width, 0.8 * width))
+            body.attach(head, RoundCone(as_tuple(base), as_tuple(tip), width, 0.8 * width))
             end = tip + length * towards(rise + bend, side * 90)
-            body.attach(head, RoundCone(_tuple(tip), _tuple(end), 0.8 * width, 0.4 * width))
+            body.attach(head, RoundCone(as_tuple(tip), as_tuple(end), 0.8 * width, 0.4 * width))
 
 
 def _tail(draw: Draw, body: Builder, rump: int, start: Tensor) -> None:
@@ -265,39 +93,39 @@ def person(draw: Draw) -> Creature:
     """Draw somebody who stands on two legs: a person, a child, a bear or a doll, with clothes, hair and bags."""
     u, body = draw.uniform, Builder(draw)
     width, height, girth, flat = u(0.1, 0.22), u(0.35, 0.7), u(0.1, 0.22), u(0.5, 1.0)
-    hips, waist = body.add(-1, _at(0, 0, 0), _at(0, 1, u(-0.1, 0.1)), height / 2, (girth, girth * u(0.75, 1.15)),
+    hips, waist = body.add(-1, at(0, 0, 0), at(0, 1, u(-0.1, 0.1)), height / 2, (girth, girth * u(0.75, 1.15)),
                            flat=flat, normal=Z, limit=25)  # fmt: skip
-    chest, top = body.add(hips, waist, _at(0, 1, u(-0.15, 0.15)), height / 2, (girth, girth * u(0.9, 1.35)),
+    chest, top = body.add(hips, waist, at(0, 1, u(-0.15, 0.15)), height / 2, (girth, girth * u(0.9, 1.35)),
                           flat=flat, normal=Z, limit=35)  # fmt: skip
     _persons_head(draw, body, chest, top)
     _arms(draw, body, chest, top, width, girth)
     leg = _legs(draw, body, hips, width)
     _clothes(draw, body, (hips, chest), (waist, top), girth, leg)
     if draw.chance(0.1):
-        _tail(draw, body, hips, _at(0, 0, -girth))
+        _tail(draw, body, hips, at(0, 0, -girth))
     return body.finish()
 
 
 def _persons_head(draw: Draw, body: Builder, chest: int, top: Tensor) -> None:
     u = draw.uniform
-    neck, chin = body.add(chest, top, _at(0, 1, 0.1), u(0.06, 0.2), (0.07, 0.06), limit=35)
+    neck, chin = body.add(chest, top, at(0, 1, 0.1), u(0.06, 0.2), (0.07, 0.06), limit=35)
     size = u(0.08, 0.16)
-    head, crown = body.add(neck, chin, _at(0, 1, u(0, 0.6)), u(0.06, 0.2), (size, size * u(0.8, 1.1)), limit=40)
-    face = chin + _at(0, 0.4 * size, 0.9 * size)
+    head, crown = body.add(neck, chin, at(0, 1, u(0, 0.6)), u(0.06, 0.2), (size, size * u(0.8, 1.1)), limit=40)
+    face = chin + at(0, 0.4 * size, 0.9 * size)
     if draw.chance(0.6):  # a nose
         body.attach(
             head,
-            RoundCone(_tuple(face), _tuple(face + _at(0, -0.2 * size, u(0.1, 0.8) * size)), 0.2 * size, 0.15 * size),
+            RoundCone(as_tuple(face), as_tuple(face + at(0, -0.2 * size, u(0.1, 0.8) * size)), 0.2 * size, 0.15 * size),
         )
     if draw.chance(0.5):  # hair, a hat or a hood
-        body.blob(head, crown + _at(0, u(-0.3, 0.6) * size, -u(0, 0.8) * size), size * u(0.7, 1.3))
+        body.blob(head, crown + at(0, u(-0.3, 0.6) * size, -u(0, 0.8) * size), size * u(0.7, 1.3))
     if draw.chance(0.2):  # a ponytail
-        body.chain(head, crown + _at(0, 0, -size), [towards(-50, 180), towards(-80, 180)], [u(0.1, 0.2)] * 2,
+        body.chain(head, crown + at(0, 0, -size), [towards(-50, 180), towards(-80, 180)], [u(0.1, 0.2)] * 2,
                    [0.05, 0.04, 0.02], limit=50)  # fmt: skip
     if draw.chance(0.3):
         rise, length = u(0, 90), u(0.04, 0.2)
         for side in SIDES:
-            body.add(head, chin + _at(side * 0.7 * size, size, 0), towards(rise, side * 90), length, (0.035, 0.02),
+            body.add(head, chin + at(side * 0.7 * size, size, 0), towards(rise, side * 90), length, (0.035, 0.02),
                      flat=u(0.4, 1), normal=Z, limit=30)  # fmt: skip
 
 
@@ -306,7 +134,7 @@ def _arms(draw: Draw, body: Builder, chest: int, top: Tensor, width: float, girt
     length, thick, rise, forward = u(0.45, 0.95), u(0.03, 0.085), u(-80, 20), u(-30, 40)
     fingers, size = draw.chance(0.4), u(0.06, 0.16)
     for side in SIDES:
-        shoulder = top + _at(side * (width + 0.4 * girth), -0.03, 0)
+        shoulder = top + at(side * (width + 0.4 * girth), -0.03, 0)
         steps = [towards(rise, side * 90), towards(rise, side * (90 - forward)), towards(rise, side * (90 - forward))]
         numbers, end = body.chain(chest, shoulder, steps, [length / 2, length / 2, size],
                                   [1.3 * thick, thick, 0.8 * thick, 0.8 * thick])  # fmt: skip
@@ -314,7 +142,7 @@ def _arms(draw: Draw, body: Builder, chest: int, top: Tensor, width: float, girt
             for spread in (-35, -12, 12, 35):
                 step = towards(rise + spread, side * (90 - forward))
                 body.attach(
-                    numbers[-1], RoundCone(_tuple(end), _tuple(end + 0.6 * size * step), 0.3 * thick, 0.25 * thick)
+                    numbers[-1], RoundCone(as_tuple(end), as_tuple(end + 0.6 * size * step), 0.3 * thick, 0.25 * thick)
                 )
 
 
@@ -323,9 +151,9 @@ def _legs(draw: Draw, body: Builder, hips: int, width: float) -> float:
     u = draw.uniform
     length, thick, foot, spread = u(0.5, 1.1), u(0.045, 0.12), u(0.1, 0.24), u(0, 15)
     for side in SIDES:
-        steps = [towards(-88, side * 30) + _at(side * math.tan(math.radians(spread)), 0, 0), _at(0, -1, -0.05),
-                 _at(side * 0.15, -0.15, 1)]  # fmt: skip
-        body.chain(hips, _at(side * 0.8 * width, 0, 0), steps, [length / 2, length / 2, foot],
+        steps = [towards(-88, side * 30) + at(side * math.tan(math.radians(spread)), 0, 0), at(0, -1, -0.05),
+                 at(side * 0.15, -0.15, 1)]  # fmt: skip
+        body.chain(hips, at(side * 0.8 * width, 0, 0), steps, [length / 2, length / 2, foot],
                    [1.4 * thick, thick, 0.7 * thick, 0.6 * thick])  # fmt: skip
     return length
 
@@ -337,30 +165,28 @@ def _clothes(
     u = draw.uniform
     (hips, chest), (waist, top) = parts, ends
     if draw.chance(0.25):
-        hem = _at(0, -leg * u(0.25, 0.8), 0)
-        body.attach(hips, _cone(waist - _at(0, 0.1, 0), hem, (girth, girth * u(1.2, 2.2)), u(0.6, 1), Z))
+        hem = at(0, -leg * u(0.25, 0.8), 0)
+        body.attach(hips, cone_of(waist - at(0, 0.1, 0), hem, (girth, girth * u(1.2, 2.2)), u(0.6, 1), Z))
     if draw.chance(0.2):
         body.attach(
             chest,
             RoundBox(
-                _tuple((waist + top) / 2 + _at(0, 0, -1.3 * girth)), (u(0.08, 0.16), u(0.1, 0.2), u(0.05, 0.1)), 0.03
+                as_tuple((waist + top) / 2 + at(0, 0, -1.3 * girth)), (u(0.08, 0.16), u(0.1, 0.2), u(0.05, 0.1)), 0.03
             ),
         )
     if draw.chance(0.25):
-        body.attach(chest, _cone(top, waist - _at(0, 0.15, 0), (girth, girth * u(1.1, 1.5)), u(0.7, 1), Z))
+        body.attach(chest, cone_of(top, waist - at(0, 0.15, 0), (girth, girth * u(1.1, 1.5)), u(0.7, 1), Z))
 
 
 def hand(draw: Draw) -> Creature:
     """Draw a hand of four or five fingers with its forearm."""
     u, body = draw.uniform, Builder(draw)
     width, length, thick = u(0.25, 0.45), u(0.35, 0.55), u(0.07, 0.11)
-    wrist, base = body.add(
-        -1, _at(0, 0, -u(0.3, 0.8)), Z, 0.5, (1.3 * thick, 1.1 * thick), flat=0.8, normal=Y, limit=40
-    )
+    wrist, base = body.add(-1, at(0, 0, -u(0.3, 0.8)), Z, 0.5, (1.3 * thick, 1.1 * thick), flat=0.8, normal=Y, limit=40)
     count, wave, total, fan, thin = draw.count(3, 4), u(0, 0.25), u(0.35, 0.7), u(0, 14), u(0.035, 0.06)
     for index in range(count):
         share = index / (count - 1) - 0.5
-        palm, tip = body.add(wrist, base + _at(0.4 * share * width, 0, 0), _at(0.8 * share * width, 0, length), length,
+        palm, tip = body.add(wrist, base + at(0.4 * share * width, 0, 0), at(0.8 * share * width, 0, length), length,
                              (thick, 0.8 * thick), flat=0.7, normal=Y, limit=6)  # fmt: skip
         size = total * (1 - wave * (2 * share - 0.2) ** 2)
         steps = [towards(-u(0, 15) * bone, 2 * share * fan) for bone in range(3)]
@@ -373,7 +199,7 @@ def hand(draw: Draw) -> Creature:
             towards(-5, side * (spread - 15)),
             towards(-5, side * (spread - 30)),
         ]
-        body.chain(wrist, base + _at(side * 0.35 * width, 0, 0.05), steps, [u(0.15, 0.3), 0.2, 0.15],
+        body.chain(wrist, base + at(side * 0.35 * width, 0, 0.05), steps, [u(0.15, 0.3), 0.2, 0.15],
                    torch.linspace(1.5 * thin, thin, 4).tolist(), limit=50)  # fmt: skip
     return body.finish()
 
@@ -396,8 +222,8 @@ def plant(draw: Draw) -> Creature:
             radii, flat = (u(0.05, 0.12), 0.02), u(0.25, 0.5)
             body.add(parent, start, aside, u(0.1, 0.35), radii, flat=flat, normal=draw.normal(3), limit=50)
 
-    grow(-1, _at(0, 0, 0), Y, u(0.25, 0.45), u(0.04, 0.1), 0)
-    grow(0, _at(0, 0.15, 0), _at(u(-1, 1), 0.6, u(-1, 1)), u(0.2, 0.4), u(0.04, 0.07), 1)
+    grow(-1, at(0, 0, 0), Y, u(0.25, 0.45), u(0.04, 0.1), 0)
+    grow(0, at(0, 0.15, 0), at(u(-1, 1), 0.6, u(-1, 1)), u(0.2, 0.4), u(0.04, 0.07), 1)
     return body.finish()
 
 
@@ -405,20 +231,20 @@ def arm(draw: Draw) -> Creature:
     """Draw a robot arm: links of boxes and cylinders between knobs, with a gripper."""
     u, body = draw.uniform, Builder(draw, rigid=draw.chance(0.5))
     parent, end = body.add(
-        -1, _at(0, 0, 0), Y, u(0.1, 0.3), (u(0.15, 0.3), u(0.1, 0.2)), flat=u(0.6, 1), normal=X, limit=1
+        -1, at(0, 0, 0), Y, u(0.1, 0.3), (u(0.15, 0.3), u(0.1, 0.2)), flat=u(0.6, 1), normal=X, limit=1
     )
     if draw.chance(0.5):
         body.attach(parent, RoundBox((0, 0, 0), (u(0.15, 0.3), u(0.04, 0.1), u(0.15, 0.3)), 0.02))
     step, thick = Y, u(0.06, 0.12)
     for _ in range(draw.count(3, 6)):
-        step = torch.nn.functional.normalize(step + 0.5 * draw.normal(3) + _at(0, 0, 0.3), dim=0)
+        step = torch.nn.functional.normalize(step + 0.5 * draw.normal(3) + at(0, 0, 0.3), dim=0)
         across = torch.linalg.cross(step, draw.normal(3))
         knob, end = body.add(parent, end, across, thick * u(0.5, 1.5), (thick * u(0.9, 1.3), thick * u(0.9, 1.3)))
         parent, end = body.add(knob, end, step, u(0.2, 0.5), (thick, thick * u(0.6, 1)), flat=u(0.5, 1),
                                normal=draw.normal(3))  # fmt: skip
         if draw.chance(0.4):
             half = (thick * u(0.6, 1.5), thick * u(0.6, 1.5), thick * u(0.6, 1.5))
-            body.attach(parent, RoundBox(_tuple(end - 0.1 * step), half, 0.2 * thick))
+            body.attach(parent, RoundBox(as_tuple(end - 0.1 * step), half, 0.2 * thick))
         thick *= u(0.75, 1)
     aside = torch.linalg.cross(step, draw.normal(3))
     for side in SIDES:
@@ -430,12 +256,12 @@ def arm(draw: Draw) -> Creature:
 def bug(draw: Draw) -> Creature:
     """Draw an insect, a spider or a crab: segments with pairs of legs."""
     u, body = draw.uniform, Builder(draw)
-    parent, end, thick = -1, _at(0, 0, -0.5), u(0.1, 0.2)
+    parent, end, thick = -1, at(0, 0, -0.5), u(0.1, 0.2)
     segments = []
     for _ in range(draw.count(2, 4)):
         radius, length = thick * u(0.6, 1.3), u(0.15, 0.4)
         start = end
-        parent, end = body.add(parent, start, _at(0, u(-0.2, 0.2), 1), length, (radius, radius * u(0.6, 1.3)),
+        parent, end = body.add(parent, start, at(0, u(-0.2, 0.2), 1), length, (radius, radius * u(0.6, 1.3)),
                                flat=u(0.6, 1), normal=Y, limit=40)  # fmt: skip
         segments.append((parent, start, radius))
     for _ in range(draw.count(1, 4)):
@@ -443,7 +269,7 @@ def bug(draw: Draw) -> Creature:
         rise, turn, count, width, length = u(-80, 60), u(30, 150), draw.count(2, 3), u(0.025, 0.07), u(0.15, 0.4)
         for side in SIDES:
             steps = [towards(rise - 35 * bone, side * turn) for bone in range(count)]
-            body.chain(part, start + _at(side * 0.6 * radius, 0, 0), steps, [length] * count,
+            body.chain(part, start + at(side * 0.6 * radius, 0, 0), steps, [length] * count,
                        torch.linspace(1.2 * width, 0.7 * width, count + 1).tolist())  # fmt: skip
     return body.finish()
 
@@ -454,7 +280,7 @@ def snake(draw: Draw) -> Creature:
     count, thick, length = draw.count(6, 14), u(0.04, 0.12), u(0.12, 0.22)
     radii = [thick * (0.6 + 0.6 * math.sin(math.pi * (index + 0.5) / (count + 1))) for index in range(count + 1)]
     steps = [towards(u(-10, 10), u(-15, 15)) for _ in range(count)]
-    numbers, end = body.chain(-1, _at(0, 0, 0), steps, [length] * count, radii, limit=35)
+    numbers, end = body.chain(-1, at(0, 0, 0), steps, [length] * count, radii, limit=35)
     body.add(numbers[-1], end, Z, u(0.08, 0.2), (thick * u(0.7, 1.4), 0.4 * thick), flat=u(0.5, 1), normal=Y, limit=30)
     return body.finish()
 
@@ -462,13 +288,13 @@ def snake(draw: Draw) -> Creature:
 def furniture(draw: Draw) -> Creature:
     """Draw a jointed thing of boxes: a lamp, a cupboard, a folding chair."""
     u, body = draw.uniform, Builder(draw, rigid=True)
-    parent, end = body.add(-1, _at(0, 0, 0), Y, u(0.05, 0.3), (u(0.04, 0.1), u(0.04, 0.1)), limit=1)
+    parent, end = body.add(-1, at(0, 0, 0), Y, u(0.05, 0.3), (u(0.04, 0.1), u(0.04, 0.1)), limit=1)
     body.attach(parent, RoundBox((0, 0, 0), (u(0.1, 0.4), u(0.02, 0.3), u(0.1, 0.4)), 0.02))
     for _ in range(draw.count(2, 5)):
         step = draw.direction() + 0.6 * Y
         part, tip = body.add(parent, end, step, u(0.15, 0.5), (u(0.02, 0.06), u(0.02, 0.06)), limit=70)
         half = (u(0.02, 0.2), u(0.02, 0.2), u(0.02, 0.2))
-        body.attach(part, RoundBox(_tuple(tip), half, 0.3 * min(half)))
+        body.attach(part, RoundBox(as_tuple(tip), half, 0.3 * min(half)))
         if draw.chance(0.6):
             parent, end = part, tip
     return body.finish()
@@ -478,18 +304,18 @@ def bird(draw: Draw) -> Creature:
     """Draw a bird: a body, two wings of two parts, a tail fan, two thin legs, a beak."""
     u, body = draw.uniform, Builder(draw)
     girth, length = u(0.1, 0.18), u(0.3, 0.5)
-    trunk, front = body.add(-1, _at(0, 0, -length / 2), towards(u(0, 40)), length, (girth, girth * u(0.7, 1)), limit=10)
+    trunk, front = body.add(-1, at(0, 0, -length / 2), towards(u(0, 40)), length, (girth, girth * u(0.7, 1)), limit=10)
     neck, nape = body.add(trunk, front, towards(u(20, 80)), u(0.08, 0.4), (0.06, 0.045), limit=50)
     head, face = body.add(neck, nape, towards(u(-20, 30)), u(0.06, 0.1), (0.07, 0.05), limit=45)
-    body.attach(head, RoundCone(_tuple(face), _tuple(face + u(0.06, 0.2) * towards(-10)), 0.03, 0.01))
+    body.attach(head, RoundCone(as_tuple(face), as_tuple(face + u(0.06, 0.2) * towards(-10)), 0.03, 0.01))
     span, chord, flat = u(0.3, 0.7), u(0.1, 0.2), u(0.12, 0.3)
     for side in SIDES:
-        shoulder = _at(side * 0.7 * girth, 0.4 * girth, 0.1 * length)
+        shoulder = at(side * 0.7 * girth, 0.4 * girth, 0.1 * length)
         body.chain(trunk, shoulder, [towards(5, side * 90), towards(5, side * 120)], [span / 2, span / 2],
                    [chord, chord, 0.4 * chord], flat=flat, normal=Y, limit=60)  # fmt: skip
-        body.chain(trunk, _at(side * 0.4 * girth, -0.7 * girth, 0), [towards(-80), towards(-100), towards(0)],
+        body.chain(trunk, at(side * 0.4 * girth, -0.7 * girth, 0), [towards(-80), towards(-100), towards(0)],
                    [u(0.1, 0.3), u(0.1, 0.3), 0.1], [0.045, 0.025, 0.02, 0.02], limit=50)  # fmt: skip
-    body.add(trunk, _at(0, 0, -length / 2), towards(u(-20, 20), 180), u(0.15, 0.4), (0.06, u(0.08, 0.16)), flat=0.25,
+    body.add(trunk, at(0, 0, -length / 2), towards(u(-20, 20), 180), u(0.15, 0.4), (0.06, u(0.08, 0.16)), flat=0.25,
              normal=Y, limit=35)  # fmt: skip
     return body.finish()
 
@@ -499,16 +325,16 @@ def fish(draw: Draw) -> Creature:
     u, body = draw.uniform, Builder(draw)
     count, girth, flat = draw.count(3, 5), u(0.12, 0.28), u(0.4, 0.8)
     radii = [girth * math.sin(math.pi * (0.2 + 0.7 * index / count)) + 0.03 for index in range(count + 1)]
-    numbers, tail = body.chain(-1, _at(0, 0, 0.5), [towards(0, 180)] * count, [1 / count] * count, radii, flat=flat,
+    numbers, tail = body.chain(-1, at(0, 0, 0.5), [towards(0, 180)] * count, [1 / count] * count, radii, flat=flat,
                                normal=X, limit=30)  # fmt: skip
     for rise in (u(20, 60), -u(20, 60)):
         body.add(numbers[-1], tail, towards(rise, 180), u(0.15, 0.35), (0.06, 0.03), flat=0.25, normal=X, limit=35)
     body.add(
-        numbers[1], _at(0, 0.7 * girth, 0.1), towards(u(40, 90), 180), u(0.1, 0.25), (0.1, 0.04), flat=0.25, normal=X
+        numbers[1], at(0, 0.7 * girth, 0.1), towards(u(40, 90), 180), u(0.1, 0.25), (0.1, 0.04), flat=0.25, normal=X
     )
     rise = u(-70, 0)
     for side in SIDES:
-        body.add(numbers[0], _at(side * 0.5 * flat * girth, -0.2 * girth, 0.3), towards(rise, side * 110), u(0.12, 0.3),
+        body.add(numbers[0], at(side * 0.5 * flat * girth, -0.2 * girth, 0.3), towards(rise, side * 110), u(0.12, 0.3),
                  (0.06, 0.03), flat=0.3, normal=Y, limit=60)  # fmt: skip
     return body.finish()
 
@@ -517,7 +343,7 @@ def squid(draw: Draw) -> Creature:
     """Draw an octopus, a starfish or a squid: arms around a middle."""
     u, body = draw.uniform, Builder(draw)
     size, count = u(0.12, 0.25), draw.count(4, 8)
-    core, _ = body.add(-1, _at(0, 0, 0), Y, u(0.02, 0.35), (size, size * u(0.6, 1.2)), limit=10)
+    core, _ = body.add(-1, at(0, 0, 0), Y, u(0.02, 0.35), (size, size * u(0.6, 1.2)), limit=10)
     bones, length, thick, sink = draw.count(3, 4), u(0.5, 0.9), u(0.05, 0.09), u(-50, 10)
     for index in range(count):
         turn = 360 * index / count
@@ -531,7 +357,7 @@ def dinosaur(draw: Draw) -> Creature:
     """Draw a heavy animal on two legs with a long tail, small arms and a large head, or a kangaroo."""
     u, body = draw.uniform, Builder(draw)
     girth, length, lean = u(0.14, 0.24), u(0.5, 0.8), u(5, 70)
-    hips, middle = body.add(-1, _at(0, 0, 0), towards(lean), length / 2, (girth, girth), limit=15)
+    hips, middle = body.add(-1, at(0, 0, 0), towards(lean), length / 2, (girth, girth), limit=15)
     chest, front = body.add(hips, middle, towards(lean + u(-10, 20)), length / 2, (girth, 0.6 * girth), limit=30)
     _tail_of_dinosaur(draw, body, hips, girth)
     neck, nape = body.add(chest, front, towards(u(20, 80)), u(0.1, 0.3), (0.5 * girth, 0.4 * girth), limit=40)
@@ -539,13 +365,13 @@ def dinosaur(draw: Draw) -> Creature:
     if draw.chance(0.5):
         for side in SIDES:
             body.add(
-                head, nape + _at(side * 0.3 * girth, 0.4 * girth, 0), towards(80, side * 40), u(0.08, 0.2), (0.03, 0.02)
+                head, nape + at(side * 0.3 * girth, 0.4 * girth, 0), towards(80, side * 40), u(0.08, 0.2), (0.03, 0.02)
             )
     leg, thick = u(0.5, 0.8), u(0.07, 0.12)
     for side in SIDES:
-        body.chain(hips, _at(side * 0.8 * girth, 0, 0), [towards(-60), towards(-110), towards(-20)],
+        body.chain(hips, at(side * 0.8 * girth, 0, 0), [towards(-60), towards(-110), towards(-20)],
                    [leg / 2, leg / 2, u(0.12, 0.3)], [1.5 * thick, 0.8 * thick, 0.6 * thick, 0.5 * thick])  # fmt: skip
-        body.chain(chest, front + _at(side * 0.6 * girth, -0.3 * girth, 0), [towards(-60, side * 20), towards(-10)],
+        body.chain(chest, front + at(side * 0.6 * girth, -0.3 * girth, 0), [towards(-60, side * 20), towards(-10)],
                    [u(0.1, 0.2), u(0.1, 0.2)], [0.05, 0.04, 0.03])  # fmt: skip
     return body.finish()
 
@@ -554,23 +380,23 @@ def _tail_of_dinosaur(draw: Draw, body: Builder, hips: int, girth: float) -> Non
     count = draw.count(3, 5)
     radii = torch.linspace(0.9 * girth, 0.15 * girth, count + 1).tolist()
     steps = [towards(-30 + 8 * index, 180) for index in range(count)]
-    body.chain(hips, _at(0, 0, -0.5 * girth), steps, [draw.uniform(0.15, 0.28)] * count, radii, limit=35)
+    body.chain(hips, at(0, 0, -0.5 * girth), steps, [draw.uniform(0.15, 0.28)] * count, radii, limit=35)
 
 
 def crane(draw: Draw) -> Creature:
     """Draw a vehicle with a boom: rigid boxes, wheels or tracks, an arm of two or three links."""
     u, body = draw.uniform, Builder(draw, rigid=True)
-    base, top = body.add(-1, _at(0, 0, 0), Y, 0.1, (0.08, 0.08), limit=1)
+    base, top = body.add(-1, at(0, 0, 0), Y, 0.1, (0.08, 0.08), limit=1)
     for side in SIDES:
         body.attach(base, RoundBox((side * u(0.12, 0.2), -0.02, 0), (0.05, 0.07, u(0.2, 0.35)), 0.04))
     cab, _ = body.add(base, top, Y, 0.08, (0.1, 0.1), limit=120)
-    body.attach(cab, RoundBox(_tuple(top + _at(0, 0.12, -0.05)), (u(0.1, 0.18), u(0.08, 0.15), u(0.12, 0.25)), 0.03))
-    body.attach(cab, RoundBox(_tuple(top + _at(-0.08, 0.3, 0.05)), (0.06, 0.08, 0.07), 0.02))
+    body.attach(cab, RoundBox(as_tuple(top + at(0, 0.12, -0.05)), (u(0.1, 0.18), u(0.08, 0.15), u(0.12, 0.25)), 0.03))
+    body.attach(cab, RoundBox(as_tuple(top + at(-0.08, 0.3, 0.05)), (0.06, 0.08, 0.07), 0.02))
     rise, thick = u(30, 70), u(0.035, 0.06)
     steps = [towards(rise), towards(rise - 50), towards(rise - 120)]
-    numbers, end = body.chain(cab, top + _at(0.06, 0.12, 0.15), steps, [u(0.3, 0.5), u(0.25, 0.4), u(0.08, 0.15)],
+    numbers, end = body.chain(cab, top + at(0.06, 0.12, 0.15), steps, [u(0.3, 0.5), u(0.25, 0.4), u(0.08, 0.15)],
                               [thick, thick, 0.8 * thick, 0.8 * thick], limit=50)  # fmt: skip
-    body.attach(numbers[-1], RoundBox(_tuple(end), (u(0.06, 0.12), u(0.04, 0.08), u(0.04, 0.08)), 0.015))
+    body.attach(numbers[-1], RoundBox(as_tuple(end), (u(0.06, 0.12), u(0.04, 0.08), u(0.04, 0.08)), 0.015))
     return body.finish()
 
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg.datasets.creature_kinds import TRAINING_KINDS, Draw, Kind
+from torchreg.datasets.creature_kinds import TRAINING_KINDS, Kind
+from torchreg.datasets.creature_parts import Draw
 from torchreg.datasets.depth_scanner import DepthScanner, SurfaceScan
 from torchreg.datasets.figures import Figure, bending_figure, jointed_figure
 from torchreg.errors import InputError

@@ -121,15 +121,24 @@ def _is_json(content: bytes) -> bool:
 # Beside folders of COLMAP's. A new format is one more row.
 FORMATS: tuple[FileFormat, ...] = (
     FileFormat(
-        "torchreg JSON", CAMERAS, (".json",), _read_json,
-        "also of Open3D, RealSense, Azure Kinect, Polycam, Record3D, ROS camera_info, K and D as lists", "load_cameras",
-        _is_json,
+        name="torchreg JSON",
+        kind=CAMERAS,
+        endings=(".json",),
+        read=_read_json,
+        holds="also of Open3D, RealSense, Azure Kinect, Polycam, Record3D, ROS camera_info, K and D as lists",
+        loader="load_cameras",
+        sniff=_is_json,
     ),
     FileFormat(
-        "OpenCV YAML", CAMERAS, (".yml", ".yaml"), read_opencv, "one camera or a pair; also of ROS's calibrator and "
-        "camera_info", "load_cameras", begins(b"%YAML"),
+        name="OpenCV YAML",
+        kind=CAMERAS,
+        endings=(".yml", ".yaml"),
+        read=read_opencv,
+        holds="one camera or a pair; also of ROS's calibrator and camera_info",
+        loader="load_cameras",
+        sniff=begins(b"%YAML"),
     ),
-)  # fmt: skip
+)
 
 
 def load_depth_camera(

@@ -31,7 +31,7 @@ def _row(
     def read(_: bytes, path: Path, limits: FileLimits) -> Any:
         return loader(path, limits=limits)
 
-    return FileFormat(name, kind, endings, read, holds, shown or loader.__name__)
+    return FileFormat(name=name, kind=kind, endings=endings, read=read, holds=holds, loader=shown or loader.__name__)
 
 
 def _colmap(path: Path, *, limits: FileLimits) -> Any:

@@ -89,9 +89,7 @@ def register(
     References: Chang and Zwicker 2009, algorithm 1; Le and Deng 2012, for motions and weights in turn.
     """
     config = RegisterConfig() if config is None else config
-    source, target = scan_of(source, "source"), scan_of(target, "target")
-    check_inputs((source, target), num_bones, grid_resolution)
-    warn_about_rounding(source.points, "points of source", source.diagonal, stacklevel=4)
+    source, target = _checked_scans(source, target, num_bones, grid_resolution)
     origin = far_origin((source.points, target.points))
     if origin is not None:
         return register(
@@ -99,37 +97,54 @@ def register(
             start=None if start is None else start - origin, confidence=confidence, parts=parts,
         ).moved(origin)  # fmt: skip
     degenerate = warn_about_degenerate((source, target), stacklevel=4)
-    _check_start(source, start, confidence)
-    parts = None if parts is None else _checked_parts(source, parts, num_bones)
-    if config.printed is not None:
-        _check_no_start(start, parts)
+    _check_start(source, start, confidence, config)
+    parts = _checked_parts(source, parts, num_bones, config)
+    return _registered(
+        source, target, num_bones, grid_resolution, config, generator, on_step,
+        start=start, confidence=confidence, parts=parts, degenerate=degenerate,
+    )  # fmt: skip
+
+
+def _registered(
+    source: RangeScan,
+    target: RangeScan,
+    num_bones: int,
+    grid_resolution: int,
+    config: RegisterConfig,
+    generator: torch.Generator | None,
+    on_step: OnRegisterStep | None,
+    *,
+    start: Tensor | None,
+    confidence: Tensor | None,
+    parts: Tensor | None,
+    degenerate: bool,
+) -> ScanRegistration:
+    """Run algorithm 1 on checked scans; arguments as of `register`."""
     clock = _Clock()
     index = source_samples(source, config, generator)
     normalization = Normalization.from_points(source.points[index])
-    normalized_source = normalization.normalize_scan(source)
+    normalized_source, normalized_target = (normalization.normalize_scan(scan) for scan in (source, target))
     # Line 1 of the algorithm: the grid.
     grid = SparseGrid.from_points(normalized_source.points, grid_resolution)
     data = CellData(grid, normalized_source.points[index], config.num_patches)
     clock.lap()
+    # Line 2: first matches; by default a first alignment of all points.
+    fit: ReducedFit | PaperFit
     if config.printed is not None:
-        paper = PaperFit(
-            data, normalized_source, index, normalization.normalize_scan(target), config, config.printed,
-            num_bones=num_bones, generator=generator or torch.Generator().manual_seed(0), on_step=on_step,
+        fit = PaperFit(
+            data, normalized_source, index, normalized_target, config, config.printed, num_bones=num_bones,
+            generator=generator, on_step=on_step,
         )  # fmt: skip
-        converged = _fit_as_printed(paper, clock)
-        return _scan_registration(source, normalized_source, normalization, paper, converged, degenerate, clock.seconds)
-    # Line 2: a first alignment of all points.
-    if start is None:
-        aligned = align_scans(source, target, config.align, generator=generator, on_step=initial_records(on_step))
-        start, confidence = aligned.points, aligned.confidence
-    start = normalization.normalize(start)
-    confidence = torch.ones_like(start[:, 0]) if confidence is None else confidence.detach().cpu()
-    samples = Samples.from_alignment(normalized_source, index, start[None], confidence[None])
+    else:
+        if start is None:
+            aligned = align_scans(source, target, config.align, generator=generator, on_step=initial_records(on_step))
+            start, confidence = aligned.points, aligned.confidence
+        samples = _aligned_samples(normalized_source, index, normalization.normalize(start), confidence)
+        labels = None if parts is None else labels_of_parts(data, normalized_source.points, parts)
+        targets = (normalized_target,)
+        fit = ReducedFit(data, samples, targets, config, num_bones=num_bones, labels=labels, on_step=on_step)
     clock.lap()
     # Lines 3 to 8: motions, correspondences and labels in turn.
-    labels = None if parts is None else labels_of_parts(data, normalized_source.points, parts)
-    targets = (normalization.normalize_scan(target),)
-    fit = ReducedFit(data, samples, targets, config, num_bones=num_bones, labels=labels, on_step=on_step)
     converged = fit.fit_labels()
     clock.lap()
     # Line 9: continuous weights.
@@ -138,15 +153,20 @@ def register(
     return _scan_registration(source, normalized_source, normalization, fit, converged, degenerate, clock.seconds)
 
 
-def _fit_as_printed(fit: PaperFit, clock: _Clock) -> bool:
-    """Run algorithm 1, its stages timed, and return whether it converged."""
-    fit.start()
-    clock.lap()
-    converged = fit.fit_labels()
-    clock.lap()
-    converged = fit.refine() and converged
-    clock.lap()
-    return converged
+def _checked_scans(source: Any, target: Any, num_bones: int, grid_resolution: int) -> tuple[RangeScan, RangeScan]:
+    """Return the scans; raise unless they are some and the numbers fit, and warn where they are rounded."""
+    source, target = scan_of(source, "source"), scan_of(target, "target")
+    check_inputs((source, target), num_bones, grid_resolution)
+    # From the caller of `register` and its two decorators.
+    warn_about_rounding(source.points, "points of source", source.diagonal, stacklevel=5)
+    _warn_about_units(source, target)
+    return source, target
+
+
+def _aligned_samples(source: RangeScan, index: Tensor, start: Tensor, confidence: Tensor | None) -> Samples:
+    """Return the samples of a source whose points (N, 3) start at known positions, all confident by default."""
+    confidence = torch.ones_like(start[:, 0]) if confidence is None else confidence.detach().cpu()
+    return Samples.from_alignment(source, index, start[None], confidence[None])
 
 
 def _scan_registration(
@@ -234,7 +254,6 @@ def check_inputs(scans: tuple[Any, ...], num_bones: int, grid_resolution: int) -
     for name, scan in zip(("source", "target"), (scans[0], scans[-1]), strict=True):
         if not scan.diagonal > 0:
             raise InputError(f"{name} must have points at different places")
-    _warn_about_units(scans[0], scans[-1])
     check_count(num_bones, "num_bones", 1)
     check_count(grid_resolution, "grid_resolution", 1)
     if grid_resolution > MAX_RESOLUTION:
@@ -276,12 +295,15 @@ def _warn_about_units(source: RangeScan, target: RangeScan) -> None:
         f"{larger} is {max(ratio, 1 / ratio):.4g} times as large as {smaller}: are they in one unit? "
         f"If not, load {larger} with scale={factor:g}",
         UnitsWarning,
-        stacklevel=4,
+        stacklevel=6,
     )
 
 
-def _checked_parts(source: RangeScan, parts: Any, num_bones: int) -> Tensor:
+def _checked_parts(source: RangeScan, parts: Any, num_bones: int, config: RegisterConfig) -> Tensor | None:
     """Return known parts (N,) as int64 on the CPU; raise unless they fit the source and the number of bones."""
+    if parts is None:
+        return None
+    _check_unused("parts", config)
     parts = as_tensor(parts, "parts", "integers")
     if parts.is_floating_point() or parts.dtype == torch.bool:
         raise InputTypeError(f"parts must be integers, got {parts.dtype}")
@@ -293,22 +315,22 @@ def _checked_parts(source: RangeScan, parts: Any, num_bones: int) -> Tensor:
     return parts.detach().cpu().long()
 
 
-def _check_no_start(start: Any, parts: Any) -> None:
+def _check_unused(name: str, config: RegisterConfig) -> None:
     """Raise if the algorithm as printed is given what replaces its own first steps."""
-    for name, value in (("start", start), ("parts", parts)):
-        if value is not None:
-            raise InputError(
-                f"{name} cannot be used by RegisterConfig.paper(), which begins with a random segmentation and spin "
-                f"images; leave out {name}, or use RegisterConfig()"
-            )
+    if config.printed is not None:
+        raise InputError(
+            f"{name} cannot be used by RegisterConfig.paper(), which begins with a random segmentation and spin "
+            f"images; leave out {name}, or use RegisterConfig()"
+        )
 
 
-def _check_start(source: RangeScan, start: Any, confidence: Any) -> None:
+def _check_start(source: RangeScan, start: Any, confidence: Any, config: RegisterConfig) -> None:
     """Raise unless a known start fits the source."""
     if start is None:
         if confidence is not None:
             raise InputError("confidence is that of start; give both or neither")
         return
+    _check_unused("start", config)
     start = as_float_tensor(start, "start")
     check_shape(start, "start", tuple(source.points.shape))
     check_finite(start, "start")

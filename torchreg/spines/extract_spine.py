@@ -127,18 +127,12 @@ def extract_spine(
     """
     config = config or SpineConfig()
     meshes = _check_meshes(meshes)
-    if workers is not None:
-        check_count(workers, "workers", 1)
-    if prior is not None and config.printed:
-        raise InputError(
-            "prior cannot be used by SpineConfig.paper(), which knows of none; leave it out, or use SpineConfig()"
-        )
+    _check_settings(config, prior, workers)
     origin = far_origin([mesh.vertices for mesh in meshes])
     if origin is not None:
         near = [TriangleMesh(mesh.vertices - origin.to(mesh.vertices), mesh.faces) for mesh in meshes]
         return extract_spine(
-            near, times=times, prior=prior, config=config, workers=workers, on_step=on_step,
-            progress=progress,
+            near, times=times, prior=prior, config=config, workers=workers, on_step=on_step, progress=progress
         ).moved(origin)  # fmt: skip
     known = None if prior is None else PriorSkeleton.from_given(prior, config.num_tips)
     first = meshes[0].vertices
@@ -153,11 +147,10 @@ def extract_spine(
         limbs = _all_limbs(observed, graph, meshes, known, reference)
         curves, radii = (torch.stack([getattr(frame, name) for frame in limbs]) for name in ("curves", "radii"))
         frames = transported_frames(curves, reference)
-    like, topologies = meshes[0].vertices.detach(), tuple(curve_topology(graph, rows) for rows in curves)
-    curves, radii, frames = curves.to(like), radii.to(like), frames.to(like)
+    topologies = tuple(curve_topology(graph, rows) for rows in curves)
+    curves, radii, frames = (rows.to(meshes[0].vertices.detach()) for rows in (curves, radii, frames))
     model = Spine(curves, graph.edges, radii=radii, frames=frames, times=times)  # eq. 1
-    found, observed_limbs = labels >= 0, torch.stack([frame.observed for frame in observed])
-    notes = [_notes(*rows) for rows in zip(skeletons, found, observed_limbs, strict=True)]
+    found, own = labels >= 0, torch.stack([frame.observed for frame in observed])
     return SpineSequence(
         model=model,
         graph=model.graph,
@@ -166,14 +159,30 @@ def extract_spine(
         frames=frames,
         times=model.times.clone(),
         found=found,
-        own=observed_limbs,
+        own=own,
         reference=reference,
         topologies=topologies,
         own_topologies=tuple(skeleton.topology for skeleton in skeletons),
-        statuses=tuple(Status.WITH_WARNINGS if rows else Status.CONVERGED for rows in notes),
-        status=Status.WITH_WARNINGS if any(notes) else Status.CONVERGED,
-        warnings=tuple(f"frame {frame}: {row}" for frame, rows in enumerate(notes) for row in rows),
+        **_told([_notes(*rows) for rows in zip(skeletons, found, own, strict=True)]),
     )
+
+
+def _told(notes: Sequence[Sequence[str]]) -> dict[str, Any]:
+    """Return the statuses of the frames and of all, and the warnings, from the notes on each frame."""
+    return {
+        "statuses": tuple(Status.WITH_WARNINGS if rows else Status.CONVERGED for rows in notes),
+        "status": Status.WITH_WARNINGS if any(notes) else Status.CONVERGED,
+        "warnings": tuple(f"frame {frame}: {row}" for frame, rows in enumerate(notes) for row in rows),
+    }
+
+
+def _check_settings(config: SpineConfig, prior: Skeleton | SpineSequence | None, workers: int | None) -> None:
+    if workers is not None:
+        check_count(workers, "workers", 1)
+    if prior is not None and config.printed:
+        raise InputError(
+            "prior cannot be used by SpineConfig.paper(), which knows of none; leave it out, or use SpineConfig()"
+        )
 
 
 def _check_meshes(meshes: Sequence[TriangleMesh]) -> list[TriangleMesh]:

@@ -4,7 +4,8 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.datasets.creature_kinds import HELD_OUT_KINDS, Draw
+from torchreg.datasets.creature_kinds import HELD_OUT_KINDS
+from torchreg.datasets.creature_parts import Draw
 from torchreg.datasets.matching_pairs import matching_pairs
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp

@@ -85,7 +85,6 @@ def test_stiff_joints_keep_bones_together(pair):
             CellData(grid, source.points[index]), source, index, target, config, config.printed,
             num_bones=7, generator=torch.Generator().manual_seed(0),
         )  # fmt: skip
-        fit.start()
         moments = fit.model.joint_moments()
         for _ in range(3):
             fit.solve_motions()

@@ -22,7 +22,8 @@ from torchreg.registration.bones.labels import CellData, LabelCosts, first_label
 from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
 from torchreg.registration.bones.motions import BoneFit, fit_bones
 from torchreg.registration.bones.motions_and_joints import JointFit, fit_bones_and_joints
-from torchreg.registration.bones.registration_energy import EnergyState, energy_terms, term_weights
+from torchreg.registration.bones.registration_energy import EnergyState
+from torchreg.registration.bones.step_record import cut_edges, reported_weights, step_record
 from torchreg.registration.bones.weights import refine_weights
 from torchreg.registration.results import RegisterRecord
 
@@ -95,13 +96,7 @@ class ReducedFit:
         self._num_bones, self._on_step = num_bones, on_step
         self.history: list[RegisterRecord] = []
         self._edges = data.grid.edges()
-        # The same in all steps, so that their energies compare.
-        self._term_weights = term_weights(
-            distance=config.refine.distance,
-            smoothness=config.refine.smoothness,
-            norm=config.refine.normalization,
-            discontinuity=config.refine.closeness,
-        )
+        self._term_weights = reported_weights(config)
         self.matchers = [CompatibleMatcher(target, config.normal_scale) for target in targets]
         self._matches: list[CompatibleMatches] = []
         self._costs = LabelCosts(
@@ -239,9 +234,7 @@ class ReducedFit:
 
     def moved(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
         """Return points (N, 3) and their unit normals moved in every frame, (F, N, 3) each."""
-        with torch.no_grad():
-            weights, transforms = self.model.weights_at(points), self.model.transforms
-            return self.model.move(points, weights), turned_normals(normals, weights, transforms)
+        return moved_surface(self.model, points, normals)
 
     @property
     def _joint_weight(self) -> float:
@@ -281,27 +274,25 @@ class ReducedFit:
 
     @torch.no_grad()
     def _report(self, stage: str, step: int, num_steps: int) -> None:
-        state = self._energy_state()
-        squares = self.correspondences.squared_residuals(state.moved)
-        weights, neighbors = self.correspondences.weights, self.data.neighbors
         joints = self._joints()
-        record = RegisterRecord(
-            stage=stage,
-            step=step,
-            num_steps=num_steps,
-            distance=float((weights * squares).sum() / weights.sum().clamp_min(1e-300)),
+        record = step_record(
+            self._energy_state(),
+            self._term_weights,
+            cut_edges=cut_edges(self.labels, self.data),
             joint=0.0 if joints is None else float(joints.gaps.square().sum(-1).mean()),
-            smoothness=int((self.labels[neighbors[:, 0]] != self.labels[neighbors[:, 1]]).sum()),
-            num_labels=self.model.num_bones,
-            energies={name: float(term.mean()) for name, term in energy_terms(state, self._term_weights).items()},
-            **{
-                name: sum(int(getattr(matches, name).sum()) for matches in self._matches)
-                for name in ("kept", "boundary", "far", "turned")
-            },
+            matches=self._matches,
+            at=(stage, step, num_steps),
         )
         self.history.append(record)
         if self._on_step is not None:
             self._on_step(record)
+
+
+@torch.no_grad()
+def moved_surface(model: GridLBS, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+    """Return points (N, 3) and their unit normals moved by all F poses of a model, (F, N, 3) each."""
+    weights, transforms = model.weights_at(points), model.transforms
+    return model.move(points, weights), turned_normals(normals, weights, transforms)
 
 
 def turned_normals(normals: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:

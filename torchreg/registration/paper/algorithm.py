@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.registration.annealing import geometric_at
-from torchreg.registration.bones.alternation import turned_normals
+from torchreg.registration.bones.alternation import moved_surface
 from torchreg.registration.bones.closest_compatible import CompatibleMatcher, CompatibleMatches
 from torchreg.registration.bones.config import BoneConfig, OnRegisterStep
 from torchreg.registration.bones.correspondences import Correspondences
@@ -17,7 +17,8 @@ from torchreg.registration.bones.joint_moments import NEGLIGIBLE, JointMoments
 from torchreg.registration.bones.labels import CellData, LabelCosts, relabel
 from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
 from torchreg.registration.bones.motions import fit_bones
-from torchreg.registration.bones.registration_energy import EnergyState, energy_terms, term_weights
+from torchreg.registration.bones.registration_energy import EnergyState
+from torchreg.registration.bones.step_record import cut_edges, reported_weights, step_record
 from torchreg.registration.bones.weights import refine_weights
 from torchreg.registration.paper.config import PaperConfig
 from torchreg.registration.paper.segmentation import best_candidates, nearest_seed, reuse_labels
@@ -36,7 +37,7 @@ class PaperFit:
         config: what the printed algorithm shares with the default one.
         paper: what it does not share.
         num_bones: B, also of the first segmentation.
-        generator: draws seeds, samples and halves.
+        generator: draws seeds, samples and halves; None draws the same at every call.
         on_step: called with a `RegisterRecord` after each round.
 
     Attributes:
@@ -55,26 +56,22 @@ class PaperFit:
         paper: PaperConfig,
         *,
         num_bones: int,
-        generator: torch.Generator,
+        generator: torch.Generator | None = None,
         on_step: OnRegisterStep | None = None,
     ) -> None:
         self.data, self.config, self._paper = data, config, paper
-        self._source, self._index, self._generator = source, index, generator
+        self._source, self._index = source, index
+        self._generator = torch.Generator().manual_seed(0) if generator is None else generator
         self._num_bones, self._on_step = num_bones, on_step
         self.matchers = [CompatibleMatcher(target, config.normal_scale)]
         self.history: list[RegisterRecord] = []
-        self._matches: CompatibleMatches | None = None
+        self._matches: list[CompatibleMatches] = []
         self._progress = 0.0
         self._edges = data.grid.edges()
-        # The same in all rounds, as in the default algorithm, so that their energies compare.
-        self._term_weights = term_weights(
-            distance=config.refine.distance,
-            smoothness=config.refine.smoothness,
-            norm=config.refine.normalization,
-            discontinuity=config.refine.closeness,
-        )
+        self._term_weights = reported_weights(config)
+        self._start()
 
-    def start(self) -> None:
+    def _start(self) -> None:
         """Segment the grid at random and match spin images, or closest points: lines 1 and 2."""
         grid, points = self.data.grid, self._source.points
         seeds = points[best_candidates(points, self._num_bones, self._generator)]
@@ -145,17 +142,15 @@ class PaperFit:
         """Match the moved samples with the closest compatible points of the target, under the angle of the round."""
         (moved,), (normals,) = self.moved(self._samples, self._source.normals[self._index])
         (matcher,) = self.matchers
-        self._matches = matcher.match(
+        found = matcher.match(
             moved,
             normals,
             max_distance=self._paper.max_distance * self._source.spacing,
             max_angle=geometric_at(self.config.max_angle, self._progress),
         )
+        self._matches = [found]
         self.correspondences = Correspondences(
-            self._matches.targets[None],
-            self._matches.normals[None],
-            self._matches.kept.to(moved)[None],
-            point_to_point=0.0,
+            found.targets[None], found.normals[None], found.kept.to(moved)[None], point_to_point=0.0
         )
 
     def solve_labels(self) -> float:
@@ -180,9 +175,7 @@ class PaperFit:
 
     def moved(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
         """Return points (N, 3) and their unit normals moved, (1, N, 3) each."""
-        with torch.no_grad():
-            weights, transforms = self.model.weights_at(points), self.model.transforms
-            return self.model.move(points, weights), turned_normals(normals, weights, transforms)
+        return moved_surface(self.model, points, normals)
 
     @property
     def _samples(self) -> Tensor:
@@ -206,7 +199,6 @@ class PaperFit:
 
     @torch.no_grad()
     def _report(self, stage: str, step: int, num_steps: int) -> None:
-        matches, neighbors, weights = self._matches, self.data.neighbors, self.correspondences.weights
         labeled = GridLBS.from_labels(self.data.grid, self.labels, self.model.num_bones)
         state = EnergyState(
             model=self.model,
@@ -216,17 +208,13 @@ class PaperFit:
             edges=self._edges,
             label_weights=labeled.weights,
         )
-        squares = self.correspondences.squared_residuals(state.moved)
-        record = RegisterRecord(
-            stage=stage,
-            step=step,
-            num_steps=num_steps,
-            distance=float((weights * squares).sum() / weights.sum().clamp_min(1e-300)),
+        record = step_record(
+            state,
+            self._term_weights,
+            cut_edges=cut_edges(self.labels, self.data),
             joint=float(JointEnergy()(self.model.transforms[0], state.moments)),
-            smoothness=int((self.labels[neighbors[:, 0]] != self.labels[neighbors[:, 1]]).sum()),
-            num_labels=self.model.num_bones,
-            energies={name: float(term.mean()) for name, term in energy_terms(state, self._term_weights).items()},
-            **{name: int(getattr(matches, name).sum()) for name in ("kept", "boundary", "far", "turned")},
+            matches=self._matches,
+            at=(stage, step, num_steps),
         )
         self.history.append(record)
         if self._on_step is not None:
