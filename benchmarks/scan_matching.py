@@ -36,7 +36,7 @@ from torchreg.registration.dense.config import ScanAlignConfig
 from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
 from torchreg.registration.dense.node_graph import spread_weights
 from torchreg.registration.dense.problem import NORMAL_SCALE, ScanAlignProblem, describe
-from torchreg.registration.dense.scan_matcher import ScanMatcher, posterior
+from torchreg.registration.dense.scan_matcher import ScanMatcher, match_probabilities
 from torchreg.registration.dense.scan_tokens import SIZES, ScanTokens
 
 # A match is right, and a place is visible, within these shares of the diagonal.
@@ -132,7 +132,7 @@ def measured(pair: Pair, matcher: ScanMatcher) -> list[float]:
     tokens = [
         ScanTokens.from_even(scan.points, scan.normals, scan.boundary) for scan in (problem.source, problem.target)
     ]
-    (probability,), (hidden,), _ = (value.double() for value in posterior(matcher(*tokens)))
+    (probability,), (hidden,), _ = (value.double() for value in match_probabilities(matcher(*tokens)))
     size = pair.target.diagonal / problem.unit.scale
     truth = problem.unit.normalize(pair.truth)[problem.samples[: SIZES.num_tokens]]
     places = problem.target.points[: SIZES.num_tokens]

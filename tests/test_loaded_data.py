@@ -5,7 +5,7 @@ import torch
 
 import torchreg as tr
 from torchreg.errors import InputTypeError
-from torchreg.geometry.loaded import mesh_of, points_of, scan_of
+from torchreg.geometry.loaded import as_mesh, as_points, as_scan
 from torchreg.io.points import save_points
 
 
@@ -20,14 +20,16 @@ def loaded(tmp_path, arm):
 def test_points_scans_and_meshes_of_what_was_loaded(loaded):
     cloud, mesh, scan, points = loaded
     for value in loaded:
-        assert torch.equal(points_of(value), points)
+        assert torch.equal(as_points(value), points)
     for value in (cloud, mesh, scan):
-        assert torch.equal(scan_of(value, "source").points, points)
-        assert torch.equal(mesh_of(value, "mesh").faces, mesh.faces)
+        assert torch.equal(as_scan(value, "source").points, points)
+        assert torch.equal(as_mesh(value, "mesh").faces, mesh.faces)
     with pytest.raises(InputTypeError, match=r"source must be a RangeScan, got Tensor; .* load a file"):
-        scan_of(points, "source")
+        as_scan(points, "source")
     with pytest.raises(InputTypeError, match="mesh must be a TriangleMesh, got Tensor; load a file with load_mesh"):
-        mesh_of(points, "mesh")
+        as_mesh(points, "mesh")
+    with pytest.raises(InputTypeError, match="got the points of a RangeScan alone; mesh them first"):
+        as_mesh(tr.RangeScan(points), "mesh")
 
 
 def test_systems_take_them(loaded, arm):

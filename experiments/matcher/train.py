@@ -15,7 +15,7 @@ import torch
 import typer
 from torch import Tensor, distributed, nn
 
-from torchreg.registration.dense.scan_matcher import ScanMatcher, posterior
+from torchreg.registration.dense.scan_matcher import ScanMatcher, match_probabilities
 
 from ..matcher.shards import PairBatch, PairStore
 
@@ -95,7 +95,7 @@ def validate(net: ScanMatcher, pairs: PairStore, device: str = "cpu", size: int 
     for first in range(0, len(pairs), size):
         batch = pairs.batch(torch.arange(first, min(first + size, len(pairs)))).to(device)
         logits = net(batch.source, batch.target)
-        probability, hidden, _ = posterior(logits)
+        probability, hidden, _ = match_probabilities(logits)
         places = batch.target.at_tokens(batch.target.points)
         best = places.gather(1, probability.argmax(2, keepdim=True).expand(-1, -1, 3))
         right = (best - batch.source_truth).norm(dim=-1) < NEAR

@@ -26,7 +26,7 @@ from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.errors import InputError, UnitsWarning
-from torchreg.geometry.loaded import points_of
+from torchreg.geometry.loaded import as_points
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
@@ -175,7 +175,7 @@ def align(
 
     References: Dewaele et al. 2006, section 3.
     """
-    config, data = config or AlignConfig(), points_of(data)
+    config, data = config or AlignConfig(), as_points(data)
     origin = floating_origin(shape, data)
     if origin is not None:
         return _align_about(origin, shape, data, initial_pose, model_points, mask, config, on_step)

@@ -24,7 +24,7 @@ from torchreg.alignment.results import PoseStarts
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource, bent_pose, register_rigidly
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.errors import InputError
-from torchreg.geometry.loaded import points_of
+from torchreg.geometry.loaded import as_points
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
@@ -120,7 +120,7 @@ def find_pose(
 
     Cost: 1 to 2 s for a hand on one CPU core, whatever the number of data.
     """
-    config, data = config or FindPoseConfig(), points_of(data)
+    config, data = config or FindPoseConfig(), as_points(data)
     check_count(num_starts, "num_starts", 1)
     if not sources:
         raise InputError("sources must hold at least one source of rough poses, got none")

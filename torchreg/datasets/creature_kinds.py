@@ -18,7 +18,7 @@ from torchreg.datasets.solids import RoundBox, RoundCone
 X, Y, Z = torch.eye(3, dtype=torch.float64)
 
 
-def quadruped(draw: Draw) -> Creature:
+def draw_quadruped(draw: Draw) -> Creature:
     """Draw a four-legged animal: anything between a mouse, a giraffe and an elephant."""
     u, body = draw.uniform, Builder(draw)
     length, girth, fat = u(0.6, 1.2), u(0.1, 0.25), u(0.8, 1.3)
@@ -89,7 +89,7 @@ def _tail(draw: Draw, body: Builder, rump: int, start: Tensor) -> None:
                limit=45)  # fmt: skip
 
 
-def person(draw: Draw) -> Creature:
+def draw_person(draw: Draw) -> Creature:
     """Draw somebody who stands on two legs: a person, a child, a bear or a doll, with clothes, hair and bags."""
     u, body = draw.uniform, Builder(draw)
     width, height, girth, flat = u(0.1, 0.22), u(0.35, 0.7), u(0.1, 0.22), u(0.5, 1.0)
@@ -178,7 +178,7 @@ def _clothes(
         body.attach(chest, cone_of(top, waist - at(0, 0.15, 0), (girth, girth * u(1.1, 1.5)), u(0.7, 1), Z))
 
 
-def hand(draw: Draw) -> Creature:
+def draw_hand(draw: Draw) -> Creature:
     """Draw a hand of four or five fingers with its forearm."""
     u, body = draw.uniform, Builder(draw)
     width, length, thick = u(0.25, 0.45), u(0.35, 0.55), u(0.07, 0.11)
@@ -204,7 +204,7 @@ def hand(draw: Draw) -> Creature:
     return body.finish()
 
 
-def plant(draw: Draw) -> Creature:
+def draw_plant(draw: Draw) -> Creature:
     """Draw a branching plant with leaves."""
     u, body = draw.uniform, Builder(draw)
     leafy = u(0, 1)
@@ -227,7 +227,7 @@ def plant(draw: Draw) -> Creature:
     return body.finish()
 
 
-def arm(draw: Draw) -> Creature:
+def draw_arm(draw: Draw) -> Creature:
     """Draw a robot arm: links of boxes and cylinders between knobs, with a gripper."""
     u, body = draw.uniform, Builder(draw, rigid=draw.chance(0.5))
     parent, end = body.add(
@@ -253,7 +253,7 @@ def arm(draw: Draw) -> Creature:
     return body.finish()
 
 
-def bug(draw: Draw) -> Creature:
+def draw_bug(draw: Draw) -> Creature:
     """Draw an insect, a spider or a crab: segments with pairs of legs."""
     u, body = draw.uniform, Builder(draw)
     parent, end, thick = -1, at(0, 0, -0.5), u(0.1, 0.2)
@@ -274,7 +274,7 @@ def bug(draw: Draw) -> Creature:
     return body.finish()
 
 
-def snake(draw: Draw) -> Creature:
+def draw_snake(draw: Draw) -> Creature:
     """Draw a long body without legs: a snake, a worm or a rope, thick in the middle or not."""
     u, body = draw.uniform, Builder(draw)
     count, thick, length = draw.count(6, 14), u(0.04, 0.12), u(0.12, 0.22)
@@ -285,7 +285,7 @@ def snake(draw: Draw) -> Creature:
     return body.finish()
 
 
-def furniture(draw: Draw) -> Creature:
+def draw_furniture(draw: Draw) -> Creature:
     """Draw a jointed thing of boxes: a lamp, a cupboard, a folding chair."""
     u, body = draw.uniform, Builder(draw, rigid=True)
     parent, end = body.add(-1, at(0, 0, 0), Y, u(0.05, 0.3), (u(0.04, 0.1), u(0.04, 0.1)), limit=1)
@@ -300,7 +300,7 @@ def furniture(draw: Draw) -> Creature:
     return body.finish()
 
 
-def bird(draw: Draw) -> Creature:
+def draw_bird(draw: Draw) -> Creature:
     """Draw a bird: a body, two wings of two parts, a tail fan, two thin legs, a beak."""
     u, body = draw.uniform, Builder(draw)
     girth, length = u(0.1, 0.18), u(0.3, 0.5)
@@ -320,7 +320,7 @@ def bird(draw: Draw) -> Creature:
     return body.finish()
 
 
-def fish(draw: Draw) -> Creature:
+def draw_fish(draw: Draw) -> Creature:
     """Draw a fish: a body that bends sideways, a tail fin, fins on the back and in pairs."""
     u, body = draw.uniform, Builder(draw)
     count, girth, flat = draw.count(3, 5), u(0.12, 0.28), u(0.4, 0.8)
@@ -339,7 +339,7 @@ def fish(draw: Draw) -> Creature:
     return body.finish()
 
 
-def squid(draw: Draw) -> Creature:
+def draw_squid(draw: Draw) -> Creature:
     """Draw an octopus, a starfish or a squid: arms around a middle."""
     u, body = draw.uniform, Builder(draw)
     size, count = u(0.12, 0.25), draw.count(4, 8)
@@ -353,7 +353,7 @@ def squid(draw: Draw) -> Creature:
     return body.finish()
 
 
-def dinosaur(draw: Draw) -> Creature:
+def draw_dinosaur(draw: Draw) -> Creature:
     """Draw a heavy animal on two legs with a long tail, small arms and a large head, or a kangaroo."""
     u, body = draw.uniform, Builder(draw)
     girth, length, lean = u(0.14, 0.24), u(0.5, 0.8), u(5, 70)
@@ -383,7 +383,7 @@ def _tail_of_dinosaur(draw: Draw, body: Builder, hips: int, girth: float) -> Non
     body.chain(hips, at(0, 0, -0.5 * girth), steps, [draw.uniform(0.15, 0.28)] * count, radii, limit=35)
 
 
-def crane(draw: Draw) -> Creature:
+def draw_crane(draw: Draw) -> Creature:
     """Draw a vehicle with a boom: rigid boxes, wheels or tracks, an arm of two or three links."""
     u, body = draw.uniform, Builder(draw, rigid=True)
     base, top = body.add(-1, at(0, 0, 0), Y, 0.1, (0.08, 0.08), limit=1)
@@ -403,16 +403,19 @@ def crane(draw: Draw) -> Creature:
 Kind = Callable[[Draw], Creature]
 # With the share of each in what is drawn: most of what is scanned are people and animals.
 TRAINING_KINDS: dict[str, tuple[Kind, float]] = {
-    "quadruped": (quadruped, 0.32),
-    "person": (person, 0.32),
-    "hand": (hand, 0.08),
-    "plant": (plant, 0.05),
-    "arm": (arm, 0.06),
-    "bug": (bug, 0.08),
-    "snake": (snake, 0.03),
-    "furniture": (furniture, 0.06),
+    "quadruped": (draw_quadruped, 0.32),
+    "person": (draw_person, 0.32),
+    "hand": (draw_hand, 0.08),
+    "plant": (draw_plant, 0.05),
+    "arm": (draw_arm, 0.06),
+    "bug": (draw_bug, 0.08),
+    "snake": (draw_snake, 0.03),
+    "furniture": (draw_furniture, 0.06),
 }
 HELD_OUT_KINDS: dict[str, tuple[Kind, float]] = {
-    name: (kind, 0.2)
-    for name, kind in {"bird": bird, "fish": fish, "squid": squid, "dinosaur": dinosaur, "crane": crane}.items()
+    "bird": (draw_bird, 0.2),
+    "fish": (draw_fish, 0.2),
+    "squid": (draw_squid, 0.2),
+    "dinosaur": (draw_dinosaur, 0.2),
+    "crane": (draw_crane, 0.2),
 }

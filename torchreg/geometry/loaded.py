@@ -9,7 +9,7 @@ from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.range_scan import RangeScan
 
 
-def points_of(value: Any) -> Any:
+def as_points(value: Any) -> Any:
     """Return the points of a cloud or a scan, or the vertices of a mesh; anything else as it is."""
     for name in ("points", "vertices"):
         if hasattr(value, name) and not isinstance(value, type):
@@ -17,7 +17,7 @@ def points_of(value: Any) -> Any:
     return value
 
 
-def scan_of(value: Any, name: str) -> RangeScan:
+def as_scan(value: Any, name: str) -> RangeScan:
     """Return a scan as it is, and a cloud or a mesh as one.
 
     Raises:
@@ -26,7 +26,7 @@ def scan_of(value: Any, name: str) -> RangeScan:
     """
     if isinstance(value, RangeScan):
         return value
-    points = points_of(value)
+    points = as_points(value)
     if points is value:
         raise InputTypeError(
             f"{name} must be a RangeScan, got {type(value).__name__}; wrap points by RangeScan(...), or load a "
@@ -35,7 +35,7 @@ def scan_of(value: Any, name: str) -> RangeScan:
     return RangeScan(points, getattr(value, "faces", None), getattr(value, "normals", None))
 
 
-def mesh_of(value: Any, name: str) -> TriangleMesh:
+def as_mesh(value: Any, name: str) -> TriangleMesh:
     """Return a mesh as it is, and a cloud or a scan with faces as one.
 
     Raises:
@@ -43,7 +43,12 @@ def mesh_of(value: Any, name: str) -> TriangleMesh:
     """
     if isinstance(value, TriangleMesh):
         return value
-    faces = getattr(value, "faces", None)
-    if faces is None or not hasattr(value, "points"):
+    if not hasattr(value, "points"):
         raise InputTypeError(f"{name} must be a TriangleMesh, got {type(value).__name__}; load a file with load_mesh")
+    faces = getattr(value, "faces", None)
+    if faces is None:
+        raise InputTypeError(
+            f"{name} must be a TriangleMesh, or a scan with faces, got the points of a {type(value).__name__} alone; "
+            f"mesh them first"
+        )
     return TriangleMesh(value.points, faces)

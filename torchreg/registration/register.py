@@ -16,7 +16,7 @@ from torchreg._checks import as_float_tensor, as_tensor, check_count, check_fini
 from torchreg._threads import one_thread
 from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.far_origin import far_origin
-from torchreg.geometry.loaded import scan_of
+from torchreg.geometry.loaded import as_scan
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.spread import SPREADS, spread_dimensions
@@ -96,7 +96,7 @@ def register(
             source.shifted(-origin), target.shifted(-origin), num_bones, grid_resolution, config, generator, on_step,
             start=None if start is None else start - origin, confidence=confidence, parts=parts,
         ).moved(origin)  # fmt: skip
-    degenerate = warn_about_degenerate((source, target), stacklevel=4)
+    degenerate = warn_about_flat_scans((source, target), stacklevel=4)
     _check_start(source, start, confidence, config)
     parts = _checked_parts(source, parts, num_bones, config)
     return _registered(
@@ -155,7 +155,7 @@ def _registered(
 
 def _checked_scans(source: Any, target: Any, num_bones: int, grid_resolution: int) -> tuple[RangeScan, RangeScan]:
     """Return the scans; raise unless they are some and the numbers fit, and warn where they are rounded."""
-    source, target = scan_of(source, "source"), scan_of(target, "target")
+    source, target = as_scan(source, "source"), as_scan(target, "target")
     check_inputs((source, target), num_bones, grid_resolution)
     # From the caller of `register` and its two decorators.
     warn_about_rounding(source.points, "points of source", source.diagonal, stacklevel=5)
@@ -260,7 +260,7 @@ def check_inputs(scans: tuple[Any, ...], num_bones: int, grid_resolution: int) -
         raise InputError(f"grid_resolution must be at most {MAX_RESOLUTION}, got {grid_resolution}")
 
 
-def warn_about_degenerate(scans: Sequence[RangeScan], *, stacklevel: int) -> bool:
+def warn_about_flat_scans(scans: Sequence[RangeScan], *, stacklevel: int) -> bool:
     """Return whether a scan lies on a line or on a plane, in which it may slide; warn if one does."""
     spreads = [int(spread_dimensions(scan.points, scan.diagonal)) for scan in scans]
     if min(spreads) >= len(SPREADS):

@@ -12,7 +12,7 @@ from torchreg._checks import check_count, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.errors import InputError
 from torchreg.geometry.far_origin import far_origin
-from torchreg.geometry.loaded import scan_of
+from torchreg.geometry.loaded import as_scan
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.registration.bones.alternation import ReducedFit, Samples, turned_normals
@@ -28,7 +28,7 @@ from torchreg.registration.register import (
     initial_records,
     register,
     source_samples,
-    warn_about_degenerate,
+    warn_about_flat_scans,
 )
 from torchreg.registration.results import SequenceRegistration
 
@@ -172,7 +172,7 @@ def register_sequence(
             "config must be a RegisterConfig without printed, got one of RegisterConfig.paper(), which registers pairs "
             "only, as the paper does; call register for each pair"
         )
-    scans = tuple(scan_of(scan, f"scans[{number}]") for number, scan in enumerate(scans))
+    scans = tuple(as_scan(scan, f"scans[{number}]") for number, scan in enumerate(scans))
     if len(scans) < 2:
         raise InputError(f"scans must hold at least two, got {len(scans)}")
     for scan in scans:
@@ -187,7 +187,7 @@ def register_sequence(
         return register_sequence(
             near, num_bones, grid_resolution, config, generator, on_step, reference=reference
         ).moved(origin)  # fmt: skip
-    degenerate = warn_about_degenerate(scans, stacklevel=4)
+    degenerate = warn_about_flat_scans(scans, stacklevel=4)
     source = scans[reference]
     index = source_samples(source, config, generator)
     normalization = Normalization.from_points(source.points[index])

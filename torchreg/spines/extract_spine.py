@@ -13,7 +13,7 @@ from torch import Tensor
 from torchreg._checks import check_count, warn_about_rounding
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.far_origin import far_origin
-from torchreg.geometry.loaded import mesh_of
+from torchreg.geometry.loaded import as_mesh
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.result import Status
@@ -189,7 +189,7 @@ def _check_meshes(meshes: Sequence[TriangleMesh]) -> list[TriangleMesh]:
     """Return the frames as a list; raise InputError or InputTypeError unless each is a mesh with faces."""
     if isinstance(meshes, TriangleMesh):
         raise InputTypeError("meshes must be a sequence of TriangleMesh, got one mesh; put it into a list")
-    meshes = [mesh_of(mesh, f"meshes[{frame}]") for frame, mesh in enumerate(meshes)]
+    meshes = [as_mesh(mesh, f"meshes[{frame}]") for frame, mesh in enumerate(meshes)]
     if not meshes:
         raise InputError("meshes must hold at least one frame, got none")
     for frame, mesh in enumerate(meshes):

@@ -12,7 +12,7 @@ from torchreg._checks import check_choice, check_count, check_positive
 from torchreg.errors import InputError
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.geodesics import GeodesicGraph
-from torchreg.geometry.loaded import mesh_of
+from torchreg.geometry.loaded import as_mesh
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton, build_skeleton
 from torchreg.geometry.spread import SPREADS, spread_dimensions
@@ -103,7 +103,7 @@ def skeletonize(mesh: TriangleMesh, config: SkeletonizeConfig | None = None) -> 
 
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1, eq. 4 and 5.
     """
-    mesh = mesh_of(mesh, "mesh")
+    mesh = as_mesh(mesh, "mesh")
     config = SkeletonizeConfig() if config is None else config
     origin = far_origin(mesh.vertices)
     if origin is not None:

@@ -15,7 +15,7 @@ from torchreg._threads import one_thread
 from torchreg.alignment.align import AlignConfig, align
 from torchreg.alignment.inputs import check_skin, floating_origin, warn_about_degenerate, warn_about_units
 from torchreg.errors import InputError, InputTypeError
-from torchreg.geometry.loaded import points_of
+from torchreg.geometry.loaded import as_points
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
@@ -127,7 +127,7 @@ class Tracker:
 
         Differentiable: no.
         """
-        points = points_of(points)
+        points = as_points(points)
         self._check_time(time)
         self._place_origin(points)
         cloud = self._checked_points(points)

@@ -9,7 +9,7 @@ from torchreg.datasets.creature_parts import Draw
 from torchreg.datasets.matching_pairs import matching_pairs
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
-from torchreg.registration.dense.scan_matcher import ScanMatcher, posterior
+from torchreg.registration.dense.scan_matcher import ScanMatcher, match_probabilities
 from torchreg.registration.dense.scan_tokens import SIZES, ScanTokens
 
 
@@ -75,7 +75,7 @@ def test_a_batch_gives_what_its_pairs_give_alone(matcher, pair):
 
 def test_probabilities_are_some():
     logits = torch.randn(2, 5, 7, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    probability, hidden, target_hidden = posterior(logits)
+    probability, hidden, target_hidden = match_probabilities(logits)
     assert probability.shape == (2, 4, 6)
     rows = torch.softmax(logits[:, :-1], 2)
     torch.testing.assert_close(rows[..., -1], hidden)

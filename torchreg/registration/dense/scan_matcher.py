@@ -109,7 +109,7 @@ class ScanMatcher(nn.Module):
         check_same_kind(target.points, "target", source.points, "source")
         device = self.project.weight.device
         tokens = [ScanTokens.from_scan(scan).to(device) for scan in (source, target)]
-        probability, hidden, target_hidden = posterior(self(*tokens))
+        probability, hidden, target_hidden = match_probabilities(self(*tokens))
         like = source.points
         return ScanMatches(
             source_index=tokens[0].token_index[0].to(like.device),
@@ -169,7 +169,7 @@ class _Attention(nn.Module):
         return state + self.layer(self.second_norm(state))
 
 
-def posterior(logits: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def match_probabilities(logits: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return probabilities (B, S, T) of matches, and that tokens are hidden, (B, S) and (B, T), of logits.
 
     A match is as likely as both tokens choose each other.
