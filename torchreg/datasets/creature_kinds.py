@@ -12,7 +12,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchreg.datasets.creature_parts import SIDES, Builder, Creature, Draw, as_tuple, at, cone_of, towards
+from torchreg.datasets.creature_parts import LEFT_RIGHT, Builder, Creature, Draw, as_tuple, at, cone_of, towards
 from torchreg.datasets.solids import RoundBox, RoundCone
 
 X, Y, Z = torch.eye(3, dtype=torch.float64)
@@ -32,7 +32,7 @@ def draw_quadruped(draw: Draw) -> Creature:
     for part, z in ((rump, -length / 2 * u(0.7, 1.0)), (chest, length / 2 * u(0.7, 1.0))):
         bend, split, width = u(-25, 25), u(0.4, 0.6), thick * u(0.8, 1.3)
         hoof = draw.chance(0.4)
-        for side in SIDES:
+        for side in LEFT_RIGHT:
             hip = at(side * 0.75 * girth, -0.3 * girth, z)
             steps = [towards(-90 + bend, side * 5), towards(-90 - bend), towards(-60 if hoof else -9)]
             body.chain(part, hip, steps, [height * split, height * (1 - split), foot],
@@ -63,14 +63,14 @@ def _pairs_on_head(draw: Draw, body: Builder, head: int, nape: Tensor, size: flo
     """Draw ears, and horns or antlers."""
     u = draw.uniform
     rise, out, length, width, flat = u(10, 100), u(30, 90), u(0.05, 0.3), u(0.025, 0.09), u(0.25, 1)
-    for side in SIDES:
+    for side in LEFT_RIGHT:
         base = nape + at(side * 0.6 * size, 0.5 * size, 0)
         body.add(
             head, base, towards(rise, side * out), length, (width, width * u(0.3, 1)), flat=flat, normal=Z, limit=40
         )
     if draw.chance(0.3):
         rise, length, width, bend = u(40, 90), u(0.08, 0.3), u(0.02, 0.045), u(-60, 60)
-        for side in SIDES:
+        for side in LEFT_RIGHT:
             base = nape + at(side * 0.35 * size, 0.8 * size, 0.3 * size)
             tip = base + length * towards(rise, side * 40)
             body.attach(head, RoundCone(as_tuple(base), as_tuple(tip), width, 0.8 * width))
@@ -124,7 +124,7 @@ def _persons_head(draw: Draw, body: Builder, chest: int, top: Tensor) -> None:
                    [0.05, 0.04, 0.02], limit=50)  # fmt: skip
     if draw.chance(0.3):
         rise, length = u(0, 90), u(0.04, 0.2)
-        for side in SIDES:
+        for side in LEFT_RIGHT:
             body.add(head, chin + at(side * 0.7 * size, size, 0), towards(rise, side * 90), length, (0.035, 0.02),
                      flat=u(0.4, 1), normal=Z, limit=30)  # fmt: skip
 
@@ -133,7 +133,7 @@ def _arms(draw: Draw, body: Builder, chest: int, top: Tensor, width: float, girt
     u = draw.uniform
     length, thick, rise, forward = u(0.45, 0.95), u(0.03, 0.085), u(-80, 20), u(-30, 40)
     fingers, size = draw.chance(0.4), u(0.06, 0.16)
-    for side in SIDES:
+    for side in LEFT_RIGHT:
         shoulder = top + at(side * (width + 0.4 * girth), -0.03, 0)
         steps = [towards(rise, side * 90), towards(rise, side * (90 - forward)), towards(rise, side * (90 - forward))]
         numbers, end = body.chain(chest, shoulder, steps, [length / 2, length / 2, size],
@@ -150,7 +150,7 @@ def _legs(draw: Draw, body: Builder, hips: int, width: float) -> float:
     """Draw both legs and return their length."""
     u = draw.uniform
     length, thick, foot, spread = u(0.5, 1.1), u(0.045, 0.12), u(0.1, 0.24), u(0, 15)
-    for side in SIDES:
+    for side in LEFT_RIGHT:
         steps = [towards(-88, side * 30) + at(side * math.tan(math.radians(spread)), 0, 0), at(0, -1, -0.05),
                  at(side * 0.15, -0.15, 1)]  # fmt: skip
         body.chain(hips, at(side * 0.8 * width, 0, 0), steps, [length / 2, length / 2, foot],
@@ -247,7 +247,7 @@ def draw_arm(draw: Draw) -> Creature:
             body.attach(parent, RoundBox(as_tuple(end - 0.1 * step), half, 0.2 * thick))
         thick *= u(0.75, 1)
     aside = torch.linalg.cross(step, draw.normal(3))
-    for side in SIDES:
+    for side in LEFT_RIGHT:
         body.chain(parent, end, [step + side * u(0.5, 1) * aside, step], [u(0.08, 0.2), u(0.08, 0.2)],
                    [0.6 * thick, 0.5 * thick, 0.4 * thick], limit=40)  # fmt: skip
     return body.finish()
@@ -267,7 +267,7 @@ def draw_bug(draw: Draw) -> Creature:
     for _ in range(draw.count(1, 4)):
         part, start, radius = segments[draw.count(0, len(segments) - 1)]
         rise, turn, count, width, length = u(-80, 60), u(30, 150), draw.count(2, 3), u(0.025, 0.07), u(0.15, 0.4)
-        for side in SIDES:
+        for side in LEFT_RIGHT:
             steps = [towards(rise - 35 * bone, side * turn) for bone in range(count)]
             body.chain(part, start + at(side * 0.6 * radius, 0, 0), steps, [length] * count,
                        torch.linspace(1.2 * width, 0.7 * width, count + 1).tolist())  # fmt: skip
@@ -309,7 +309,7 @@ def draw_bird(draw: Draw) -> Creature:
     head, face = body.add(neck, nape, towards(u(-20, 30)), u(0.06, 0.1), (0.07, 0.05), limit=45)
     body.attach(head, RoundCone(as_tuple(face), as_tuple(face + u(0.06, 0.2) * towards(-10)), 0.03, 0.01))
     span, chord, flat = u(0.3, 0.7), u(0.1, 0.2), u(0.12, 0.3)
-    for side in SIDES:
+    for side in LEFT_RIGHT:
         shoulder = at(side * 0.7 * girth, 0.4 * girth, 0.1 * length)
         body.chain(trunk, shoulder, [towards(5, side * 90), towards(5, side * 120)], [span / 2, span / 2],
                    [chord, chord, 0.4 * chord], flat=flat, normal=Y, limit=60)  # fmt: skip
@@ -333,7 +333,7 @@ def draw_fish(draw: Draw) -> Creature:
         numbers[1], at(0, 0.7 * girth, 0.1), towards(u(40, 90), 180), u(0.1, 0.25), (0.1, 0.04), flat=0.25, normal=X
     )
     rise = u(-70, 0)
-    for side in SIDES:
+    for side in LEFT_RIGHT:
         body.add(numbers[0], at(side * 0.5 * flat * girth, -0.2 * girth, 0.3), towards(rise, side * 110), u(0.12, 0.3),
                  (0.06, 0.03), flat=0.3, normal=Y, limit=60)  # fmt: skip
     return body.finish()
@@ -363,12 +363,12 @@ def draw_dinosaur(draw: Draw) -> Creature:
     neck, nape = body.add(chest, front, towards(u(20, 80)), u(0.1, 0.3), (0.5 * girth, 0.4 * girth), limit=40)
     head, _ = body.add(neck, nape, towards(u(-20, 10)), u(0.2, 0.35), (0.6 * girth, 0.35 * girth), limit=45)
     if draw.chance(0.5):
-        for side in SIDES:
+        for side in LEFT_RIGHT:
             body.add(
                 head, nape + at(side * 0.3 * girth, 0.4 * girth, 0), towards(80, side * 40), u(0.08, 0.2), (0.03, 0.02)
             )
     leg, thick = u(0.5, 0.8), u(0.07, 0.12)
-    for side in SIDES:
+    for side in LEFT_RIGHT:
         body.chain(hips, at(side * 0.8 * girth, 0, 0), [towards(-60), towards(-110), towards(-20)],
                    [leg / 2, leg / 2, u(0.12, 0.3)], [1.5 * thick, 0.8 * thick, 0.6 * thick, 0.5 * thick])  # fmt: skip
         body.chain(chest, front + at(side * 0.6 * girth, -0.3 * girth, 0), [towards(-60, side * 20), towards(-10)],
@@ -387,7 +387,7 @@ def draw_crane(draw: Draw) -> Creature:
     """Draw a vehicle with a boom: rigid boxes, wheels or tracks, an arm of two or three links."""
     u, body = draw.uniform, Builder(draw, rigid=True)
     base, top = body.add(-1, at(0, 0, 0), Y, 0.1, (0.08, 0.08), limit=1)
-    for side in SIDES:
+    for side in LEFT_RIGHT:
         body.attach(base, RoundBox((side * u(0.12, 0.2), -0.02, 0), (0.05, 0.07, u(0.2, 0.35)), 0.04))
     cab, _ = body.add(base, top, Y, 0.08, (0.1, 0.1), limit=120)
     body.attach(cab, RoundBox(as_tuple(top + at(0, 0.12, -0.05)), (u(0.1, 0.18), u(0.08, 0.15), u(0.12, 0.25)), 0.03))

@@ -13,7 +13,7 @@ from torchreg.datasets.figures import Part
 from torchreg.datasets.solids import FlatCone, RoundCone, Solid
 
 # Left (+x) and right, with y up and z forward.
-SIDES = (1.0, -1.0)
+LEFT_RIGHT = (1.0, -1.0)
 
 
 class Draw:
