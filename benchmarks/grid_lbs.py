@@ -25,7 +25,7 @@ from torch import Tensor
 import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy, walking_figure
-from torchreg.registration.bones import alternation
+from torchreg.registration.bones import step_record
 from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.registration.bones.weights import WeightsConfig, refine_weights
 
@@ -85,7 +85,7 @@ def grid_diameter(model: tr.GridLBS) -> int:
 
 def reported_energies(pair: object, num_bones: int, resolution: int) -> tuple[tr.ScanRegistration, float]:
     """Return a registration, and the share of its time that the energies of its records took."""
-    spent, evaluate = [0.0], alternation.energy_terms
+    spent, evaluate = [0.0], step_record.energy_terms
 
     def timed(state: object, weights: dict[str, float]) -> dict[str, Tensor]:
         start = time.perf_counter()
@@ -96,13 +96,13 @@ def reported_energies(pair: object, num_bones: int, resolution: int) -> tuple[tr
         spent[0] += time.perf_counter() - start
         return terms
 
-    alternation.energy_terms = timed
+    step_record.energy_terms = timed
     try:
         start = time.perf_counter()
         found = tr.register(pair.source, pair.target, num_bones, resolution)
         total = time.perf_counter() - start
     finally:
-        alternation.energy_terms = evaluate
+        step_record.energy_terms = evaluate
     return found, spent[0] / total
 
 
