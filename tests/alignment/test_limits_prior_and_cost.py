@@ -10,6 +10,7 @@ from torchreg.alignment.problem import INLIER_SHARE, PRIOR_SHARE, alignment_cost
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
+from torchreg.shapes.link_surface import LinkSurface
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.skin import sample_skin
@@ -135,6 +136,8 @@ def test_shapes_with_a_mesh_are_fitted_by_it(plain_hand, problem):
     weights = torch.nn.functional.one_hot(torch.zeros(len(mesh.vertices)).long(), 16).float()
     rigged = Hand().requires_grad_(False)
     rigged.surface = RigSurface(mesh.vertices, mesh.faces, weights)
+    assert isinstance(precision_of(rigged, 0.3).surface, LinkSurface)
+    weights[0, :2] = 0.5
     assert isinstance(precision_of(rigged, 0.3).surface, SkinSurface)
 
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchreg.errors import InputError, InputTypeError
-from torchreg.geometry.mesh import TriangleMesh, concatenate, interpolate, sample_surface, unit_sphere
+from torchreg.geometry.mesh import TriangleMesh, concatenate, even_samples, interpolate, sample_surface, unit_sphere
 
 
 def bumpy(seed: int = 0, dtype: torch.dtype = torch.float64) -> TriangleMesh:
@@ -206,3 +206,18 @@ def test_interpolation_reproduces_linear_fields():
     expected = torch.einsum("vi,ijk->vjk", points, slope)
     torch.testing.assert_close(interpolate(field, mesh.faces, face, weights), expected)
     torch.testing.assert_close(interpolate(mesh.vertices[:, 0], mesh.faces, face, weights), points[:, 0])
+
+
+def test_even_samples_follow_the_areas_and_leave_smaller_gaps_than_random_ones():
+    from scipy.spatial import cKDTree
+
+    mesh = unit_sphere(2, dtype=torch.float64)
+    probes = torch.nn.functional.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)).double())
+    even, face = even_samples(mesh, 4000)
+    shares = torch.bincount(face, minlength=mesh.num_faces) / 4000
+    assert float((shares - mesh.face_areas() / mesh.face_areas().sum()).abs().max()) < 1.01 / 4000
+    normals = mesh.face_normals()[face]
+    on_plane = (normals * (even - mesh.vertices[mesh.faces[face, 0]])).sum(-1)
+    torch.testing.assert_close(on_plane, torch.zeros_like(on_plane))
+    gaps = [cKDTree(points).query(probes)[0].max() for points in (even, sample_surface(mesh, 4000)[0])]
+    assert gaps[0] < 0.8 * gaps[1]

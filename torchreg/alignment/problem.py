@@ -10,6 +10,7 @@ from torch import Tensor
 from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
 from torchreg.geometry.kinematic_tree import stack_sizes
 from torchreg.shapes.articulation import Articulation
+from torchreg.shapes.link_surface import LinkSurface, has_rigid_links
 from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import FusedSurface, ShapeSurface, SkinSurface, dense_file_skin
@@ -222,6 +223,8 @@ def _surface(shape: Articulation, skin: LinearBlendSkin) -> ShapeSurface:
     """Return the surface to fit: that of the shape's file where there is one, else the fused solids."""
     if shape.surface is None:
         return FusedSurface(shape)
+    if has_rigid_links(shape):
+        return LinkSurface(shape)
     dense = skin.normals is not None and len(skin) >= _DENSE_SKIN_POINTS
     return SkinSurface(skin if dense else dense_file_skin(shape))
 
