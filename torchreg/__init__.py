@@ -22,6 +22,7 @@ _NAMES = {
     "alignment.sigma_schedule": "SigmaSchedule",
     "alignment.skeleton_source": "SpineLimbs",
     "capture.depth": "depth_scan fuse_scans load_depth_scan",
+    "capture.depth_frame": "DepthFrame",
     "capture.silhouette_frames": "SilhouetteFrames",
     "capture.silhouettes": "visual_hull",
     "capture.stereo": "StereoConfig stereo_points",

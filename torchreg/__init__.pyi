@@ -19,6 +19,7 @@ from torchreg.alignment.skeleton_source import SpineLimbs as SpineLimbs
 from torchreg.capture.depth import depth_scan as depth_scan
 from torchreg.capture.depth import fuse_scans as fuse_scans
 from torchreg.capture.depth import load_depth_scan as load_depth_scan
+from torchreg.capture.depth_frame import DepthFrame as DepthFrame
 from torchreg.capture.silhouette_frames import SilhouetteFrames as SilhouetteFrames
 from torchreg.capture.silhouettes import visual_hull as visual_hull
 from torchreg.capture.stereo import StereoConfig as StereoConfig
@@ -83,6 +84,7 @@ __all__ = [
     "Camera",
     "CameraRig",
     "DemoResult",
+    "DepthFrame",
     "EMLoss",
     "FindPoseConfig",
     "FrameResult",

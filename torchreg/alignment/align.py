@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -12,8 +13,15 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_choice, check_count, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.alignment.annealed_em import ANNEALING, CORRESPONDENCES, OnStep, StageResult, anneal, outlier_level
-from torchreg.alignment.find_pose import FindPoseConfig, find_pose
-from torchreg.alignment.inputs import check_clouds, check_skin, floating_origin, warn_about_degenerate, warn_about_units
+from torchreg.alignment.find_pose import FindPoseConfig, search_everywhere
+from torchreg.alignment.inputs import (
+    Observation,
+    check_clouds,
+    check_skin,
+    floating_origin,
+    warn_about_degenerate,
+    warn_about_units,
+)
 from torchreg.alignment.local_search import explore, needs_search
 from torchreg.alignment.problem import (
     INLIER_SHARE,
@@ -23,10 +31,12 @@ from torchreg.alignment.problem import (
     masked_mean,
 )
 from torchreg.alignment.results import AlignRecord, AlignResult
+from torchreg.alignment.rough_poses import DEFAULT_SOURCES
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
+from torchreg.capture.depth_frame import DepthFrame
+from torchreg.capture.free_space import FreeSpace
 from torchreg.errors import InputError, UnitsWarning
-from torchreg.geometry.loaded import as_points
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
@@ -132,7 +142,7 @@ class AlignConfig:
 
 def align(
     shape: ArticulatedShape,
-    data: Tensor,
+    data: Tensor | DepthFrame | Sequence[DepthFrame],
     initial_pose: Tensor | None = None,
     *,
     model_points: Tensor | LinearBlendSkin | None = None,
@@ -147,7 +157,8 @@ def align(
 
     Args:
         shape: the articulated shape, in metres.
-        data: (M, 3), metres, or a cloud, scan or mesh as loaders return; or (B, M, 3) for a batch of clouds.
+        data: (M, 3), metres, or a cloud, scan or mesh as loaders return; or (B, M, 3) for a batch of clouds. Or a
+            `DepthFrame`, whose free space counts too, or a sequence of B of them.
         initial_pose: (num_dofs,) start, moved inside the limits first; without one, `find_pose` looks for it.
             (B, num_dofs) with a batch of clouds. (S, num_dofs) with one cloud: several starts, of which the best
             alignment is returned.
@@ -175,20 +186,32 @@ def align(
 
     References: Dewaele et al. 2006, section 3.
     """
-    config, data = config or AlignConfig(), as_points(data)
-    origin = floating_origin(shape, data)
+    config, seen = config or AlignConfig(), Observation.of(data, mask)
+    origin = floating_origin(shape, seen.points)
     if origin is not None:
-        return _align_about(origin, shape, data, initial_pose, model_points, mask, config, on_step)
+        return _align_about(origin, shape, seen, initial_pose, model_points, config, on_step)
+    return _align(shape, seen, initial_pose, model_points, config, on_step)
+
+
+def _align(
+    shape: ArticulatedShape,
+    seen: Observation,
+    initial_pose: Tensor | None,
+    model_points: Tensor | LinearBlendSkin | None,
+    config: AlignConfig,
+    on_step: OnStep | None,
+) -> AlignResult:
+    """Return the alignment to what was seen not far from the origin of coordinates."""
     if initial_pose is None:
-        initial_pose = _found_pose(shape, data, model_points, mask, config)
+        initial_pose = _found_pose(shape, seen, model_points, config)
     # A sixth faster than without gradients alone, as most of the time goes to small operations.
     with torch.inference_mode():
-        clouds, valid = check_clouds(shape, data, mask, config.nan_policy)
+        clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
         pose, several = _check_start(shape, initial_pose, clouds)
         skin = _model_skin(shape, model_points, pose, config)  # the X_i of eq. 3
-        batch = _centered_batch(skin, clouds, valid, pose, config, on_step)
-        warn_about_rounding(clouds, "data", batch.problem.size, stacklevel=2)
-        warn_about_units(batch.problem.data, batch.problem.valid, batch.problem.size, stacklevel=2)
+        batch = _centered_batch(skin, clouds, valid, pose, config, on_step, seen.free_space)
+        warn_about_rounding(clouds, "data", batch.problem.size, stacklevel=3)
+        warn_about_units(batch.problem.data, batch.problem.valid, batch.problem.size, stacklevel=3)
         with one_thread(batch.problem.valid.numel() < _LIMITS.many_data):
             found = _register(batch, config)  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3
             found = _fit_surface(batch, found, config)  # eqs. 21 and 22: section 3.4
@@ -201,10 +224,9 @@ def align(
 def _align_about(
     origin: Tensor,
     shape: ArticulatedShape,
-    data: Tensor,
+    seen: Observation,
     initial_pose: Tensor | None,
     model_points: Tensor | LinearBlendSkin | None,
-    mask: Tensor | None,
     config: AlignConfig,
     on_step: OnStep | None,
 ) -> AlignResult:
@@ -214,20 +236,13 @@ def _align_about(
         if on_step is not None:
             on_step(replace(step, pose=shifted(step.pose.double(), origin.to(step.pose.device))))
 
-    near = data - origin.to(data.device)
     start = None if initial_pose is None else shifted(torch.as_tensor(initial_pose).double(), -origin)
     points = model_points - origin if isinstance(model_points, Tensor) else model_points
-    return align(
-        shape, near, start, model_points=points, mask=mask, config=config, on_step=moved_step
-    ).moved(origin)  # fmt: skip
+    return _align(shape, seen.near(origin), start, points, config, moved_step).moved(origin)
 
 
 def _found_pose(
-    shape: ArticulatedShape,
-    data: Tensor,
-    model_points: Tensor | LinearBlendSkin | None,
-    mask: Tensor | None,
-    config: AlignConfig,
+    shape: ArticulatedShape, seen: Observation, model_points: Tensor | LinearBlendSkin | None, config: AlignConfig
 ) -> Tensor:
     """Return the best pose that a search without a start finds, (num_dofs,) or (B, num_dofs)."""
     if model_points is not None and not isinstance(model_points, LinearBlendSkin):
@@ -235,7 +250,7 @@ def _found_pose(
     search = FindPoseConfig(num_model_points=config.num_model_points, nan_policy=config.nan_policy, seed=config.seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnitsWarning)  # the alignment tells it
-        return find_pose(shape, data, num_starts=1, mask=mask, model_points=model_points, config=search).best
+        return search_everywhere(shape, seen, 1, DEFAULT_SOURCES, model_points, search).best
 
 
 @dataclass(frozen=True)
@@ -297,14 +312,22 @@ def _model_skin(
 
 
 def _centered_batch(
-    skin: LinearBlendSkin, clouds: Tensor, valid: Tensor, pose: Tensor, config: AlignConfig, on_step: OnStep | None
+    skin: LinearBlendSkin,
+    clouds: Tensor,
+    valid: Tensor,
+    pose: Tensor,
+    config: AlignConfig,
+    on_step: OnStep | None,
+    free_space: FreeSpace | None,
 ) -> _Batch:
     """Return the alignments of clouds ((B,) M, 3) from starts (B, num_dofs), each about the mean of its data."""
     data, valid = clouds.expand(len(pose), *clouds.shape[-2:]), valid.expand(len(pose), valid.shape[-1])
     origin = masked_mean(data, valid)
+    if free_space is not None and len(free_space.picture) < len(pose):
+        free_space = free_space.rows(torch.zeros(len(pose), dtype=torch.int64, device=free_space.picture.device))
     problem = centered_problem(
         skin, data, valid, pose, origin, prior_std=config.prior_std, pose_atol=config.pose_atol,
-        outlier=config.outlier, debias=config.debias, correspondence=config.correspondence,
+        outlier=config.outlier, debias=config.debias, correspondence=config.correspondence, free_space=free_space,
     )  # fmt: skip
     return _Batch(problem=problem, start=shifted(pose, -origin), origin=origin, on_step=on_step, history=[])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -70,4 +70,4 @@ def _squared_distances(data: Tensor) -> Tensor:
 def _thinned(problem: AlignProblem, count: int) -> AlignProblem:
     """Return the problem with every k-th datum, so that about ``count`` remain at most."""
     stride = -(-problem.data.shape[-2] // count)
-    return replace(problem, data=problem.data[:, ::stride], valid=problem.valid[:, ::stride])
+    return problem.with_data(problem.data[:, ::stride], problem.valid[:, ::stride])

@@ -11,7 +11,14 @@ from torch import Tensor
 from torchreg._checks import check_choice, check_count, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.alignment.confidence import is_misfit, pose_confidence
-from torchreg.alignment.inputs import check_clouds, check_skin, floating_origin, warn_about_degenerate, warn_about_units
+from torchreg.alignment.inputs import (
+    Observation,
+    check_clouds,
+    check_skin,
+    floating_origin,
+    warn_about_degenerate,
+    warn_about_units,
+)
 from torchreg.alignment.limb_search import distinct_first, take_rows
 from torchreg.alignment.pose_search import PoseSearch, mean_distances
 from torchreg.alignment.problem import (
@@ -23,8 +30,8 @@ from torchreg.alignment.problem import (
 from torchreg.alignment.results import PoseStarts
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource, bent_pose, register_rigidly
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
+from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError
-from torchreg.geometry.loaded import as_points
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
@@ -81,7 +88,7 @@ class FindPoseConfig:
 
 def find_pose(
     shape: ArticulatedShape,
-    data: Tensor,
+    data: Tensor | DepthFrame | Sequence[DepthFrame],
     *,
     num_starts: int = 4,
     mask: Tensor | None = None,
@@ -97,7 +104,8 @@ def find_pose(
 
     Args:
         shape: the articulated shape, in metres; where its base is bolted down, only its joints are sought.
-        data: (M, 3), metres, or (B, M, 3) for a batch of clouds.
+        data: (M, 3), metres, or (B, M, 3) for a batch of clouds; or a `DepthFrame`, whose free space counts too, or a
+            sequence of B of them.
         num_starts: poses returned, at most `FindPoseConfig.num_searched`; fewer where they fall together.
         mask: (M,) or (B, M), False where data are padding.
         sources: of rough poses, see `PoseSource`.
@@ -120,28 +128,41 @@ def find_pose(
 
     Cost: 1 to 2 s for a hand on one CPU core, whatever the number of data.
     """
-    config, data = config or FindPoseConfig(), as_points(data)
     check_count(num_starts, "num_starts", 1)
     if not sources:
         raise InputError("sources must hold at least one source of rough poses, got none")
-    far = floating_origin(shape, data)
-    if far is not None:
-        near = data - far.to(data.device)
-        starts = find_pose(
-            shape, near, num_starts=num_starts, mask=mask, sources=sources, model_points=model_points, config=config
-        )
-        return replace(starts, poses=shifted(starts.poses.double(), far.to(starts.poses.device)))
+    seen = Observation.of(data, mask)
+    far = floating_origin(shape, seen.points)
+    near = seen if far is None else seen.near(far)
+    starts = search_everywhere(shape, near, num_starts, sources, model_points, config or FindPoseConfig())
+    return starts if far is None else replace(
+        starts, poses=shifted(starts.poses.double(), far.to(starts.poses.device))
+    )  # fmt: skip
+
+
+def search_everywhere(
+    shape: ArticulatedShape,
+    seen: Observation,
+    num_starts: int,
+    sources: Sequence[PoseSource],
+    model_points: LinearBlendSkin | None,
+    config: FindPoseConfig,
+) -> PoseStarts:
+    """Return the starts that `find_pose` finds in what was seen, not far from the origin."""
     with torch.no_grad():
-        clouds, valid = check_clouds(shape, data, mask, config.nan_policy)
+        clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
         batch, batch_valid = (clouds, valid) if clouds.ndim == 3 else (clouds[None], valid[None])
         origin = masked_mean(batch, batch_valid)
         typical = shifted(bent_pose(shape, _CANDIDATES.typical).expand(len(batch), -1), origin)
         count = config.num_model_points
         skin = sample_skin(shape, count) if model_points is None else check_skin(shape, model_points)
-        problem = centered_problem(skin, batch, batch_valid, typical, origin, prior_std=config.prior_std, pose_atol=0.0)
-        warn_about_rounding(clouds, "data", problem.size, stacklevel=2)
-        warn_about_units(problem.data, problem.valid, problem.size, stacklevel=2)
-        degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=2)
+        problem = centered_problem(
+            skin, batch, batch_valid, typical, origin, prior_std=config.prior_std, pose_atol=0.0,
+            free_space=seen.free_space,
+        )  # fmt: skip
+        warn_about_rounding(clouds, "data", problem.size, stacklevel=3)
+        warn_about_units(problem.data, problem.valid, problem.size, stacklevel=3)
+        degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=3)
         with one_thread():
             poses, costs = _search_with_retries(problem, sources, config)
         starts = _ranked(problem, poses, costs, num_starts)

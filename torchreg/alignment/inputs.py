@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import math
 import warnings
-from dataclasses import dataclass
-from typing import ClassVar
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from torchreg._checks import as_float_tensor, check_shape
+from torchreg.capture.depth_frame import DepthFrame
+from torchreg.capture.free_space import FreeSpace
 from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.far_origin import far_origin
+from torchreg.geometry.loaded import as_points
 from torchreg.geometry.spread import SAME_SHARE, SPREADS, spread_dimensions
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
@@ -28,6 +33,50 @@ class UnitsCheck:
 
 
 UNITS = UnitsCheck()
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """What a shape is aligned to.
+
+    Args:
+        points: (M, 3) or (B, M, 3), metres; unchecked.
+        mask: (M,) or (B, M), False where points are padding; None without.
+        free_space: of B pictures, or one, where the points are those of depth frames.
+    """
+
+    points: Any
+    mask: Tensor | None
+    free_space: FreeSpace | None = None
+
+    @classmethod
+    def of(cls, data: Any, mask: Tensor | None) -> Observation:
+        """Return what is given: points, something with points, a depth frame or a sequence of depth frames.
+
+        Raises:
+            InputError: if there is a mask beside depth frames, which have their own, or a sequence is empty.
+            InputTypeError: if a sequence holds other things beside depth frames.
+        """
+        several = isinstance(data, Sequence) and any(isinstance(item, DepthFrame) for item in data)
+        frames = list(data) if several else [data]
+        if not isinstance(frames[0], DepthFrame) and not several:
+            return cls(as_points(data), mask)
+        if mask is not None:
+            raise InputError("mask goes with clouds; a depth frame has its own: DepthFrame(depth, camera, mask)")
+        for number, frame in enumerate(frames):
+            if not isinstance(frame, DepthFrame):
+                raise InputTypeError(f"data[{number}] must be a DepthFrame like the others, got {type(frame).__name__}")
+        clouds, space = [frame.points for frame in frames], FreeSpace.stacked([frame.free_space for frame in frames])
+        if not several:
+            return cls(clouds[0], None, space)
+        counts = torch.tensor([len(cloud) for cloud in clouds], device=clouds[0].device)
+        points = pad_sequence(clouds, batch_first=True)
+        return cls(points, torch.arange(points.shape[1], device=counts.device) < counts.unsqueeze(-1), space)
+
+    def near(self, origin: Tensor) -> Observation:
+        """Return the same in coordinates that begin at an origin (3,)."""
+        space = None if self.free_space is None else self.free_space.moved(origin)
+        return replace(self, points=self.points - origin.to(self.points.device), free_space=space)
 
 
 def check_clouds(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchreg.alignment.free_space_term import FreeSpaceTerm
 from torchreg.shapes.pose_algebra import BASE_DOFS, difference
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import ShapeSurface
@@ -105,6 +106,7 @@ class SurfaceObjective:
         noise: (B,) standard deviation of the distances, metres; weighs data against the prior.
         prior: on the pose.
         lever: distance of the shape's points from the base's axis of rotation, metres.
+        free_space: what depth pictures say against a pose, and the skin whose points it looks at; None for clouds.
     """
 
     def __init__(
@@ -116,8 +118,10 @@ class SurfaceObjective:
         noise: Tensor,
         prior: GaussianPosePrior,
         lever: float = 1.0,
+        free_space: tuple[FreeSpaceTerm, LinearBlendSkin] | None = None,
     ) -> None:
         self.surface, self.data, self.valid, self.prior = surface, data, valid, prior
+        self.sigma, self.noise, self.free_space = sigma, noise, free_space
         self.inverse_square = sigma.square().reciprocal().unsqueeze(-1)
         self.scale = noise.square().reciprocal()
         # Motions of the base that the data leave free, as along a cylinder's axis, are then not taken.
@@ -136,12 +140,21 @@ class SurfaceObjective:
         weighted = jacobian * (beta * self.valid * self.scale.unsqueeze(-1)).unsqueeze(-1)
         gradient = (weighted.mT @ distance.unsqueeze(-1)).squeeze(-1)
         hessian = weighted.mT @ jacobian + torch.diag_embed(self.base_damping)
-        return self.prior.add_to(Linearization(self._data_cost(beta), gradient, hessian), pose)
+        problem = Linearization(self._data_cost(beta), gradient, hessian)
+        if self.free_space is not None:
+            term, skin = self.free_space
+            against = term.linearized(skin, pose, self.sigma, self.noise)
+            problem = Linearization(*(first + second for first, second in zip(problem, against, strict=True)))
+        return self.prior.add_to(problem, pose)
 
     def cost(self, pose: Tensor) -> Tensor:
         """Return the cost alone (B,), in half the time."""
         beta = self._beta(self.surface.distance(self.data, pose))
-        return self._data_cost(beta) + self.prior.cost(pose)
+        cost = self._data_cost(beta) + self.prior.cost(pose)
+        if self.free_space is None:
+            return cost
+        term, skin = self.free_space
+        return cost + term.cost(skin(pose), self.sigma, self.noise)
 
     def _beta(self, distance: Tensor) -> Tensor:
         return welsch_weight(distance.square() * self.inverse_square)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.limb_search import Effort, LimbSearch, distinct_first, take_rows
-from torchreg.alignment.problem import PRIOR_SHARE, AlignProblem
+from torchreg.alignment.problem import PRIOR_SHARE, AlignProblem, free_space_loss
 from torchreg.alignment.surface_fit import surface_steps
 from torchreg.geometry.sampling import farthest_points
 from torchreg.shapes.skin import LinearBlendSkin
@@ -84,7 +84,7 @@ class PoseSearch:
 
     def __init__(self, problem: AlignProblem, generator: torch.Generator) -> None:
         shape = problem.skin.shape
-        reduced = replace(problem, skin=_coarse_skin(problem.skin), surface=FusedSurface(shape))
+        reduced = replace(problem.with_skin(_coarse_skin(problem.skin)), surface=FusedSurface(shape))
         self.problem = reduced.draw(SEARCH_BUDGET.num_data, generator)
         self.coarse_problem = self.problem.draw(SEARCH_BUDGET.num_coarse_data, generator)
         self.limbs = LimbSearch(shape)
@@ -188,7 +188,8 @@ def fit_candidates(problem: AlignProblem, poses: Tensor, widths: Sequence[float]
 
 
 def score_candidates(problem: AlignProblem, poses: Tensor, width: float) -> Tensor:
-    """Return the score (B, K) of poses (B, K, num_dofs): outliers, softly counted, and the prior; lower is better."""
+    """Return the score (B, K) of poses (B, K, num_dofs), as `alignment_cost`; lower is better."""
     distance = problem.surface.distance(problem.data.unsqueeze(1), poses)
     outliers = welsch_loss((distance / (width * problem.size)).square())
-    return (outliers * problem.valid.unsqueeze(1)).sum(-1) + PRIOR_SHARE * problem.prior.cost(poses)
+    scores = (outliers * problem.valid.unsqueeze(1)).sum(-1) + PRIOR_SHARE * problem.prior.cost(poses)
+    return scores + free_space_loss(problem, poses, width)

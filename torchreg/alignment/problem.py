@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchreg.alignment.free_space_term import FreeSpaceTerm
 from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
+from torchreg.capture.free_space import FreeSpace
 from torchreg.geometry.kinematic_tree import stack_sizes
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.link_surface import LinkSurface, has_rigid_links
@@ -67,6 +69,7 @@ class AlignProblem:
         outlier: "limit", "volume", or c.
         debias: share of the kernel's shrinkage that is taken out of the targets of the EM.
         correspondence: one of `CORRESPONDENCES`.
+        free_space: what depth pictures say of where nothing is; None for clouds alone.
     """
 
     skin: LinearBlendSkin
@@ -82,6 +85,7 @@ class AlignProblem:
     outlier: str | float = "limit"
     debias: float = 0.0
     correspondence: str = "em"
+    free_space: FreeSpaceTerm | None = None
 
     def rows(self, index: Tensor) -> AlignProblem:
         """Return the problems of some rows of the batch, which may repeat."""
@@ -93,6 +97,7 @@ class AlignProblem:
             lower=_rows(self.lower, index),
             upper=_rows(self.upper, index),
             prior=replace(self.prior, mean=self.prior.mean[index]),
+            free_space=None if self.free_space is None else self.free_space.rows(index),
         )
 
     def repeated(self, count: int) -> AlignProblem:
@@ -104,7 +109,19 @@ class AlignProblem:
         draw = torch.rand(self.valid.shape[-1], generator=generator, dtype=torch.float32).to(self.data)
         keep = torch.where(self.valid, draw, -1.0).topk(min(count, draw.shape[-1]), dim=-1).indices
         data = self.data.gather(1, keep.unsqueeze(-1).expand(*keep.shape, 3))
-        return replace(self, data=data, valid=self.valid.gather(1, keep))
+        return self.with_data(data, self.valid.gather(1, keep))
+
+    def with_data(self, data: Tensor, valid: Tensor) -> AlignProblem:
+        """Return the problem with a sample of its data (B, M, 3), valid or not (B, M), that stands for all."""
+        space = self.free_space
+        if space is not None:
+            space = space.thinned(self.valid.sum(-1) / valid.sum(-1).clamp_min(1))
+        return replace(self, data=data, valid=valid, free_space=space)
+
+    def with_skin(self, skin: LinearBlendSkin) -> AlignProblem:
+        """Return the problem with other model points that cover the shape as evenly."""
+        space = None if self.free_space is None else self.free_space.for_skin(skin)
+        return replace(self, skin=skin, free_space=space)
 
     def solve(
         self,
@@ -170,6 +187,7 @@ def centered_problem(
     outlier: str | float = "limit",
     debias: float = 0.0,
     correspondence: str = "em",
+    free_space: FreeSpace | None = None,
 ) -> AlignProblem:
     """Return a batch of alignments in coordinates with the origin of each cloud at zero, where float32 is precise.
 
@@ -184,10 +202,12 @@ def centered_problem(
         outlier: "limit", "volume", or c.
         debias: share of the kernel's shrinkage that is taken out of the targets of the EM.
         correspondence: one of `CORRESPONDENCES`.
+        free_space: of the clouds, in the world, where they come from depth pictures.
     """
     shape, size = skin.shape, model_size(skin)
     shift = torch.nn.functional.pad(origin, (0, shape.num_dofs - 3))
     lower, upper = shape.lower, shape.upper
+    term = None if free_space is None else FreeSpaceTerm.of_skin(free_space.to(data).moved(origin), skin, size)
     if not bool(torch.isinf(shape.lower[:3]).all()):
         lower, upper = shape.lower - shift, shape.upper - shift
     return AlignProblem(
@@ -204,6 +224,7 @@ def centered_problem(
         outlier=outlier,
         debias=debias,
         correspondence=correspondence,
+        free_space=term,
     )
 
 
@@ -235,7 +256,24 @@ def soft_inliers(problem: AlignProblem, distances: Tensor) -> Tensor:
 
 
 def alignment_cost(problem: AlignProblem, pose: Tensor, distances: Tensor | None = None) -> Tensor:
-    """Return the cost (B,) by which alignments of the same data are ranked: outliers, softly counted, and the prior."""
+    """Return the cost (B,) by which alignments of the same data are ranked.
+
+    Outliers, softly counted, those that would be if the shape's points in free space were seen, and the prior.
+    """
     distances = problem.surface.distance(problem.data, pose) if distances is None else distances
     outliers = welsch_loss((distances / (INLIER_SHARE * problem.size)).square())
-    return (outliers * problem.valid).sum(-1) + PRIOR_SHARE * problem.prior.cost(pose)
+    cost = (outliers * problem.valid).sum(-1) + PRIOR_SHARE * problem.prior.cost(pose)
+    return cost + free_space_loss(problem, pose, INLIER_SHARE)
+
+
+def free_space_loss(problem: AlignProblem, pose: Tensor, width: float) -> Tensor | float:
+    """Return the data (B, ...), softly counted, that model points in free space stand for; zero for clouds alone.
+
+    Args:
+        problem: the batch.
+        pose: (B, ..., num_dofs).
+        width: of the kernel, as a share of the model's size.
+    """
+    if problem.free_space is None:
+        return 0.0
+    return problem.free_space.loss(problem.skin(pose), width * problem.size)

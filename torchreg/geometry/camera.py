@@ -175,7 +175,7 @@ class Camera:
 
         Differentiable: in ``plane`` and the distortion.
         """
-        return _distort(plane, self.distortion.to(plane)) if self.is_distorted else plane
+        return distort(plane, self.distortion.to(plane)) if self.is_distorted else plane
 
     def undistorted(self, plane: Tensor) -> Tensor:
         """Return the points (..., 2) of the plane at depth one with given distorted positions; NaN if there are none.
@@ -188,14 +188,14 @@ class Camera:
         with torch.no_grad():
             found = plane.clone()
             for _ in range(_NEWTON_STEPS):
-                found = found - _solve_2x2(lens_jacobian(found, lens), _distort(found, lens) - plane)
+                found = found - _solve_2x2(lens_jacobian(found, lens), distort(found, lens) - plane)
             jacobian = lens_jacobian(found, lens)
             slack = 1e3 * torch.finfo(plane.dtype).eps * (1 + plane.norm(dim=-1))
-            valid = ((_distort(found, lens) - plane).norm(dim=-1) <= slack) & (torch.linalg.det(jacobian) > 0)
+            valid = ((distort(found, lens) - plane).norm(dim=-1) <= slack) & (torch.linalg.det(jacobian) > 0)
             found = torch.where(valid.unsqueeze(-1), found, torch.zeros_like(found))
             jacobian = torch.where(valid[..., None, None], jacobian, torch.eye(2).to(jacobian))
         # One more step with the derivative of the solution (implicit function theorem).
-        found = found - _solve_2x2(jacobian, _distort(found, lens) - plane)
+        found = found - _solve_2x2(jacobian, distort(found, lens) - plane)
         return torch.where(valid.unsqueeze(-1), found, torch.nan)
 
     def pixel_grid(self, *, like: Tensor | None = None) -> Tensor:
@@ -287,7 +287,13 @@ def _float64(value: Any, name: str) -> Tensor:
         raise InputError(f"{name} must hold numbers, got {value!r}") from error
 
 
-def _distort(plane: Tensor, lens: Tensor) -> Tensor:
+def distort(plane: Tensor, lens: Tensor) -> Tensor:
+    """Return the distorted positions (..., 2) of points (..., 2) of the plane at depth one.
+
+    Args:
+        plane: (..., 2).
+        lens: (8,) see `Camera`; (8, ...) for a lens of each point.
+    """
     k1, k2, p1, p2, k3, k4, k5, k6 = lens.unbind()
     u, v = plane.unbind(-1)
     square = u * u + v * v
@@ -302,7 +308,7 @@ def lens_jacobian(plane: Tensor, lens: Tensor) -> Tensor:
 
     Args:
         plane: (..., 2).
-        lens: (8,) see `Camera`.
+        lens: (8,) see `Camera`; (8, ...) for a lens of each point.
     """
     k1, k2, p1, p2, k3, k4, k5, k6 = lens.unbind()
     u, v = plane.unbind(-1)

@@ -1,0 +1,97 @@
+"""What a depth picture says against a pose: posed skin points that lie where it saw nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from torch import Tensor
+
+from torchreg.capture.free_space import FreeSpace
+from torchreg.geometry.neighbors import sampling_distance
+from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.solvers.levenberg_marquardt import Linearization
+from torchreg.solvers.robust import welsch_loss, welsch_weight
+
+
+@dataclass(frozen=True)
+class Intrusion:
+    """Numbers of what lies in free space."""
+
+    tolerance: float = 0.012  # of the model's size that solids and skins are not exact: nearer is on the surface
+    shown: float = 0.25  # of its area that a surface shows from a direction, on average (Cauchy)
+
+
+INTRUSION = Intrusion()
+
+
+@dataclass(frozen=True, eq=False)
+class FreeSpaceTerm:
+    """The cost of skin points in free space, each as that of the data which would be seen if it were there.
+
+    Args:
+        free_space: of the pictures of B problems, in their coordinates.
+        area: that a skin point stands for, square metres.
+        tolerance: intrusion that costs nothing, metres.
+    """
+
+    free_space: FreeSpace
+    area: float
+    tolerance: float
+
+    @classmethod
+    def of_skin(cls, free_space: FreeSpace, skin: LinearBlendSkin, size: float) -> FreeSpaceTerm:
+        """Return the term for a skin that covers a shape of some size evenly."""
+        return cls(free_space, sampling_distance(skin.points, skin.points) ** 2, INTRUSION.tolerance * size)
+
+    def for_skin(self, skin: LinearBlendSkin) -> FreeSpaceTerm:
+        """Return the term for another skin of the shape."""
+        return replace(self, area=sampling_distance(skin.points, skin.points) ** 2)
+
+    def rows(self, index: Tensor) -> FreeSpaceTerm:
+        """Return the term for some problems, which may repeat."""
+        return replace(self, free_space=self.free_space.rows(index))
+
+    def thinned(self, factor: Tensor) -> FreeSpaceTerm:
+        """Return the term for data of which each stands for (B,) times as many."""
+        return replace(self, free_space=self.free_space.thinned(factor))
+
+    def weight(self) -> Tensor:
+        """Return how many data a skin point stands for, (B,)."""
+        space = self.free_space
+        # In the problems' coordinates the data lie around the origin.
+        depth = space.depths(space.datum_area.new_zeros(len(space.picture), 1, 3))[:, 0]
+        return INTRUSION.shown * self.area / (space.datum_area * depth.square()).clamp_min(1e-12)
+
+    def intrusion(self, points: Tensor) -> Tensor:
+        """Return by how much points (B, ..., 3) are farther in free space than is tolerated, (B, ...), metres."""
+        return (self.free_space.intrusion(points) - self.tolerance).clamp_min(0)
+
+    def loss(self, points: Tensor, width: float) -> Tensor:
+        """Return the data (B, ...), softly counted, that points (B, ..., N, 3) in free space stand for.
+
+        Args:
+            points: of the skin.
+            width: of the kernel, metres.
+        """
+        counted = welsch_loss((self.intrusion(points) / width).square()).sum(-1)
+        return counted * self.weight().reshape(-1, *[1] * (counted.ndim - 1))
+
+    def cost(self, points: Tensor, sigma: Tensor, noise: Tensor) -> Tensor:
+        """Return the cost (B,) of points (B, N, 3) in the units of a surface fit of widths and noises (B,)."""
+        loss = welsch_loss((self.intrusion(points) / sigma.unsqueeze(-1)).square()).sum(-1)
+        return 0.5 * self.weight() * (sigma / noise).square() * loss
+
+    def linearized(self, skin: LinearBlendSkin, pose: Tensor, sigma: Tensor, noise: Tensor) -> Linearization:
+        """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs)."""
+        rows, derivative = skin.shape.transform_jacobian(pose, chart="tangent")
+        points = skin.place(rows)
+        intrusion, slope = self.free_space.intrusion_gradient(points)
+        residual = (intrusion - self.tolerance).clamp_min(0)
+        beta = welsch_weight((residual / sigma.unsqueeze(-1)).square())
+        weight = (self.weight() / noise.square()).unsqueeze(-1)
+        along = (skin.basis.unsqueeze(-1) * slope.unsqueeze(-2)).flatten(-2)
+        jacobian = (along @ derivative.flatten(-3, -2)) * (residual > 0).unsqueeze(-1)
+        weighted = jacobian * (weight * beta).unsqueeze(-1)
+        cost = 0.5 * weight[:, 0] * sigma.square() * (1 - beta).sum(-1)
+        gradient = (weighted.mT @ residual.unsqueeze(-1)).squeeze(-1)
+        return Linearization(cost, gradient, weighted.mT @ jacobian)
