@@ -15,10 +15,11 @@ __version__ = "0.1.0"
 _NAMES = {
     "alignment.align": "AlignConfig align",
     "alignment.calibrate": "CalibrateConfig calibrate",
+    "alignment.calibrate_base": "calibrate_base",
     "alignment.em_loss": "EMLoss",
     "alignment.find_pose": "FindPoseConfig find_pose",
     "alignment.pose_initializer": "InitialPose PoseInitializer PoseInitializerConfig",
-    "alignment.results": "AlignResult Calibration PoseStarts",
+    "alignment.results": "AlignResult BaseCalibration Calibration PoseStarts",
     "alignment.sigma_schedule": "SigmaSchedule",
     "alignment.skeleton_source": "SpineLimbs",
     "capture.depth": "depth_scan fuse_scans load_depth_scan",

@@ -5,6 +5,7 @@ from torchreg.alignment.align import AlignConfig as AlignConfig
 from torchreg.alignment.align import align as align
 from torchreg.alignment.calibrate import CalibrateConfig as CalibrateConfig
 from torchreg.alignment.calibrate import calibrate as calibrate
+from torchreg.alignment.calibrate_base import calibrate_base as calibrate_base
 from torchreg.alignment.em_loss import EMLoss as EMLoss
 from torchreg.alignment.find_pose import FindPoseConfig as FindPoseConfig
 from torchreg.alignment.find_pose import find_pose as find_pose
@@ -12,6 +13,7 @@ from torchreg.alignment.pose_initializer import InitialPose as InitialPose
 from torchreg.alignment.pose_initializer import PoseInitializer as PoseInitializer
 from torchreg.alignment.pose_initializer import PoseInitializerConfig as PoseInitializerConfig
 from torchreg.alignment.results import AlignResult as AlignResult
+from torchreg.alignment.results import BaseCalibration as BaseCalibration
 from torchreg.alignment.results import Calibration as Calibration
 from torchreg.alignment.results import PoseStarts as PoseStarts
 from torchreg.alignment.sigma_schedule import SigmaSchedule as SigmaSchedule
@@ -78,6 +80,7 @@ __all__ = [
     "AlignConfig",
     "AlignResult",
     "ArticulatedShape",
+    "BaseCalibration",
     "BendingSkin",
     "CalibrateConfig",
     "Calibration",
@@ -126,6 +129,7 @@ __all__ = [
     "__version__",
     "align",
     "calibrate",
+    "calibrate_base",
     "depth_scan",
     "errors",
     "extract_spine",

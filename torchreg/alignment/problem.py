@@ -212,7 +212,7 @@ def centered_problem(
         lower, upper = shape.lower - shift, shape.upper - shift
     return AlignProblem(
         skin=skin,
-        surface=_surface(shape, skin),
+        surface=fitted_surface(shape, skin),
         data=torch.where(valid.unsqueeze(-1), data - origin.unsqueeze(1), 0.0),
         valid=valid,
         origin=origin,
@@ -240,7 +240,7 @@ def _joint_precision(shape: Articulation, size: float, std: float | None) -> Ten
     return precision
 
 
-def _surface(shape: Articulation, skin: LinearBlendSkin) -> ShapeSurface:
+def fitted_surface(shape: Articulation, skin: LinearBlendSkin) -> ShapeSurface:
     """Return the surface to fit: that of the shape's file where there is one, else the fused solids."""
     if shape.surface is None:
         return FusedSurface(shape)

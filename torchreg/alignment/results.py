@@ -129,6 +129,38 @@ class Calibration(Result):
 
 
 @dataclass(frozen=True)
+class BaseCalibration(Result):
+    """Where a robot's base is in a camera's coordinates.
+
+    Args:
+        T_camera_base: (4, 4) float64, ``p_camera = T_camera_base @ p_base``, metres.
+        offsets: (J,) found at the joints, to be added to what encoders read, radians or metres; zero where the data do
+            not tell.
+        offset_std: (J,) their standard deviations, zero where none was looked for or told.
+        covariance: (6, 6) of the base: its translation, metres, and its rotation about the base's origin, radians, both
+            along the camera's axes.
+        residuals: (T,) median distance of each frame's data from the robot's surface, metres.
+        depth_offset: () distance by which the camera sees surfaces too near, along their normals, metres.
+        outliers: frames that do not show the robot where the others have it, by number.
+        status: of the calibration at its end.
+    """
+
+    shapes: ClassVar[Mapping[str, str]] = {
+        "T_camera_base": "4 4", "offsets": "J", "offset_std": "J", "covariance": "6 6", "residuals": "T",
+        "depth_offset": "",
+    }  # fmt: skip
+
+    T_camera_base: Tensor
+    offsets: Tensor
+    offset_std: Tensor
+    covariance: Tensor
+    residuals: Tensor
+    depth_offset: Tensor
+    outliers: tuple[int, ...]
+    status: Status
+
+
+@dataclass(frozen=True)
 class PoseStarts(Result):
     """Poses in which an articulated shape may lie on data, best first. A batch adds a leading dimension B to all.
 

@@ -1,0 +1,158 @@
+"""A robot's base from clouds and depth pictures of it with known joints."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import torchreg as tr
+from torchreg.alignment.base_frames import read_joints
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.rigid import rigid_matrix, transform_points
+from torchreg.geometry.rotation import so3_exp
+from torchreg.geometry.visibility import sample_visible
+
+ARM = """<robot name="arm">
+  <link name="base"><visual><origin xyz="0.02 0 0.1"/><geometry><box size="0.16 0.1 0.2"/></geometry></visual></link>
+  <link name="upper"><visual><origin xyz="0.03 0 0.15"/><geometry><box size="0.06 0.09 0.3"/></geometry></visual></link>
+  <link name="lower"><visual><origin xyz="0 0.04 0.12"/><geometry><box size="0.05 0.07 0.24"/></geometry></visual></link>
+  <link name="tool"><visual><origin xyz="0 0.02 0.08"/><geometry><box size="0.12 0.04 0.08"/></geometry></visual></link>
+  <joint name="turn" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.2"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="1" velocity="1"/></joint>
+  <joint name="elbow" type="revolute"><parent link="upper"/><child link="lower"/><origin xyz="0 0 0.3"/>
+    <axis xyz="0 1 0"/><limit lower="-2.2" upper="2.2" effort="1" velocity="1"/></joint>
+  <joint name="wrist" type="revolute"><parent link="lower"/><child link="tool"/><origin xyz="0 0 0.24"/>
+    <axis xyz="1 0 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>
+</robot>"""
+JOINTS = torch.tensor([[0.3, 0.9, -0.4], [-0.8, -1.1, 0.7], [1.6, 0.5, 1.1]], dtype=torch.float64)
+BASE = rigid_matrix(
+    so3_exp(torch.tensor([[1.9, -0.4, 0.7]], dtype=torch.float64))[0], torch.tensor([0.1, 0.25, 1.2]).double()
+)
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory):
+    path = tmp_path_factory.mktemp("robot") / "arm.urdf"
+    path.write_text(ARM)
+    return tr.ArticulatedShape.from_urdf(path, dtype=torch.float64)
+
+
+def posed_mesh(shape, joints):
+    """Return the robot in camera coordinates."""
+    skin = shape.file_skin()
+    pose = torch.nn.functional.pad(joints, (6, 0))
+    return TriangleMesh(transform_points(BASE, skin(pose)), skin.faces)
+
+
+@pytest.fixture(scope="module")
+def clouds(arm):
+    """Three clouds of the side towards a camera at the origin, with noise of 1 mm and 5 % of points elsewhere."""
+    generator = torch.Generator().manual_seed(0)
+    found = []
+    for row in JOINTS:
+        points = sample_visible(posed_mesh(arm, row), torch.zeros(3), 280, generator)[0]
+        points = points + 0.001 * torch.randn(points.shape, generator=generator, dtype=torch.float64)
+        found.append(torch.cat([points, BASE[:3, 3] + torch.rand(15, 3, generator=generator) - 0.5]))
+    return found
+
+
+def errors(base):
+    """Return how far a point of the workspace is off, metres, and the base's rotation, degrees."""
+    point = torch.tensor([0.3, 0.0, 0.3, 1.0], dtype=torch.float64)
+    turn = ((base[:3, :3] * BASE[:3, :3]).sum() - 1) / 2
+    return float(((base - BASE) @ point).norm()), math.degrees(math.acos(min(float(turn), 1.0)))
+
+
+def test_the_base_is_found_without_a_start_and_a_frame_of_something_else_is_named(arm, clouds, tmp_path):
+    ball = torch.nn.functional.normalize(torch.randn(300, 3, generator=torch.Generator().manual_seed(1)), dim=-1)
+    found = tr.calibrate_base(arm, [*clouds, BASE[:3, 3] + 0.1 * ball], torch.cat([JOINTS, JOINTS[:1]]))
+    shift, turn = errors(found.T_camera_base)
+    assert shift < 0.002 and turn < 0.2
+    std = found.covariance.diagonal().sqrt()
+    assert float(std[:3].max()) < 0.003 and float(std[3:].max()) < math.radians(1)
+    assert not found.offsets.any() and abs(float(found.depth_offset)) < 0.001
+    assert found.outliers == (3,) and found.status is tr.Status.WITH_WARNINGS
+    assert float(found.residuals[:3].max()) < 0.002 and float(found.residuals[3]) > 0.01
+    found.save(tmp_path / "base.safetensors")
+    again = tr.load(tmp_path / "base.safetensors")
+    torch.testing.assert_close(again.T_camera_base, found.T_camera_base)
+    assert again.outliers == (3,) and again.status is found.status
+
+
+def test_offsets_that_the_data_tell_are_found_and_others_stay_zero(arm, clouds):
+    """The first joint's offset turns the base alone but for the base's own link."""
+    off = torch.tensor([0.0, math.radians(1.0), math.radians(-1.5)])
+    found = tr.calibrate_base(arm, clouds, JOINTS - off, offsets=True)
+    assert found.status is tr.Status.CONVERGED and errors(found.T_camera_base)[0] < 0.003
+    assert math.degrees(float((found.offsets - off).abs().max())) < 0.2
+    assert float(found.offset_std[1]) > 0
+
+
+def test_clouds_without_the_robot_are_told(arm):
+    generator = torch.Generator().manual_seed(0)
+    plane = torch.rand(1, 200, 3, generator=generator) * torch.tensor([3.0, 3.0, 0.0]) + torch.tensor([-1.5, -1.5, 3.0])
+    assert tr.calibrate_base(arm, plane, JOINTS[:1]).status in (tr.Status.FEW_INLIERS, tr.Status.WITH_WARNINGS)
+
+
+def test_depth_frames_in_any_world_give_the_base_in_camera_coordinates(arm):
+    camera = tr.Camera(80, 60, (100.0, 100.0, 39.5, 29.5))
+    ahead = camera.directions(torch.cartesian_prod(torch.arange(80.0), torch.arange(60.0)).double())
+    frames = []
+    for row in JOINTS:
+        depth = ray_depths(posed_mesh(arm, row), ahead).reshape(80, 60).mT
+        moved = tr.Camera(80, 60, camera.intrinsics, BASE)
+        frames.append(tr.DepthFrame(depth, moved, depth > 0))
+    found = tr.calibrate_base(arm, frames, JOINTS)
+    shift, turn = errors(found.T_camera_base)
+    assert shift < 0.006 and turn < 0.8
+
+
+def ray_depths(mesh, directions):
+    """Return the depths (N,) at which rays (N, 3) from the origin first meet a mesh, zero for none."""
+    best = torch.full_like(directions[:, 0], torch.inf)
+    for first, second, third in mesh.vertices[mesh.faces]:
+        sides = torch.stack((first - second, first - third), dim=-1).expand(len(directions), 3, 2)
+        system = torch.cat([sides, directions.unsqueeze(-1)], dim=-1)
+        u, v, t = torch.linalg.solve_ex(system, first.expand_as(directions))[0].unbind(-1)
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)
+        best = torch.where(hit, torch.minimum(best, t * directions[:, 2]), best)
+    return torch.where(best.isfinite(), best, 0.0)
+
+
+def test_joints_come_in_many_forms(arm):
+    names = arm.dof_names[6:]
+    rows = [dict(zip(names, row.tolist(), strict=True)) | {"gripper": 9.0} for row in JOINTS]
+    with_base = torch.nn.functional.pad(JOINTS, (6, 0), value=3.0)
+    for form in (JOINTS, JOINTS.numpy(), JOINTS.tolist(), list(JOINTS.numpy()), rows, with_base):
+        torch.testing.assert_close(read_joints(arm, form, 3), JOINTS)
+    torch.testing.assert_close(read_joints(arm, JOINTS.numpy().astype(np.float32), 3), JOINTS, atol=1e-6, rtol=0)
+    assert read_joints(arm, [[0, 1, -1]], 1).tolist() == [[0.0, 1.0, -1.0]]
+
+
+@pytest.mark.parametrize(
+    ("poses", "message"),
+    [
+        ([{"turn": 0.1, "elbow": 0.2}], r"poses\[0\] lacks joint 'wrist'; the robot's joints are turn, elbow, wrist"),
+        ([[17.0, 51.0, -23.0]], r"poses\[0\] has joint 'turn' at 17, .*as degrees all would fit"),
+        ([[0.1, 2.6, 0.0]], r"joint 'elbow' at 2.6, beyond its limits -2.2 to 2.2; check units and order"),
+        ([[0.1, 0.2]], r"must have shape \(1, 3\), the joints turn, elbow, wrist, .* got \(1, 2\)"),
+        ([[0.1, 0.2, 0.3]] * 2, "one row for each of 1 frames, got 2"),
+        ([[0.1, math.nan, 0.3]], r"poses\[0\] holds no finite number for joint 'elbow'"),
+    ],
+)
+def test_bad_joints_are_told(arm, clouds, poses, message):
+    with pytest.raises(InputError, match=message):
+        tr.calibrate_base(arm, clouds[:1], poses)
+
+
+def test_bad_frames_are_told(arm):
+    with pytest.raises(InputError, match="at least one cloud or depth frame"):
+        tr.calibrate_base(arm, [], JOINTS)
+    with pytest.raises(InputError, match=r"frames\[0\] must hold at least one finite point"):
+        tr.calibrate_base(arm, [torch.full((4, 3), math.nan)], JOINTS[:1])
+    with pytest.raises(InputTypeError, match="poses must be numbers"):
+        tr.calibrate_base(arm, [torch.zeros(4, 3)], ["turn"])
+    with pytest.raises(InputTypeError, match=r"poses\[1\] must be a dictionary"):
+        read_joints(arm, [{"turn": 0.0, "elbow": 0.0, "wrist": 0.0}, [0.0, 0.0, 0.0]], 2)

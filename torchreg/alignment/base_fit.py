@@ -1,0 +1,244 @@
+"""The fit of a robot's base, and of offsets of its joints, to all frames of a calibration together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchreg.alignment.base_frames import BaseFrame
+from torchreg.alignment.surface_fit import SURFACE_FIT, surface_noise
+from torchreg.geometry.neighbors import sampling_distance
+from torchreg.geometry.rigid import rigid_matrix
+from torchreg.geometry.rotation import so3_exp, so3_log
+from torchreg.shapes.pose_algebra import BASE_DOFS, retract
+from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.shapes.surface import ShapeSurface
+from torchreg.solvers.levenberg_marquardt import Linearization, levenberg_marquardt
+from torchreg.solvers.robust import welsch_weight
+
+
+@dataclass(frozen=True)
+class BaseFitNumbers:
+    """Numbers of the fit of a base; lengths are shares of the model's size."""
+
+    widths: tuple[float, ...] = (0.09, 0.05, 0.03)  # of the kernel before the last one, which follows from the noise
+    steps: int = 3  # at each of them
+    last_steps: int = 20  # at the last one, at most
+    atol: float = 1e-4  # change that ends it, metres and radians
+    depth_std: float = 0.02  # by which all measured surfaces may lie off the true ones, along their normals
+    offset_std: float = 0.05  # of a joint's offset about zero, radians: three degrees
+    slide_std: float = 0.01  # the same of joints that slide
+    told: float = 0.3  # of that, which may be left of an offset that the data tell
+    # Within which residuals are one error: about a link, whose data are off together as its mesh, its joint or the
+    # depth is.
+    patch: float = 0.15
+    space_share: float = 0.25  # of its area that a surface shows from a direction, on average (Cauchy)
+
+
+BASE_FIT = BaseFitNumbers()
+# The base, then one number for the depth, then the joints' offsets.
+_DEPTH, _OFFSETS = BASE_DOFS, BASE_DOFS + 1
+# Residual of data that count as outliers, whatever the kernel, metres.
+_FAR = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class BaseProblem:
+    """All frames of a calibration, and what is fitted to them.
+
+    A state (1, 7 + J) is the base (translation, rotation vector), the distance by which all data lie outside of the
+    surface, metres, and the offsets of the joints.
+
+    Args:
+        frames: of one base.
+        shares: of each frame's data that are independent.
+        surface: of the robot.
+        skin: points that should not lie in free space.
+        size: of the robot, metres.
+        free: (J,) True for joints with an offset.
+    """
+
+    frames: tuple[BaseFrame, ...]
+    shares: tuple[float, ...]
+    surface: ShapeSurface
+    skin: LinearBlendSkin
+    size: float
+    free: Tensor
+
+    @classmethod
+    def of(cls, frames: Sequence[BaseFrame], surface: ShapeSurface, skin: LinearBlendSkin, size: float) -> BaseProblem:
+        """Return the problem without offsets."""
+        shares = tuple(_independent_share(frame.points, BASE_FIT.patch * size) for frame in frames)
+        free = torch.zeros(skin.shape.num_dofs - BASE_DOFS, dtype=torch.bool)
+        return cls(frames=tuple(frames), shares=shares, surface=surface, skin=skin, size=size, free=free)
+
+    def state(self, base: Tensor) -> Tensor:
+        """Return the state (1, 7 + J) of a base (4, 4) without offsets."""
+        vector = torch.cat([base[:3, 3], so3_log(base[None, :3, :3])[0]])
+        return pad(vector, (0, 1 + len(self.free)))[None]
+
+    def precision(self) -> Tensor:
+        """Return the precision (7 + J,) of the prior about zero."""
+        slides = self.skin.shape.is_sliding[BASE_DOFS:].cpu()
+        std = torch.where(slides, BASE_FIT.slide_std * self.size, BASE_FIT.offset_std).double()
+        head = torch.tensor([0.0] * BASE_DOFS + [(BASE_FIT.depth_std * self.size) ** -2], dtype=torch.float64)
+        return torch.cat([head, std**-2])
+
+    def poses(self, state: Tensor) -> list[Tensor]:
+        """Return the pose (num_dofs,) of each frame, in the shape's dtype."""
+        like, offsets = self.skin.shape.rest, state[0, _OFFSETS:]
+        return [torch.cat([state[0, :BASE_DOFS], frame.joints + offsets]).to(like) for frame in self.frames]
+
+    def residuals(self, state: Tensor) -> list[Tensor]:
+        """Return the distance (M,) of each frame's data from the surface as it was measured, float64."""
+        poses = self.poses(state)
+        rows = [
+            self.surface.distance(frame.points.to(pose), pose) for frame, pose in zip(self.frames, poses, strict=True)
+        ]
+        return [row.cpu().double() - state[0, _DEPTH] for row in rows]
+
+    def linearize(self, state: Tensor, sigma: float, noise: float) -> Linearization:
+        """Return cost, gradient and Gauss-Newton Hessian with a Welsch kernel of a width and a noise, metres."""
+        prior = self.precision()
+        cost, gradient, hessian = 0.5 * (prior * state[0].square()).sum(), prior * state[0], torch.diag(prior)
+        for number, pose in enumerate(self.poses(state)):
+            for residual, jacobian, weight in self._terms(number, pose, float(state[0, _DEPTH])):
+                beta = welsch_weight((residual / sigma).square())
+                weighted = jacobian * (weight * beta / noise**2).unsqueeze(-1)
+                cost = cost + 0.5 * weight * (1 - beta).sum() * (sigma / noise) ** 2
+                gradient, hessian = gradient + weighted.mT @ residual, hessian + weighted.mT @ jacobian
+        held = torch.cat([torch.zeros(_OFFSETS, dtype=torch.bool), ~self.free])
+        gradient = gradient.masked_fill(held, 0.0)
+        return Linearization(cost[None], gradient[None], hessian.masked_fill(held | held.unsqueeze(-1), 0.0)[None])
+
+    def _terms(self, number: int, pose: Tensor, depth: float) -> Iterator[tuple[Tensor, Tensor, float]]:
+        """Yield residuals (N,), their Jacobian (N, 7 + J) and weight: of a frame's data, and of what is not there."""
+        frame, share = self.frames[number], self.shares[number]
+        distance, jacobian = self.surface.distance_jacobian(frame.points.to(pose), pose)
+        # Along an outline the nearest surface may be one that is turned away, which the camera cannot have measured.
+        facing = (jacobian[:, :3] * frame.points.to(pose)).sum(-1) > 0
+        distance = torch.where(facing, distance.cpu().double() - depth, _FAR)
+        yield distance, _with_depth(jacobian, -1.0), share
+        if frame.free_space is None:
+            return
+        space = frame.free_space
+        rows, derivative = self.skin.shape.transform_jacobian(pose, chart="tangent")
+        points = self.skin.place(rows).to(space.depth)
+        intrusion, slope = (value[0].to(pose) for value in space.intrusion_gradient(points[None]))
+        along = (self.skin.basis.unsqueeze(-1) * slope.unsqueeze(-2)).flatten(-2)
+        shown = BASE_FIT.space_share * self.skin_area() / float(space.datum_area) / points[:, 2].mean().square()
+        yield intrusion.cpu().double(), _with_depth(along @ derivative.flatten(-3, -2), 0.0), share * float(shown)
+
+    def skin_area(self) -> float:
+        """Return the area that a point of the skin stands for, square metres."""
+        return sampling_distance(self.skin.points) ** 2
+
+
+def _with_depth(jacobian: Tensor, by_depth: float) -> Tensor:
+    """Return a Jacobian (N, 6 + J) by poses as one (N, 7 + J) by states, float64."""
+    base, joints = jacobian.cpu().double().split([BASE_DOFS, jacobian.shape[-1] - BASE_DOFS], dim=-1)
+    return torch.cat([base, torch.full_like(base[:, :1], by_depth), joints], dim=-1)
+
+
+def _independent_share(points: Tensor, patch: float) -> float:
+    """Return the share of points (M, 3) that are independent: one for each patch of a surface, metres."""
+    return len((points / patch).floor().unique(dim=0)) / len(points)
+
+
+@dataclass(frozen=True, eq=False)
+class BaseFit:
+    """A base fitted to frames.
+
+    Args:
+        problem: what was fitted.
+        state: (1, 7 + J).
+        sigma: width of the last kernel, metres.
+        noise: robust standard deviation of the residuals, metres.
+        converged: whether the last step was small.
+    """
+
+    problem: BaseProblem
+    state: Tensor
+    sigma: float
+    noise: float
+    converged: bool
+
+    @property
+    def base(self) -> Tensor:
+        """``T_camera_base`` (4, 4)."""
+        return rigid_matrix(so3_exp(self.state[:, 3:BASE_DOFS])[0], self.state[0, :3])
+
+    @property
+    def offsets(self) -> Tensor:
+        """Offsets (J,) of the joints."""
+        return self.state[0, _OFFSETS:]
+
+    def covariance(self) -> tuple[Tensor, Tensor]:
+        """Return the covariance (6, 6) of the base and the standard deviations (J,) of the offsets."""
+        found = _inverse(self.problem.linearize(self.state, self.sigma, self.noise).hessian[0])
+        return found[:BASE_DOFS, :BASE_DOFS], found.diagonal()[_OFFSETS:].clamp_min(0).sqrt()
+
+    @property
+    def depth(self) -> float:
+        """Distance by which all data lie outside of the surface, metres."""
+        return float(self.state[0, _DEPTH])
+
+
+def fit_base(problem: BaseProblem, state: Tensor, widths: Sequence[float] = BASE_FIT.widths) -> BaseFit:
+    """Return the state after a fit with kernels of some widths, shares of the size, and one that follows the noise."""
+    noise = SURFACE_FIT.max_noise(problem.size)
+    for width in widths:
+        state = _solve(problem, state, width * problem.size, noise, BASE_FIT.steps)[0]
+    residual = torch.cat(problem.residuals(state))
+    noise = float(surface_noise(residual, torch.ones_like(residual, dtype=torch.bool), problem.size))
+    sigma = SURFACE_FIT.width_per_noise * noise
+    state, converged = _solve(problem, state, sigma, noise, BASE_FIT.last_steps)
+    return BaseFit(problem=problem, state=state, sigma=sigma, noise=noise, converged=converged)
+
+
+def _solve(
+    problem: BaseProblem, state: Tensor, sigma: float, noise: float, steps: int
+) -> tuple[Tensor, bool]:  # fmt: skip
+    solved = levenberg_marquardt(
+        partial(problem.linearize, sigma=sigma, noise=noise), state, retract=retract, max_steps=steps,
+        atol=BASE_FIT.atol,
+    )  # fmt: skip
+    return solved.state, float(solved.last_step.abs().max()) <= BASE_FIT.atol or solved.num_steps < steps
+
+
+def _inverse(hessian: Tensor) -> Tensor:
+    """Return the inverse (D, D) of a Hessian on the variables that have a curvature, zero for the others."""
+    index = (hessian.diagonal() > 0).nonzero()[:, 0]
+    scale = hessian.diagonal()[index].rsqrt()
+    outer = scale.unsqueeze(-1) * scale
+    found = torch.zeros_like(hessian)
+    found[index.unsqueeze(-1), index] = outer * torch.linalg.pinv(hessian[index.unsqueeze(-1), index] * outer)
+    return found
+
+
+def fit_offsets(fit: BaseFit) -> BaseFit:
+    """Return a fit with offsets of those joints whose offsets the data tell.
+
+    The one that they tell least is held at zero again and again: an offset of the first joint turns the base alone.
+    """
+    problem = replace(fit.problem, free=torch.ones_like(fit.problem.free))
+    found = fit_base(problem, fit.state, widths=())
+    prior, hessian = problem.precision()[_OFFSETS:].rsqrt(), problem.linearize(
+        found.state, found.sigma, found.noise
+    ).hessian[0]  # fmt: skip
+    free = problem.free.clone()
+    while bool(free.any()):
+        kept = torch.cat([torch.ones(_OFFSETS, dtype=torch.bool), free])
+        std = _inverse(hessian.masked_fill(~kept | ~kept.unsqueeze(-1), 0.0)).diagonal()[_OFFSETS:].sqrt()
+        worst = int(torch.where(free, std / prior, 0.0).argmax())
+        if float(std[worst]) <= BASE_FIT.told * float(prior[worst]):
+            break
+        free[worst] = False
+    state = fit.state.clone()
+    state[0, _OFFSETS:] = torch.where(free, found.state[0, _OFFSETS:], 0.0)
+    return fit_base(replace(problem, free=free), state, widths=BASE_FIT.widths[-1:])
