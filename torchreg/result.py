@@ -140,11 +140,12 @@ class Status(Enum):
     NO_DATA = "no_data"
     LOST = "lost"
     OTHER_UNITS = "other_units"
+    DOUBTFUL = "doubtful"  # a result that its own evidence speaks against
     DEGENERATE = "degenerate"  # data at one place, on a line or on a plane, which determine no pose
 
     @property
     def usable(self) -> bool:
-        """Whether the result rests on data, converged or not."""
+        """Whether the result rests on data that support it, converged or not."""
         return self in (Status.CONVERGED, Status.MAX_STEPS, Status.WITH_WARNINGS)
 
 

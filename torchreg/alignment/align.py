@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -13,7 +14,8 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_choice, check_count, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.alignment.annealed_em import ANNEALING, CORRESPONDENCES, OnStep, StageResult, anneal, outlier_level
-from torchreg.alignment.find_pose import FindPoseConfig, search_everywhere
+from torchreg.alignment.find_pose import FindPoseConfig, FoundStarts, search_everywhere
+from torchreg.alignment.in_picture import surest_crop
 from torchreg.alignment.inputs import (
     Observation,
     check_clouds,
@@ -29,6 +31,15 @@ from torchreg.alignment.problem import (
     alignment_cost,
     centered_problem,
     masked_mean,
+    model_size,
+)
+from torchreg.alignment.reliability import (
+    CALIBRATION,
+    confidence_of,
+    curvature,
+    gather_evidence,
+    told_doubts,
+    without_cut,
 )
 from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES
@@ -158,7 +169,8 @@ def align(
     Args:
         shape: the articulated shape, in metres.
         data: (M, 3), metres, or a cloud, scan or mesh as loaders return; or (B, M, 3) for a batch of clouds. Or a
-            `DepthFrame`, whose free space counts too, or a sequence of B of them.
+            `DepthFrame`, whose free space counts too, or a sequence of B of them. In a single frame without a mask and
+            without a start, surfaces of about the shape's size, and the ends of larger ones, are tried, nearest first.
         initial_pose: (num_dofs,) start, moved inside the limits first; without one, `find_pose` looks for it.
             (B, num_dofs) with a batch of clouds. (S, num_dofs) with one cloud: several starts, of which the best
             alignment is returned.
@@ -186,7 +198,14 @@ def align(
 
     References: Dewaele et al. 2006, section 3.
     """
-    config, seen = config or AlignConfig(), Observation.of(data, mask)
+    config = config or AlignConfig()
+    if isinstance(data, DepthFrame) and data.mask is None and initial_pose is None and mask is None:
+        skin = _model_skin(shape, model_points, shape.rest[None], config)
+        found, crop = surest_crop(
+            data, model_size(skin), partial(align, shape, model_points=skin, config=config, on_step=on_step)
+        )
+        return replace(found, crop=crop.mask)
+    seen = Observation.of(data, mask)
     origin = floating_origin(shape, seen.points)
     if origin is not None:
         return _align_about(origin, shape, seen, initial_pose, model_points, config, on_step)
@@ -202,8 +221,10 @@ def _align(
     on_step: OnStep | None,
 ) -> AlignResult:
     """Return the alignment to what was seen not far from the origin of coordinates."""
+    lead = None
     if initial_pose is None:
-        initial_pose = _found_pose(shape, seen, model_points, config)
+        search = _found_pose(shape, seen, model_points, config)
+        initial_pose, lead = search.starts.best, search.lead
     # A sixth faster than without gradients alone, as most of the time goes to small operations.
     with torch.inference_mode():
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
@@ -217,7 +238,9 @@ def _align(
             found = _fit_surface(batch, found, config)  # eqs. 21 and 22: section 3.4
             batch, found = _best_start(batch, found) if several else (batch, found)
             found = _search_where_needed(batch, found, config)
-        result = _result(batch, found, config)  # inliers by eq. 2, the posterior by eq. 17
+            judged = without_cut(batch.problem, found.pose, seen.frames)
+            found = _refit(batch, judged, found, config)
+        result = _result(batch, found, config, lead, judged)  # inliers by eq. 2, the posterior by eq. 17
         return normal_copy(_unbatched(result) if clouds.ndim == 2 else result)
 
 
@@ -243,14 +266,14 @@ def _align_about(
 
 def _found_pose(
     shape: ArticulatedShape, seen: Observation, model_points: Tensor | LinearBlendSkin | None, config: AlignConfig
-) -> Tensor:
-    """Return the best pose that a search without a start finds, (num_dofs,) or (B, num_dofs)."""
+) -> FoundStarts:
+    """Return the best pose that a search without a start finds, and its lead over others."""
     if model_points is not None and not isinstance(model_points, LinearBlendSkin):
         raise InputError("model_points given as a tensor need a single initial_pose, that they are in; give both")
     search = FindPoseConfig(num_model_points=config.num_model_points, nan_policy=config.nan_policy, seed=config.seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnitsWarning)  # the alignment tells it
-        return search_everywhere(shape, seen, 1, DEFAULT_SOURCES, model_points, search).best
+        return search_everywhere(shape, seen, 1, DEFAULT_SOURCES, model_points, search)
 
 
 @dataclass(frozen=True)
@@ -378,7 +401,18 @@ def _search_where_needed(batch: _Batch, found: StageResult, config: AlignConfig)
     return replace(found, pose=pose, change=change)
 
 
-def _result(batch: _Batch, found: StageResult, config: AlignConfig) -> AlignResult:
+def _refit(batch: _Batch, judged: AlignProblem, found: StageResult, config: AlignConfig) -> StageResult:
+    """Return the poses fitted without what a crop cuts off, as a forearm, where there is any."""
+    if config.surface_steps == 0 or bool((judged.valid == batch.problem.valid).all()):
+        return found
+    steps = max(config.surface_steps, SURFACE_FIT.search_steps)
+    refined = fit_surface(judged, found.pose, steps=steps, widths=SURFACE_FIT.widths[-1:], on_step=batch.record)
+    return replace(refined, sigma=found.sigma)
+
+
+def _result(
+    batch: _Batch, found: StageResult, config: AlignConfig, lead: Tensor | None, judged: AlignProblem
+) -> AlignResult:
     problem, pose = batch.problem, found.pose
     distances = problem.surface.distance(problem.data, pose)
     cost = alignment_cost(problem, pose, distances)
@@ -391,7 +425,12 @@ def _result(batch: _Batch, found: StageResult, config: AlignConfig) -> AlignResu
     # What lies off the surface tells nothing of the pose, unless all does.
     told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
     degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=3)
-    rows = (inliers.sum(-1), problem.valid.sum(-1), found.change <= config.pose_atol, degenerate)
+    around, evidence = curvature(judged, pose), gather_evidence(judged, pose, lead)
+    table = evidence.table()
+    confidence = torch.where(degenerate, 0.0, confidence_of(table))
+    converged = found.change <= config.pose_atol
+    converged = converged | around.converged if config.surface_steps else converged
+    rows = (inliers.sum(-1), problem.valid.sum(-1), converged, degenerate, confidence)
     return AlignResult(
         pose=world,
         registered=posed + batch.origin.unsqueeze(1),
@@ -403,22 +442,30 @@ def _result(batch: _Batch, found: StageResult, config: AlignConfig) -> AlignResu
         cost=cost,
         status=tuple(_status(*row) for row in zip(*(row.tolist() for row in rows), strict=True)),
         history=tuple(batch.history),
+        covariance=around.covariance,
+        confidence=confidence,
+        evidence=table,
+        doubt=told_doubts(judged, pose, evidence),
     )
 
 
-def _status(num_inliers: int, num_data: int, converged: bool, degenerate: bool) -> Status:
+def _status(num_inliers: int, num_data: int, converged: bool, degenerate: bool, confidence: float) -> Status:
     if num_data == 0:
         return Status.NO_DATA
     if degenerate:
         return Status.DEGENERATE
     if num_inliers < max(_LIMITS.min_inliers, _LIMITS.min_share * num_data):
         return Status.FEW_INLIERS
+    if confidence < CALIBRATION.doubtful:
+        return Status.DOUBTFUL
     return Status.CONVERGED if converged else Status.MAX_STEPS
 
 
 def _unbatched(result: AlignResult) -> AlignResult:
     """Return the result of the single problem of a batch."""
     first = {
-        item.name: getattr(result, item.name)[0] for item in fields(result) if item.name not in ("history", "origin")
+        item.name: getattr(result, item.name)[0]
+        for item in fields(result)
+        if item.name not in ("history", "origin") and getattr(result, item.name) is not None
     }
     return replace(result, **first)

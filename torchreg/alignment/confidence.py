@@ -76,9 +76,18 @@ def beside_share(problem: AlignProblem, pose: Tensor, off: OffSurface = OFF_SURF
 def known_ends(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return the probability (B,) that the limbs end where poses (B, num_dofs) have them.
 
+    The mean of the ends' spreads is taken for that of a Rayleigh distribution's squares, of which a share lies within
+    the tolerance.
+    """
+    spread = end_spreads(problem, pose).mean(-1)
+    return 1 - (-(EVIDENCE.tolerance * problem.size / spread).square()).exp()
+
+
+def end_spreads(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return by how much the ends (B, L) of the limbs may be off in poses (B, num_dofs), metres.
+
     The position of an end spreads by the covariance of the pose, given the data near the surface and the prior; that of
-    a limb which explains no data alone spreads by the prior. The mean of the spreads is taken for that of a Rayleigh
-    distribution's squares, of which a share lies within the tolerance.
+    a limb which explains no data alone spreads by the prior.
     """
     if problem.data.shape[-2] > EVIDENCE.num_data:
         problem = problem.draw(EVIDENCE.num_data, torch.Generator().manual_seed(0))
@@ -93,21 +102,20 @@ def known_ends(problem: AlignProblem, pose: Tensor) -> Tensor:
     covariance = _covariance(problem, pose, prior)
     fitted = ((moves.flatten(-3, -2) @ covariance).unflatten(-2, moves.shape[-3:-1]) * moves).sum((-2, -1)).clamp_min(0)
     alone = (-_limb_data(problem, pose) / EVIDENCE.limb_data).exp()
-    spread = (fitted + alone * (loose - fitted).clamp_min(0)).clamp_min(torch.finfo(pose.dtype).tiny).sqrt().mean(-1)
-    return 1 - (-(EVIDENCE.tolerance * problem.size / spread).square()).exp()
+    return (fitted + alone * (loose - fitted).clamp_min(0)).clamp_min(torch.finfo(pose.dtype).tiny).sqrt()
 
 
 def limb_ends(skin: LinearBlendSkin) -> Tensor:
     """Return the indices (L,) of the skin points farthest out on each limb; of all points without limbs."""
     transforms = skin.shape.part_transforms(skin.reference_pose)
     ends = []
-    for limb, index in _limb_points(skin):
+    for limb, index in limb_points(skin):
         root = transforms[limb.bodies[0].parts[0], :3, 3]
         ends.append(index[(skin.points[index] - root).norm(dim=-1).argmax()])
     return torch.stack(ends) if ends else torch.arange(len(skin), device=skin.points.device)
 
 
-def _limb_points(skin: LinearBlendSkin) -> list[tuple[Limb, Tensor]]:
+def limb_points(skin: LinearBlendSkin) -> list[tuple[Limb, Tensor]]:
     """Return the limbs that have skin points, with the indices of those."""
     part = skin.weights.argmax(-1)
     points = [
@@ -130,7 +138,7 @@ def _limb_data(problem: AlignProblem, pose: Tensor) -> Tensor:
     shape = problem.skin.shape
     explained = soft_inliers(problem, shape.distance(problem.data, pose))
     counts = []
-    for limb, _ in _limb_points(problem.skin):
+    for limb, _ in limb_points(problem.skin):
         rest = [number for number in range(shape.num_parts) if number not in limb.parts]
         by_rest = soft_inliers(problem, shape.distance(problem.data, pose, parts=rest)) if rest else 0.0
         counts.append((explained - by_rest).clamp_min(0).sum(-1))

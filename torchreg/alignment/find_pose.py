@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -11,6 +12,7 @@ from torch import Tensor
 from torchreg._checks import check_choice, check_count, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.alignment.confidence import is_misfit, pose_confidence
+from torchreg.alignment.in_picture import surest_crop
 from torchreg.alignment.inputs import (
     Observation,
     check_clouds,
@@ -26,6 +28,7 @@ from torchreg.alignment.problem import (
     alignment_cost,
     centered_problem,
     masked_mean,
+    model_size,
 )
 from torchreg.alignment.results import PoseStarts
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource, bent_pose, register_rigidly
@@ -105,7 +108,7 @@ def find_pose(
     Args:
         shape: the articulated shape, in metres; where its base is bolted down, only its joints are sought.
         data: (M, 3), metres, or (B, M, 3) for a batch of clouds; or a `DepthFrame`, whose free space counts too, or a
-            sequence of B of them.
+            sequence of B of them. In a single frame without a mask the shape may be anywhere.
         num_starts: poses returned, at most `FindPoseConfig.num_searched`; fewer where they fall together.
         mask: (M,) or (B, M), False where data are padding.
         sources: of rough poses, see `PoseSource`.
@@ -131,10 +134,16 @@ def find_pose(
     check_count(num_starts, "num_starts", 1)
     if not sources:
         raise InputError("sources must hold at least one source of rough poses, got none")
+    if isinstance(data, DepthFrame) and data.mask is None:
+        skin = model_points or sample_skin(shape, (config or FindPoseConfig()).num_model_points)
+        search = partial(
+            find_pose, shape, num_starts=num_starts, sources=sources, model_points=skin, config=config
+        )  # fmt: skip
+        return surest_crop(data, model_size(skin), search)[0]
     seen = Observation.of(data, mask)
     far = floating_origin(shape, seen.points)
     near = seen if far is None else seen.near(far)
-    starts = search_everywhere(shape, near, num_starts, sources, model_points, config or FindPoseConfig())
+    starts = search_everywhere(shape, near, num_starts, sources, model_points, config or FindPoseConfig()).starts
     return starts if far is None else replace(
         starts, poses=shifted(starts.poses.double(), far.to(starts.poses.device))
     )  # fmt: skip
@@ -147,8 +156,8 @@ def search_everywhere(
     sources: Sequence[PoseSource],
     model_points: LinearBlendSkin | None,
     config: FindPoseConfig,
-) -> PoseStarts:
-    """Return the starts that `find_pose` finds in what was seen, not far from the origin."""
+) -> FoundStarts:
+    """Return what `find_pose` finds in what was seen, not far from the origin."""
     with torch.no_grad():
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
         batch, batch_valid = (clouds, valid) if clouds.ndim == 3 else (clouds[None], valid[None])
@@ -165,10 +174,24 @@ def search_everywhere(
         degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=3)
         with one_thread():
             poses, costs = _search_with_retries(problem, sources, config)
-        starts = _ranked(problem, poses, costs, num_starts)
+        lead = _lead(problem, poses, costs)
+        starts = _ranked(problem, poses, costs, lead, num_starts)
         confidence = torch.where(degenerate, 0.0, starts.confidence)
         starts = replace(starts, poses=shifted(starts.poses, origin.unsqueeze(1)), confidence=confidence)
-    return starts if clouds.ndim == 3 else starts.row(0)
+    return FoundStarts(starts if clouds.ndim == 3 else starts.row(0), lead)
+
+
+@dataclass(frozen=True, eq=False)
+class FoundStarts:
+    """Starts, and by how much the first is better than others.
+
+    Args:
+        starts: best first.
+        lead: (B,) cost by which the best of different poses is worse than the first; infinite where there is none.
+    """
+
+    starts: PoseStarts
+    lead: Tensor
 
 
 def _search_with_retries(
@@ -213,10 +236,15 @@ def _best_distinct(problem: AlignProblem, poses: Tensor, costs: Tensor, count: i
     return take_rows(poses, order[:, :count])
 
 
-def _ranked(problem: AlignProblem, poses: Tensor, costs: Tensor, count: int) -> PoseStarts:
+def _lead(problem: AlignProblem, poses: Tensor, costs: Tensor) -> Tensor:
+    """Return the cost (B,) by which the best of different poses is worse than the first, infinite without any."""
+    apart = mean_distances(problem, poses)[:, 0] > _CANDIDATES.same * problem.size
+    return torch.where(apart, costs, torch.inf).amin(1) - costs[:, 0]
+
+
+def _ranked(problem: AlignProblem, poses: Tensor, costs: Tensor, lead: Tensor, count: int) -> PoseStarts:
     """Return the candidates, best first; duplicates of a better one come last."""
     apart = mean_distances(problem, poses) > _CANDIDATES.same * problem.size
-    rival = torch.where(apart[:, 0], costs, torch.inf).amin(1)
-    confidence = pose_confidence(problem, poses[:, 0], rival - costs[:, 0])
+    confidence = pose_confidence(problem, poses[:, 0], lead)
     order = distinct_first(~apart)[:, :count]
     return PoseStarts(poses=take_rows(poses, order), costs=costs.gather(1, order), confidence=confidence)

@@ -43,11 +43,13 @@ class Observation:
         points: (M, 3) or (B, M, 3), metres; unchecked.
         mask: (M,) or (B, M), False where points are padding; None without.
         free_space: of B pictures, or one, where the points are those of depth frames.
+        frames: these frames.
     """
 
     points: Any
     mask: Tensor | None
     free_space: FreeSpace | None = None
+    frames: tuple[DepthFrame, ...] = ()
 
     @classmethod
     def of(cls, data: Any, mask: Tensor | None) -> Observation:
@@ -68,10 +70,12 @@ class Observation:
                 raise InputTypeError(f"data[{number}] must be a DepthFrame like the others, got {type(frame).__name__}")
         clouds, space = [frame.points for frame in frames], FreeSpace.stacked([frame.free_space for frame in frames])
         if not several:
-            return cls(clouds[0], None, space)
+            return cls(clouds[0], None, space, tuple(frames))
         counts = torch.tensor([len(cloud) for cloud in clouds], device=clouds[0].device)
         points = pad_sequence(clouds, batch_first=True)
-        return cls(points, torch.arange(points.shape[1], device=counts.device) < counts.unsqueeze(-1), space)
+        return cls(
+            points, torch.arange(points.shape[1], device=counts.device) < counts.unsqueeze(-1), space, tuple(frames)
+        )
 
     def near(self, origin: Tensor) -> Observation:
         """Return the same in coordinates that begin at an origin (3,)."""

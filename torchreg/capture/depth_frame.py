@@ -27,6 +27,8 @@ class _Picture:
 
     farthest: float = 100.0  # median depth that no depth camera reaches, metres: the numbers are in another unit
     min_points: int = 3  # fewer are no surface
+    least_rim: int = 2  # pixels up to which the rim of a mask is not exact
+    steepest: float = 6.0  # tangent of the steepest slope of one surface, 80 degrees
 
 
 _PICTURE = _Picture()
@@ -120,13 +122,17 @@ class DepthFrame:
     @cached_property
     def measured(self) -> Tensor:
         """Mask (H, W) of the pixels that count and show a surface: depths between two surfaces at an edge do not."""
-        fx, fy = self.camera.intrinsics[:2].tolist()
-        clean = without_flying_pixels(self.depth, (fx, fy)) > 0
-        clean = clean if self.mask is None else clean & self.mask
+        clean = self._clean if self.mask is None else self._clean & self.mask
         # Of pictures too coarse to tell, all depths are kept.
         if int(clean.sum()) < _PICTURE.min_points:
             clean = self.depth > 0 if self.mask is None else (self.depth > 0) & self.mask
         return clean
+
+    @cached_property
+    def _clean(self) -> Tensor:
+        """Mask (H, W) of the depths that are of one surface."""
+        fx, fy = self.camera.intrinsics[:2].tolist()
+        return without_flying_pixels(self.depth, (fx, fy)) > 0
 
     @cached_property
     def stride(self) -> int:
@@ -162,11 +168,54 @@ class DepthFrame:
         """What the picture says of where nothing is."""
         return FreeSpace.of_picture(self.depth, self.camera, self.mask, self.stride)
 
+    @cached_property
+    def links(self) -> Tensor:
+        """Pairs (E, 2) of points that are neighbors on the grid and on one surface."""
+        stride, number = self.stride, torch.full_like(self.depth, -1, dtype=torch.int64)
+        column, row = self.pixels.unbind(-1)
+        number[row, column] = torch.arange(len(row), device=row.device)
+        number, depth = number[::stride, ::stride], self.depth[::stride, ::stride]
+        step = _PICTURE.steepest * stride * depth / float(self.camera.intrinsics[:2].min())
+        pairs = []
+        for axis in (0, 1):
+            size = number.shape[axis] - 1
+            first, second = number.narrow(axis, 0, size), number.narrow(axis, 1, size)
+            joined = depth.diff(dim=axis).abs() <= step.narrow(axis, 0, size)
+            joined &= (first >= 0) & (second >= 0)
+            pairs.append(torch.stack((first[joined], second[joined]), dim=-1))
+        return torch.cat(pairs)
+
+    @cached_property
+    def cut(self) -> Tensor:
+        """Mask (M,) of the points beside which their surface goes on where no pixel counts, or leaves the picture."""
+        radius = max(_PICTURE.least_rim, self.stride)
+        outside = torch.zeros_like(self.measured) if self.mask is None else ~self.mask & self._clean
+        # What is thinner than the radius is the rim of a mask that is not exact.
+        outside = _grown(~_grown(~outside, radius), radius)
+        low = -_pooled(torch.where(outside, -self.depth, -torch.inf), radius + 1)
+        high = _pooled(torch.where(outside, self.depth, -torch.inf), radius + 1)
+        step = _PICTURE.steepest * radius * self.depth / float(self.camera.intrinsics[:2].min())
+        goes_on = (self.depth >= low - step) & (self.depth <= high + step)
+        goes_on[[0, -1]], goes_on[:, [0, -1]] = True, True
+        near = _grown(goes_on & self.measured, self.stride)
+        column, row = self.pixels.unbind(-1)
+        return near[row, column]
+
     def cropped(self, mask: Any) -> DepthFrame:
         """Return the frame with those pixels alone that are in a mask (H, W) too."""
         mask = _as_mask(mask, self.depth)
         both = mask if self.mask is None else mask & self.mask
         return DepthFrame(self.depth, self.camera, both, max_points=self.max_points)
+
+
+def _pooled(picture: Tensor, radius: int) -> Tensor:
+    """Return the largest number of a picture (H, W) within some pixels of each."""
+    return torch.nn.functional.max_pool2d(picture[None], 2 * radius + 1, 1, radius)[0]
+
+
+def _grown(mask: Tensor, radius: int) -> Tensor:
+    """Return a mask (H, W) grown by some pixels."""
+    return _pooled(mask.float(), radius) > 0
 
 
 def _as_mask(mask: Any, depth: Tensor) -> Tensor:

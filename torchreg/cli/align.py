@@ -19,10 +19,12 @@ from torchreg.cli.align_options import (
     Sigma,
     Time,
     alignment_summary,
+    cloud_files,
     read_cloud,
     read_schedule,
     write_pose,
 )
+from torchreg.cli.cameras import Depth, DepthRange, Intrinsics, Mask, check_used, depth_source
 from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 
     from torchreg.alignment.align import AlignConfig
     from torchreg.alignment.results import AlignResult
+    from torchreg.capture.depth_frames import DepthFrames
     from torchreg.shapes.articulated import ArticulatedShape
     from torchreg.shapes.skin import LinearBlendSkin
 
@@ -57,8 +60,8 @@ def align(
         list[Path],
         typer.Argument(
             metavar="CLOUD",
-            help="Point clouds, metres, of any format that `torchreg formats` shows; several are taken for the frames "
-            "of a motion, and each starts from the pose before.",
+            help="Point clouds, metres, of any format that `torchreg formats` shows, or a folder of them; several are "
+            "taken for the frames of a motion, and each starts from the pose before. With --depth depth pictures.",
         ),
     ],
     output: Annotated[
@@ -71,6 +74,10 @@ def align(
             "without one the shape is searched for."
         ),
     ] = None,
+    depth: Depth = False,
+    intrinsics: Intrinsics = None,
+    mask: Mask = None,
+    depth_range: DepthRange = None,
     sigma: Sigma = None,
     outlier: Outlier = "limit",
     search: Search = "auto",
@@ -101,8 +108,15 @@ def align(
     Coordinates far from the origin, as in maps, keep their digits; pictures and the .glb file, which has single
     precision, begin at an origin near the clouds that the result tells.
 
-    Exit codes: 0; 1 if an alignment found too few inliers to mean anything; 2 for an error; 130 for Ctrl-C.
+    With --depth --intrinsics FILE what the pictures say of free space counts too: nothing is in front of what was
+    measured, nor beside the --mask.
+
+    Exit codes: 0; 1 if an alignment is doubtful, or found too few inliers to mean anything; 2 for an error; 130 for
+    Ctrl-C.
     """
+    check_used(depth, "--depth", {"--intrinsics": intrinsics, "--mask": mask, "--depth-range": depth_range})
+    pictures = depth_source(clouds, intrinsics, mask, depth_range) if depth else None
+    clouds = cloud_files(clouds) if pictures is None else [Path(name) for name in pictures.names]
     output = with_ending(output, (".safetensors",), add=True)
     optional = with_ending(pose, (".json", ".csv")), with_ending(ply, (".ply",)), with_ending(picture, PICTURE_ENDINGS)
     count = len(clouds)
@@ -122,12 +136,12 @@ def align(
         config = AlignConfig(schedule=read_schedule(sigma), outlier=outlier, search=search, nan_policy=nan_policy)
         first = None if start is None else load_pose(start, model)
         points = sample_skin(model, config.num_model_points, sharpness=config.sharpness)
-        run = _AlignRun(model, config, points, scale, time, frame, first)
+        run = _AlignRun(model, config, points, scale, time, frame, first, pictures)
         interrupted = False
         try:
-            for path, entry in zip(clouds, files, strict=True):
+            for number, (path, entry) in enumerate(zip(clouds, files, strict=True)):
                 bar.set_description(path.name)
-                result = run.align(path, entry, on_step=lambda record: _show_stage(bar, record.stage))
+                result = run.align(number, path, entry, on_step=lambda record: _show_stage(bar, record.stage))
                 bar.update()
                 if not quiet:
                     bar.write(f"{path}: {alignment_summary(result)} -> {entry.result}")
@@ -157,6 +171,7 @@ class _AlignRun:
     time: float | None
     frame: int | None
     start: Tensor | None
+    pictures: DepthFrames | None = None
     results: list[AlignResult] = field(default_factory=list)
 
     @functools.cached_property
@@ -166,13 +181,18 @@ class _AlignRun:
 
         return surface_skin(self.shape)
 
-    def align(self, path: Path, files: _Files, on_step: Callable[[Any], None]) -> AlignResult:
-        """Return the alignment to one cloud, after writing it."""
+    def align(self, number: int, path: Path, files: _Files, on_step: Callable[[Any], None]) -> AlignResult:
+        """Return the alignment to one cloud or picture, after writing it."""
         from torchreg.alignment.align import align
+        from torchreg.geometry.loaded import as_points
 
-        data = read_cloud(path, self.scale, self.config.nan_policy, self.time, self.frame)
+        data: Any
+        if self.pictures is not None:
+            data = self.pictures[number]
+        else:
+            data = read_cloud(path, self.scale, self.config.nan_policy, self.time, self.frame)
         result = align(self.shape, data, self.start, model_points=self.skin, config=self.config, on_step=on_step)
-        self._write(result, data, files)
+        self._write(result, as_points(data), files)
         self.results.append(result)
         if result.statuses[0].usable:
             self.start = result.pose

@@ -59,6 +59,23 @@ def read_cloud(
     return load_points(path, scale=scale, nan_policy=nan_policy, time=time, frame=frame).points
 
 
+def cloud_files(paths: list[Path]) -> list[Path]:
+    """Return the files that are meant: those of a folder, or that match a pattern, in the order of their numbers."""
+    import glob
+
+    from torchreg.io.frames import load_frames, natural_sorted
+
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            files += [Path(name) for name in load_frames(path).names]
+        elif not path.exists() and (matching := glob.glob(str(path))):
+            files += natural_sorted(Path(name) for name in matching)
+        else:
+            files.append(path)
+    return files
+
+
 def write_pose(path: Path, shape: ArticulatedShape, pose: Tensor) -> None:
     """Write a pose (num_dofs,) by name of degree of freedom, as JSON or as a table of one row (.csv)."""
     import json
@@ -75,8 +92,12 @@ def write_pose(path: Path, shape: ArticulatedShape, pose: Tensor) -> None:
 
 
 def alignment_summary(result: AlignResult) -> str:
-    """Return status, inliers, residual and cost of an alignment in one line."""
+    """Return status, confidence, what is doubtful, inliers, residual and cost of an alignment in one line."""
     near = result.distances[result.inliers]
     rms = f"rms {1e3 * float(near.square().mean().sqrt()):.2f} mm, " if len(near) else ""
+    from torchreg.result import Status
+
     counts = f"{len(near)} of {len(result.distances)} points inliers"
-    return f"{result.statuses[0].value}, {counts}, {rms}cost {float(result.cost):.4g}"
+    sure = "" if result.confidence is None else f" (confidence {float(result.confidence):.2f})"
+    doubt = f"; {result.doubt}" if result.statuses[0] is Status.DOUBTFUL and result.doubt else ""
+    return f"{result.statuses[0].value}{sure}, {counts}, {rms}cost {float(result.cost):.4g}{doubt}"

@@ -11,6 +11,7 @@ import typer
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
+    from torchreg.capture.depth_frames import DepthFrames
     from torchreg.capture.stereo_frames import StereoFrames
     from torchreg.geometry.camera_rig import CameraRig
     from torchreg.shapes.articulated import ArticulatedShape
@@ -26,6 +27,17 @@ DepthRange = Annotated[
 Volume = Annotated[
     tuple[float, float, float, float, float, float] | None,
     typer.Option(metavar="X Y Z X Y Z", help="Lower and upper corner of the volume of interest, metres."),
+]
+Depth = Annotated[
+    bool,
+    typer.Option(
+        "--depth", help="The files are depth pictures (16-bit .png or .tif, .exr, .npy), folders or patterns of them."
+    ),
+]
+Intrinsics = Annotated[Path | None, typer.Option(metavar="FILE", help="The camera of the depth pictures, .json.")]
+Mask = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Picture whose bright pixels may show the shape; or a folder, one per picture."),
 ]
 Matcher = Annotated[
     str | None,
@@ -69,6 +81,23 @@ def load_calibration(calibration: Path | None, flag: str, scale: float = 1.0) ->
     if calibration is None:
         raise InputError(f"{flag} takes --calibration FILE with the cameras")
     return load_cameras(calibration, scale=scale)
+
+
+def depth_source(
+    paths: list[Path], intrinsics: Path | None, mask: Path | None, depths: tuple[float, float] | None
+) -> DepthFrames:
+    """Return the frames of depth pictures."""
+    from torchreg.capture.depth_frames import DepthFrames
+
+    if intrinsics is None:
+        raise InputError("--depth takes --intrinsics FILE with the camera")
+    nearest, farthest = depths or (0.0, float("inf"))
+    return DepthFrames(paths, intrinsics, mask, nearest=nearest, farthest=farthest)
+
+
+def depth_job(frames: DepthFrames) -> dict[str, Any]:
+    """Return all settings that determine the frames of depth pictures, as plain data."""
+    return {"--depth": True, "--depth-range": list(frames.depths), "--mask": list(frames.masks)}
 
 
 def stereo_source(

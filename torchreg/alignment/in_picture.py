@@ -1,0 +1,47 @@
+"""A shape in a whole picture: the crops that may show it are tried, and the surest answer is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from torchreg.alignment.results import AlignResult, PoseStarts
+from torchreg.capture.depth_frame import DepthFrame
+from torchreg.capture.depth_segments import candidate_crops
+
+
+@dataclass(frozen=True)
+class Choice:
+    """How the crops of a picture are tried."""
+
+    sure: float = 0.8  # confidence from which on no other crop is tried
+
+
+CHOICE = Choice()
+Answer = TypeVar("Answer", AlignResult, PoseStarts)
+
+
+def surest_crop(frame: DepthFrame, size: float, answer: Callable[[DepthFrame], Answer]) -> tuple[Answer, DepthFrame]:
+    """Return the answer of highest confidence for the crops of a frame, and that crop; nearer ones are tried first.
+
+    Args:
+        frame: the picture.
+        size: of the shape, metres.
+        answer: what is found in a crop.
+    """
+    best: tuple[Answer, DepthFrame] | None = None
+    for crop in candidate_crops(frame, size):
+        found = answer(crop)
+        if best is None or _confidence(found) > _confidence(best[0]):
+            best = found, crop
+        if _confidence(found) >= CHOICE.sure:
+            break
+    if best is not None:
+        return best
+    everything = frame.cropped(frame.measured)
+    return answer(everything), everything
+
+
+def _confidence(found: Any) -> float:
+    return float(found.confidence)

@@ -1,0 +1,268 @@
+"""How far an alignment can be trusted: the evidence for its pose, and a probability calibrated on made-up data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import takewhile
+
+import torch
+from torch import Tensor
+
+from torchreg.alignment.clusters import OFF_SURFACE, clustered_data
+from torchreg.alignment.confidence import EVIDENCE, beside_share, end_spreads, limb_points
+from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem, free_space_loss
+from torchreg.alignment.surface_fit import SURFACE_FIT, pose_covariance, surface_noise, surface_objective
+from torchreg.capture.depth_frame import DepthFrame
+from torchreg.capture.depth_segments import beyond_cut
+from torchreg.geometry.neighbors import NeighborTree
+from torchreg.shapes.limbs import Limb
+from torchreg.shapes.pose_algebra import BASE_DOFS
+from torchreg.solvers.levenberg_marquardt import held_at_limits
+from torchreg.solvers.robust import welsch_weight
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What speaks for or against poses, (B,) each, from 0 (good) to about 1.
+
+    Args:
+        noise: of the data about the surface, from the least (0) to the largest (1) that a fit assumes, in logarithms.
+        beside: root of the share of the data that lie beside the surface, not far.
+        clusters: root of the data in dense clusters off the surface, as a share of those on it.
+        off: share of the data that are not on the surface.
+        free_space: root of the data that the shape's points in free space stand for, as a share of the data.
+        unknown: probability that the data do not tell where the limbs end.
+        rival: how near the second-best pose of a search comes, 0 for a start that was given.
+        rival_share: the same, relative to the number of data.
+        limits: share of the joints at a limit.
+        few: smallness of the number of data on the surface.
+    """
+
+    noise: Tensor
+    beside: Tensor
+    clusters: Tensor
+    off: Tensor
+    free_space: Tensor
+    unknown: Tensor
+    rival: Tensor
+    rival_share: Tensor
+    limits: Tensor
+    few: Tensor
+
+    def table(self) -> Tensor:
+        """Return the numbers as (B, E)."""
+        return torch.stack([getattr(self, item.name) for item in fields(self)], dim=-1)
+
+
+@dataclass(frozen=True)
+class _Scales:
+    """Scales of the evidence."""
+
+    rival_share: float = 0.02  # of the data by which a pose leads: at which a rival counts 1 / e
+    num_few: float = 30.0  # data on the surface at which their smallness counts 1 / e
+    at_limit: float = 1e-3  # from a joint to its limit, radians or metres
+    num_correlated: int = 1000  # data by which the correlation of residuals is measured
+    lattice: int = 12  # neighbors to each side whose correlation counts
+    max_correlation: float = 0.95  # of neighboring residuals
+    gain: float = 0.1  # of a further step in log-likelihood: less than half a standard deviation of the pose
+
+
+_SCALES = _Scales()
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The logistic model of the confidence: log-odds of a right pose, ``bias - sum_k weight_k evidence_k``.
+
+    A pose is right if the ends of the shape's limbs are off by at most `right` of its size on average. Fitted by
+    ``benchmarks/confidence.py --calibrate`` to made-up alignments of hands, robots and animals.
+    """
+
+    bias: float = 4.0
+    weights: tuple[float, ...] = (1.0,) * 10
+    right: float = 0.058  # of the size: 15 mm of a hand
+    doubtful: float = 0.5  # confidence below which a result is doubtful
+
+
+CALIBRATION = Calibration()
+
+
+def without_cut(problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame]) -> AlignProblem:
+    """Return a problem without the data that a crop cuts off, as a forearm: they speak neither for nor against a pose.
+
+    Args:
+        problem: the batch.
+        pose: (B, num_dofs), fitted.
+        frames: whose points the data are, in their order; others stay.
+    """
+    if len(frames) != len(pose):
+        return problem
+    distance = problem.surface.distance(problem.data, pose)
+    noise = surface_noise(distance, problem.valid, problem.size)
+    off = distance.abs() > OFF_SURFACE.distance(noise, problem.size).unsqueeze(-1)
+    valid = problem.valid.clone()
+    for row, frame in zip(range(len(frames)), frames, strict=True):
+        count = len(frame.points)
+        valid[row, :count] &= ~beyond_cut(frame, off[row, :count])
+    return replace(problem, valid=torch.where(valid.any(-1, keepdim=True), valid, problem.valid))
+
+
+def gather_evidence(problem: AlignProblem, pose: Tensor, lead: Tensor | None) -> Evidence:
+    """Return the evidence for poses (B, num_dofs).
+
+    Args:
+        problem: the batch.
+        pose: fitted.
+        lead: (B,) cost by which the second best pose of a search was worse, infinite where there was none; None for
+            starts that were given.
+    """
+    distance = problem.surface.distance(problem.data, pose)
+    noise = surface_noise(distance, problem.valid, problem.size)
+    least, most = (
+        SURFACE_FIT.min_width * problem.size / SURFACE_FIT.width_per_noise,
+        SURFACE_FIT.max_noise(problem.size),
+    )
+    count = problem.valid.sum(-1).clamp_min(1).to(pose)
+    near = ((distance.abs() < SURFACE_FIT.max_width * problem.size) & problem.valid).sum(-1).to(pose)
+    clustered, on_surface = clustered_data(problem, pose)
+    intruding = torch.zeros_like(noise) + free_space_loss(problem, pose, SURFACE_FIT.max_width)
+    spread = end_spreads(problem, pose).mean(-1)
+    rival = torch.zeros_like(noise) if lead is None else (-lead.clamp_min(0) / EVIDENCE.lead).exp()
+    share = torch.zeros_like(noise) if lead is None else (-lead.clamp_min(0) / (_SCALES.rival_share * count)).exp()
+    return Evidence(
+        noise=(noise / least).log() / math.log(most / least),
+        beside=beside_share(problem, pose).sqrt(),
+        clusters=(clustered.to(pose) / on_surface.clamp_min(1)).sqrt().clamp_max(1),
+        off=1 - near / count,
+        free_space=(intruding / count).sqrt().clamp_max(1),
+        unknown=(-(EVIDENCE.tolerance * problem.size / spread).square()).exp(),
+        rival=rival,
+        rival_share=share,
+        limits=_share_at_limits(problem, pose),
+        few=(-near / _SCALES.num_few).exp(),
+    )
+
+
+def confidence_of(evidence: Tensor) -> Tensor:
+    """Return the calibrated probabilities (B,) that poses with evidence (B, E) are right."""
+    return torch.sigmoid(CALIBRATION.bias - evidence @ evidence.new_tensor(CALIBRATION.weights))
+
+
+def _share_at_limits(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return the share (B,) of the joints that can move and are at a limit; zero without joints."""
+    lower, upper = (limit.expand_as(pose)[:, BASE_DOFS:] for limit in (problem.lower, problem.upper))
+    joints, movable = pose[:, BASE_DOFS:], upper > lower
+    at_limit = (joints <= lower + _SCALES.at_limit) | (joints >= upper - _SCALES.at_limit)
+    return (at_limit & movable).sum(-1).to(pose) / movable.sum(-1).clamp_min(1)
+
+
+@dataclass(frozen=True, eq=False)
+class Curvature:
+    """The objective around fitted poses.
+
+    Args:
+        covariance: (B, num_dofs, num_dofs) in tangent coordinates.
+        gain: (B,) log-likelihood that a further step would gain.
+    """
+
+    covariance: Tensor
+    gain: Tensor
+
+    @property
+    def converged(self) -> Tensor:
+        """Whether a further step would hardly matter, (B,)."""
+        return self.gain <= _SCALES.gain
+
+
+def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
+    """Return the covariance of fitted poses (B, num_dofs), and what another step would gain.
+
+    Neighboring data err together, by the noise of a sensor and by a shape that is not exact: the correlation of their
+    residuals says how many of them count as one. What no data tell is as uncertain as the joints' limits leave it.
+    """
+    distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
+    noise = surface_noise(distance, problem.valid, problem.size)
+    sigma = SURFACE_FIT.width_per_noise * noise
+    near = welsch_weight((distance / sigma.unsqueeze(-1)).square()) * problem.valid
+    shared = shared_errors(problem.data, distance, near)
+    precision = _plausible_precision(problem, pose)
+    covariance = pose_covariance(jacobian, near, noise * shared.sqrt(), precision)
+    around = surface_objective(problem, sigma, noise).linearize(pose, distance, jacobian)
+    free = ~held_at_limits(around.gradient, pose, problem.lower, problem.upper)
+    slope = around.gradient * free
+    gain = 0.5 * (slope.unsqueeze(-2) @ covariance @ slope.unsqueeze(-1)).flatten() / shared.square()
+    return Curvature(covariance, gain)
+
+
+def _plausible_precision(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return 1 / variance (B, num_dofs) of poses of which no more is known than the limits of the joints."""
+    spans = (problem.upper - problem.lower).expand_as(pose)
+    uniform = 12 / spans.square().clamp_min(_SCALES.at_limit**2)
+    return torch.maximum(uniform, BROAD_PRIOR.precision(problem.skin.shape, problem.size))
+
+
+def shared_errors(data: Tensor, residual: Tensor, weight: Tensor) -> Tensor:
+    """Return how many data (B,) err as one: the sum of the correlations of a residual with all around it.
+
+    The correlation of nearest neighbors, taken to fall off exponentially with the distance, is summed over a lattice.
+
+    Args:
+        data: (B, M, 3).
+        residual: (B, M) metres.
+        weight: (B, M) of the residuals, from 0 to 1.
+    """
+    stride = -(-data.shape[1] // _SCALES.num_correlated)
+    together = []
+    for points, errors, shares in zip(data, residual, weight, strict=True):
+        chosen = (shares > 0).nonzero()[:, 0]
+        if len(chosen) < 2:
+            together.append(errors.new_zeros(()))
+            continue
+        points, errors, shares = points[chosen], errors[chosen], shares[chosen]
+        neighbor = NeighborTree(points).k_nearest(points[::stride], 2)[0][:, 1]
+        both = (shares[::stride] * shares[neighbor]).sqrt()
+        product = (both * errors[::stride] * errors[neighbor]).sum() / both.sum().clamp_min(1e-12)
+        together.append(product / ((shares * errors.square()).sum() / shares.sum()).clamp_min(1e-30))
+    correlation = torch.stack(together).clamp(0, _SCALES.max_correlation)
+    step = torch.arange(-_SCALES.lattice, _SCALES.lattice + 1).to(residual)
+    distance = (step.unsqueeze(-1).square() + step.square()).sqrt().flatten()
+    return (correlation.unsqueeze(-1) ** distance).sum(-1)
+
+
+def told_doubts(problem: AlignProblem, pose: Tensor, evidence: Evidence) -> tuple[str, ...]:
+    """Return what is doubtful about poses (B, num_dofs), a sentence each, empty where nothing is."""
+    spread = end_spreads(problem, pose)
+    limbs = [limb for limb, _ in limb_points(problem.skin)]
+    loose = (spread > EVIDENCE.tolerance * problem.size).tolist()
+    sentences = []
+    for row in range(len(pose)):
+        reasons = []
+        unseen = [_limb_name(problem, limb) for limb, is_loose in zip(limbs, loose[row], strict=False) if is_loose]
+        if unseen:
+            reasons.append(f"hardly any data show where {', '.join(unseen)} end{'s' * (len(unseen) == 1)}")
+        reasons += [
+            text.format(getattr(evidence, name)[row].item() ** 2)
+            for name, limit, text in _REASONS
+            if float(getattr(evidence, name)[row]) > limit
+        ]
+        sentences.append("; ".join(reasons))
+    return tuple(sentences)
+
+
+# Evidence from which on a reason is told, and its words; {} is the square of the evidence.
+_REASONS = (
+    ("rival", 0.37, "another pose explains nearly as much"),
+    ("clusters", 0.2, "data in clusters off the shape are {:.0%} of those on it"),
+    ("beside", 0.3, "{:.0%} of the data lie beside the shape's surface"),
+    ("free_space", 0.2, "parts of the shape lie where the picture shows nothing"),
+)
+
+
+def _limb_name(problem: AlignProblem, limb: Limb) -> str:
+    """Return the name of a limb: what its parts' names begin with, or that of its last part."""
+    names = [problem.skin.shape.part_names[part] for part in limb.parts]
+    letters = takewhile(lambda column: len(set(column)) == 1, zip(*names, strict=False))
+    common = "".join(column[0] for column in letters).rstrip("_-. 0123456789")
+    return common if len(names) > 1 and common else names[-1]

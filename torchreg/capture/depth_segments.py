@@ -1,0 +1,146 @@
+"""The surfaces of a depth picture: which pixels belong together, and where something of a given size may be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg.capture.depth_frame import DepthFrame
+from torchreg.geometry.graphs import Graph, connected_components
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """How a picture is cut. Lengths are shares of the size that is looked for."""
+
+    spacing: float = 0.02  # of the pixels that are looked at
+    step: float = 0.05  # in depth, between neighboring pixels of one surface
+    least: float = 0.3  # extent of a surface that may show the shape
+    reach: float = 1.0  # along the surface from an end of it: what is farther is cut off
+    apart: float = 0.8  # ends nearer to one another show the same
+    max_ends: int = 4  # of a surface
+    max_crops: int = 8  # of a picture
+
+
+SEGMENTATION = Segmentation()
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Every ``stride``-th pixel of a picture, and the graph of those on one surface."""
+
+    frame: DepthFrame
+    stride: int
+    pixels: Tensor
+    points: Tensor
+    graph: Graph
+
+    @classmethod
+    def of(cls, frame: DepthFrame, size: float) -> _Grid:
+        depth = frame.depth * frame.measured
+        middle = float(depth[depth > 0].median())
+        focal = float(frame.camera.intrinsics[:2].mean())
+        stride = max(1, round(SEGMENTATION.spacing * size * focal / middle))
+        coarse = depth[::stride, ::stride]
+        pixels = coarse.nonzero()
+        number = torch.full(coarse.shape, -1, dtype=torch.int64, device=depth.device)
+        number[tuple(pixels.T)] = torch.arange(len(pixels), device=depth.device)
+        edges = [
+            torch.stack((first[joined], second[joined]), dim=-1)
+            for first, second, step in (
+                (number[:, :-1], number[:, 1:], coarse[:, 1:] - coarse[:, :-1]),
+                (number[:-1], number[1:], coarse[1:] - coarse[:-1]),
+            )
+            if (joined := (first >= 0) & (second >= 0) & (step.abs() <= SEGMENTATION.step * size)) is not None
+        ]
+        seen = stride * pixels.flip(-1)
+        points = frame.camera.unproject(seen.double(), depth[seen[:, 1], seen[:, 0]].double())
+        pairs = torch.cat(edges)
+        lengths = (points[pairs[:, 0]] - points[pairs[:, 1]]).norm(dim=-1)
+        return cls(frame, stride, pixels, points, Graph.from_edges(pairs, lengths, len(pixels)))
+
+    def mask(self, kept: Tensor) -> Tensor:
+        """Return the mask (H, W) of what some nodes (V,) stand for."""
+        coarse = torch.zeros(self.frame.depth[:: self.stride, :: self.stride].shape, dtype=torch.bool)
+        coarse[tuple(self.pixels[kept.cpu()].T.cpu())] = True
+        height, width = self.frame.depth.shape
+        full = coarse.repeat_interleave(self.stride, 0).repeat_interleave(self.stride, 1)[:height, :width]
+        return full.to(self.frame.depth.device) & self.frame.measured
+
+
+def candidate_crops(frame: DepthFrame, size: float) -> Iterator[DepthFrame]:
+    """Yield crops of a frame that may show a shape of some size, metres, those of nearer surfaces first.
+
+    A surface of about that size is one crop. Of a larger one, as an arm or a body, its ends are: what lies within reach
+    of an end, along the surface.
+    """
+    grid = _Grid.of(frame, size)
+    component = grid.graph.components().to(grid.points.device)
+    depth = frame.camera.project(grid.points)[1]
+    counts = torch.bincount(component)
+    nearness = torch.zeros_like(depth[: len(counts)]).scatter_reduce(0, component, depth, "mean", include_self=False)
+    num_crops = 0
+    for number in nearness.argsort().tolist():
+        index = (component == number).nonzero()[:, 0]
+        extent = (grid.points[index].amax(0) - grid.points[index].amin(0)).norm()
+        if float(extent) < SEGMENTATION.least * size:
+            continue
+        for kept in _parts(grid, index, size):
+            yield frame.cropped(grid.mask(kept))
+            num_crops += 1
+            if num_crops == SEGMENTATION.max_crops:
+                return
+
+
+def _parts(grid: _Grid, index: Tensor, size: float) -> Iterator[Tensor]:
+    """Yield the nodes (V,) of a surface, or those around its ends, farthest from the picture's rim first."""
+    every = torch.zeros(len(grid.points), dtype=torch.bool)
+    every[index] = True
+    inside = _distance(grid, int(index[0]), every)
+    first = int(inside.argmax())
+    ends, around = [first], [_distance(grid, first, every)]
+    if float(around[0].max()) <= (SEGMENTATION.reach + SEGMENTATION.least) * size:
+        yield every
+        return
+    while len(ends) < SEGMENTATION.max_ends:
+        nearest = torch.stack(around).amin(0)
+        farthest = int(nearest.argmax())
+        if float(nearest[farthest]) < SEGMENTATION.apart * size:
+            break
+        ends.append(farthest)
+        around.append(_distance(grid, farthest, every))
+    for number in _rim_distance(grid, ends).argsort(descending=True).tolist():
+        yield every & (around[number] <= SEGMENTATION.reach * size)
+
+
+def _distance(grid: _Grid, source: int, every: Tensor) -> Tensor:
+    """Return the distances (V,) of nodes from a source along the surface, -1 off it."""
+    return torch.where(every, grid.graph.distances([source])[0], -1.0)
+
+
+def _rim_distance(grid: _Grid, nodes: list[int]) -> Tensor:
+    """Return the distances of nodes from the rim of the picture, pixels of the grid."""
+    height, width = grid.frame.depth[:: grid.stride, :: grid.stride].shape
+    row, column = grid.pixels[nodes].unbind(-1)
+    return torch.stack((row, height - 1 - row, column, width - 1 - column)).amin(0)
+
+
+def beyond_cut(frame: DepthFrame, off: Tensor) -> Tensor:
+    """Return which points (M,) off a shape belong to what the mask, or the rim of the picture, cuts off.
+
+    Args:
+        frame: the picture.
+        off: (M,) bool, True for points off the shape.
+
+    Returns:
+        (M,) bool, True for points that are joined to the cut by points off the shape: of a forearm, say.
+    """
+    edges = frame.links
+    edges = edges[off[edges].all(-1)]
+    part = connected_components(edges, len(off))
+    is_cut = torch.zeros(int(part.max()) + 1, dtype=torch.bool, device=off.device)
+    is_cut[part[frame.cut & off]] = True
+    return off & is_cut[part]
