@@ -9,6 +9,7 @@ import typer
 
 from torchreg import __version__
 from torchreg.cli.align import align
+from torchreg.cli.calibrate import calibrate
 from torchreg.cli.demo import demo
 from torchreg.cli.figure import figure
 from torchreg.cli.formats import formats
@@ -56,6 +57,7 @@ def _options(
 
 
 app.command(short_help="Align a shape to point clouds.")(align)
+app.command(short_help="Find a robot's base in a camera, or the size of a hand.")(calibrate)
 app.command(short_help="Run the main job on built-in data.")(demo)
 app.command(short_help="Draw the bending skin, or the picture of the README.")(figure)
 app.command(short_help="Show the formats of files that are read.")(formats)

@@ -1,0 +1,71 @@
+"""Where a robot's base is in a camera, from the command line."""
+
+import json
+
+import pytest
+import torch
+
+from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.rigid import rigid_matrix, transform_points
+from torchreg.geometry.rotation import so3_exp
+from torchreg.geometry.visibility import sample_visible
+from torchreg.io.points import save_points
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.storage import load
+
+BASE = rigid_matrix(so3_exp(torch.tensor([[1.7, 0.3, -0.2]]))[0], torch.tensor([0.1, 0.2, 1.1]))
+
+
+@pytest.fixture(scope="module")
+def clouds(folder):
+    """Two clouds of the robot's side towards the camera, and the table of its joints."""
+    arm = ArticulatedShape.from_urdf(folder / "arm.urdf")
+    skin = arm.file_skin()
+    lines = ["shoulder,rail,time"]
+    for number, (shoulder, rail) in enumerate([(0.6, 0.05), (-0.9, 0.2)]):
+        vertices = transform_points(BASE, skin(torch.tensor([0.0] * 6 + [shoulder, rail])))
+        points = sample_visible(TriangleMesh(vertices, skin.faces), torch.zeros(3), 250)[0]
+        save_points(folder / f"robot{number}.ply", points)
+        lines.append(f"{shoulder},{rail},{number}")
+    (folder / "joints.csv").write_text("\n".join(lines) + "\n")
+    return [folder / "robot0.ply", folder / "robot1.ply"]
+
+
+def test_the_base_is_written_as_numbers_for_ros_and_drawn(run, folder, clouds, tmp_path):
+    answer = run(
+        "calibrate", folder / "arm.urdf", *clouds, "--joints", folder / "joints.csv", "-o", tmp_path / "base"
+    )  # fmt: skip
+    assert answer.exit_code == 0, answer.output
+    assert "base within" in answer.output
+    written = json.loads((tmp_path / "base_transform.json").read_text())
+    found = load(tmp_path / "base.safetensors")
+    assert written["T_camera_base"] == found.T_camera_base.tolist()
+    assert "static_transform_publisher --x" in written["ros2"]
+    assert written["ros2"].endswith("--child-frame-id base")
+    assert list(written["offsets"]) == ["shoulder", "rail"]
+    torch.testing.assert_close(found.T_camera_base[:3, 3].float(), BASE[:3, 3], rtol=0, atol=0.02)
+    assert len(list((tmp_path / "base_seen").glob("*.png"))) == 2
+
+
+def test_what_does_not_fit_is_told(error_of, folder, clouds, tmp_path):
+    robot, output = folder / "arm.urdf", ["-o", tmp_path / "out"]
+    table = tmp_path / "joints.csv"
+    assert "takes --joints TABLE.csv" in error_of("calibrate", robot, *clouds, *output)
+    table.write_text("shoulder,arm\n0.1,0.2\n0.1,0.2\n")
+    named = error_of("calibrate", robot, *clouds, "--joints", table, *output)
+    assert "has no column rail; the robot's joints are shoulder, rail" in named
+    table.write_text("shoulder,rail\n0.1,0.2\n")
+    assert "a row for each of 2 frames, got 1" in error_of("calibrate", robot, *clouds, "--joints", table, *output)
+    table.write_text("shoulder,rail\n34.0,0.2\n-50.0,0.2\n")
+    assert "as degrees all would fit" in error_of("calibrate", robot, *clouds, "--joints", table, *output)
+    hand = error_of("calibrate", "hand", *clouds, "--joints", table, *output)
+    assert "--joints has no meaning without a robot" in hand
+    masks = error_of("calibrate", robot, *clouds, "--joints", table, "--masks", table, *output)
+    assert "--masks has no meaning without --depth" in masks
+
+
+def test_a_hand_is_fitted_to_clouds(run, folder, tmp_path):
+    answer = run("calibrate", "hand", folder / "cloud0.ply", "-o", tmp_path / "hand")
+    assert answer.exit_code in (0, 1), answer.output
+    assert "times those of the shape" in answer.output
+    assert load(tmp_path / "hand.safetensors").poses.shape == (1, 27)

@@ -1,0 +1,241 @@
+"""``torchreg calibrate``: where a robot's base is in a camera, or how large a hand is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from torchreg.cli.align_options import NanPolicy, Scale, read_cloud
+from torchreg.cli.cameras import Seen, check_used, seen_folder
+from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
+from torchreg.cli.reporting import ExitCode, reporting
+from torchreg.cli.shape_argument import PackageDir, Shape, load_shape
+from torchreg.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from torchreg.alignment.results import BaseCalibration
+    from torchreg.capture.depth_frame import DepthFrame
+    from torchreg.shapes.articulated import ArticulatedShape
+
+
+@reporting
+def calibrate(
+    shape: Shape,
+    frames: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FRAMES",
+            help="Clouds in camera coordinates, metres, or depth images; one for each row of --joints.",
+        ),
+    ],
+    joints: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="TABLE.csv",
+            help="Joints of a robot, a row for each of FRAMES: a line of names, then radians, metres.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output", "-o", metavar="RESULT", help="RESULT.safetensors and RESULT.json are written, and more."
+        ),
+    ] = Path("calibration"),
+    depth: Annotated[
+        bool, typer.Option("--depth", help="FRAMES are depth images (16-bit .png or .tif, .exr, .npy).")
+    ] = False,
+    intrinsics: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The camera of the depth images, .json.")
+    ] = None,
+    masks: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="FILE", help="Mask of the robot in a depth image, once for each of FRAMES."),
+    ] = None,
+    offsets: Annotated[bool, typer.Option("--offsets", help="Look for constant offsets of the joints, too.")] = False,
+    scale: Scale = 1.0,
+    nan_policy: NanPolicy = "omit",
+    package_dir: PackageDir = None,
+    seen: Seen = None,
+    force: Force = False,
+    quiet: Quiet = False,
+) -> None:
+    """Find a robot's base in a camera from frames with known joints; or fit a hand's size and proportions to clouds.
+
+    Of a robot RESULT_transform.json holds the base, what is known of it and ROS's static transform, and RESULT_seen a
+    picture of the robot over each frame. Joints whose names are those of the robot's file are read; offsets of joints
+    that the frames do not tell stay zero.
+
+    Exit codes: 0; 1 if no frame shows the robot; 2 for an error; 130 for Ctrl-C.
+    """
+    output = with_ending(output, (".safetensors",), add=True)
+    is_hand = not Path(shape).suffix
+    transform = None if is_hand else output.with_name(f"{output.stem}_transform.json")
+    check_outputs([output, output.with_suffix(".json"), transform], force)
+    robot_options = {"--joints": joints, "--depth": depth or None, "--offsets": offsets or None, "--seen": seen}
+    if is_hand:
+        check_used(False, "a robot", {**robot_options, "--intrinsics": intrinsics, "--masks": masks or None})
+    check_used(depth, "--depth", {"--intrinsics": intrinsics, "--masks": masks or None})
+    model = load_shape(shape, package_dirs=package_dir)
+    if is_hand or transform is None:
+        _calibrate_hand(model, [read_cloud(path, scale, nan_policy) for path in frames], output, quiet)
+        return
+    if joints is None:
+        raise InputError("a robot takes --joints TABLE.csv with the joints of each frame")
+    rows = _read_joints(joints, model, frames)
+    given = _depth_frames(frames, intrinsics, masks) if depth else [read_cloud(f, scale, nan_policy) for f in frames]
+    folder = seen_folder(seen, output, force)
+    from torchreg.alignment.calibrate_base import calibrate_base
+
+    found = calibrate_base(model, given, rows, offsets)
+    _write_transform(transform, model, found)
+    _draw_frames(folder, model, found, frames, given, rows)
+    found.save(output)
+    if not quiet:
+        typer.echo(f"{_summary(model, found, frames)} -> {transform}")
+    if not found.status.usable:
+        raise typer.Exit(ExitCode.UNUSABLE)
+
+
+def _read_joints(path: Path, shape: ArticulatedShape, frames: Sequence[Path]) -> list[dict[str, float]]:
+    """Return the joints by name of each frame."""
+    from torchreg.io.pose_table import load_pose_table
+
+    names = shape.dof_names[6:]
+    rows = load_pose_table(path, names)
+    lacking = [name for name in names if name not in rows[0]]
+    if lacking:
+        raise InputError(f"{path} has no column {', '.join(lacking[:4])}; the robot's joints are {', '.join(names)}")
+    if len(rows) != len(frames):
+        raise InputError(f"{path} must hold a row for each of {len(frames)} frames, got {len(rows)}")
+    return rows
+
+
+def _depth_frames(frames: Sequence[Path], intrinsics: Path | None, masks: Sequence[Path] | None) -> list[DepthFrame]:
+    from torchreg.capture.depth_frame import DepthFrame
+
+    if intrinsics is None:
+        raise InputError("--depth takes --intrinsics FILE with the camera")
+    if masks and len(masks) != len(frames):
+        raise InputError(f"--masks is given once for each of {len(frames)} frames, got {len(masks)}")
+    if not masks:
+        return [DepthFrame.load(path, intrinsics) for path in frames]
+    return [DepthFrame.load(path, intrinsics, mask) for path, mask in zip(frames, masks, strict=True)]
+
+
+def _calibrate_hand(shape: ArticulatedShape, clouds: Sequence[Tensor], output: Path, quiet: bool) -> None:
+    """Fit a hand to clouds and write it."""
+    from torchreg.alignment.calibrate import calibrate as fit
+
+    found = fit(shape, clouds)
+    found.save(output)
+    if not quiet:
+        length = float(found.log_length_scales.exp().mean())
+        typer.echo(f"{found.status.value}: lengths {length:.3f} times those of the shape on average -> {output}")
+    if not found.status.usable:
+        raise typer.Exit(ExitCode.UNUSABLE)
+
+
+def transform_record(shape: ArticulatedShape, found: BaseCalibration) -> Mapping[str, Any]:
+    """Return a calibration as plain numbers, with the command by which ROS 2 publishes it."""
+    from torchreg.geometry.rotation import so3_log
+    from torchreg.geometry.rotation_representations import quaternion_from_rotation_vector
+
+    base = found.T_camera_base
+    w, x, y, z = quaternion_from_rotation_vector(so3_log(base[None, :3, :3])[0]).tolist()
+    place = dict(zip("xyz", base[:3, 3].tolist(), strict=True))
+    turn = {"qx": x, "qy": y, "qz": z, "qw": w}
+    options = " ".join(f"--{name} {value:.9g}" for name, value in (place | turn).items())
+    publish = f"ros2 run tf2_ros static_transform_publisher {options} --frame-id camera --child-frame-id"
+    return {
+        "T_camera_base": base.tolist(),
+        "translation": place,
+        "rotation": turn,
+        "std_translation_m": found.covariance.diagonal()[:3].sqrt().tolist(),
+        "std_rotation_rad": found.covariance.diagonal()[3:].sqrt().tolist(),
+        "offsets": dict(zip(shape.dof_names[6:], found.offsets.tolist(), strict=True)),
+        "residuals_m": found.residuals.tolist(),
+        "outliers": list(found.outliers),
+        "status": found.status.value,
+        "ros2": f"{publish} {shape.part_names[0]}",
+    }
+
+
+def _write_transform(path: Path, shape: ArticulatedShape, found: BaseCalibration) -> None:
+    from torchreg.io.atomic import write_atomic
+
+    write_atomic(path, (json.dumps(transform_record(shape, found), indent=2) + "\n").encode())
+
+
+def _draw_frames(
+    folder: Path,
+    shape: ArticulatedShape,
+    found: BaseCalibration,
+    paths: Sequence[Path],
+    frames: Sequence[Any],
+    rows: Sequence[Mapping[str, float]],
+) -> None:
+    """Draw the robot over each frame."""
+    import torch
+
+    from torchreg.geometry.rotation import so3_log
+    from torchreg.viz.figures import draw_alignment, save_picture
+
+    base = found.T_camera_base
+    vector = torch.cat([base[:3, 3], so3_log(base[None, :3, :3])[0]])
+    skin = shape.file_skin() if shape.surface is not None else None
+    for number, (path, frame, row) in enumerate(zip(paths, frames, rows, strict=True)):
+        joints = torch.tensor([row[name] for name in shape.dof_names[6:]], dtype=torch.float64) + found.offsets
+        pose = torch.cat([vector, joints]).to(shape.rest)
+        picture = folder / f"{number:02d}_{path.stem}.png"
+        if hasattr(frame, "camera") and skin is not None and skin.faces is not None:
+            _draw_over(picture, frame, skin(pose), skin.faces)
+        else:
+            points = frame.points if hasattr(frame, "points") else frame
+            ax = draw_alignment(None, shape, pose, points.to(pose), skin=skin)
+            save_picture(ax.get_figure(), picture)  # type: ignore[arg-type]
+
+
+def _draw_over(picture: Path, frame: DepthFrame, vertices: Tensor, faces: Tensor) -> None:
+    """Draw the outline of a mesh in camera coordinates over a depth image, its points blue."""
+    import torch
+
+    from torchreg.geometry.camera import Camera
+    from torchreg.geometry.mesh import TriangleMesh
+    from torchreg.io.images import save_image
+    from torchreg.viz.seen import cut_picture, mask_outline, model_mask, picture_with_points
+
+    given = frame.camera
+    camera = Camera(given.width, given.height, given.intrinsics, distortion=given.distortion)
+    outline = mask_outline(model_mask(TriangleMesh(vertices.double(), faces), camera))
+    kept = frame.depth > 0 if frame.mask is None else frame.mask
+    everything = torch.ones(len(frame.pixels), dtype=torch.bool)
+    drawn = picture_with_points(
+        cut_picture(frame.depth, kept), frame.pixels.double(), everything, outline, radius=0
+    )  # fmt: skip
+    save_image(picture, drawn)
+
+
+def _summary(shape: ArticulatedShape, found: BaseCalibration, paths: Sequence[Path]) -> str:
+    """Return what was found in one line: how sure it is, which frames do not fit, which offsets were told."""
+    import math
+
+    std = found.covariance.diagonal().sqrt()
+    words = [
+        f"{found.status.value.replace('_', ' ')}: base within {1e3 * float(std[:3].max()):.1f} mm and "
+        f"{math.degrees(float(std[3:].max())):.2f} degrees (one standard deviation)",
+        f"data {1e3 * float(found.residuals.median()):.1f} mm from the robot",
+    ]
+    if found.outliers:
+        words.append("does not show the robot there: " + ", ".join(paths[k].name for k in found.outliers))
+    told = [
+        f"{name} {math.degrees(value):+.2f} degrees"
+        for name, value in zip(shape.dof_names[6:], found.offsets.tolist(), strict=True)
+        if value
+    ]
+    return "; ".join([*words, *(["offsets " + ", ".join(told)] if told else [])])
