@@ -24,6 +24,7 @@ from torchreg.alignment.inputs import (
     warn_about_degenerate,
     warn_about_units,
 )
+from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.local_search import explore, needs_search
 from torchreg.alignment.problem import (
     INLIER_SHARE,
@@ -158,6 +159,8 @@ def align(
     *,
     model_points: Tensor | LinearBlendSkin | None = None,
     mask: Tensor | None = None,
+    locked: Sequence[str] | Tensor = (),
+    prior: tuple[Any, Any] | None = None,
     config: AlignConfig | None = None,
     on_step: OnStep | None = None,
 ) -> AlignResult:
@@ -177,6 +180,12 @@ def align(
         model_points: a skin of the shape (see `sample_skin`; reuse it when aligning many clouds), or (N, 3) points in
             the initial pose; sampled on the surface by default.
         mask: (M,) or (B, M), False where data are padding.
+        locked: degrees of freedom that are held at the start's value: their names, "base" for all six of the base, or a
+            mask (num_dofs,). Without a start they are held at the prior's mean, or as at rest.
+        prior: what is known of the pose, as by encoders: mean and standard deviation, metres and radians, in place of
+            ``config.prior_std``. Each is a tensor (num_dofs,) or (B, num_dofs), or a dictionary by name of degree of
+            freedom; the deviation also one number, for all that a dictionary names or for all joints. The data count
+            against it as errors that neighbors share, not one by one.
         config: see `AlignConfig`.
         on_step: called with an `AlignRecord` after each iteration.
 
@@ -202,14 +211,16 @@ def align(
     if isinstance(data, DepthFrame) and data.mask is None and initial_pose is None and mask is None:
         skin = _model_skin(shape, model_points, shape.rest[None], config)
         found, crop = surest_crop(
-            data, model_size(skin), partial(align, shape, model_points=skin, config=config, on_step=on_step)
+            data,
+            model_size(skin),
+            partial(align, shape, model_points=skin, locked=locked, prior=prior, config=config, on_step=on_step),
         )
         return replace(found, crop=crop.mask)
-    seen = Observation.of(data, mask)
+    seen, known = Observation.of(data, mask), KnownDofs.of(shape, locked, prior)
     origin = floating_origin(shape, seen.points)
     if origin is not None:
-        return _align_about(origin, shape, seen, initial_pose, model_points, config, on_step)
-    return _align(shape, seen, initial_pose, model_points, config, on_step)
+        return _align_about(origin, shape, seen, initial_pose, model_points, known, config, on_step)
+    return _align(shape, seen, initial_pose, model_points, known, config, on_step)
 
 
 def _align(
@@ -217,13 +228,16 @@ def _align(
     seen: Observation,
     initial_pose: Tensor | None,
     model_points: Tensor | LinearBlendSkin | None,
+    known: KnownDofs | None,
     config: AlignConfig,
     on_step: OnStep | None,
 ) -> AlignResult:
     """Return the alignment to what was seen not far from the origin of coordinates."""
     lead = None
+    if initial_pose is None and known is not None and known.places_base:
+        initial_pose = known.start(shape)
     if initial_pose is None:
-        search = _found_pose(shape, seen, model_points, config)
+        search = _found_pose(shape, seen, model_points, known, config)
         initial_pose, lead = search.starts.best, search.lead
     # A sixth faster than without gradients alone, as most of the time goes to small operations.
     with torch.inference_mode():
@@ -231,6 +245,8 @@ def _align(
         pose, several = _check_start(shape, initial_pose, clouds)
         skin = _model_skin(shape, model_points, pose, config)  # the X_i of eq. 3
         batch = _centered_batch(skin, clouds, valid, pose, config, on_step, seen.free_space)
+        if known is not None:
+            batch = replace(batch, problem=known.applied(batch.problem, batch.start))
         warn_about_rounding(clouds, "data", batch.problem.size, stacklevel=3)
         warn_about_units(batch.problem.data, batch.problem.valid, batch.problem.size, stacklevel=3)
         with one_thread(batch.problem.valid.numel() < _LIMITS.many_data):
@@ -250,6 +266,7 @@ def _align_about(
     seen: Observation,
     initial_pose: Tensor | None,
     model_points: Tensor | LinearBlendSkin | None,
+    known: KnownDofs | None,
     config: AlignConfig,
     on_step: OnStep | None,
 ) -> AlignResult:
@@ -261,11 +278,16 @@ def _align_about(
 
     start = None if initial_pose is None else shifted(torch.as_tensor(initial_pose).double(), -origin)
     points = model_points - origin if isinstance(model_points, Tensor) else model_points
-    return _align(shape, seen.near(origin), start, points, config, moved_step).moved(origin)
+    known = None if known is None else known.near(origin)
+    return _align(shape, seen.near(origin), start, points, known, config, moved_step).moved(origin)
 
 
 def _found_pose(
-    shape: ArticulatedShape, seen: Observation, model_points: Tensor | LinearBlendSkin | None, config: AlignConfig
+    shape: ArticulatedShape,
+    seen: Observation,
+    model_points: Tensor | LinearBlendSkin | None,
+    known: KnownDofs | None,
+    config: AlignConfig,
 ) -> FoundStarts:
     """Return the best pose that a search without a start finds, and its lead over others."""
     if model_points is not None and not isinstance(model_points, LinearBlendSkin):
@@ -273,7 +295,7 @@ def _found_pose(
     search = FindPoseConfig(num_model_points=config.num_model_points, nan_policy=config.nan_policy, seed=config.seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnitsWarning)  # the alignment tells it
-        return search_everywhere(shape, seen, 1, DEFAULT_SOURCES, model_points, search)
+        return search_everywhere(shape, seen, 1, DEFAULT_SOURCES, model_points, search, known)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchreg.alignment.base_frames import BaseFrame
+from torchreg.alignment.known_dofs import PATCH, independent_share
 from torchreg.alignment.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.geometry.neighbors import sampling_distance
 from torchreg.geometry.rigid import rigid_matrix
@@ -34,9 +35,6 @@ class BaseFitNumbers:
     offset_std: float = 0.05  # of a joint's offset about zero, radians: three degrees
     slide_std: float = 0.01  # the same of joints that slide
     told: float = 0.3  # of that, which may be left of an offset that the data tell
-    # Within which residuals are one error: about a link, whose data are off together as its mesh, its joint or the
-    # depth is.
-    patch: float = 0.15
     space_share: float = 0.25  # of its area that a surface shows from a direction, on average (Cauchy)
 
 
@@ -73,7 +71,7 @@ class BaseProblem:
     @classmethod
     def of(cls, frames: Sequence[BaseFrame], surface: ShapeSurface, skin: LinearBlendSkin, size: float) -> BaseProblem:
         """Return the problem without offsets."""
-        shares = tuple(_independent_share(frame.points, BASE_FIT.patch * size) for frame in frames)
+        shares = tuple(independent_share(frame.points, PATCH * size) for frame in frames)
         free = torch.zeros(skin.shape.num_dofs - BASE_DOFS, dtype=torch.bool)
         return cls(frames=tuple(frames), shares=shares, surface=surface, skin=skin, size=size, free=free)
 
@@ -143,11 +141,6 @@ def _with_depth(jacobian: Tensor, by_depth: float) -> Tensor:
     """Return a Jacobian (N, 6 + J) by poses as one (N, 7 + J) by states, float64."""
     base, joints = jacobian.cpu().double().split([BASE_DOFS, jacobian.shape[-1] - BASE_DOFS], dim=-1)
     return torch.cat([base, torch.full_like(base[:, :1], by_depth), joints], dim=-1)
-
-
-def _independent_share(points: Tensor, patch: float) -> float:
-    """Return the share of points (M, 3) that are independent: one for each patch of a surface, metres."""
-    return len((points / patch).floor().unique(dim=0)) / len(points)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,6 +22,7 @@ from torchreg.alignment.inputs import (
     warn_about_degenerate,
     warn_about_units,
 )
+from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.limb_search import distinct_first, take_rows
 from torchreg.alignment.pose_search import PoseSearch, mean_distances
 from torchreg.alignment.problem import (
@@ -97,6 +99,8 @@ def find_pose(
     mask: Tensor | None = None,
     sources: Sequence[PoseSource] = DEFAULT_SOURCES,
     model_points: LinearBlendSkin | None = None,
+    locked: Sequence[str] | Tensor = (),
+    prior: tuple[Any, Any] | None = None,
     config: FindPoseConfig | None = None,
 ) -> PoseStarts:
     """Return the poses in which an articulated shape may lie on 3-D data, best first, and the confidence in the first.
@@ -113,6 +117,8 @@ def find_pose(
         mask: (M,) or (B, M), False where data are padding.
         sources: of rough poses, see `PoseSource`.
         model_points: a skin of the shape to reuse; sampled on the surface by default.
+        locked: what is held, see `align`: at the prior's mean where it has one, else as at rest.
+        prior: what is known of the pose, see `align`.
         config: see `FindPoseConfig`.
 
     Returns:
@@ -137,13 +143,16 @@ def find_pose(
     if isinstance(data, DepthFrame) and data.mask is None:
         skin = model_points or sample_skin(shape, (config or FindPoseConfig()).num_model_points)
         search = partial(
-            find_pose, shape, num_starts=num_starts, sources=sources, model_points=skin, config=config
+            find_pose, shape, num_starts=num_starts, sources=sources, model_points=skin, locked=locked,
+            prior=prior, config=config,
         )  # fmt: skip
         return surest_crop(data, model_size(skin), search)[0]
     seen = Observation.of(data, mask)
     far = floating_origin(shape, seen.points)
     near = seen if far is None else seen.near(far)
-    starts = search_everywhere(shape, near, num_starts, sources, model_points, config or FindPoseConfig()).starts
+    known = KnownDofs.of(shape, locked, prior)
+    known = known if known is None or far is None else known.near(far)
+    starts = search_everywhere(shape, near, num_starts, sources, model_points, config or FindPoseConfig(), known).starts
     return starts if far is None else replace(
         starts, poses=shifted(starts.poses.double(), far.to(starts.poses.device))
     )  # fmt: skip
@@ -156,6 +165,7 @@ def search_everywhere(
     sources: Sequence[PoseSource],
     model_points: LinearBlendSkin | None,
     config: FindPoseConfig,
+    known: KnownDofs | None = None,
 ) -> FoundStarts:
     """Return what `find_pose` finds in what was seen, not far from the origin."""
     with torch.no_grad():
@@ -169,16 +179,29 @@ def search_everywhere(
             skin, batch, batch_valid, typical, origin, prior_std=config.prior_std, pose_atol=0.0,
             free_space=seen.free_space,
         )  # fmt: skip
+        if known is not None:
+            problem = known.applied(problem, shifted(known.start(shape).expand_as(typical), -origin))
         warn_about_rounding(clouds, "data", problem.size, stacklevel=3)
         warn_about_units(problem.data, problem.valid, problem.size, stacklevel=3)
         degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=3)
         with one_thread():
-            poses, costs = _search_with_retries(problem, sources, config)
+            poses, costs = _search_with_retries(problem, _informed_sources(sources, known), config)
         lead = _lead(problem, poses, costs)
         starts = _ranked(problem, poses, costs, lead, num_starts)
         confidence = torch.where(degenerate, 0.0, starts.confidence)
         starts = replace(starts, poses=shifted(starts.poses, origin.unsqueeze(1)), confidence=confidence)
     return FoundStarts(starts if clouds.ndim == 3 else starts.row(0), lead)
+
+
+def _informed_sources(sources: Sequence[PoseSource], known: KnownDofs | None) -> Sequence[PoseSource]:
+    """Return sources whose poses are what is known beforehand, as far as that goes."""
+    if known is None:
+        return sources
+
+    def informed(source: PoseSource) -> PoseSource:
+        return lambda problem, generator: known.informed(problem, source(problem, generator))
+
+    return [informed(source) for source in sources]
 
 
 @dataclass(frozen=True, eq=False)

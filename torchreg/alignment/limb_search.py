@@ -274,9 +274,13 @@ class _Search:
         kept = torch.linspace(0, len(samples) - 1, num_kept, dtype=torch.float32).round().long()
         samples = samples[kept]
         values = torch.cat([samples.expand(batch, *samples.shape), pose[:, None, dofs]], dim=1)
+        lower, upper = (limit.expand_as(pose)[:, None, dofs] for limit in (near.lower, near.upper))
+        # Samples know the shape's limits alone, not what is held.
+        held = bool((lower == upper).any())
+        values = torch.minimum(torch.maximum(values, lower), upper) if held else values
         poses = beam.poses.unsqueeze(2).repeat(1, 1, values.shape[1], 1)
         poses[..., dofs] = values.unsqueeze(1)
-        if body in self.limbs.relative:
+        if body in self.limbs.relative and not held:
             sampled = self.limbs.relative[body][kept]
             given = self.limbs.transforms_on_parent(body, pose, transforms).unsqueeze(1)
             relative = torch.cat([sampled.expand(batch, *sampled.shape), given], dim=1).unsqueeze(1)
@@ -307,7 +311,7 @@ class _Search:
         share = self.problem.valid.sum(-1).to(losses) / self.subset.valid.sum(-1).clamp_min(1)
         noise = _PLACEMENT.noise * problem.size
         weights = (losses * problem.valid.unsqueeze(1)) * (share / noise**2)[:, None, None]
-        lower, upper = self.shape.lower[dofs], self.shape.upper[dofs]
+        lower, upper = (limit.expand_as(poses[:, 0])[:, None, dofs] for limit in (problem.lower, problem.upper))
         for width in self.effort.refine_widths:
             distance, jacobian = self.shape.distance_jacobian(
                 problem.data.unsqueeze(1), poses, chart="tangent", parts=self.limbs.parts[limb]

@@ -47,7 +47,10 @@ class GaussianPosePrior:
     def cost(self, pose: Tensor) -> Tensor:
         """Return the prior's cost (...) of poses (..., num_dofs); the mean's batch is the first dimension."""
         mean = self.mean.reshape(self.mean.shape[0], *[1] * (pose.ndim - 2), -1)
-        return 0.5 * (self.precision * self._offset(pose, mean).square()).sum(-1)
+        precision = self.precision
+        if precision.ndim > 1:
+            precision = precision.reshape(len(precision), *[1] * (pose.ndim - 2), -1)
+        return 0.5 * (precision * self._offset(pose, mean).square()).sum(-1)
 
     def _offset(self, pose: Tensor, mean: Tensor) -> Tensor:
         return difference(mean, pose) if self.holds_base else pose - mean

@@ -70,6 +70,7 @@ class AlignProblem:
         debias: share of the kernel's shrinkage that is taken out of the targets of the EM.
         correspondence: one of `CORRESPONDENCES`.
         free_space: what depth pictures say of where nothing is; None for clouds alone.
+        told_precision: (B, num_dofs) 1 / std^2 of what is known beforehand, zero where nothing is; None for nothing.
     """
 
     skin: LinearBlendSkin
@@ -86,6 +87,7 @@ class AlignProblem:
     debias: float = 0.0
     correspondence: str = "em"
     free_space: FreeSpaceTerm | None = None
+    told_precision: Tensor | None = None
 
     def rows(self, index: Tensor) -> AlignProblem:
         """Return the problems of some rows of the batch, which may repeat."""
@@ -96,7 +98,8 @@ class AlignProblem:
             origin=self.origin[index],
             lower=_rows(self.lower, index),
             upper=_rows(self.upper, index),
-            prior=replace(self.prior, mean=self.prior.mean[index]),
+            prior=replace(self.prior, mean=self.prior.mean[index], precision=_rows(self.prior.precision, index)),
+            told_precision=None if self.told_precision is None else self.told_precision[index],
             free_space=None if self.free_space is None else self.free_space.rows(index),
         )
 

@@ -200,7 +200,8 @@ def _plausible_precision(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return 1 / variance (B, num_dofs) of poses of which no more is known than the limits of the joints."""
     spans = (problem.upper - problem.lower).expand_as(pose)
     uniform = 12 / spans.square().clamp_min(_SCALES.at_limit**2)
-    return torch.maximum(uniform, BROAD_PRIOR.precision(problem.skin.shape, problem.size))
+    plausible = torch.maximum(uniform, BROAD_PRIOR.precision(problem.skin.shape, problem.size))
+    return plausible if problem.told_precision is None else torch.maximum(plausible, problem.told_precision)
 
 
 def shared_errors(data: Tensor, residual: Tensor, weight: Tensor) -> Tensor:

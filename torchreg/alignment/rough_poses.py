@@ -140,7 +140,7 @@ def register_rigidly(search: PoseSearch, poses: Tensor, generator: torch.Generat
     points = skin(poses)[..., farthest_points(skin.points, min(_RIGID_EM.num_points, len(skin))), :]
     moved, motion = points, torch.eye(4).to(points).expand(*poses.shape[:2], 4, 4)
     data, mask = drawn.data.unsqueeze(1), drawn.valid.unsqueeze(1)
-    for width in () if _has_fixed_base(skin.shape) else _RIGID_EM.widths:
+    for width in () if _has_fixed_base(search.problem) else _RIGID_EM.widths:
         outlier = _RIGID_EM.outlier * OUTLIER_CONSTANT
         matches = expectation(moved, data, moved.new_tensor(width * size), outlier, mask=mask)
         motion = fit_rigid(points, matches.targets, matches.weights)
@@ -151,8 +151,8 @@ def register_rigidly(search: PoseSearch, poses: Tensor, generator: torch.Generat
     return registered, _two_sided_cost(moved, drawn, size)
 
 
-def _has_fixed_base(shape: Articulation) -> bool:
-    return bool((shape.lower[:BASE_DOFS] == shape.upper[:BASE_DOFS]).all())
+def _has_fixed_base(problem: AlignProblem) -> bool:
+    return bool((problem.lower[..., :BASE_DOFS] == problem.upper[..., :BASE_DOFS]).all())
 
 
 def _two_sided_cost(points: Tensor, problem: AlignProblem, size: float) -> Tensor:
