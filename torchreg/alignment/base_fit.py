@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchreg.alignment.base_frames import BaseFrame
-from torchreg.alignment.known_dofs import PATCH, independent_share
+from torchreg.alignment.patches import independent_share
 from torchreg.alignment.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.geometry.neighbors import sampling_distance
 from torchreg.geometry.rigid import rigid_matrix
@@ -71,7 +71,7 @@ class BaseProblem:
     @classmethod
     def of(cls, frames: Sequence[BaseFrame], surface: ShapeSurface, skin: LinearBlendSkin, size: float) -> BaseProblem:
         """Return the problem without offsets."""
-        shares = tuple(independent_share(frame.points, PATCH * size) for frame in frames)
+        shares = tuple(independent_share(frame.points, size) for frame in frames)
         free = torch.zeros(skin.shape.num_dofs - BASE_DOFS, dtype=torch.bool)
         return cls(frames=tuple(frames), shares=shares, surface=surface, skin=skin, size=size, free=free)
 

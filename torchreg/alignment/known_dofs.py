@@ -11,14 +11,12 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_shape
 from torchreg.alignment.objectives import GaussianPosePrior
+from torchreg.alignment.patches import errors_per_patch
 from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem
 from torchreg.errors import InputError, InputTypeError
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import BASE_DOF_NAMES, BASE_DOFS, shifted
 
-# Edge of the patches, as a share of the size, within which data err together: about a link, whose data are off together
-# as its mesh, its joint or the depth is.
-PATCH = 0.15
 # Name for all six degrees of freedom of the base.
 _BASE = "base"
 
@@ -92,7 +90,7 @@ class KnownDofs:
         has_prior = self.std.isfinite()
         mean = torch.where(has_prior, shifted(self.mean.expand_as(start), -problem.origin), problem.prior.mean)
         told = torch.where(has_prior, self.std, 1.0).square().reciprocal()
-        factor = shared_errors_by_patch(problem).unsqueeze(-1)
+        factor = errors_per_patch(problem.data, problem.valid, problem.size).unsqueeze(-1)
         precision = torch.where(has_prior, told * factor, problem.prior.precision)
         lower, upper = (limit.expand_as(start) for limit in (problem.lower, problem.upper))
         return replace(
@@ -108,19 +106,6 @@ class KnownDofs:
         broad = BROAD_PRIOR.precision(problem.skin.shape, problem.size).rsqrt()
         known = (self.std < broad).expand_as(problem.prior.mean).unsqueeze(1)
         return torch.where(known, problem.prior.mean.unsqueeze(1), poses)
-
-
-def shared_errors_by_patch(problem: AlignProblem) -> Tensor:
-    """Return how many data (B,) share an error: those in one patch."""
-    return torch.stack([
-        torch.tensor(1.0 / independent_share(data[valid], PATCH * problem.size)).to(data)
-        for data, valid in zip(problem.data, problem.valid, strict=True)
-    ])  # fmt: skip
-
-
-def independent_share(points: Tensor, patch: float) -> float:
-    """Return the share of points (M, 3) that are independent: one for each patch of a surface, metres."""
-    return len((points / patch).floor().unique(dim=0)) / max(1, len(points))
 
 
 def _read_locked(shape: ArticulatedShape, locked: Any) -> Tensor:

@@ -44,6 +44,7 @@ class _Around:
     placed_share: float = 0.35  # of the candidates, the best, whose limbs are placed
     num_refined: int = 3  # candidates that are refined thoroughly, at most
     data_per_candidate: int = 500  # on which it is measured, with its limbs in several positions
+    held_share: float = 0.35 # of the candidates, that suffice where the base is held
     entries: int = 4_000_000  # of a table in memory
 
 
@@ -96,6 +97,8 @@ def explore(
     Returns:
         (B, num_dofs).
     """
+    if bool((problem.lower[..., :BASE_DOFS] == problem.upper[..., :BASE_DOFS]).all()):
+        candidates = max(1, round(_AROUND.held_share * candidates))
     per_problem = candidates * _AROUND.data_per_candidate * problem.skin.shape.num_parts
     rows = torch.arange(len(start), device=start.device).split(max(1, _AROUND.entries // per_problem))
     state, found = generator.get_state(), []

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchreg.alignment.clusters import OFF_SURFACE, clustered_data
 from torchreg.alignment.confidence import EVIDENCE, beside_share, end_spreads, limb_points
+from torchreg.alignment.patches import errors_per_patch
 from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem, free_space_loss
 from torchreg.alignment.surface_fit import SURFACE_FIT, pose_covariance, surface_noise, surface_objective
 from torchreg.capture.depth_frame import DepthFrame
@@ -187,8 +188,16 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
     sigma = SURFACE_FIT.width_per_noise * noise
     near = welsch_weight((distance / sigma.unsqueeze(-1)).square()) * problem.valid
     shared = shared_errors(problem.data, distance, near)
+    if problem.told_precision is not None:
+        # As the fit weighed the data against what was told.
+        shared = torch.maximum(shared, errors_per_patch(problem.data, problem.valid, problem.size))
     precision = _plausible_precision(problem, pose)
     covariance = pose_covariance(jacobian, near, noise * shared.sqrt(), precision)
+    if problem.told_precision is not None:
+        # A depth camera sees all surfaces off by one distance, of the order of the noise: it moves what is not held.
+        pull = jacobian.mT @ (near / (noise.square() * shared).unsqueeze(-1)).unsqueeze(-1)
+        moved = covariance @ pull * noise[:, None, None]
+        covariance = covariance + moved @ moved.mT
     around = surface_objective(problem, sigma, noise).linearize(pose, distance, jacobian)
     free = ~held_at_limits(around.gradient, pose, problem.lower, problem.upper)
     slope = around.gradient * free

@@ -1,0 +1,26 @@
+"""How many data are independent where whole parts err together, as by a mesh, a joint or a depth that is off."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+# Edge of the patches within which data err together, as a share of the size: about a link of an arm.
+_PATCH = 0.15
+
+
+def independent_share(points: Tensor, size: float) -> float:
+    """Return the share of points (M, 3) on a thing of some size, metres, that are independent: one for each patch."""
+    return len((points / (_PATCH * size)).floor().unique(dim=0)) / max(1, len(points))
+
+
+def errors_per_patch(data: Tensor, valid: Tensor, size: float) -> Tensor:
+    """Return how many data (B,) err as one: those in a patch, on average.
+
+    Args:
+        data: (B, M, 3).
+        valid: (B, M) False where padded.
+        size: of the model, metres.
+    """
+    shares = [independent_share(points[chosen], size) for points, chosen in zip(data, valid, strict=True)]
+    return torch.tensor([1 / share for share in shares]).to(data)
