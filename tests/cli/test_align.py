@@ -166,3 +166,21 @@ def test_errors_are_one_line(error_of, folder, tmp_path):
     ]:
         assert message in error_of("align", "hand", *arguments), arguments
     assert sorted(path.suffix for path in tmp_path.iterdir()) == [".json", ".ply"]
+
+
+def test_known_joints_hold_a_robot_and_what_is_open_is_told(run, error_of, folder, tmp_path):
+    table, robot = tmp_path / "joints.csv", folder / "arm.urdf"
+    table.write_text("shoulder,rail\n0.05,0.01\n")
+    known = ["--locked", "base", "--joints", table, "--joint-std", "20deg"]
+    answer = run("align", robot, folder / "arm.npz", *known, "--search", "never", "-o", tmp_path / "known")
+    assert answer.exit_code in (0, 1), answer.output
+    pose = load(tmp_path / "known.safetensors").pose
+    assert not pose[:6].any()
+    out = ["-o", tmp_path / "bad"]
+    assert "no meaning without --joints" in error_of("align", robot, folder / "arm.npz", "--joint-std", "1deg", *out)
+    wrong = error_of("align", robot, folder / "arm.npz", "--joints", table, "--joint-std", "wide", *out)
+    assert "--joint-std must be a positive angle as in 0.5deg" in wrong
+    named = error_of("align", robot, folder / "arm.npz", "--locked", "elbow", *out)
+    assert "locked names 'elbow', which is no degree of freedom" in named
+    table.write_text("shoulder,rail\n50,0.01\n")
+    assert "angles are radians" in error_of("align", robot, folder / "arm.npz", "--joints", table, *out)

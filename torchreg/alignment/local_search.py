@@ -44,7 +44,7 @@ class _Around:
     placed_share: float = 0.35  # of the candidates, the best, whose limbs are placed
     num_refined: int = 3  # candidates that are refined thoroughly, at most
     data_per_candidate: int = 500  # on which it is measured, with its limbs in several positions
-    held_share: float = 0.35 # of the candidates, that suffice where the base is held
+    held_share: float = 0.35  # of the candidates, that suffice where the base is held
     entries: int = 4_000_000  # of a table in memory
 
 

@@ -25,6 +25,7 @@ from torchreg.cli.align_options import (
     write_pose,
 )
 from torchreg.cli.cameras import Depth, DepthRange, Intrinsics, Mask, check_used, depth_source
+from torchreg.cli.known_options import Joints, JointStd, Known, Locked, observability, read_known
 from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
@@ -78,6 +79,9 @@ def align(
     intrinsics: Intrinsics = None,
     mask: Mask = None,
     depth_range: DepthRange = None,
+    locked: Locked = None,
+    joints: Joints = None,
+    joint_std: JointStd = None,
     sigma: Sigma = None,
     outlier: Outlier = "limit",
     search: Search = "auto",
@@ -111,6 +115,8 @@ def align(
     With --depth --intrinsics FILE what the pictures say of free space counts too: nothing is in front of what was
     measured, nor beside the --mask.
 
+    What is known of the pose, --joints, counts with its --joint-std against data of which neighbors err together.
+
     Exit codes: 0; 1 if an alignment is doubtful, or found too few inliers to mean anything; 2 for an error; 130 for
     Ctrl-C.
     """
@@ -136,7 +142,8 @@ def align(
         config = AlignConfig(schedule=read_schedule(sigma), outlier=outlier, search=search, nan_policy=nan_policy)
         first = None if start is None else load_pose(start, model)
         points = sample_skin(model, config.num_model_points, sharpness=config.sharpness)
-        run = _AlignRun(model, config, points, scale, time, frame, first, pictures)
+        known = read_known(model, locked, joints, joint_std, count)
+        run = _AlignRun(model, config, points, scale, time, frame, first, known, pictures)
         interrupted = False
         try:
             for number, (path, entry) in enumerate(zip(clouds, files, strict=True)):
@@ -144,7 +151,9 @@ def align(
                 result = run.align(number, path, entry, on_step=lambda record: _show_stage(bar, record.stage))
                 bar.update()
                 if not quiet:
-                    bar.write(f"{path}: {alignment_summary(result)} -> {entry.result}")
+                    loose = observability(model, result) if known.rows else ""
+                    told = "; ".join(filter(None, (alignment_summary(result), loose)))
+                    bar.write(f"{path}: {told} -> {entry.result}")
         except KeyboardInterrupt:
             interrupted = True
         if gltf is not None and run.results:
@@ -171,6 +180,7 @@ class _AlignRun:
     time: float | None
     frame: int | None
     start: Tensor | None
+    known: Known
     pictures: DepthFrames | None = None
     results: list[AlignResult] = field(default_factory=list)
 
@@ -191,7 +201,10 @@ class _AlignRun:
             data = self.pictures[number]
         else:
             data = read_cloud(path, self.scale, self.config.nan_policy, self.time, self.frame)
-        result = align(self.shape, data, self.start, model_points=self.skin, config=self.config, on_step=on_step)
+        result = align(
+            self.shape, data, self.start, model_points=self.skin, locked=self.known.locked,
+            prior=self.known.prior(number), config=self.config, on_step=on_step,
+        )  # fmt: skip
         self._write(result, as_points(data), files)
         self.results.append(result)
         if result.statuses[0].usable:
