@@ -46,6 +46,7 @@ class Arm:
 
     @classmethod
     def load(cls, folder: Path) -> Arm:
+        """Return the arm of a folder."""
         truth = json.loads((folder / "truth.json").read_text())
         shape = tr.ArticulatedShape.from_urdf(folder / "xarm7.urdf")
         names, pictures = sorted(truth["joints"]), folder / "frames"
