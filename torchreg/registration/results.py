@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +13,9 @@ from torch import Tensor, nn
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.result import Result, Status, formerly, stored_as
 from torchreg.solvers.rigid_groups import merge_alike
+
+if TYPE_CHECKING:
+    from torchreg.registration.robot_model import RobotModel
 
 # Weight that two bones share, as a share of all points, from which they are neighbors.
 _LEAST_SHARED = 1e-3
@@ -201,6 +205,37 @@ class SequenceRegistration(Result):
             tolerance: share of the diagonal of the moved points.
         """
         return _parts(self.deformed, self.transforms, self.labels, self.weights, tolerance)
+
+    def to_urdf(self, path: str | os.PathLike[str], tolerance: float = 0.01) -> RobotModel:
+        """Write what was scanned as a robot, and return it with its joint values in every frame.
+
+        Parts that never part are one link. Whether two of them turn about an axis, slide or hold together is decided by
+        the residuals of their motions, seen from each other, over all frames; the joints of least residual between the
+        nearest parts make the tree. The zero pose is the reference scan; each link has the reference's triangles in
+        PATH_meshes, beside the file. Limits are those of the motions that were seen. Scans must be in metres.
+
+        Args:
+            path: of the .urdf file.
+            tolerance: see `parts`.
+
+        Returns:
+            A record: the kinematic ``tree``, the ``part`` (N,) of each point, ``joint_values`` (T, J), radians and
+            metres, the ``base`` (T, 4, 4) of each frame and the ``residuals`` (T,) of the points, metres.
+
+        Raises:
+            FormatError: if the ending is not .urdf.
+            InputError: if the scans have no triangles.
+            FileNotFoundError: if the folder does not exist.
+
+        Differentiable: no.
+
+        References: Umeyama 1991 for the motions of parts; Kruskal 1956 for the tree.
+        """
+        from torchreg.registration.robot_model import find_robot, write_robot
+
+        found = find_robot(self.points, self.deformed, self.parts(tolerance))
+        write_robot(path, found, self.points, self.faces)
+        return found
 
 
 @dataclass(frozen=True)
