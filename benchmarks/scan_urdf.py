@@ -125,8 +125,8 @@ def show(arm: Arm, name: str) -> None:
     print(
         f"{name}: {kinds.count('revolute')} hinges and {kinds.count('prismatic')} sliders found, Rand "
         f"{rand_index(robot.part, arm.link):.2f}, axes off {', '.join(f'{a:.1f}' for a in angles.tolist())} degrees; "
-        f"points off {100 * float(off.median()) / size:.2f} % of the size, {100 * float(off.max()) / size:.2f} % in the "
-        f"worst frame (joints alone: {100 * float(robot.residuals.max()) / size:.2f} %); "
+        f"points off {100 * float(off.median()) / size:.2f} % of the size, {100 * float(off.max()) / size:.2f} % in "
+        f"the worst frame (joints alone: {100 * float(robot.residuals.max()) / size:.2f} %); "
         f"registered in {middle - begin:.0f} CPU s, robot in {time.process_time() - middle:.1f}; "
         f"{math.degrees(STEP):.0f} degrees a step",
         flush=True,
