@@ -28,7 +28,7 @@ class _Kinematics:
 
     weld: float = 2.0  # residual of parts held together, in that of the parts' own rigid motions: below, they hold
     simpler: float = 1.3  # by how much the residual of a slider may exceed a hinge's, which has a point more
-    least_points: int = 12  # of a part: smaller ones join their neighbor
+    least_share: float = 0.04  # of the points, of a part: where parts meet, slivers move like neither; they join one
     least_turn: float = 0.02  # of a hinge over the frames, radians: less is noise
     contact_weight: float = 1.0  # of the gap between two parts, beside the residual of their joint
     floor: float = 0.002  # residual below which all is noise
@@ -101,7 +101,7 @@ def find_robot(points: Tensor, deformed: Tensor, part: Tensor) -> RobotModel:
 def _without_crumbs(points: Tensor, part: Tensor) -> Tensor:
     """Return parts numbered from 0, those of few points with the nearest other part."""
     counts = torch.bincount(part)
-    small = counts[part] < _NUMBERS.least_points
+    small = counts[part] < _NUMBERS.least_share * len(part)
     if bool(small.any()) and not bool(small.all()):
         nearest = NeighborTree(points[~small]).nearest(points[small])[0]
         part = part.clone()
