@@ -45,7 +45,7 @@ SEARCHED, OTHER, PICTURES, CUT, STRETCHED = 0.67, 0.7, 0.5, 0.3, 0.3
 SENSORS = (DepthNoise.structured_light(), DepthNoise.time_of_flight(), DepthNoise(quadratic=1e-3, jitter=0.3))
 OTHER_SCALES = (0.05, 0.05, 0.1, 0.1, 0.15)
 FOCAL, WIDTH, HEIGHT = 475.0, 320, 240
-RIDGE, EPOCHS, BINS, MIN_CASES = 0.02, 200, 10, 15
+RIDGE, EPOCHS, BINS, MIN_CASES = 0.0015, 200, 10, 15
 
 
 @dataclass(frozen=True)

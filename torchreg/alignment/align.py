@@ -46,7 +46,6 @@ from torchreg.alignment.rough_poses import DEFAULT_SOURCES
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.capture.depth_frame import DepthFrame
-from torchreg.capture.free_space import FreeSpace
 from torchreg.errors import InputError, UnitsWarning
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
@@ -158,6 +157,8 @@ def align(
     *,
     model_points: Tensor | LinearBlendSkin | None = None,
     mask: Tensor | None = None,
+    keypoints: Tensor | None = None,
+    keypoint_std: Tensor | float | None = None,
     config: AlignConfig | None = None,
     on_step: OnStep | None = None,
 ) -> AlignResult:
@@ -177,6 +178,11 @@ def align(
         model_points: a skin of the shape (see `sample_skin`; reuse it when aligning many clouds), or (N, 3) points in
             the initial pose; sampled on the surface by default.
         mask: (M,) or (B, M), False where data are padding.
+        keypoints: where a detector saw the shape's keypoints (of a hand 21, see `AlignResult.keypoints`), as evidence
+            beside the data: (K, 3), metres, or with depth frames of one camera (K, 2), pixels as (column, row); NaN for
+            those not seen. (B, K, 3) or (B, K, 2) for a batch.
+        keypoint_std: their standard deviation, () or (K,), in metres or pixels; by default 3 % of the shape's size, or
+            5 pixels. Beyond three of them a keypoint is taken for wrong.
         config: see `AlignConfig`.
         on_step: called with an `AlignRecord` after each iteration.
 
@@ -202,10 +208,15 @@ def align(
     if isinstance(data, DepthFrame) and data.mask is None and initial_pose is None and mask is None:
         skin = _model_skin(shape, model_points, shape.rest[None], config)
         found, crop = surest_crop(
-            data, model_size(skin), partial(align, shape, model_points=skin, config=config, on_step=on_step)
-        )
+            data,
+            model_size(skin),
+            partial(
+                align, shape, model_points=skin, keypoints=keypoints, keypoint_std=keypoint_std, config=config,
+                on_step=on_step,
+            ),
+        )  # fmt: skip
         return replace(found, crop=crop.mask)
-    seen = Observation.of(data, mask)
+    seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
     origin = floating_origin(shape, seen.points)
     if origin is not None:
         return _align_about(origin, shape, seen, initial_pose, model_points, config, on_step)
@@ -230,7 +241,7 @@ def _align(
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
         pose, several = _check_start(shape, initial_pose, clouds)
         skin = _model_skin(shape, model_points, pose, config)  # the X_i of eq. 3
-        batch = _centered_batch(skin, clouds, valid, pose, config, on_step, seen.free_space)
+        batch = _centered_batch(skin, clouds, valid, pose, config, on_step, seen)
         warn_about_rounding(clouds, "data", batch.problem.size, stacklevel=3)
         warn_about_units(batch.problem.data, batch.problem.valid, batch.problem.size, stacklevel=3)
         with one_thread(batch.problem.valid.numel() < _LIMITS.many_data):
@@ -341,16 +352,18 @@ def _centered_batch(
     pose: Tensor,
     config: AlignConfig,
     on_step: OnStep | None,
-    free_space: FreeSpace | None,
+    seen: Observation,
 ) -> _Batch:
     """Return the alignments of clouds ((B,) M, 3) from starts (B, num_dofs), each about the mean of its data."""
     data, valid = clouds.expand(len(pose), *clouds.shape[-2:]), valid.expand(len(pose), valid.shape[-1])
     origin = masked_mean(data, valid)
+    free_space = seen.free_space
     if free_space is not None and len(free_space.picture) < len(pose):
         free_space = free_space.rows(torch.zeros(len(pose), dtype=torch.int64, device=free_space.picture.device))
     problem = centered_problem(
         skin, data, valid, pose, origin, prior_std=config.prior_std, pose_atol=config.pose_atol,
         outlier=config.outlier, debias=config.debias, correspondence=config.correspondence, free_space=free_space,
+        keypoints=seen.keypoints,
     )  # fmt: skip
     return _Batch(problem=problem, start=shifted(pose, -origin), origin=origin, on_step=on_step, history=[])
 

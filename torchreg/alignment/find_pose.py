@@ -97,6 +97,8 @@ def find_pose(
     mask: Tensor | None = None,
     sources: Sequence[PoseSource] = DEFAULT_SOURCES,
     model_points: LinearBlendSkin | None = None,
+    keypoints: Tensor | None = None,
+    keypoint_std: Tensor | float | None = None,
     config: FindPoseConfig | None = None,
 ) -> PoseStarts:
     """Return the poses in which an articulated shape may lie on 3-D data, best first, and the confidence in the first.
@@ -113,6 +115,8 @@ def find_pose(
         mask: (M,) or (B, M), False where data are padding.
         sources: of rough poses, see `PoseSource`.
         model_points: a skin of the shape to reuse; sampled on the surface by default.
+        keypoints: see `align`.
+        keypoint_std: see `align`.
         config: see `FindPoseConfig`.
 
     Returns:
@@ -137,10 +141,11 @@ def find_pose(
     if isinstance(data, DepthFrame) and data.mask is None:
         skin = model_points or sample_skin(shape, (config or FindPoseConfig()).num_model_points)
         search = partial(
-            find_pose, shape, num_starts=num_starts, sources=sources, model_points=skin, config=config
+            find_pose, shape, num_starts=num_starts, sources=sources, model_points=skin, keypoints=keypoints,
+            keypoint_std=keypoint_std, config=config,
         )  # fmt: skip
         return surest_crop(data, model_size(skin), search)[0]
-    seen = Observation.of(data, mask)
+    seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
     far = floating_origin(shape, seen.points)
     near = seen if far is None else seen.near(far)
     starts = search_everywhere(shape, near, num_starts, sources, model_points, config or FindPoseConfig()).starts
@@ -167,7 +172,7 @@ def search_everywhere(
         skin = sample_skin(shape, count) if model_points is None else check_skin(shape, model_points)
         problem = centered_problem(
             skin, batch, batch_valid, typical, origin, prior_std=config.prior_std, pose_atol=0.0,
-            free_space=seen.free_space,
+            free_space=seen.free_space, keypoints=seen.keypoints,
         )  # fmt: skip
         warn_about_rounding(clouds, "data", problem.size, stacklevel=3)
         warn_about_units(problem.data, problem.valid, problem.size, stacklevel=3)

@@ -137,6 +137,7 @@ def surface_objective(
         prior=prior or problem.prior,
         lever=SURFACE_FIT.lever * problem.size,
         free_space=None if problem.free_space is None else (problem.free_space, problem.skin),
+        landmarks=problem.landmarks,
     )
 
 
