@@ -47,7 +47,6 @@ from torchreg.alignment.rough_poses import DEFAULT_SOURCES
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.capture.depth_frame import DepthFrame
-from torchreg.capture.free_space import FreeSpace
 from torchreg.errors import InputError, UnitsWarning
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
@@ -161,6 +160,8 @@ def align(
     mask: Tensor | None = None,
     locked: Sequence[str] | Tensor = (),
     prior: tuple[Any, Any] | None = None,
+    keypoints: Tensor | None = None,
+    keypoint_std: Tensor | float | None = None,
     config: AlignConfig | None = None,
     on_step: OnStep | None = None,
 ) -> AlignResult:
@@ -186,6 +187,11 @@ def align(
             ``config.prior_std``. Each is a tensor (num_dofs,) or (B, num_dofs), or a dictionary by name of degree of
             freedom; the deviation also one number, for all that a dictionary names or for all joints. The data count
             against it as errors that neighbors share, not one by one.
+        keypoints: where a detector saw the shape's keypoints (of a hand 21, see `AlignResult.keypoints`), as evidence
+            beside the data: (K, 3), metres, or with depth frames of one camera (K, 2), pixels as (column, row); NaN for
+            those not seen. (B, K, 3) or (B, K, 2) for a batch.
+        keypoint_std: their standard deviation, () or (K,), in metres or pixels; by default 3 % of the shape's size, or
+            5 pixels. Beyond three of them a keypoint is taken for wrong.
         config: see `AlignConfig`.
         on_step: called with an `AlignRecord` after each iteration.
 
@@ -213,10 +219,14 @@ def align(
         found, crop = surest_crop(
             data,
             model_size(skin),
-            partial(align, shape, model_points=skin, locked=locked, prior=prior, config=config, on_step=on_step),
-        )
+            partial(
+                align, shape, model_points=skin, locked=locked, prior=prior, keypoints=keypoints,
+                keypoint_std=keypoint_std, config=config, on_step=on_step,
+            ),
+        )  # fmt: skip
         return replace(found, crop=crop.mask)
-    seen, known = Observation.of(data, mask), KnownDofs.of(shape, locked, prior)
+    seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
+    known = KnownDofs.of(shape, locked, prior)
     origin = floating_origin(shape, seen.points)
     if origin is not None:
         return _align_about(origin, shape, seen, initial_pose, model_points, known, config, on_step)
@@ -244,7 +254,7 @@ def _align(
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
         pose, several = _check_start(shape, initial_pose, clouds)
         skin = _model_skin(shape, model_points, pose, config)  # the X_i of eq. 3
-        batch = _centered_batch(skin, clouds, valid, pose, config, on_step, seen.free_space)
+        batch = _centered_batch(skin, clouds, valid, pose, config, on_step, seen)
         if known is not None:
             batch = replace(batch, problem=known.applied(batch.problem, batch.start))
         warn_about_rounding(clouds, "data", batch.problem.size, stacklevel=3)
@@ -363,16 +373,18 @@ def _centered_batch(
     pose: Tensor,
     config: AlignConfig,
     on_step: OnStep | None,
-    free_space: FreeSpace | None,
+    seen: Observation,
 ) -> _Batch:
     """Return the alignments of clouds ((B,) M, 3) from starts (B, num_dofs), each about the mean of its data."""
     data, valid = clouds.expand(len(pose), *clouds.shape[-2:]), valid.expand(len(pose), valid.shape[-1])
     origin = masked_mean(data, valid)
+    free_space = seen.free_space
     if free_space is not None and len(free_space.picture) < len(pose):
         free_space = free_space.rows(torch.zeros(len(pose), dtype=torch.int64, device=free_space.picture.device))
     problem = centered_problem(
         skin, data, valid, pose, origin, prior_std=config.prior_std, pose_atol=config.pose_atol,
         outlier=config.outlier, debias=config.debias, correspondence=config.correspondence, free_space=free_space,
+        keypoints=seen.keypoints,
     )  # fmt: skip
     return _Batch(problem=problem, start=shifted(pose, -origin), origin=origin, on_step=on_step, history=[])
 

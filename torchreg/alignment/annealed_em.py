@@ -101,7 +101,8 @@ def anneal(
             rows, derivative = problem.skin.shape.transform_jacobian(pose, chart="tangent")
             posed = problem.skin.place(rows)
             matches = _match(problem, posed, sigma)
-            objective = RegistrationObjective(problem.skin, matches, sigma, _tempered_prior(problem, matches))
+            prior = _tempered_prior(problem, matches)
+            objective = RegistrationObjective(problem.skin, matches, sigma, prior, problem.landmarks)
             around = objective.linearize(pose, rows, derivative)
             if m_steps > 1:
                 solved = problem.solve(objective, pose, m_steps, around, damping)

@@ -136,12 +136,12 @@ def calibrate(
                 radius_std=config.radius_std, part_std=config.part_std,
             )  # fmt: skip
             found = align(fitted, data, poses, model_points=skin, mask=valid, config=config.align)
-            aligned = torch.tensor([status.usable for status in found.statuses], device=valid.device)
+            aligned = torch.tensor([_rests_on_data(status) for status in found.statuses], device=valid.device)
             problem = ScaleProblem(fitted, data, valid & aligned.unsqueeze(-1), prior, size, config.max_points)
             better = problem.unexplained(found.pose) < problem.unexplained(poses)
             poses = torch.where(better.unsqueeze(-1), found.pose, poses)
             poses, cost, change = _fit_jointly(problem, poses, config, number, on_step)
-    failed = {status for status in found.statuses if not status.usable}
+    failed = {status for status in found.statuses if not _rests_on_data(status)}
     status = Status.CONVERGED if change <= config.align.pose_atol else Status.MAX_STEPS
     for parameter, original in zip(fitted.parameters(), shape.parameters(), strict=True):
         parameter.requires_grad_(original.requires_grad)
@@ -153,6 +153,11 @@ def calibrate(
         cost=cost,
         status=Status.DEGENERATE if Status.DEGENERATE in failed else Status.FEW_INLIERS if failed else status,
     )
+
+
+def _rests_on_data(status: Status) -> bool:
+    """Return whether a frame counts: a doubtful one does, as the scales are not fitted yet."""
+    return status.usable or status is Status.DOUBTFUL
 
 
 def _fit_jointly(

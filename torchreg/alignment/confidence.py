@@ -66,7 +66,11 @@ def is_misfit(problem: AlignProblem, pose: Tensor) -> Tensor:
 
 def beside_share(problem: AlignProblem, pose: Tensor, off: OffSurface = OFF_SURFACE) -> Tensor:
     """Return the share (B,) of the data that lie beside the surface: off it, but not far."""
-    distance = problem.surface.distance(problem.data, pose)
+    return share_beside(problem, problem.surface.distance(problem.data, pose), off)
+
+
+def share_beside(problem: AlignProblem, distance: Tensor, off: OffSurface = OFF_SURFACE) -> Tensor:
+    """Return the same for data at distances (B, M) from the surface."""
     noise = surface_noise(distance, problem.valid, problem.size)
     beyond = off.distance(noise, problem.size).unsqueeze(-1)
     beside = (distance.abs() > beyond) & (distance.abs() < _MISFIT.reach * problem.size) & problem.valid
@@ -91,18 +95,28 @@ def end_spreads(problem: AlignProblem, pose: Tensor) -> Tensor:
     """
     if problem.data.shape[-2] > EVIDENCE.num_data:
         problem = problem.draw(EVIDENCE.num_data, torch.Generator().manual_seed(0))
-    ends = limb_ends(problem.skin)
-    _, derivative = problem.skin.shape.transform_jacobian(pose, chart="tangent")
-    moves = (problem.skin.basis[ends] @ derivative.flatten(-2)).unflatten(-1, (3, -1))
+    moves = end_motions(problem.skin, pose, limb_ends(problem.skin))
     # What the prior leaves free is plausible, at least.
     prior = torch.maximum(problem.prior.precision, BROAD_PRIOR.precision(problem.skin.shape, problem.size))
     variances = prior.reciprocal()
     variances[..., :BASE_DOFS] = 0
     loose = (moves.square() * variances[..., None, None, :]).sum((-2, -1))
     covariance = _covariance(problem, pose, prior)
-    fitted = ((moves.flatten(-3, -2) @ covariance).unflatten(-2, moves.shape[-3:-1]) * moves).sum((-2, -1)).clamp_min(0)
-    alone = (-_limb_data(problem, pose) / EVIDENCE.limb_data).exp()
+    fitted = end_variances(moves, covariance)
+    alone = (-limb_data(problem, pose) / EVIDENCE.limb_data).exp()
     return (fitted + alone * (loose - fitted).clamp_min(0)).clamp_min(torch.finfo(pose.dtype).tiny).sqrt()
+
+
+def end_motions(skin: LinearBlendSkin, pose: Tensor, ends: Tensor) -> Tensor:
+    """Return the derivatives (B, L, 3, num_dofs) of some points (L,) of a skin in poses, in tangent coordinates."""
+    _, derivative = skin.shape.transform_jacobian(pose, chart="tangent")
+    return (skin.basis[ends] @ derivative.flatten(-2)).unflatten(-1, (3, -1))
+
+
+def end_variances(moves: Tensor, covariance: Tensor) -> Tensor:
+    """Return the variances (B, L) of points with derivatives (B, L, 3, num_dofs), all coordinates together."""
+    spread = (moves.flatten(-3, -2) @ covariance).unflatten(-2, moves.shape[-3:-1])
+    return (spread * moves).sum((-2, -1)).clamp_min(0)
 
 
 def limb_ends(skin: LinearBlendSkin) -> Tensor:
@@ -133,7 +147,7 @@ def _covariance(problem: AlignProblem, pose: Tensor, precision: Tensor) -> Tenso
     return pose_covariance(jacobian, near, noise, precision)
 
 
-def _limb_data(problem: AlignProblem, pose: Tensor) -> Tensor:
+def limb_data(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return the number of data (B, L) that only one limb explains, for each limb; infinity without limbs."""
     shape = problem.skin.shape
     explained = soft_inliers(problem, shape.distance(problem.data, pose))

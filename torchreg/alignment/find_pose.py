@@ -101,6 +101,8 @@ def find_pose(
     model_points: LinearBlendSkin | None = None,
     locked: Sequence[str] | Tensor = (),
     prior: tuple[Any, Any] | None = None,
+    keypoints: Tensor | None = None,
+    keypoint_std: Tensor | float | None = None,
     config: FindPoseConfig | None = None,
 ) -> PoseStarts:
     """Return the poses in which an articulated shape may lie on 3-D data, best first, and the confidence in the first.
@@ -119,6 +121,8 @@ def find_pose(
         model_points: a skin of the shape to reuse; sampled on the surface by default.
         locked: what is held, see `align`: at the prior's mean where it has one, else as at rest.
         prior: what is known of the pose, see `align`.
+        keypoints: see `align`.
+        keypoint_std: see `align`.
         config: see `FindPoseConfig`.
 
     Returns:
@@ -143,11 +147,11 @@ def find_pose(
     if isinstance(data, DepthFrame) and data.mask is None:
         skin = model_points or sample_skin(shape, (config or FindPoseConfig()).num_model_points)
         search = partial(
-            find_pose, shape, num_starts=num_starts, sources=sources, model_points=skin, locked=locked,
-            prior=prior, config=config,
+            find_pose, shape, num_starts=num_starts, sources=sources, model_points=skin, locked=locked, prior=prior,
+            keypoints=keypoints, keypoint_std=keypoint_std, config=config,
         )  # fmt: skip
         return surest_crop(data, model_size(skin), search)[0]
-    seen = Observation.of(data, mask)
+    seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
     far = floating_origin(shape, seen.points)
     near = seen if far is None else seen.near(far)
     known = KnownDofs.of(shape, locked, prior)
@@ -177,7 +181,7 @@ def search_everywhere(
         skin = sample_skin(shape, count) if model_points is None else check_skin(shape, model_points)
         problem = centered_problem(
             skin, batch, batch_valid, typical, origin, prior_std=config.prior_std, pose_atol=0.0,
-            free_space=seen.free_space,
+            free_space=seen.free_space, keypoints=seen.keypoints,
         )  # fmt: skip
         if known is not None:
             problem = known.applied(problem, shifted(known.start(shape).expand_as(typical), -origin))

@@ -41,11 +41,11 @@ class FreeSpaceTerm:
     @classmethod
     def of_skin(cls, free_space: FreeSpace, skin: LinearBlendSkin, size: float) -> FreeSpaceTerm:
         """Return the term for a skin that covers a shape of some size evenly."""
-        return cls(free_space, sampling_distance(skin.points, skin.points) ** 2, INTRUSION.tolerance * size)
+        return cls(free_space, sampling_distance(skin.points) ** 2, INTRUSION.tolerance * size)
 
     def for_skin(self, skin: LinearBlendSkin) -> FreeSpaceTerm:
         """Return the term for another skin of the shape."""
-        return replace(self, area=sampling_distance(skin.points, skin.points) ** 2)
+        return replace(self, area=sampling_distance(skin.points) ** 2)
 
     def rows(self, index: Tensor) -> FreeSpaceTerm:
         """Return the term for some problems, which may repeat."""

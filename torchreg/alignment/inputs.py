@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from torchreg._checks import as_float_tensor, check_shape
+from torchreg.alignment.landmarks import MeasuredKeypoints
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.free_space import FreeSpace
 from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning
@@ -44,12 +45,14 @@ class Observation:
         mask: (M,) or (B, M), False where points are padding; None without.
         free_space: of B pictures, or one, where the points are those of depth frames.
         frames: these frames.
+        keypoints: measured beside, or None.
     """
 
     points: Any
     mask: Tensor | None
     free_space: FreeSpace | None = None
     frames: tuple[DepthFrame, ...] = ()
+    keypoints: MeasuredKeypoints | None = None
 
     @classmethod
     def of(cls, data: Any, mask: Tensor | None) -> Observation:
@@ -80,7 +83,19 @@ class Observation:
     def near(self, origin: Tensor) -> Observation:
         """Return the same in coordinates that begin at an origin (3,)."""
         space = None if self.free_space is None else self.free_space.moved(origin)
-        return replace(self, points=self.points - origin.to(self.points.device), free_space=space)
+        keypoints = None if self.keypoints is None else self.keypoints.near(origin)
+        points = self.points - origin.to(self.points.device)
+        return replace(self, points=points, free_space=space, keypoints=keypoints)
+
+    def with_keypoints(self, shape: ArticulatedShape, keypoints: Any, std: Any) -> Observation:
+        """Return the same with measured keypoints of a shape, None for none; see `MeasuredKeypoints`."""
+        if keypoints is None:
+            if std is not None:
+                raise InputError("keypoint_std goes with keypoints; give both, or none")
+            return self
+        camera = self.frames[0].camera if self.frames else None
+        size = float((shape.keypoints(shape.rest_pose()).amax(0) - shape.keypoints(shape.rest_pose()).amin(0)).norm())
+        return replace(self, keypoints=MeasuredKeypoints.of(shape, keypoints, std, camera, size))
 
 
 def check_clouds(

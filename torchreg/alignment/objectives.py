@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchreg.alignment.free_space_term import FreeSpaceTerm
+from torchreg.alignment.landmarks import Landmarks
 from torchreg.shapes.pose_algebra import BASE_DOFS, difference
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import ShapeSurface
@@ -66,10 +67,19 @@ class RegistrationObjective:
         matches: lambda and G from the E-step.
         sigma: (B,) metres.
         prior: on the joints.
+        landmarks: measured keypoints, or None.
     """
 
-    def __init__(self, skin: LinearBlendSkin, matches: EStep, sigma: Tensor, prior: GaussianPosePrior) -> None:
+    def __init__(
+        self,
+        skin: LinearBlendSkin,
+        matches: EStep,
+        sigma: Tensor,
+        prior: GaussianPosePrior,
+        landmarks: Landmarks | None = None,
+    ) -> None:
         self.skin, self.prior, self.targets = skin, prior, matches.targets
+        self.sigma, self.landmarks = sigma, landmarks
         weights = torch.threshold(matches.weights, 1e-12, 0.0)
         self.weights = (weights / (sigma * sigma).unsqueeze(-1)).unsqueeze(-1)
         self.curvature = skin.basis.mT @ (self.weights * skin.basis)
@@ -88,12 +98,15 @@ class RegistrationObjective:
         gradient = (flat.mT @ by_transform).squeeze(-1)
         curved = (self.curvature @ derivative.flatten(-2)).reshape(flat.shape)
         problem = Linearization(0.5 * (weighted * residual).sum((-2, -1)), gradient, flat.mT @ curved)
+        if self.landmarks is not None:
+            problem = problem.plus(self.landmarks.linearized(pose, self.sigma))
         return self.prior.add_to(problem, pose)
 
     def cost(self, pose: Tensor) -> Tensor:
         """Return the cost alone (B,), in a third of the time."""
         residual = self.skin(pose) - self.targets
-        return 0.5 * (self.weights * residual * residual).sum((-2, -1)) + self.prior.cost(pose)
+        cost = 0.5 * (self.weights * residual * residual).sum((-2, -1)) + self.prior.cost(pose)
+        return cost if self.landmarks is None else cost + self.landmarks.cost(pose, self.sigma)
 
 
 class SurfaceObjective:
@@ -110,6 +123,7 @@ class SurfaceObjective:
         prior: on the pose.
         lever: distance of the shape's points from the base's axis of rotation, metres.
         free_space: what depth pictures say against a pose, and the skin whose points it looks at; None for clouds.
+        landmarks: measured keypoints, or None.
     """
 
     def __init__(
@@ -122,9 +136,10 @@ class SurfaceObjective:
         prior: GaussianPosePrior,
         lever: float = 1.0,
         free_space: tuple[FreeSpaceTerm, LinearBlendSkin] | None = None,
+        landmarks: Landmarks | None = None,
     ) -> None:
         self.surface, self.data, self.valid, self.prior = surface, data, valid, prior
-        self.sigma, self.noise, self.free_space = sigma, noise, free_space
+        self.sigma, self.noise, self.free_space, self.landmarks = sigma, noise, free_space, landmarks
         self.inverse_square = sigma.square().reciprocal().unsqueeze(-1)
         self.scale = noise.square().reciprocal()
         # Motions of the base that the data leave free, as along a cylinder's axis, are then not taken.
@@ -147,13 +162,17 @@ class SurfaceObjective:
         if self.free_space is not None:
             term, skin = self.free_space
             against = term.linearized(skin, pose, self.sigma, self.noise)
-            problem = Linearization(*(first + second for first, second in zip(problem, against, strict=True)))
+            problem = problem.plus(against)
+        if self.landmarks is not None:
+            problem = problem.plus(self.landmarks.linearized(pose, self.sigma))
         return self.prior.add_to(problem, pose)
 
     def cost(self, pose: Tensor) -> Tensor:
         """Return the cost alone (B,), in half the time."""
         beta = self._beta(self.surface.distance(self.data, pose))
         cost = self._data_cost(beta) + self.prior.cost(pose)
+        if self.landmarks is not None:
+            cost = cost + self.landmarks.cost(pose, self.sigma)
         if self.free_space is None:
             return cost
         term, skin = self.free_space

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.free_space_term import FreeSpaceTerm
+from torchreg.alignment.landmarks import Landmarks, MeasuredKeypoints
 from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
 from torchreg.capture.free_space import FreeSpace
 from torchreg.geometry.kinematic_tree import stack_sizes
@@ -71,6 +72,7 @@ class AlignProblem:
         correspondence: one of `CORRESPONDENCES`.
         free_space: what depth pictures say of where nothing is; None for clouds alone.
         told_precision: (B, num_dofs) 1 / std^2 of what is known beforehand, zero where nothing is; None for nothing.
+        landmarks: measured keypoints, or None.
     """
 
     skin: LinearBlendSkin
@@ -88,6 +90,7 @@ class AlignProblem:
     correspondence: str = "em"
     free_space: FreeSpaceTerm | None = None
     told_precision: Tensor | None = None
+    landmarks: Landmarks | None = None
 
     def rows(self, index: Tensor) -> AlignProblem:
         """Return the problems of some rows of the batch, which may repeat."""
@@ -101,6 +104,7 @@ class AlignProblem:
             prior=replace(self.prior, mean=self.prior.mean[index], precision=_rows(self.prior.precision, index)),
             told_precision=None if self.told_precision is None else self.told_precision[index],
             free_space=None if self.free_space is None else self.free_space.rows(index),
+            landmarks=None if self.landmarks is None else self.landmarks.rows(index),
         )
 
     def repeated(self, count: int) -> AlignProblem:
@@ -191,6 +195,7 @@ def centered_problem(
     debias: float = 0.0,
     correspondence: str = "em",
     free_space: FreeSpace | None = None,
+    keypoints: MeasuredKeypoints | None = None,
 ) -> AlignProblem:
     """Return a batch of alignments in coordinates with the origin of each cloud at zero, where float32 is precise.
 
@@ -206,6 +211,7 @@ def centered_problem(
         debias: share of the kernel's shrinkage that is taken out of the targets of the EM.
         correspondence: one of `CORRESPONDENCES`.
         free_space: of the clouds, in the world, where they come from depth pictures.
+        keypoints: measured, in the world, if any.
     """
     shape, size = skin.shape, model_size(skin)
     shift = torch.nn.functional.pad(origin, (0, shape.num_dofs - 3))
@@ -228,6 +234,7 @@ def centered_problem(
         debias=debias,
         correspondence=correspondence,
         free_space=term,
+        landmarks=None if keypoints is None else keypoints.of_problems(shape, origin),
     )
 
 
@@ -266,7 +273,12 @@ def alignment_cost(problem: AlignProblem, pose: Tensor, distances: Tensor | None
     distances = problem.surface.distance(problem.data, pose) if distances is None else distances
     outliers = welsch_loss((distances / (INLIER_SHARE * problem.size)).square())
     cost = (outliers * problem.valid).sum(-1) + PRIOR_SHARE * problem.prior.cost(pose)
-    return cost + free_space_loss(problem, pose, INLIER_SHARE)
+    return cost + free_space_loss(problem, pose, INLIER_SHARE) + landmark_loss(problem, pose, INLIER_SHARE)
+
+
+def landmark_loss(problem: AlignProblem, pose: Tensor, width: float) -> Tensor | float:
+    """Return the negative log-likelihood (B, ...) of the landmarks; zero without any; see `free_space_loss`."""
+    return 0.0 if problem.landmarks is None else problem.landmarks.cost(pose, width * problem.size)
 
 
 def free_space_loss(problem: AlignProblem, pose: Tensor, width: float) -> Tensor | float:

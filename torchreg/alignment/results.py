@@ -82,7 +82,7 @@ class AlignResult(Result):
     covariance: Tensor | None = None
     confidence: Tensor | None = None
     evidence: Tensor | None = None
-    doubt: str | tuple[str, ...] = ""
+    doubt: str | tuple[str, ...] | None = None
     crop: Tensor | None = None
     origin: Tensor | None = None
 

@@ -34,6 +34,10 @@ class SurfaceFit:
         """Return the largest noise of data on a model of some size, as a standard deviation, metres."""
         return self.max_width * size / self.width_per_noise
 
+    def min_noise(self, size: float) -> float:
+        """Return the smallest: what a model of some size is not exact, metres."""
+        return self.min_width * size / self.width_per_noise
+
 
 SURFACE_FIT = SurfaceFit()
 
@@ -133,6 +137,7 @@ def surface_objective(
         prior=prior or problem.prior,
         lever=SURFACE_FIT.lever * problem.size,
         free_space=None if problem.free_space is None else (problem.free_space, problem.skin),
+        landmarks=problem.landmarks,
     )
 
 
@@ -155,7 +160,7 @@ def surface_noise(distance: Tensor, valid: Tensor, size: float) -> Tensor:
     distance = distance.abs()
     near = (distance < SURFACE_FIT.widths[-1] * size) & valid
     median = torch.where(near, distance, torch.nan).nanmedian(-1).values
-    lowest, highest = SURFACE_FIT.min_width * size / SURFACE_FIT.width_per_noise, SURFACE_FIT.max_noise(size)
+    lowest, highest = SURFACE_FIT.min_noise(size), SURFACE_FIT.max_noise(size)
     return torch.nan_to_num(_MAD_TO_STD * median, nan=highest).clamp(lowest, highest)
 
 

@@ -201,6 +201,12 @@ class DepthFrame:
         column, row = self.pixels.unbind(-1)
         return near[row, column]
 
+    def near(self, origin: Tensor) -> DepthFrame:
+        """Return the frame in coordinates that begin at an origin (3,)."""
+        shift = torch.eye(4, dtype=torch.float64)
+        shift[:3, 3] = -origin.double().cpu()
+        return DepthFrame(self.depth, self.camera.moved(shift), self.mask, max_points=self.max_points)
+
     def cropped(self, mask: Any) -> DepthFrame:
         """Return the frame with those pixels alone that are in a mask (H, W) too."""
         mask = _as_mask(mask, self.depth)

@@ -21,6 +21,7 @@ class Segmentation:
     least: float = 0.3  # extent of a surface that may show the shape
     reach: float = 1.0  # along the surface from an end of it: what is farther is cut off
     apart: float = 0.8  # ends nearer to one another show the same
+    beyond: float = 0.2  # from an end: nothing so near is farther from the other ends
     max_ends: int = 4  # of a surface
     max_crops: int = 8  # of a picture
 
@@ -105,15 +106,19 @@ def _parts(grid: _Grid, index: Tensor, size: float) -> Iterator[Tensor]:
     if float(around[0].max()) <= (SEGMENTATION.reach + SEGMENTATION.least) * size:
         yield every
         return
-    while len(ends) < SEGMENTATION.max_ends:
+    while len(around) < 2 * SEGMENTATION.max_ends and len(ends) < SEGMENTATION.max_ends:
         nearest = torch.stack(around).amin(0)
         farthest = int(nearest.argmax())
         if float(nearest[farthest]) < SEGMENTATION.apart * size:
             break
-        ends.append(farthest)
         around.append(_distance(grid, farthest, every))
+        # The middle of a long surface is far from its ends, too, but more of it lies beyond.
+        beside = every & (around[-1] <= SEGMENTATION.beyond * size)
+        if float(around[0][beside].max()) <= float(around[0][farthest]) + SEGMENTATION.step * size:
+            ends.append(farthest)
+    reached = [_distance(grid, end, every) for end in ends]
     for number in _rim_distance(grid, ends).argsort(descending=True).tolist():
-        yield every & (around[number] <= SEGMENTATION.reach * size)
+        yield every & (reached[number] <= SEGMENTATION.reach * size)
 
 
 def _distance(grid: _Grid, source: int, every: Tensor) -> Tensor:

@@ -97,7 +97,7 @@ def depth_source(
 
 def depth_job(frames: DepthFrames) -> dict[str, Any]:
     """Return all settings that determine the frames of depth pictures, as plain data."""
-    return {"--depth": True, "--depth-range": list(frames.depths), "--mask": list(frames.masks)}
+    return {"--depth": True, "--depth-range": [str(limit) for limit in frames.depths], "--mask": list(frames.masks)}
 
 
 def stereo_source(

@@ -12,12 +12,17 @@ import typer
 from torchreg.cli.align_options import NanPolicy, Scale
 from torchreg.cli.cameras import (
     Calibration,
+    Depth,
     DepthRange,
+    Intrinsics,
+    Mask,
     Matcher,
     Reach,
     Seen,
     Volume,
     check_used,
+    depth_job,
+    depth_source,
     seen_folder,
     stereo_job,
     stereo_source,
@@ -49,7 +54,8 @@ def track(
         typer.Argument(
             metavar="FRAMES",
             help="The clouds, metres: files, which are put in the order of the numbers in their names, one folder of "
-            "them, or one .npz of frames. With --stereo two folders: the left pictures and the right ones.",
+            "them, or one .npz of frames. With --stereo two folders: the left pictures and the right ones; with "
+            "--depth depth pictures, folders or patterns of them.",
         ),
     ],
     output: Annotated[
@@ -72,6 +78,9 @@ def track(
         bool, typer.Option("--stereo", help="FRAMES are the pictures of a calibrated pair of cameras.")
     ] = False,
     calibration: Calibration = None,
+    depth: Depth = False,
+    intrinsics: Intrinsics = None,
+    mask: Mask = None,
     depth_range: DepthRange = None,
     volume: Volume = None,
     matcher: Matcher = None,
@@ -124,7 +133,10 @@ def track(
     pictures go to RESULT_seen: the disparity, and the left picture with its points, blue where they are inliers, and
     the outline of the shape.
 
-    Exit codes: 0; 1 if in any frame the shape was lost or there were no data; 2 for an error; 130 for Ctrl-C.
+    With --depth --intrinsics FILE frames are depth pictures, and what they say of free space counts too.
+
+    Exit codes: 0; 1 if in any frame the shape was lost or is doubtful, or there were no data; 2 for an error; 130 for
+    Ctrl-C.
     """
     from torchreg._checks import check_positive
 
@@ -133,14 +145,19 @@ def track(
     check_outputs([poses], force or resumed)
     check_positive(fps, "--fps")
     check_positive(scale, "--scale")
-    views = {"--depth-range": depth_range, "--volume": volume, "--matcher": matcher, "--reach": reach, "--seen": seen}
+    views = {"--volume": volume, "--matcher": matcher, "--reach": reach, "--seen": seen}
     check_used(stereo, "--stereo", {"--calibration": calibration, **views})
+    check_used(depth, "--depth", {"--intrinsics": intrinsics, "--mask": mask})
+    check_used(stereo or depth, "--stereo or --depth", {"--depth-range": depth_range})
     options = parents, package_dir, free_base, skin
     pictures = None
     if stereo:
         model = load_shape(shape, *options)
         pictures = stereo_source(frames, calibration, model, depth_range, volume, matcher, reach, scale)
         clouds, folder = Clouds(pictures, floating=False), seen_folder(seen, files.result, force or resumed)
+    elif depth:
+        images = depth_source(frames, intrinsics, mask, depth_range)
+        clouds, model = Clouds(images), load_shape(shape, *options)
     else:
         clouds, model = _clouds(frames, scale, nan_policy), load_shape(shape, *options)
 
@@ -160,6 +177,8 @@ def track(
         if pictures is not None:
             run.job |= stereo_job(pictures)
             run.seen = _drawn_pictures(pictures, folder)
+        if depth:
+            run.job |= depth_job(images)
         if view:
             run.live = _live_page(pages, port, browser, quiet)
         complete = _run(run, bar, resumed)

@@ -16,12 +16,14 @@ import typer
 from torchreg.cli.outputs import check_outputs, tell_origin
 from torchreg.cli.reporting import show_warning
 from torchreg.errors import FormatError, InputError, UnitsWarning
+from torchreg.geometry.loaded import as_points
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from torch import Tensor
 
+    from torchreg.capture.depth_frames import DepthFrames
     from torchreg.capture.stereo_frames import StereoFrames
     from torchreg.cli.track_checkpoint import TrackProgress
     from torchreg.io.frames import Frames
@@ -78,7 +80,7 @@ class Clouds(Sequence["Tensor"]):
         floating: whether an origin may be chosen.
     """
 
-    def __init__(self, frames: Frames | StereoFrames, floating: bool = True) -> None:
+    def __init__(self, frames: Frames | StereoFrames | DepthFrames, floating: bool = True) -> None:
         self.names, self._frames, self._floating = frames.names, frames, floating
         self.on_drop: Callable[[int, str], None] | None = None
         self._contents: dict[int, str] = {}
@@ -93,9 +95,15 @@ class Clouds(Sequence["Tensor"]):
         return len(self._frames)
 
     def __getitem__(self, index: Any) -> Any:
+        return as_points(self.frame(index))
+
+    def frame(self, index: Any) -> Any:
+        """Return what the tracker is given: a cloud, or a depth picture, see `DepthFrame`."""
         try:
-            points = self._frames[index]
-            return points if self.origin is None else points.double() - self.origin
+            found = self._frames[index]
+            if self.origin is None:
+                return found
+            return found.near(self.origin) if hasattr(found, "near") else found.double() - self.origin
         except (FormatError, OSError) as error:
             if self.on_drop is not None:
                 self.on_drop(index, " ".join(str(error).split()))
@@ -110,7 +118,7 @@ class Clouds(Sequence["Tensor"]):
 
         for index in range(len(self) if self._floating else 0):
             try:
-                first = self._frames[index]
+                first = as_points(self._frames[index])
             except (FormatError, OSError):
                 continue
             if len(first):
@@ -289,7 +297,7 @@ class TrackRun:
 
         times = [number / self.fps for number in numbers]
         try:
-            result = self.tracker.run((self.clouds[number] for number in numbers), note, times=times)
+            result = self.tracker.run((self.clouds.frame(number) for number in numbers), note, times=times)
         except KeyboardInterrupt:
             if not self.parts:
                 raise

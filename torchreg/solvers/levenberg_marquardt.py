@@ -44,6 +44,10 @@ class Linearization(NamedTuple):
     gradient: Tensor
     hessian: Tensor
 
+    def plus(self, other: Linearization) -> Linearization:
+        """Return the problem whose cost is the sum of both."""
+        return Linearization(self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian)
+
 
 @dataclass(frozen=True)
 class LMResult:

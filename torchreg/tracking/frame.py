@@ -11,6 +11,7 @@ from torchreg.alignment.annealed_em import ANNEALING
 from torchreg.alignment.inputs import UNITS
 from torchreg.alignment.problem import AlignProblem
 from torchreg.alignment.surface_fit import SURFACE_FIT
+from torchreg.capture.depth_frame import DepthFrame
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import stacked_rows
 from torchreg.tracking.results import TrackState
@@ -41,11 +42,13 @@ class Frame:
         cloud: (M, 3), metres.
         finite: (M,) True where a point is finite.
         elapsed: time since the frame before, in intervals.
+        picture: whose points the cloud holds, if it is that of a depth camera.
     """
 
     cloud: Tensor
     finite: Tensor
     elapsed: float
+    picture: DepthFrame | None = None
 
     @property
     def data(self) -> Tensor:

@@ -11,10 +11,14 @@ from torch import Tensor
 
 from torchreg.alignment.align import AlignConfig
 from torchreg.alignment.annealed_em import anneal
+from torchreg.alignment.confidence import end_motions, end_variances, limb_ends, share_beside
+from torchreg.alignment.free_space_term import INTRUSION, FreeSpaceTerm
 from torchreg.alignment.objectives import GaussianPosePrior
 from torchreg.alignment.problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem
+from torchreg.alignment.reliability import Evidence, hardly_gains, weigh
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, SurfaceResult, pose_covariance, refine_surface, surface_noise
+from torchreg.geometry.neighbors import sampling_distance
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.limbs import find_limbs
 from torchreg.shapes.pose_algebra import shifted
@@ -58,6 +62,8 @@ class FrameFitter:
         count = config.num_model_points * (2 if config.model_points == "seen" else 1)
         self.skin = skin or sample_skin(shape, count, sharpness=config.sharpness)
         self.limbs = find_limbs(shape)[0]
+        self._ends = limb_ends(self.skin)
+        self._skin_area = sampling_distance(self.skin.points) ** 2
         origin = torch.zeros_like(shape.rest[None, :3])
         self._template = centered_problem(
             self.skin, origin[None], torch.ones_like(origin[:, :1], dtype=torch.bool), shape.rest[None], origin,
@@ -81,6 +87,7 @@ class FrameFitter:
         posed, reach = self.skin.place(rows), _SETTINGS.reach * self.size * uncertainty_growth(state, frame.elapsed)
         data = frame.cloud - origin
         in_reach = ((data > posed.amin(0) - reach) & (data < posed.amax(0) + reach)).all(-1)
+        num_in_reach = int(in_reach.sum())
         data = subsample(data[in_reach], self.config.max_points, frame_generator(state))
         if len(data) < MIN_DATA:
             return None
@@ -90,8 +97,16 @@ class FrameFitter:
             valid=torch.ones_like(data[None, :, 0], dtype=torch.bool),
             lower=self.shape.lower - shift, upper=self.shape.upper - shift,
             prior=GaussianPosePrior(local[None], self._joint_precision(FILTER.max_joint_std)),
+            free_space=self._free_space(frame, origin, num_in_reach / len(data)),
         )  # fmt: skip
         return FrameView(problem=problem, origin=origin, rows=rows, in_reach=in_reach)
+
+    def _free_space(self, frame: Frame, origin: Tensor, thinning: float) -> FreeSpaceTerm | None:
+        """Return what a picture says against poses about an origin (3,), whose data each stand for some of its own."""
+        if frame.picture is None:
+            return None
+        space = frame.picture.free_space.to(origin).moved(origin).thinned(origin.new_tensor([thinning]))
+        return FreeSpaceTerm(space, self._skin_area, INTRUSION.tolerance * self.size)
 
     def look(self, state: TrackState, frame: Frame, pose: Tensor) -> FrameView | None:
         """Return the frame as seen from the predicted pose (num_dofs,), with the model points that were seen last.
@@ -145,6 +160,20 @@ class FrameFitter:
         weights = _inlier_weights(fit.distance[0], fit.residual)
         covariance = pose_covariance(fit.jacobian[0], weights, fit.residual, precision)
         return covariance, (1 - covariance.diagonal() * precision).clamp(0, 1)
+
+    def judged(self, fit: FrameFit, covariance: Tensor) -> tuple[Evidence, bool]:
+        """Return the evidence for a fit with a covariance (num_dofs, num_dofs), and whether it has converged."""
+        problem, pose = fit.view.problem, fit.pose
+        moves = end_motions(self.skin, pose, self._ends)
+        evidence = weigh(
+            problem, pose, fit.distance, beside=share_beside(problem, fit.distance),
+            clustered=pose.new_tensor([len(fit.unexplained) / max(1, fit.num_inliers)]),
+            spread=end_variances(moves, covariance[None]).clamp_min(torch.finfo(pose.dtype).tiny).sqrt().mean(-1),
+        )  # fmt: skip
+        converged = fit.change <= problem.pose_atol or hardly_gains(
+            problem, pose, fit.distance, fit.jacobian, fit.residual[None], covariance[None]
+        )
+        return evidence, bool(converged)
 
     def _with_evidence(
         self, view: FrameView, state: TrackState, acquired: str, fitted: SurfaceResult, residual: Tensor

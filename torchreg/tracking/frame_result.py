@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.annealed_em import outlier_level
+from torchreg.alignment.reliability import CALIBRATION, confidence_of
 from torchreg.result import Status
 from torchreg.solvers.e_step import expectation
 from torchreg.tracking.frame import WIDTHS, Frame, FrameFit
@@ -27,6 +28,8 @@ def fitted_result(
         data = (frame.cloud[in_reach] - origin)[None]
         distance = problem.surface.distance(data, fit.pose)[0]
     posed = problem.skin.place(fit.rows)
+    evidence, converged = fitter.judged(fit, covariance)
+    confidence = confidence_of(evidence.table())[0]
     sigma = posed.new_tensor(WIDTHS.stop * problem.size)
     outlier = outlier_level(problem, posed[None], sigma[None])
     distances = _distances_out_of_reach(frame)
@@ -37,9 +40,16 @@ def fitted_result(
         fitter, state, frame, pose=fit.world_pose, registered=posed + origin,
         keypoints=fitter.shape.placed_keypoints(fit.transforms) + origin, distances=distances, posterior=posterior,
         sigma=sigma, cost=posed.new_tensor(fit.cost), covariance=covariance, acquired=fit.acquired,
-        status=Status.CONVERGED if fit.change <= problem.pose_atol else Status.MAX_STEPS,
-        residual=float(fit.residual),
+        status=fit_status(converged, float(confidence)), residual=float(fit.residual), confidence=confidence,
+        evidence=evidence.table()[0],
     )  # fmt: skip
+
+
+def fit_status(converged: bool, confidence: float) -> Status:
+    """Return the status of a fit by what is known of it."""
+    if confidence < CALIBRATION.doubtful:
+        return Status.DOUBTFUL
+    return Status.CONVERGED if converged else Status.MAX_STEPS
 
 
 def predicted_result(fitter: FrameFitter, state: TrackState, frame: Frame, pose: Tensor, status: Status) -> FrameResult:
@@ -50,7 +60,7 @@ def predicted_result(fitter: FrameFitter, state: TrackState, frame: Frame, pose:
         fitter, state, frame, pose=pose, registered=fitter.skin(pose), keypoints=fitter.shape.keypoints(pose),
         distances=distances, posterior=torch.zeros_like(distances), sigma=unknown, cost=unknown,
         covariance=unknown.expand(len(pose), len(pose)).clone(), status=status,
-        acquired="lost" if status is Status.LOST else "held", residual=math.nan,
+        acquired="lost" if status is Status.LOST else "held", residual=math.nan, confidence=torch.zeros_like(unknown),
     )  # fmt: skip
 
 

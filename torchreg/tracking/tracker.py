@@ -14,6 +14,7 @@ from torchreg._checks import as_float_tensor, check_finite, check_shape, warn_ab
 from torchreg._threads import one_thread
 from torchreg.alignment.align import AlignConfig, align
 from torchreg.alignment.inputs import check_skin, floating_origin, warn_about_degenerate, warn_about_units
+from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.loaded import as_points
 from torchreg.result import Status, normal_copy
@@ -106,11 +107,11 @@ class Tracker:
             )
         self._state = state
 
-    def step(self, points: Tensor, time: float | None = None) -> FrameResult:
+    def step(self, points: Tensor | DepthFrame, time: float | None = None) -> FrameResult:
         """Return the pose of the shape in the next frame, and what is known of it.
 
         Args:
-            points: (M, 3), metres; M may be zero.
+            points: (M, 3), metres; M may be zero. Or a `DepthFrame`, whose free space counts too.
             time: of the frame, in any unit, seconds say; by default one interval after the frame before. Where frames
                 were dropped, it tells how far the shape may have moved.
 
@@ -127,14 +128,17 @@ class Tracker:
 
         Differentiable: no.
         """
-        points = as_points(points)
+        picture = points if isinstance(points, DepthFrame) else None
+        given = as_points(points)
         self._check_time(time)
-        self._place_origin(points)
-        cloud = self._checked_points(points)
+        self._place_origin(given)
+        cloud = self._checked_points(given)
+        if picture is not None and self._state.origin is not None:
+            picture = picture.near(self._state.origin)
         state, elapsed = advance_clock(self._state, time)
         # A tenth faster than without gradients alone, as most of the time goes to small operations.
         with torch.inference_mode(), one_thread(), self.shape.held_sizes():
-            frame = Frame(cloud=cloud, finite=torch.isfinite(cloud).all(-1), elapsed=elapsed)
+            frame = Frame(cloud=cloud, finite=torch.isfinite(cloud).all(-1), elapsed=elapsed, picture=picture)
             rejection = self._rejection(frame.data)
             if rejection is not None:
                 result, state = self._hold(state, frame, rejection)
@@ -153,15 +157,20 @@ class Tracker:
         return found if state.origin is None else found.moved(state.origin)
 
     def run(
-        self, frames: Iterable[Tensor], on_frame: OnFrame | None = None, *, times: Sequence[float] | None = None
+        self,
+        frames: Iterable[Tensor | DepthFrame],
+        on_frame: OnFrame | None = None,
+        *,
+        times: Sequence[float] | None = None,
     ) -> TrackResult:
         """Return the poses of all given frames, which follow those that the tracker has seen before.
 
         An interruption by the keyboard after the first frame ends the sequence: the result then holds the frames done.
 
         Args:
-            frames: T clouds (M_t, 3), metres, such as `load_frames` gives; each is read just before its step.
-            on_frame: called with each cloud and the result of its `step`.
+            frames: T clouds (M_t, 3), metres, such as `load_frames` gives, or T depth frames; each is read just before
+                its step.
+            on_frame: called with each cloud, or the points of each depth frame, and the result of its `step`.
             times: (T,) of the frames; see `step`.
 
         Raises:
@@ -178,7 +187,7 @@ class Tracker:
                 seconds.append(clock.perf_counter() - started)
                 results.append(result)
                 if on_frame is not None:
-                    on_frame(points, result)
+                    on_frame(as_points(points), result)
         except KeyboardInterrupt:
             if not results:
                 raise

@@ -1,0 +1,137 @@
+"""Depth frames in alignment: free space in the objective and in the choice of poses, crops of whole pictures."""
+
+import pytest
+import torch
+
+import torchreg as tr
+from torchreg.alignment.free_space_term import FreeSpaceTerm
+from torchreg.alignment.inputs import Observation
+from torchreg.alignment.problem import alignment_cost, centered_problem, masked_mean
+from torchreg.capture.depth_segments import beyond_cut, candidate_crops
+from torchreg.datasets.hand import surface_skin
+from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.visibility import rasterize
+
+CAMERA = tr.Camera(96, 72, (110.0, 110.0, 47.5, 35.5))
+
+
+@pytest.fixture(scope="module")
+def links_pose(links):
+    pose = links.rest_pose()
+    pose[:3] = torch.tensor([-0.1, 0.0, 0.6])
+    pose[3:6] = torch.tensor([0.0, 1.4, 0.0])
+    pose[6:] = torch.tensor([0.3, 0.2])
+    return pose
+
+
+@pytest.fixture(scope="module")
+def picture(links, links_pose):
+    """A frame of the links before a wall at 1.2 m, without noise."""
+    surface = surface_skin(links)
+    raster = rasterize(TriangleMesh(surface(links_pose), surface.faces), CAMERA.view())
+    shown = raster.face_index >= 0
+    return tr.DepthFrame(torch.where(shown, raster.depth, 1.2), CAMERA, shown)
+
+
+def problem_of(skin, pose, frame, spaces=True):
+    data = frame.points[None]
+    valid = torch.ones_like(data[..., 0], dtype=torch.bool)
+    return centered_problem(
+        skin, data, valid, pose[None], masked_mean(data, valid), prior_std=0.3, pose_atol=1e-3,
+        free_space=frame.free_space if spaces else None,
+    )  # fmt: skip
+
+
+def test_the_term_is_the_gradient_of_its_cost(links, links_skin, links_pose, picture):
+    term = FreeSpaceTerm.of_skin(picture.free_space, links_skin, 0.3)
+    pose = links.retract(links_pose, 0.1 * torch.ones_like(links_pose))[None]
+    sigma, noise = pose.new_tensor([0.03]), pose.new_tensor([0.002])
+    found = term.linearized(links_skin, pose, sigma, noise)
+    assert float(found.cost) > 0
+    torch.testing.assert_close(found.cost, term.cost(links_skin(pose), sigma, noise))
+    steps = 1e-6 * torch.eye(pose.shape[1], dtype=pose.dtype)
+    ahead, back = (
+        torch.stack([term.cost(links_skin(links.retract(pose, sign * step[None])), sigma, noise)[0] for step in steps])
+        for sign in (1, -1)
+    )
+    torch.testing.assert_close(found.gradient[0], (ahead - back) / 2e-6, rtol=1e-3, atol=1e-3 * float(found.cost))
+
+
+def test_a_pose_costs_what_would_be_seen_of_it(links, links_skin, links_pose, picture):
+    before = links_pose.clone()
+    before[2] -= 0.2
+    behind = links_pose.clone()
+    behind[2] += 0.2
+    with_space, without = (problem_of(links_skin, links_pose, picture, spaces) for spaces in (True, False))
+
+    def extra(pose):
+        local = pose[None].clone()
+        local[:, :3] -= with_space.origin
+        return float(alignment_cost(with_space, local) - alignment_cost(without, local))
+
+    assert extra(links_pose) == pytest.approx(0, abs=2)
+    assert extra(behind) < 0.2 * extra(before)
+    assert 0.2 * len(picture.points) < extra(before) < 2 * len(picture.points)
+
+
+def test_a_frame_is_aligned_as_its_points_and_a_batch_as_each_alone(links, links_skin, links_pose, picture):
+    start = links.retract(links_pose, 0.03 * torch.ones_like(links_pose))
+    config = tr.AlignConfig(search="never")
+    alone = tr.align(links, picture, start, model_points=links_skin, config=config)
+    assert torch.allclose(links.keypoints(alone.pose), links.keypoints(links_pose), atol=2e-3)
+    smaller = picture.cropped(torch.arange(96).expand(72, -1) < 60)
+    batch = tr.align(links, [picture, smaller], start.expand(2, -1), model_points=links_skin, config=config)
+    # The steps of a batch end together.
+    torch.testing.assert_close(batch.pose[0], alone.pose, atol=1e-3, rtol=0)
+    assert batch.statuses[0] is tr.Status.CONVERGED
+    far = torch.tensor([3e5, -2e5, 1e4], dtype=torch.float64)
+    moved = tr.align(
+        links, picture.near(-far), start + torch.nn.functional.pad(far, (0, 5)), model_points=links_skin, config=config
+    )
+    torch.testing.assert_close(moved.pose[:3] - far, alone.pose[:3], atol=1e-6, rtol=0)
+
+
+def test_the_free_space_tells_limbs_apart_that_points_do_not(links, links_skin, links_pose, picture):
+    # Only the first link is seen; the others may be anywhere but where the picture shows the wall.
+    bent = links_pose.clone()
+    bent[6:] = torch.tensor([-1.5, 0.0])
+    with_space, without = (problem_of(links_skin, links_pose, picture, spaces) for spaces in (True, False))
+    local = bent[None].clone()
+    local[:, :3] -= with_space.origin
+    assert float(alignment_cost(with_space, local)) > float(alignment_cost(without, local)) + 20
+
+
+def test_frames_and_other_data_do_not_mix(links, picture):
+    with pytest.raises(InputError, match="a depth frame has its own"):
+        tr.align(links, picture, mask=torch.ones(3, dtype=torch.bool))
+    with pytest.raises(InputTypeError, match=r"data\[1\] must be a DepthFrame like the others, got Tensor"):
+        tr.align(links, [picture, picture.points])
+    assert Observation.of(picture.points, None).frames == ()
+
+
+def scene():
+    """A wall at 2 m, and before it a strip of 8 x 48 cm at 1 m that leaves the picture to the right."""
+    depth = torch.full((72, 96), 2.0, dtype=torch.float64)
+    depth[30:39, 43:] = 1.0
+    return tr.DepthFrame(depth, CAMERA)
+
+
+def test_crops_are_the_ends_of_the_nearest_surface_first():
+    crops = list(candidate_crops(scene(), 0.2))
+    first, second = crops[:2]
+    assert float(first.points[:, 2].max()) == 1.0
+    column = first.pixels[:, 0]
+    assert int(column.min()) == 43
+    assert 0.15 <= (int(column.max()) - 43) / 110 <= 0.25
+    assert int(second.pixels[:, 0].max()) == 95
+    assert float(crops[-1].points[:, 2].min()) == 2.0
+
+
+def test_what_a_crop_cuts_off_is_told_from_what_stands_alone():
+    frame = scene().cropped(torch.arange(96).expand(72, -1) < 80)
+    strip = (frame.pixels[:, 0] > 43) & (frame.points[:, 2] < 1.5)
+    # Off the shape: the strip from its middle on, and a piece of its near end.
+    off = strip & ((frame.pixels[:, 0] > 60) | (frame.pixels[:, 0] < 48))
+    cut = beyond_cut(frame, off)
+    assert torch.equal(cut, strip & (frame.pixels[:, 0] > 60))

@@ -1,0 +1,90 @@
+"""Measured keypoints as evidence beside points: their likelihood, and what they change."""
+
+import math
+
+import pytest
+import torch
+
+import torchreg as tr
+from torchreg.alignment.landmarks import LANDMARKS, MeasuredKeypoints, keypoint_skin
+from torchreg.errors import InputError
+
+CAMERA = tr.Camera(640, 480, (475.0, 480.0, 320.0, 240.0), None, (-0.1, 0.03, 1e-3, -2e-3))
+
+
+@pytest.fixture(scope="module")
+def pose(links):
+    pose = links.rest_pose()
+    pose[:3] = torch.tensor([-0.1, 0.02, 0.6])
+    pose[3:] = torch.tensor([0.3, 1.2, -0.2, 0.4, -0.3])
+    return pose
+
+
+def test_keypoints_are_carried_by_parts(links, plain_hand, pose):
+    torch.testing.assert_close(keypoint_skin(links)(pose), links.keypoints(pose))
+    bent = plain_hand.clamp(plain_hand.rest_pose() + 0.3)
+    torch.testing.assert_close(keypoint_skin(plain_hand)(bent), plain_hand.keypoints(bent), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("pixels", [False, True], ids=["space", "picture"])
+def test_the_gradient_is_that_of_the_likelihood(links, pose, pixels):
+    truth = links.keypoints(pose)
+    targets = CAMERA.project(truth)[0] if pixels else truth.clone()
+    targets[1] = torch.nan
+    origin = truth.mean(0)
+    given = MeasuredKeypoints.of(links, targets, None, CAMERA, 0.3).of_problems(links, origin[None])
+    width = pose.new_tensor([0.004])
+    local = links.retract(pose, torch.full_like(pose, 0.01))[None]
+    local[:, :3] -= origin
+    found = given.linearized(local, width)
+    torch.testing.assert_close(found.cost, given.cost(local, width))
+    steps = 1e-6 * torch.eye(len(pose), dtype=pose.dtype)
+    ahead, back = (
+        torch.cat([given.cost(links.retract(local, sign * step[None]), width) for step in steps]) for sign in (1, -1)
+    )
+    torch.testing.assert_close(found.gradient[0], (ahead - back) / 2e-6, rtol=1e-5, atol=1e-6)
+    assert float(found.gradient.abs().max()) > 1
+
+
+def test_a_wrong_landmark_costs_no_more_than_its_share(links, pose):
+    truth = links.keypoints(pose)[None]
+    far = truth.clone()
+    far[0, 0] += 10
+    given = MeasuredKeypoints.of(links, far, 0.01, None, 0.3).of_problems(links, torch.zeros(1, 3, dtype=pose.dtype))
+    cost = float(given.cost(pose[None], 0.0))
+    assert cost == pytest.approx(math.log1p(LANDMARKS.floor) - math.log(LANDMARKS.floor))
+    assert float(given.linearized(pose[None], 0.0).gradient.abs().max()) < 1e-12
+
+
+def test_landmarks_tell_what_the_points_do_not(links, links_skin, pose):
+    # Points of the first link alone, and the far joints where a detector saw them.
+    part = links_skin.weights.argmax(-1)
+    points = links_skin(pose)[part == 0]
+    start = links.retract(pose, 0.15 * torch.ones_like(pose))
+    config = tr.AlignConfig(search="never")
+    truth = links.keypoints(pose)
+
+    def error(**options):
+        found = tr.align(links, points, start, model_points=links_skin, config=config, **options)
+        return float((links.keypoints(found.pose) - truth).norm(dim=-1).max())
+
+    alone = error()
+    assert error(keypoints=truth, keypoint_std=0.005) < 0.3 * alone
+    wrong = truth.clone()
+    wrong[-1] += 0.5
+    assert error(keypoints=wrong, keypoint_std=0.005) < 2 * alone
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"keypoints": torch.zeros(2, 3)}, r"keypoints must have shape \(3, 3\), metres.* got \(2, 3\)"),
+        ({"keypoints": torch.zeros(3, 2)}, "keypoints in pixels need the camera of a DepthFrame"),
+        ({"keypoints": torch.full((3, 3), torch.nan)}, "all are NaN"),
+        ({"keypoints": torch.zeros(3, 3), "keypoint_std": 0.0}, "keypoint_std must be"),
+        ({"keypoint_std": 0.01}, "keypoint_std goes with keypoints"),
+    ],
+)
+def test_bad_landmarks_are_told(links, options, message):
+    with pytest.raises(InputError, match=message):
+        tr.align(links, torch.zeros(20, 3), links.rest_pose(), **options)

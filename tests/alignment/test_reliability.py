@@ -1,0 +1,116 @@
+"""How far alignments can be trusted: what residuals share, covariance, confidence, and doubts in words."""
+
+import pytest
+import torch
+
+import torchreg as tr
+from torchreg.alignment.problem import centered_problem, masked_mean
+from torchreg.alignment.reliability import (
+    CALIBRATION,
+    Evidence,
+    confidence_of,
+    curvature,
+    gather_evidence,
+    shared_errors,
+    told_doubts,
+)
+
+
+def lattice(count=30):
+    steps = torch.arange(count, dtype=torch.float64)
+    rows, columns = torch.meshgrid(steps, steps, indexing="ij")
+    return torch.stack((rows, columns, 0 * rows), dim=-1).reshape(1, -1, 3)
+
+
+def test_independent_residuals_count_each_and_smooth_ones_together():
+    data, generator = lattice(), torch.Generator().manual_seed(0)
+    noise = torch.randn(1, 900, generator=generator, dtype=torch.float64)
+    ones = torch.ones(1, 900, dtype=torch.float64)
+    assert float(shared_errors(data, noise, ones)) == pytest.approx(1, abs=0.4)
+    smooth = torch.nn.functional.avg_pool2d(noise.reshape(1, 30, 30), 3, 1, 1).reshape(1, 900)
+    # A mean of nine values is correlated with its neighbors as boxes overlap: the sum of all correlations is 9.
+    assert float(shared_errors(data, smooth, ones)) == pytest.approx(9, rel=0.5)
+    assert float(shared_errors(data, ones, ones)) > 50
+
+
+def test_no_evidence_against_a_pose_is_the_highest_confidence():
+    none = torch.zeros(1, len(CALIBRATION.weights))
+    worse = torch.eye(len(CALIBRATION.weights))
+    assert float(confidence_of(none)) == pytest.approx(float(torch.sigmoid(torch.tensor(CALIBRATION.bias))))
+    assert bool((confidence_of(worse) <= confidence_of(none)).all())
+
+
+@pytest.fixture(scope="module")
+def measured(links, links_skin):
+    """Points of the links in a pose, 2 mm noise, and their alignment in the pose's coordinates."""
+    pose = links.rest_pose()
+    pose[6:] = torch.tensor([0.4, -0.3])
+    generator = torch.Generator().manual_seed(0)
+    data = links_skin(pose) + 0.002 * torch.randn(300, 3, generator=generator, dtype=torch.float64)
+    return pose, data
+
+
+def problem_of(skin, data, pose):
+    valid = torch.ones(1, len(data), dtype=torch.bool)
+    zero = torch.zeros(1, 3, dtype=torch.float64)
+    return centered_problem(skin, data[None], valid, pose[None], zero, prior_std=0.3, pose_atol=1e-3)
+
+
+def test_evidence_is_none_at_the_truth_and_speaks_against_a_wrong_pose(links, links_skin, measured):
+    pose, data = measured
+    problem = problem_of(links_skin, data, pose)
+    right = gather_evidence(problem, pose[None], None)
+    wrong_pose = pose.clone()
+    wrong_pose[6] = -0.8
+    wrong = gather_evidence(problem, wrong_pose[None], pose.new_tensor([0.0]))
+    assert float(right.off) < 0.1
+    assert float(wrong.off) > 0.4
+    assert float(wrong.rival) == 1
+    assert float(right.rival) == 0
+    assert float(confidence_of(right.table())) > float(confidence_of(wrong.table()))
+    assert right.table().shape == (1, len(CALIBRATION.weights))
+
+
+def test_a_fit_has_converged_where_another_step_gains_nothing(links, links_skin, measured):
+    pose, data = measured
+    found = tr.align(links, data, pose, model_points=links_skin, config=tr.AlignConfig(search="never"))
+    assert found.status is tr.Status.CONVERGED
+    problem = problem_of(links_skin, data, pose)
+    assert bool(curvature(problem, found.pose[None]).converged)
+    off = links.retract(found.pose[None], torch.full_like(pose[None], 0.02))
+    assert not bool(curvature(problem, off).converged)
+
+
+def test_the_covariance_is_that_of_repeated_measurements(links, links_skin, measured):
+    pose, _ = measured
+    generator = torch.Generator().manual_seed(1)
+    noise = 0.002 * torch.randn(24, 300, 3, generator=generator, dtype=torch.float64)
+    clouds = links_skin(pose) + noise
+    config = tr.AlignConfig(search="never", prior_std=None)
+    found = tr.align(links, clouds, pose.expand(24, -1), model_points=links_skin, config=config)
+    spread = found.pose[:, 6:].std(0)
+    told = found.covariance.diagonal(dim1=-2, dim2=-1).mean(0).sqrt()[6:]
+    assert bool((told > 0.6 * spread).all())
+    assert bool((told < 4 * spread).all())
+
+
+def test_doubts_name_the_limb_and_the_reason(plain_hand, plain_hand_skin):
+    pose = plain_hand.rest_pose()[None]
+    part = plain_hand_skin.weights.argmax(-1)
+    hidden = [number for number, name in enumerate(plain_hand.part_names) if name.startswith("ring")]
+    data = plain_hand_skin(pose)[:, ~torch.isin(part, torch.tensor(hidden))]
+    valid = torch.ones_like(data[..., 0], dtype=torch.bool)
+    problem = centered_problem(
+        plain_hand_skin, data, valid, pose, masked_mean(data, valid), prior_std=0.4, pose_atol=1e-3
+    )
+    local = pose.clone()
+    local[:, :3] -= problem.origin
+    evidence = gather_evidence(problem, local, pose.new_tensor([0.0]))
+    (told,) = told_doubts(problem, local, evidence)
+    assert "hardly any data show where ring ends" in told
+    assert "another pose explains nearly as much" in told
+
+
+def test_every_number_of_the_evidence_has_a_weight():
+    assert len(Evidence.__dataclass_fields__) == len(CALIBRATION.weights)
+    assert min(CALIBRATION.weights) >= 0
