@@ -118,7 +118,7 @@ def scene():
 
 
 def test_crops_are_the_ends_of_the_nearest_surface_first():
-    crops = list(candidate_crops(scene(), 0.2))
+    crops = [crop for surface in candidate_crops(scene(), 0.2) for crop in surface]
     first, second = crops[:2]
     assert float(first.points[:, 2].max()) == 1.0
     column = first.pixels[:, 0]

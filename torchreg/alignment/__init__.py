@@ -6,9 +6,10 @@ Besides the public names, other rooms may use `AlignRecord` and `label_frames`, 
 - the annealed EM: `anneal`, `outlier_level`;
 - the surface fit: `refine_surface`, `surface_steps`, `surface_noise`, `pose_covariance`, `SurfaceResult`;
 - the search for poses: `PoseSearch`, `fit_candidates`, `score_candidates`;
-- the evidence for poses: `Evidence`, `weigh`, `hardly_gains`, `confidence_of`, `end_motions`, `end_variances`,
-  `limb_ends`, `share_beside`, `CALIBRATION`, and of free space `FreeSpaceTerm`, `INTRUSION`;
+- free space: `FreeSpaceTerm`;
+- what can be trusted: `Evidence`, `weigh`, `confidence_of`, `hardly_gains`, `share_beside`, `limb_ends`, `end_motions`,
+  `end_variances`;
 - checks of input: `check_skin`, `floating_origin`, `warn_about_units`, `warn_about_degenerate`;
-- numbers: `ANNEALING`, `CLUSTERS`, `INLIER_SHARE`, `OFF_SURFACE`, `PRIOR_SHARE`, `SEARCH_BUDGET`, `SURFACE_FIT`,
-  `UNITS`.
+- numbers: `ANNEALING`, `CALIBRATION`, `CLUSTERS`, `INLIER_SHARE`, `INTRUSION`, `OFF_SURFACE`, `PRIOR_SHARE`,
+  `SEARCH_BUDGET`, `SURFACE_FIT`, `UNITS`.
 """

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from torchreg.alignment.reliability import CALIBRATION
 from torchreg.alignment.results import AlignResult, PoseStarts
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import candidate_crops
@@ -16,6 +17,7 @@ class Choice:
     """How the crops of a picture are tried."""
 
     sure: float = 0.8  # confidence from which on no other crop is tried
+    enough: float = CALIBRATION.doubtful  # from which on no surface farther away is
 
 
 CHOICE = Choice()
@@ -31,12 +33,16 @@ def surest_crop(frame: DepthFrame, size: float, answer: Callable[[DepthFrame], A
         answer: what is found in a crop.
     """
     best: tuple[Answer, DepthFrame] | None = None
-    for crop in candidate_crops(frame, size):
-        found = answer(crop)
-        if best is None or _confidence(found) > _confidence(best[0]):
-            best = found, crop
-        if _confidence(found) >= CHOICE.sure:
-            break
+    for crops in candidate_crops(frame, size):
+        for crop in crops:
+            found = answer(crop)
+            if best is None or _confidence(found) > _confidence(best[0]):
+                best = found, crop
+            if _confidence(found) >= CHOICE.sure:
+                return best
+        # Farther surfaces are tried where no end of a nearer one may be the shape.
+        if best is not None and _confidence(best[0]) >= CHOICE.enough:
+            return best
     if best is not None:
         return best
     everything = frame.cropped(frame.measured)

@@ -23,7 +23,7 @@ class Segmentation:
     apart: float = 0.8  # ends nearer to one another show the same
     beyond: float = 0.2  # from an end: nothing so near is farther from the other ends
     max_ends: int = 4  # of a surface
-    max_crops: int = 8  # of a picture
+    max_surfaces: int = 3  # of a picture
 
 
 SEGMENTATION = Segmentation()
@@ -72,8 +72,8 @@ class _Grid:
         return full.to(self.frame.depth.device) & self.frame.measured
 
 
-def candidate_crops(frame: DepthFrame, size: float) -> Iterator[DepthFrame]:
-    """Yield crops of a frame that may show a shape of some size, metres, those of nearer surfaces first.
+def candidate_crops(frame: DepthFrame, size: float) -> Iterator[Iterator[DepthFrame]]:
+    """Yield the crops of a frame that may show a shape of some size, metres, surface by surface, nearer ones first.
 
     A surface of about that size is one crop. Of a larger one, as an arm or a body, its ends are: what lies within reach
     of an end, along the surface.
@@ -83,17 +83,16 @@ def candidate_crops(frame: DepthFrame, size: float) -> Iterator[DepthFrame]:
     depth = frame.camera.project(grid.points)[1]
     counts = torch.bincount(component)
     nearness = torch.zeros_like(depth[: len(counts)]).scatter_reduce(0, component, depth, "mean", include_self=False)
-    num_crops = 0
+    num_surfaces = 0
     for number in nearness.argsort().tolist():
         index = (component == number).nonzero()[:, 0]
         extent = (grid.points[index].amax(0) - grid.points[index].amin(0)).norm()
         if float(extent) < SEGMENTATION.least * size:
             continue
-        for kept in _parts(grid, index, size):
-            yield frame.cropped(grid.mask(kept))
-            num_crops += 1
-            if num_crops == SEGMENTATION.max_crops:
-                return
+        yield (frame.cropped(grid.mask(kept)) for kept in _parts(grid, index, size))
+        num_surfaces += 1
+        if num_surfaces == SEGMENTATION.max_surfaces:
+            return
 
 
 def _parts(grid: _Grid, index: Tensor, size: float) -> Iterator[Tensor]:
