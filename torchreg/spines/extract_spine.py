@@ -20,6 +20,7 @@ from torchreg.result import Status
 from torchreg.spines.frame_skeletons import skeletonize_frames
 from torchreg.spines.labeled_tree import LimbGraph, most_frequent_splits, skeleton_splits
 from torchreg.spines.limb_transfer import complete_from_prior, transfer_missing_limbs, transported_frames
+from torchreg.spines.name_chain import TipNames
 from torchreg.spines.observed_limbs import (
     FrameLimbs,
     accept_shared_paths,
@@ -34,6 +35,7 @@ from torchreg.spines.prior import PriorSkeleton
 from torchreg.spines.results import SpineRecord, SpineSequence
 from torchreg.spines.skeletonize import SkeletonizeConfig
 from torchreg.spines.spine import Spine
+from torchreg.spines.tip_relations import TipRelations
 from torchreg.spines.tip_tracking import has_loops, track_tips
 
 
@@ -139,10 +141,13 @@ def extract_spine(
     warn_about_rounding(first, "meshes", float((first.amax(0) - first.amin(0)).norm()), stacklevel=2)
     with torch.no_grad():
         # Section 4.1: the second factor of eq. 3, frame by frame.
-        skeletons = skeletonize_frames(meshes, config.skeletons, workers=workers, on_step=on_step, progress=progress)
-        skeletons = [smooth_rough_limbs(skeleton) for skeleton in skeletons]
+        found = skeletonize_frames(meshes, config.skeletons, workers=workers, on_step=on_step, progress=progress)
+        skeletons, relations = [smooth_rough_limbs(skeleton) for skeleton, _ in found], [row for _, row in found]
         known = known and known.fitted(skeletons, config.num_tips)
-        labels, reference, graph = _named_tips(skeletons, config, known)
+        names = _named_tips(skeletons, relations, config, known)
+        labels, reference = names.labels, names.reference
+        # Section 4.3: the first factor of eq. 3.
+        graph = _most_frequent_graph(skeletons, labels) if known is None else known.graph
         observed = _observed_limbs(skeletons, labels, graph, config.num_samples, known)  # section 4.3: G imposed
         limbs = _all_limbs(observed, graph, meshes, known, reference)
         curves, radii = (torch.stack([getattr(frame, name) for frame in limbs]) for name in ("curves", "radii"))
@@ -150,7 +155,7 @@ def extract_spine(
     topologies = tuple(curve_topology(graph, rows) for rows in curves)
     curves, radii, frames = (rows.to(meshes[0].vertices.detach()) for rows in (curves, radii, frames))
     model = Spine(curves, graph.edges, radii=radii, frames=frames, times=times)  # eq. 1
-    found, own = labels >= 0, torch.stack([frame.observed for frame in observed])
+    shown, own = labels >= 0, torch.stack([frame.observed for frame in observed])
     return SpineSequence(
         model=model,
         graph=model.graph,
@@ -158,12 +163,13 @@ def extract_spine(
         radii=radii,
         frames=frames,
         times=model.times.clone(),
-        found=found,
+        found=shown,
+        confidence=names.confidence.to(curves),
         own=own,
         reference=reference,
         topologies=topologies,
         own_topologies=tuple(skeleton.topology for skeleton in skeletons),
-        **_told([_notes(*rows) for rows in zip(skeletons, found, own, strict=True)]),
+        **_told([_notes(*rows) for rows in zip(skeletons, shown, own, strict=True)]),
     )
 
 
@@ -199,14 +205,13 @@ def _check_meshes(meshes: Sequence[TriangleMesh]) -> list[TriangleMesh]:
 
 
 def _named_tips(
-    skeletons: Sequence[Skeleton], config: SpineConfig, prior: PriorSkeleton | None
-) -> tuple[Tensor, int, LimbGraph]:
-    """Return the labels (T, K) of the tips, the frame from which they were tracked, and the graph of the limbs."""
-    if prior is not None:
-        return *track_tips(skeletons, prior=prior.skeleton), prior.graph
-    track = track_tips_rigidly if config.printed else track_tips
-    labels, reference = track(skeletons, config.num_tips)  # section 4.2, eqs. 6-8
-    return labels, reference, _most_frequent_graph(skeletons, labels)  # section 4.3: the first factor of eq. 3
+    skeletons: Sequence[Skeleton], relations: Sequence[TipRelations], config: SpineConfig, prior: PriorSkeleton | None
+) -> TipNames:
+    """Return the names of the tips in all frames."""
+    if config.printed:
+        labels, reference = track_tips_rigidly(skeletons, config.num_tips)  # section 4.2, eqs. 6-8
+        return TipNames(labels=labels, confidence=(labels >= 0).double(), reference=reference)
+    return track_tips(skeletons, config.num_tips, None if prior is None else prior.skeleton, relations)
 
 
 def _most_frequent_graph(skeletons: Sequence[Skeleton], labels: Tensor) -> LimbGraph:

@@ -56,11 +56,13 @@ class SpineSequence(Result):
         warnings: irregularities, with the number of the frame.
         origin: (3,) float64 about which it was computed, where the surfaces, in float64, lie far from that of
             coordinates; None elsewhere.
+        confidence: (T, K) probability, given all frames, that a name is right: that of the tip, or where the frame's
+            own skeleton lacks the tip, that it does. None in files of earlier releases.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
         "graph": "L 2", "curves": "T L S 3", "radii": "T L S", "frames": "T L S 3 3", "times": "T", "found": "T K",
-        "own": "T L", "topologies": "T", "own_topologies": "T", "statuses": "T",
+        "confidence": "T K", "own": "T L", "topologies": "T", "own_topologies": "T", "statuses": "T",
     }  # fmt: skip
 
     model: Spine = field(metadata=stored_as(Spine.record, Spine.from_record))
@@ -78,6 +80,7 @@ class SpineSequence(Result):
     status: Status
     warnings: tuple[str, ...]
     origin: Tensor | None = None
+    confidence: Tensor | None = None
 
     def moved(self, origin: Tensor) -> SpineSequence:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""

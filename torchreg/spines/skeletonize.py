@@ -27,6 +27,7 @@ from torchreg.spines.loops import OpenedLoops, open_loops
 from torchreg.spines.paper.metanodes import metanode_junctions
 from torchreg.spines.paper.vertex_level_sets import vertex_level_sets
 from torchreg.spines.protrusions import average_geodesic_distance, find_protrusions
+from torchreg.spines.tip_relations import TipRelations, surface_relations
 from torchreg.spines.tip_trees import TipTree, consensus_junctions, estimate_junction, grow_tip_tree
 
 
@@ -65,7 +66,6 @@ class SkeletonizeConfig:
         check_choice(self.pieces, "pieces", PIECES)
 
 
-@torch.no_grad()
 def skeletonize(mesh: TriangleMesh, config: SkeletonizeConfig | None = None) -> Skeleton:
     """Return the skeleton of a surface: a tree of curves in its middle that ends in the tips of its limbs.
 
@@ -103,13 +103,19 @@ def skeletonize(mesh: TriangleMesh, config: SkeletonizeConfig | None = None) -> 
 
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1, eq. 4 and 5.
     """
+    return skeletonize_surface(mesh, config)[0]
+
+
+@torch.no_grad()
+def skeletonize_surface(mesh: TriangleMesh, config: SkeletonizeConfig | None = None) -> tuple[Skeleton, TipRelations]:
+    """Return the skeleton of a surface, see `skeletonize`, and the relations of its tips along the surface."""
     mesh = as_mesh(mesh, "mesh")
     config = SkeletonizeConfig() if config is None else config
     origin = far_origin(mesh.vertices)
     if origin is not None:
         offset = origin.to(mesh.vertices)
-        found = skeletonize(TriangleMesh(mesh.vertices - offset, mesh.faces), config)
-        return replace(found, nodes=found.nodes + offset)
+        found, relations = skeletonize_surface(TriangleMesh(mesh.vertices - offset, mesh.faces), config)
+        return replace(found, nodes=found.nodes + offset), relations
     body = _prepared(mesh, config)
     tips = _find_tips(body, config)  # section 4.1: maxima of the average geodesic distance
     # "Growing Skeletons": rings of the distance from each tip; "Merging Skeletons", figure 3B.
@@ -175,6 +181,7 @@ class _SurfaceTips:
         vertices: (K,) of the surface.
         confidence: (K,).
         distances: (K, V) geodesic distances from them.
+        relations: of the tips along the surface.
         spacing: between levels of these distances, and so between nodes.
         notes: for the skeleton.
     """
@@ -183,6 +190,7 @@ class _SurfaceTips:
     vertices: Tensor
     confidence: Tensor
     distances: Tensor
+    relations: TipRelations
     spacing: float
     notes: tuple[str, ...]
 
@@ -209,6 +217,7 @@ def _find_tips(body: _Body, config: SkeletonizeConfig) -> _SurfaceTips:
         vertices=vertices,
         confidence=confidence,
         distances=distances,
+        relations=surface_relations(mesh, distances, vertices),
         spacing=float(distances.max()) / config.num_levels,
         notes=notes,
     )
@@ -301,18 +310,24 @@ def _centered_limbs(limbs: Sequence[_Limb], mesh: TriangleMesh, interior: Interi
     return centered
 
 
-def _assembled(limbs: Sequence[_Limb], interior: Interior, tips: _SurfaceTips, like: Tensor) -> Skeleton:
-    """Return the skeleton of limbs that share their end nodes, in the dtype and device of ``like``."""
+def _assembled(
+    limbs: Sequence[_Limb], interior: Interior, tips: _SurfaceTips, like: Tensor
+) -> tuple[Skeleton, TipRelations]:
+    """Return the skeleton of limbs that share their end nodes, in the dtype and device of ``like``.
+
+    With it come the relations of its tips.
+    """
     rows = [(limb.points, interior.clearance(limb.points), limb.frames) for limb in limbs]
     skeleton = build_skeleton(rows, [limb.ends for limb in limbs], tips.notes)
     # Tips are nodes in the order in which limbs name them first.
     first_named = list(dict.fromkeys(end for limb in limbs for end in limb.ends))
-    confidence = tips.confidence[sorted(range(len(tips.vertices)), key=first_named.index)]
-    return replace(
+    order = torch.tensor(sorted(range(len(tips.vertices)), key=first_named.index))
+    skeleton = replace(
         skeleton,
         nodes=skeleton.nodes.to(like),
         edges=skeleton.edges.to(like.device),
         radii=skeleton.radii.to(like),
         frames=skeleton.frames.to(like),
-        confidence=confidence.to(like),
+        confidence=tips.confidence[order].to(like),
     )
+    return skeleton, tips.relations.of_tips(order)
