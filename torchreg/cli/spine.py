@@ -28,8 +28,8 @@ def spine(
         list[Path],
         typer.Argument(
             metavar="FRAMES",
-            help="The meshes, in any unit: files, which are put in the order of the numbers in their names, or one "
-            "folder of them. With --silhouettes one folder of masks per camera.",
+            help="The meshes, or clouds of points, in any unit: files, which are put in the order of the numbers in "
+            "their names, or one folder of them. With --silhouettes one folder of masks per camera.",
         ),
     ],
     output: Annotated[
@@ -176,15 +176,17 @@ def _read_prior(path: Path | None) -> Skeleton | SpineSequence | None:
 
 
 def _read(frames: list[Path], scale: float, nan_policy: str) -> tuple[list[TriangleMesh], tuple[str, ...]]:
-    """Return the meshes in the order of time, and their names."""
+    """Return the meshes, and the surfaces of clouds, in the order of time, and their names."""
     from torchreg.errors import InputError
     from torchreg.io.frames import load_frames
-    from torchreg.io.points import load_mesh
+    from torchreg.io.points import load_points
+    from torchreg.spines.surfaces import as_surface
 
     if any(frame.suffix.lower() == ".npz" for frame in frames):
         raise InputError("FRAMES must be files of meshes, not of arrays; give a folder, or files such as *.ply")
     names = load_frames(frames[0] if len(frames) == 1 else frames).names
-    return [load_mesh(name, scale=scale, nan_policy=nan_policy) for name in names], names
+    clouds = ((name, load_points(name, scale=scale, nan_policy=nan_policy)) for name in names)
+    return [as_surface(cloud, name)[0] for name, cloud in clouds], names
 
 
 def _silhouettes(

@@ -57,7 +57,7 @@ def name_over_time(frames: Sequence[TipObservations], reference: int, names: Ten
         reference: number of the frame whose names are known.
         names: (K,) index of each name's tip there, -1 for none.
 
-    Cost: 30 ms a frame of six tips, on one CPU core.
+    Cost: 0.1 s a frame of six tips, on one CPU core.
 
     References: Viterbi 1967; Rabiner 1989 for the probabilities of single states.
     """
