@@ -55,6 +55,10 @@ def spine(
     npz: Annotated[
         Path | None, typer.Option(metavar="OUT.npz", help="Also write tips, graph, curves, radii as arrays.")
     ] = None,
+    table: Annotated[
+        Path | None,
+        typer.Option(metavar="OUT.csv", help="Also write lengths, radii and angles of limbs, one line per frame."),
+    ] = None,
     movie: Annotated[
         Path | None, typer.Option(metavar="OUT.gif", help="Also draw all frames as a moving picture, .gif or .mp4.")
     ] = None,
@@ -95,7 +99,7 @@ def spine(
     check_positive(fps, "--fps")
     glb = with_ending(output, (".glb",), add=True)
     result = glb.with_suffix(".safetensors")
-    swc, npz = with_ending(swc, (".swc",)), with_ending(npz, (".npz",))
+    swc, npz, table = with_ending(swc, (".swc",)), with_ending(npz, (".npz",)), with_ending(table, (".csv",))
     hulls = {"--calibration": calibration, "--screen": screen, "--resolution": resolution, "--seen": seen}
     check_used(silhouettes, "--silhouettes", hulls)
     known = _read_prior(prior)
@@ -106,7 +110,7 @@ def spine(
         meshes, names = _read(frames, scale, nan_policy)
         count = len(meshes)
     curves = [numbered(swc, frame, count) for frame in range(count)] if swc is not None else []
-    check_outputs([glb, result, result.with_suffix(".json"), npz, movie, *curves], force)
+    check_outputs([glb, result, result.with_suffix(".json"), npz, table, movie, *curves], force)
     if movie is not None:
         from torchreg.viz.animation import check_animation_path
 
@@ -121,6 +125,8 @@ def spine(
         found = _extracted(meshes, known, config, workers, progress, quiet)
         found.save(result)
         _write(found, meshes, glb, curves, npz, fps)
+        if table is not None:
+            found.measurements().save_csv(table)
         _draw(found, meshes, movie, pictures, fps)
     if not quiet:
         for warning in found.warnings:
@@ -230,7 +236,7 @@ def _write(
         if path is not None:
             save_swc(path, found.model.skeleton(float(found.times[frame])), f"frame {frame}")
     if npz is not None:
-        names = ("tips", "junctions", "graph", "curves", "radii", "frames", "times", "found", "own")
+        names = ("tips", "junctions", "graph", "curves", "radii", "frames", "times", "found", "own", "confidence")
         save_arrays(npz, {name: getattr(found, name) for name in names})
 
 

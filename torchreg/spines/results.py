@@ -9,6 +9,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from torchreg.result import Result, Status, stored_as
+from torchreg.spines.measurements import SpineMeasurements, measure_limbs
 from torchreg.spines.spine import Spine
 
 
@@ -109,3 +110,7 @@ class SpineSequence(Result):
         flat = self.graph.reshape(-1)
         first = [int((flat == node).nonzero()[0, 0]) for node in range(self.num_tips, len(self.graph) + 1)]
         return self.curves[:, :, [0, -1]].flatten(1, 2)[:, first]
+
+    def measurements(self) -> SpineMeasurements:
+        """Return the lengths, radii and angles of the limbs over time, which can be written as a table."""
+        return measure_limbs(self.curves, self.radii, self.graph, self.times)
