@@ -1,32 +1,92 @@
-"""Rigs of files as bodies that can be posed at random."""
+"""Rigs of files, and people of the body model anny, as bodies that can be posed at random."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch import Tensor
 
+from torchreg.datasets.creature_parts import Draw
 from torchreg.datasets.figures import Figure
 from torchreg.datasets.matching_pairs import PosableBody
+from torchreg.errors import MissingExtraError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.io.gltf import load_rig
 
-# Joints of a rig turn by so much at most, degrees; those that carry nearly all of it a quarter of that.
+# Joints turn by so much at most, degrees; those that carry most of the body, the root and the spine, a quarter of that.
 _LIMIT = 60.0
-_MOST = 0.9
+_MOST = 0.5
+
+
+@cache
+def rig_bodies(folder: Path) -> Mapping[str, PosableBody]:
+    """Return the rigs of a folder as bodies that can be posed at random."""
+    return {file.stem: body_of_rig(file) for file in sorted(folder.glob("*.glb"))}
 
 
 def body_of_rig(path: Path) -> PosableBody:
     """Return a rig as a body; see `PosableBody`."""
     rig = load_rig(path)
-    parents = [int(parent) for parent in rig.parents]
+    return posable(
+        TriangleMesh(rig.vertices.double(), rig.faces), rig.weights.double(), rig.joint_transforms[:, :3, 3].double(),
+        [int(parent) for parent in rig.parents],
+    )  # fmt: skip
+
+
+def people(draw: Draw, count: int) -> dict[str, PosableBody]:
+    """Return so many people of anny, each of another age, build and height.
+
+    Raises:
+        MissingExtraError: if anny is not installed.
+    """
+    model = _anny()
+    indices, shares = model.vertex_bone_indices.long(), model.vertex_bone_weights.double()
+    weights = torch.zeros(len(indices), len(model.bone_labels), dtype=torch.float64).scatter_add_(1, indices, shares)
+    found = {}
+    for number in range(count):
+        lowest = {"age": 0.3}
+        phenotype = {name: draw.uniform(lowest.get(name, 0.0), 1.0) for name in model.phenotype_labels}
+        with torch.no_grad():
+            body = model(phenotype_kwargs=phenotype)
+        # anny's z is up.
+        up = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)
+        mesh = TriangleMesh(body["rest_vertices"][0].double() @ up.mT, model.get_triangular_faces().long())
+        joints = body["rest_bone_poses"][0, :, :3, 3].double() @ up.mT
+        found[f"person {number}"] = posable(
+            mesh, weights / weights.sum(1, keepdim=True), joints, [int(parent) for parent in model.bone_parents]
+        )
+    return found
+
+
+@cache
+def _anny() -> Any:
+    try:
+        import anny
+    except ImportError as error:
+        raise MissingExtraError("people need anny; install it with: pip install 'torchreg[anny]'") from error
+    return anny.Anny()
+
+
+def posable(mesh: TriangleMesh, weights: Tensor, joints: Tensor, parents: list[int]) -> PosableBody:
+    """Return a skinned mesh as a body whose joints may come in any order.
+
+    Args:
+        mesh: V vertices at rest.
+        weights: (V, J) of skinning.
+        joints: (J, 3) at rest.
+        parents: J numbers of joints, -1 for roots.
+    """
     # A figure has one root.
     first = parents.index(-1)
     parents = [first if parent < 0 and joint != first else parent for joint, parent in enumerate(parents)]
     order = _parents_first(parents)
     place = {joint: number for number, joint in enumerate(order)}
-    weights = rig.weights.double()[:, order]
+    weights = weights[:, order]
     carried = weights.sum(0)
     for number in reversed(range(len(order))):
         parent = parents[order[number]]
@@ -34,9 +94,9 @@ def body_of_rig(path: Path) -> PosableBody:
             carried[place[parent]] += carried[number]
     limits = torch.where(carried > _MOST * carried.max(), 0.25, 1.0) * math.radians(_LIMIT)
     figure = Figure(
-        mesh=TriangleMesh(rig.vertices.double(), rig.faces),
+        mesh=mesh,
         weights=weights,
-        joints=rig.joint_transforms[order, :3, 3].double(),
+        joints=joints[order],
         parents=tuple(-1 if parents[joint] < 0 else place[parents[joint]] for joint in order),
         part_names=tuple(f"joint {joint}" for joint in order),
     )

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
-from functools import cache
 from pathlib import Path
 
 import torch
@@ -14,10 +13,12 @@ import typer
 from torch import Tensor
 
 from torchreg.datasets.creature_kinds import HELD_OUT_KINDS, TRAINING_KINDS
-from torchreg.datasets.matching_pairs import MatchingPair, PosableBody, matching_pairs
+from torchreg.datasets.creature_parts import Draw
+from torchreg.datasets.matching_pairs import MatchingPair, matching_pairs
 from torchreg.registration.dense.scan_tokens import SIZES, ScanTokens
 
-from ..matcher.rigs import body_of_rig
+from ..matcher.rigs import people as drawn_people
+from ..matcher.rigs import rig_bodies
 
 # Pairs in a file: some 12 MB, and half a minute of one process to make.
 SHARD = 50
@@ -85,7 +86,14 @@ def tokens_of_pair(pair: MatchingPair, generator: torch.Generator) -> PairBatch:
 
 
 def make_shards(
-    folder: Path, count: int, seed: int, workers: int, *, held_out: bool = False, rigs: Path | None = None
+    folder: Path,
+    count: int,
+    seed: int,
+    workers: int,
+    *,
+    held_out: bool = False,
+    rigs: Path | None = None,
+    people: int = 0,
 ) -> list[Path]:
     """Return the files of so many pairs, after making those that lack.
 
@@ -96,41 +104,39 @@ def make_shards(
         workers: processes that make them.
         held_out: of the kinds that are never trained on, instead of the others.
         rigs: folder of rigs (glTF) that are drawn as well.
+        people: of the body model anny that are drawn as well, in each file.
     """
     folder.mkdir(parents=True, exist_ok=True)
     files = [folder / f"pairs_{seed}_{number:04d}.pt" for number in range(-(-count // SHARD))]
     missing = [number for number, file in enumerate(files) if not file.exists()]
     if missing:
-        jobs = [(files[number], seed, number, held_out, rigs) for number in missing]
+        jobs = [(files[number], seed, number, held_out, rigs, people) for number in missing]
         with multiprocessing.get_context("spawn").Pool(min(workers, len(jobs))) as pool:
             for done, _ in enumerate(pool.imap_unordered(_make_shard, jobs), 1):
                 typer.echo(f"{done} of {len(jobs)} files of pairs")
     return files
 
 
-def _make_shard(job: tuple[Path, int, int, bool, Path | None]) -> None:
-    file, seed, number, held_out, rigs = job
+def _make_shard(job: tuple[Path, int, int, bool, Path | None, int]) -> None:
+    file, seed, number, held_out, rigs, people = job
     torch.set_num_threads(1)
     # Unlike neighboring seeds, all draws of one generator are independent.
     seeds = torch.randint(2**62, (number + 1,), generator=torch.Generator().manual_seed(seed))
     generator = torch.Generator().manual_seed(int(seeds[-1]))
-    stream = _stream(int(seeds[-1]), held_out, rigs)
+    stream = _stream(int(seeds[-1]), held_out, rigs, people)
     batch = stacked([tokens_of_pair(next(stream), generator) for _ in range(SHARD)])
     part = file.with_suffix(".part")
     torch.save(_packed(batch), part)
     os.replace(part, file)
 
 
-def _stream(seed: int, held_out: bool, rigs: Path | None) -> Iterator[MatchingPair]:
+def _stream(seed: int, held_out: bool, rigs: Path | None, people: int) -> Iterator[MatchingPair]:
     if held_out:
         return matching_pairs(seed, HELD_OUT_KINDS)
-    return matching_pairs(seed, bodies=None if rigs is None else rig_bodies(rigs))
-
-
-@cache
-def rig_bodies(folder: Path) -> Mapping[str, PosableBody]:
-    """Return the rigs of a folder as bodies that can be posed at random."""
-    return {file.stem: body_of_rig(file) for file in sorted(folder.glob("*.glb"))}
+    bodies = {} if rigs is None else dict(rig_bodies(rigs))
+    if people:
+        bodies |= drawn_people(Draw(torch.Generator().manual_seed(seed)), people)
+    return matching_pairs(seed, bodies=bodies)
 
 
 def stacked(batches: list[PairBatch]) -> PairBatch:

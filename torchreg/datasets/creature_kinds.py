@@ -300,6 +300,45 @@ def draw_furniture(draw: Draw) -> Creature:
     return body.finish()
 
 
+def draw_chimera(draw: Draw) -> Creature:
+    """Draw something like nothing: a trunk with limbs, fins and knobs anywhere, single, in pairs or around it."""
+    u, body = draw.uniform, Builder(draw)
+    count, thick, length, rise = draw.count(1, 5), u(0.07, 0.25), u(0.4, 1.2), u(-20, 90)
+    start, parent, trunk = at(0, 0, 0), -1, []
+    for _ in range(count):
+        rise += u(-30, 30)
+        radii, begin = (thick * u(0.6, 1.2), thick * u(0.6, 1.2)), start
+        parent, start = body.add(parent, begin, towards(rise), length / count, radii, flat=u(0.4, 1),
+                                 normal=X if draw.chance(0.5) else Y, limit=30)  # fmt: skip
+        trunk.append((parent, begin, start, min(radii)))
+    for _ in range(draw.count(2, 6)):
+        _limbs_of_chimera(draw, body, trunk[draw.count(0, count - 1)])
+    return body.finish()
+
+
+def _limbs_of_chimera(draw: Draw, body: Builder, segment: tuple[int, Tensor, Tensor, float]) -> None:
+    """Draw one limb in the middle plane, a pair of them, or several around a segment of the trunk."""
+    u = draw.uniform
+    part, start, end, thick = segment
+    base = start + u(0, 1) * (end - start)
+    bones, length, width = draw.count(1, 4), u(0.1, 0.9), u(0.02, 0.6 * thick + 0.03)
+    elevation, bend, flat, normal = u(-90, 90), u(-50, 50), u(0.25, 1), draw.normal(3)
+    radii = [width * u(0.5, 1.4) for _ in range(bones + 1)]
+    azimuths = {0: [u(0, 1) // 0.5 * 180.0], 1: [u(10, 170)] * 2, 2: [u(20, 160)] * 2}[draw.count(0, 2)]
+    if draw.chance(0.1):  # like a star
+        around = draw.count(3, 6)
+        azimuths = [360.0 * index / around for index in range(around)]
+    knob = width * u(1.2, 2.5) if draw.chance(0.25) else 0.0
+    for number, azimuth in enumerate(azimuths):
+        mirrored = len(azimuths) == 2 and number == 1
+        turn, facing = (-azimuth, normal * at(-1, 1, 1)) if mirrored else (azimuth, normal)
+        steps = [towards(elevation + bone * bend, turn) for bone in range(bones)]
+        numbers, tip = body.chain(part, base + 0.8 * thick * steps[0], steps, [length / bones] * bones, radii,
+                                  flat=flat, normal=facing, limit=60)  # fmt: skip
+        if knob:
+            body.blob(numbers[-1], tip, knob)
+
+
 def draw_bird(draw: Draw) -> Creature:
     """Draw a bird: a body, two wings of two parts, a tail fan, two thin legs, a beak."""
     u, body = draw.uniform, Builder(draw)
@@ -403,14 +442,15 @@ def draw_crane(draw: Draw) -> Creature:
 Kind = Callable[[Draw], Creature]
 # With the share of each in what is drawn: most of what is scanned are people and animals.
 TRAINING_KINDS: dict[str, tuple[Kind, float]] = {
-    "quadruped": (draw_quadruped, 0.32),
-    "person": (draw_person, 0.32),
-    "hand": (draw_hand, 0.08),
-    "plant": (draw_plant, 0.05),
-    "arm": (draw_arm, 0.06),
-    "bug": (draw_bug, 0.08),
+    "quadruped": (draw_quadruped, 0.26),
+    "person": (draw_person, 0.22),
+    "hand": (draw_hand, 0.06),
+    "plant": (draw_plant, 0.04),
+    "arm": (draw_arm, 0.05),
+    "bug": (draw_bug, 0.07),
     "snake": (draw_snake, 0.03),
-    "furniture": (draw_furniture, 0.06),
+    "furniture": (draw_furniture, 0.05),
+    "chimera": (draw_chimera, 0.2),
 }
 HELD_OUT_KINDS: dict[str, tuple[Kind, float]] = {
     "bird": (draw_bird, 0.2),
