@@ -52,6 +52,7 @@ _NAMES = {
     "shapes.pose_prior": "PosePrior",
     "shapes.skin": "BendingSkin LinearBlendSkin sample_skin",
     "spines.extract_spine": "SpineConfig extract_spine",
+    "spines.measurements": "SpineMeasurements",
     "spines.results": "SpineSequence",
     "spines.skeletonize": "SkeletonizeConfig skeletonize",
     "spines.spine": "Spine",

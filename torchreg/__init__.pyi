@@ -60,6 +60,7 @@ from torchreg.shapes.skin import LinearBlendSkin as LinearBlendSkin
 from torchreg.shapes.skin import sample_skin as sample_skin
 from torchreg.spines.extract_spine import SpineConfig as SpineConfig
 from torchreg.spines.extract_spine import extract_spine as extract_spine
+from torchreg.spines.measurements import SpineMeasurements as SpineMeasurements
 from torchreg.spines.results import SpineSequence as SpineSequence
 from torchreg.spines.skeletonize import SkeletonizeConfig as SkeletonizeConfig
 from torchreg.spines.skeletonize import skeletonize as skeletonize
@@ -116,6 +117,7 @@ __all__ = [
     "Spine",
     "SpineConfig",
     "SpineLimbs",
+    "SpineMeasurements",
     "SpineSequence",
     "Status",
     "StereoConfig",

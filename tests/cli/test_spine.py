@@ -36,7 +36,7 @@ def masks(tmp_path_factory):
 
 
 def test_everything_is_written(run, frames, tmp_path):
-    options = ("--swc", "a.swc", "--npz", "a.npz", "--movie", "a.gif", "--pictures", "pictures")
+    options = ("--swc", "a.swc", "--npz", "a.npz", "--table", "a.csv", "--movie", "a.gif", "--pictures", "pictures")
     options = [tmp_path / option if not option.startswith("--") else option for option in options]
     answer = run("spine", frames, "-o", tmp_path / "a.glb", *options)
     assert answer.exit_code == 0, answer.output
@@ -49,6 +49,11 @@ def test_everything_is_written(run, frames, tmp_path):
         np.testing.assert_array_equal(archive["curves"], found.curves.numpy())
         assert archive["tips"].shape == (3, 5, 3)
     assert len(list((tmp_path / "pictures").glob("frame_*.png"))) == 3
+    lines = (tmp_path / "a.csv").read_text().splitlines()
+    assert lines[0].startswith("time,length_0,")
+    assert [float(line.split(",")[1]) for line in lines[1:]] == pytest.approx(
+        found.measurements().lengths[:, 0].tolist()
+    )
     for name in ("a.glb", "a.json", "a.gif"):
         assert (tmp_path / name).stat().st_size > 0
 

@@ -243,7 +243,7 @@ def test_a_single_limb_has_no_junction():
 
 
 def test_a_worker_that_is_killed_is_replaced_once(meshes, monkeypatch, tmp_path):
-    here, plain = os.getpid(), frame_skeletons.skeletonize
+    here, plain = os.getpid(), frame_skeletons.skeletonize_surface
 
     def dies(mesh, config):
         if os.getpid() != here and not (tmp_path / "died").exists():
@@ -252,7 +252,7 @@ def test_a_worker_that_is_killed_is_replaced_once(meshes, monkeypatch, tmp_path)
         return plain(mesh, config)
 
     alone = extract_spine(meshes, workers=1)
-    monkeypatch.setattr(frame_skeletons, "skeletonize", dies)
+    monkeypatch.setattr(frame_skeletons, "skeletonize_surface", dies)
     assert torch.equal(extract_spine(meshes, workers=2).curves, alone.curves)
     assert (tmp_path / "died").exists()
 
@@ -260,7 +260,7 @@ def test_a_worker_that_is_killed_is_replaced_once(meshes, monkeypatch, tmp_path)
         os.kill(os.getpid(), signal.SIGKILL) if os.getpid() != here else None
         return plain(mesh, config)
 
-    monkeypatch.setattr(frame_skeletons, "skeletonize", always_dies)
+    monkeypatch.setattr(frame_skeletons, "skeletonize_surface", always_dies)
     with pytest.raises(SolverError, match=r"was killed twice.*pass workers=1"):
         extract_spine(meshes, workers=2)
 

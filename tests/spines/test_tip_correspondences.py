@@ -133,12 +133,12 @@ def tree(curves, order, extra=None, notes=()):
 
 def tracked_arms(skeletons, orders):
     """Which arm has each label in each frame, -1 for none; and the reference."""
-    labels, reference = track_tips(skeletons)
+    names = track_tips(skeletons)
     arms = [
         [order[k] if 0 <= k < len(order) else -1 for k in row]
-        for row, order in zip(labels.tolist(), orders, strict=True)
+        for row, order in zip(names.labels.tolist(), orders, strict=True)
     ]
-    return arms, reference
+    return arms, names.reference
 
 
 @pytest.mark.parametrize("count", [5, 8])
@@ -179,7 +179,7 @@ def test_frames_in_which_arms_touch_are_no_references(creatures):
     notes = [("1 loop(s) cut",) if 1 <= frame <= 5 else () for frame in range(FRAMES)]
     skeletons = [tree(curves[frame], range(5), notes=notes[frame]) for frame in range(FRAMES)]
     assert [has_loops(skeleton) for skeleton in skeletons] == [1 <= frame <= 5 for frame in range(FRAMES)]
-    assert track_tips(skeletons)[1] == 6
+    assert track_tips(skeletons).reference == 6
 
 
 def test_k_is_the_most_frequent_number_or_what_was_asked_for(creatures):
@@ -187,7 +187,7 @@ def test_k_is_the_most_frequent_number_or_what_was_asked_for(creatures):
     assert most_frequent_count([4, 5, 4, 5]) == 5
     curves = creatures[5].curves
     skeletons = [tree(curves[frame], range(5)) for frame in range(3)]
-    labels, _ = track_tips(skeletons, 3)
+    labels = track_tips(skeletons, 3).labels
     assert labels.shape == (3, 3)
     assert all(row == labels[0].tolist() for row in labels.tolist())
-    assert track_tips(skeletons[:1])[0].tolist() == [[0, 1, 2, 3, 4]]
+    assert track_tips(skeletons[:1]).labels.tolist() == [[0, 1, 2, 3, 4]]

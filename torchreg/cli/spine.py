@@ -28,8 +28,8 @@ def spine(
         list[Path],
         typer.Argument(
             metavar="FRAMES",
-            help="The meshes, in any unit: files, which are put in the order of the numbers in their names, or one "
-            "folder of them. With --silhouettes one folder of masks per camera.",
+            help="The meshes, or clouds of points, in any unit: files, which are put in the order of the numbers in "
+            "their names, or one folder of them. With --silhouettes one folder of masks per camera.",
         ),
     ],
     output: Annotated[
@@ -54,6 +54,10 @@ def spine(
     ] = None,
     npz: Annotated[
         Path | None, typer.Option(metavar="OUT.npz", help="Also write tips, graph, curves, radii as arrays.")
+    ] = None,
+    table: Annotated[
+        Path | None,
+        typer.Option(metavar="OUT.csv", help="Also write lengths, radii and angles of limbs, one line per frame."),
     ] = None,
     movie: Annotated[
         Path | None, typer.Option(metavar="OUT.gif", help="Also draw all frames as a moving picture, .gif or .mp4.")
@@ -95,7 +99,7 @@ def spine(
     check_positive(fps, "--fps")
     glb = with_ending(output, (".glb",), add=True)
     result = glb.with_suffix(".safetensors")
-    swc, npz = with_ending(swc, (".swc",)), with_ending(npz, (".npz",))
+    swc, npz, table = with_ending(swc, (".swc",)), with_ending(npz, (".npz",)), with_ending(table, (".csv",))
     hulls = {"--calibration": calibration, "--screen": screen, "--resolution": resolution, "--seen": seen}
     check_used(silhouettes, "--silhouettes", hulls)
     known = _read_prior(prior)
@@ -106,7 +110,7 @@ def spine(
         meshes, names = _read(frames, scale, nan_policy)
         count = len(meshes)
     curves = [numbered(swc, frame, count) for frame in range(count)] if swc is not None else []
-    check_outputs([glb, result, result.with_suffix(".json"), npz, movie, *curves], force)
+    check_outputs([glb, result, result.with_suffix(".json"), npz, table, movie, *curves], force)
     if movie is not None:
         from torchreg.viz.animation import check_animation_path
 
@@ -121,6 +125,8 @@ def spine(
         found = _extracted(meshes, known, config, workers, progress, quiet)
         found.save(result)
         _write(found, meshes, glb, curves, npz, fps)
+        if table is not None:
+            found.measurements().save_csv(table)
         _draw(found, meshes, movie, pictures, fps)
     if not quiet:
         for warning in found.warnings:
@@ -176,15 +182,17 @@ def _read_prior(path: Path | None) -> Skeleton | SpineSequence | None:
 
 
 def _read(frames: list[Path], scale: float, nan_policy: str) -> tuple[list[TriangleMesh], tuple[str, ...]]:
-    """Return the meshes in the order of time, and their names."""
+    """Return the meshes, and the surfaces of clouds, in the order of time, and their names."""
     from torchreg.errors import InputError
     from torchreg.io.frames import load_frames
-    from torchreg.io.points import load_mesh
+    from torchreg.io.points import load_points
+    from torchreg.spines.surfaces import as_surface
 
     if any(frame.suffix.lower() == ".npz" for frame in frames):
         raise InputError("FRAMES must be files of meshes, not of arrays; give a folder, or files such as *.ply")
     names = load_frames(frames[0] if len(frames) == 1 else frames).names
-    return [load_mesh(name, scale=scale, nan_policy=nan_policy) for name in names], names
+    clouds = ((name, load_points(name, scale=scale, nan_policy=nan_policy)) for name in names)
+    return [as_surface(cloud, name)[0] for name, cloud in clouds], names
 
 
 def _silhouettes(
@@ -228,7 +236,7 @@ def _write(
         if path is not None:
             save_swc(path, found.model.skeleton(float(found.times[frame])), f"frame {frame}")
     if npz is not None:
-        names = ("tips", "junctions", "graph", "curves", "radii", "frames", "times", "found", "own")
+        names = ("tips", "junctions", "graph", "curves", "radii", "frames", "times", "found", "own", "confidence")
         save_arrays(npz, {name: getattr(found, name) for name in names})
 
 

@@ -1,10 +1,10 @@
-"""Distance transforms of masks on a grid: each cell's signed distance to the border, and its nearest cell inside."""
+"""Masks on a grid: each cell's signed distance to the border, its nearest cell inside, and masks without holes."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_fill_holes, distance_transform_edt
 from torch import Tensor
 
 
@@ -45,3 +45,12 @@ def nearest_inside(mask: Tensor) -> Tensor:
     """
     indices = distance_transform_edt(~mask.cpu().numpy(), return_distances=False, return_indices=True)
     return torch.from_numpy(np.ravel_multi_index(tuple(indices), tuple(mask.shape))).to(mask.device)
+
+
+def fill_holes(mask: Tensor) -> Tensor:
+    """Return a mask with the cells that it encloses, those that no path along the axes joins to the grid's border.
+
+    Args:
+        mask: bool of any shape.
+    """
+    return torch.from_numpy(binary_fill_holes(mask.cpu().numpy())).to(mask.device)

@@ -13,13 +13,13 @@ from torch import Tensor
 from torchreg._checks import check_count, warn_about_rounding
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.far_origin import far_origin
-from torchreg.geometry.loaded import as_mesh
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.result import Status
-from torchreg.spines.frame_skeletons import skeletonize_frames
+from torchreg.spines.frame_skeletons import FrameSkeleton, skeletonize_frames
 from torchreg.spines.labeled_tree import LimbGraph, most_frequent_splits, skeleton_splits
 from torchreg.spines.limb_transfer import complete_from_prior, transfer_missing_limbs, transported_frames
+from torchreg.spines.name_chain import TipNames
 from torchreg.spines.observed_limbs import (
     FrameLimbs,
     accept_shared_paths,
@@ -34,6 +34,8 @@ from torchreg.spines.prior import PriorSkeleton
 from torchreg.spines.results import SpineRecord, SpineSequence
 from torchreg.spines.skeletonize import SkeletonizeConfig
 from torchreg.spines.spine import Spine
+from torchreg.spines.surfaces import as_surface
+from torchreg.spines.tip_relations import TipRelations
 from torchreg.spines.tip_tracking import has_loops, track_tips
 
 
@@ -46,7 +48,7 @@ class SpineConfig:
         num_samples: points along each limb, both ends included.
         skeletons: how each frame is skeletonized.
         printed: tips are identified as in the paper, by rigid fits of their positions alone to a reference frame, see
-            `track_tips_rigidly`; by default also by turns, lengths and curves, from frame to frame.
+            `track_tips_rigidly`; by default over all frames at once, see `track_tips`.
     """
 
     num_tips: int | None = None
@@ -76,7 +78,7 @@ class SpineConfig:
 
 
 def extract_spine(
-    meshes: Sequence[TriangleMesh],
+    meshes: Sequence[TriangleMesh | Tensor],
     *,
     prior: Skeleton | SpineSequence | None = None,
     times: Tensor | None = None,
@@ -88,8 +90,9 @@ def extract_spine(
     """Return the spine of a moving creature: one graph of limbs, their curves in every frame, tips that keep names.
 
     1. Every frame is skeletonized by itself.
-    2. K is the most frequent number of tips. From a reference in the middle of the longest run of frames with K tips,
-       tips are tracked from frame to frame by rigid fits (eqs. 6-8), which leaves superfluous tips without names.
+    2. K is the most frequent number of tips. Those of the middle of the longest run of frames with K tips give the
+       names; all frames are named at once, by what the surface tells of its tips and by motion, see `confidence`.
+       Superfluous tips have no names.
     3. The graph G is the most frequent tree of the tracked tips.
     4. G is imposed on every frame: its junctions are placed on the frame's own skeleton, its limbs are the paths
        between them. Limbs that a frame does not show, because they merge or tuck in, are transferred from the frames
@@ -101,7 +104,8 @@ def extract_spine(
     left out; a limb that no frame shows is the prior's, moved with the others and into the body.
 
     Args:
-        meshes: T surfaces, of any numbers of vertices, in one unit.
+        meshes: T surfaces, of any numbers of vertices, in one unit; or points (N, 3) of them, clouds or scans without
+            faces, see `skeletonize`.
         prior: a skeleton with all limbs, or another spine, whose names (numbers of tips) and graph are kept.
         times: (T,) of the frames, strictly increasing; 0, 1, 2, ... by default.
         config: see `SpineConfig`.
@@ -121,36 +125,45 @@ def extract_spine(
 
     Differentiable: no; `SpineSequence.model` is.
 
-    Cost: about 1 s per frame of 15,000 vertices and CPU core; half a second more where limbs are transferred.
+    Cost: about 1 s per frame of 15,000 vertices and CPU core; half a second more where limbs are transferred; 0.1 s for
+    names.
 
     References: Brostow, Essa, Steedly and Kwatra 2004; a prior skeleton is its section 6's.
     """
     config = config or SpineConfig()
-    meshes = _check_meshes(meshes)
+    surfaces, told = _check_surfaces(meshes)
     _check_settings(config, prior, workers)
-    origin = far_origin([mesh.vertices for mesh in meshes])
+    origin = far_origin([mesh.vertices for mesh in surfaces])
     if origin is not None:
-        near = [TriangleMesh(mesh.vertices - origin.to(mesh.vertices), mesh.faces) for mesh in meshes]
-        return extract_spine(
-            near, times=times, prior=prior, config=config, workers=workers, on_step=on_step, progress=progress
-        ).moved(origin)  # fmt: skip
+        surfaces = [TriangleMesh(mesh.vertices - origin.to(mesh.vertices), mesh.faces) for mesh in surfaces]
     known = None if prior is None else PriorSkeleton.from_given(prior, config.num_tips)
-    first = meshes[0].vertices
+    first = surfaces[0].vertices
     warn_about_rounding(first, "meshes", float((first.amax(0) - first.amin(0)).norm()), stacklevel=2)
     with torch.no_grad():
         # Section 4.1: the second factor of eq. 3, frame by frame.
-        skeletons = skeletonize_frames(meshes, config.skeletons, workers=workers, on_step=on_step, progress=progress)
-        skeletons = [smooth_rough_limbs(skeleton) for skeleton in skeletons]
-        known = known and known.fitted(skeletons, config.num_tips)
-        labels, reference, graph = _named_tips(skeletons, config, known)
-        observed = _observed_limbs(skeletons, labels, graph, config.num_samples, known)  # section 4.3: G imposed
-        limbs = _all_limbs(observed, graph, meshes, known, reference)
-        curves, radii = (torch.stack([getattr(frame, name) for frame in limbs]) for name in ("curves", "radii"))
-        frames = transported_frames(curves, reference)
-    topologies = tuple(curve_topology(graph, rows) for rows in curves)
-    curves, radii, frames = (rows.to(meshes[0].vertices.detach()) for rows in (curves, radii, frames))
+        found = skeletonize_frames(surfaces, config.skeletons, workers=workers, on_step=on_step, progress=progress)
+    spine = _joined_spine(surfaces, found, told, known, times, config)
+    return spine if origin is None else spine.moved(origin)
+
+
+@torch.no_grad()
+def _joined_spine(
+    surfaces: Sequence[TriangleMesh], found: Sequence[FrameSkeleton], told: Sequence[tuple[str, ...]],
+    known: PriorSkeleton | None, times: Tensor | None, config: SpineConfig,
+) -> SpineSequence:  # fmt: skip
+    """Return the spine of surfaces whose skeletons were found, and of which some notes were told."""
+    skeletons, relations = [smooth_rough_limbs(skeleton) for skeleton, _ in found], [row for _, row in found]
+    known = known and known.fitted(skeletons, config.num_tips)
+    names = _named_tips(skeletons, relations, config, known)
+    # Section 4.3: the first factor of eq. 3, then G imposed.
+    graph = _most_frequent_graph(skeletons, names.labels) if known is None else known.graph
+    observed = _observed_limbs(skeletons, names.labels, graph, config.num_samples, known)
+    limbs = _all_limbs(observed, graph, surfaces, known, names.reference)
+    curves, radii = (torch.stack([getattr(frame, name) for frame in limbs]) for name in ("curves", "radii"))
+    frames, topologies = transported_frames(curves, names.reference), [curve_topology(graph, rows) for rows in curves]
+    curves, radii, frames = (rows.to(surfaces[0].vertices) for rows in (curves, radii, frames))
     model = Spine(curves, graph.edges, radii=radii, frames=frames, times=times)  # eq. 1
-    found, own = labels >= 0, torch.stack([frame.observed for frame in observed])
+    shown, own = names.labels >= 0, torch.stack([frame.observed for frame in observed])
     return SpineSequence(
         model=model,
         graph=model.graph,
@@ -158,12 +171,13 @@ def extract_spine(
         radii=radii,
         frames=frames,
         times=model.times.clone(),
-        found=found,
+        found=shown,
+        confidence=names.confidence.to(curves),
         own=own,
-        reference=reference,
-        topologies=topologies,
+        reference=names.reference,
+        topologies=tuple(topologies),
         own_topologies=tuple(skeleton.topology for skeleton in skeletons),
-        **_told([_notes(*rows) for rows in zip(skeletons, found, own, strict=True)]),
+        **_told([_notes(*rows) for rows in zip(skeletons, told, shown, own, strict=True)]),
     )
 
 
@@ -185,28 +199,27 @@ def _check_settings(config: SpineConfig, prior: Skeleton | SpineSequence | None,
         )
 
 
-def _check_meshes(meshes: Sequence[TriangleMesh]) -> list[TriangleMesh]:
-    """Return the frames as a list; raise InputError or InputTypeError unless each is a mesh with faces."""
+def _check_surfaces(meshes: Sequence[TriangleMesh | Tensor]) -> tuple[list[TriangleMesh], list[tuple[str, ...]]]:
+    """Return the surfaces of the frames and notes; raise InputError or InputTypeError unless each has one."""
     if isinstance(meshes, TriangleMesh):
         raise InputTypeError("meshes must be a sequence of TriangleMesh, got one mesh; put it into a list")
-    meshes = [as_mesh(mesh, f"meshes[{frame}]") for frame, mesh in enumerate(meshes)]
-    if not meshes:
+    rows = [as_surface(mesh, f"meshes[{frame}]") for frame, mesh in enumerate(meshes)]
+    if not rows:
         raise InputError("meshes must hold at least one frame, got none")
-    for frame, mesh in enumerate(meshes):
+    for frame, (mesh, _) in enumerate(rows):
         if not mesh.num_faces:
             raise InputError(f"meshes[{frame}] must have faces, got none; leave out frames without a surface")
-    return meshes
+    return [mesh for mesh, _ in rows], [notes for _, notes in rows]
 
 
 def _named_tips(
-    skeletons: Sequence[Skeleton], config: SpineConfig, prior: PriorSkeleton | None
-) -> tuple[Tensor, int, LimbGraph]:
-    """Return the labels (T, K) of the tips, the frame from which they were tracked, and the graph of the limbs."""
-    if prior is not None:
-        return *track_tips(skeletons, prior=prior.skeleton), prior.graph
-    track = track_tips_rigidly if config.printed else track_tips
-    labels, reference = track(skeletons, config.num_tips)  # section 4.2, eqs. 6-8
-    return labels, reference, _most_frequent_graph(skeletons, labels)  # section 4.3: the first factor of eq. 3
+    skeletons: Sequence[Skeleton], relations: Sequence[TipRelations], config: SpineConfig, prior: PriorSkeleton | None
+) -> TipNames:
+    """Return the names of the tips in all frames."""
+    if config.printed:
+        labels, reference = track_tips_rigidly(skeletons, config.num_tips)  # section 4.2, eqs. 6-8
+        return TipNames(labels=labels, confidence=(labels >= 0).double(), reference=reference)
+    return track_tips(skeletons, config.num_tips, None if prior is None else prior.skeleton, relations)
 
 
 def _most_frequent_graph(skeletons: Sequence[Skeleton], labels: Tensor) -> LimbGraph:
@@ -253,9 +266,9 @@ def _all_limbs(
     return transfer_missing_limbs(frames, graph, meshes)
 
 
-def _notes(skeleton: Skeleton, found: Tensor, observed: Tensor) -> list[str]:
+def _notes(skeleton: Skeleton, notes: Sequence[str], found: Tensor, observed: Tensor) -> list[str]:
     """Return the irregularities of a frame, given which tips (K,) were found and which limbs (L,) observed."""
-    rows = list(skeleton.notes)
+    rows = [*notes, *skeleton.notes]
     superfluous = len(skeleton.tips) - int(found.sum())
     if superfluous > 0:
         rows.append(f"{superfluous} superfluous tip(s) left out")

@@ -6,7 +6,7 @@ import hashlib
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import astuple
@@ -22,14 +22,18 @@ from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.io.tensors import load_tensors, save_tensors
 from torchreg.spines.results import SpineRecord
-from torchreg.spines.skeletonize import SkeletonizeConfig, skeletonize
+from torchreg.spines.skeletonize import SkeletonizeConfig, skeletonize_surface
+from torchreg.spines.tip_relations import TipRelations
 
 # Fewer frames are not worth the start of processes.
 _MIN_PARALLEL = 4
-# The tensors of a skeleton.
+# The tensors of a skeleton, and those of its tips' relations.
 _FIELDS = ("nodes", "edges", "radii", "frames", "confidence")
+_RELATIONS = ("geodesics", "volumes")
 # A skeleton's tensors as arrays, which pass between processes without shared memory, its notes, and seconds.
 _Packed = tuple[dict[str, np.ndarray[Any, Any]], tuple[str, ...], float]
+# A skeleton and the relations of its tips along the surface.
+FrameSkeleton = tuple[Skeleton, TipRelations]
 # What a forked process works on, set in that process alone: it inherits them, so that no surface is copied.
 _meshes: Sequence[TriangleMesh] = ()
 
@@ -41,8 +45,8 @@ def skeletonize_frames(
     workers: int | None = None,
     on_step: Callable[[SpineRecord], None] | None = None,
     progress: str | os.PathLike[str] | None = None,
-) -> list[Skeleton]:
-    """Return the skeleton of every frame.
+) -> list[FrameSkeleton]:
+    """Return the skeleton of every frame, and the relations of its tips along the surface.
 
     Args:
         meshes: T surfaces.
@@ -57,11 +61,12 @@ def skeletonize_frames(
         InputError: if a surface cannot be skeletonized; names the frame.
         SolverError: if a process is killed, and again on the second attempt.
     """
-    skeletons: dict[int, Skeleton] = {}
+    skeletons: dict[int, FrameSkeleton] = {}
     folder = None if progress is None else Path(progress)
 
-    def done(frame: int, skeleton: Skeleton, seconds: float) -> None:
-        skeletons[frame] = skeleton
+    def done(frame: int, found: FrameSkeleton, seconds: float) -> None:
+        skeletons[frame] = found
+        skeleton = found[0]
         if on_step is not None:
             on_step(
                 SpineRecord(
@@ -81,10 +86,10 @@ def skeletonize_frames(
                 done(frame, kept, 0.0)
     missing = [frame for frame in range(len(meshes)) if frame not in skeletons]
     for frame, (arrays, notes, seconds) in _computed(meshes, config, missing, workers):
-        skeleton = Skeleton(**{name: torch.from_numpy(array) for name, array in arrays.items()}, notes=notes)
+        found = _from_tensors({name: torch.from_numpy(array) for name, array in arrays.items()}, notes)
         if folder is not None:
-            _save_skeleton(folder, frame, _fingerprint(meshes[frame], config), skeleton)
-        done(frame, skeleton, seconds)
+            _save_skeleton(folder, frame, _fingerprint(meshes[frame], config), found)
+        done(frame, found, seconds)
     return [skeletons[frame] for frame in range(len(meshes))]
 
 
@@ -143,10 +148,10 @@ def _compute_forked(frame: int, config: SkeletonizeConfig) -> _Packed:
 def _compute(mesh: TriangleMesh, frame: int, config: SkeletonizeConfig) -> _Packed:
     start = time.perf_counter()
     try:
-        skeleton = skeletonize(mesh, config)
+        skeleton, relations = skeletonize_surface(mesh, config)
     except InputError as error:
         raise InputError(f"meshes[{frame}]: {error}") from error
-    arrays = {name: getattr(skeleton, name).detach().cpu().numpy() for name in _FIELDS}
+    arrays = {name: tensor.detach().cpu().numpy() for name, tensor in _tensors((skeleton, relations)).items()}
     return arrays, skeleton.notes, time.perf_counter() - start
 
 
@@ -162,17 +167,24 @@ def _file(folder: Path, frame: int) -> Path:
     return folder / f"frame_{frame:05d}.safetensors"
 
 
-def _save_skeleton(folder: Path, frame: int, fingerprint: str, skeleton: Skeleton) -> None:
-    tensors: dict[str, Tensor] = {name: getattr(skeleton, name) for name in _FIELDS}
-    save_tensors(_file(folder, frame), tensors, {"surface": fingerprint, "notes": list(skeleton.notes)})
+def _tensors(found: FrameSkeleton) -> dict[str, Tensor]:
+    skeleton, relations = found
+    return {name: getattr(skeleton, name) for name in _FIELDS} | {name: getattr(relations, name) for name in _RELATIONS}
 
 
-def _load_skeleton(folder: Path, frame: int, fingerprint: str) -> Skeleton | None:
+def _from_tensors(tensors: Mapping[str, Tensor], notes: Sequence[str]) -> FrameSkeleton:
+    skeleton = Skeleton(**{name: tensors[name] for name in _FIELDS}, notes=tuple(notes))
+    return skeleton, TipRelations(**{name: tensors[name] for name in _RELATIONS})
+
+
+def _save_skeleton(folder: Path, frame: int, fingerprint: str, found: FrameSkeleton) -> None:
+    save_tensors(_file(folder, frame), _tensors(found), {"surface": fingerprint, "notes": list(found[0].notes)})
+
+
+def _load_skeleton(folder: Path, frame: int, fingerprint: str) -> FrameSkeleton | None:
     """Return the skeleton that was kept of a surface; None if there is none or its file is damaged."""
     try:
         tensors, metadata = load_tensors(_file(folder, frame))
-        if metadata.get("surface") != fingerprint:
-            return None
-        return Skeleton(**{name: tensors[name] for name in _FIELDS}, notes=tuple(metadata["notes"]))
+        return _from_tensors(tensors, metadata["notes"]) if metadata.get("surface") == fingerprint else None
     except (FileNotFoundError, FormatError, KeyError, InputError):
         return None

@@ -9,6 +9,7 @@ from typing import ClassVar
 from torch import Tensor
 
 from torchreg.result import Result, Status, stored_as
+from torchreg.spines.measurements import SpineMeasurements, measure_limbs
 from torchreg.spines.spine import Spine
 
 
@@ -56,11 +57,13 @@ class SpineSequence(Result):
         warnings: irregularities, with the number of the frame.
         origin: (3,) float64 about which it was computed, where the surfaces, in float64, lie far from that of
             coordinates; None elsewhere.
+        confidence: (T, K) probability, given all frames, that a name is right: that of the tip, or where the frame's
+            own skeleton lacks the tip, that it does. None in files of earlier releases.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
         "graph": "L 2", "curves": "T L S 3", "radii": "T L S", "frames": "T L S 3 3", "times": "T", "found": "T K",
-        "own": "T L", "topologies": "T", "own_topologies": "T", "statuses": "T",
+        "confidence": "T K", "own": "T L", "topologies": "T", "own_topologies": "T", "statuses": "T",
     }  # fmt: skip
 
     model: Spine = field(metadata=stored_as(Spine.record, Spine.from_record))
@@ -78,6 +81,7 @@ class SpineSequence(Result):
     status: Status
     warnings: tuple[str, ...]
     origin: Tensor | None = None
+    confidence: Tensor | None = None
 
     def moved(self, origin: Tensor) -> SpineSequence:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
@@ -106,3 +110,7 @@ class SpineSequence(Result):
         flat = self.graph.reshape(-1)
         first = [int((flat == node).nonzero()[0, 0]) for node in range(self.num_tips, len(self.graph) + 1)]
         return self.curves[:, :, [0, -1]].flatten(1, 2)[:, first]
+
+    def measurements(self) -> SpineMeasurements:
+        """Return the lengths, radii and angles of the limbs over time, which can be written as a table."""
+        return measure_limbs(self.curves, self.radii, self.graph, self.times)

@@ -12,7 +12,6 @@ from torchreg._checks import check_choice, check_count, check_positive
 from torchreg.errors import InputError
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.geodesics import GeodesicGraph
-from torchreg.geometry.loaded import as_mesh
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton, build_skeleton
 from torchreg.geometry.spread import SPREADS, spread_dimensions
@@ -27,6 +26,8 @@ from torchreg.spines.loops import OpenedLoops, open_loops
 from torchreg.spines.paper.metanodes import metanode_junctions
 from torchreg.spines.paper.vertex_level_sets import vertex_level_sets
 from torchreg.spines.protrusions import average_geodesic_distance, find_protrusions
+from torchreg.spines.surfaces import as_surface
+from torchreg.spines.tip_relations import TipRelations, surface_relations
 from torchreg.spines.tip_trees import TipTree, consensus_junctions, estimate_junction, grow_tip_tree
 
 
@@ -65,8 +66,7 @@ class SkeletonizeConfig:
         check_choice(self.pieces, "pieces", PIECES)
 
 
-@torch.no_grad()
-def skeletonize(mesh: TriangleMesh, config: SkeletonizeConfig | None = None) -> Skeleton:
+def skeletonize(mesh: TriangleMesh | Tensor, config: SkeletonizeConfig | None = None) -> Skeleton:
     """Return the skeleton of a surface: a tree of curves in its middle that ends in the tips of its limbs.
 
     Tips are salient local maxima of the average geodesic distance. From each tip, level sets of the geodesic distance
@@ -86,7 +86,8 @@ def skeletonize(mesh: TriangleMesh, config: SkeletonizeConfig | None = None) -> 
 
     Args:
         mesh: any triangles that make a surface: open, with duplicate vertices, wrong winding, edges of more than two
-            triangles.
+            triangles; or points of a surface (N, 3), a cloud or a scan without faces, around which one is laid, see
+            `cloud_surface`.
         config: defaults do for bodies with limbs.
 
     Returns:
@@ -94,8 +95,9 @@ def skeletonize(mesh: TriangleMesh, config: SkeletonizeConfig | None = None) -> 
         radius is the distance to the nearest vertex or center of a triangle of the (coarsened) surface.
 
     Raises:
-        InputError: if there is no triangle with an area, or several pieces and ``config.pieces`` is "error".
-        InputTypeError: if ``mesh`` is no `TriangleMesh`.
+        InputError: if there is no triangle with an area, there are fewer than 100 different points, or several pieces
+            and ``config.pieces`` is "error".
+        InputTypeError: if ``mesh`` is neither a `TriangleMesh` nor points.
 
     Differentiable: no.
 
@@ -103,13 +105,20 @@ def skeletonize(mesh: TriangleMesh, config: SkeletonizeConfig | None = None) -> 
 
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1, eq. 4 and 5.
     """
-    mesh = as_mesh(mesh, "mesh")
+    surface, notes = as_surface(mesh, "mesh")
+    found = skeletonize_surface(surface, config)[0]
+    return replace(found, notes=(*found.notes, *notes)) if notes else found
+
+
+@torch.no_grad()
+def skeletonize_surface(mesh: TriangleMesh, config: SkeletonizeConfig | None = None) -> tuple[Skeleton, TipRelations]:
+    """Return the skeleton of a surface, see `skeletonize`, and the relations of its tips along the surface."""
     config = SkeletonizeConfig() if config is None else config
     origin = far_origin(mesh.vertices)
     if origin is not None:
         offset = origin.to(mesh.vertices)
-        found = skeletonize(TriangleMesh(mesh.vertices - offset, mesh.faces), config)
-        return replace(found, nodes=found.nodes + offset)
+        found, relations = skeletonize_surface(TriangleMesh(mesh.vertices - offset, mesh.faces), config)
+        return replace(found, nodes=found.nodes + offset), relations
     body = _prepared(mesh, config)
     tips = _find_tips(body, config)  # section 4.1: maxima of the average geodesic distance
     # "Growing Skeletons": rings of the distance from each tip; "Merging Skeletons", figure 3B.
@@ -175,6 +184,7 @@ class _SurfaceTips:
         vertices: (K,) of the surface.
         confidence: (K,).
         distances: (K, V) geodesic distances from them.
+        relations: of the tips along the surface.
         spacing: between levels of these distances, and so between nodes.
         notes: for the skeleton.
     """
@@ -183,6 +193,7 @@ class _SurfaceTips:
     vertices: Tensor
     confidence: Tensor
     distances: Tensor
+    relations: TipRelations
     spacing: float
     notes: tuple[str, ...]
 
@@ -209,6 +220,7 @@ def _find_tips(body: _Body, config: SkeletonizeConfig) -> _SurfaceTips:
         vertices=vertices,
         confidence=confidence,
         distances=distances,
+        relations=surface_relations(mesh, distances, vertices),
         spacing=float(distances.max()) / config.num_levels,
         notes=notes,
     )
@@ -301,18 +313,24 @@ def _centered_limbs(limbs: Sequence[_Limb], mesh: TriangleMesh, interior: Interi
     return centered
 
 
-def _assembled(limbs: Sequence[_Limb], interior: Interior, tips: _SurfaceTips, like: Tensor) -> Skeleton:
-    """Return the skeleton of limbs that share their end nodes, in the dtype and device of ``like``."""
+def _assembled(
+    limbs: Sequence[_Limb], interior: Interior, tips: _SurfaceTips, like: Tensor
+) -> tuple[Skeleton, TipRelations]:
+    """Return the skeleton of limbs that share their end nodes, in the dtype and device of ``like``.
+
+    With it come the relations of its tips.
+    """
     rows = [(limb.points, interior.clearance(limb.points), limb.frames) for limb in limbs]
     skeleton = build_skeleton(rows, [limb.ends for limb in limbs], tips.notes)
     # Tips are nodes in the order in which limbs name them first.
     first_named = list(dict.fromkeys(end for limb in limbs for end in limb.ends))
-    confidence = tips.confidence[sorted(range(len(tips.vertices)), key=first_named.index)]
-    return replace(
+    order = torch.tensor(sorted(range(len(tips.vertices)), key=first_named.index))
+    skeleton = replace(
         skeleton,
         nodes=skeleton.nodes.to(like),
         edges=skeleton.edges.to(like.device),
         radii=skeleton.radii.to(like),
         frames=skeleton.frames.to(like),
-        confidence=confidence.to(like),
+        confidence=tips.confidence[order].to(like),
     )
+    return skeleton, tips.relations.of_tips(order)

@@ -1,0 +1,240 @@
+"""How likely names of tips are: features that stay the same in all frames, and limbs that move little between two."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.skeleton import nearest_rotation
+from torchreg.spines.student_t import SHRINKAGE, TAILS, GroupedDensity, fit_groups, t_log_density
+from torchreg.spines.tip_features import SAMPLING, TipFeatures, TipObservations
+
+
+@dataclass(frozen=True)
+class NamingPriors:
+    """What is assumed of names before any frame is seen; lengths in sizes of the body."""
+
+    missing: float = -1.0  # log-probability of a tip that a frame lacks, against one that it shows
+    independent_points: float = 2.0  # of a limb: the others move with these
+    turn: float = 0.1  # mean of 1 - cos of the body's rotation between two frames, at first: about 26 degrees
+    turn_samples: float = 2.0  # rotations that this counts for when it is learned
+    correlation: float = 0.8  # of features between frames, at first: errors come from poses, which last
+    max_correlation: float = 0.95
+    min_displacement: float = 0.01  # scale of displacements that is never undercut: nodes are no nearer to each other
+    noise: float = 1e-3  # of features, below which no difference counts
+    background_maps: int = 40  # random names per frame that show what features look like if names are wrong
+
+
+PRIORS = NamingPriors()
+
+
+def relative_maps(before: Tensor, after: Tensor, num_tips: int) -> Tensor:
+    """Return the tips (A, B, M) of a frame that M tips of the one before become, -1 for none.
+
+    Args:
+        before: (A, K) tips of the names in the frame before, -1 for none.
+        after: (B, K) in the frame after.
+        num_tips: M, in the frame before.
+    """
+    shape = (len(before), len(after), before.shape[1])
+    tips = torch.full((*shape[:2], num_tips + 1), -1)
+    where = torch.where(before >= 0, before, num_tips)[:, None].expand(shape)
+    return tips.scatter_(2, where, after[None].expand(shape))[..., :num_tips]
+
+
+@dataclass(frozen=True, eq=False)
+class NameModel:
+    """The probability of all frames' names: a chain.
+
+    A frame's features are those of the frame before, and as far as they do not correlate, those of a mean frame; both
+    up to multivariate t-distributed errors. The points of each limb stay where they were, or move rigidly with the
+    whole body, up to t-distributed displacements. Tips without a name, and features and places under wrong names, are
+    background.
+
+    Args:
+        features: that are compared.
+        mean: (n,) features of a mean frame, NaN where unknown.
+        density: of their errors.
+        background_mean: (n,) under random names.
+        background: density of features under random names.
+        correlation: (G,) of errors between two frames, of each group of features.
+        usual: (K (K - 1) / 2,) distances between named tips.
+        displacement: (S,) scale of the displacements of a limb's points.
+        turn: mean of 1 - cos of the body's rotation between two frames.
+        log_volume: of the space that limbs move in.
+        weight: of features against motion: one, but before anything is known of them.
+    """
+
+    features: TipFeatures
+    mean: Tensor
+    density: GroupedDensity
+    background_mean: Tensor
+    background: GroupedDensity
+    correlation: Tensor
+    usual: Tensor
+    displacement: Tensor
+    turn: float
+    log_volume: float
+    weight: float = 1.0
+
+    @classmethod
+    def from_frame(
+        cls, frames: Sequence[TipObservations], reference: int, names: Tensor, displacement: float, weight: float
+    ) -> NameModel:
+        """Return the model of which one frame's names (K,) are known, for a scale of displacements and a weight."""
+        with_volumes = any(bool(frame.volumes.any()) for frame in frames)
+        features = TipFeatures(len(names), frames[0].limbs.shape[1], with_volumes=with_volumes)
+        center, background = _background(features, frames)
+        usual = features.distances(frames[reference], names[None])[0]
+        usual = torch.where(usual.isnan(), usual.nanmean().nan_to_num(), usual)
+        points = torch.cat([frame.curves.flatten(0, 1) for frame in frames])
+        return cls(
+            features=features,
+            mean=features(frames[reference], names[None], usual)[0],
+            density=GroupedDensity(features.groups, [SHRINKAGE.variance * c for c in background.covariances]),
+            background_mean=center,
+            background=background,
+            correlation=torch.full((len(features.groups),), PRIORS.correlation, dtype=torch.float64),
+            usual=usual,
+            displacement=torch.full((SAMPLING.num_points,), displacement, dtype=torch.float64),
+            turn=PRIORS.turn,
+            log_volume=3 * math.log(float((points.amax(0) - points.amin(0)).norm().clamp_min(1e-6))),
+            weight=weight,
+        )
+
+    def of_names(self, frame: TipObservations, maps: Tensor) -> Tensor:
+        """Return the features (P, n) of a frame under mappings (P, K)."""
+        return self.features(frame, maps, self.usual)
+
+    def first_scores(self, features: Tensor) -> Tensor:
+        """Return the log-probability ratios (P,) of features (P, n) of a frame by itself to the background."""
+        scores = self.density(features - self.mean) - self._background_scores(features)
+        return self.weight * scores.sum(-1)
+
+    def next_scores(self, before: Tensor, after: Tensor) -> Tensor:
+        """Return those (A, B) of features (B, n) after a frame with features (A, n)."""
+        correlation = torch.zeros_like(self.mean)
+        for group, value in zip(self.features.groups, self.correlation, strict=True):
+            correlation[group.index] = value
+        errors = before - self.mean
+        share = torch.where(errors.isnan(), 0.0, correlation)
+        innovation = (1 - share.square()).sqrt().unsqueeze(1)
+        residuals = (after - self.mean - (share * errors.nan_to_num()).unsqueeze(1)) / innovation
+        known = (~(after - self.mean).isnan()).to(after)
+        log_innovation = torch.stack(
+            [(known[:, g.index] * innovation[..., g.index].log()).mean(-1) * g.rank for g in self.features.groups], -1
+        )
+        scores = self.density(residuals) - log_innovation - self._background_scores(after)
+        return self.weight * scores.sum(-1)
+
+    def _background_scores(self, features: Tensor) -> Tensor:
+        """Return the log-densities (..., G) of features (..., n) under random names, of those that the model knows."""
+        return self.background(torch.where(self.mean.isnan(), torch.nan, features) - self.background_mean)
+
+    def motion_scores(self, before: TipObservations, after: TipObservations, tips: Tensor) -> Tensor:
+        """Return those (P,) of the limbs' places, for tips (P, M) that those of the frame before become, -1 for none.
+
+        The rigid motion of the body is fitted to each mapping, see `rank_mappings`.
+        """
+        found = (tips >= 0).to(before.curves)
+        moved, turn = self._moved(before.curves, after.curves[tips.clamp_min(0)], found)
+        still = (after.curves[tips.clamp_min(0)] - before.curves).square().sum(-1)
+        rows = [t_log_density(squares, self.displacement, 3) for squares in (moved, still)]
+        scores = torch.logaddexp(*rows) - math.log(2) + self.log_volume
+        scores = PRIORS.independent_points * (scores.mean(-1) * found).sum(-1)
+        return scores - 1.5 * (turn / self.turn + math.log(self.turn))  # of three angles, each with the same spread
+
+    def _moved(self, source: Tensor, target: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
+        """Return squared distances (P, M, S) from target points to rigidly moved ones, and 1 - cos of the turns (P,).
+
+        Args:
+            source: (M, S, 3).
+            target: (P, M, S, 3).
+            found: (P, M) one where they belong together, else zero.
+        """
+        weights = found.unsqueeze(-1) / self.displacement.square()
+        total = weights.sum((1, 2)).clamp_min(1e-12)[:, None]
+        start = source - (torch.einsum("pks,ksi->pi", weights, source) / total)[:, None, None]
+        end = target - (torch.einsum("pks,pksi->pi", weights, target) / total)[:, None, None]
+        rotation = nearest_rotation(torch.einsum("pks,pksi,pksj->pij", weights, end, start))
+        squares = (end - torch.einsum("pij,pksj->pksi", rotation, start)).square().sum(-1)
+        return squares, (3 - rotation.diagonal(dim1=1, dim2=2).sum(-1)) / 2
+
+    def refitted(self, frames: Sequence[TipObservations], names: Tensor) -> NameModel:
+        """Return the model that fits names (T, K) best."""
+        maps = names.unsqueeze(1)
+        distances = torch.cat([self.features.distances(*row) for row in zip(frames, maps, strict=True)])
+        usual = distances.nanmedian(0).values
+        usual = torch.where(usual.isnan(), self.usual, usual)
+        samples = torch.cat([self.features(frame, row, usual) for frame, row in zip(frames, maps, strict=True)])
+        mean, density = fit_groups(samples, self.background)
+        return replace(
+            self,
+            mean=mean,
+            density=density,
+            correlation=_correlations(density.whitened(samples - mean)),
+            usual=usual,
+            weight=1.0,
+            **self._motion(frames, names),
+        )
+
+    def _motion(self, frames: Sequence[TipObservations], names: Tensor) -> dict[str, Any]:
+        """Return the scales of displacements and rotations under names (T, K)."""
+        moved, still, turns = [], [], []
+        for number in range(1, len(frames)):
+            before, after = frames[number - 1], frames[number]
+            tips = relative_maps(names[number - 1 : number], names[number : number + 1], len(before))[0]
+            found, target = tips[0] >= 0, after.curves[tips.clamp_min(0)]
+            squares, turn = self._moved(before.curves, target, found[None].to(target))
+            moved.append(squares[0, found])
+            still.append((target[0] - before.curves).square().sum(-1)[found])
+            turns.append(float(turn))
+        mean_turn = (sum(turns) + PRIORS.turn_samples * PRIORS.turn) / (len(turns) + PRIORS.turn_samples)
+        squares = torch.stack((torch.cat(moved), torch.cat(still))) if moved else torch.zeros(2, 0)
+        displacement = _mixture_scales(squares) if squares.numel() else self.displacement
+        return {"displacement": displacement, "turn": max(mean_turn, PRIORS.noise)}
+
+
+def _mixture_scales(squares: Tensor) -> Tensor:
+    """Return the scales (S,) of t-distributed displacements of which each has one of two squared lengths (2, n, S)."""
+    scale = (squares.amin(0).median(0).values / 3).sqrt().clamp_min(PRIORS.min_displacement)
+    for _ in range(TAILS.num_rounds):
+        shares = t_log_density(squares, scale, 3).softmax(0)
+        weights = (TAILS.displacement_dof + 3) / (TAILS.displacement_dof + squares / scale.square())
+        scale = ((shares * weights * squares).sum(0).mean(0) / 3).sqrt().clamp_min(PRIORS.min_displacement)
+    return scale
+
+
+def _background(features: TipFeatures, frames: Sequence[TipObservations]) -> tuple[Tensor, GroupedDensity]:
+    """Return the mean and the density of features under random names: alike in all directions of a group."""
+    generator, rows = torch.Generator().manual_seed(0), []
+    for frame in frames:
+        order = torch.rand(PRIORS.background_maps, max(len(frame), features.num_names), generator=generator).argsort(1)
+        maps = torch.where(order < len(frame), order, -1)[:, : features.num_names]
+        pairs = torch.zeros(features.pairs.shape[1], dtype=torch.float64) + frame.geodesics.mean()
+        rows.append(features(frame, maps, pairs))
+    samples = torch.cat(rows)
+    center = samples.nanmean(0).nan_to_num()
+    residuals = (samples - center).nan_to_num()
+    covariances = []
+    for group in features.groups:
+        values, vectors = torch.linalg.eigh(residuals[:, group.index].mT @ residuals[:, group.index] / len(samples))
+        level = values[-group.rank :].mean() + PRIORS.noise**2
+        covariances.append(level * vectors[:, -group.rank :] @ vectors[:, -group.rank :].mT)
+    return center, GroupedDensity(features.groups, covariances)
+
+
+def _correlations(whitened: Sequence[Tensor]) -> Tensor:
+    """Return the correlations (G,) between frames of whitened errors (T, rank); far ones count as unit vectors."""
+    rows = []
+    for errors in whitened:
+        errors = errors / (1 + errors.square().mean(-1, keepdim=True)).sqrt()
+        before, after = errors[:-1], errors[1:]
+        size = (before.square().sum() + after.square().sum()) / 2
+        rows.append((before * after).sum() / size.clamp_min(1e-12))
+    return torch.stack(rows).clamp(0, PRIORS.max_correlation)
