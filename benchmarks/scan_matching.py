@@ -4,8 +4,8 @@ Pairs of kinds that the matcher never saw in training, and with --data those of 
 
 - right: share of visible tokens whose best match lies within 5 % of the diagonal of the truth,
 - hidden: recall and precision of tokens called hidden,
-- error and registered of a dense alignment (before bones) by one EM in which the matcher's posterior is the prior of
-  every match: a pair counts as registered when 90 % of its points end within 2.5 % of the diagonal of the truth,
+- error and registered of the dense alignment (before bones), in which the matcher's posterior is the prior of matches:
+  a pair counts as registered when 90 % of its points end within 2.5 % of the diagonal of the truth,
 - the same with the matches of the truth, which tells what the matcher and what the alignment leave to be done.
 
     python benchmarks/scan_matching.py                       # --smoke: one pair of each kind, in seconds
@@ -19,7 +19,7 @@ import itertools
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,11 +29,10 @@ from torch import Tensor
 import torchreg as tr
 from torchreg.datasets.creature_kinds import HELD_OUT_KINDS
 from torchreg.datasets.matching_pairs import matching_pairs
-from torchreg.geometry.neighbors import k_nearest
-from torchreg.registration.annealing import geometric_at
 from torchreg.registration.blend import blend_linear
+from torchreg.registration.dense.align_scans import align_problem
 from torchreg.registration.dense.config import ScanAlignConfig
-from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
+from torchreg.registration.dense.match_prior import MatchPrior
 from torchreg.registration.dense.node_graph import spread_weights
 from torchreg.registration.dense.problem import NORMAL_SCALE, ScanAlignProblem, describe
 from torchreg.registration.dense.scan_matcher import ScanMatcher, match_probabilities
@@ -41,6 +40,8 @@ from torchreg.registration.dense.scan_tokens import SIZES, ScanTokens
 
 # A match is right, and a place is visible, within these shares of the diagonal.
 RIGHT, VISIBLE = 0.05, 0.03
+# Logit of what is known for sure.
+SURE = 30.0
 
 
 @dataclass(frozen=True)
@@ -51,69 +52,6 @@ class Pair:
     source: tr.RangeScan
     target: tr.RangeScan
     truth: Tensor
-
-
-@dataclass(frozen=True)
-class KeptMatches:
-    """An EM that keeps the matcher's posterior as the prior of matches; first and last values, lengths in sizes."""
-
-    num_steps: int = 24
-    sigma: tuple[float, float] = (0.35, 0.006)  # from the motion of a limb to the noise
-    stiffness: tuple[float, float] = (1.0, 0.006)  # of the deformation graph
-    give: tuple[float, float] = (0.03, 0.01)  # by which joints may disagree
-    slide: tuple[float, float] = (1.0, 0.03)  # along the surface, in the second half
-    normal_weight: float = 3.0  # exponent lost at right angles, at the end
-    floor: tuple[float, float] = (4e-4, 0.02)  # prior of any match of a visible point: the matcher may err
-    outlier: float = 0.03  # of the mass of a sample in the middle of its matches
-
-    def align(self, problem: ScanAlignProblem, probability: Tensor, hidden: Tensor) -> Tensor:
-        """Return motions (J, 4, 4) from probabilities (S, T) of token pairs and of hidden tokens (S,)."""
-        source, target = problem.source, problem.target
-        to_tokens = shares(source.points[: len(problem.samples)], source.points[: len(probability)])
-        from_tokens = shares(target.points, target.points[: probability.shape[1]])
-        prior, visible = to_tokens @ probability, to_tokens @ (1 - hidden)
-        transforms = problem.graph.rest()
-        for step in range(self.num_steps):
-            share = step / (self.num_steps - 1)
-            sigma = geometric_at(self.sigma, share)
-            count = min(len(problem.samples), max(300, round(0.3 / sigma**2)))
-            seen = min(len(target), max(500, round(0.6 / sigma**2)))
-            floor = geometric_at(self.floor, share) * visible[:count, None]
-            pair_prior = prior[:count] @ from_tokens[:seen].mT + floor
-            matches = self._matches(problem, transforms, pair_prior, sigma, share)
-            stiffness, give = geometric_at(self.stiffness, share), geometric_at(self.give, share)
-            transforms = fit_graph(problem.graph, transforms, matches, stiffness, give=give).transforms
-        return transforms
-
-    def _matches(
-        self, problem: ScanAlignProblem, transforms: Tensor, prior: Tensor, sigma: float, share: float
-    ) -> GraphMatches:
-        """Return the expected matches of the first samples: the E-step."""
-        (count, seen), target = prior.shape, problem.target
-        moved, normals = problem.graph.move_with_normals(transforms, slice(0, count))
-        exponent = -torch.cdist(moved, target.points[:seen]).square() / (2 * sigma**2)
-        exponent = exponent - self.normal_weight * share * (1 - normals @ target.normals[:seen].mT)
-        mass = prior * exponent.exp()
-        if sigma < ScanAlignConfig().refine.boundary_above:
-            mass = mass * ~target.boundary[:seen]
-        # In the middle of a surface a sample has about this many others within its reach.
-        outlier = self.outlier * min(max(1.0, 2 * seen * sigma**2), seen / 20)
-        choice = mass / (mass.sum(1, keepdim=True) + outlier)
-        if sigma > ScanAlignConfig().refine.both_ways_above:
-            choice = choice + mass / (mass.sum(0) + outlier) * (count / seen)
-        weights = choice.sum(1)
-        targets = torch.where(weights[:, None] > 0, choice @ target.points[:seen] / weights[:, None], moved)
-        facing = torch.nn.functional.normalize(choice @ target.normals[:seen], dim=1)
-        slide = geometric_at(self.slide, max(0.0, 2 * share - 1))
-        return GraphMatches(slice(0, count), targets, weights, facing, slide)
-
-
-def shares(points: Tensor, tokens: Tensor) -> Tensor:
-    """Return by how much points (N, 3) belong to tokens (T, 3), (N, T): to the three nearest, rows sum to one."""
-    index, distance = k_nearest(points, tokens, 3)
-    weights = 1 / (distance + 0.25 * distance.mean())
-    weights = (weights / weights.sum(1, keepdim=True)).to(points)
-    return points.new_zeros(len(points), len(tokens)).scatter_(1, index, weights)
 
 
 def moved_points(problem: ScanAlignProblem, transforms: Tensor, scan: tr.RangeScan) -> Tensor:
@@ -127,25 +65,34 @@ def moved_points(problem: ScanAlignProblem, transforms: Tensor, scan: tr.RangeSc
 @torch.no_grad()
 def measured(pair: Pair, matcher: ScanMatcher) -> list[float]:
     """Return the figures of one pair, in the order of the columns; NaN where there is nothing hidden or called so."""
-    begin = time.process_time()
-    problem = describe(pair.source, pair.target, ScanAlignConfig())
-    tokens = [
-        ScanTokens.from_even(scan.points, scan.normals, scan.boundary) for scan in (problem.source, problem.target)
-    ]
-    (probability,), (hidden,), _ = (value.double() for value in match_probabilities(matcher(*tokens)))
+    begin, config = time.process_time(), ScanAlignConfig()
+    problem = describe(pair.source, pair.target, config)
+    scans = (problem.source, problem.target)
+    logits = matcher(*(ScanTokens.from_even(scan.points, scan.normals, scan.boundary) for scan in scans))
+    (probability,), (hidden,), _ = (value.double() for value in match_probabilities(logits))
     size = pair.target.diagonal / problem.unit.scale
     truth = problem.unit.normalize(pair.truth)[problem.samples[: SIZES.num_tokens]]
     places = problem.target.points[: SIZES.num_tokens]
     visible = torch.cdist(truth, problem.target.points).amin(1) < VISIBLE * size
     right = (places[probability.argmax(1)] - truth).norm(dim=1) < RIGHT * size
     called = hidden > 0.5
-    true_matches = (-torch.cdist(truth, places).square() / (2 * 0.025**2)).softmax(1) * visible[:, None]
     figures = [share(right[visible]), share(called[~visible]), share(~visible[called])]
-    for matches, lost in ((probability, hidden), (true_matches, 1 - visible.double())):
-        transforms = KeptMatches().align(problem, matches, lost)
+    for known in (logits[0].double(), true_logits(truth, places, visible)):
+        prior = MatchPrior.of_logits(known, problem.graph.points, problem.target.points)
+        transforms, _ = align_problem(replace(problem, prior=prior), config, lambda _: None)
         error = (moved_points(problem, transforms, pair.source) - pair.truth).norm(dim=1) / pair.target.diagonal
         figures += [100 * float(error.mean()), float((error < 0.025).double().mean() >= 0.9)]
     return [*figures, time.process_time() - begin]
+
+
+def true_logits(truth: Tensor, places: Tensor, visible: Tensor) -> Tensor:
+    """Return logits (S + 1, T + 1) of who knows where tokens went (S, 3), among others (T, 3), and which are seen."""
+    apart = torch.cdist(truth, places)
+    logits = torch.full((len(truth) + 1, len(places) + 1), -SURE, dtype=torch.float64)
+    logits[:-1, :-1] = -apart.square() / (2 * (RIGHT / 2) ** 2)
+    logits[:-1, -1] = torch.where(visible, -SURE, SURE)
+    logits[-1, :-1] = torch.where(apart.amin(0) < RIGHT, -SURE, 0.0)
+    return logits
 
 
 def share(flags: Tensor) -> float:

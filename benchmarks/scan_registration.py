@@ -127,24 +127,12 @@ def _ablations() -> list[Recipe]:
         Recipe("without label reuse", config=replace(plain, reuse=False)),
         Recipe("without refinement", config=replace(plain, refine_steps=0)),
         Recipe("without settling", config=replace(plain, settle_steps=0)),
-        Recipe("without descriptors", config=replace(plain, align=replace(plain.align, match=_no_matches(plain)))),
-        Recipe("learned descriptors", config=replace(plain, align=_learned(plain.align))),
         Recipe("without wide regions", config=replace(plain, align=_no_regions(plain.align))),
         Recipe("without visibility", config=replace(plain, align=_blind(plain.align))),
         Recipe("limbs may overlap", config=replace(plain, align=_overlapping(plain.align))),
         *(Recipe(f"grid {size}", grid=size) for size in (20, 35, 65, 80)),
         *(Recipe(f"bones {size}", bones=size) for size in (4, 6, 10, 15)),
     ]
-
-
-def _no_matches(config: tr.RegisterConfig):
-    """Return settings under which there are never enough matches of descriptors to start from."""
-    return replace(config.align.match, min_matches=10**9)
-
-
-def _learned(align: ScanAlignConfig) -> ScanAlignConfig:
-    """Return settings under which first matches are found by learned descriptors."""
-    return replace(align, match=replace(align.match, descriptor="learned"))
 
 
 def _no_regions(align: ScanAlignConfig) -> ScanAlignConfig:

@@ -2,10 +2,9 @@ import pytest
 
 from torchreg.errors import InputError
 from torchreg.registration.dense.config import (
-    AssignConfig,
     ChoiceConfig,
+    CoarseConfig,
     EMConfig,
-    MatchConfig,
     ScanAlignConfig,
     ScanAlignRecord,
 )
@@ -15,19 +14,12 @@ from torchreg.registration.dense.e_step import ScanEMConfig
 @pytest.mark.parametrize(
     ("kind", "arguments", "message"),
     [
-        (MatchConfig, {"num_points": 0}, "num_points must be at least 1"),
-        (MatchConfig, {"descriptor": "sift"}, "descriptor must be one of"),
-        (
-            ScanAlignConfig,
-            {"curvature_radii": (0.02, 0.05), "match": MatchConfig(descriptor="learned")},
-            "curvature_radii must be .*spin_image",
-        ),
-        (MatchConfig, {"radius": 0.0}, "radius must be positive"),
-        (MatchConfig, {"stiffness": ()}, "stiffness must hold"),
-        (MatchConfig, {"stiffness": (1.0, -1.0)}, "stiffness must be positive"),
-        (AssignConfig, {"reach": (0.1, 0.0)}, "reach must be positive"),
-        (AssignConfig, {"stiffness": (0.1,)}, "stiffness must be two numbers"),
-        (AssignConfig, {"feature_weight": -0.1}, "feature_weight must be"),
+        (CoarseConfig, {"num_steps": 0}, "num_steps must be at least 1"),
+        (CoarseConfig, {"sigma": (0.1, 0.0)}, "sigma must be positive"),
+        (CoarseConfig, {"doubt": (0.1,)}, "doubt must be two numbers"),
+        (CoarseConfig, {"area": 0.0}, "area must be positive"),
+        (CoarseConfig, {"normal_weight": -0.1}, "normal_weight must be"),
+        (EMConfig, {"doubt": 0.0}, "doubt must be positive"),
         (EMConfig, {"final_steps": -1}, "final_steps must be at least 0"),
         (EMConfig, {"slow_steps": -1}, "slow_steps must be at least 0"),
         (EMConfig, {"slide": (1.0, 0.0)}, "slide must be positive"),
@@ -40,7 +32,6 @@ from torchreg.registration.dense.e_step import ScanEMConfig
         (ScanAlignConfig, {"curvature_radii": ()}, "curvature_radii must hold"),
         (ScanAlignConfig, {"curvature_radii": (-0.1,)}, "curvature_radii must be positive"),
         (EMConfig, {"near_sigma": 0.0}, "near_sigma must be positive"),
-        (MatchConfig, {"stiffer": ()}, "stiffer must hold"),
         (EMConfig, {"expected": -1.0}, "expected must be"),
         (EMConfig, {"expected_scale": 0.0}, "expected_scale must be positive"),
         (EMConfig, {"regions": -0.1}, "regions must be"),

@@ -8,8 +8,8 @@ from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.geometry.neighbors import k_nearest
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import se3_exp
-from torchreg.registration.dense.config import MatchConfig, ScanAlignConfig
-from torchreg.registration.dense.problem import describe, first_matches
+from torchreg.registration.dense.config import ScanAlignConfig
+from torchreg.registration.dense.problem import describe
 
 CONFIG = ScanAlignConfig(num_samples=400, num_target_samples=800, num_nodes=30)
 
@@ -73,13 +73,3 @@ def test_moved_samples_are_those_of_the_graph(problem):
     torch.testing.assert_close(rest.points, problem.source.points[:7])
     torch.testing.assert_close(rest.features, problem.source.features[:7])
     assert len(problem.moved(problem.graph.rest())) == len(problem.moved(problem.graph.rest(), 9999)) == 400
-
-
-@pytest.mark.parametrize("descriptor", ["learned", "spin_image"])
-def test_most_first_matches_are_right(pair, problem, descriptor):
-    matches = first_matches(problem, MatchConfig(num_points=400, descriptor=descriptor))
-    truth = problem.unit.normalize(pair.truth[problem.samples])[matches.which]
-    near = (matches.targets - truth).norm(dim=-1) < 0.05
-    assert len(near) > 50
-    assert float(near.double().mean()) > 0.9
-    assert float(matches.weights.min()) > 0.5

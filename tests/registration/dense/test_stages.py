@@ -9,27 +9,22 @@ from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import se3_exp
 from torchreg.registration.dense.config import (
-    AssignConfig,
     ChoiceConfig,
     EMConfig,
-    MatchConfig,
     ScanAlignConfig,
 )
-from torchreg.registration.dense.graph_fit import GraphMatches
 from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.registration.dense.problem import describe
 from torchreg.registration.dense.stages import (
     Reporter,
     agree,
     embedded,
-    fit_first_matches,
     follow_regions,
     judge,
     leaps,
     loses_limb,
     mismatch,
     overlaps,
-    pull_one_to_one,
     refine,
     used_samples,
 )
@@ -58,33 +53,15 @@ def misses(pair, problem, transforms):
     return (problem.graph(transforms) - truth).norm(dim=-1)
 
 
-def test_wrong_ones_among_the_first_matches_are_ignored(pair, problem, reporter):
-    truth = problem.unit.normalize(pair.truth[problem.samples])
-    targets = truth[:200].clone()
-    targets[::10] += 0.3
-    matches = GraphMatches(torch.arange(200), targets, torch.ones(200, dtype=torch.float64))
-    fitted = fit_first_matches(problem, matches, (0.2, 0.06, 0.02, 0.02), MatchConfig(), reporter[0])
-    assert float(misses(pair, problem, fitted).median()) < 0.5 * float(
-        misses(pair, problem, problem.graph.rest()).median()
-    )
-    kept = [record.matched for record in reporter[1]]
-    assert kept[-1] < 0.95 * kept[0]
-
-
-@pytest.mark.parametrize("stage", ["assign", "refine"])
-def test_stages_come_nearer_and_report(pair, problem, reporter, stage):
+def test_steps_come_nearer_and_report(pair, problem, reporter):
     rest = problem.graph.rest()
-    if stage == "assign":
-        moved = pull_one_to_one(problem, rest, AssignConfig(num_steps=4, num_points=200), reporter[0])
-    else:
-        moved = refine(problem, rest, EMConfig(num_steps=3, final_steps=1), reporter[0])
+    moved = refine(problem, rest, EMConfig(num_steps=3, final_steps=1), reporter[0])
     assert float(misses(pair, problem, moved).mean()) < float(misses(pair, problem, rest).mean())
     assert len(reporter[1]) == 4
     widths = [record.width for record in reporter[1]]
     assert widths == sorted(widths, reverse=True)
-    ends = {"assign": (0.35, 0.08), "refine": (0.025, 0.006)}[stage]
-    assert (widths[0], widths[-1]) == pytest.approx([2 * end for end in ends])
-    assert all(record.hypothesis == "some" and record.stage == stage for record in reporter[1])
+    assert (widths[0], widths[-1]) == pytest.approx((2 * 0.025, 2 * 0.006))
+    assert all(record.hypothesis == "some" and record.stage == "refine" for record in reporter[1])
 
 
 def test_small_sigmas_use_more_samples(problem):

@@ -1,9 +1,9 @@
-"""One scan bent onto another, however far its limbs moved: several hypotheses, each refined, the best kept."""
+"""One scan bent onto another, however far its limbs moved: by learnt matches and from rest, the best of both kept."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
@@ -15,6 +15,7 @@ from torchreg._threads import one_thread, run_both
 from torchreg.geometry.neighbors import k_nearest
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.registration.blend import blend_linear
+from torchreg.registration.dense.coarse_fit import fit_coarsely
 from torchreg.registration.dense.config import (
     Hypothesis,
     OnStep,
@@ -23,20 +24,15 @@ from torchreg.registration.dense.config import (
     ScanAlignRecord,
 )
 from torchreg.registration.dense.fusion import fuse_motions
-from torchreg.registration.dense.global_rotation import turned_motions
 from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
-from torchreg.registration.dense.limb_covering import covering_limbs
-from torchreg.registration.dense.limb_swap import exchanged_limbs
 from torchreg.registration.dense.node_graph import spread_weights
-from torchreg.registration.dense.problem import NORMAL_SCALE, ScanAlignProblem, describe, first_matches
+from torchreg.registration.dense.problem import NORMAL_SCALE, ScanAlignProblem, describe
 from torchreg.registration.dense.stages import (
     Reporter,
     agree,
-    fit_first_matches,
     follow_regions,
     judge,
     loses_limb,
-    pull_one_to_one,
     refine,
     soft_matches,
     used_samples,
@@ -44,14 +40,8 @@ from torchreg.registration.dense.stages import (
 
 _One = TypeVar("_One")
 _Other = TypeVar("_Other")
-# Fewer are not fused, nor are limbs of the best rearranged: two that started apart agreed, or there are few matches.
-_LEAST_FUSED = 4
-# Nor where the two best take samples within so many times what makes hypotheses agree.
-_CONFIRMED = 2.0
 # How a graph is taken to where points are expected: that may be wrong in parts, and limbs turn far.
 _EXPECTED_STIFFNESS, _EXPECTED_FITS = 0.02, 4
-# Rearranged limbs that one-to-one matches leave worse than the best by more than this energy are not gone on with.
-_HARDLY_WORSE = 0.1
 # What the slow end may cost more than the quick one: cloth that follows its folds looks better by its features.
 # Between the two it counts so much more that the target is left bare: from far back, what bends strongly can be lost.
 _SLOW_COSTS_MORE, _BARE = 0.05, 15.0
@@ -70,20 +60,18 @@ def align_scans(
 ) -> ScanAlignment:
     """Return the source moved onto the target: a deformation graph of many small nodes, without bones yet.
 
-    Both scans are described by even samples, their curvature at several sizes and spin images. Hypotheses start from
-    rest; from where points are expected, if that is known; from matches of spin images that agree on distances along
-    the surface, fitted stiffly, or softly and then pulled by one-to-one matches; and from one-to-one matches alone.
-    Each goes on by an EM with an outlier class, while edges of the graph give where its parts disagree, matches
-    beside what something nearer hides hold across the surface alone, and samples where the target's camera saw
-    nothing are taken back into its picture. Then, unless the two best about agree and leave little of both scans over,
-    all of the source is turned, if it lies better on the target then, each part moves as in the hypothesis that suits
-    it, and the EM goes on from there as well, and from the best with two limbs exchanged or with one laid where nothing
-    covers the target, if one-to-one matches make that about as good. The best covers the target, most of all where its
-    camera would have seen it, is covered by it, is like it, bends least, leaves the larger part of each wide region
-    rigid, is nearest to what is expected, and takes no two limbs to one place; its EM is taken to the end, and beside
-    that run anew, slowly, with matches that may slide, while what is unlike the target all around follows the wide
-    regions it is in: that end is kept unless it is clearly worse or leaves more of the target bare. Where rest and
-    stiff matches agree and leave little of both scans over, the softer ones are left out, and so is the slow EM.
+    Both scans are described by even samples, their curvature at several sizes, and what a learnt `ScanMatcher` says of
+    their matches. Hypotheses start from rest; from where points are expected, if that is known; and from the matcher's
+    matches, to which a stiff graph is fitted by an EM in which they are the prior, see `fit_coarsely`. Each goes on by
+    an EM with an outlier class in which they still are, while edges of the graph give where its parts disagree, matches
+    beside what something nearer hides hold across the surface alone, and samples where the target's camera saw nothing
+    are taken back into its picture. Then, unless the two best agree and leave little of both scans over, each part
+    moves as in the hypothesis that suits it, and the EM goes on from there as well. The best covers the target, most of
+    all where its camera would have seen it, is covered by it, is like it, bends least, leaves the larger part of each
+    wide region rigid, is nearest to what is expected, and takes no two limbs to one place; its EM is taken to the end,
+    and beside that, unless two agreed, run anew, slowly, with matches that may slide, while what is unlike the target
+    all around follows the wide regions it is in: that end is kept unless it is clearly worse or leaves more of the
+    target bare.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -105,7 +93,7 @@ def align_scans(
 
     Differentiable: no.
 
-    Cost: 1 to 2.5 s for scans of 8,000 points on one core; three quarters of it where torch may use two threads, which
+    Cost: 0.7 to 1.5 s for scans of 8,000 points on one core; three quarters where torch may use two threads, which
     then follow two hypotheses side by side: the result is the same to the bit.
 
     References: Chang and Zwicker 2009, section 5, on where to start; Sumner, Schmid and Pauly 2007 for the graph;
@@ -120,14 +108,7 @@ def align_scans(
             on_step(record)
 
     problem = describe(source, target, config, generator, None if expected is None else _checked(expected, source))
-    found = sorted(_candidates(problem, config, report), key=_energy)
-    unsure = len(found) >= _LEAST_FUSED
-    if unsure and not _confirmed(problem, found, config):
-        found = sorted([*found, *_turned(problem, config, report)], key=_energy)
-        found = sorted([*found, _fused(problem, found, config, report)], key=_energy)
-        found = sorted([*found, *_rearranged(problem, found[0], config, report)], key=_energy)
-    chosen = found[0].hypothesis
-    transforms = _finished(problem, found[0], config, unsure, report)
+    transforms, hypotheses = align_problem(problem, config, report)
     weights = spread_weights(
         problem.unit.normalize(source.points),
         source.normals.detach().cpu().double(),
@@ -144,10 +125,22 @@ def align_scans(
         nodes=problem.nodes,
         weights=weights.to(source.points),
         transforms=problem.unit.denormalize_motions(transforms).to(source.points),
-        chosen=chosen,
-        hypotheses=tuple(candidate.hypothesis for candidate in found),
+        chosen=hypotheses[0],
+        hypotheses=hypotheses,
         history=tuple(history),
     )
+
+
+def align_problem(
+    problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep
+) -> tuple[Tensor, tuple[Hypothesis, ...]]:
+    """Return the motions (J, 4, 4) of the nodes, and all hypotheses, the best first; see `align_scans`."""
+    found = sorted(_candidates(problem, config, on_step), key=_energy)
+    unsure = not _confirmed(problem, found, config)
+    if unsure:
+        found = sorted([*found, _fused(problem, found, config, on_step)], key=_energy)
+    transforms = _finished(problem, found[0], config, unsure, on_step)
+    return transforms, tuple(candidate.hypothesis for candidate in found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,29 +151,17 @@ class _Candidate:
         hypothesis: how they compare.
         transforms: the motions.
         sigma: with which their EM began.
-        pulled: whether one-to-one matches led there.
     """
 
     hypothesis: Hypothesis
     transforms: Tensor
     sigma: float
-    pulled: bool = False
 
 
 def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
-    """Return candidates; where two that started apart agree and no limb is lost, others are left out."""
-    near, (matches, stiff) = _both_told(
-        on_step, partial(_near, problem, config), partial(_by_stiff_matches, problem, config)
-    )
-    if stiff is None:
-        return [*near, _one_to_one(problem, config, on_step)]
-    settled = agree(problem, near[0].transforms, stiff.transforms, config.choice)
-    if settled and not loses_limb(problem, stiff.transforms, config.choice):
-        return [*near, stiff]
-    soft, alone = _both_told(
-        on_step, partial(_by_matches, problem, config, matches), partial(_one_to_one, problem, config)
-    )
-    return [*near, stiff, soft, alone]
+    """Return the candidates before any are fused."""
+    near, matched = _both_told(on_step, partial(_near, problem, config), partial(_by_matches, problem, config))
+    return [*near, matched]
 
 
 def _near(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
@@ -194,33 +175,11 @@ def _near(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -
     return found
 
 
-def _by_stiff_matches(
-    problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep
-) -> tuple[GraphMatches, _Candidate | None]:
-    """Return the first matches, and the candidate that they lead to where parts hardly bend, if they are enough."""
-    matches = first_matches(problem, config.match)
-    if len(matches.weights) < config.match.min_matches:
-        return matches, None
-    reporter = Reporter("stiff matches", problem.unit.scale, on_step)
-    fitted = fit_first_matches(problem, matches, config.match.stiffer, config.match, reporter)
-    return matches, _compared(problem, fitted, config.refine.near_sigma, config, reporter)
-
-
-def _by_matches(
-    problem: ScanAlignProblem, config: ScanAlignConfig, matches: GraphMatches, on_step: OnStep
-) -> _Candidate:
-    """Return the candidate from the first matches, pulled one to one."""
+def _by_matches(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> _Candidate:
+    """Return the candidate from the matches of the matcher."""
     reporter = Reporter("matches", problem.unit.scale, on_step)
-    fitted = fit_first_matches(problem, matches, config.match.stiffness, config.match, reporter)
-    pulled = pull_one_to_one(problem, fitted, config.reassign, reporter)
-    return replace(_compared(problem, pulled, config.refine.sigma[0], config, reporter), pulled=True)
-
-
-def _one_to_one(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> _Candidate:
-    """Return the candidate pulled from rest by one-to-one matches alone."""
-    reporter = Reporter("one to one", problem.unit.scale, on_step)
-    pulled = pull_one_to_one(problem, problem.graph.rest(), config.assign, reporter)
-    return replace(_compared(problem, pulled, config.refine.sigma[0], config, reporter), pulled=True)
+    begin = fit_coarsely(problem, config.coarse, reporter)
+    return _compared(problem, begin, config.refine.near_sigma, config, reporter)
 
 
 def _both_told(
@@ -242,13 +201,6 @@ def _checked(expected: Any, source: RangeScan) -> Tensor:
     return expected.detach()
 
 
-def _turned(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
-    """Return the candidates from the likeliest turns of all of the source, two at most."""
-    turns = [motion.repeat(problem.graph.num_nodes, 1, 1) for motion in turned_motions(problem, config.choice, 2)]
-    starts = list(zip(("turned", "turned otherwise"), turns, strict=False))
-    return _side_by_side(problem, starts, config.refine.sigma[0], config, on_step)
-
-
 def _fused(
     problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig, on_step: OnStep
 ) -> _Candidate:
@@ -256,59 +208,6 @@ def _fused(
     begin = fuse_motions(problem, torch.stack([candidate.transforms for candidate in found]), config.choice)
     reporter = Reporter("fused", problem.unit.scale, on_step)
     return _compared(problem, begin, config.refine.fused_sigma, config, reporter)
-
-
-def _rearranged(
-    problem: ScanAlignProblem, best: _Candidate, config: ScanAlignConfig, on_step: OnStep
-) -> list[_Candidate]:
-    """Return the candidates in which two limbs of the best change places, and in which one covers what is left bare.
-
-    Of each kind it is the option that one-to-one matches make the best, and none if that looks clearly worse.
-    """
-    exchanged, covering = run_both(
-        partial(exchanged_limbs, problem, best.transforms),
-        partial(covering_limbs, problem, best.transforms, config.choice),
-    )
-    options = [("exchanged", option) for option in exchanged] + [("covering", option) for option in covering]
-    some, others = _both_told(
-        on_step, *(partial(_pulled, problem, part, config) for part in (options[::2], options[1::2]))
-    )
-    starts = []
-    for name in ("exchanged", "covering"):
-        kind = [option for option in (*some, *others) if option.hypothesis.name == name]
-        likeliest = min(kind, key=_energy, default=None)
-        if likeliest is not None and _energy(likeliest) <= _energy(best) + _HARDLY_WORSE:
-            starts.append((name, likeliest.transforms))
-    return _side_by_side(problem, starts, config.refine.near_sigma, config, on_step)
-
-
-def _pulled(
-    problem: ScanAlignProblem, options: Sequence[tuple[str, Tensor]], config: ScanAlignConfig, on_step: OnStep
-) -> list[_Candidate]:
-    """Return named options as one-to-one matches pull them."""
-    found = []
-    for name, option in options:
-        reporter = Reporter(name, problem.unit.scale, on_step)
-        transforms = pull_one_to_one(problem, option, config.reassign, reporter)
-        found.append(_Candidate(judge(problem, name, transforms, config.choice), transforms, config.refine.near_sigma))
-    return found
-
-
-def _side_by_side(
-    problem: ScanAlignProblem,
-    starts: Sequence[tuple[str, Tensor]],
-    sigma: float,
-    config: ScanAlignConfig,
-    on_step: OnStep,
-) -> list[_Candidate]:
-    """Return the candidates from two named motions (J, 4, 4) at most, followed at once."""
-
-    def followed(name: str, transforms: Tensor, told: OnStep) -> _Candidate:
-        return _compared(problem, transforms, sigma, config, Reporter(name, problem.unit.scale, told))
-
-    if len(starts) < 2:
-        return [followed(*start, on_step) for start in starts]
-    return list(_both_told(on_step, *(partial(followed, *start) for start in starts)))
 
 
 def _compared(
@@ -349,18 +248,9 @@ def _slow_is_kept(slow: Hypothesis, quick: Hypothesis) -> bool:
 
 
 def _confirmed(problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig) -> bool:
-    """Return whether the best of several candidates is believed: the next best goes there too, and no limb is lost.
-
-    The next best is one found in another way: what one-to-one matches pull from two starts is often wrong alike.
-    """
-    best = found[0]
-    next_best = next((other for other in found if other.pulled != best.pulled), None)
-    if next_best is None:
-        return False
-    like = replace(config.choice, same=_CONFIRMED * config.choice.same)
-    if not agree(problem, best.transforms, next_best.transforms, like):
-        return False
-    return not loses_limb(problem, best.transforms, config.choice)
+    """Return whether the best of several candidates is believed: the next best goes there too, and no limb is lost."""
+    best, second = (candidate.transforms for candidate in found[:2])
+    return agree(problem, best, second, config.choice) and not loses_limb(problem, best, config.choice)
 
 
 def _energy(candidate: _Candidate) -> float:

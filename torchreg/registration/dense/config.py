@@ -7,87 +7,51 @@ from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
-from torchreg._checks import check_choice, check_count, check_positive
+from torchreg._checks import check_count, check_positive
 from torchreg.errors import InputError
 from torchreg.registration.annealing import check_ends
 from torchreg.registration.dense.e_step import ScanEMConfig
-from torchreg.registration.dense.learned_descriptors import CURVATURE_RADII
 
-DESCRIPTORS = ("spin_image", "learned")
-
-
-@dataclass(frozen=True)
-class MatchConfig:
-    """How first matches are found, by descriptors, and kept, by distances along the surface.
-
-    Args:
-        num_points: of each scan that are described.
-        descriptor: "spin_image", compared by correlation, or "learned", see `learned_descriptors`: right more often,
-            in half again the time; the stages that follow mend about as much either way.
-        bin_size: of the spin images, length; learned ones have their own.
-        num_candidates: most similar targets of each point.
-        max_distance: targets farther away are no candidates, length.
-        radius: within which points vote on each other's candidates, length.
-        slack: by which distances may differ, length.
-        min_support: of the votes that a match needs.
-        min_matches: with fewer the motion is not known from them.
-        stiffness: of the graph, one fit after the other, before one-to-one matches pull it.
-        stiffer: the same for a hypothesis of parts that hardly bend.
-        scale: misses beyond this count ever less in all fits but the first, length.
-    """
-
-    num_points: int = 800
-    descriptor: str = "spin_image"
-    bin_size: float = 0.034
-    num_candidates: int = 6
-    max_distance: float = 0.35
-    radius: float = 0.2
-    slack: float = 0.02
-    min_support: float = 0.5
-    min_matches: int = 20
-    stiffness: tuple[float, ...] = (0.2, 0.06, 0.02, 0.02, 0.02)
-    stiffer: tuple[float, ...] = (6.0, 2.0, 2.0, 2.0)
-    scale: float = 0.03
-
-    def __post_init__(self) -> None:
-        check_choice(self.descriptor, "descriptor", DESCRIPTORS)
-        for name in ("num_points", "num_candidates", "min_matches"):
-            check_count(getattr(self, name), name, 1)
-        for name in ("bin_size", "max_distance", "radius", "slack", "min_support", "scale"):
-            check_positive(getattr(self, name), name)
-        for name in ("stiffness", "stiffer"):
-            _check_values(getattr(self, name), name)
+# Radii of the curvature features.
+CURVATURE_RADII = (0.02, 0.035, 0.06)
 
 
 @dataclass(frozen=True)
-class AssignConfig:
-    """How a graph is pulled by one-to-one matches, from far to near.
+class CoarseConfig:
+    """How a graph is first pulled by the matches of a learnt matcher, from far to near.
 
     Args:
-        num_steps: rounds of matching and fitting.
-        reach: beyond which there is no match, first and last, length.
-        stiffness: of the graph, first and last.
-        num_points: of the target; as many of the source as make it as dense.
-        normal_weight: see `match_one_to_one`.
-        feature_weight: see `match_one_to_one`.
-        fits_per_step: Gauss-Newton steps on the same matches.
+        num_steps: while sigma shrinks.
+        sigma: first and last, length: from the motion of a limb to what tokens are apart.
+        stiffness: of the graph, first and last: parts hardly bend.
+        give: nodes that disagree by more than this hold each other less, first and last, length.
+        normal_weight: exponent lost by normals at right angles, at the end.
+        doubt: share of the prior of a match that does not rest on the matcher, first and last.
+        outliers: samples that no match explains although the matcher calls them visible, as a share.
+        area: over which outliers are spread, squared length.
+        density: samples used per squared sigma.
+        least_samples: used of each scan, where there are as many.
     """
 
-    num_steps: int = 12
-    reach: tuple[float, float] = (0.35, 0.08)
-    stiffness: tuple[float, float] = (2.0, 0.2)
-    num_points: int = 400
-    normal_weight: float = 0.01
-    feature_weight: float = 0.02
-    fits_per_step: int = 1
+    num_steps: int = 14
+    sigma: tuple[float, float] = (0.35, 0.03)
+    stiffness: tuple[float, float] = (6.0, 1.0)
+    give: tuple[float, float] = (0.03, 0.02)
+    normal_weight: float = 3.0
+    doubt: tuple[float, float] = (0.02, 0.3)
+    outliers: float = 0.03
+    area: float = 0.5
+    density: float = 0.3
+    least_samples: int = 300
 
     def __post_init__(self) -> None:
-        for name in ("num_steps", "num_points", "fits_per_step"):
+        for name in ("num_steps", "least_samples"):
             check_count(getattr(self, name), name, 1)
-        for name in ("reach", "stiffness"):
+        for name in ("sigma", "stiffness", "give", "doubt"):
             check_ends(getattr(self, name), name)
-        for name in ("normal_weight", "feature_weight"):
-            check_positive(getattr(self, name), name, allow_zero=True)
+        for name in ("outliers", "area", "density"):
+            check_positive(getattr(self, name), name)
+        check_positive(self.normal_weight, "normal_weight", allow_zero=True)
 
 
 @dataclass(frozen=True)
@@ -105,6 +69,7 @@ class EMConfig:
         fused_sigma: from motions that have been refined and put together.
         stiffness: of the graph, first and last.
         give: nodes that disagree by more than this hold each other less, length.
+        doubt: support of a match that the matcher calls impossible, beside one of a sure match.
         feature_weight: see `ScanEMConfig`, first and last: bending and hidden surroundings change features a little.
         slide: how much misses along the surface count, squared, first and last.
         regions: how much it counts in that, while sigma shrinks, that a sample leaves the wide regions it follows, see
@@ -137,6 +102,7 @@ class EMConfig:
     fused_sigma: float = 0.012
     stiffness: tuple[float, float] = (0.2, 0.006)
     give: float = 0.01
+    doubt: float = 0.05
     feature_weight: tuple[float, float] = (8.0, 1.0)
     slide: tuple[float, float] = (1.0, 0.03)
     regions: float = 0.1
@@ -164,7 +130,7 @@ class EMConfig:
             check_ends(getattr(self, name), name)
         if self.unlike[0] >= self.unlike[1]:
             raise InputError(f"unlike must grow, got {self.unlike[0]:g} and {self.unlike[1]:g}")
-        for name in ("near_sigma", "fused_sigma", "give", "beyond_scale", "expected_scale"):
+        for name in ("near_sigma", "fused_sigma", "give", "doubt", "beyond_scale", "expected_scale"):
             check_positive(getattr(self, name), name)
         weights, limits = ("regions", "beyond", "expected"), ("both_ways_above", "boundary_above")
         for name in (*weights, *limits, "beyond_below", "beyond_margin", "density"):
@@ -239,14 +205,12 @@ class ScanAlignConfig:
         region_give: samples off a region's rigid motion by more than this are free, length.
         overlap_samples: of the source, that must not come together
         overlap_reach: if they are farther apart than this along the surface, length.
-        curvature_radii: of the features, lengths; learned descriptors rest on the default ones.
+        curvature_radii: of the features, lengths.
         occluder_depth: a surface this much nearer to the camera beside an edge hides what is behind, length.
         occluder_reach: spacings of samples within which of such an edge matches hold across the surface alone.
         most_cut: share of its outline at which a target may face the camera, if what the camera did not see is to count
             as empty: with more, the target lacks data.
-        match: the first matches.
-        assign: matches one to one from the unmoved source.
-        reassign: the same from the first matches.
+        coarse: the EM that begins with the matches of the matcher.
         refine: the EM that ends every hypothesis.
         choice: among the hypotheses.
 
@@ -267,11 +231,7 @@ class ScanAlignConfig:
     occluder_depth: float = 0.03
     occluder_reach: float = 2.5
     most_cut: float = 0.125
-    match: MatchConfig = field(default_factory=MatchConfig)
-    assign: AssignConfig = field(default_factory=AssignConfig)
-    reassign: AssignConfig = field(
-        default_factory=lambda: AssignConfig(num_steps=6, reach=(0.15, 0.08), stiffness=(0.6, 0.2))
-    )
+    coarse: CoarseConfig = field(default_factory=CoarseConfig)
     refine: EMConfig = field(default_factory=EMConfig)
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
 
@@ -288,11 +248,6 @@ class ScanAlignConfig:
         for name in ("region_reach", "region_give", "overlap_reach"):
             check_positive(getattr(self, name), name)
         _check_values(self.curvature_radii, "curvature_radii")
-        if self.match.descriptor == "learned" and tuple(self.curvature_radii) != CURVATURE_RADII:
-            raise InputError(
-                f"curvature_radii must be {CURVATURE_RADII}, from which descriptors were learned, got "
-                f"{self.curvature_radii}; others go with match.descriptor='spin_image'"
-            )
         check_positive(self.occluder_depth, "occluder_depth")
         check_positive(self.most_cut, "most_cut")
         check_positive(self.occluder_reach, "occluder_reach", allow_zero=True)
@@ -304,10 +259,10 @@ class ScanAlignRecord:
 
     Args:
         hypothesis: name of what is being followed, such as "rest" or "matches".
-        stage: "match", "assign", "refine" or, once more and slowly, "slide".
+        stage: "match", "refine" or, once more and slowly, "slide".
         step: number of the step in its stage.
         num_steps: steps planned in the stage.
-        width: reach or sigma, in the user's unit.
+        width: sigma, in the user's unit.
         misses: weighted mean squared miss of the matches, squared shares of the size.
         gaps: disagreement of neighboring nodes, squared shares of the size.
         stiffness: weight of the latter.

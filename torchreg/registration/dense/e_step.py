@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 
 from torchreg._checks import check_count, check_positive
 from torchreg.geometry.neighbors import k_nearest
+from torchreg.registration.dense.match_prior import MatchPrior
 from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.solvers.e_step import responsibilities
 
@@ -72,6 +74,8 @@ def match_softly(
     *,
     both_ways: bool = True,
     boundary: bool = True,
+    prior: MatchPrior | None = None,
+    doubt: float = 1.0,
 ) -> SoftMatches:
     """Return the expected matches of source samples, by an E-step in which every sample may be an outlier.
 
@@ -86,6 +90,8 @@ def match_softly(
         config: see `ScanEMConfig`.
         both_ways: see above.
         boundary: whether samples may match targets on a boundary, behind which the surface may go on.
+        prior: what a matcher says of matches, by which ``e_ij`` are multiplied; None if nothing is known.
+        doubt: see `MatchPrior.logarithm`.
 
     Returns:
         `SoftMatches`.
@@ -103,7 +109,7 @@ def match_softly(
     config = ScanEMConfig() if config is None else config
     scales = (sigma * math.sqrt(config.normal_weight), sigma * math.sqrt(config.feature_weight))
     here, there = source.embedded(*scales), target.embedded(*scales)
-    index, chosen = _choices(here, there, sigma, config)
+    index, chosen = _choices(here, there, sigma, config, _support(prior, doubt, by_target=False))
     if not boundary:
         chosen = chosen * ~target.boundary[index]
     posterior = chosen.sum(1)
@@ -113,7 +119,7 @@ def match_softly(
     sums = torch.einsum("sk,skd->sd", chosen, ends[index])
     weights = posterior
     if both_ways:
-        index, chosen = _choices(there, here, sigma, config)
+        index, chosen = _choices(there, here, sigma, config, _support(prior, doubt, by_target=True))
         chosen = chosen * (len(source) / len(target))
         flat = index.reshape(-1)
         weights = weights.index_add(0, flat, chosen.reshape(-1))
@@ -123,10 +129,22 @@ def match_softly(
     return SoftMatches(weights, targets, torch.nn.functional.normalize(sums[:, 3:], dim=-1), posterior, cut_off)
 
 
-def _choices(chooser: Tensor, offered: Tensor, sigma: float, config: ScanEMConfig) -> tuple[Tensor, Tensor]:
+def _support(prior: MatchPrior | None, doubt: float, *, by_target: bool) -> Callable[[Tensor], Tensor] | None:
+    """Return what tells the logarithms of the prior of matches."""
+    return None if prior is None else lambda index: prior.logarithm(index, doubt, by_target=by_target)
+
+
+def _choices(
+    chooser: Tensor,
+    offered: Tensor,
+    sigma: float,
+    config: ScanEMConfig,
+    support: Callable[[Tensor], Tensor] | None,
+) -> tuple[Tensor, Tensor]:
     """Return the most compatible others (N, K) of each sample and their posteriors."""
     index, distance = k_nearest(chooser, offered, min(config.num_candidates, len(offered)))
     # In the middle of a surface a sample has about this many others within its reach.
     density = max(1.0, _DENSITY * len(offered) * sigma**2)
     outlier = config.outliers * density * math.exp(-0.5 * _FEATURE_MISS * config.feature_weight)
-    return index, responsibilities(-0.5 * (distance.to(chooser) / sigma).square(), outlier, dim=1)
+    exponent = -0.5 * (distance.to(chooser) / sigma).square()
+    return index, responsibilities(exponent if support is None else exponent + support(index), outlier, dim=1)

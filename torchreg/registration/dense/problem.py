@@ -8,33 +8,26 @@ import torch
 from torch import Tensor
 
 from torchreg._threads import run_both
-from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.graphs import Graph
 from torchreg.geometry.neighbors import NeighborTree, sampling_distance
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.sampling import even_order
-from torchreg.registration.dense.config import MatchConfig, ScanAlignConfig
+from torchreg.registration.dense.config import ScanAlignConfig
 from torchreg.registration.dense.curvature import curvature_features
 from torchreg.registration.dense.deformation_graph import DeformationGraph
-from torchreg.registration.dense.descriptor_matching import match_descriptors
 from torchreg.registration.dense.free_space import FreeSpace
-from torchreg.registration.dense.graph_fit import GraphMatches
-from torchreg.registration.dense.isometry import consistent_matches
-from torchreg.registration.dense.learned_descriptors import learned_descriptors
+from torchreg.registration.dense.match_prior import MatchPrior
 from torchreg.registration.dense.node_graph import build_node_graph
 from torchreg.registration.dense.occlusion import likely_viewpoint, occlusion_edges
 from torchreg.registration.dense.oriented_samples import OrientedSamples, scaled_together
 from torchreg.registration.dense.rigid_regions import WideRegions
 from torchreg.registration.dense.sample_graph import sample_graph
-from torchreg.registration.dense.spin_images import spin_images
 from torchreg.registration.normalization import Normalization
 
 # What opposite normals count as where a point takes over from the samples around it, length.
 NORMAL_SCALE = 0.03
-# Points that descriptors look at, and neighbors that curvature looks at.
-SCENE, _AROUND = 1250, 100
-# Neighbors of a sample in the graph that distances for the matches are measured on.
-_NEIGHBORS = 8
+# Neighbors that curvature looks at.
+_AROUND = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +41,7 @@ class ScanAlignProblem:
         regions: of the graph's first samples, about its nodes, each of which mostly moves rigidly.
         far: (M, M) which of the graph's first samples are far from each other along the surface.
         free: where the camera saw nothing when the target was scanned; None if it is not known where the camera was.
+        prior: what the matcher says of matches of the graph's samples and those of the target.
         samples: (S,) source points that are samples of the graph.
         nodes: (J,) source points that are nodes.
         unit: in which coordinates are given.
@@ -60,6 +54,7 @@ class ScanAlignProblem:
     regions: WideRegions
     far: Tensor
     free: FreeSpace | None
+    prior: MatchPrior
     samples: Tensor
     nodes: Tensor
     unit: Normalization
@@ -121,6 +116,7 @@ def describe(
     far = _far_apart(ways, config)
     return ScanAlignProblem(
         graph=graph, source=one, target=other, regions=regions, far=far, free=free,
+        prior=MatchPrior.of_samples(one, other, len(samples)),
         samples=samples, nodes=samples[nodes.nodes], unit=unit, expected=ahead,
     )  # fmt: skip
 
@@ -152,41 +148,3 @@ def _cut_off(edges: Tensor, points: Tensor, eye: Tensor | None, config: ScanAlig
     if eye is None or len(edges) == 0:
         return torch.zeros(len(points), dtype=torch.bool)
     return NeighborTree(edges).nearest(points)[1] < config.occluder_reach * sampling_distance(points)
-
-
-def first_matches(problem: ScanAlignProblem, config: MatchConfig) -> GraphMatches:
-    """Return matches of descriptors that agree on distances along the surface, weighted by how well they do.
-
-    Cost: 0.4 s.
-
-    References: Johnson 1997; Huang et al. 2008; see `consistent_matches`.
-    """
-    here = problem.source.first(min(config.num_points, len(problem.samples)))
-    there = problem.target.first(config.num_points)
-    # Voters are within the radius; the targets of two points that vote may be farther apart.
-    (seen, ways), (other_seen, other_ways) = run_both(
-        lambda: _described(here, problem.source, config, config.radius),
-        lambda: _described(there, problem.target, config, 2 * config.radius),
-    )
-    matches = match_descriptors(
-        seen,
-        other_seen,
-        similarity="distance" if config.descriptor == "learned" else "correlation",
-        num_candidates=config.num_candidates,
-        source_points=here.points.float(),
-        target_points=there.points.float(),
-        max_distance=config.max_distance,
-    )
-    found = consistent_matches(matches, ways, other_ways, radius=config.radius, slack=config.slack)
-    kept = (found.support > config.min_support).nonzero()[:, 0]
-    return GraphMatches(kept, there.points[found.index[kept]], found.support[kept].double())
-
-
-def _described(few: OrientedSamples, scan: OrientedSamples, config: MatchConfig, limit: float) -> tuple[Tensor, Tensor]:
-    """Return descriptors of a few samples of a scan, and their distances along the surface up to a limit."""
-    scene = scan.first(SCENE)
-    ways = GeodesicGraph.from_points(few.points, min(_NEIGHBORS, len(few.points) - 1)).distances(limit=limit).float()
-    if config.descriptor == "learned":
-        return learned_descriptors(few, scene), ways
-    surface = (value.float() for value in (few.points, few.normals, scene.points, scene.normals))
-    return spin_images(*surface, bin_size=config.bin_size), ways

@@ -1,4 +1,4 @@
-"""The stages that pull a deformation graph onto a target: by few sure matches, by one-to-one matches, by EM."""
+"""The EM that pulls a deformation graph onto a target, and how well it has come there."""
 
 from __future__ import annotations
 
@@ -7,20 +7,17 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg.geometry.neighbors import NeighborTree, k_nearest, sampling_distance
+from torchreg.geometry.neighbors import NeighborTree, k_nearest
 from torchreg.registration.annealing import geometric_at
 from torchreg.registration.dense.config import (
-    AssignConfig,
     ChoiceConfig,
     EMConfig,
     Hypothesis,
-    MatchConfig,
     OnStep,
     ScanAlignRecord,
 )
 from torchreg.registration.dense.e_step import SoftMatches, match_softly
 from torchreg.registration.dense.graph_fit import GraphFit, GraphMatches, fit_graph, joined
-from torchreg.registration.dense.one_to_one import count_of_spacing, match_one_to_one
 from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.registration.dense.problem import ScanAlignProblem
 from torchreg.solvers.robust import geman_mcclure_weight
@@ -66,49 +63,6 @@ class Reporter:
         )
 
 
-def fit_first_matches(
-    problem: ScanAlignProblem,
-    matches: GraphMatches,
-    stiffnesses: tuple[float, ...],
-    config: MatchConfig,
-    reporter: Reporter,
-) -> Tensor:
-    """Return motions fitted to few sure matches, of which those that do not fit count less and less."""
-    transforms = problem.graph.rest()
-    for step, stiffness in enumerate(stiffnesses):
-        weighted = matches
-        if step > 0:
-            miss = (problem.graph(transforms, matches.which) - matches.targets).square().sum(-1)
-            weighted = replace(matches, weights=matches.weights * geman_mcclure_weight(miss / config.scale**2))
-        fit = fit_graph(problem.graph, transforms, weighted, stiffness, num_steps=2)
-        transforms = fit.transforms
-        kept = float(weighted.weights.sum()) / len(problem.samples)
-        reporter.report("match", step, len(stiffnesses), config.scale, fit, stiffness, kept)
-    return transforms
-
-
-def pull_one_to_one(problem: ScanAlignProblem, transforms: Tensor, config: AssignConfig, reporter: Reporter) -> Tensor:
-    """Return motions pulled by one-to-one matches of even samples, whose reach shrinks while the graph softens."""
-    target = problem.target.first(config.num_points)
-    count = count_of_spacing(problem.graph.points, sampling_distance(target.points))
-    for step in range(config.num_steps):
-        share = step / max(config.num_steps - 1, 1)
-        reach, stiffness = geometric_at(config.reach, share), geometric_at(config.stiffness, share)
-        found = match_one_to_one(
-            problem.moved(transforms, count),
-            target,
-            reach,
-            normal_weight=config.normal_weight,
-            feature_weight=config.feature_weight,
-        )
-        weights = (found >= 0).to(transforms)
-        matches = GraphMatches(slice(0, count), target.points[found.clamp(min=0)], weights)
-        fit = fit_graph(problem.graph, transforms, matches, stiffness, config.fits_per_step)
-        transforms = fit.transforms
-        reporter.report("assign", step, config.num_steps, reach, fit, stiffness, float(weights.mean()))
-    return transforms
-
-
 def refine(
     problem: ScanAlignProblem,
     transforms: Tensor,
@@ -152,11 +106,12 @@ def refine(
 
 def used_samples(problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: EMConfig) -> OrientedSamples:
     """Return as many moved samples as the sigma asks for."""
-    return problem.moved(transforms, _num_used(sigma, config))
+    return problem.moved(transforms, num_used(sigma, config.density, config.least_samples))
 
 
-def _num_used(sigma: float, config: EMConfig) -> int:
-    return max(round(config.density / sigma**2), config.least_samples)
+def num_used(sigma: float, density: float, least: int) -> int:
+    """Return how many samples a sigma asks for: so many per squared sigma, and at least some."""
+    return max(round(density / sigma**2), least)
 
 
 def soft_matches(
@@ -167,11 +122,13 @@ def soft_matches(
     compatible = replace(config.compatible, feature_weight=first + (last - first) * min(share, 1.0))
     return match_softly(
         moved,
-        problem.target.first(_num_used(sigma, config)),
+        problem.target.first(num_used(sigma, config.density, config.least_samples)),
         sigma,
         compatible,
         both_ways=sigma > config.both_ways_above,
         boundary=sigma >= config.boundary_above,
+        prior=problem.prior,
+        doubt=config.doubt,
     )
 
 

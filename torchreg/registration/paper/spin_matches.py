@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchreg.geometry.range_scan import RangeScan
-from torchreg.registration.dense.spin_images import image_similarity, spin_images
 from torchreg.registration.paper.config import PaperConfig
+from torchreg.registration.paper.spin_images import image_similarity, spin_images
 from torchreg.solvers.ransac import ransac_rigid
 
 # Points that spin images count are this share of a bin apart, so that both scans are sampled alike.

@@ -1,0 +1,85 @@
+"""From rest to about the target: a graph pulled by a learnt matcher's matches, by an EM that keeps them as prior."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.rigid import fit_rigid, transform_points
+from torchreg.registration.annealing import geometric_at
+from torchreg.registration.dense.config import CoarseConfig
+from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
+from torchreg.registration.dense.match_prior import MatchPrior
+from torchreg.registration.dense.problem import ScanAlignProblem
+from torchreg.registration.dense.stages import Reporter, num_used
+from torchreg.solvers.robust import geman_mcclure_weight
+
+# Rounds in which matches that do not fit a rigid motion count less and less.
+_ROUNDS = 5
+
+
+def fit_coarsely(problem: ScanAlignProblem, config: CoarseConfig, reporter: Reporter) -> Tensor:
+    """Return motions (J, 4, 4) of the nodes, however far the source moved or was turned.
+
+    A sample i matches a target j with ``q_ij = p_ij N_ij / (sum_k p_ik N_ik + h_i / A)``, N_ij a Gaussian of their
+    distance: the matcher's posterior p stays the prior of every match to the end, and what it calls hidden, h, is the
+    outlier class, spread over an area A. Targets choose among samples alike. While sigma shrinks, normals count ever
+    more, the matcher is doubted ever more, and the graph softens.
+
+    References: Myronenko and Song 2010, for the EM with an outlier class.
+    """
+    transforms = rigid_start(problem.prior, problem.source.points, problem.target.points, config)
+    transforms = transforms.repeat(problem.graph.num_nodes, 1, 1)
+    for step in range(config.num_steps):
+        share = step / max(config.num_steps - 1, 1)
+        sigma, stiffness = geometric_at(config.sigma, share), geometric_at(config.stiffness, share)
+        matches = _expected_matches(problem, transforms, sigma, share, config)
+        fit = fit_graph(problem.graph, transforms, matches, stiffness, give=geometric_at(config.give, share))
+        transforms = fit.transforms
+        reporter.report("match", step, config.num_steps, sigma, fit, stiffness, float(matches.weights.mean()))
+    return transforms
+
+
+def rigid_start(prior: MatchPrior, source: Tensor, target: Tensor, config: CoarseConfig) -> Tensor:
+    """Return the motion (4, 4) of all of a source that suits most of the matches of the matcher.
+
+    Args:
+        prior: of the matches.
+        source: (S, 3) samples, the first of which are tokens.
+        target: (T, 3) the same of the target.
+        config: matches off by more than the first sigma count ever less.
+    """
+    mass = prior.by_source.sum(1)
+    targets = prior.by_source @ target[: prior.by_source.shape[1]]
+    targets = targets / mass.clamp_min(torch.finfo(mass.dtype).tiny).unsqueeze(1)
+    tokens, weights = source[: len(mass)], mass
+    for _ in range(_ROUNDS):
+        motion = fit_rigid(tokens, targets, weights)
+        apart = (transform_points(motion, tokens) - targets).square().sum(-1)
+        weights = mass * geman_mcclure_weight(apart / config.sigma[0] ** 2)
+    return motion
+
+
+def _expected_matches(
+    problem: ScanAlignProblem, transforms: Tensor, sigma: float, share: float, config: CoarseConfig
+) -> GraphMatches:
+    """Return the E-step of as many samples as the sigma asks for."""
+    count = min(len(problem.samples), num_used(sigma, config.density, config.least_samples))
+    target = problem.target.first(num_used(sigma, 2 * config.density, config.least_samples))
+    moved, normals = problem.graph.move_with_normals(transforms, slice(0, count))
+    near = torch.cdist(moved, target.points).square().mul_(-1 / (2 * sigma**2))
+    near = near.add_(normals @ target.normals.mT - 1, alpha=config.normal_weight * share).exp_()
+    prior, doubt = problem.prior, geometric_at(config.doubt, share)
+    visible, shown = prior.visible[:count, None], prior.target_visible[: len(target)]
+    by_source, by_target = prior.tables(count, len(target))
+    # A density per area, as that of the Gaussian along the surface.
+    outlier = 2 * math.pi * sigma**2 / config.area
+    chosen = near * torch.lerp(by_source, visible / len(target), doubt)
+    choice = chosen / (chosen.sum(1, keepdim=True) + outlier * (1 - visible + config.outliers))
+    chosen = near * torch.lerp(by_target, shown / count, doubt)
+    choice += (count / len(target)) * chosen / (chosen.sum(0) + outlier * (1 - shown + config.outliers))
+    weights = choice.sum(1)
+    targets = choice @ target.points / weights.clamp_min(torch.finfo(weights.dtype).tiny).unsqueeze(1)
+    return GraphMatches(slice(0, count), torch.where(weights.unsqueeze(1) > 0, targets, moved), weights)

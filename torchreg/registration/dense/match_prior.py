@@ -1,0 +1,115 @@
+"""What a learnt matcher says of the samples of two scans: the prior of every match in an EM."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.neighbors import k_nearest
+from torchreg.registration.dense.oriented_samples import OrientedSamples
+from torchreg.registration.dense.scan_matcher import ScanMatcher
+from torchreg.registration.dense.scan_tokens import ScanTokens
+
+# Tokens about each sample between which it lies, and how much nearer the nearest one counts: about their spacing.
+_ABOUT, _SOFT = 3, 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class MatchPrior:
+    """Probabilities of matches of the tokens of two scans, spread over the samples about them.
+
+    Args:
+        by_source: (A, B) that a token of the source is each of the target's; what is missing to one: that it is hidden.
+        by_target: (A, B) that a token of the target is each of the source's; columns alike.
+        source: (S, A) by how much each sample of the source belongs to each token; rows sum to one.
+        target: (T, B) the same of the target.
+    """
+
+    by_source: Tensor
+    by_target: Tensor
+    source: Tensor
+    target: Tensor
+
+    @classmethod
+    def of_logits(cls, logits: Tensor, source: Tensor, target: Tensor) -> MatchPrior:
+        """Return the prior of a matcher's logits.
+
+        Args:
+            logits: (A + 1, B + 1), see `ScanMatcher`.
+            source: (S, 3) samples, the first A of which are tokens; fewer samples than A are repeated.
+            target: (T, 3).
+        """
+        by_source, by_target = logits[:-1].softmax(1)[:, :-1], logits[:, :-1].softmax(0)[:-1]
+        return cls(by_source, by_target, _shares(source, by_source.shape[0]), _shares(target, by_source.shape[1]))
+
+    @classmethod
+    def of_samples(cls, source: OrientedSamples, target: OrientedSamples, count: int) -> MatchPrior:
+        """Return what the matcher of torchreg says of samples, the first ``count`` of the source alone.
+
+        Cost: 0.2 CPU seconds.
+        """
+        tokens = (ScanTokens.from_even(scan.points, scan.normals, scan.boundary) for scan in (source, target))
+        logits = _matcher()(*tokens)[0].to(source.points)
+        return cls.of_logits(logits, source.points[:count], target.points)
+
+    @cached_property
+    def _offers(self) -> tuple[tuple[Tensor, tuple[Tensor, Tensor]], tuple[Tensor, tuple[Tensor, Tensor]]]:
+        """What each sample (S, B) makes of the other scan's tokens, and the few tokens about each of its samples."""
+        count = min(_ABOUT, *self.by_source.shape)
+        near, there = self.source.topk(count, dim=1), self.target.topk(count, dim=1)
+        return (self.source @ self.by_source, (there[0], there[1])), (
+            self.target @ self.by_target.mT,
+            (near[0], near[1]),
+        )
+
+    @cached_property
+    def visible(self) -> Tensor:
+        """(S,) probability that the target shows each sample of the source."""
+        return self.source @ self.by_source.sum(1)
+
+    @cached_property
+    def target_visible(self) -> Tensor:
+        """(T,) probability that the source shows each sample of the target."""
+        return self.target @ self.by_target.sum(0)
+
+    def tables(self, count: int, seen: int) -> tuple[Tensor, Tensor]:
+        """Return probabilities (n, m) of matches of the first samples of both scans, by source and by target.
+
+        What a token has is shared among the samples about it, so that rows and columns sum to what is visible.
+        """
+        here, there = self.source[:count], self.target[:seen]
+        tiny = torch.finfo(here.dtype).tiny
+        one = here @ self.by_source @ (there / there.sum(0).clamp_min(tiny)).mT
+        other = (here / here.sum(0).clamp_min(tiny)) @ self.by_target @ there.mT
+        return one, other
+
+    def logarithm(self, index: Tensor, doubt: float, *, by_target: bool = False) -> Tensor:
+        """Return the logarithm (n, K) of how far matches are supported: zero for a sure one.
+
+        Args:
+            index: (n, K) samples of the other scan that each of the first samples may match.
+            doubt: support of what the matcher calls impossible.
+            by_target: whether the target's samples choose among the source's, instead of the other way.
+        """
+        chances, (weight, about) = self._offers[int(by_target)]
+        rows = torch.arange(len(index), device=index.device)[:, None, None]
+        # A sure match of samples between tokens has the share of one token.
+        support = _ABOUT * (chances[rows, about[index]] * weight[index]).sum(-1)
+        return ((support + doubt) / (1 + doubt)).log()
+
+
+@cache
+def _matcher() -> ScanMatcher:
+    return ScanMatcher().requires_grad_(False)
+
+
+def _shares(points: Tensor, count: int) -> Tensor:
+    """Return by how much points (N, 3) belong to tokens, the first of them, (N, count); rows sum to one."""
+    tokens = points[:count]
+    index, distance = k_nearest(points, tokens, min(_ABOUT, len(tokens)))
+    weights = 1 / (distance + (_SOFT * distance.mean()).clamp_min(torch.finfo(distance.dtype).tiny))
+    weights = (weights / weights.sum(1, keepdim=True)).to(points)
+    return points.new_zeros(len(points), count).scatter_(1, index, weights)
