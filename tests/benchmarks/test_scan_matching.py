@@ -16,10 +16,9 @@ def test_smoke_prints_every_kind(benchmark, capsys, monkeypatch):
     assert all(name in printed for name in (*kinds, "all", "skipped"))
 
 
-def test_points_belong_to_the_tokens_around_them(benchmark):
-    tokens = torch.eye(3, dtype=torch.float64).repeat(2, 1)
-    tokens[3:] += 10
-    rows = benchmark.shares(torch.tensor([[0.9, 0.0, 0.0]], dtype=torch.float64), tokens)
-    assert float(rows.sum()) == pytest.approx(1.0)
-    assert int(rows.argmax()) == 0
-    assert float(rows[0, 3:].sum()) == 0.0
+def test_who_knows_the_truth_is_sure_of_it(benchmark):
+    truth = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [9.0, 0, 0]], dtype=torch.float64)
+    places = torch.tensor([[1.0, 0, 0], [0.0, 0, 0], [4.0, 0, 0]], dtype=torch.float64)
+    logits = benchmark.true_logits(truth, places, torch.tensor([True, True, False]))
+    assert logits[:-1].argmax(1).tolist() == [1, 0, 3]
+    assert logits[:, :2].argmax(0).tolist() == [1, 0]

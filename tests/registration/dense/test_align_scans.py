@@ -334,7 +334,7 @@ def about(place, angle):
     return turn
 
 
-@pytest.mark.parametrize(("raised", "bent"), [(0.2, 0.4), (0.3, 0.9)])
+@pytest.mark.parametrize(("raised", "bent"), [(0.2, 0.4), (0.1, 0.6)])
 def test_a_hand_leaves_the_hip_that_it_touches(raised, bent):
     points, normals, part, moved, _ = body(raised, bent, 0)
     _, _, _, there, facing = body(raised, bent, 1)
@@ -344,13 +344,12 @@ def test_a_hand_leaves_the_hip_that_it_touches(raised, bent):
     assert float(error.mean()) < 0.005
 
 
-def test_tiny_and_disjoint_scans_have_sound_results(pair):
+def test_tiny_flat_and_distant_scans_have_sound_results(pair):
     tiny = RangeScan(torch.rand(6, 3, generator=torch.Generator().manual_seed(0)))
     assert bool(align_scans(tiny, tiny, QUICK).points.isfinite().all())
     flat = torch.rand(200, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 1.0, 0.0])
     plane = align_scans(RangeScan(flat), RangeScan(flat + 0.01), QUICK)
     assert float((plane.points - flat).norm(dim=-1).max()) < 0.2
-    far = pair.target.transformed(se3_exp(torch.tensor([1000.0, 0, 0, 0, 0, 0])))
-    apart = align_scans(pair.source, far, QUICK)
-    assert float(apart.confidence.max()) == 0
-    torch.testing.assert_close(apart.points, pair.source.points)
+    shift = torch.tensor([20.0, 0.0, 0.0])
+    far = align_scans(pair.source, pair.target.shifted(shift), QUICK)
+    assert float(((far.points - shift - pair.truth).norm(dim=-1) < 0.025 * pair.source.diagonal).float().mean()) > 0.9

@@ -49,6 +49,21 @@ def test_support_is_that_of_the_tokens_about(prior, by_target):
             assert float(found[row, column]) == pytest.approx(float(((3 * chance + 0.1) / 1.1).log()))
 
 
+def test_tokens_that_repeat_samples_count_together():
+    generator = torch.Generator().manual_seed(2)
+    source, target = (torch.rand(size, 3, generator=generator, dtype=torch.float64) for size in (4, 5))
+    alone = torch.randn(5, 6, generator=generator, dtype=torch.float64)
+    # Twice each token, with half its odds: hidden tokens stay as likely.
+    rows, columns = torch.tensor([0, 1, 2, 3] * 2 + [4]), torch.tensor([0, 1, 2, 3, 4] * 2 + [5])
+    doubled = alone[rows][:, columns] - torch.log(torch.tensor(2.0))
+    doubled[:, -1], doubled[-1] = alone[rows, -1], alone[-1, columns]
+    doubled[-1, -1] = alone[-1, -1]
+    one, two = (MatchPrior.of_logits(logits, source, target) for logits in (alone, doubled))
+    torch.testing.assert_close(two.by_source, one.by_source)
+    torch.testing.assert_close(two.by_target, one.by_target)
+    assert two.source.shape == (4, 4)
+
+
 def test_doubt_bounds_what_impossible_matches_lose(prior):
     index = torch.arange(90).expand(60, -1)
     assert float(prior.logarithm(index, 0.1).min()) >= torch.tensor(0.1 / 1.1).log()

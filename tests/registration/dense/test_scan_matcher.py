@@ -49,7 +49,9 @@ def test_turns_shifts_and_size_of_either_scan_change_nothing(matcher, pair):
     double = pair.target.transformed(torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0])))
     moved = matcher.match(turned(pair.source), turned(double, 1))
     assert torch.equal(moved.source_index, alone.source_index)
-    torch.testing.assert_close(moved.probability, alone.probability, atol=2e-3, rtol=0)
+    torch.testing.assert_close(
+        moved.probability, alone.probability, atol=1e-2, rtol=0
+    )  # float32, 4 blocks of attention
 
 
 def test_right_is_told_from_left(matcher, pair):

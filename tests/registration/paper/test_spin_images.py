@@ -5,7 +5,7 @@ import torch
 
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.rigid import se3_exp, transform_points
-from torchreg.registration.dense import spin_images as module
+from torchreg.registration.paper import spin_images as module
 from torchreg.registration.paper.spin_images import image_similarity, spin_images
 
 

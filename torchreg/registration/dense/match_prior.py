@@ -39,11 +39,13 @@ class MatchPrior:
 
         Args:
             logits: (A + 1, B + 1), see `ScanMatcher`.
-            source: (S, 3) samples, the first A of which are tokens; fewer samples than A are repeated.
+            source: (S, 3) samples, the first A of which are tokens; of fewer samples tokens repeat some.
             target: (T, 3).
         """
         by_source, by_target = logits[:-1].softmax(1)[:, :-1], logits[:, :-1].softmax(0)[:-1]
-        return cls(by_source, by_target, _shares(source, by_source.shape[0]), _shares(target, by_source.shape[1]))
+        rows, columns = (min(size, len(points)) for size, points in zip(by_source.shape, (source, target), strict=True))
+        by_source, by_target = _folded(by_source, columns)[:rows], _folded(by_target.mT, rows).mT[:, :columns]
+        return cls(by_source, by_target, _shares(source, rows), _shares(target, columns))
 
     @classmethod
     def of_samples(cls, source: OrientedSamples, target: OrientedSamples, count: int) -> MatchPrior:
@@ -104,6 +106,11 @@ class MatchPrior:
 @cache
 def _matcher() -> ScanMatcher:
     return ScanMatcher().requires_grad_(False)
+
+
+def _folded(table: Tensor, count: int) -> Tensor:
+    """Return a table (A, B) with what it holds of repeated tokens, those after ``count``, added to the first ones."""
+    return table.new_zeros(len(table), count).index_add(1, torch.arange(table.shape[1]) % count, table)
 
 
 def _shares(points: Tensor, count: int) -> Tensor:
