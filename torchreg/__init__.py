@@ -39,6 +39,7 @@ _NAMES = {
     "io.scans": "load_scan",
     "registration.bones.grid_lbs": "GridLBS",
     "registration.bones.registration_energy": "RegistrationEnergy",
+    "registration.dense.scan_matcher": "ScanMatcher ScanMatches",
     "registration.config": "RegisterConfig",
     "registration.register": "register",
     "registration.register_sequence": "register_sequence",

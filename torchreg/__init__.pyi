@@ -42,6 +42,8 @@ from torchreg.io.scans import load_scan as load_scan
 from torchreg.registration.bones.grid_lbs import GridLBS as GridLBS
 from torchreg.registration.bones.registration_energy import RegistrationEnergy as RegistrationEnergy
 from torchreg.registration.config import RegisterConfig as RegisterConfig
+from torchreg.registration.dense.scan_matcher import ScanMatcher as ScanMatcher
+from torchreg.registration.dense.scan_matcher import ScanMatches as ScanMatches
 from torchreg.registration.register import register as register
 from torchreg.registration.register_sequence import register_sequence as register_sequence
 from torchreg.registration.results import PoseSolution as PoseSolution
@@ -106,6 +108,8 @@ __all__ = [
     "RangeScan",
     "RegisterConfig",
     "RegistrationEnergy",
+    "ScanMatcher",
+    "ScanMatches",
     "ScanRegistration",
     "SequenceRegistration",
     "ShapeOutput",

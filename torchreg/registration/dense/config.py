@@ -69,7 +69,8 @@ class EMConfig:
         fused_sigma: from motions that have been refined and put together.
         stiffness: of the graph, first and last.
         give: nodes that disagree by more than this hold each other less, length.
-        doubt: support of a match that the matcher calls impossible, beside one of a sure match.
+        doubt: support at first of a match that the matcher calls impossible, beside one of a sure match; at the last
+            sigma, far below what its tokens are apart, all count alike.
         feature_weight: see `ScanEMConfig`, first and last: bending and hidden surroundings change features a little.
         slide: how much misses along the surface count, squared, first and last.
         regions: how much it counts in that, while sigma shrinks, that a sample leaves the wide regions it follows, see

@@ -128,7 +128,7 @@ def soft_matches(
         both_ways=sigma > config.both_ways_above,
         boundary=sigma >= config.boundary_above,
         prior=problem.prior,
-        doubt=config.doubt,
+        doubt=geometric_at((config.doubt, 1.0), min(share, 1.0)),
     )
 
 
