@@ -1,9 +1,10 @@
 """A robot's description out of scans of it: made-up arms of boxes in a few poses, registered and written as URDF.
 
 An arm has 3 to 7 hinges with axes at random, links of boxes of different sizes, and moves by random steps about each
-axis from frame to frame; scans are its whole surface, sampled anew in each frame, as fused views give it. Reported are
-the Rand index of the parts, the median angle of the axes from the nearest true one, and how far the points of the
-reference, moved by the found joints, lie from where they truly are, as medians in the worst frame and over all.
+axis from frame to frame; scans are its whole surface, the same points of it in every frame, which is easier than what
+cameras see. Reported are the Rand index of the parts, the median angle of the axes from the nearest true one, and how
+far the points of the reference, moved by the found joints, lie from where they truly are, as medians in the worst frame
+and over all.
 
     python benchmarks/scan_urdf.py
 """

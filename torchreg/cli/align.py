@@ -125,15 +125,14 @@ def align(
     clouds = cloud_files(clouds) if pictures is None else [Path(name) for name in pictures.names]
     output = with_ending(output, (".safetensors",), add=True)
     optional = with_ending(pose, (".json", ".csv")), with_ending(ply, (".ply",)), with_ending(picture, PICTURE_ENDINGS)
-    count = len(clouds)
-    files = [_Files(numbered(output, k, count), *(numbered(name, k, count) for name in optional)) for k in range(count)]
+    files = _output_files(output, optional, len(clouds))
     check_outputs([*(path for entry in files for path in entry.all()), with_ending(gltf, (".glb",))], force)
     for path in clouds:
         path.stat()  # a missing file is reported before the first is aligned
 
     from tqdm import tqdm
 
-    with tqdm(total=count, unit="cloud", desc="reading", leave=False, disable=quiet) as bar:
+    with tqdm(total=len(clouds), unit="cloud", desc="reading", leave=False, disable=quiet) as bar:
         model = load_shape(shape, parents, package_dir, free_base, skin)
         from torchreg.alignment.align import AlignConfig
         from torchreg.shapes.skin import sample_skin
@@ -142,26 +141,27 @@ def align(
         config = AlignConfig(schedule=read_schedule(sigma), outlier=outlier, search=search, nan_policy=nan_policy)
         first = None if start is None else load_pose(start, model)
         points = sample_skin(model, config.num_model_points, sharpness=config.sharpness)
-        known = read_known(model, locked, joints, joint_std, count)
+        known = read_known(model, locked, joints, joint_std, len(clouds))
         run = _AlignRun(model, config, points, scale, time, frame, first, known, pictures)
-        interrupted = False
         try:
-            for number, (path, entry) in enumerate(zip(clouds, files, strict=True)):
-                bar.set_description(path.name)
-                result = run.align(number, path, entry, on_step=lambda record: _show_stage(bar, record.stage))
-                bar.update()
-                if not quiet:
-                    loose = observability(model, result) if known.rows else ""
-                    told = "; ".join(filter(None, (alignment_summary(result), loose)))
-                    bar.write(f"{path}: {told} -> {entry.result}")
+            run.align_all(clouds, files, bar, quiet)
+            interrupted = False
         except KeyboardInterrupt:
             interrupted = True
         if gltf is not None and run.results:
             run.save_motion(gltf)
     if interrupted:
-        raise interruption(f"{len(run.results)} of {count} clouds are done")
+        raise interruption(f"{len(run.results)} of {len(clouds)} clouds are done")
     if not all(result.statuses[0].usable for result in run.results):
         raise typer.Exit(ExitCode.UNUSABLE)
+
+
+def _output_files(output: Path, optional: Iterable[Path | None], count: int) -> list[_Files]:
+    """Return the outputs of each cloud, numbered if there are several."""
+    return [
+        _Files(numbered(output, number, count), *(numbered(name, number, count) for name in optional))
+        for number in range(count)
+    ]
 
 
 def _show_stage(bar: Any, stage: str) -> None:
@@ -190,6 +190,17 @@ class _AlignRun:
         from torchreg.datasets.hand import surface_skin
 
         return surface_skin(self.shape)
+
+    def align_all(self, clouds: list[Path], files: list[_Files], bar: Any, quiet: bool) -> None:
+        """Align to all clouds, and tell of each."""
+        for number, (path, entry) in enumerate(zip(clouds, files, strict=True)):
+            bar.set_description(path.name)
+            result = self.align(number, path, entry, on_step=lambda record: _show_stage(bar, record.stage))
+            bar.update()
+            if not quiet:
+                loose = observability(self.shape, result) if self.known.rows else ""
+                told = "; ".join(filter(None, (alignment_summary(result), loose)))
+                bar.write(f"{path}: {told} -> {entry.result}")
 
     def align(self, number: int, path: Path, files: _Files, on_step: Callable[[Any], None]) -> AlignResult:
         """Return the alignment to one cloud or picture, after writing it."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -227,7 +227,7 @@ def _limited(tree: KinematicTree, values: Tensor, size: float) -> KinematicTree:
             margin = _NUMBERS.margin * (size if joint.kind == "prismatic" else 1.0)
             column = values[:, number]
             lower, upper = min(0.0, float(column.min())) - margin, max(0.0, float(column.max())) + margin
-            joint = Joint(joint.name, joint.parent, joint.offset, joint.kind, joint.axis, lower, upper)
+            joint = replace(joint, lower=lower, upper=upper)
             number += 1
         joints.append(joint)
     return KinematicTree(tuple(joints))
