@@ -23,10 +23,9 @@ def skin(hand):
 
 def frame_of(alignment, number, pose, status, acquired):
     known = {item.name: getattr(alignment, item.name) for item in fields(alignment)}
-    known |= {"pose": pose, "status": status}
+    known |= {"pose": pose, "status": status, "covariance": torch.eye(27)}
     return FrameResult(
-        **known, covariance=torch.eye(27), acquired=acquired, frame=number, time=0.05 * number, inlier_ratio=0.5,
-        residual=0.001,
+        **known, acquired=acquired, frame=number, time=0.05 * number, inlier_ratio=0.5, residual=0.001
     )  # fmt: skip
 
 

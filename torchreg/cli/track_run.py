@@ -16,7 +16,6 @@ import typer
 from torchreg.cli.outputs import check_outputs, tell_origin
 from torchreg.cli.reporting import show_warning
 from torchreg.errors import FormatError, InputError, UnitsWarning
-from torchreg.geometry.loaded import as_points
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -95,6 +94,8 @@ class Clouds(Sequence["Tensor"]):
         return len(self._frames)
 
     def __getitem__(self, index: Any) -> Any:
+        from torchreg.geometry.loaded import as_points
+
         return as_points(self.frame(index))
 
     def frame(self, index: Any) -> Any:
@@ -115,6 +116,7 @@ class Clouds(Sequence["Tensor"]):
     def origin(self) -> Tensor | None:
         """Where coordinates begin (3,), float64; None at zero."""
         from torchreg.geometry.far_origin import far_origin
+        from torchreg.geometry.loaded import as_points
 
         for index in range(len(self) if self._floating else 0):
             try:

@@ -442,8 +442,8 @@ def draw_crane(draw: Draw) -> Creature:
 Kind = Callable[[Draw], Creature]
 # With the share of each in what is drawn: most of what is scanned are people and animals.
 TRAINING_KINDS: dict[str, tuple[Kind, float]] = {
-    "quadruped": (draw_quadruped, 0.26),
-    "person": (draw_person, 0.22),
+    "quadruped": (draw_quadruped, 0.27),
+    "person": (draw_person, 0.23),
     "hand": (draw_hand, 0.06),
     "plant": (draw_plant, 0.04),
     "arm": (draw_arm, 0.05),
