@@ -256,7 +256,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--smoke", action="store_true", help="a version of seconds")
     options = parser.parse_args(arguments)
-    count, seconds = (8, 1.0) if options.smoke else (options.count, options.seconds)
+    count, seconds = (4, 0.4) if options.smoke else (options.count, options.seconds)
     with tempfile.TemporaryDirectory() as name:
         if _RESET.exists():
             (Path(name) / "crafted").mkdir()
