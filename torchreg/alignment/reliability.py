@@ -212,8 +212,8 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
     gain = _gain(problem, pose, distance, jacobian, noise, covariance) / shared.square()
     if problem.told_precision is not None:
         # A depth camera sees all surfaces off by one distance, of the order of the noise: it moves what is not held.
-        pull = jacobian.mT @ (near / (noise.square() * shared).unsqueeze(-1)).unsqueeze(-1)
-        moved = covariance @ pull * noise[:, None, None]
+        gradient = jacobian.mT @ (near / (noise.square() * shared).unsqueeze(-1)).unsqueeze(-1)
+        moved = covariance @ gradient * noise[:, None, None]
         covariance = covariance + moved @ moved.mT
     return Curvature(covariance + torch.diag_embed(_misplaced_share(problem, pose) / precision), gain)
 

@@ -131,8 +131,8 @@ def _joint(points: Tensor, part: Tensor, motions: Tensor, first: int, second: in
     matrix, right = relative[:, :3, :3] - torch.eye(3).double(), -relative[:, :3, 3]
     normal = (matrix.mT @ matrix).sum(0)
     regular = 1e-3 * normal.diagonal().sum().clamp_min(1e-9)
-    pull = ((right - matrix @ middle).unsqueeze(-2) @ matrix).sum(0)[0]
-    point = middle + torch.linalg.solve(normal + regular * torch.outer(axis, axis) + 1e-12 * torch.eye(3), pull)
+    gradient = ((right - matrix @ middle).unsqueeze(-2) @ matrix).sum(0)[0]
+    point = middle + torch.linalg.solve(normal + regular * torch.outer(axis, axis) + 1e-12 * torch.eye(3), gradient)
     posed = (moved - point) @ rotations.mT + point
     hinge = _root_mean_square(seen - posed)
     if weld < _NUMBERS.weld * noise:

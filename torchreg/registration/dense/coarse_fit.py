@@ -1,4 +1,4 @@
-"""From rest to about the target: a graph pulled by a learnt matcher's matches, by an EM that keeps them as prior."""
+"""A coarse fit of the deformation graph to a learnt matcher's matches, by an EM that keeps them as prior."""
 
 from __future__ import annotations
 

@@ -12,13 +12,10 @@ from torchreg.errors import InputError
 from torchreg.registration.annealing import check_ends
 from torchreg.registration.dense.e_step import ScanEMConfig
 
-# Radii of the curvature features.
-CURVATURE_RADII = (0.02, 0.035, 0.06)
-
 
 @dataclass(frozen=True)
 class CoarseConfig:
-    """How a graph is first pulled by the matches of a learnt matcher, from far to near.
+    """How the graph is first fitted to the matches of a learnt matcher, by EM with an annealed sigma.
 
     Args:
         num_steps: while sigma shrinks.
@@ -56,7 +53,7 @@ class CoarseConfig:
 
 @dataclass(frozen=True)
 class EMConfig:
-    """How a graph is pulled by soft matches, annealed.
+    """How the graph is fitted to soft matches, by EM with an annealed sigma.
 
     Args:
         num_steps: while sigma shrinks.
@@ -228,7 +225,7 @@ class ScanAlignConfig:
     region_give: float = 0.05
     overlap_samples: int = 600
     overlap_reach: float = 0.1
-    curvature_radii: tuple[float, ...] = CURVATURE_RADII
+    curvature_radii: tuple[float, ...] = (0.02, 0.035, 0.06)
     occluder_depth: float = 0.03
     occluder_reach: float = 2.5
     most_cut: float = 0.125

@@ -1,4 +1,4 @@
-"""The EM that pulls a deformation graph onto a target, and how well it has come there."""
+"""The EM that fits a deformation graph to a target, and the energy by which results are compared."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def soft_matches(
 
 def _along_surface(found: SoftMatches, slide: float, beside_edges: bool, follow: Tensor | None) -> GraphMatches:
     """Return matches of the first samples, that may slide; the more beside what is hidden, and if they follow."""
-    # A sample beside an edge, whose own place may be hidden behind, must not be pulled to what is still seen.
+    # A sample beside an edge, whose own place may be hidden behind, must not be attracted to what is still seen.
     free = slide * (1 - found.cut_off) if beside_edges else torch.full_like(found.weights, slide)
     free = free if follow is None else free * (1 - follow[: len(free)])
     return GraphMatches(slice(0, len(found.weights)), found.targets, found.weights, found.normals, free)
