@@ -36,6 +36,7 @@ from torchreg.cli.view import Browser, Port, tell_url
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from torchreg.capture.depth_frames import DepthFrames
     from torchreg.capture.stereo_frames import StereoFrames
     from torchreg.shapes.articulated import ArticulatedShape
     from torchreg.shapes.skin import LinearBlendSkin
@@ -138,19 +139,16 @@ def track(
     Exit codes: 0; 1 if in any frame the shape was lost or is doubtful, or there were no data; 2 for an error; 130 for
     Ctrl-C.
     """
-    from torchreg._checks import check_positive
-
     files, resumed = _files(output, movie, gltf, overlay, resume, force)
     poses = with_ending(poses, (".csv",))
     check_outputs([poses], force or resumed)
-    check_positive(fps, "--fps")
-    check_positive(scale, "--scale")
+    _check_rates(fps, scale)
     views = {"--volume": volume, "--matcher": matcher, "--reach": reach, "--seen": seen}
     check_used(stereo, "--stereo", {"--calibration": calibration, **views})
     check_used(depth, "--depth", {"--intrinsics": intrinsics, "--mask": mask})
     check_used(stereo or depth, "--stereo or --depth", {"--depth-range": depth_range})
     options = parents, package_dir, free_base, skin
-    pictures = None
+    pictures = images = folder = None
     if stereo:
         model = load_shape(shape, *options)
         pictures = stereo_source(frames, calibration, model, depth_range, volume, matcher, reach, scale)
@@ -174,17 +172,31 @@ def track(
         run = TrackRun(
             tracker=tracker, clouds=clouds, fps=fps, job=job, files=files, report=report, save_every=save_every
         )
-        if pictures is not None:
-            run.job |= stereo_job(pictures)
-            run.seen = _drawn_pictures(pictures, folder)
-        if depth:
-            run.job |= depth_job(images)
+        _add_pictures(run, pictures, folder, images)
         if view:
             run.live = _live_page(pages, port, browser, quiet)
         complete = _run(run, bar, resumed)
     if poses is not None:
         _write_poses(poses, model, run.located)
     _report_end(run, complete, quiet)
+
+
+def _check_rates(fps: float, scale: float) -> None:
+    from torchreg._checks import check_positive
+
+    check_positive(fps, "--fps")
+    check_positive(scale, "--scale")
+
+
+def _add_pictures(
+    run: TrackRun, pictures: StereoFrames | None, folder: Path | None, images: DepthFrames | None
+) -> None:
+    """Tell a run which pictures its clouds come from: progress belongs to them, and what two cameras see is drawn."""
+    if pictures is not None and folder is not None:
+        run.job |= stereo_job(pictures)
+        run.seen = _drawn_pictures(pictures, folder)
+    if images is not None:
+        run.job |= depth_job(images)
 
 
 def _write_poses(path: Path, shape: ArticulatedShape, result: TrackResult) -> None:
