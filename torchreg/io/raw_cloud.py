@@ -163,16 +163,21 @@ def fan_triangles(counts: Array, indices: Array) -> Array:
     # A part after the other, as numbers of corners take more memory than corners.
     for first in range(0, len(counts), _POLYGONS):
         part = counts[first : first + _POLYGONS]
-        numbers = _fan_corners(part)
-        numbers += start
-        np.take(indices, numbers, out=result[before : before + len(numbers)], mode="clip")  # without a copy
-        before, start = before + len(numbers), start + int(part.sum())
+        count = _fill_fans(result[before:], part, indices[start:])
+        before, start = before + count, start + int(part.sum())
     return result
 
 
-def _fan_corners(counts: Array) -> Array:
-    """Return the (F, 3) numbers of the corners of the triangles of polygons with counts (P,) of corners."""
-    triangles = np.maximum(counts - 2, 0)
-    start = np.repeat(np.cumsum(counts) - counts, triangles)
-    step = np.arange(int(triangles.sum())) - np.repeat(np.cumsum(triangles) - triangles, triangles)
-    return np.stack((start, start + step + 1, start + step + 2), axis=-1)
+def _fill_fans(triangles: Array, counts: Array, indices: Array) -> int:
+    """Fill the first triangles (F, 3) with those of polygons with counts (P,) of corners; return how many these are."""
+    per_polygon = np.maximum(counts - 2, 0)
+    total = int(per_polygon.sum())
+    corner = np.repeat(np.cumsum(counts) - counts, per_polygon)
+    triangles[:total, 0] = indices[corner]
+    # A column after the other, and in place: triangles of a large polygon take enough memory by themselves.
+    corner += np.arange(total)
+    corner -= np.repeat(np.cumsum(per_polygon) - per_polygon, per_polygon)
+    for column in (1, 2):
+        corner += 1
+        triangles[:total, column] = indices[corner]
+    return total
