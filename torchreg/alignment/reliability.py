@@ -208,16 +208,15 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
         # As the fit weighed the data against what was told.
         shared = torch.maximum(shared, errors_per_patch(problem.data, problem.valid, problem.size))
     precision = _plausible_precision(problem, pose)
-    covariance = covariance_of_fit = pose_covariance(jacobian, near, noise * shared.sqrt(), precision)
+    covariance = pose_covariance(jacobian, near, noise * shared.sqrt(), precision)
     gain = _gain(problem, pose, distance, jacobian, noise, covariance) / shared.square()
     if problem.told_precision is not None:
         # A fit takes noise for no larger than a share of the size, so that it keeps its hold; what is known must not.
         error = surface_noise(distance, problem.valid, problem.size, clamped=False)
-        covariance = _of_noisier_data(covariance, precision, (error / noise).square())
         # A depth camera sees all surfaces off by one distance, of the order of the noise: it moves what is not held.
         gradient = jacobian.mT @ (near / (noise.square() * shared).unsqueeze(-1)).unsqueeze(-1)
-        moved = covariance_of_fit @ gradient * error[:, None, None]
-        covariance = covariance + moved @ moved.mT
+        moved = covariance @ gradient * error[:, None, None]
+        covariance = _of_noisier_data(covariance, precision, (error / noise).square()) + moved @ moved.mT
     return Curvature(covariance + torch.diag_embed(_misplaced_share(problem, pose) / precision), gain)
 
 
