@@ -31,7 +31,7 @@ from torchreg.shapes.posed_tree import PosedTree
 class ModelNumbers:
     """Of the whole search."""
 
-    samples: int = 2000  # of the reference
+    samples: int = 2500  # of the reference
     rounds: int = 2  # of links, joints and the fit of all; a third changes nothing on scans of arms
     thinned: float = 0.5  # of a scan's spacing, between points of a surface that is made of all scans
     margin: float = 0.05  # beyond the motions seen, that limits allow, radians, or shares of the diagonal
@@ -121,10 +121,12 @@ def find_robot(
     for number in range(MODEL.rounds):
         motions, label, noise = find_links(surfaces, motions, label, split=number == 0)
         motions, label, joints = without_welds(surfaces, motions, label, noise)
-        mechanism, label, loose = assembled(motions, label, joints)
+        mechanism, label = assembled(surfaces, motions, label, joints)
         mechanism = settled(surfaces, mechanism, label, noise)
         motions = mechanism.motions()
-    label = labeled(surfaces, motions, label, surfaces.noise(motions, label), len(frames) + 4.0)
+    noise = surfaces.noise(motions, label)
+    label = labeled(surfaces, motions, label, noise, len(frames) + 4.0)
+    loose = _loose(surfaces, mechanism, label, noise)
     residuals = torch.zeros(len(deformed), dtype=torch.float64)
     residuals[frames] = surfaces.distances(motions, label)
     link = label[NeighborTree(surfaces.samples).nearest(points)[0]]
@@ -156,13 +158,14 @@ def without_welds(
 
 
 def assembled(
-    motions: Tensor, label: Tensor, joints: dict[tuple[int, int], Candidate]
-) -> tuple[Mechanism, Tensor, tuple[bool, ...]]:
-    """Return the tree of the joints of most evidence, the labels by its links, and whose links move freely rather.
+    surfaces: Surfaces, motions: Tensor, label: Tensor, joints: dict[tuple[int, int], Candidate]
+) -> tuple[Mechanism, Tensor]:
+    """Return the tree of the joints of most evidence, and the labels by its links.
 
-    The root is the largest link.
+    The root is the link that moves least: that of an arm stands still.
 
     Args:
+        surfaces: the data.
         motions: (T, K, 4, 4) of links that all touch another, if there are two.
         label: (n,).
         joints: of pairs of links, the lower number first.
@@ -171,21 +174,31 @@ def assembled(
     pairs = torch.tensor(list(joints), dtype=torch.long).reshape(-1, 2)
     lengths = torch.tensor([joint.length for joint in joints.values()], dtype=torch.float64)
     chosen = pairs[minimum_spanning_forest(pairs, lengths - lengths.min() + 1, count).chosen()] if len(pairs) else pairs
-    parents, order = rooted(chosen, torch.bincount(label).argmax().reshape(1), count)
+    parents, order = rooted(chosen, surfaces.travel(motions, label).argmin().reshape(1), count)
     place = torch.empty_like(order)
     place[order] = torch.arange(count)
-    above, axes, values, loose = [-1], [torch.zeros(6).double()], [torch.zeros(frames).double()], [False]
+    above, axes, values = [-1], [torch.zeros(6).double()], [torch.zeros(frames).double()]
     for link in order[1:].tolist():
         parent = int(parents[link])
         joint = joints[min(link, parent), max(link, parent)]
         above.append(int(place[parent]))
         axes.append(joint.twist)
         values.append(joint.values if parent < link else -joint.values)
-        loose.append(joint.length > 0)
     mechanism = Mechanism(
         parents=tuple(above), axes=torch.stack(axes), base=motions[:, order[0]], values=torch.stack(values, 1)
     )
-    return mechanism, place[label], tuple(loose)
+    return mechanism, place[label]
+
+
+def _loose(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noise: Noise) -> tuple[bool, ...]:
+    """Return for each link whether the data speak for a free motion about its parent rather than for any joint."""
+    scale = NUMBERS.cut * noise.sigma
+    motions = surfaces.refined(mechanism.motions(), label, [scale] * 3)
+    blocks = surfaces.blocks(motions, label, scale)
+    pairs = [(parent, link) for link, parent in enumerate(mechanism.parents)]
+    return tuple(
+        pair[0] >= 0 and best_joint(relative(motions, blocks, pair, noise, surfaces.size)).length > 0 for pair in pairs
+    )
 
 
 def _described(

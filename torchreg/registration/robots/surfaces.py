@@ -190,6 +190,13 @@ class Surfaces:
             rows.append(geman_mcclure_loss((square / scale**2).clamp_max(1e12)).sum())
         return torch.stack(rows)
 
+    def travel(self, motions: Tensor, label: Tensor) -> Tensor:
+        """Return how far the samples of each part (K,) are from the reference, on average over samples and frames."""
+        moved = torch.stack([self.moved(frame[label])[0] for frame in motions])
+        paths = (moved - self.samples).norm(dim=-1).mean(0)
+        member = torch.nn.functional.one_hot(label, motions.shape[1]).to(paths)
+        return (paths @ member) / member.sum(0).clamp_min(1)
+
     def distances(self, motions: Tensor, label: Tensor) -> Tensor:
         """Return the median distances (T,) of the samples from the scans."""
         found = [
