@@ -32,7 +32,7 @@ def test_the_gradient_is_that_of_the_likelihood(links, pose, pixels):
     targets = CAMERA.project(truth)[0] if pixels else truth.clone()
     targets[1] = torch.nan
     origin = truth.mean(0)
-    given = MeasuredKeypoints.of(links, targets, None, CAMERA, 0.3).of_problems(links, origin[None])
+    given = MeasuredKeypoints.of(links, targets, None, CAMERA, 0.3).of_problems(keypoint_skin(links), origin[None])
     width = pose.new_tensor([0.004])
     local = links.retract(pose, torch.full_like(pose, 0.01))[None]
     local[:, :3] -= origin
@@ -50,7 +50,8 @@ def test_a_wrong_landmark_costs_no_more_than_its_share(links, pose):
     truth = links.keypoints(pose)[None]
     far = truth.clone()
     far[0, 0] += 10
-    given = MeasuredKeypoints.of(links, far, 0.01, None, 0.3).of_problems(links, torch.zeros(1, 3, dtype=pose.dtype))
+    given = MeasuredKeypoints.of(links, far, 0.01, None, 0.3)
+    given = given.of_problems(keypoint_skin(links), torch.zeros(1, 3, dtype=pose.dtype))
     cost = float(given.cost(pose[None], 0.0))
     assert cost == pytest.approx(math.log1p(LANDMARKS.floor) - math.log(LANDMARKS.floor))
     assert float(given.linearized(pose[None], 0.0).gradient.abs().max()) < 1e-12

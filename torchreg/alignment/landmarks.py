@@ -60,6 +60,10 @@ class Landmarks:
         names = ("targets", "seen", "std", "origin")
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
+    def seen_parts(self) -> set[int]:
+        """Return the parts that carry keypoints seen in any of the problems."""
+        return set(self.skin.weights.argmax(-1)[self.seen.any(0)].tolist())
+
     def cost(self, pose: Tensor, width: Tensor | float) -> Tensor:
         """Return the negative log-likelihood (B, ...) at poses (B, ..., num_dofs), zero where all are right.
 
@@ -169,14 +173,14 @@ class MeasuredKeypoints:
         shift[:3, 3] = -origin.double().cpu()
         return replace(self, camera=self.camera.moved(shift))
 
-    def of_problems(self, shape: Articulation, origin: Tensor) -> Landmarks:
-        """Return the landmarks of problems whose coordinates begin at origins (B, 3)."""
+    def of_problems(self, skin: LinearBlendSkin, origin: Tensor) -> Landmarks:
+        """Return the landmarks of problems whose coordinates begin at origins (B, 3), with a `keypoint_skin`."""
         targets = self.targets.expand(len(origin), *self.targets.shape[-2:])
         if self.camera is None:
             targets = targets - origin.unsqueeze(1)
         seen = targets.isfinite().all(-1)
         return Landmarks(
-            skin=keypoint_skin(shape),
+            skin=skin,
             targets=torch.where(seen.unsqueeze(-1), targets, 0.0),
             seen=seen,
             std=self.std.expand(seen.shape),

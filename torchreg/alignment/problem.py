@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.free_space_term import FreeSpaceTerm
-from torchreg.alignment.landmarks import Landmarks, MeasuredKeypoints
+from torchreg.alignment.landmarks import Landmarks, MeasuredKeypoints, keypoint_skin
 from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
 from torchreg.capture.free_space import FreeSpace
 from torchreg.geometry.kinematic_tree import stack_sizes
@@ -234,7 +234,7 @@ def centered_problem(
         debias=debias,
         correspondence=correspondence,
         free_space=term,
-        landmarks=None if keypoints is None else keypoints.of_problems(shape, origin),
+        landmarks=None if keypoints is None else keypoints.of_problems(keypoint_skin(shape), origin),
     )
 
 

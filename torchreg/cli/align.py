@@ -25,6 +25,7 @@ from torchreg.cli.align_options import (
     write_pose,
 )
 from torchreg.cli.cameras import Depth, DepthRange, Intrinsics, Mask, check_used, depth_source
+from torchreg.cli.keypoint_options import Keypoints, KeypointStd, MeasuredFrames, read_keypoints
 from torchreg.cli.known_options import Joints, JointStd, Known, Locked, observability, read_known
 from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
@@ -82,6 +83,8 @@ def align(
     locked: Locked = None,
     joints: Joints = None,
     joint_std: JointStd = None,
+    keypoints: Keypoints = None,
+    keypoint_std: KeypointStd = None,
     sigma: Sigma = None,
     outlier: Outlier = "limit",
     search: Search = "auto",
@@ -116,6 +119,7 @@ def align(
     measured, nor beside the --mask.
 
     What is known of the pose, --joints, counts with its --joint-std against data of which neighbors err together.
+    So do keypoints that a detector saw, --keypoints, of which some may be wrong.
 
     Exit codes: 0; 1 if an alignment is doubtful, or found too few inliers to mean anything; 2 for an error; 130 for
     Ctrl-C.
@@ -142,7 +146,8 @@ def align(
         first = None if start is None else load_pose(start, model)
         points = sample_skin(model, config.num_model_points, sharpness=config.sharpness)
         known = read_known(model, locked, joints, joint_std, len(clouds))
-        run = _AlignRun(model, config, points, scale, time, frame, first, known, pictures)
+        measured = read_keypoints(keypoints, keypoint_std, len(clouds))
+        run = _AlignRun(model, config, points, scale, time, frame, first, known, measured, pictures)
         try:
             run.align_all(clouds, files, bar, quiet)
             interrupted = False
@@ -181,6 +186,7 @@ class _AlignRun:
     frame: int | None
     start: Tensor | None
     known: Known
+    measured: MeasuredFrames
     pictures: DepthFrames | None = None
     results: list[AlignResult] = field(default_factory=list)
 
@@ -214,7 +220,7 @@ class _AlignRun:
             data = read_cloud(path, self.scale, self.config.nan_policy, self.time, self.frame)
         result = align(
             self.shape, data, self.start, model_points=self.skin, locked=self.known.locked,
-            prior=self.known.prior(number), config=self.config, on_step=on_step,
+            prior=self.known.prior(number), config=self.config, on_step=on_step, **self.measured.of(number),
         )  # fmt: skip
         self._write(result, as_points(data), files)
         self.results.append(result)

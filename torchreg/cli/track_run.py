@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
+from torchreg.cli.keypoint_options import MeasuredFrames
 from torchreg.cli.outputs import check_outputs, tell_origin
 from torchreg.cli.reporting import show_warning
 from torchreg.errors import FormatError, InputError, UnitsWarning
@@ -204,6 +205,7 @@ class TrackRun:
         save_every: frames between two writings.
         seen: draws what the cameras saw of a frame, or None.
         live: shows a frame in the browser, or None.
+        measured: keypoints of the frames.
         parts: results of the frames done.
         state: after them.
     """
@@ -217,6 +219,7 @@ class TrackRun:
     save_every: int
     seen: Callable[[LinearBlendSkin], OnFrame] | None = None
     live: Callable[[LinearBlendSkin], OnFrame] | None = None
+    measured: MeasuredFrames = field(default_factory=MeasuredFrames)
     parts: list[TrackResult] = field(default_factory=list)
     state: TrackState = field(init=False)
 
@@ -299,7 +302,8 @@ class TrackRun:
 
         times = [number / self.fps for number in numbers]
         try:
-            result = self.tracker.run((self.clouds.frame(number) for number in numbers), note, times=times)
+            frames = (self.clouds.frame(number) for number in numbers)
+            result = self.tracker.run(frames, note, times=times, **self.measured.part(numbers, self.clouds.origin))
         except KeyboardInterrupt:
             if not self.parts:
                 raise

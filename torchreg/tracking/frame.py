@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchreg.alignment.annealed_em import ANNEALING
 from torchreg.alignment.inputs import UNITS
+from torchreg.alignment.landmarks import MeasuredKeypoints
 from torchreg.alignment.problem import AlignProblem
 from torchreg.alignment.surface_fit import SURFACE_FIT
 from torchreg.capture.depth_frame import DepthFrame
@@ -43,17 +45,31 @@ class Frame:
         finite: (M,) True where a point is finite.
         elapsed: time since the frame before, in intervals.
         picture: whose points the cloud holds, if it is that of a depth camera.
+        keypoints: that a detector saw, or None.
     """
 
     cloud: Tensor
     finite: Tensor
     elapsed: float
     picture: DepthFrame | None = None
+    keypoints: MeasuredKeypoints | None = None
 
     @property
     def data(self) -> Tensor:
         """The finite points (F, 3)."""
         return self.cloud[self.finite]
+
+    @property
+    def seen_keypoints(self) -> dict[str, Any]:
+        """The keypoints as `align` and `find_pose` take them beside what the camera saw; nothing without any."""
+        if self.keypoints is None:
+            return {}
+        return {"keypoints": self.keypoints.targets, "keypoint_std": self.keypoints.std}
+
+    @property
+    def keypoints_in_space(self) -> dict[str, Any]:
+        """The same beside a cloud, which has no camera."""
+        return {} if self.keypoints is None or self.keypoints.camera is not None else self.seen_keypoints
 
 
 @dataclass(frozen=True)
