@@ -25,6 +25,7 @@ from torchreg.alignment.inputs import (
     warn_about_units,
 )
 from torchreg.alignment.known_dofs import KnownDofs
+from torchreg.alignment.landmark_fit import align_keypoints, measured_alone
 from torchreg.alignment.local_search import explore, needs_search
 from torchreg.alignment.problem import (
     INLIER_SHARE,
@@ -48,6 +49,7 @@ from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, UnitsWarning
+from torchreg.geometry.camera import Camera
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
@@ -153,7 +155,7 @@ class AlignConfig:
 
 def align(
     shape: ArticulatedShape,
-    data: Tensor | DepthFrame | Sequence[DepthFrame],
+    data: Tensor | DepthFrame | Sequence[DepthFrame] | Camera | None,
     initial_pose: Tensor | None = None,
     *,
     model_points: Tensor | LinearBlendSkin | None = None,
@@ -175,6 +177,7 @@ def align(
         data: (M, 3), metres, or a cloud, scan or mesh as loaders return; or (B, M, 3) for a batch of clouds. Or a
             `DepthFrame`, whose free space counts too, or a sequence of B of them. In a single frame without a mask and
             without a start, surfaces of about the shape's size, and the ends of larger ones, are tried, nearest first.
+            None, or the `Camera` of keypoints in pixels, where keypoints are all there is.
         initial_pose: (num_dofs,) start, moved inside the limits first; without one, `find_pose` looks for it.
             (B, num_dofs) with a batch of clouds. (S, num_dofs) with one cloud: several starts, of which the best
             alignment is returned.
@@ -214,6 +217,11 @@ def align(
     References: Dewaele et al. 2006, section 3.
     """
     config = config or AlignConfig()
+    if data is None or isinstance(data, Camera):
+        skin = _model_skin(shape, model_points, shape.rest[None], config)
+        measured = measured_alone(shape, data, keypoints, keypoint_std)
+        start = None if initial_pose is None else _check_start(shape, initial_pose, shape.rest[None, :3])[0]
+        return align_keypoints(shape, skin, measured, start, KnownDofs.of(shape, locked, prior))
     if isinstance(data, DepthFrame) and data.mask is None and initial_pose is None and mask is None:
         skin = _model_skin(shape, model_points, shape.rest[None], config)
         found, crop = surest_crop(

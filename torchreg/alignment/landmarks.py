@@ -64,6 +64,16 @@ class Landmarks:
         """Return the parts that carry keypoints seen in any of the problems."""
         return set(self.skin.weights.argmax(-1)[self.seen.any(0)].tolist())
 
+    def informed(self, covariance: Tensor, pose: Tensor) -> Tensor:
+        """Return the covariance (B, num_dofs, num_dofs) of poses, of which others tell the rest."""
+        information = torch.linalg.inv(covariance.double()) + self.linearized(pose, 0.0).hessian.double()
+        return torch.linalg.inv(information).to(covariance)
+
+    def agree(self, pose: Tensor) -> Tensor:
+        """Return the mask (B, K) of landmarks that agree with poses (B, num_dofs): right more likely than wrong."""
+        residual = self._measured(self.skin(pose.unsqueeze(1)))[:, 0] - self.targets
+        return self.seen & (residual.square().sum(-1) < LANDMARKS.wrong**2 * self.std.square())
+
     def cost(self, pose: Tensor, width: Tensor | float) -> Tensor:
         """Return the negative log-likelihood (B, ...) at poses (B, ..., num_dofs), zero where all are right.
 
@@ -187,6 +197,12 @@ class MeasuredKeypoints:
             camera=self.camera,
             origin=origin,
         )
+
+
+def keypoint_extent(shape: Articulation) -> float:
+    """Return the diagonal of the bounding box of a shape's keypoints at rest, metres."""
+    points = shape.keypoints(shape.rest_pose()).detach()
+    return float((points.amax(0) - points.amin(0)).norm())
 
 
 def keypoint_skin(shape: Articulation) -> LinearBlendSkin:

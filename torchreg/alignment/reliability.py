@@ -209,8 +209,10 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
     if problem.told_precision is not None:
         # As the fit weighed the data against what was told.
         shared = torch.maximum(shared, errors_per_patch(problem.data, problem.valid, problem.size))
-    precision = _plausible_precision(problem, pose)
+    precision = plausible_precision(problem, pose)
     covariance = pose_covariance(jacobian, near, noise * shared.sqrt(), precision)
+    if problem.landmarks is not None:
+        covariance = problem.landmarks.informed(covariance, pose)
     gain = _gain(problem, pose, distance, jacobian, noise, covariance) / shared.square()
     if problem.told_precision is not None:
         # A depth camera sees all surfaces off by one distance, of the order of the noise: it moves what is not held.
@@ -262,7 +264,7 @@ def _misplaced_share(problem: AlignProblem, pose: Tensor) -> Tensor:
     return share
 
 
-def _plausible_precision(problem: AlignProblem, pose: Tensor) -> Tensor:
+def plausible_precision(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return 1 / variance (B, num_dofs) of poses of which no more is known than the limits of the joints."""
     spans = (problem.upper - problem.lower).expand_as(pose)
     uniform = 12 / spans.square().clamp_min(_SCALES.least_span**2)
