@@ -97,12 +97,17 @@ def subjects(data: Path | None) -> list[Subject]:
             "hand", hand, [other_hand(torch.Generator().manual_seed(k), scale) for k, scale in enumerate(OTHER_SCALES)]
         )
     ]
+    return [*found, *other_subjects(data)]
+
+
+def other_subjects(data: Path | None) -> list[Subject]:
+    """Return a robot arm and an animal; nothing without data."""
     if data is None:
         print("without --data: no robot and no animal")
-        return found
+        return []
     arm = tr.ArticulatedShape.from_urdf(data / "xarm7" / "xarm7.urdf")
     fox = tr.ArticulatedShape.from_gltf(data / "rigs" / "fox-animations.glb")
-    return [*found, subject("arm", arm), replace(subject("fox", fox), searched=0.5 * SEARCHED)]
+    return [subject("arm", arm), replace(subject("fox", fox), searched=0.5 * SEARCHED)]
 
 
 def random_pose(shape: tr.ArticulatedShape, size: float, generator: torch.Generator) -> Tensor:
