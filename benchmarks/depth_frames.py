@@ -1,7 +1,7 @@
 """A hand in depth pictures: real ones, cut to the hand and whole, made-up ones with and without free space, and tracks.
 
     python benchmarks/depth_frames.py --data SHARED   # every figure; an hour on a busy core, less with --only
-    python benchmarks/depth_frames.py --smoke         # two made-up pictures and a short track, to see that it runs
+    python benchmarks/depth_frames.py --smoke         # a made-up cloud, picture and short track, to see that it runs
 
 - cut, whole: SHARED/hand_depth, a right hand before a body, fingertips marked by eye; no start. Cut to what is within
   19 cm of the middle fingertip, and as they are. A tip's error is its distance from the mark at the depth there; the
@@ -35,7 +35,7 @@ from tqdm import tqdm
 
 import torchreg as tr
 from torchreg.capture.depth_noise import DepthNoise
-from torchreg.datasets.hand import hand_motion, make_hand_cloud, surface_skin
+from torchreg.datasets.hand import hand_motion, make_hand_cloud
 
 TIPS = [4, 8, 12, 16, 20]
 REACH, RIGHT, FAR, FLIPPED, UNUSABLE = 0.19, 0.015, 0.025, 0.06, 0.04
@@ -119,14 +119,13 @@ def clouds(thing: Subject, count: int, hand_size: float) -> list[Outcome]:
     return outcomes
 
 
-def landmarks(hand: tr.Hand, skin: tr.LinearBlendSkin, count: int) -> dict[str, list[Outcome]]:
+def landmarks(hand: tr.Hand, thing: Subject, count: int) -> dict[str, list[Outcome]]:
     """Return outcomes of few points, of keypoints in the picture, and of both."""
-    surface, size = surface_skin(hand), float((skin.points.amax(0) - skin.points.amin(0)).norm())
     kinds: dict[str, list[Outcome]] = {"points": [], "keypoints": [], "both": []}
     for seed in tqdm(range(count), desc="landmarks", leave=False, disable=None):
         generator = torch.Generator().manual_seed(20_000 + seed)
-        pose = random_pose(hand, size, generator)
-        frame = picture(surface, pose, generator, sensor=SENSOR)
+        pose = random_pose(hand, thing.size, generator)
+        frame = picture(thing.truths[0][1], pose, generator, sensor=SENSOR)
         step = max(1, round((int(frame.measured.sum()) / NUM_BESIDE) ** 0.5))
         thin = torch.zeros_like(frame.measured)
         thin[::step, ::step] = frame.measured[::step, ::step]
@@ -141,29 +140,28 @@ def landmarks(hand: tr.Hand, skin: tr.LinearBlendSkin, count: int) -> dict[str, 
         for name, data, beside in (
             ("points", frame, {}), ("keypoints", frame.camera, told), ("both", frame, told),
         ):  # fmt: skip
-            kinds[name].append(aligned(str(seed), hand, skin, data, truth[TIPS], **beside))
+            kinds[name].append(aligned(str(seed), hand, thing.skin, data, truth[TIPS], **beside))
     return kinds
 
 
-def few_fingers(hand: tr.Hand, skin: tr.LinearBlendSkin, count: int) -> tuple[list[Outcome], list[Outcome]]:
+def few_fingers(hand: tr.Hand, thing: Subject, count: int) -> tuple[list[Outcome], list[Outcome]]:
     """Return outcomes with free space and without, of the same pictures."""
-    surface, size = surface_skin(hand), float((skin.points.amax(0) - skin.points.amin(0)).norm())
     kinds: tuple[list[Outcome], list[Outcome]] = ([], [])
     for seed in tqdm(range(count), desc="few fingers", leave=False, disable=None):
         generator = torch.Generator().manual_seed(10_000 + seed)
-        pose = random_pose(hand, size, generator)
-        frame = picture(surface, pose, generator, cut=1.0)
+        pose = random_pose(hand, thing.size, generator)
+        frame = picture(thing.truths[0][1], pose, generator, cut=1.0)
         with torch.no_grad():
             tips = hand.keypoints(pose)[TIPS]
         for outcomes, data in zip(kinds, (frame, frame.points), strict=True):
-            outcomes.append(aligned(str(seed), hand, skin, data, tips))
+            outcomes.append(aligned(str(seed), hand, thing.skin, data, tips))
     return kinds
 
 
-def track(hand: tr.Hand, count: int) -> str:
+def track(hand: tr.Hand, thing: Subject, count: int) -> str:
     """Return the table of a sequence tracked as frames and as clouds."""
-    poses, surface, generator = hand_motion(hand, "bend", count, FPS), surface_skin(hand), torch.Generator()
-    frames = [picture(surface, pose, generator, sensor=SENSOR) for pose in poses]
+    poses, generator = hand_motion(hand, "bend", count, FPS), torch.Generator()
+    frames = [picture(thing.truths[0][1], pose, generator, sensor=SENSOR) for pose in poses]
     with torch.no_grad():
         truth = hand.keypoints(poses)[:, TIPS]
     lines = []
@@ -223,28 +221,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--smoke", action="store_true")
     options = parser.parse_args(arguments)
     count, frames = (1, 3) if options.smoke else (options.count, options.frames)
+    if options.smoke:
+        options.only = [part for part in PARTS if part != "few"]
     hand = tr.Hand()
-    skin = tr.sample_skin(hand)
+    known = subject("hand", hand)
     bars = {"cut": (0.9, 7), "whole": (0.75, 6)}
     for name in [part for part in bars if part in options.only]:
         if options.data is None:
             print(f"{name}: left out without --data")
         else:
-            found = real_pictures(hand, skin, options.data / "hand_depth", cut=name == "cut")
+            found = real_pictures(hand, known.skin, options.data / "hand_depth", cut=name == "cut")
             print(pictures_table(name, found, *bars[name]))
     if "clouds" in options.only:
-        known = subject("hand", hand)
         print(line_of("clouds", clouds(known, count, known.size)))
         for thing in other_subjects(options.data):
             print(line_of(f"clouds of the {thing.name}", clouds(thing, -(-count // OTHERS), known.size)))
     if "landmarks" in options.only:
-        for name, found in landmarks(hand, skin, -(-count // OTHERS)).items():
+        for name, found in landmarks(hand, known, -(-count // OTHERS)).items():
             print(line_of(f"landmarks, {name}", found))
     if "few" in options.only:
-        for name, found in zip(("with free space", "clouds alone"), few_fingers(hand, skin, count), strict=True):
+        for name, found in zip(("with free space", "clouds alone"), few_fingers(hand, known, count), strict=True):
             print(line_of(f"few fingers, {name}", found))
     if "track" in options.only:
-        print(track(hand, frames))
+        print(track(hand, known, frames))
     return 0
 
 

@@ -39,6 +39,7 @@ from torchreg.alignment.reliability import (
     CALIBRATION,
     confidence_of,
     curvature,
+    end_errors,
     gather_evidence,
     told_doubts,
     without_cut,
@@ -467,7 +468,9 @@ def _result(
     # What lies off the surface tells nothing of the pose, unless all does.
     told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
     degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=3)
-    around, evidence = curvature(judged, pose), gather_evidence(judged, pose, lead)
+    around = curvature(judged, pose)
+    ends = end_errors(judged, pose, around)
+    evidence = gather_evidence(judged, pose, ends, lead)
     table = evidence.table()
     confidence = torch.where(degenerate, 0.0, confidence_of(table))
     converged = found.change <= config.pose_atol
@@ -487,7 +490,7 @@ def _result(
         covariance=around.covariance,
         confidence=confidence,
         evidence=table,
-        doubt=told_doubts(judged, pose, evidence),
+        doubt=told_doubts(judged, ends, evidence),
     )
 
 
