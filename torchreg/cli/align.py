@@ -25,6 +25,7 @@ from torchreg.cli.align_options import (
     write_pose,
 )
 from torchreg.cli.cameras import Depth, DepthRange, Intrinsics, Mask, check_used, depth_source
+from torchreg.cli.hand_side import Side, better_hand, shape_of_side
 from torchreg.cli.keypoint_options import Keypoints, KeypointStd, MeasuredFrames, read_keypoints
 from torchreg.cli.known_options import Joints, JointStd, Known, Locked, observability, read_known
 from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending
@@ -96,6 +97,7 @@ def align(
     package_dir: PackageDir = None,
     free_base: FreeBase = None,
     skin: Skin = None,
+    side: Side = None,
     pose: Annotated[
         Path | None, typer.Option(help="Also write the pose by name of degree of freedom (.json or .csv).")
     ] = None,
@@ -137,7 +139,7 @@ def align(
     from tqdm import tqdm
 
     with tqdm(total=len(clouds), unit="cloud", desc="reading", leave=False, disable=quiet) as bar:
-        model = load_shape(shape, parents, package_dir, free_base, skin)
+        model = load_shape(shape_of_side(shape, side), parents, package_dir, free_base, skin)
         from torchreg.alignment.align import AlignConfig
         from torchreg.shapes.skin import sample_skin
         from torchreg.storage import load_pose
@@ -148,6 +150,10 @@ def align(
         known = read_known(model, locked, joints, joint_std, len(clouds))
         measured = read_keypoints(keypoints, keypoint_std, len(clouds))
         run = _AlignRun(model, config, points, scale, time, frame, first, known, measured, pictures)
+        if side == "either":
+            side = run.choose_hand(clouds[0])
+            if not quiet:
+                bar.write(f"{clouds[0]}: a {side} hand")
         try:
             run.align_all(clouds, files, bar, quiet)
             interrupted = False
@@ -213,11 +219,7 @@ class _AlignRun:
         from torchreg.alignment.align import align
         from torchreg.geometry.loaded import as_points
 
-        data: Any
-        if self.pictures is not None:
-            data = self.pictures[number]
-        else:
-            data = read_cloud(path, self.scale, self.config.nan_policy, self.time, self.frame)
+        data = self._data(number, path)
         result = align(
             self.shape, data, self.start, model_points=self.skin, locked=self.known.locked,
             prior=self.known.prior(number), config=self.config, on_step=on_step, **self.measured.of(number),
@@ -227,6 +229,27 @@ class _AlignRun:
         if result.statuses[0].usable:
             self.start = result.pose
         return result
+
+    def _data(self, number: int, path: Path) -> Any:
+        if self.pictures is not None:
+            return self.pictures[number]
+        return read_cloud(path, self.scale, self.config.nan_policy, self.time, self.frame)
+
+    def choose_hand(self, path: Path) -> str:
+        """Go on with the hand that the first cloud or picture shows, and return its side."""
+        from torchreg.alignment.align import align
+        from torchreg.shapes.skin import sample_skin
+
+        data = self._data(0, path)
+        found = better_hand(
+            lambda hand: align(
+                hand, data, self.start, locked=self.known.locked, prior=self.known.prior(0), config=self.config,
+                **self.measured.of(0),
+            )
+        )  # fmt: skip
+        self.shape = found
+        self.skin = sample_skin(found, self.config.num_model_points, sharpness=self.config.sharpness)
+        return found.side
 
     def _write(self, result: AlignResult, data: Tensor, files: _Files) -> None:
         if files.pose is not None:
