@@ -95,6 +95,17 @@ def test_a_fit_has_converged_where_another_step_gains_nothing(links, links_skin,
     assert not bool(curvature(problem, off).converged)
 
 
+def test_a_fit_goes_on_where_another_step_would_gain(links, links_skin, measured):
+    pose, data = measured
+    schedule = tr.SigmaSchedule.geometric(0.06, 0.05, 1)
+    start, found = links.retract(pose, 0.12 * torch.ones_like(pose)), {}
+    for search in ("never", "auto"):
+        config = tr.AlignConfig(search=search, schedule=schedule, em_steps=1, surface_steps=1, pose_atol=1e-9)
+        found[search] = tr.align(links, data, start, model_points=links_skin, config=config)
+    assert found["never"].status is tr.Status.MAX_STEPS
+    assert found["auto"].status is tr.Status.CONVERGED
+
+
 def test_the_covariance_is_that_of_repeated_measurements(links, links_skin, measured):
     pose, _ = measured
     generator = torch.Generator().manual_seed(1)

@@ -64,6 +64,7 @@ class _Limits:
 
     min_inliers: int = 10  # fewer inliers, and the pose means nothing
     min_share: float = 0.02  # the same, as a share of the data
+    more_steps: int = 5  # of a fit that has not converged, as a multiple of those at its last width
     many_data: int = 10_000  # in a batch, from which all threads of torch are of use
 
 
@@ -275,6 +276,7 @@ def _align(
             found = _search_where_needed(batch, found, config)
             judged = without_cut(batch.problem, found.pose, seen.frames)
             found = _refit(batch, judged, found, config)
+            found = _finished(batch, judged, found, config)
         result = _result(batch, found, config, lead, judged)  # inliers by eq. 2, the posterior by eq. 17
         return normal_copy(_unbatched(result) if clouds.ndim == 2 else result)
 
@@ -451,6 +453,22 @@ def _refit(batch: _Batch, judged: AlignProblem, found: StageResult, config: Alig
     steps = max(config.surface_steps, SURFACE_FIT.search_steps)
     refined = fit_surface(judged, found.pose, steps=steps, widths=SURFACE_FIT.widths[-1:], on_step=batch.record)
     return replace(refined, sigma=found.sigma)
+
+
+def _finished(batch: _Batch, judged: AlignProblem, found: StageResult, config: AlignConfig) -> StageResult:
+    """Return the poses after more steps of the last fit, where another would still gain; not of a plain descent."""
+    if config.surface_steps == 0 or config.search == "never":
+        return found
+    rows = (found.change > config.pose_atol).nonzero()[:, 0]
+    rows = rows[~curvature(judged.rows(rows), found.pose[rows]).converged] if len(rows) else rows
+    if len(rows) == 0:
+        return found
+    refined = fit_surface(
+        judged.rows(rows), found.pose[rows], steps=_LIMITS.more_steps, widths=(), on_step=batch.record
+    )  # fmt: skip
+    pose, change = found.pose.clone(), found.change.clone()
+    pose[rows], change[rows] = refined.pose, refined.change
+    return replace(found, pose=pose, change=change)
 
 
 def _result(
