@@ -13,7 +13,6 @@ from torchreg.alignment.reliability import (
     confidence_of,
     correlated_count,
     curvature,
-    end_errors,
     gather_evidence,
     neighbor_correlation,
     told_doubts,
@@ -66,17 +65,13 @@ def problem_of(skin, data, pose):
     return centered_problem(skin, data[None], valid, pose[None], zero, prior_std=0.3, pose_atol=1e-3)
 
 
-def evidence_of(problem, pose, lead):
-    return gather_evidence(problem, pose, end_errors(problem, pose, curvature(problem, pose)), lead)
-
-
 def test_evidence_is_none_at_the_truth_and_speaks_against_a_wrong_pose(links, links_skin, measured):
     pose, data = measured
     problem = problem_of(links_skin, data, pose)
-    right = evidence_of(problem, pose[None], None)
+    right = gather_evidence(problem, pose[None], None)
     wrong_pose = pose.clone()
     wrong_pose[6] = -0.8
-    wrong = evidence_of(problem, wrong_pose[None], pose.new_tensor([0.0]))
+    wrong = gather_evidence(problem, wrong_pose[None], pose.new_tensor([0.0]))
     assert float(right.off) < 0.1
     assert float(wrong.off) > 0.4
     assert float(wrong.rival) == 1
@@ -149,8 +144,8 @@ def test_doubts_name_the_limb_and_the_reason(plain_hand, plain_hand_skin):
     )
     local = pose.clone()
     local[:, :3] -= problem.origin
-    ends = end_errors(problem, local, curvature(problem, local))
-    (told,) = told_doubts(problem, ends, gather_evidence(problem, local, ends, pose.new_tensor([0.0])))
+    evidence = gather_evidence(problem, local, pose.new_tensor([0.0]))
+    (told,) = told_doubts(problem, local, evidence)
     assert "hardly any data show where ring ends" in told
     assert "another pose explains nearly as much" in told
 

@@ -39,7 +39,6 @@ from torchreg.alignment.reliability import (
     CALIBRATION,
     confidence_of,
     curvature,
-    end_errors,
     gather_evidence,
     told_doubts,
     without_cut,
@@ -486,9 +485,7 @@ def _result(
     # What lies off the surface tells nothing of the pose, unless all does.
     told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
     degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=3)
-    around = curvature(judged, pose)
-    ends = end_errors(judged, pose, around)
-    evidence = gather_evidence(judged, pose, ends, lead)
+    around, evidence = curvature(judged, pose), gather_evidence(judged, pose, lead)
     table = evidence.table()
     confidence = torch.where(degenerate, 0.0, confidence_of(table))
     converged = found.change <= config.pose_atol
@@ -508,7 +505,7 @@ def _result(
         covariance=around.covariance,
         confidence=confidence,
         evidence=table,
-        doubt=told_doubts(judged, ends, evidence),
+        doubt=told_doubts(judged, pose, evidence),
     )
 
 

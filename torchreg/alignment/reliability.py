@@ -11,15 +11,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.clusters import OFF_SURFACE, clustered_data
-from torchreg.alignment.confidence import (
-    EVIDENCE,
-    beside_share,
-    end_motions,
-    end_variances,
-    limb_data,
-    limb_ends,
-    limb_points,
-)
+from torchreg.alignment.confidence import EVIDENCE, beside_share, end_spreads, limb_data, limb_points
 from torchreg.alignment.patches import errors_per_patch
 from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem, free_space_loss
 from torchreg.alignment.shape_errors import proportion_covariance
@@ -28,7 +20,6 @@ from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import beyond_cut
 from torchreg.geometry.neighbors import NeighborTree
 from torchreg.shapes.limbs import Limb
-from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.solvers.levenberg_marquardt import held_at_limits
 from torchreg.solvers.robust import welsch_weight
 
@@ -43,7 +34,7 @@ class Evidence:
         clusters: root of the data in dense clusters off the surface, as a share of those on it.
         off: share of the data that are not on the surface.
         free_space: root of the data that the shape's points in free space stand for, as a share of the data.
-        unknown: probability that the limbs end elsewhere, by how far off their ends may be, see `end_errors`.
+        unknown: probability that the data do not tell where the limbs end.
         rival: how near the second-best pose of a search comes, 0 for a start that was given.
         rival_share: the same, relative to the number of data.
     """
@@ -84,11 +75,11 @@ class Calibration:
     """The logistic model of the confidence: log-odds of a right pose, ``bias - sum_k weight_k evidence_k``.
 
     A pose is right if the ends of the shape's limbs are off by at most `right` of its size on average. Fitted by
-    ``benchmarks/confidence.py --calibrate`` to 166 made-up alignments of hands, a robot arm and a fox.
+    ``benchmarks/confidence.py --calibrate`` to 143 made-up alignments of hands, a robot arm and a fox.
     """
 
-    bias: float = 4.77
-    weights: tuple[float, ...] = (0.69, 1.08, 7.59, 1.71, 2.6, 5.33, 1.34, 2.43)  # in the order of `Evidence`
+    bias: float = 5.35
+    weights: tuple[float, ...] = (1.36, 4.4, 8.69, 3.46, 8.53, 5.48, 1.03, 3.93)  # in the order of `Evidence`
     right: float = 0.058  # of the size: 15 mm of a hand
     doubtful: float = 0.5  # confidence below which a result is doubtful
 
@@ -116,13 +107,12 @@ def without_cut(problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame
     return replace(problem, valid=torch.where(valid.any(-1, keepdim=True), valid, problem.valid))
 
 
-def gather_evidence(problem: AlignProblem, pose: Tensor, ends: Tensor, lead: Tensor | None) -> Evidence:
+def gather_evidence(problem: AlignProblem, pose: Tensor, lead: Tensor | None) -> Evidence:
     """Return the evidence for poses (B, num_dofs).
 
     Args:
         problem: the batch.
         pose: fitted.
-        ends: (B, L) by how much the limbs' ends may be off, see `end_errors`.
         lead: (B,) cost by which the second best pose of a search was worse, infinite where there was none; None for
             starts that were given.
     """
@@ -134,7 +124,7 @@ def gather_evidence(problem: AlignProblem, pose: Tensor, ends: Tensor, lead: Ten
         distance,
         beside=beside_share(problem, pose),
         clustered=clustered.to(pose) / on_surface.clamp_min(1),
-        spread=ends.mean(-1),
+        spread=end_spreads(problem, pose).mean(-1),
         lead=lead,
     )
 
@@ -157,7 +147,7 @@ def weigh(
         distance: (B, M) of the data from the surface.
         beside: (B,) share of the data beside the surface, see `beside_share`.
         clustered: (B,) data in clusters, as a share of those on the surface.
-        spread: (B,) by how much the limbs' ends may be off on average, metres.
+        spread: (B,) mean of `end_spreads`, metres.
         lead: see `gather_evidence`.
     """
     noise = surface_noise(distance, problem.valid, problem.size)
@@ -172,8 +162,7 @@ def weigh(
         clusters=clustered.sqrt().clamp_max(1),
         off=1 - near / count,
         free_space=(intruding / count).sqrt().clamp_max(1),
-        # Rayleigh's share of errors beyond that of a right pose.
-        unknown=(-(CALIBRATION.right * problem.size / spread).square()).exp(),
+        unknown=(-(EVIDENCE.tolerance * problem.size / spread).square()).exp(),
         rival=(-lead / EVIDENCE.lead).exp(),
         rival_share=(-lead / (_SCALES.rival_share * count)).exp(),
     )
@@ -189,21 +178,12 @@ class Curvature:
     """The objective around fitted poses.
 
     Args:
-        fitted: (B, num_dofs, num_dofs) covariance of the fit in tangent coordinates.
-        anywhere: (B, num_dofs) variance of joints of limbs that hardly any data show, times the probability of that.
-        missing: (B, L) that probability for each limb.
+        covariance: (B, num_dofs, num_dofs) in tangent coordinates.
         gain: (B,) log-likelihood that a further step would gain.
     """
 
-    fitted: Tensor
-    anywhere: Tensor
-    missing: Tensor
+    covariance: Tensor
     gain: Tensor
-
-    @property
-    def covariance(self) -> Tensor:
-        """The covariance of the pose (B, num_dofs, num_dofs): of the fit, or of joints that may be anywhere."""
-        return self.fitted + torch.diag_embed(self.anywhere)
 
     @property
     def converged(self) -> Tensor:
@@ -243,11 +223,8 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
         problem, pose, distance=distance, jacobian=jacobian, factor=near.sqrt() / noise.unsqueeze(-1),
         covariance=pose_covariance(jacobian, near, noise, precision), share=correlation,
     )  # fmt: skip
-    missing = (-limb_data(problem, pose) / _SCALES.limb_data).exp()
-    return Curvature(
-        fitted=(covariance + proportions).to(pose), anywhere=_misplaced_share(problem, missing) / precision,
-        missing=missing, gain=gain,
-    )  # fmt: skip
+    misplaced = torch.diag_embed(_misplaced_share(problem, pose) / precision)
+    return Curvature((covariance + misplaced + proportions).to(pose), gain)
 
 
 def _gain(
@@ -278,26 +255,10 @@ def hardly_gains(
     return _gain(problem, pose, distance, jacobian, noise, covariance) / shared <= _SCALES.gain
 
 
-def end_errors(problem: AlignProblem, pose: Tensor, around: Curvature) -> Tensor:
-    """Return how far the ends (B, L) of the limbs are off in poses (B, num_dofs), on average, metres.
-
-    By the covariance of the fit, or as far as plausible poses are, with the probability that hardly any data show it.
-    """
-    skin = problem.skin
-    moves = end_motions(skin, pose, limb_ends(skin))
-    fitted = end_variances(moves, around.fitted).clamp_min(torch.finfo(pose.dtype).tiny).sqrt()
-    if around.missing.shape != fitted.shape:
-        return fitted
-    precision = torch.maximum(problem.prior.precision, BROAD_PRIOR.precision(skin.shape, problem.size))
-    plausible = precision.reciprocal().expand_as(pose).clone()
-    plausible[:, :BASE_DOFS] = 0
-    loose = (moves.square() * plausible[:, None, None]).sum((-2, -1)).sqrt()
-    return fitted + around.missing * (loose - fitted)
-
-
-def _misplaced_share(problem: AlignProblem, missing: Tensor) -> Tensor:
-    """Return the probability (B, num_dofs) that a joint is anywhere, from that of its limb (B, L)."""
-    share = missing.new_zeros(len(missing), problem.skin.shape.num_dofs)
+def _misplaced_share(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return the probability (B, num_dofs) that a joint is anywhere: that of a limb which hardly any data show."""
+    share = torch.zeros_like(pose)
+    missing = (-limb_data(problem, pose) / _SCALES.limb_data).exp()
     for column, (limb, _) in enumerate(limb_points(problem.skin)):
         share[:, limb.dofs] = missing[:, column : column + 1]
     return share
@@ -344,12 +305,13 @@ def neighbor_correlation(data: Tensor, residual: Tensor, weight: Tensor) -> Tens
     return torch.stack(together).clamp(0, _SCALES.max_correlation)
 
 
-def told_doubts(problem: AlignProblem, ends: Tensor, evidence: Evidence) -> tuple[str, ...]:
-    """Return what is doubtful where limbs may end (B, L) off, metres, a sentence for each pose, empty for nothing."""
+def told_doubts(problem: AlignProblem, pose: Tensor, evidence: Evidence) -> tuple[str, ...]:
+    """Return what is doubtful about poses (B, num_dofs), a sentence each, empty where nothing is."""
+    spread = end_spreads(problem, pose)
     limbs = [limb for limb, _ in limb_points(problem.skin)]
-    loose = (ends > CALIBRATION.right * problem.size).tolist()
+    loose = (spread > EVIDENCE.tolerance * problem.size).tolist()
     sentences = []
-    for row in range(len(ends)):
+    for row in range(len(pose)):
         reasons = []
         unseen = [_limb_name(problem, limb) for limb, is_loose in zip(limbs, loose[row], strict=False) if is_loose]
         if unseen:
