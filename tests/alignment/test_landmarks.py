@@ -32,7 +32,7 @@ def test_the_gradient_is_that_of_the_likelihood(links, pose, pixels):
     targets = CAMERA.project(truth)[0] if pixels else truth.clone()
     targets[1] = torch.nan
     origin = truth.mean(0)
-    given = MeasuredKeypoints.of(links, targets, None, CAMERA, 0.3).of_problems(links, origin[None])
+    given = MeasuredKeypoints.of(links, targets, None, CAMERA, 0.3).of_problems(keypoint_skin(links), origin[None])
     width = pose.new_tensor([0.004])
     local = links.retract(pose, torch.full_like(pose, 0.01))[None]
     local[:, :3] -= origin
@@ -50,7 +50,8 @@ def test_a_wrong_landmark_costs_no_more_than_its_share(links, pose):
     truth = links.keypoints(pose)[None]
     far = truth.clone()
     far[0, 0] += 10
-    given = MeasuredKeypoints.of(links, far, 0.01, None, 0.3).of_problems(links, torch.zeros(1, 3, dtype=pose.dtype))
+    given = MeasuredKeypoints.of(links, far, 0.01, None, 0.3)
+    given = given.of_problems(keypoint_skin(links), torch.zeros(1, 3, dtype=pose.dtype))
     cost = float(given.cost(pose[None], 0.0))
     assert cost == pytest.approx(math.log1p(LANDMARKS.floor) - math.log(LANDMARKS.floor))
     assert float(given.linearized(pose[None], 0.0).gradient.abs().max()) < 1e-12
@@ -88,3 +89,36 @@ def test_landmarks_tell_what_the_points_do_not(links, links_skin, pose):
 def test_bad_landmarks_are_told(links, options, message):
     with pytest.raises(InputError, match=message):
         tr.align(links, torch.zeros(20, 3), links.rest_pose(), **options)
+
+
+@pytest.mark.parametrize("pixels", [False, True], ids=["space", "picture"])
+def test_keypoints_alone_place_a_hand_though_some_are_wrong(plain_hand, plain_hand_skin, pixels):
+    truth = plain_hand.rest_pose()
+    truth[:6] = torch.tensor([0.05, -0.03, 0.5, 0.4, 2.0, -1.0])
+    truth[6:] = plain_hand.clamp(truth + 0.3)[6:]
+    seen = plain_hand.keypoints(truth)
+    measured = CAMERA.project(seen.double())[0].float() if pixels else seen.clone()
+    generator = torch.Generator().manual_seed(0)
+    measured += (0.5 if pixels else 0.002) * torch.randn(measured.shape, generator=generator)
+    measured[6], measured[10] = torch.nan, measured[3]
+    told = {"keypoints": measured, "keypoint_std": 0.5 if pixels else 0.002}
+    found = tr.align(plain_hand, CAMERA if pixels else None, model_points=plain_hand_skin, **told)
+    off = (found.keypoints - seen).norm(dim=-1)
+    assert float(off.mean()) < (0.01 if pixels else 0.003)
+    assert "1 of the seen keypoints do not agree" in found.doubt
+    assert found.statuses[0].usable is (float(found.confidence) >= 0.5)
+    assert len(found.distances) == 0
+    starts = tr.find_pose(plain_hand, CAMERA if pixels else None, num_starts=2, model_points=plain_hand_skin, **told)
+    torch.testing.assert_close(starts.best, found.pose)
+    near = tr.align(plain_hand, None, found.pose, keypoints=seen, model_points=plain_hand_skin, keypoint_std=0.002)
+    assert float((near.keypoints - seen).norm(dim=-1).mean()) < 1e-3
+
+
+def test_keypoints_alone_that_hold_nothing_are_told(links):
+    with pytest.raises(InputError, match="data must be given, or keypoints"):
+        tr.align(links, None)
+    with pytest.raises(InputError, match="keypoints alone must be of one frame"):
+        tr.find_pose(links, None, keypoints=torch.zeros(2, 3, 3))
+    one = torch.full((3, 3), torch.nan)
+    one[0] = 0.1
+    assert tr.align(links, None, keypoints=one).status is tr.Status.FEW_INLIERS

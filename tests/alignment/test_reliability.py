@@ -1,5 +1,7 @@
 """How far alignments can be trusted: what residuals share, covariance, confidence, and doubts in words."""
 
+import copy
+
 import pytest
 import torch
 
@@ -9,11 +11,14 @@ from torchreg.alignment.reliability import (
     CALIBRATION,
     Evidence,
     confidence_of,
+    correlated_count,
     curvature,
     gather_evidence,
-    shared_errors,
+    neighbor_correlation,
     told_doubts,
 )
+from torchreg.geometry.sampling import farthest_points
+from torchreg.shapes.pose_algebra import difference
 
 
 def lattice(count=30):
@@ -22,15 +27,19 @@ def lattice(count=30):
     return torch.stack((rows, columns, 0 * rows), dim=-1).reshape(1, -1, 3)
 
 
+def correlated(data, residual, weight):
+    return correlated_count(neighbor_correlation(data, residual, weight))
+
+
 def test_independent_residuals_count_each_and_smooth_ones_together():
     data, generator = lattice(), torch.Generator().manual_seed(0)
     noise = torch.randn(1, 900, generator=generator, dtype=torch.float64)
     ones = torch.ones(1, 900, dtype=torch.float64)
-    assert float(shared_errors(data, noise, ones)) == pytest.approx(1, abs=0.4)
+    assert float(correlated(data, noise, ones)) == pytest.approx(1, abs=0.4)
     smooth = torch.nn.functional.avg_pool2d(noise.reshape(1, 30, 30), 3, 1, 1).reshape(1, 900)
     # A mean of nine values is correlated with its neighbors as boxes overlap: the sum of all correlations is 9.
-    assert float(shared_errors(data, smooth, ones)) == pytest.approx(9, rel=0.5)
-    assert float(shared_errors(data, ones, ones)) > 50
+    assert float(correlated(data, smooth, ones)) == pytest.approx(9, rel=0.5)
+    assert float(correlated(data, ones, ones)) > 50
 
 
 def test_no_evidence_against_a_pose_is_the_highest_confidence():
@@ -81,6 +90,17 @@ def test_a_fit_has_converged_where_another_step_gains_nothing(links, links_skin,
     assert not bool(curvature(problem, off).converged)
 
 
+def test_a_fit_goes_on_where_another_step_would_gain(links, links_skin, measured):
+    pose, data = measured
+    schedule = tr.SigmaSchedule.geometric(0.06, 0.05, 1)
+    start, found = links.retract(pose, 0.12 * torch.ones_like(pose)), {}
+    for search in ("never", "auto"):
+        config = tr.AlignConfig(search=search, schedule=schedule, em_steps=1, surface_steps=1, pose_atol=1e-9)
+        found[search] = tr.align(links, data, start, model_points=links_skin, config=config)
+    assert found["never"].status is tr.Status.MAX_STEPS
+    assert found["auto"].status is tr.Status.CONVERGED
+
+
 def test_the_covariance_is_that_of_repeated_measurements(links, links_skin, measured):
     pose, _ = measured
     generator = torch.Generator().manual_seed(1)
@@ -92,6 +112,25 @@ def test_the_covariance_is_that_of_repeated_measurements(links, links_skin, meas
     told = found.covariance.diagonal(dim1=-2, dim2=-1).mean(0).sqrt()[6:]
     assert bool((told > 0.6 * spread).all())
     assert bool((told < 4 * spread).all())
+
+
+def test_the_covariance_is_that_of_shapes_of_other_proportions(links, links_skin, measured):
+    pose, _ = measured
+    generator, other, clouds = torch.Generator().manual_seed(2), copy.deepcopy(links), []
+    with torch.no_grad():
+        for _ in range(24):
+            for scales in (other.log_length_scales, other.log_radius_scales):
+                scales.copy_(0.05 * torch.randn(scales.shape, generator=generator, dtype=scales.dtype))
+            vertices = other.surface_mesh(pose, spacing=0.012).vertices
+            clouds.append(vertices[farthest_points(vertices, 300)])
+    config = tr.AlignConfig(search="never", prior_std=None)
+    found = tr.align(links, torch.stack(clouds), pose.expand(24, -1), model_points=links_skin, config=config)
+    off = difference(found.pose, pose.expand(24, -1))
+    squares = (off * torch.linalg.solve(found.covariance, off.unsqueeze(-1)).squeeze(-1)).sum(-1)
+    assert 0.4 < float(squares.mean()) / len(pose) < 1.6
+    # So do the variances alone.
+    told = found.covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
+    assert float(off.square().sum(-1).mean()) == pytest.approx(float(told.mean()), rel=0.6)
 
 
 def test_doubts_name_the_limb_and_the_reason(plain_hand, plain_hand_skin):

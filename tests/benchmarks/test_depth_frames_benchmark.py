@@ -13,7 +13,13 @@ def bench(loaded_benchmark):
 def test_smoke_prints_every_part(bench, capsys):
     assert bench.main(["--smoke"]) == 0
     printed = capsys.readouterr().out
-    for part in ("cut: left out without --data", "whole: left out", "clouds: 1 hands", "few fingers, clouds alone"):
+    for part in (
+        "cut: left out without --data",
+        "whole: left out",
+        "clouds: 1 cases",
+        "landmarks, both",
+        "few fingers, clouds",
+    ):
         assert part in printed
     assert printed.count("track, ") == 2
 

@@ -7,6 +7,7 @@ import torch
 
 import torchreg as tr
 from torchreg.datasets.hand import surface_skin
+from torchreg.datasets.pose_labels import PoseLabels
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.visibility import rasterize
 from torchreg.io.calibration import save_depth_camera
@@ -23,15 +24,19 @@ def pictures(tmp_path_factory):
     hand = tr.Hand()
     pose = hand.rest_pose()
     pose[:3], pose[3] = torch.tensor([0.0, 0.06, 0.5]), 1.5
-    surface = surface_skin(hand)
+    surface, keypoints = surface_skin(hand), []
     for folder in ("depth", "masks"):
         (place / folder).mkdir()
     for number in range(2):
         pose[0] = 0.004 * number
+        with torch.no_grad():
+            keypoints.append(CAMERA.project(hand.keypoints(pose))[0].tolist())
         raster = rasterize(TriangleMesh(surface(pose), surface.faces), CAMERA.view())
         shown = raster.face_index >= 0
         save_depth(place / "depth" / f"{number}.png", torch.where(shown, raster.depth, 0.9), 1e-4)
         save_image(place / "masks" / f"{number}.png", shown.float())
+    keypoints[0][3] = None
+    (place / "keypoints.json").write_text(json.dumps(keypoints), encoding="utf-8")
     save_depth_camera(place / "camera.json", CAMERA, 1e-4)
     (place / "start.json").write_text(json.dumps(pose.tolist()), encoding="utf-8")
     return place
@@ -58,12 +63,25 @@ def test_pictures_of_a_pattern_are_aligned(run, pictures, tmp_path):
     assert len(first.distances) == len(frame.points)
 
 
-def test_a_folder_of_pictures_is_tracked(run, pictures, tmp_path):
+def test_a_folder_of_pictures_is_tracked_with_keypoints_in_them(run, pictures, tmp_path):
     answer = run(
-        "track", "hand", pictures / "depth", *options(pictures, tmp_path), "--movie", "none", "--no-gltf"
+        "track", "hand", pictures / "depth", *options(pictures, tmp_path), "--movie", "none", "--no-gltf",
+        "--keypoints", pictures / "keypoints.json", "--keypoint-std", 4,
     )  # fmt: skip
     assert answer.exit_code == 0, answer.output
     assert all(status.usable for status in load(tmp_path / "r.safetensors").statuses)
+
+
+def test_pictures_become_labels(run, pictures, tmp_path):
+    picture, mask = pictures / "depth" / "1.png", pictures / "masks" / "1.png"
+    answer = run(
+        "label", "hand", picture, "--depth", "--intrinsics", pictures / "camera.json", "--mask", mask, "--start",
+        pictures / "start.json", "--trusted", 0, "-o", tmp_path / "labels",
+    )  # fmt: skip
+    assert answer.exit_code == 0, answer.output
+    (label,) = PoseLabels(tmp_path / "labels")
+    torch.testing.assert_close(label["points"], tr.DepthFrame.load(picture, pictures / "camera.json", mask).points)
+    assert float(label["pose"][0]) == pytest.approx(0.004, abs=1e-3)
 
 
 DARK = ("--depth", "--intrinsics", "camera.json", "--mask", "depth/0.png", "--depth-range", "5", "6")
@@ -76,7 +94,14 @@ DARK = ("--depth", "--intrinsics", "camera.json", "--mask", "depth/0.png", "--de
         ("track", ("--depth",), "--depth takes --intrinsics FILE with the camera"),
         ("align", ("--intrinsics", "camera.json"), "--intrinsics has no meaning without --depth"),
         ("track", ("--intrinsics", "camera.json"), "--intrinsics has no meaning without --depth"),
+        ("label", ("--intrinsics", "camera.json"), "--intrinsics has no meaning without --depth"),
         ("align", DARK, "0.png: depth"),
+        (
+            "align",
+            (*DARK[:3], "--keypoints", "keypoints.json"),
+            "keypoints.json must hold the keypoints of each of 1 frames; got those of 2",
+        ),
+        ("track", (*DARK[:3], "--keypoint-std", "4"), "--keypoint-std has no meaning without --keypoints"),
     ],
 )
 def test_what_does_not_go_together_is_told(run, pictures, tmp_path, command, changed, message):

@@ -127,7 +127,7 @@ def find(monkeypatch):
     def replace_by(poses, costs):
         calls = []
 
-        def found(shape, data, *, config):
+        def found(shape, data, *, config, **keypoints):
             calls.append((len(data), config))
             chosen = poses(len(calls)) if callable(poses) else poses
             return PoseStarts(chosen, torch.tensor(costs), torch.tensor(0.9, dtype=chosen.dtype))

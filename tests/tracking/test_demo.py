@@ -60,7 +60,7 @@ def stop_at(monkeypatch, frame):
     """Let the keyboard interrupt the tracker while it works on a frame."""
     step = Tracker.step
 
-    def stopped(self, points, time=None):
+    def stopped(self, points, time=None, **keypoints):
         if self.state.frame == frame:
             raise KeyboardInterrupt
         return step(self, points, time)

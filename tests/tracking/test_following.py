@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from torchreg.errors import InputError
 from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.tracking.motion_model import predict_pose
 
@@ -106,3 +107,27 @@ def test_fast_joints_may_stop_go_on_or_double(tracking, pace):
     fitter, frame = tracking.fitter(), tracking.frame()
     fit = fitter.descend(fitter.look(state, frame, fitter.predict(state, 1.0)), state, 1.0)
     torch.testing.assert_close(fit.world_pose, tracking.pose, atol=0.02, rtol=0)
+
+
+def test_keypoints_tell_where_a_hidden_finger_is(plain_hand, plain_hand_skin, truths, tracker):
+    hidden = [number for number, name in enumerate(plain_hand.part_names) if name.startswith("index")]
+    shown = ~torch.isin(plain_hand_skin.weights.argmax(-1), torch.tensor(hidden))
+    truth = truths[0].clone()
+    truth[[plain_hand.dof_names.index(name) for name in plain_hand.dof_names if name.startswith("index")]] += 0.3
+    truth = plain_hand.clamp(truth)
+    clouds, seen = [plain_hand_skin(truth)[shown]] * 3, plain_hand.keypoints(truth)
+    nothing = torch.full_like(seen, torch.nan)
+    kept = (None, [nothing, seen, seen])
+    alone, told = (tracker(truths[0]).run(clouds, keypoints=given, keypoint_std=0.003) for given in kept)
+    off = [(track.keypoints[:, 8] - seen[8]).norm(dim=-1) for track in (alone, told)]
+    assert float(off[0][0] - off[1][0]) == 0
+    assert float(off[1][-1]) < 0.006 < 0.015 < float(off[0][-1])
+
+
+def test_bad_keypoints_are_told(plain_hand, tracker, frames):
+    with pytest.raises(InputError, match=r"keypoints must have shape \(21, 3\)"):
+        tracker().step(frames[0], keypoints=torch.zeros(5, 3))
+    with pytest.raises(InputError, match="keypoints in pixels need the camera"):
+        tracker().step(frames[0], keypoints=torch.zeros(21, 2))
+    with pytest.raises(InputError, match="keypoints must hold one entry per frame"):
+        tracker().run(frames[:2], keypoints=plain_hand.keypoints(plain_hand.rest_pose())[None])

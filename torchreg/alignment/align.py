@@ -25,6 +25,7 @@ from torchreg.alignment.inputs import (
     warn_about_units,
 )
 from torchreg.alignment.known_dofs import KnownDofs
+from torchreg.alignment.landmark_fit import align_keypoints, measured_alone
 from torchreg.alignment.local_search import explore, needs_search
 from torchreg.alignment.problem import (
     INLIER_SHARE,
@@ -48,6 +49,7 @@ from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, UnitsWarning
+from torchreg.geometry.camera import Camera
 from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
@@ -61,6 +63,7 @@ class _Limits:
 
     min_inliers: int = 10  # fewer inliers, and the pose means nothing
     min_share: float = 0.02  # the same, as a share of the data
+    more_steps: int = 5  # of a fit that has not converged, as a multiple of those at its last width
     many_data: int = 10_000  # in a batch, from which all threads of torch are of use
 
 
@@ -153,7 +156,7 @@ class AlignConfig:
 
 def align(
     shape: ArticulatedShape,
-    data: Tensor | DepthFrame | Sequence[DepthFrame],
+    data: Tensor | DepthFrame | Sequence[DepthFrame] | Camera | None,
     initial_pose: Tensor | None = None,
     *,
     model_points: Tensor | LinearBlendSkin | None = None,
@@ -175,6 +178,7 @@ def align(
         data: (M, 3), metres, or a cloud, scan or mesh as loaders return; or (B, M, 3) for a batch of clouds. Or a
             `DepthFrame`, whose free space counts too, or a sequence of B of them. In a single frame without a mask and
             without a start, surfaces of about the shape's size, and the ends of larger ones, are tried, nearest first.
+            None, or the `Camera` of keypoints in pixels, where keypoints are all there is.
         initial_pose: (num_dofs,) start, moved inside the limits first; without one, `find_pose` looks for it.
             (B, num_dofs) with a batch of clouds. (S, num_dofs) with one cloud: several starts, of which the best
             alignment is returned.
@@ -214,6 +218,11 @@ def align(
     References: Dewaele et al. 2006, section 3.
     """
     config = config or AlignConfig()
+    if data is None or isinstance(data, Camera):
+        skin = _model_skin(shape, model_points, shape.rest[None], config)
+        measured = measured_alone(shape, data, keypoints, keypoint_std)
+        start = None if initial_pose is None else _check_start(shape, initial_pose, shape.rest[None, :3])[0]
+        return align_keypoints(shape, skin, measured, start, KnownDofs.of(shape, locked, prior))
     if isinstance(data, DepthFrame) and data.mask is None and initial_pose is None and mask is None:
         skin = _model_skin(shape, model_points, shape.rest[None], config)
         found, crop = surest_crop(
@@ -266,6 +275,7 @@ def _align(
             found = _search_where_needed(batch, found, config)
             judged = without_cut(batch.problem, found.pose, seen.frames)
             found = _refit(batch, judged, found, config)
+            found = _finished(batch, judged, found, config)
         result = _result(batch, found, config, lead, judged)  # inliers by eq. 2, the posterior by eq. 17
         return normal_copy(_unbatched(result) if clouds.ndim == 2 else result)
 
@@ -442,6 +452,22 @@ def _refit(batch: _Batch, judged: AlignProblem, found: StageResult, config: Alig
     steps = max(config.surface_steps, SURFACE_FIT.search_steps)
     refined = fit_surface(judged, found.pose, steps=steps, widths=SURFACE_FIT.widths[-1:], on_step=batch.record)
     return replace(refined, sigma=found.sigma)
+
+
+def _finished(batch: _Batch, judged: AlignProblem, found: StageResult, config: AlignConfig) -> StageResult:
+    """Return the poses after more steps of the last fit, where another would still gain; not of a plain descent."""
+    if config.surface_steps == 0 or config.search == "never":
+        return found
+    rows = (found.change > config.pose_atol).nonzero()[:, 0]
+    rows = rows[~curvature(judged.rows(rows), found.pose[rows]).converged] if len(rows) else rows
+    if len(rows) == 0:
+        return found
+    refined = fit_surface(
+        judged.rows(rows), found.pose[rows], steps=_LIMITS.more_steps, widths=(), on_step=batch.record
+    )  # fmt: skip
+    pose, change = found.pose.clone(), found.change.clone()
+    pose[rows], change[rows] = refined.pose, refined.change
+    return replace(found, pose=pose, change=change)
 
 
 def _result(

@@ -144,7 +144,8 @@ def _covariance(problem: AlignProblem, pose: Tensor, precision: Tensor) -> Tenso
     noise = surface_noise(distance, problem.valid, problem.size)
     width = SURFACE_FIT.width_per_noise * noise
     near = welsch_weight((distance / width.unsqueeze(-1)).square()) * problem.valid
-    return pose_covariance(jacobian, near, noise, precision)
+    covariance = pose_covariance(jacobian, near, noise, precision)
+    return covariance if problem.landmarks is None else problem.landmarks.informed(covariance, pose)
 
 
 def limb_data(problem: AlignProblem, pose: Tensor) -> Tensor:

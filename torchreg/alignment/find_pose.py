@@ -23,6 +23,7 @@ from torchreg.alignment.inputs import (
     warn_about_units,
 )
 from torchreg.alignment.known_dofs import KnownDofs
+from torchreg.alignment.landmark_fit import find_keypoints, measured_alone
 from torchreg.alignment.limb_search import distinct_first, take_rows
 from torchreg.alignment.pose_search import PoseSearch, mean_distances
 from torchreg.alignment.problem import (
@@ -37,6 +38,7 @@ from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource, bent_pos
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError
+from torchreg.geometry.camera import Camera
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
@@ -93,7 +95,7 @@ class FindPoseConfig:
 
 def find_pose(
     shape: ArticulatedShape,
-    data: Tensor | DepthFrame | Sequence[DepthFrame],
+    data: Tensor | DepthFrame | Sequence[DepthFrame] | Camera | None,
     *,
     num_starts: int = 4,
     mask: Tensor | None = None,
@@ -114,7 +116,8 @@ def find_pose(
     Args:
         shape: the articulated shape, in metres; where its base is bolted down, only its joints are sought.
         data: (M, 3), metres, or (B, M, 3) for a batch of clouds; or a `DepthFrame`, whose free space counts too, or a
-            sequence of B of them. In a single frame without a mask the shape may be anywhere.
+            sequence of B of them. In a single frame without a mask the shape may be anywhere. None, or a `Camera`, for
+            keypoints alone, see `align`.
         num_starts: poses returned, at most `FindPoseConfig.num_searched`; fewer where they fall together.
         mask: (M,) or (B, M), False where data are padding.
         sources: of rough poses, see `PoseSource`.
@@ -144,6 +147,10 @@ def find_pose(
     check_count(num_starts, "num_starts", 1)
     if not sources:
         raise InputError("sources must hold at least one source of rough poses, got none")
+    if data is None or isinstance(data, Camera):
+        points = model_points or sample_skin(shape, (config or FindPoseConfig()).num_model_points)
+        measured = measured_alone(shape, data, keypoints, keypoint_std)
+        return find_keypoints(shape, points, measured, num_starts, KnownDofs.of(shape, locked, prior))
     if isinstance(data, DepthFrame) and data.mask is None:
         skin = model_points or sample_skin(shape, (config or FindPoseConfig()).num_model_points)
         search = partial(

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from torchreg._checks import as_float_tensor, check_shape
-from torchreg.alignment.landmarks import MeasuredKeypoints
+from torchreg.alignment.landmarks import MeasuredKeypoints, keypoint_extent
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.free_space import FreeSpace
 from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning
@@ -94,7 +94,7 @@ class Observation:
                 raise InputError("keypoint_std goes with keypoints; give both, or none")
             return self
         camera = self.frames[0].camera if self.frames else None
-        size = float((shape.keypoints(shape.rest_pose()).amax(0) - shape.keypoints(shape.rest_pose()).amin(0)).norm())
+        size = keypoint_extent(shape)
         return replace(self, keypoints=MeasuredKeypoints.of(shape, keypoints, std, camera, size))
 
 

@@ -60,6 +60,20 @@ class Landmarks:
         names = ("targets", "seen", "std", "origin")
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
+    def seen_parts(self) -> set[int]:
+        """Return the parts that carry keypoints seen in any of the problems."""
+        return set(self.skin.weights.argmax(-1)[self.seen.any(0)].tolist())
+
+    def informed(self, covariance: Tensor, pose: Tensor) -> Tensor:
+        """Return the covariance (B, num_dofs, num_dofs) of poses, of which others tell the rest."""
+        information = torch.linalg.inv(covariance.double()) + self.linearized(pose, 0.0).hessian.double()
+        return torch.linalg.inv(information).to(covariance)
+
+    def agree(self, pose: Tensor) -> Tensor:
+        """Return the mask (B, K) of landmarks that agree with poses (B, num_dofs): right more likely than wrong."""
+        residual = self._measured(self.skin(pose.unsqueeze(1)))[:, 0] - self.targets
+        return self.seen & (residual.square().sum(-1) < LANDMARKS.wrong**2 * self.std.square())
+
     def cost(self, pose: Tensor, width: Tensor | float) -> Tensor:
         """Return the negative log-likelihood (B, ...) at poses (B, ..., num_dofs), zero where all are right.
 
@@ -169,20 +183,26 @@ class MeasuredKeypoints:
         shift[:3, 3] = -origin.double().cpu()
         return replace(self, camera=self.camera.moved(shift))
 
-    def of_problems(self, shape: Articulation, origin: Tensor) -> Landmarks:
-        """Return the landmarks of problems whose coordinates begin at origins (B, 3)."""
+    def of_problems(self, skin: LinearBlendSkin, origin: Tensor) -> Landmarks:
+        """Return the landmarks of problems whose coordinates begin at origins (B, 3), with a `keypoint_skin`."""
         targets = self.targets.expand(len(origin), *self.targets.shape[-2:])
         if self.camera is None:
             targets = targets - origin.unsqueeze(1)
         seen = targets.isfinite().all(-1)
         return Landmarks(
-            skin=keypoint_skin(shape),
+            skin=skin,
             targets=torch.where(seen.unsqueeze(-1), targets, 0.0),
             seen=seen,
             std=self.std.expand(seen.shape),
             camera=self.camera,
             origin=origin,
         )
+
+
+def keypoint_extent(shape: Articulation) -> float:
+    """Return the diagonal of the bounding box of a shape's keypoints at rest, metres."""
+    points = shape.keypoints(shape.rest_pose()).detach()
+    return float((points.amax(0) - points.amin(0)).norm())
 
 
 def keypoint_skin(shape: Articulation) -> LinearBlendSkin:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -55,6 +56,16 @@ class GaussianPosePrior:
 
     def _offset(self, pose: Tensor, mean: Tensor) -> Tensor:
         return difference(mean, pose) if self.holds_base else pose - mean
+
+
+class Objective(Protocol):
+    """What a fit minimizes over poses (B, num_dofs)."""
+
+    def __call__(self, pose: Tensor) -> Linearization:
+        """Return cost, gradient and Gauss-Newton Hessian."""
+
+    def cost(self, pose: Tensor) -> Tensor:
+        """Return the cost alone (B,)."""
 
 
 class RegistrationObjective:

@@ -11,7 +11,7 @@ _PATCH = 0.15
 
 def independent_share(points: Tensor, size: float) -> float:
     """Return the share of points (M, 3) on a thing of some size, metres, that are independent: one for each patch."""
-    return len((points / (_PATCH * size)).floor().unique(dim=0)) / max(1, len(points))
+    return max(1, len((points / (_PATCH * size)).floor().unique(dim=0))) / max(1, len(points))
 
 
 def errors_per_patch(data: Tensor, valid: Tensor, size: float) -> Tensor:

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.free_space_term import FreeSpaceTerm
-from torchreg.alignment.landmarks import Landmarks, MeasuredKeypoints
-from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
+from torchreg.alignment.landmarks import Landmarks, MeasuredKeypoints, keypoint_skin
+from torchreg.alignment.objectives import GaussianPosePrior, Objective
 from torchreg.capture.free_space import FreeSpace
 from torchreg.geometry.kinematic_tree import stack_sizes
 from torchreg.shapes.articulation import Articulation
@@ -132,7 +132,7 @@ class AlignProblem:
 
     def solve(
         self,
-        objective: RegistrationObjective | SurfaceObjective,
+        objective: Objective,
         pose: Tensor,
         max_steps: int,
         around: Linearization,
@@ -234,7 +234,7 @@ def centered_problem(
         debias=debias,
         correspondence=correspondence,
         free_space=term,
-        landmarks=None if keypoints is None else keypoints.of_problems(shape, origin),
+        landmarks=None if keypoints is None else keypoints.of_problems(keypoint_skin(shape), origin),
     )
 
 

@@ -8,15 +8,23 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_positive
+from torchreg.alignment.align import align
 from torchreg.alignment.inputs import floating_origin
 from torchreg.alignment.pose_initializer import InitialPose, PoseInitializer
 from torchreg.alignment.problem import INLIER_SHARE, model_size
+from torchreg.alignment.results import AlignResult
+from torchreg.capture.depth_frame import DepthFrame
 from torchreg.datasets.pose_labels import PoseLabel
+from torchreg.geometry.loaded import as_points
 from torchreg.shapes.pose_algebra import shifted
 
 
 def label_frames(
-    initializer: PoseInitializer, frames: Iterable[Tensor], *, trusted: float = 0.5, start: Tensor | None = None
+    initializer: PoseInitializer,
+    frames: Iterable[Tensor | DepthFrame],
+    *,
+    trusted: float = 0.5,
+    start: Tensor | None = None,
 ) -> Iterator[PoseLabel]:
     """Yield a label for each frame of a motion.
 
@@ -25,7 +33,8 @@ def label_frames(
 
     Args:
         initializer: of the shape.
-        frames: clouds (M, 3), metres.
+        frames: clouds (M, 3), metres; or depth frames, which are aligned with their free space, and labeled in the crop
+            that shows the shape.
         trusted: least confidence in a pose that the next frame starts from.
         start: (num_dofs,) of the first frame, if known.
 
@@ -42,11 +51,16 @@ def label_frames(
     origin, is_first = None, True
     for frame in frames:
         if is_first:
-            origin, is_first = floating_origin(initializer.shape, frame), False
+            origin, is_first = floating_origin(initializer.shape, as_points(frame)), False
             start = start if start is None or origin is None else shifted(start.double(), -origin)
-        points = (frame if origin is None else frame.double() - origin).to(initializer.shape.rest)
         with torch.no_grad():
-            found = _pose_of(initializer, points, start, trusted)
+            if isinstance(frame, DepthFrame):
+                near = frame if origin is None else frame.near(origin)
+                crop, found = _pose_in_picture(initializer, near, start, trusted)
+                points = crop.points.to(initializer.shape.rest)
+            else:
+                points = (frame if origin is None else frame.double() - origin).to(initializer.shape.rest)
+                found = _pose_of(initializer, points, start, trusted)
             parts = _part_labels(initializer, points, found.pose)
         start = found.pose if float(found.confidence) >= trusted else None
         label = PoseLabel(
@@ -62,6 +76,28 @@ def _pose_of(initializer: PoseInitializer, points: Tensor, start: Tensor | None,
         return found
     searched = initializer(points)
     return searched if found is None or searched.confidence > found.confidence else found
+
+
+def _pose_in_picture(
+    initializer: PoseInitializer, frame: DepthFrame, start: Tensor | None, trusted: float
+) -> tuple[DepthFrame, InitialPose]:
+    """Return the crop of a picture that shows the shape, and the pose: from a start or, where not sure, without one."""
+    crop, found = frame, None
+    if start is not None:
+        found = _as_pose(align(initializer.shape, frame, start, model_points=initializer.skin))
+    if found is None or float(found.confidence) < trusted:
+        aligned = align(initializer.shape, frame, model_points=initializer.skin)
+        searched = _as_pose(aligned)
+        if found is None or searched.confidence > found.confidence:
+            crop, found = frame if aligned.crop is None else frame.cropped(aligned.crop), searched
+    return crop, found
+
+
+def _as_pose(aligned: AlignResult) -> InitialPose:
+    confidence = aligned.pose.new_zeros(()) if aligned.confidence is None else aligned.confidence
+    return InitialPose(
+        pose=aligned.pose, confidence=confidence, keypoints=aligned.keypoints, registered=aligned.registered
+    )
 
 
 def _part_labels(initializer: PoseInitializer, points: Tensor, pose: Tensor) -> Tensor:

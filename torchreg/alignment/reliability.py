@@ -14,6 +14,7 @@ from torchreg.alignment.clusters import OFF_SURFACE, clustered_data
 from torchreg.alignment.confidence import EVIDENCE, beside_share, end_spreads, limb_data, limb_points
 from torchreg.alignment.patches import errors_per_patch
 from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem, free_space_loss
+from torchreg.alignment.shape_errors import proportion_covariance
 from torchreg.alignment.surface_fit import SURFACE_FIT, pose_covariance, surface_noise, surface_objective
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import beyond_cut
@@ -194,8 +195,8 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
     """Return the covariance of fitted poses (B, num_dofs), and what another step would gain.
 
     Neighboring data err together: the correlation of their residuals says how many of them count as one. Beside noise,
-    a patch of the surface errs by what the model is not exact. What no data tell is as uncertain as the joints' limits
-    leave it, and so is a limb that hardly any data show.
+    a patch of the surface errs by what the model is not exact, and the proportions of solids may be wrong. What no data
+    tell is as uncertain as the joints' limits leave it, and so is a limb that hardly any data show.
     """
     distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
     noise = surface_noise(distance, problem.valid, problem.size)
@@ -203,12 +204,15 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
     near = welsch_weight((distance / sigma.unsqueeze(-1)).square()) * problem.valid
     patches = _SCALES.patches * problem.skin.shape.num_parts
     inexact = (SURFACE_FIT.min_noise(problem.size) / noise).square() * near.sum(-1) / patches
-    shared = shared_errors(problem.data, distance, near) + inexact
+    correlation = neighbor_correlation(problem.data, distance, near)
+    shared = correlated_count(correlation) + inexact
     if problem.told_precision is not None:
         # As the fit weighed the data against what was told.
         shared = torch.maximum(shared, errors_per_patch(problem.data, problem.valid, problem.size))
-    precision = _plausible_precision(problem, pose)
+    precision = plausible_precision(problem, pose)
     covariance = pose_covariance(jacobian, near, noise * shared.sqrt(), precision)
+    if problem.landmarks is not None:
+        covariance = problem.landmarks.informed(covariance, pose)
     gain = _gain(problem, pose, distance, jacobian, noise, covariance) / shared.square()
     if problem.told_precision is not None:
         # A fit takes noise for no larger than a share of the size, so that it keeps its hold; what is known must not.
@@ -217,7 +221,12 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
         gradient = jacobian.mT @ (near / (noise.square() * shared).unsqueeze(-1)).unsqueeze(-1)
         moved = covariance @ gradient * error[:, None, None]
         covariance = _of_noisier_data(covariance, precision, (error / noise).square()) + moved @ moved.mT
-    return Curvature(covariance + torch.diag_embed(_misplaced_share(problem, pose) / precision), gain)
+    proportions = proportion_covariance(
+        problem, pose, distance=distance, jacobian=jacobian, factor=near.sqrt() / noise.unsqueeze(-1),
+        covariance=pose_covariance(jacobian, near, noise, precision), share=correlation,
+    )  # fmt: skip
+    misplaced = torch.diag_embed(_misplaced_share(problem, pose) / precision)
+    return Curvature((covariance + misplaced + proportions).to(pose), gain)
 
 
 def _of_noisier_data(covariance: Tensor, precision: Tensor, excess: Tensor) -> Tensor:
@@ -274,7 +283,7 @@ def _misplaced_share(problem: AlignProblem, pose: Tensor) -> Tensor:
     return share
 
 
-def _plausible_precision(problem: AlignProblem, pose: Tensor) -> Tensor:
+def plausible_precision(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return 1 / variance (B, num_dofs) of poses of which no more is known than the limits of the joints."""
     spans = (problem.upper - problem.lower).expand_as(pose)
     uniform = 12 / spans.square().clamp_min(_SCALES.least_span**2)
@@ -282,10 +291,18 @@ def _plausible_precision(problem: AlignProblem, pose: Tensor) -> Tensor:
     return plausible if problem.told_precision is None else torch.maximum(plausible, problem.told_precision)
 
 
-def shared_errors(data: Tensor, residual: Tensor, weight: Tensor) -> Tensor:
+def correlated_count(correlation: Tensor) -> Tensor:
     """Return how many data (B,) err as one: the sum of the correlations of a residual with all around it.
 
-    The correlation of nearest neighbors, taken to fall off as a Gaussian with the distance, is summed over a lattice.
+    The correlation (B,) of nearest neighbors, taken to fall off as a Gaussian with the distance, is summed over a
+    lattice.
+    """
+    step = torch.arange(-_SCALES.lattice, _SCALES.lattice + 1).to(correlation)
+    return (correlation.unsqueeze(-1) ** step.square()).sum(-1).square()
+
+
+def neighbor_correlation(data: Tensor, residual: Tensor, weight: Tensor) -> Tensor:
+    """Return the correlation (B,) of the residuals of nearest neighbors, not negative.
 
     Args:
         data: (B, M, 3).
@@ -304,9 +321,7 @@ def shared_errors(data: Tensor, residual: Tensor, weight: Tensor) -> Tensor:
         both = (shares[::stride] * shares[neighbor]).sqrt()
         product = (both * errors[::stride] * errors[neighbor]).sum() / both.sum().clamp_min(1e-12)
         together.append(product / ((shares * errors.square()).sum() / shares.sum()).clamp_min(1e-30))
-    correlation = torch.stack(together).clamp(0, _SCALES.max_correlation)
-    step = torch.arange(-_SCALES.lattice, _SCALES.lattice + 1).to(residual)
-    return (correlation.unsqueeze(-1) ** step.square()).sum(-1).square()
+    return torch.stack(together).clamp(0, _SCALES.max_correlation)
 
 
 def told_doubts(problem: AlignProblem, pose: Tensor, evidence: Evidence) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ from torch.nn.functional import pad
 from torchreg.alignment.problem import masked_mean
 from torchreg.alignment.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.primitives import fuse
 from torchreg.solvers.levenberg_marquardt import Linearization
@@ -180,7 +181,7 @@ class ScaleProblem:
         return Linearization(problem.cost.view(1), problem.gradient.unsqueeze(0), problem.hessian.unsqueeze(0))
 
 
-def scale_jacobian(shape: ArticulatedShape, points: Tensor, poses: Tensor) -> Tensor:
+def scale_jacobian(shape: Articulation, points: Tensor, poses: Tensor) -> Tensor:
     """Return the Jacobian of the fused distance with respect to the logarithms of all lengths and radii.
 
     Args:
@@ -225,7 +226,7 @@ def _learning(parameter: Tensor) -> Iterator[None]:
         parameter.requires_grad_(before)
 
 
-def _solid_motions(shape: ArticulatedShape, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _solid_motions(shape: Articulation, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return centers (T, P, 3) and rotations (T, P, 3, 3) of the solids, and motions of the centers (T, P, 3, P).
 
     The motions, by the logarithms of all lengths, are in each solid's own frame.

@@ -25,6 +25,8 @@ from torchreg.cli.align_options import (
     write_pose,
 )
 from torchreg.cli.cameras import Depth, DepthRange, Intrinsics, Mask, check_used, depth_source
+from torchreg.cli.hand_side import Side, better_hand, shape_of_side
+from torchreg.cli.keypoint_options import Keypoints, KeypointStd, MeasuredFrames, read_keypoints
 from torchreg.cli.known_options import Joints, JointStd, Known, Locked, observability, read_known
 from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
@@ -82,6 +84,8 @@ def align(
     locked: Locked = None,
     joints: Joints = None,
     joint_std: JointStd = None,
+    keypoints: Keypoints = None,
+    keypoint_std: KeypointStd = None,
     sigma: Sigma = None,
     outlier: Outlier = "limit",
     search: Search = "auto",
@@ -93,6 +97,7 @@ def align(
     package_dir: PackageDir = None,
     free_base: FreeBase = None,
     skin: Skin = None,
+    side: Side = None,
     pose: Annotated[
         Path | None, typer.Option(help="Also write the pose by name of degree of freedom (.json or .csv).")
     ] = None,
@@ -116,6 +121,7 @@ def align(
     measured, nor beside the --mask.
 
     What is known of the pose, --joints, counts with its --joint-std against data of which neighbors err together.
+    So do keypoints that a detector saw, --keypoints, of which some may be wrong.
 
     Exit codes: 0; 1 if an alignment is doubtful, or found too few inliers to mean anything; 2 for an error; 130 for
     Ctrl-C.
@@ -133,7 +139,7 @@ def align(
     from tqdm import tqdm
 
     with tqdm(total=len(clouds), unit="cloud", desc="reading", leave=False, disable=quiet) as bar:
-        model = load_shape(shape, parents, package_dir, free_base, skin)
+        model = load_shape(shape_of_side(shape, side), parents, package_dir, free_base, skin)
         from torchreg.alignment.align import AlignConfig
         from torchreg.shapes.skin import sample_skin
         from torchreg.storage import load_pose
@@ -142,7 +148,12 @@ def align(
         first = None if start is None else load_pose(start, model)
         points = sample_skin(model, config.num_model_points, sharpness=config.sharpness)
         known = read_known(model, locked, joints, joint_std, len(clouds))
-        run = _AlignRun(model, config, points, scale, time, frame, first, known, pictures)
+        measured = read_keypoints(keypoints, keypoint_std, len(clouds))
+        run = _AlignRun(model, config, points, scale, time, frame, first, known, measured, pictures)
+        if side == "either":
+            side = run.choose_hand(clouds[0])
+            if not quiet:
+                bar.write(f"{clouds[0]}: a {side} hand")
         try:
             run.align_all(clouds, files, bar, quiet)
             interrupted = False
@@ -181,6 +192,7 @@ class _AlignRun:
     frame: int | None
     start: Tensor | None
     known: Known
+    measured: MeasuredFrames
     pictures: DepthFrames | None = None
     results: list[AlignResult] = field(default_factory=list)
 
@@ -207,20 +219,37 @@ class _AlignRun:
         from torchreg.alignment.align import align
         from torchreg.geometry.loaded import as_points
 
-        data: Any
-        if self.pictures is not None:
-            data = self.pictures[number]
-        else:
-            data = read_cloud(path, self.scale, self.config.nan_policy, self.time, self.frame)
+        data = self._data(number, path)
         result = align(
             self.shape, data, self.start, model_points=self.skin, locked=self.known.locked,
-            prior=self.known.prior(number), config=self.config, on_step=on_step,
+            prior=self.known.prior(number), config=self.config, on_step=on_step, **self.measured.of(number),
         )  # fmt: skip
         self._write(result, as_points(data), files)
         self.results.append(result)
         if result.statuses[0].usable:
             self.start = result.pose
         return result
+
+    def _data(self, number: int, path: Path) -> Any:
+        if self.pictures is not None:
+            return self.pictures[number]
+        return read_cloud(path, self.scale, self.config.nan_policy, self.time, self.frame)
+
+    def choose_hand(self, path: Path) -> str:
+        """Go on with the hand that the first cloud or picture shows, and return its side."""
+        from torchreg.alignment.align import align
+        from torchreg.shapes.skin import sample_skin
+
+        data = self._data(0, path)
+        found = better_hand(
+            lambda hand: align(
+                hand, data, self.start, locked=self.known.locked, prior=self.known.prior(0), config=self.config,
+                **self.measured.of(0),
+            )
+        )  # fmt: skip
+        self.shape = found
+        self.skin = sample_skin(found, self.config.num_model_points, sharpness=self.config.sharpness)
+        return found.side
 
     def _write(self, result: AlignResult, data: Tensor, files: _Files) -> None:
         if files.pose is not None:

@@ -1,13 +1,14 @@
-"""``torchreg label``: clouds to training data for pose networks."""
+"""``torchreg label``: clouds and depth pictures to training data for pose networks."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from torchreg.cli.align_options import NanPolicy, Scale
+from torchreg.cli.cameras import Depth, DepthRange, Intrinsics, Mask, check_used, depth_source
 from torchreg.cli.outputs import Force, Quiet, check_outputs
 from torchreg.cli.reporting import interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
@@ -21,7 +22,7 @@ def label(
         typer.Argument(
             metavar="FRAMES",
             help="The clouds, metres: files, which are put in the order of the numbers in their names, one folder of "
-            "them, or one .npz of frames.",
+            "them, or one .npz of frames. With --depth depth pictures, folders or patterns of them.",
         ),
     ],
     output: Annotated[
@@ -34,6 +35,10 @@ def label(
     trusted: Annotated[
         float, typer.Option(help="Poses less sure than this are not started from: the next frame is searched.")
     ] = 0.5,
+    depth: Depth = False,
+    intrinsics: Intrinsics = None,
+    mask: Mask = None,
+    depth_range: DepthRange = None,
     nan_policy: NanPolicy = "raise",
     scale: Scale = 1.0,
     parents: Parents = None,
@@ -43,7 +48,7 @@ def label(
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
-    """Label point clouds with poses, keypoints, parts and confidence.
+    """Label point clouds, or depth pictures, with poses, keypoints, parts and confidence.
 
     Each frame gives label_NUMBER.safetensors and .json; torchreg.datasets.pose_labels.PoseLabels reads them for torch.
 
@@ -55,7 +60,12 @@ def label(
     from torchreg.io.frames import load_frames
 
     check_positive(scale, "--scale")
-    sequence = load_frames(frames[0] if len(frames) == 1 else frames, scale=scale, nan_policy=nan_policy)
+    check_used(depth, "--depth", {"--intrinsics": intrinsics, "--mask": mask, "--depth-range": depth_range})
+    sequence: Any
+    if depth:
+        sequence = depth_source(frames, intrinsics, mask, depth_range)
+    else:
+        sequence = load_frames(frames[0] if len(frames) == 1 else frames, scale=scale, nan_policy=nan_policy)
     with tqdm(total=len(sequence), unit="frame", desc="reading", leave=False, disable=quiet) as bar:
         from torchreg.alignment.pose_initializer import PoseInitializer
         from torchreg.alignment.pseudo_labels import label_frames

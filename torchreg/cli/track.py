@@ -27,6 +27,7 @@ from torchreg.cli.cameras import (
     stereo_job,
     stereo_source,
 )
+from torchreg.cli.keypoint_options import Keypoints, KeypointStd, read_keypoints
 from torchreg.cli.known_options import Joints, JointStd, Locked, read_known
 from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, shifted_to, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
@@ -91,6 +92,8 @@ def track(
     locked: Locked = None,
     joints: Joints = None,
     joint_std: JointStd = None,
+    keypoints: Keypoints = None,
+    keypoint_std: KeypointStd = None,
     fps: Annotated[float, typer.Option(help="Frames per second.")] = 20.0,
     scale: Scale = 1.0,
     nan_policy: NanPolicy = "omit",
@@ -138,7 +141,8 @@ def track(
     pictures go to RESULT_seen: the disparity, and the left picture with its points, blue where they are inliers, and
     the outline of the shape.
 
-    With --depth --intrinsics FILE frames are depth pictures, and what they say of free space counts too.
+    With --depth --intrinsics FILE frames are depth pictures, and what they say of free space counts too. Keypoints that
+    a detector saw, --keypoints, count beside any frames.
 
     Exit codes: 0; 1 if in any frame the shape was lost or is doubtful, or there were no data; 2 for an error; 130 for
     Ctrl-C.
@@ -171,12 +175,13 @@ def track(
     )
     first = None if start is None else shifted_to(clouds.origin, load_pose(start, model))
     known = read_known(model, locked, joints, joint_std, len(clouds))
-    job = track_job(shape, options, first, config, fps, scale, nan_policy, clouds) | known.job()
+    measured = read_keypoints(keypoints, keypoint_std, len(clouds))
+    job = track_job(shape, options, first, config, fps, scale, nan_policy, clouds) | known.job() | measured.job()
     with claimed(files.result), ExitStack() as pages, _progress_bar(len(clouds), quiet) as bar:
         tracker, report = Tracker(model, first, config=config, locked=known.locked), Report(bar, clouds, quiet)
         run = TrackRun(
             tracker=tracker, clouds=clouds, fps=fps, job=job, files=files, report=report, save_every=save_every,
-            known=known,
+            known=known, measured=measured,
         )  # fmt: skip
         _add_pictures(run, pictures, folder, images)
         if view:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
+from torchreg.cli.keypoint_options import MeasuredFrames
 from torchreg.cli.known_options import Known
 from torchreg.cli.outputs import check_outputs, tell_origin
 from torchreg.cli.reporting import show_warning
@@ -206,6 +207,7 @@ class TrackRun:
         seen: draws what the cameras saw of a frame, or None.
         live: shows a frame in the browser, or None.
         known: what is known of the poses.
+        measured: keypoints of the frames.
         parts: results of the frames done.
         state: after them.
     """
@@ -220,6 +222,7 @@ class TrackRun:
     seen: Callable[[LinearBlendSkin], OnFrame] | None = None
     live: Callable[[LinearBlendSkin], OnFrame] | None = None
     known: Known = field(default_factory=Known.nothing)
+    measured: MeasuredFrames = field(default_factory=MeasuredFrames)
     parts: list[TrackResult] = field(default_factory=list)
     state: TrackState = field(init=False)
 
@@ -304,7 +307,8 @@ class TrackRun:
         told = [self.known.prior(number, self.clouds.origin) for number in numbers]
         try:
             frames = (self.clouds.frame(number) for number in numbers)
-            result = self.tracker.run(frames, note, times=times, priors=told if any(told) else None)
+            told_of = self.measured.part(numbers, self.clouds.origin)
+            result = self.tracker.run(frames, note, times=times, priors=told if any(told) else None, **told_of)
         except KeyboardInterrupt:
             if not self.parts:
                 raise

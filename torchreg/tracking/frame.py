@@ -11,6 +11,7 @@ from torch import Tensor
 from torchreg.alignment.annealed_em import ANNEALING
 from torchreg.alignment.inputs import UNITS
 from torchreg.alignment.known_dofs import KnownDofs
+from torchreg.alignment.landmarks import MeasuredKeypoints
 from torchreg.alignment.problem import AlignProblem
 from torchreg.alignment.surface_fit import SURFACE_FIT
 from torchreg.capture.depth_frame import DepthFrame
@@ -46,6 +47,7 @@ class Frame:
         elapsed: time since the frame before, in intervals.
         picture: whose points the cloud holds, if it is that of a depth camera.
         known: what is held or told of the pose, or None.
+        keypoints: that a detector saw, or None.
     """
 
     cloud: Tensor
@@ -53,6 +55,7 @@ class Frame:
     elapsed: float
     picture: DepthFrame | None = None
     known: KnownDofs | None = None
+    keypoints: MeasuredKeypoints | None = None
 
     @property
     def told(self) -> dict[str, Any]:
@@ -63,6 +66,18 @@ class Frame:
     def data(self) -> Tensor:
         """The finite points (F, 3)."""
         return self.cloud[self.finite]
+
+    @property
+    def seen_keypoints(self) -> dict[str, Any]:
+        """The keypoints as `align` and `find_pose` take them beside what the camera saw; nothing without any."""
+        if self.keypoints is None:
+            return {}
+        return {"keypoints": self.keypoints.targets, "keypoint_std": self.keypoints.std}
+
+    @property
+    def keypoints_in_space(self) -> dict[str, Any]:
+        """The same beside a cloud, which has no camera."""
+        return {} if self.keypoints is None or self.keypoints.camera is not None else self.seen_keypoints
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from torchreg.alignment.align import AlignConfig
 from torchreg.alignment.annealed_em import anneal
 from torchreg.alignment.confidence import end_motions, end_variances, limb_ends, share_beside
 from torchreg.alignment.free_space_term import INTRUSION, FreeSpaceTerm
+from torchreg.alignment.landmarks import keypoint_skin
 from torchreg.alignment.objectives import GaussianPosePrior
 from torchreg.alignment.problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem
 from torchreg.alignment.reliability import Evidence, hardly_gains, weigh
@@ -102,12 +104,17 @@ class FrameFitter:
             lower=self.shape.lower - shift, upper=self.shape.upper - shift,
             prior=GaussianPosePrior(local[None], self._joint_precision(FILTER.max_joint_std)),
             free_space=self._free_space(frame, origin, num_in_reach / len(data)),
+            landmarks=None if frame.keypoints is None else frame.keypoints.of_problems(self._keypoints, origin[None]),
         )  # fmt: skip
         if frame.known is not None:
             told = frame.known.near(origin).applied(problem, local[None])
             prior = replace(told.prior, precision=told.prior.precision[0])
             problem = replace(told, lower=told.lower[0], upper=told.upper[0], prior=prior)
         return FrameView(problem=problem, origin=origin, rows=rows, in_reach=in_reach)
+
+    @cached_property
+    def _keypoints(self) -> LinearBlendSkin:
+        return keypoint_skin(self.shape)
 
     def _free_space(self, frame: Frame, origin: Tensor, thinning: float) -> FreeSpaceTerm | None:
         """Return what a picture says against poses about an origin (3,), whose data each stand for some of its own."""
@@ -243,14 +250,19 @@ class FrameFitter:
     ) -> SurfaceResult:
         """Return the fit with limbs at their prediction that hardly any data show.
 
-        What attracts such a limb are single outliers and the edges of its neighbors.
+        What attracts such a limb are single outliers and the edges of its neighbors; unless keypoints of it were seen.
         """
         if not self.limbs:
             return fitted
         levers = [fitted.jacobian[0][:, limb.dofs].norm(dim=-1) for limb in self.limbs]
         shown = torch.stack(levers) > _SETTINGS.min_lever * self.size
         counts = (_inlier_weights(fitted.distance[0], residual) * shown).sum(-1).tolist()
-        unseen = [limb for limb, count in zip(self.limbs, counts, strict=True) if count < _SETTINGS.min_limb_data]
+        detected = set() if problem.landmarks is None else problem.landmarks.seen_parts()
+        unseen = [
+            limb
+            for limb, count in zip(self.limbs, counts, strict=True)
+            if count < _SETTINGS.min_limb_data and detected.isdisjoint(limb.parts)
+        ]
         dofs = [dof for limb in unseen for dof in limb.dofs]
         if not dofs:
             return fitted

@@ -16,6 +16,7 @@ from torchreg._threads import one_thread
 from torchreg.alignment.align import AlignConfig, align
 from torchreg.alignment.inputs import check_skin, floating_origin, warn_about_degenerate, warn_about_units
 from torchreg.alignment.known_dofs import KnownDofs
+from torchreg.alignment.landmarks import MeasuredKeypoints
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.loaded import as_points
@@ -115,7 +116,13 @@ class Tracker:
         self._state = state
 
     def step(
-        self, points: Tensor | DepthFrame, time: float | None = None, *, prior: tuple[Any, Any] | None = None
+        self,
+        points: Tensor | DepthFrame,
+        time: float | None = None,
+        *,
+        prior: tuple[Any, Any] | None = None,
+        keypoints: Tensor | None = None,
+        keypoint_std: Tensor | float | None = None,
     ) -> FrameResult:
         """Return the pose of the shape in the next frame, and what is known of it.
 
@@ -124,6 +131,9 @@ class Tracker:
             time: of the frame, in any unit, seconds say; by default one interval after the frame before. Where frames
                 were dropped, it tells how far the shape may have moved.
             prior: what is known of the pose in this frame, as encoders tell: mean and standard deviation, see `align`.
+            keypoints: where a detector saw the shape's keypoints, see `align`: (K, 3), metres, or with a `DepthFrame`
+                (K, 2), pixels; NaN for those not seen, which may be all.
+            keypoint_std: see `align`.
 
         Returns:
             The frame's result. Its pose rests on data unless its status is NO_DATA, LOST, DEGENERATE or
@@ -141,16 +151,20 @@ class Tracker:
         picture = points if isinstance(points, DepthFrame) else None
         given = as_points(points)
         self._check_time(time)
+        measured = self._checked_keypoints(keypoints, keypoint_std, picture)
         self._place_origin(given)
         cloud = self._checked_points(given)
-        if picture is not None and self._state.origin is not None:
-            picture = picture.near(self._state.origin)
+        if self._state.origin is not None:
+            picture = None if picture is None else picture.near(self._state.origin)
+            measured = None if measured is None else measured.near(self._state.origin)
         known = self._known(prior)
         state, elapsed = advance_clock(self._state, time)
         # A tenth faster than without gradients alone, as most of the time goes to small operations.
         with torch.inference_mode(), one_thread(), self.shape.held_sizes():
             finite = torch.isfinite(cloud).all(-1)
-            frame = Frame(cloud=cloud, finite=finite, elapsed=elapsed, picture=picture, known=known)
+            frame = Frame(
+                cloud=cloud, finite=finite, elapsed=elapsed, picture=picture, known=known, keypoints=measured
+            )  # fmt: skip
             rejection = self._rejection(frame.data)
             if rejection is not None:
                 result, state = self._hold(state, frame, rejection)
@@ -175,6 +189,8 @@ class Tracker:
         *,
         times: Sequence[float] | None = None,
         priors: Sequence[tuple[Any, Any] | None] | None = None,
+        keypoints: Sequence[Tensor] | Tensor | None = None,
+        keypoint_std: Tensor | float | None = None,
     ) -> TrackResult:
         """Return the poses of all given frames, which follow those that the tracker has seen before.
 
@@ -186,21 +202,25 @@ class Tracker:
             on_frame: called with each cloud, or the points of each depth frame, and the result of its `step`.
             times: (T,) of the frames; see `step`.
             priors: of each frame; see `step`.
+            keypoints: of each frame, T times (K, 3) or (K, 2); see `step`.
+            keypoint_std: see `step`.
 
         Raises:
-            InputError: if there is no frame, times or priors are missing, or a frame cannot be used; see `step`.
+            InputError: if there is no frame, times, priors or keypoints are missing, or a frame cannot be used; see
+                `step`.
         """
         results: list[FrameResult] = []
         seconds: list[float] = []
         try:
             for number, points in enumerate(frames):
-                for name, values in (("times", times), ("priors", priors)):
+                for name, values in (("times", times), ("priors", priors), ("keypoints", keypoints)):
                     if values is not None and number >= len(values):
                         raise InputError(f"{name} must hold one entry per frame, got {len(values)} and more frames")
                 time = None if times is None else float(times[number])
+                prior = None if priors is None else priors[number]
+                measured = None if keypoints is None else keypoints[number]
                 started = clock.perf_counter()
-                told = {} if priors is None else {"prior": priors[number]}
-                result = self.step(points, time, **told)
+                result = self.step(points, time, prior=prior, keypoints=measured, keypoint_std=keypoint_std)
                 seconds.append(clock.perf_counter() - started)
                 results.append(result)
                 if on_frame is not None:
@@ -249,6 +269,13 @@ class Tracker:
         near = known if origin is None else known.near(origin)
         return near.holding(held if origin is None else shifted(held.double(), -origin))
 
+    def _checked_keypoints(self, keypoints: Any, std: Any, picture: DepthFrame | None) -> MeasuredKeypoints | None:
+        """Return measured keypoints; None where none was seen."""
+        if keypoints is None or not bool(torch.as_tensor(keypoints).isfinite().all(-1).any()):
+            return None
+        camera = None if picture is None else picture.camera
+        return MeasuredKeypoints.of(self.shape, keypoints, std, camera, self._fitter.size)
+
     def _check_time(self, time: float | None) -> None:
         if time is None:
             return
@@ -286,7 +313,10 @@ class Tracker:
             return None
         data = subsample(frame.data, self.config.max_points, frame_generator(state))
         config = AlignConfig(sharpness=self.config.sharpness)
-        pose = align(self.shape, data, state.pose, model_points=self._fitter.skin, config=config, **frame.told).pose
+        pose = align(
+            self.shape, data, state.pose, model_points=self._fitter.skin, config=config, **frame.told,
+            **frame.keypoints_in_space,
+        ).pose  # fmt: skip
         return self._fitter.fit_at(state, frame, pose, "tracked")
 
     def _is_trusted(self, state: TrackState, frame: Frame, fit: FrameFit | None) -> bool:
