@@ -12,13 +12,20 @@ from torch.nn.functional import pad
 
 from torchreg.alignment.annealed_em import ANNEALING, OnStep, StageResult, anneal
 from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
-from torchreg.alignment.problem import AlignProblem, alignment_cost, joint_precision, masked_mean, model_size
+from torchreg.alignment.problem import (
+    BROAD_PRIOR,
+    AlignProblem,
+    alignment_cost,
+    joint_precision,
+    masked_mean,
+    model_size,
+)
 from torchreg.alignment.reliability import shared_errors
 from torchreg.alignment.results import AlignRecord
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface, pose_covariance, surface_noise
 from torchreg.errors import InputError
+from torchreg.geometry.facing_normals import facing_normals
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
-from torchreg.geometry.normals import estimate_normals
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.sampling import farthest_points
 from torchreg.result import normal_copy
@@ -287,7 +294,10 @@ def _covariance(problem: ShapeProblem, state: Tensor) -> Tensor:
     noise = surface_noise(distance, problem.valid, problem.size)
     near = welsch_weight((distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square()) * problem.valid
     shared = shared_errors(problem.data, distance, near)
-    return pose_covariance(jacobian, near, noise * shared.sqrt(), problem.prior.precision.expand_as(state))
+    rig = problem.skin.shape.rig
+    broad = pad(BROAD_PRIOR.precision(rig, problem.size), (0, state.shape[-1] - rig.num_dofs))
+    precision = torch.maximum(problem.prior.precision, broad).expand_as(state)
+    return pose_covariance(jacobian, near, noise * shared.clamp_min(1).sqrt(), precision)
 
 
 def different_people(space: ShapeSpace, generator: torch.Generator) -> Tensor:
@@ -328,8 +338,8 @@ def _problem(
     model, dense = _skins(tree, surface, config.num_model_points, generator)
     size, count, scans = model_size(model), len(people), len(data)
     origin = masked_mean(data, valid)
-    root = space.rest(torch.cat([space.mean[None], people]))[1][:, 0]
-    start = _start(poses - pad(origin, (0, shape.num_dofs - 3)), people, root[0] - root[1:])
+    middle = space.rest(torch.cat([space.mean[None], people]))[0].mean(-2)
+    start = _start(poses - pad(origin, (0, shape.num_dofs - 3)), people, middle[0] - middle[1:])
     mean = torch.cat([start[:, : shape.num_dofs], space.mean.expand(len(start), -1)], dim=-1)
     precision = torch.cat([joint_precision(shape, size, config.prior_std), space.std.square().reciprocal() / scans])
     every = normals.repeat(count, 1, 1)
@@ -343,15 +353,15 @@ def _problem(
     return problem, start
 
 
-def _start(poses: Tensor, people: Tensor, roots: Tensor) -> Tensor:
-    """Return states (S T, D + K) of people (S, K) in poses (T, D), with their root joint where the mean's is.
+def _start(poses: Tensor, people: Tensor, offsets: Tensor) -> Tensor:
+    """Return states (S T, D + K) of people (S, K) in poses (T, D), with their middle where the mean's is.
 
     Args:
         poses: of the rig at its mean.
         people: coefficients.
-        roots: (S, 3) offset of the mean's root from theirs, at rest, metres.
+        offsets: (S, 3) of the mean's middle from theirs, at rest, metres.
     """
-    moved = (so3_exp(poses[:, 3:6]) @ roots[:, None, :, None]).squeeze(-1)
+    moved = (so3_exp(poses[:, 3:6]) @ offsets[:, None, :, None]).squeeze(-1)
     placed = poses + pad(moved, (0, poses.shape[-1] - 3))
     shared = people.unsqueeze(1).expand(-1, len(poses), -1)
     return torch.cat([placed, shared], dim=-1).flatten(0, 1)
@@ -360,7 +370,7 @@ def _start(poses: Tensor, people: Tensor, roots: Tensor) -> Tensor:
 def _scan_normals(points: Tensor, valid: Tensor, viewpoint: Tensor | None) -> Tensor:
     """Return the normals (M, 3) of a scan, zero where a point is padding."""
     normals = torch.zeros_like(points)
-    normals[valid] = estimate_normals(points[valid], viewpoint=viewpoint)
+    normals[valid] = facing_normals(points[valid], viewpoint).to(points)
     return normals
 
 
