@@ -289,7 +289,8 @@ def _align_person(
     origin = floating_origin(shape, seen.points)
     if origin is not None:
         start = None if initial_pose is None else shifted(torch.as_tensor(initial_pose).double(), -origin)
-        return _align_person(shape, seen.near(origin), start, config, on_step).moved(origin)
+        told = None if on_step is None else partial(_tell_moved, on_step, origin)
+        return _align_person(shape, seen.near(origin), start, config, told).moved(origin)
     with torch.inference_mode():
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
         if clouds.ndim != 2:
@@ -298,9 +299,15 @@ def _align_person(
         initial_pose = _found_pose(shape, seen, None, None, config).starts.best
     pose = _check_start(shape, initial_pose, clouds[None])[0]
     history: list[AlignRecord] = []
+
+    def record(step: AlignRecord) -> None:
+        history.append(step)
+        if on_step is not None:
+            on_step(step)
+
     viewpoints = torch.stack([frame.camera.position for frame in seen.frames]) if seen.frames else None
     fitted = fit_coefficients(
-        shape, clouds[None], valid[None], pose, config=config, viewpoints=viewpoints, on_step=history.append
+        shape, clouds[None], valid[None], pose, config=config, viewpoints=viewpoints, on_step=record
     )
     person = shape.with_coefficients(fitted.coefficients)
     with torch.inference_mode():
@@ -329,15 +336,16 @@ def _align_about(
     on_step: OnStep | None,
 ) -> AlignResult:
     """Return the alignment to data far from the origin of coordinates, computed about an origin (3,) near them."""
-
-    def moved_step(step: AlignRecord) -> None:
-        if on_step is not None:
-            on_step(replace(step, pose=shifted(step.pose.double(), origin.to(step.pose.device))))
-
+    told = None if on_step is None else partial(_tell_moved, on_step, origin)
     start = None if initial_pose is None else shifted(torch.as_tensor(initial_pose).double(), -origin)
     points = model_points - origin if isinstance(model_points, Tensor) else model_points
     known = None if known is None else known.near(origin)
-    return _align(shape, seen.near(origin), start, points, known, config, moved_step).moved(origin)
+    return _align(shape, seen.near(origin), start, points, known, config, told).moved(origin)
+
+
+def _tell_moved(on_step: OnStep, origin: Tensor, step: AlignRecord) -> None:
+    """Pass a record on in coordinates that begin where an origin (3,) is given."""
+    on_step(replace(step, pose=shifted(step.pose.double(), origin.to(step.pose.device))))
 
 
 def _found_pose(

@@ -130,6 +130,8 @@ class Calibration(Result):
         log_radius_scales: (P,) of the fitted shape.
         cost: (), of the joint fit, lower is better.
         status: of the calibration at its end.
+        coefficients: (C,) that all frames share, where the shape has coefficients; it is then that of the person.
+        coefficient_covariance: (C, C) of them.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -137,6 +139,8 @@ class Calibration(Result):
         "log_length_scales": "P",
         "log_radius_scales": "P",
         "cost": "",
+        "coefficients": "C",
+        "coefficient_covariance": "C C",
     }
 
     shape: ArticulatedShape = field(metadata=stored_as(record_shape, build_shape))
@@ -145,6 +149,8 @@ class Calibration(Result):
     log_radius_scales: Tensor
     cost: Tensor
     status: Status
+    coefficients: Tensor | None = None
+    coefficient_covariance: Tensor | None = None
 
 
 @dataclass(frozen=True)

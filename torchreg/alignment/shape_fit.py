@@ -22,6 +22,7 @@ from torchreg.alignment.problem import (
 )
 from torchreg.alignment.reliability import shared_errors
 from torchreg.alignment.results import AlignRecord
+from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface, pose_covariance, surface_noise
 from torchreg.errors import InputError
 from torchreg.geometry.facing_normals import facing_normals
@@ -61,6 +62,7 @@ class ShapeFit:
     coarse_steps: int = 3  # at each width of the surface fit
     fine_steps: int = 4
     em_steps: int = 6  # values of sigma
+    again: float = 0.06  # first sigma of the second annealing, as a share of the size
 
 
 SHAPE_FIT = ShapeFit()
@@ -74,6 +76,7 @@ class FittedShape:
         poses: (T, num_dofs) of the scans.
         coefficients: (K,).
         covariance: (T, num_dofs + K, num_dofs + K), of pose and coefficients in tangent coordinates.
+        cost: () by which people are ranked.
         sigma: (1,) last width of the annealed EM, metres.
         change: (1,) of the last step.
     """
@@ -81,6 +84,7 @@ class FittedShape:
     poses: Tensor
     coefficients: Tensor
     covariance: Tensor
+    cost: Tensor
     sigma: Tensor
     change: Tensor
 
@@ -206,19 +210,21 @@ def fitted_rig(shape: ArticulatedShape, fit_shape: bool | str, *, plain: bool = 
     """Return the rig whose coefficients are to be fitted.
 
     Args:
-        shape: with coefficients of its own.
-        fit_shape: True, for those.
+        shape: with coefficients of its own, or a mesh.
+        fit_shape: True for those coefficients, "bones" for lengths and radii of its parts.
         plain: whether nothing is asked for beside them.
 
     Raises:
         InputError: if it has none, or more is asked for.
     """
-    if fit_shape is not True:
-        raise InputError(f"fit_shape must be True or False, got {fit_shape!r}")
-    shape.coefficient_space()
-    shape.file_surface()
+    if fit_shape is not True and fit_shape != "bones":
+        raise InputError(f"fit_shape must be True, False or 'bones', got {fit_shape!r}")
     if not plain:
         raise InputError("fit_shape goes without model_points, keypoints, locked and prior; leave them out")
+    shape.file_surface()
+    if fit_shape == "bones":
+        return shape.with_bone_coefficients()
+    shape.coefficient_space()
     return shape
 
 
@@ -260,6 +266,7 @@ def fit_coefficients(
     kept = problem.people(coarse.cost_of_people(found.pose).argsort()[: SHAPE_FIT.num_kept])
     coarse, state = coarse.rows(kept), found.pose[kept]
     state = fit_surface(coarse, state, steps=SHAPE_FIT.coarse_steps, on_step=on_step).pose
+    state = _placed_again(coarse, state, config, on_step)
     best = problem.people(coarse.cost_of_people(state).argmin().unsqueeze(0))
     problem, state = problem.rows(kept[best]), state[best]
     fine = problem.sample(SHAPE_FIT.fine_data, generator)
@@ -268,6 +275,18 @@ def fit_coefficients(
         problem, state, steps=SHAPE_FIT.fine_steps, widths=SURFACE_FIT.widths[-1:], on_step=on_step
     )  # fmt: skip
     return _fitted(problem, replace(last, sigma=sigma), shape.num_dofs)
+
+
+def _placed_again(problem: ShapeProblem, state: Tensor, config: AlignConfig, on_step: OnStep | None) -> Tensor:
+    """Return states (B, D + K) after another, narrower annealing, where that explains more of the data.
+
+    Once size and trunk are right, limbs that the first annealing put on the wrong data find theirs.
+    """
+    again = SigmaSchedule.geometric(SHAPE_FIT.again * problem.size, ANNEALING.stop * problem.size, SHAPE_FIT.em_steps)
+    found = anneal(problem, state, again, em_steps=config.em_steps, m_steps=config.m_steps, on_step=on_step).pose
+    found = fit_surface(problem, found, steps=SHAPE_FIT.coarse_steps, on_step=on_step).pose
+    better = problem.cost_of_people(found) < problem.cost_of_people(state)
+    return torch.where(better.repeat_interleave(problem.scans).unsqueeze(-1), found, state)
 
 
 def _tell(on_step: OnStep, problem: ShapeProblem, num_dofs: int, record: AlignRecord) -> None:
@@ -283,6 +302,7 @@ def _fitted(problem: ShapeProblem, found: StageResult, num_dofs: int) -> FittedS
         poses=poses + pad(problem.origin, (0, num_dofs - 3)),
         coefficients=coefficients[0],
         covariance=_covariance(problem, found.pose),
+        cost=problem.cost_of_people(found.pose)[0],
         sigma=found.sigma,
         change=found.change.amax(0, keepdim=True),
     )

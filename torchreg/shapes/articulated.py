@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from torchreg.errors import InputError
 from torchreg.io.file_format import naming
 from torchreg.io.npz import load_arrays
 from torchreg.shapes.articulation import Articulation
+from torchreg.shapes.bone_space import bone_space
 from torchreg.shapes.rigs import spec_from_arrays, spec_from_gltf
 from torchreg.shapes.robots import spec_from_chain, spec_from_urdf
 from torchreg.shapes.shape_space import ShapeSpace
@@ -366,6 +368,18 @@ class ArticulatedShape(Articulation):
             spec = person_spec(self, surface, *space.rest(coefficients))
         free_base = bool(self.upper[0] > 0)
         return ArticulatedShape.from_spec(spec, free_base=free_base, dtype=self.rest.dtype).to(self.rest.device)
+
+    def with_bone_coefficients(self) -> ArticulatedShape:
+        """Return the rig with its own proportions as coefficients: size, girth, lengths and radii of its parts.
+
+        Each is a relative change, 0 for the rig as it is. A fit of them gives another rig the size of a person.
+
+        Raises:
+            InputError: if the shape has no mesh.
+        """
+        other = copy.deepcopy(self)
+        other.space = bone_space(self, self.file_surface()).to(self.rest)
+        return other
 
     def coefficient_space(self) -> ShapeSpace:
         """Return the space of rest states; InputError where the shape has no coefficients."""

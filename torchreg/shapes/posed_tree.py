@@ -270,6 +270,10 @@ class PosedTree(nn.Module):
         """Return a matrix (P, 6 + J) of zeros and ones: which parts the base and every moving joint move."""
         return self._part_moves
 
+    def offset_owners(self) -> Tensor:
+        """Return, per frame (F,), 1 + the part whose length scales its offset from its parent, or 0."""
+        return self._owners
+
     def couplings(self) -> Tensor:
         """Return the matrix (6 + J, num_dofs) from degrees of freedom to base and moving joints."""
         return self._couplings
