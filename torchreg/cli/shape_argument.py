@@ -52,7 +52,7 @@ def load_shape(
     }  # fmt: skip
     if name not in _HANDS and name not in _PEOPLE and ending not in uses:
         raise InputError(
-            f"SHAPE must be hand, hand-left, {', '.join(_PEOPLE)} or a file ending in .urdf, .glb or .gltf; "
+            f"SHAPE must be hand, hand-left or a file ending in .urdf, .glb or .gltf, or one of {', '.join(_PEOPLE)}; "
             f"got {name!r}"
         )
     for option, value in given.items():
