@@ -2,13 +2,15 @@
 
 import json
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from torchreg.alignment.results import AlignResult
 from torchreg.alignment.sigma_schedule import SigmaSchedule
-from torchreg.cli.align_options import alignment_summary, read_cloud, read_schedule, write_pose
+from torchreg.cli.align_options import alignment_summary, person_summary, read_cloud, read_schedule, write_pose
 from torchreg.errors import FormatError, InputError
 from torchreg.io.points import save_points
 from torchreg.result import Status
@@ -58,3 +60,14 @@ def test_the_summary_counts_inliers_and_tells_their_distance():
     assert alignment_summary(found) == "converged, 2 of 3 points inliers, rms 3.54 mm, cost 12.5"
     lost = AlignResult(inliers=torch.zeros(3, dtype=torch.bool), status=Status.FEW_INLIERS, **common)
     assert alignment_summary(lost) == f"{Status.FEW_INLIERS.value}, 0 of 3 points inliers, cost 12.5"
+
+
+def test_people_are_told_by_their_coefficients():
+    value, none = torch.zeros(()), torch.zeros(0)
+    plain = AlignResult(none, none, none, none, none, none, value, value, Status.CONVERGED)
+    fitted = replace(
+        plain, coefficients=torch.tensor([0.25, 1.5]), coefficient_covariance=torch.tensor([0.01, 0.04]).diag()
+    )
+    shape = SimpleNamespace(coefficient_names=("age", "height"))
+    assert person_summary(shape, plain) == ""
+    assert person_summary(shape, fitted) == "age 0.25 +- 0.10, height 1.50 +- 0.20"

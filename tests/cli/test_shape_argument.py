@@ -14,6 +14,14 @@ def test_hands_have_names():
     assert not left.keypoints(rest).allclose(right.keypoints(rest), atol=1e-3)
 
 
+def test_people_have_names(monkeypatch):
+    asked = []
+    monkeypatch.setattr("torchreg.shapes.articulated.ArticulatedShape.from_anny", asked.append)
+    for name in ("anny-body", "anny-hand", "anny-hand-left"):
+        load_shape(name)
+    assert asked == ["body", "hand.R", "hand.L"]
+
+
 def test_robots_are_files_with_a_free_base_unless_fixed(folder):
     name = str(folder / "arm.urdf")
     assert load_shape(name).lower[:6].isinf().all()

@@ -45,6 +45,7 @@ from torchreg.alignment.reliability import (
 )
 from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES
+from torchreg.alignment.shape_fit import fit_coefficients, fitted_rig
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.capture.depth_frame import DepthFrame
@@ -163,6 +164,7 @@ def align(
     mask: Tensor | None = None,
     locked: Sequence[str] | Tensor = (),
     prior: tuple[Any, Any] | None = None,
+    fit_shape: bool | str = False,
     keypoints: Tensor | None = None,
     keypoint_std: Tensor | float | None = None,
     config: AlignConfig | None = None,
@@ -191,6 +193,9 @@ def align(
             ``config.prior_std``. Each is a tensor (num_dofs,) or (B, num_dofs), or a dictionary by name of degree of
             freedom; the deviation also one number, for all that a dictionary names or for all joints. The data count
             against it as errors that neighbors share, not one by one.
+        fit_shape: True to fit the shape's coefficients too, with their prior: a body to a person. "bones" does so for
+            any rig, whose coefficients are then the lengths and radii of its parts. For one cloud or depth frame
+            without keypoints, locked degrees of freedom and prior; a start is given for the mean coefficients.
         keypoints: where a detector saw the shape's keypoints (of a hand 21, see `AlignResult.keypoints`), as evidence
             beside the data: (K, 3), metres, or with depth frames of one camera (K, 2), pixels as (column, row); NaN for
             those not seen. (B, K, 3) or (B, K, 2) for a batch.
@@ -236,6 +241,9 @@ def align(
         return replace(found, crop=crop.mask)
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
     known = KnownDofs.of(shape, locked, prior)
+    if fit_shape is not False:
+        shape = fitted_rig(shape, fit_shape, plain=known is None and model_points is None and seen.keypoints is None)
+        return _align_person(shape, seen, initial_pose, config, on_step)
     origin = floating_origin(shape, seen.points)
     if origin is not None:
         return _align_about(origin, shape, seen, initial_pose, model_points, known, config, on_step)
@@ -280,6 +288,53 @@ def _align(
         return normal_copy(_unbatched(result) if clouds.ndim == 2 else result)
 
 
+def _align_person(
+    shape: ArticulatedShape,
+    seen: Observation,
+    initial_pose: Tensor | None,
+    config: AlignConfig,
+    on_step: OnStep | None,
+) -> AlignResult:
+    """Return the alignment of a rig whose coefficients are fitted together with its pose."""
+    origin = floating_origin(shape, seen.points)
+    if origin is not None:
+        start = None if initial_pose is None else shifted(torch.as_tensor(initial_pose).double(), -origin)
+        told = None if on_step is None else partial(_tell_moved, on_step, origin)
+        return _align_person(shape, seen.near(origin), start, config, told).moved(origin)
+    with torch.inference_mode():
+        clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
+        if clouds.ndim != 2:
+            raise InputError("fit_shape takes one cloud; calibrate fits several scans of one person")
+    if initial_pose is None:
+        initial_pose = _found_pose(shape, seen, None, None, config).starts.best
+    pose = _check_start(shape, initial_pose, clouds[None])[0]
+    history: list[AlignRecord] = []
+
+    def record(step: AlignRecord) -> None:
+        history.append(step)
+        if on_step is not None:
+            on_step(step)
+
+    viewpoints = torch.stack([frame.camera.position for frame in seen.frames]) if seen.frames else None
+    fitted = fit_coefficients(
+        shape, clouds[None], valid[None], pose, config=config, viewpoints=viewpoints, on_step=record
+    )
+    person = shape.with_coefficients(fitted.coefficients)
+    with torch.inference_mode():
+        skin = _model_skin(person, None, fitted.poses, config)
+        batch = _centered_batch(skin, clouds, valid, fitted.poses, config, on_step, seen)
+        found = StageResult(pose=batch.start, sigma=fitted.sigma, change=fitted.change)
+        result = _unbatched(_result(batch, found, config, None, batch.problem))
+        dofs = shape.num_dofs
+        return normal_copy(replace(
+            result,
+            history=tuple(history),
+            coefficients=fitted.coefficients,
+            covariance=fitted.covariance[0, :dofs, :dofs],
+            coefficient_covariance=fitted.covariance[0, dofs:, dofs:],
+        ))  # fmt: skip
+
+
 def _align_about(
     origin: Tensor,
     shape: ArticulatedShape,
@@ -291,15 +346,16 @@ def _align_about(
     on_step: OnStep | None,
 ) -> AlignResult:
     """Return the alignment to data far from the origin of coordinates, computed about an origin (3,) near them."""
-
-    def moved_step(step: AlignRecord) -> None:
-        if on_step is not None:
-            on_step(replace(step, pose=shifted(step.pose.double(), origin.to(step.pose.device))))
-
+    told = None if on_step is None else partial(_tell_moved, on_step, origin)
     start = None if initial_pose is None else shifted(torch.as_tensor(initial_pose).double(), -origin)
     points = model_points - origin if isinstance(model_points, Tensor) else model_points
     known = None if known is None else known.near(origin)
-    return _align(shape, seen.near(origin), start, points, known, config, moved_step).moved(origin)
+    return _align(shape, seen.near(origin), start, points, known, config, told).moved(origin)
+
+
+def _tell_moved(on_step: OnStep, origin: Tensor, step: AlignRecord) -> None:
+    """Pass a record on in coordinates that begin where an origin (3,) is given."""
+    on_step(replace(step, pose=shifted(step.pose.double(), origin.to(step.pose.device))))
 
 
 def _found_pose(

@@ -16,6 +16,7 @@ from torchreg.alignment.sigma_schedule import SigmaSchedule, estimate_sigma
 from torchreg.alignment.softassign import softassign
 from torchreg.solvers.e_step import OUTLIER_CONSTANT, EStep, expectation, outlier_constant, working_volume
 from torchreg.solvers.levenberg_marquardt import LMResult
+from torchreg.solvers.oriented_e_step import oriented_expectation
 
 OnStep = Callable[[AlignRecord], None]
 
@@ -98,9 +99,9 @@ def anneal(
         if not adaptive:
             sigma = torch.full_like(sigma, schedule.values[step])
         for _ in range(em_steps):
-            rows, derivative = problem.skin.shape.transform_jacobian(pose, chart="tangent")
+            rows, derivative = problem.skin.row_jacobian(pose)
             posed = problem.skin.place(rows)
-            matches = _match(problem, posed, sigma)
+            matches = _match(problem, rows, posed, sigma)
             prior = _tempered_prior(problem, matches)
             objective = RegistrationObjective(problem.skin, matches, sigma, prior, problem.landmarks)
             around = objective.linearize(pose, rows, derivative)
@@ -118,13 +119,16 @@ def anneal(
     return StageResult(pose=pose, sigma=sigma, change=change)
 
 
-def _match(problem: AlignProblem, posed: Tensor, sigma: Tensor) -> EStep:
+def _match(problem: AlignProblem, rows: Tensor, posed: Tensor, sigma: Tensor) -> EStep:
     """Return the E-step at posed model points (B, N, 3), debiased while the kernel is wide."""
     outlier = outlier_level(problem, posed, sigma)
-    rule = CORRESPONDENCES[problem.correspondence]
-    matches = rule(posed, problem.data, sigma, outlier, mask=problem.valid)
+    rule, model, data = CORRESPONDENCES[problem.correspondence], posed, problem.data
+    if problem.normals is not None:
+        rule = oriented_expectation
+        model, data = torch.cat([posed, problem.skin.turn_normals(rows)], -1), torch.cat([data, problem.normals], -1)
+    matches = rule(model, data, sigma, outlier, mask=problem.valid)
     if problem.debias > 0 and float(sigma.max()) > ANNEALING.debias_from * problem.size:
-        return _debiased(matches, posed, rule(posed, posed, sigma, outlier), problem.debias)
+        return _debiased(matches, posed, rule(model, model, sigma, outlier), problem.debias)
     return matches
 
 

@@ -17,9 +17,10 @@ from torchreg.alignment.inputs import check_clouds
 from torchreg.alignment.problem import model_size
 from torchreg.alignment.results import Calibration
 from torchreg.alignment.scale_fit import SCALE_FIT, ScalePrior, ScaleProblem
+from torchreg.alignment.shape_fit import fit_coefficients
 from torchreg.alignment.surface_fit import SURFACE_FIT
 from torchreg.errors import InputError
-from torchreg.result import Status
+from torchreg.result import Status, normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import sample_skin
 from torchreg.solvers.levenberg_marquardt import levenberg_marquardt
@@ -95,9 +96,12 @@ def calibrate(
     all data, robustly (eqs. 21 and 22 summed over the frames), with a hierarchical prior on the scales: one overall
     size, one ratio of radii to lengths, and small deviations of each part. Both are repeated with the better shape.
 
+    Of a shape with coefficients, the frames are scans of one person: its coefficients and all poses are fitted
+    together, as ``align(..., fit_shape=True)`` fits those of one scan.
+
     Args:
-        shape: where to start, in metres; it is not changed. Its solids are fitted, so it must not have come from a file
-            with a mesh.
+        shape: where to start, in metres; it is not changed. It has coefficients, or its solids are fitted: then it must
+            not have come from a file with a mesh.
         frames: T clouds: (T, M, 3), or a sequence of (M_t, 3), metres. One to ten frames whose joints move help most.
         initial_poses: (T, num_dofs) or (num_dofs,) for all; the rest pose by default.
         masks: (T, M) False where data are padding; for frames in one tensor.
@@ -119,9 +123,12 @@ def calibrate(
     References: Dewaele et al. 2006, section 3.4, for the distances.
     """
     config = config or CalibrateConfig()
+    if shape.space is not None:
+        return _calibrate_person(shape, frames, initial_poses, masks, config)
     if shape.surface is not None:
         raise InputError(
-            "shape has the surface of a file, whose mesh cannot follow the scales; calibrate a shape made of solids"
+            "shape has the surface of a file, whose mesh cannot follow the scales; calibrate a shape made of solids, "
+            "or shape.with_bone_coefficients()"
         )
     with torch.no_grad():
         data, valid = _check_frames(shape, frames, masks, config.align.nan_policy)
@@ -153,6 +160,35 @@ def calibrate(
         cost=cost,
         status=Status.DEGENERATE if Status.DEGENERATE in failed else Status.FEW_INLIERS if failed else status,
     )
+
+
+def _calibrate_person(
+    shape: ArticulatedShape,
+    frames: Tensor | Sequence[Tensor],
+    initial_poses: Tensor | None,
+    masks: Tensor | None,
+    config: CalibrateConfig,
+) -> Calibration:
+    """Return the person whom frames show: one set of coefficients, and a pose for each frame."""
+    with torch.inference_mode():
+        data, valid = _check_frames(shape, frames, masks, config.align.nan_policy)
+        poses = _check_poses(shape, initial_poses, len(data))
+    fitted = fit_coefficients(shape, data, valid, poses, config=config.align)
+    person = shape.with_coefficients(fitted.coefficients)
+    # Each frame tells of the coefficients what it would alone, with its share of the prior; information adds up.
+    alone = fitted.covariance[:, shape.num_dofs :, shape.num_dofs :].double()
+    shared = torch.linalg.inv(torch.linalg.inv(alone).sum(0))
+    status = Status.CONVERGED if float(fitted.change.max()) <= config.align.pose_atol else Status.MAX_STEPS
+    return normal_copy(Calibration(
+        shape=person,
+        poses=fitted.poses,
+        log_length_scales=person.log_length_scales.detach().clone(),
+        log_radius_scales=person.log_radius_scales.detach().clone(),
+        cost=fitted.cost,
+        status=status,
+        coefficients=fitted.coefficients,
+        coefficient_covariance=shared.to(poses),
+    ))  # fmt: skip
 
 
 def _rests_on_data(status: Status) -> bool:

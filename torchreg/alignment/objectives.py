@@ -97,7 +97,7 @@ class RegistrationObjective:
 
     def __call__(self, pose: Tensor) -> Linearization:
         """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs)."""
-        return self.linearize(pose, *self.skin.shape.transform_jacobian(pose, chart="tangent"))
+        return self.linearize(pose, *self.skin.row_jacobian(pose))
 
     def linearize(self, pose: Tensor, rows: Tensor, derivative: Tensor) -> Linearization:
         """Return the same, given the part transforms and their derivatives at the pose (see `transform_jacobian`)."""

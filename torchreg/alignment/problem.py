@@ -15,6 +15,7 @@ from torchreg.geometry.kinematic_tree import stack_sizes
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.link_surface import LinkSurface, has_rigid_links
 from torchreg.shapes.pose_algebra import BASE_DOFS
+from torchreg.shapes.shaped import ShapedSkin
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.surface import FusedSurface, ShapeSurface, SkinSurface, dense_file_skin
 from torchreg.solvers.levenberg_marquardt import (
@@ -73,6 +74,7 @@ class AlignProblem:
         free_space: what depth pictures say of where nothing is; None for clouds alone.
         told_precision: (B, num_dofs) 1 / std^2 of what is known beforehand, zero where nothing is; None for nothing.
         landmarks: measured keypoints, or None.
+        normals: (B, M, 3) of the data, which count beside positions in the EM; None where they do not.
     """
 
     skin: LinearBlendSkin
@@ -91,6 +93,7 @@ class AlignProblem:
     free_space: FreeSpaceTerm | None = None
     told_precision: Tensor | None = None
     landmarks: Landmarks | None = None
+    normals: Tensor | None = None
 
     def rows(self, index: Tensor) -> AlignProblem:
         """Return the problems of some rows of the batch, which may repeat."""
@@ -105,6 +108,7 @@ class AlignProblem:
             told_precision=None if self.told_precision is None else self.told_precision[index],
             free_space=None if self.free_space is None else self.free_space.rows(index),
             landmarks=None if self.landmarks is None else self.landmarks.rows(index),
+            normals=None if self.normals is None else self.normals[index],
         )
 
     def repeated(self, count: int) -> AlignProblem:
@@ -177,7 +181,7 @@ def masked_mean(data: Tensor, valid: Tensor) -> Tensor:
     return (data * valid.unsqueeze(-1)).sum(-2) / valid.sum(-1, keepdim=True).clamp_min(1)
 
 
-def model_size(skin: LinearBlendSkin) -> float:
+def model_size(skin: LinearBlendSkin | ShapedSkin) -> float:
     """Return the diagonal of the bounding box of model points in their reference pose, metres."""
     return float((skin.points.amax(0) - skin.points.amin(0)).norm())
 
@@ -228,7 +232,7 @@ def centered_problem(
         size=size,
         lower=lower,
         upper=upper,
-        prior=GaussianPosePrior(pose - shift, _joint_precision(shape, size, prior_std)),
+        prior=GaussianPosePrior(pose - shift, joint_precision(shape, size, prior_std)),
         pose_atol=pose_atol,
         outlier=outlier,
         debias=debias,
@@ -238,7 +242,7 @@ def centered_problem(
     )
 
 
-def _joint_precision(shape: Articulation, size: float, std: float | None) -> Tensor:
+def joint_precision(shape: Articulation, size: float, std: float | None) -> Tensor:
     """Return the precision (num_dofs,) of a prior that leaves the base free, from the joints' deviation."""
     precision = torch.zeros_like(shape.rest)
     if std is not None:

@@ -62,11 +62,15 @@ class AlignResult(Result):
             posterior are those of ``frame.cropped(crop).points``. None where what was aligned to was given.
         origin: (3,) float64 about which it was computed, where the data lie so far from that of coordinates that the
             shape's precision would round them; pose, registered points and keypoints are float64 then. None elsewhere.
+        coefficients: (C,) of the shape, where they were fitted too; the distances and all else are those of
+            ``shape.with_coefficients(coefficients)``. None where the shape was taken as it was.
+        coefficient_covariance: (C, C) of them.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
         "pose": "D", "registered": "N 3", "keypoints": "K 3", "distances": "M", "inliers": "M", "posterior": "M",
         "sigma": "", "cost": "", "covariance": "D D", "confidence": "", "evidence": "E", "crop": "H W",
+        "coefficients": "C", "coefficient_covariance": "C C",
     }  # fmt: skip
 
     pose: Tensor
@@ -85,6 +89,8 @@ class AlignResult(Result):
     doubt: str | tuple[str, ...] | None = None
     crop: Tensor | None = None
     origin: Tensor | None = None
+    coefficients: Tensor | None = None
+    coefficient_covariance: Tensor | None = None
 
     def moved(self, origin: Tensor) -> Self:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
@@ -124,6 +130,8 @@ class Calibration(Result):
         log_radius_scales: (P,) of the fitted shape.
         cost: (), of the joint fit, lower is better.
         status: of the calibration at its end.
+        coefficients: (C,) that all frames share, where the shape has coefficients; it is then that of the person.
+        coefficient_covariance: (C, C) of them.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -131,6 +139,8 @@ class Calibration(Result):
         "log_length_scales": "P",
         "log_radius_scales": "P",
         "cost": "",
+        "coefficients": "C",
+        "coefficient_covariance": "C C",
     }
 
     shape: ArticulatedShape = field(metadata=stored_as(record_shape, build_shape))
@@ -139,6 +149,8 @@ class Calibration(Result):
     log_radius_scales: Tensor
     cost: Tensor
     status: Status
+    coefficients: Tensor | None = None
+    coefficient_covariance: Tensor | None = None
 
 
 @dataclass(frozen=True)

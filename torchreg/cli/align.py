@@ -20,6 +20,7 @@ from torchreg.cli.align_options import (
     Time,
     alignment_summary,
     cloud_files,
+    person_summary,
     read_cloud,
     read_schedule,
     write_pose,
@@ -77,6 +78,14 @@ def align(
             "without one the shape is searched for."
         ),
     ] = None,
+    fit_shape: Annotated[
+        bool,
+        typer.Option(
+            "--fit-shape",
+            help="Also fit the shape's coefficients, as of a body to a person; of a rig without any the lengths and "
+            "radii of its parts.",
+        ),
+    ] = False,
     depth: Depth = False,
     intrinsics: Intrinsics = None,
     mask: Mask = None,
@@ -120,6 +129,8 @@ def align(
     With --depth --intrinsics FILE what the pictures say of free space counts too: nothing is in front of what was
     measured, nor beside the --mask.
 
+    With --fit-shape the result holds the coefficients, and every cloud starts from --start, or is searched, by itself.
+
     What is known of the pose, --joints, counts with its --joint-std against data of which neighbors err together.
     So do keypoints that a detector saw, --keypoints, of which some may be wrong.
 
@@ -149,7 +160,9 @@ def align(
         points = sample_skin(model, config.num_model_points, sharpness=config.sharpness)
         known = read_known(model, locked, joints, joint_std, len(clouds))
         measured = read_keypoints(keypoints, keypoint_std, len(clouds))
-        run = _AlignRun(model, config, points, scale, time, frame, first, known, measured, pictures)
+        run = _AlignRun(
+            model, config, points, scale, time, frame, first, known, measured, pictures=pictures, fit_shape=fit_shape
+        )
         if side == "either":
             side = run.choose_hand(clouds[0])
             if not quiet:
@@ -194,7 +207,12 @@ class _AlignRun:
     known: Known
     measured: MeasuredFrames
     pictures: DepthFrames | None = None
+    fit_shape: bool = False
     results: list[AlignResult] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        if self.fit_shape and not self.shape.coefficient_names:
+            self.shape = self.shape.with_bone_coefficients()
 
     @functools.cached_property
     def surface(self) -> LinearBlendSkin:
@@ -202,6 +220,13 @@ class _AlignRun:
         from torchreg.datasets.hand import surface_skin
 
         return surface_skin(self.shape)
+
+    def fitted(self, result: AlignResult) -> tuple[ArticulatedShape, LinearBlendSkin]:
+        """Return the shape of a result, and its surface: with --fit-shape those of the person found."""
+        if result.coefficients is None:
+            return self.shape, self.surface
+        person = self.shape.with_coefficients(result.coefficients)
+        return person, person.file_skin()
 
     def align_all(self, clouds: list[Path], files: list[_Files], bar: Any, quiet: bool) -> None:
         """Align to all clouds, and tell of each."""
@@ -211,7 +236,7 @@ class _AlignRun:
             bar.update()
             if not quiet:
                 loose = observability(self.shape, result) if self.known.rows else ""
-                told = "; ".join(filter(None, (alignment_summary(result), loose)))
+                told = "; ".join(filter(None, (alignment_summary(result), person_summary(self.shape, result), loose)))
                 bar.write(f"{path}: {told} -> {entry.result}")
 
     def align(self, number: int, path: Path, files: _Files, on_step: Callable[[Any], None]) -> AlignResult:
@@ -221,12 +246,13 @@ class _AlignRun:
 
         data = self._data(number, path)
         result = align(
-            self.shape, data, self.start, model_points=self.skin, locked=self.known.locked,
-            prior=self.known.prior(number), config=self.config, on_step=on_step, **self.measured.of(number),
+            self.shape, data, self.start, model_points=None if self.fit_shape else self.skin, locked=self.known.locked,
+            prior=self.known.prior(number), fit_shape=self.fit_shape, config=self.config, on_step=on_step,
+            **self.measured.of(number),
         )  # fmt: skip
         self._write(result, as_points(data), files)
         self.results.append(result)
-        if result.statuses[0].usable:
+        if result.statuses[0].usable and not self.fit_shape:
             self.start = result.pose
         return result
 
@@ -263,7 +289,8 @@ class _AlignRun:
 
             shown = result.local(self.shape.rest)
             near = data if result.origin is None else (data - result.origin).to(self.shape.rest)
-            ax = draw_alignment(None, self.shape, shown.pose, near, result.inliers, skin=self.surface)
+            shape, surface = self.fitted(result)
+            ax = draw_alignment(None, shape, shown.pose, near, result.inliers, skin=surface)
             save_picture(ax.get_figure(), files.picture)  # type: ignore[arg-type]
         # The result is written last: if it exists, all others do.
         result.save(files.result)
@@ -277,5 +304,6 @@ class _AlignRun:
 
         origin = self.results[0].origin
         poses = torch.stack([shifted_to(origin, result.pose) for result in self.results])
-        save_shape_animation(path, self.shape, poses, skin=self.surface)
+        shape, surface = self.fitted(self.results[-1])
+        save_shape_animation(path, shape, poses, skin=surface)
         tell_origin(path, origin)

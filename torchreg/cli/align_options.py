@@ -101,3 +101,18 @@ def alignment_summary(result: AlignResult) -> str:
     sure = "" if result.confidence is None else f" (confidence {float(result.confidence):.2f})"
     doubt = f"; {result.doubt}" if result.statuses[0] is Status.DOUBTFUL and result.doubt else ""
     return f"{result.statuses[0].value}{sure}, {counts}, {rms}cost {float(result.cost):.4g}{doubt}"
+
+
+# Coefficients told in a line of a terminal: anny's, and the size and girth of a rig with some of its parts.
+_TOLD = 6
+
+
+def person_summary(shape: ArticulatedShape, result: AlignResult) -> str:
+    """Return the coefficients that were fitted, with their standard deviations; nothing where none were."""
+    if result.coefficients is None or result.coefficient_covariance is None:
+        return ""
+    rows = zip(
+        shape.coefficient_names, result.coefficients.tolist(),
+        result.coefficient_covariance.diagonal().sqrt().tolist(), strict=True,
+    )  # fmt: skip
+    return ", ".join(f"{name} {value:.2f} +- {std:.2f}" for name, value, std in list(rows)[:_TOLD])

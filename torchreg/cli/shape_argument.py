@@ -15,7 +15,11 @@ if TYPE_CHECKING:
     from torchreg.shapes.articulated import ArticulatedShape
 
 _HANDS = {"hand": "right", "hand-left": "left"}
-_HELP = "hand, hand-left, a robot (.urdf) or a rigged character (.glb, .gltf)."
+_PEOPLE = {"anny-body": "body", "anny-hand": "hand.R", "anny-hand-left": "hand.L"}
+_HELP = (
+    "hand, hand-left, a robot (.urdf) or a rigged character (.glb, .gltf); or a person of anny: anny-body, anny-hand, "
+    "anny-hand-left."
+)
 
 Shape = Annotated[str, typer.Argument(metavar="SHAPE", help=_HELP)]
 Parents = Annotated[
@@ -46,8 +50,11 @@ def load_shape(
         "--parents": parents, "--package-dir": package_dirs or None, "--free-base/--fixed-base": free_base,
         "--skin": skin,
     }  # fmt: skip
-    if name not in _HANDS and ending not in uses:
-        raise InputError(f"SHAPE must be hand, hand-left or a file ending in .urdf, .glb or .gltf; got {name!r}")
+    if name not in _HANDS and name not in _PEOPLE and ending not in uses:
+        raise InputError(
+            f"SHAPE must be hand, hand-left or a file ending in .urdf, .glb or .gltf, or one of {', '.join(_PEOPLE)}; "
+            f"got {name!r}"
+        )
     for option, value in given.items():
         if value is not None and option not in uses.get(ending, set()):
             raise InputError(f"{option} has no meaning for {name}; leave it out")
@@ -57,6 +64,8 @@ def load_shape(
         return Hand(_HANDS[name])
     from torchreg.shapes.articulated import ArticulatedShape
 
+    if name in _PEOPLE:
+        return ArticulatedShape.from_anny(_PEOPLE[name])
     if ending == ".urdf":
         return ArticulatedShape.from_urdf(name, package_dirs=package_dirs or (), free_base=free_base is not False)
     chosen = int(skin) if skin is not None and skin.isdecimal() else skin

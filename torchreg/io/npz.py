@@ -7,16 +7,18 @@ import io
 import math
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import IO
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from torchreg.errors import FormatError, InputError
 from torchreg.io.atomic import write_atomic
 from torchreg.io.columns import cloud_of_columns
-from torchreg.io.limits import FileLimits, check_allowed, local_path, open_zip
+from torchreg.io.file_format import naming
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, open_zip, read_bytes
 from torchreg.io.raw_cloud import Array, RawCloud, as_indices
 
 
@@ -153,6 +155,36 @@ def _read_array(archive: zipfile.ZipFile, name: str) -> Array:
     if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != held:
         raise FormatError(f"member {name!r} claims the shape {shape} of {dtype} but holds {held} bytes")
     return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape, order="F" if fortran else "C")
+
+
+def load_arrays(
+    path: str | os.PathLike[str], names: Sequence[str], *, limits: FileLimits = DEFAULT_LIMITS
+) -> dict[str, Tensor]:
+    """Return arrays of real numbers by name from an .npz file; all others in it are left alone.
+
+    Args:
+        path: a local file ending in .npz.
+        names: of the arrays.
+        limits: on the size of the file.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FormatError: if it is no archive, or lacks an array or holds one of objects, which are never loaded.
+    """
+    file = local_path(path)
+    content = read_bytes(file, limits)
+    with naming(path), open_zip(content, limits) as archive:
+        held = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
+        lacking = [name for name in names if name not in held]
+        if lacking:
+            raise FormatError(f"lacks the array {lacking[0]!r}; it holds {', '.join(sorted(held)[:12]) or 'none'}")
+        arrays = {name: _read_array(archive, held[name]) for name in names}
+    return {name: torch.from_numpy(_signed(array)) for name, array in arrays.items()}
+
+
+def _signed(array: Array) -> Array:
+    """Return a copy of an array in a type that torch has."""
+    return array.astype(np.int64 if array.dtype.kind in "iu" else array.dtype.newbyteorder("="))
 
 
 def write_npz(cloud: RawCloud) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,12 +10,19 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from torchreg._checks import as_float_tensor, check_count, check_finite, check_shape
 from torchreg.errors import InputError
+from torchreg.io.file_format import naming
+from torchreg.io.npz import load_arrays
 from torchreg.shapes.articulation import Articulation
+from torchreg.shapes.bone_space import bone_space
 from torchreg.shapes.rigs import spec_from_arrays, spec_from_gltf
 from torchreg.shapes.robots import spec_from_chain, spec_from_urdf
+from torchreg.shapes.shape_space import ShapeSpace
+from torchreg.shapes.shaped import ShapedTree, blended
+from torchreg.shapes.shaped_rig import Coefficients, ShapeDirs, person_spec
 from torchreg.shapes.skin import LinearBlendSkin
-from torchreg.shapes.spec import ShapeSpec
+from torchreg.shapes.spec import RigSurface, ShapeSpec
 
 if TYPE_CHECKING:
     from torchreg.shapes.kinematics import Chain
@@ -43,6 +51,7 @@ class ArticulatedShape(Articulation):
         part_names: names of the parts; the frame names by default.
         free_base: False pins the base at the origin (its six limits are zero).
         surface: mesh and skin weights of the file the shape came from, if any.
+        space: rest states of the rig by shape coefficients, if it has any.
         dtype: of all parameters and buffers; the default dtype if None.
 
     Raises:
@@ -185,11 +194,20 @@ class ArticulatedShape(Articulation):
         joint_names: Sequence[str] | None = None,
         axes: Mapping[str, Sequence[str | Sequence[float]]] | None = None,
         limits: Mapping[str, Sequence[tuple[float, float]]] | None = None,
+        shape_dirs: ShapeDirs | None = None,
+        joint_dirs: Tensor | None = None,
+        joint_regressor: Tensor | None = None,
+        coefficient_names: Sequence[str] | None = None,
+        coefficient_std: Tensor | float = 1.0,
         primitive: str = "ellipsoid",
         nu: float | None = None,
         dtype: torch.dtype | None = None,
     ) -> ArticulatedShape:
         """Return the shape of a skinned mesh given as arrays, such as those of SMPL or MANO files.
+
+        With ``shape_dirs`` the rest state depends on K coefficients c: vertices ``vertices + shape_dirs @ c`` and
+        joints ``joints + joint_dirs @ c``, or ``joint_regressor @ vertices``. Offsets that depend on the pose, as SMPL
+        has, are left out.
 
         Args:
             vertices: (V, 3) in the bind pose, metres.
@@ -200,6 +218,13 @@ class ArticulatedShape(Articulation):
             joint_names: J names; "joint_0", ... by default.
             axes: see `from_gltf`.
             limits: see `from_gltf`.
+            shape_dirs: (V, 3, K) metres per unit of each coefficient; or a function of coefficients (..., K), named by
+                ``coefficient_names``, that returns vertices (..., V, 3) and joints (..., J, 3), whose mean is at zero.
+            joint_dirs: (J, 3, K), beside ``shape_dirs``.
+            joint_regressor: (J, V), in place of ``joint_dirs``.
+            coefficient_names: K names; "shape_0", ... by default.
+            coefficient_std: standard deviation of the coefficients' prior about zero, one number or (K,); a fit keeps
+                them within five of it.
             primitive: kind of the fitted solids.
             nu: fusion length, metres; from the parts' thickness by default.
             dtype: of the module; the default dtype if None.
@@ -210,12 +235,165 @@ class ArticulatedShape(Articulation):
         Raises:
             InputError: if the arrays do not fit together.
             ModelError: if the hierarchy is cyclic or disconnected.
+
+        References: Loper et al. 2015, SMPL, eqs. 2 to 10, for coefficients.
         """
         spec = spec_from_arrays(
             vertices, faces, weights, joints, parents,
             joint_names=joint_names, axes=axes, limits=limits, primitive=primitive,
         )  # fmt: skip
-        return cls.from_spec(spec, nu=nu, dtype=dtype)
+        coefficients = Coefficients(
+            shape_dirs=shape_dirs, joint_dirs=joint_dirs, joint_regressor=joint_regressor, names=coefficient_names,
+            std=coefficient_std,
+        )  # fmt: skip
+        positions = as_float_tensor(joints, "joints").double()
+        positions = positions if positions.ndim == 2 else positions[:, :3, 3]
+        names = [f"joint_{index}" for index in range(len(positions))] if joint_names is None else list(joint_names)
+        space = coefficients.space(spec.tree, as_float_tensor(vertices, "vertices").double(), positions, names)
+        return cls.from_spec(spec, nu=nu, dtype=dtype, space=space)
+
+    @classmethod
+    def from_npz(
+        cls,
+        path: str | Path,
+        *,
+        num_coefficients: int = 10,
+        joint_names: Sequence[str] | None = None,
+        nu: float | None = None,
+        dtype: torch.dtype | None = None,
+    ) -> ArticulatedShape:
+        """Return the shape of a body or hand model in an .npz file with the arrays of SMPL, SMPL-X, MANO or MHR.
+
+        Read are ``v_template`` (V, 3), ``f`` (F, 3), ``weights`` (V, J), ``kintree_table`` (2, J) and ``J_regressor``
+        (J, V), and of ``shapedirs`` (V, 3, K) the first coefficients. No pickled object is ever loaded: a .pkl file, or
+        an array of objects in the .npz file, has to be converted by its own library first.
+
+        Args:
+            path: the file.
+            num_coefficients: of shape, at most.
+            joint_names: J names; "joint_0", ... by default.
+            nu: fusion length, metres; from the parts' thickness by default.
+            dtype: of the module; the default dtype if None.
+
+        Raises:
+            FormatError: if the file is damaged, lacks an array, or holds one of objects.
+            InputError: if the arrays do not fit together.
+        """
+        check_count(num_coefficients, "num_coefficients", 1)
+        arrays = load_arrays(path, ("v_template", "f", "weights", "kintree_table", "J_regressor", "shapedirs"))
+        with naming(path):
+            vertices, regressor = (as_float_tensor(arrays[name], name) for name in ("v_template", "J_regressor"))
+            check_shape(vertices, "v_template", ("V", 3))
+            check_shape(regressor, "J_regressor", ("J", len(vertices)))
+            check_shape(arrays["kintree_table"], "kintree_table", (2, len(regressor)))
+            dirs = as_float_tensor(arrays["shapedirs"], "shapedirs")[..., :num_coefficients]
+            return cls.from_skinned_mesh(
+                vertices, arrays["f"].long(), arrays["weights"], regressor @ vertices,
+                [int(parent) for parent in arrays["kintree_table"][0]], joint_names=joint_names, shape_dirs=dirs,
+                joint_regressor=regressor, nu=nu, dtype=dtype,
+            )  # fmt: skip
+
+    @classmethod
+    def from_anny(cls, kind: str = "body", *, dtype: torch.dtype | None = None) -> ArticulatedShape:
+        """Return the body or a hand of anny, a free parametric model of people, with its phenotypes as coefficients.
+
+        The coefficients are gender, age, muscle, weight, height and proportions, from 0 to 1; at rest the vertices are
+        anny's ``rest_vertices``, in its order and coordinates (z is up). The model is read once and then kept in anny's
+        cache folder.
+
+        Args:
+            kind: "body" (`anny.Anny()`, 13,718 vertices, 103 parts), "hand.R" or "hand.L" (1,609 vertices).
+            dtype: of the module; the default dtype if None.
+
+        Raises:
+            InputError: if the kind is another.
+            MissingExtraError: if anny is not installed.
+
+        Cost: two seconds; the first time those that anny takes to build its model, minutes for a hand.
+
+        References: Bregier et al. 2025, Human mesh modeling for Anny body.
+        """
+        from torchreg.shapes.anny_body import load_anny
+
+        spec, space = load_anny(kind)
+        return cls.from_spec(spec, dtype=dtype, space=space)
+
+    @property
+    def coefficient_names(self) -> tuple[str, ...]:
+        """Names of the shape coefficients; none where the shape has no coefficients."""
+        return () if self.space is None else self.space.names
+
+    def vertices(self, pose: Tensor, coefficients: Tensor | None = None) -> Tensor:
+        """Return the vertices of the mesh in a pose, of a person with some coefficients.
+
+        Args:
+            pose: (..., num_dofs).
+            coefficients: (..., K), with batch dimensions that broadcast; the shape as it is if None.
+
+        Returns:
+            (..., V, 3), metres, in the file's order.
+
+        Raises:
+            InputError: if the shape has no mesh or no coefficients, or a size is wrong.
+
+        Differentiable: in both, in reverse and forward mode.
+        """
+        surface = self.file_surface()
+        if coefficients is None:
+            return self(pose).points
+        space = self.coefficient_space()
+        check_shape(pose, "pose", (self.num_dofs,), batch=True)
+        check_shape(coefficients, "coefficients", (len(space),), batch=True)
+        batch = torch.broadcast_shapes(pose.shape[:-1], coefficients.shape[:-1])
+        state = torch.cat([pose.expand(*batch, -1), coefficients.expand(*batch, -1)], dim=-1)
+        posed = ShapedTree(self, space).posed(state, space)
+        return blended(posed, surface.weights.to(self.rest), posed.vertices)[0]
+
+    def with_coefficients(self, coefficients: Tensor) -> ArticulatedShape:
+        """Return the shape of one person: a rig like this, with other vertices and bones, without coefficients.
+
+        Args:
+            coefficients: (K,).
+
+        Raises:
+            InputError: if the shape has no coefficients, or their number or values are wrong.
+
+        Differentiable: no; see `vertices`.
+        """
+        surface, space = self.file_surface(), self.coefficient_space()
+        coefficients = as_float_tensor(coefficients, "coefficients", like=self.rest).detach()
+        check_shape(coefficients, "coefficients", (len(space),))
+        check_finite(coefficients, "coefficients")
+        with torch.no_grad():
+            spec = person_spec(self, surface, *space.rest(coefficients))
+        free_base = bool(self.upper[0] > 0)
+        return ArticulatedShape.from_spec(spec, free_base=free_base, dtype=self.rest.dtype).to(self.rest.device)
+
+    def with_bone_coefficients(self) -> ArticulatedShape:
+        """Return the rig with its own proportions as coefficients: size, girth, lengths and radii of its parts.
+
+        Each is a relative change, 0 for the rig as it is. A fit of them gives another rig the size of a person.
+
+        Raises:
+            InputError: if the shape has no mesh.
+        """
+        other = copy.deepcopy(self)
+        other.space = bone_space(self, self.file_surface()).to(self.rest)
+        return other
+
+    def coefficient_space(self) -> ShapeSpace:
+        """Return the space of rest states; InputError where the shape has no coefficients."""
+        if self.space is None:
+            raise InputError(
+                "this shape has no coefficients; make it by from_anny, from_npz, or from_skinned_mesh(shape_dirs=...)"
+            )
+        return self.space
+
+    def file_surface(self) -> RigSurface:
+        """Return mesh and weights of the file; InputError where the shape has none."""
+        if self.surface is None:
+            raise InputError("this shape has no mesh: it was not read from a file with one")
+        return self.surface
 
     def file_skin(self) -> LinearBlendSkin:
         """Return the skin of the file this shape was read from: its vertices under its weights.

@@ -23,6 +23,7 @@ from torchreg.geometry.rigid import invert_rigid, rigid_matrix
 from torchreg.shapes.material_points import MaterialPoints, ShapeOutput, fused_points, mesh_points, onto_fused
 from torchreg.shapes.posed_tree import PosedTree, frozen
 from torchreg.shapes.primitives import Primitive, PrimitiveSet, fuse
+from torchreg.shapes.shape_space import ShapeSpace
 from torchreg.shapes.spec import RigSurface
 
 
@@ -60,6 +61,7 @@ class Articulation(PosedTree):
         part_names: Sequence[str] | None = None,
         free_base: bool = True,
         surface: RigSurface | None = None,
+        space: ShapeSpace | None = None,
         dtype: torch.dtype | None = None,
     ) -> None:
         check_positive(nu, "nu")
@@ -71,6 +73,7 @@ class Articulation(PosedTree):
         super().__init__(tree, part_frames, part_names, free_base)
         self.primitives = PrimitiveSet(primitives)
         self.surface = surface
+        self.space = space
         self.log_radius_scales = frozen(torch.zeros(len(primitives), dtype=torch.float64))
         self.log_nu = frozen(torch.tensor(math.log(nu), dtype=torch.float64))
         self.log_sharpness = frozen(torch.tensor(math.log(sharpness), dtype=torch.float64))

@@ -118,6 +118,10 @@ class ForwardKinematics(nn.Module):
             frames = torch.cat([done, above @ rest], dim=-3)
         return frames.index_select(-3, self.tree_order)
 
+    def ancestors(self) -> Tensor:
+        """Return a matrix (F, F), float64, of ones where a frame (row) is or hangs on another (column)."""
+        return _ancestor_matrix(self.tree)
+
     def _local(self, joint_values: Tensor, offset_scales: Tensor | None) -> Tensor:
         """Return the transform (..., F, 4, 4) of every frame in its parent."""
         values = nn.functional.linear(joint_values, self.frame_couplings, self.frame_values).unsqueeze(-1)

@@ -234,10 +234,14 @@ class PosedTree(nn.Module):
     def _twists(self, pose: Tensor, chart: str) -> tuple[Tensor, Tensor, Tensor]:
         """Return part transforms and the twists of base and moving joints: linear and angular (..., 6 + J, 3)."""
         frames = self.frame_transforms(pose)
+        return frames.index_select(-3, self.part_index), *self.frame_twists(pose, frames, chart)
+
+    def frame_twists(self, pose: Tensor, frames: Tensor, chart: str) -> tuple[Tensor, Tensor]:
+        """Return the twists of base and moving joints for given frames (..., F, 4, 4): both (..., 6 + J, 3)."""
         joints = self.kinematics.joint_twists(frames)[0]
         linear, angular = _base_twists(pose, chart)
         linear = torch.cat([linear, joints[..., :3]], dim=-2)
-        return frames.index_select(-3, self.part_index), linear, torch.cat([angular, joints[..., 3:]], dim=-2)
+        return linear, torch.cat([angular, joints[..., 3:]], dim=-2)
 
     def transform_jacobian(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
         """Return the stacked part transforms, in whose rows skins are linear, and their analytic derivatives.
@@ -261,6 +265,18 @@ class PosedTree(nn.Module):
         derivative = (rows.flatten(-3, -2) @ motions).unflatten(-1, (3, -1)) * self._row_moves
         derivative = derivative @ self._couplings if self.kinematics.has_mimics else derivative
         return rows[..., :3].flatten(-3, -2), derivative
+
+    def part_moves(self) -> Tensor:
+        """Return a matrix (P, 6 + J) of zeros and ones: which parts the base and every moving joint move."""
+        return self._part_moves
+
+    def offset_owners(self) -> Tensor:
+        """Return, per frame (F,), 1 + the part whose length scales its offset from its parent, or 0."""
+        return self._owners
+
+    def couplings(self) -> Tensor:
+        """Return the matrix (6 + J, num_dofs) from degrees of freedom to base and moving joints."""
+        return self._couplings
 
     def _offset_scales(self) -> Tensor:
         """Return the factors (F,) on the length of each frame's offset from its parent."""

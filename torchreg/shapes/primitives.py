@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchreg.errors import ModelError
 from torchreg.geometry.primitives import PRIMITIVE_KINDS, Planes
-from torchreg.geometry.rigid import RIGID_TOLERANCE, rotation_error
+from torchreg.geometry.rigid import RIGID_TOLERANCE, rigid_matrix, rotation_error
 
 # Radius of a ball that holds a solid, in norms of its sizes: boxes reach their corners and capsules their round ends.
 BALL_FACTOR = 1.5
@@ -87,6 +87,16 @@ class PrimitiveSet(nn.Module):
 
     def __len__(self) -> int:
         return len(self.part_kinds)
+
+    def solids(self) -> list[Primitive]:
+        """Return the solids with their present sizes and poses, in the order of the parts; detached, on the CPU."""
+        sizes = {
+            int(part): tuple(row)
+            for kind, rows in zip(self.kinds, self.sizes, strict=True)
+            for part, row in zip(self.get_buffer(f"members_{kind}"), rows.tolist(), strict=True)
+        }
+        poses = rigid_matrix(self.rotations, self.centers).detach().cpu()
+        return [Primitive(kind, sizes[part], poses[part]) for part, kind in enumerate(self.part_kinds)]
 
     def scaled_sizes(self, length_scales: Tensor, radius_scales: Tensor) -> list[Tensor]:
         """Return the sizes (P_kind, S_kind) of each kind's solids with lengths along z and radii across it scaled.

@@ -8,10 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from torchreg.errors import InputTypeError, ModelError
-from torchreg.geometry.rigid import rigid_matrix
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
-from torchreg.shapes.primitives import Primitive, PrimitiveSet
 from torchreg.shapes.spec import ShapeSpec
 
 # Tensors of a record that earlier releases did not have: nu and sharpness.
@@ -65,7 +63,7 @@ def record_shape(shape: ArticulatedShape) -> ShapeRecord:
     elif type(shape) is ArticulatedShape:
         tree = shape.kinematics.tree
         frames = tuple(tree.joints[index].name for index in shape.part_index.tolist())
-        solids = tuple(_solids(shape.primitives))
+        solids = tuple(shape.primitives.solids())
         spec = ShapeSpec(
             tree=tree,
             part_frames=frames,
@@ -125,14 +123,3 @@ def _tensors(shape: ArticulatedShape) -> list[Tensor]:
     solids = shape.primitives
     scales = shape.log_length_scales, shape.log_radius_scales
     return [*scales, solids.centers, *solids.sizes, shape.log_nu, shape.log_sharpness]
-
-
-def _solids(primitives: PrimitiveSet) -> list[Primitive]:
-    """Return the solids with their present sizes and poses, in the order of the parts."""
-    sizes = {
-        int(part): tuple(row)
-        for kind, rows in zip(primitives.kinds, primitives.sizes, strict=True)
-        for part, row in zip(primitives.get_buffer(f"members_{kind}"), rows.tolist(), strict=True)
-    }
-    poses = rigid_matrix(primitives.rotations, primitives.centers).detach().cpu()
-    return [Primitive(kind, sizes[part], poses[part]) for part, kind in enumerate(primitives.part_kinds)]

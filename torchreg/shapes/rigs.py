@@ -100,8 +100,12 @@ def spec_from_arrays(
     axes: Axes | None = None,
     limits: Limits | None = None,
     primitive: str = "ellipsoid",
+    solids: Sequence[Primitive] | None = None,
 ) -> ShapeSpec:
-    """Return the `ShapeSpec` of a skinned mesh; see `ArticulatedShape.from_skinned_mesh`."""
+    """Return the `ShapeSpec` of a skinned mesh; see `ArticulatedShape.from_skinned_mesh`.
+
+    Solids of the parts, in their joints' frames, are fitted unless they are given.
+    """
     check_choice(primitive, "primitive", SOLID_CHOICES)
     vertices = as_float_tensor(vertices, "vertices").double()
     frames = _joint_frames(as_float_tensor(joints, "joints").double())
@@ -118,20 +122,31 @@ def spec_from_arrays(
     tree, last_frame = _ball_joint_tree(order, parent_list, names, frames, used, axes=axes or {}, limits=limits or {})
     parts = [index for index in order if bool(weights[:, index].max() > 0)]
     part_frames = tuple(last_frame[index] for index in parts)
-    owners = weights.argmax(-1)
-    solids = [fitted_solid(_owned_vertices(vertices, weights[:, index], owners == index), primitive) for index in parts]
-    nu = fusion_length(solids, _FIT.nu_per_thickness)
-    neighbors = neighbor_matrix(part_parents(tree, [tree.index(name) for name in part_frames]))
-    spread = torch.linspace(0, len(vertices) - 1, min(len(vertices), _FIT.refined_points)).long()
-    solids = refine_primitives(solids, neighbors, nu, vertices[spread], weights[spread][:, parts].argmax(-1))
+    if solids is None:
+        solids, nu = _fitted_solids(vertices, weights, parts, tree, part_frames, primitive)
+        solids = [_in_joint_frame(*pair, frames, parent_list) for pair in zip(solids, parts, strict=True)]
+    else:
+        nu = fusion_length(solids, _FIT.nu_per_thickness)
     return ShapeSpec(
         tree=tree,
         part_frames=part_frames,
-        primitives=tuple(_in_joint_frame(*pair, frames, parent_list) for pair in zip(solids, parts, strict=True)),
+        primitives=tuple(solids),
         nu=nu,
         part_names=tuple(names[index] for index in parts),
         surface=RigSurface(vertices, mesh.faces, weights[:, parts]),
     )
+
+
+def _fitted_solids(
+    vertices: Tensor, weights: Tensor, parts: Sequence[int], tree: KinematicTree, frames: Sequence[str], primitive: str
+) -> tuple[list[Primitive], float]:
+    """Return solids (one per part) fitted to the vertices of the parts, in their coordinates, and a fusion length."""
+    owners = weights.argmax(-1)
+    solids = [fitted_solid(_owned_vertices(vertices, weights[:, part], owners == part), primitive) for part in parts]
+    nu = fusion_length(solids, _FIT.nu_per_thickness)
+    neighbors = neighbor_matrix(part_parents(tree, [tree.index(name) for name in frames]))
+    spread = torch.linspace(0, len(vertices) - 1, min(len(vertices), _FIT.refined_points)).long()
+    return refine_primitives(solids, neighbors, nu, vertices[spread], weights[spread][:, parts].argmax(-1)), nu
 
 
 def _skin_weights(weights: Tensor, shape: tuple[int, int]) -> Tensor:

@@ -118,6 +118,10 @@ class LinearBlendSkin(nn.Module):
         """Return the skin as it is now, with constant weights: itself, unless it follows its shape."""
         return self
 
+    def row_jacobian(self, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the rows that `place` takes, and their derivatives (..., 4 P, 3, num_dofs) in tangent coordinates."""
+        return self.shape.transform_jacobian(pose, chart="tangent")
+
     def jacobian(self, pose: Tensor, *, chart: str = "pose") -> tuple[Tensor, Tensor]:
         """Return the posed points and their analytic Jacobian with respect to all degrees of freedom.
 

@@ -1,0 +1,411 @@
+"""Fitting the shape coefficients of a rig together with its pose, to one scan or several scans of one person."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from torchreg.alignment.annealed_em import ANNEALING, OnStep, StageResult, anneal
+from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
+from torchreg.alignment.problem import (
+    BROAD_PRIOR,
+    AlignProblem,
+    alignment_cost,
+    joint_precision,
+    masked_mean,
+    model_size,
+)
+from torchreg.alignment.reliability import shared_errors
+from torchreg.alignment.results import AlignRecord
+from torchreg.alignment.sigma_schedule import SigmaSchedule
+from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface, pose_covariance, surface_noise
+from torchreg.errors import InputError
+from torchreg.geometry.facing_normals import facing_normals
+from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
+from torchreg.geometry.rotation import so3_exp
+from torchreg.geometry.sampling import farthest_points
+from torchreg.result import normal_copy
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.shape_space import ShapeSpace
+from torchreg.shapes.shaped import ShapedSkin, ShapedTree
+from torchreg.shapes.shaped_surface import ShapedSurface
+from torchreg.shapes.spec import RigSurface
+from torchreg.solvers.levenberg_marquardt import (
+    Linearization,
+    LMResult,
+    damped_step,
+    held_at_limits,
+    levenberg_marquardt,
+)
+from torchreg.solvers.robust import welsch_weight
+
+if TYPE_CHECKING:
+    from torchreg.alignment.align import AlignConfig
+
+
+@dataclass(frozen=True)
+class ShapeFit:
+    """Numbers of a fit of pose and shape."""
+
+    num_draws: int = 200  # of the coefficients' prior, from which starts of different sizes are taken
+    num_starts: int = 6  # sizes of a body are an octave apart, and the annealed EM finds its way over a tenth
+    num_kept: int = 2  # starts that are still fitted to the surface
+    coarse_data: int = 1000  # of each scan, by which starts are told apart
+    fine_data: int = 1500  # of each scan, before all of them count
+    surface_points: int = 2000  # samples of the surface
+    oversampling: int = 8  # candidates per model point
+    coarse_steps: int = 3  # at each width of the surface fit
+    fine_steps: int = 4
+    em_steps: int = 6  # values of sigma
+    again: float = 0.06  # first sigma of the second annealing, as a share of the size
+
+
+SHAPE_FIT = ShapeFit()
+
+
+@dataclass(frozen=True)
+class FittedShape:
+    """Poses and coefficients at the end of a fit.
+
+    Args:
+        poses: (T, num_dofs) of the scans.
+        coefficients: (K,).
+        covariance: (T, num_dofs + K, num_dofs + K), of pose and coefficients in tangent coordinates.
+        cost: () by which people are ranked.
+        sigma: (1,) last width of the annealed EM, metres.
+        change: (1,) of the last step.
+    """
+
+    poses: Tensor
+    coefficients: Tensor
+    covariance: Tensor
+    cost: Tensor
+    sigma: Tensor
+    change: Tensor
+
+
+@dataclass(frozen=True)
+class ShapeProblem(AlignProblem):
+    """Alignments whose degrees of freedom end with shape coefficients, which successive rows may share.
+
+    Args:
+        skin: model points, of a `ShapedTree`.
+        surface: the surface that the surface fit fits.
+        scans: rows, one after another, of one person.
+    """
+
+    skin: ShapedSkin  # type: ignore[assignment]
+    surface: ShapedSurface
+    scans: int = 1
+
+    def rows(self, index: Tensor) -> ShapeProblem:
+        """Return the problems of some rows of the batch."""
+        chosen: ShapeProblem = super().rows(index)  # type: ignore[assignment]
+        return replace(chosen, surface=self.surface.with_normals(chosen.data_normals()))
+
+    def people(self, index: Tensor) -> Tensor:
+        """Return the rows (S T,) of some people (S,)."""
+        return (index.unsqueeze(-1) * self.scans + torch.arange(self.scans)).flatten()
+
+    def data_normals(self) -> Tensor:
+        """Return the normals (B, M, 3) of the data."""
+        return torch.zeros_like(self.data) if self.normals is None else self.normals
+
+    def sample(self, count: int, generator: torch.Generator) -> ShapeProblem:
+        """Return the problem with at most so many data of every scan, the same for all people."""
+        draw = torch.rand(self.scans, self.valid.shape[1], generator=generator).to(self.data)
+        draw = draw.repeat(len(self.data) // self.scans, 1)
+        keep = torch.where(self.valid, draw, -1.0).topk(min(count, draw.shape[-1]), dim=-1).indices
+        index = keep.unsqueeze(-1).expand(*keep.shape, 3)
+        normals = self.data_normals().gather(1, index)
+        return replace(
+            self, data=self.data.gather(1, index), valid=self.valid.gather(1, keep), normals=normals,
+            surface=self.surface.with_normals(normals),
+        )  # fmt: skip
+
+    def cost_of_people(self, state: Tensor) -> Tensor:
+        """Return the cost (S,) by which people are ranked."""
+        return alignment_cost(self, state).unflatten(0, (-1, self.scans)).sum(-1)
+
+    def solve(
+        self,
+        objective: RegistrationObjective | SurfaceObjective,
+        pose: Tensor,
+        max_steps: int,
+        around: Linearization,
+        damping: Tensor | None = None,
+    ) -> LMResult:
+        """Return the result of Levenberg-Marquardt, see `AlignProblem.solve`, with coefficients shared."""
+        if self.scans == 1:
+            return super().solve(objective, pose, max_steps, around, damping)
+        low, high = self._joined_limits()
+        found = levenberg_marquardt(
+            lambda state: self._joined(objective(self._split(state))), self._together(pose), retract=self._retract,
+            lower=low, upper=high, damping=damping, max_steps=max_steps, atol=self.pose_atol * min(1.0, self.size),
+            start=self._joined(around),
+        )  # fmt: skip
+        return self._spread(found)
+
+    def step(self, around: Linearization, pose: Tensor, damping: float = 1e-3) -> LMResult:
+        """Return the result of one damped step, see `AlignProblem.step`, with coefficients shared."""
+        if self.scans == 1:
+            return super().step(around, pose, damping)
+        joined, state = self._joined(around), self._together(pose)
+        low, high = self._joined_limits()
+        shares = torch.full_like(state[:, 0], damping)
+        step, _ = damped_step(joined, shares, frozen=held_at_limits(joined.gradient, state, low, high))
+        moved = torch.minimum(torch.maximum(self._retract(state, step), low), high)
+        return self._spread(LMResult(moved, joined.cost, shares, step, 1))
+
+    @property
+    def _dofs(self) -> int:
+        return self.skin.shape.rig.num_dofs
+
+    def _together(self, rows: Tensor) -> Tensor:
+        """Return rows (S T, D + K) as one state a person, (S, T D + K)."""
+        grouped = rows.unflatten(0, (-1, self.scans))
+        return torch.cat([grouped[..., : self._dofs].flatten(1), grouped[:, 0, self._dofs :]], dim=-1)
+
+    def _split(self, state: Tensor) -> Tensor:
+        """Return states (S, T D + K) as rows (S T, D + K)."""
+        poses, coefficients = state.tensor_split([self.scans * self._dofs], dim=-1)
+        shared = coefficients.unsqueeze(1).expand(-1, self.scans, -1)
+        return torch.cat([poses.unflatten(1, (self.scans, -1)), shared], dim=-1).flatten(0, 1)
+
+    def _retract(self, state: Tensor, step: Tensor) -> Tensor:
+        return self._together(self.skin.shape.retract(self._split(state), self._split(step)))
+
+    def _joined_limits(self) -> tuple[Tensor, Tensor]:
+        low, high = (limit.expand(self.scans, -1) for limit in (self.lower, self.upper))
+        return self._together(low)[0], self._together(high)[0]
+
+    def _joined(self, rows: Linearization) -> Linearization:
+        """Return the least-squares problem (S, T D + K) of people from that of their scans (S T, D + K)."""
+        dofs, scans = self._dofs, self.scans
+        gradient, hessian = (value.unflatten(0, (-1, scans)) for value in (rows.gradient, rows.hessian))
+        poses = hessian.new_zeros(len(hessian), scans, dofs, scans, dofs)
+        index = torch.arange(scans)
+        poses[:, index, :, index] = hessian[..., :dofs, :dofs].transpose(0, 1)
+        across = hessian[..., :dofs, dofs:].flatten(1, 2)
+        corner = hessian[..., dofs:, dofs:].sum(1)
+        top = torch.cat([poses.flatten(3, 4).flatten(1, 2), across], dim=-1)
+        return Linearization(
+            cost=rows.cost.unflatten(0, (-1, scans)).sum(-1),
+            gradient=torch.cat([gradient[..., :dofs].flatten(1), gradient[..., dofs:].sum(1)], dim=-1),
+            hessian=torch.cat([top, torch.cat([across.mT, corner], dim=-1)], dim=1),
+        )
+
+    def _spread(self, found: LMResult) -> LMResult:
+        """Return a result over people as one over their scans."""
+        cost, damping = (value.repeat_interleave(self.scans) for value in (found.cost, found.damping))
+        return LMResult(self._split(found.state), cost, damping, self._split(found.last_step), found.num_steps)
+
+
+def fitted_rig(shape: ArticulatedShape, fit_shape: bool | str, *, plain: bool = True) -> ArticulatedShape:
+    """Return the rig whose coefficients are to be fitted.
+
+    Args:
+        shape: with coefficients of its own, or a mesh.
+        fit_shape: True for those coefficients, "bones" for lengths and radii of its parts.
+        plain: whether nothing is asked for beside them.
+
+    Raises:
+        InputError: if it has none, or more is asked for.
+    """
+    if fit_shape is not True and fit_shape != "bones":
+        raise InputError(f"fit_shape must be True, False or 'bones', got {fit_shape!r}")
+    if not plain:
+        raise InputError("fit_shape goes without model_points, keypoints, locked and prior; leave them out")
+    shape.file_surface()
+    if fit_shape == "bones":
+        return shape.with_bone_coefficients()
+    shape.coefficient_space()
+    return shape
+
+
+@torch.inference_mode()
+def fit_coefficients(
+    shape: ArticulatedShape,
+    data: Tensor,
+    valid: Tensor,
+    poses: Tensor,
+    *,
+    config: AlignConfig,
+    viewpoints: Tensor | None = None,
+    on_step: OnStep | None = None,
+) -> FittedShape:
+    """Return the poses of T scans of one person and the coefficients that they share.
+
+    Annealed EM, in which normals count beside positions, registers people of different sizes; the best are fitted to
+    the surface. Coefficients are further columns of the same normal equations as the pose.
+
+    Args:
+        shape: a rig with coefficients and a mesh.
+        data: (T, M, 3), metres.
+        valid: (T, M) False where padded.
+        poses: (T, num_dofs) to start from, of the rig at its mean coefficients.
+        config: of the alignment.
+        viewpoints: (T, 3) of the cameras, where they are known.
+        on_step: called after each iteration.
+
+    Differentiable: no.
+    """
+    generator = torch.Generator().manual_seed(config.seed)
+    problem, start = _problem(shape, data, valid, poses, viewpoints, config=config, generator=generator)
+    if on_step is not None:
+        on_step = partial(_tell, on_step, problem, shape.num_dofs)
+    coarse = problem.sample(SHAPE_FIT.coarse_data, generator)
+    widths = config.schedule or ANNEALING.schedule(problem.size, SHAPE_FIT.em_steps)
+    found = anneal(coarse, start, widths, em_steps=config.em_steps, m_steps=config.m_steps, on_step=on_step)
+    sigma = found.sigma[:1]
+    kept = problem.people(coarse.cost_of_people(found.pose).argsort()[: SHAPE_FIT.num_kept])
+    coarse, state = coarse.rows(kept), found.pose[kept]
+    state = fit_surface(coarse, state, steps=SHAPE_FIT.coarse_steps, on_step=on_step).pose
+    state = _placed_again(coarse, state, config, on_step)
+    best = problem.people(coarse.cost_of_people(state).argmin().unsqueeze(0))
+    problem, state = problem.rows(kept[best]), state[best]
+    fine = problem.sample(SHAPE_FIT.fine_data, generator)
+    state = fit_surface(fine, state, steps=SHAPE_FIT.fine_steps, on_step=on_step).pose
+    last = fit_surface(
+        problem, state, steps=SHAPE_FIT.fine_steps, widths=SURFACE_FIT.widths[-1:], on_step=on_step
+    )  # fmt: skip
+    return _fitted(problem, replace(last, sigma=sigma), shape.num_dofs)
+
+
+def _placed_again(problem: ShapeProblem, state: Tensor, config: AlignConfig, on_step: OnStep | None) -> Tensor:
+    """Return states (B, D + K) after another, narrower annealing, where that explains more of the data.
+
+    Once size and trunk are right, limbs that the first annealing put on the wrong data find theirs.
+    """
+    again = SigmaSchedule.geometric(SHAPE_FIT.again * problem.size, ANNEALING.stop * problem.size, SHAPE_FIT.em_steps)
+    found = anneal(problem, state, again, em_steps=config.em_steps, m_steps=config.m_steps, on_step=on_step).pose
+    found = fit_surface(problem, found, steps=SHAPE_FIT.coarse_steps, on_step=on_step).pose
+    better = problem.cost_of_people(found) < problem.cost_of_people(state)
+    return torch.where(better.repeat_interleave(problem.scans).unsqueeze(-1), found, state)
+
+
+def _tell(on_step: OnStep, problem: ShapeProblem, num_dofs: int, record: AlignRecord) -> None:
+    """Pass on a record with the poses alone, in the coordinates of the data."""
+    scans = len(record.pose) // problem.scans
+    origin = pad(problem.origin[: problem.scans].repeat(scans, 1), (0, num_dofs - 3))
+    on_step(normal_copy(replace(record, pose=record.pose[:, :num_dofs] + origin)))
+
+
+def _fitted(problem: ShapeProblem, found: StageResult, num_dofs: int) -> FittedShape:
+    poses, coefficients = found.pose.tensor_split([num_dofs], dim=-1)
+    return FittedShape(
+        poses=poses + pad(problem.origin, (0, num_dofs - 3)),
+        coefficients=coefficients[0],
+        covariance=_covariance(problem, found.pose),
+        cost=problem.cost_of_people(found.pose)[0],
+        sigma=found.sigma,
+        change=found.change.amax(0, keepdim=True),
+    )
+
+
+def _covariance(problem: ShapeProblem, state: Tensor) -> Tensor:
+    """Return the covariance (T, D + K, D + K) of each scan's pose and the coefficients, as if it were alone."""
+    distance, jacobian = problem.surface.distance_jacobian(problem.data, state)
+    noise = surface_noise(distance, problem.valid, problem.size)
+    near = welsch_weight((distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square()) * problem.valid
+    shared = shared_errors(problem.data, distance, near)
+    rig = problem.skin.shape.rig
+    broad = pad(BROAD_PRIOR.precision(rig, problem.size), (0, state.shape[-1] - rig.num_dofs))
+    precision = torch.maximum(problem.prior.precision, broad).expand_as(state)
+    return pose_covariance(jacobian, near, noise * shared.clamp_min(1).sqrt(), precision)
+
+
+def different_people(space: ShapeSpace, generator: torch.Generator) -> Tensor:
+    """Return coefficients (S, K) of people of evenly spread sizes, of each size the most plausible of many drawn.
+
+    Args:
+        space: of rest states.
+        generator: of the draws.
+    """
+    count = SHAPE_FIT.num_draws - SHAPE_FIT.num_draws % SHAPE_FIT.num_starts
+    noise = torch.randn(count, len(space), generator=generator, dtype=torch.float64).to(space.mean)
+    drawn = torch.minimum(torch.maximum(space.mean + noise * space.std, space.lower), space.upper)
+    frames = space.rest(drawn)[1]
+    size = (frames.amax(-2) - frames.amin(-2)).norm(dim=-1)
+    groups = size.argsort().unflatten(0, (SHAPE_FIT.num_starts, -1))
+    unlikely = ((drawn - space.mean) / space.std).square().sum(-1)
+    return drawn[groups.gather(1, unlikely[groups].argmin(1, keepdim=True))[:, 0]]
+
+
+def _problem(
+    shape: ArticulatedShape,
+    data: Tensor,
+    valid: Tensor,
+    poses: Tensor,
+    viewpoints: Tensor | None,
+    *,
+    config: AlignConfig,
+    generator: torch.Generator,
+) -> tuple[ShapeProblem, Tensor]:
+    """Return the problem of S people in T scans, S T rows about the scans' means, and its start."""
+    space, surface = shape.coefficient_space(), shape.file_surface()
+    people = different_people(space, generator)
+    tree = ShapedTree(shape, space)
+    normals = torch.stack([
+        _scan_normals(points, told, None if viewpoints is None else viewpoints[number])
+        for number, (points, told) in enumerate(zip(data, valid, strict=True))
+    ])  # fmt: skip
+    model, dense = _skins(tree, surface, config.num_model_points, generator)
+    size, count, scans = model_size(model), len(people), len(data)
+    origin = masked_mean(data, valid)
+    middle = space.rest(torch.cat([space.mean[None], people]))[0].mean(-2)
+    start = _start(poses - pad(origin, (0, shape.num_dofs - 3)), people, middle[0] - middle[1:])
+    mean = torch.cat([start[:, : shape.num_dofs], space.mean.expand(len(start), -1)], dim=-1)
+    precision = torch.cat([joint_precision(shape, size, config.prior_std), space.std.square().reciprocal() / scans])
+    every = normals.repeat(count, 1, 1)
+    problem = ShapeProblem(
+        skin=model, surface=ShapedSurface(dense, every, SURFACE_FIT.max_width * size),
+        data=torch.where(valid.unsqueeze(-1), data - origin.unsqueeze(1), 0.0).repeat(count, 1, 1),
+        valid=valid.repeat(count, 1), origin=origin.repeat(count, 1), size=size, lower=tree.lower, upper=tree.upper,
+        prior=GaussianPosePrior(mean, precision), pose_atol=config.pose_atol, debias=config.debias, normals=every,
+        scans=scans,
+    )  # fmt: skip
+    return problem, start
+
+
+def _start(poses: Tensor, people: Tensor, offsets: Tensor) -> Tensor:
+    """Return states (S T, D + K) of people (S, K) in poses (T, D), with their middle where the mean's is.
+
+    Args:
+        poses: of the rig at its mean.
+        people: coefficients.
+        offsets: (S, 3) of the mean's middle from theirs, at rest, metres.
+    """
+    moved = (so3_exp(poses[:, 3:6]) @ offsets[:, None, :, None]).squeeze(-1)
+    placed = poses + pad(moved, (0, poses.shape[-1] - 3))
+    shared = people.unsqueeze(1).expand(-1, len(poses), -1)
+    return torch.cat([placed, shared], dim=-1).flatten(0, 1)
+
+
+def _scan_normals(points: Tensor, valid: Tensor, viewpoint: Tensor | None) -> Tensor:
+    """Return the normals (M, 3) of a scan, zero where a point is padding."""
+    normals = torch.zeros_like(points)
+    normals[valid] = facing_normals(points[valid], viewpoint).to(points)
+    return normals
+
+
+def _skins(
+    tree: ShapedTree, surface: RigSurface, count: int, generator: torch.Generator
+) -> tuple[ShapedSkin, ShapedSkin]:
+    """Return model points that cover the surface evenly, and denser ones to measure distances from."""
+    mean = TriangleMesh(tree.space.rest(tree.space.mean)[0].cpu(), surface.faces.cpu())
+    weights = surface.weights.cpu().to(mean.vertices)
+
+    def skin(face: Tensor, shares: Tensor) -> ShapedSkin:
+        carried = interpolate(weights, mean.faces, face, shares)
+        return ShapedSkin(tree, *(value.to(tree.rest.device) for value in (mean.faces[face], shares, carried)))
+
+    points, face, shares = sample_surface(mean, SHAPE_FIT.oversampling * count, generator=generator)
+    chosen = farthest_points(points, count)
+    _, dense_face, dense_shares = sample_surface(mean, SHAPE_FIT.surface_points, generator=generator)
+    return skin(face[chosen], shares[chosen]), skin(dense_face, dense_shares)

@@ -1,0 +1,203 @@
+"""The rest state of a rig as a function of shape coefficients."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+RestFunction = Callable[[Tensor], tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True, eq=False)
+class CoefficientPrior:
+    """What is known of shape coefficients before any data.
+
+    Args:
+        names: K names.
+        mean: (K,).
+        std: (K,) standard deviations.
+        lower: (K,) limits.
+        upper: (K,) limits.
+    """
+
+    names: tuple[str, ...]
+    mean: Tensor
+    std: Tensor
+    lower: Tensor
+    upper: Tensor
+
+    @classmethod
+    def normal(cls, names: Sequence[str], std: Tensor | float = 1.0, limit: float = 5.0) -> CoefficientPrior:
+        """Return the prior of coefficients about zero, which lie within so many standard deviations."""
+        deviations = torch.as_tensor(std, dtype=torch.float64).expand(len(names)).clone()
+        return cls(
+            names=tuple(names), mean=torch.zeros_like(deviations), std=deviations, lower=-limit * deviations,
+            upper=limit * deviations,
+        )  # fmt: skip
+
+
+class ShapeSpace(nn.Module):
+    """Rest vertices and rest frames of a rig that depend on K coefficients.
+
+    Args:
+        prior: on the coefficients.
+    """
+
+    mean: Tensor
+    std: Tensor
+    lower: Tensor
+    upper: Tensor
+
+    def __init__(self, prior: CoefficientPrior) -> None:
+        super().__init__()
+        self.names = prior.names
+        for name in ("mean", "std", "lower", "upper"):
+            self.register_buffer(name, getattr(prior, name).detach().clone(), persistent=False)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def prior(self) -> CoefficientPrior:
+        """What is known of the coefficients before any data."""
+        return CoefficientPrior(self.names, mean=self.mean, std=self.std, lower=self.lower, upper=self.upper)
+
+    def rest(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the rest state for coefficients.
+
+        Args:
+            coefficients: (..., K).
+
+        Returns:
+            Vertices (..., V, 3) and positions of the frames of the tree (..., F, 3), metres.
+
+        Differentiable: in the coefficients.
+        """
+        raise NotImplementedError
+
+    def rest_jacobian(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the derivatives (B, V, 3, K) and (B, F, 3, K) of the rest state by coefficients (B, K)."""
+        by_vertex, by_frame = _row_jacobians(self.rest, coefficients)
+        return by_vertex, by_frame
+
+    def restricted(self, index: Tensor) -> ShapeSpace:
+        """Return the space with some of the vertices only, by index (U,)."""
+        raise NotImplementedError
+
+
+class LinearSpace(ShapeSpace):
+    """Rest states that are linear in features of the coefficients, ``vertices + vertex_dirs @ features(c)``.
+
+    Args:
+        vertices: (V, 3) where the features are zero, metres.
+        vertex_dirs: (V, 3, L).
+        frames: (F, 3) where the features are zero, metres.
+        frame_dirs: (F, 3, L).
+        prior: on the coefficients.
+        features: takes coefficients (..., K) to features (..., L); None where they are the coefficients.
+    """
+
+    vertices: Tensor
+    vertex_dirs: Tensor
+    frames: Tensor
+    frame_dirs: Tensor
+
+    def __init__(
+        self,
+        vertices: Tensor,
+        vertex_dirs: Tensor,
+        frames: Tensor,
+        frame_dirs: Tensor,
+        prior: CoefficientPrior,
+        features: nn.Module | None = None,
+    ) -> None:
+        super().__init__(prior)
+        self.features = features
+        arrays = {"vertices": vertices, "vertex_dirs": vertex_dirs, "frames": frames, "frame_dirs": frame_dirs}
+        for name, value in arrays.items():
+            self.register_buffer(name, value, persistent=False)
+
+    def rest(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the rest state for coefficients, see `ShapeSpace.rest`."""
+        values = coefficients if self.features is None else self.features(coefficients)
+        return self.vertices + _along(self.vertex_dirs, values), self.frames + _along(self.frame_dirs, values)
+
+    def rest_jacobian(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the derivatives of the rest state, see `ShapeSpace.rest_jacobian`."""
+        batch = len(coefficients)
+        if self.features is None:
+            return self.vertex_dirs.expand(batch, -1, -1, -1), self.frame_dirs.expand(batch, -1, -1, -1)
+        features = self.features
+        (slopes,) = _row_jacobians(lambda values: (features(values),), coefficients)
+        # One product for the whole batch: the directions, which are many, are read once.
+        slopes = slopes.movedim(0, 1).flatten(1)
+        by_vertex, by_frame = (
+            (directions @ slopes).unflatten(-1, (batch, -1)).movedim(-2, 0)
+            for directions in (self.vertex_dirs, self.frame_dirs)
+        )
+        return by_vertex, by_frame
+
+    def restricted(self, index: Tensor) -> LinearSpace:
+        """Return the space with some of the vertices only, by index (U,)."""
+        return LinearSpace(
+            self.vertices[index], self.vertex_dirs[index], self.frames, self.frame_dirs, self.prior, self.features
+        )
+
+
+class FunctionSpace(ShapeSpace):
+    """Rest states of any function of the coefficients.
+
+    Args:
+        function: takes coefficients (..., K) to vertices (..., V, 3) and positions of the joints (..., J, 3), metres;
+            differentiable twice, and of each row of coefficients by itself.
+        owners: (F,) the joint at which each frame of the tree lies.
+        prior: on the coefficients.
+        index: (U,) vertices that count; all if None.
+    """
+
+    owners: Tensor
+
+    def __init__(
+        self, function: RestFunction, owners: Tensor, prior: CoefficientPrior, index: Tensor | None = None
+    ) -> None:
+        super().__init__(prior)
+        self.function, self.index = function, index
+        self.register_buffer("owners", owners, persistent=False)
+
+    def rest(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the rest state for coefficients, see `ShapeSpace.rest`."""
+        vertices, joints = self.function(coefficients)
+        vertices = vertices if self.index is None else vertices.index_select(-2, self.index)
+        return vertices, joints.index_select(-2, self.owners)
+
+    def restricted(self, index: Tensor) -> FunctionSpace:
+        """Return the space with some of the vertices only, by index (U,)."""
+        chosen = index if self.index is None else self.index[index]
+        return FunctionSpace(self.function, self.owners, self.prior, chosen)
+
+
+def _along(directions: Tensor, values: Tensor) -> Tensor:
+    """Return the sums (..., V, 3) of directions (V, 3, L) times values (..., L)."""
+    return (values @ directions.flatten(0, 1).mT).unflatten(-1, (-1, 3))
+
+
+def _row_jacobians(function: Callable[[Tensor], tuple[Tensor, ...]], inputs: Tensor) -> list[Tensor]:
+    """Return the derivatives (B, ..., K) of each value (B, ...) of a function of rows (B, K), each by its own row.
+
+    The product ``J^T u`` is linear in u; its derivative by u is J, in K backward passes.
+    """
+    with torch.inference_mode(False), torch.enable_grad():
+        rows = inputs.detach().clone().requires_grad_()
+        values = function(rows)
+        jacobians = []
+        for value in values:
+            probe = torch.zeros_like(value, requires_grad=True)
+            (product,) = torch.autograd.grad(value, rows, probe, create_graph=True)
+            columns = [
+                torch.autograd.grad(product[:, k].sum(), probe, retain_graph=True)[0] for k in range(rows.shape[-1])
+            ]
+            jacobians.append(torch.stack(columns, dim=-1))
+    return jacobians

@@ -1,0 +1,47 @@
+"""Distances of oriented data to the surface of a rig whose pose and shape coefficients vary."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchreg.shapes.shaped import ShapedSkin
+from torchreg.shapes.surface import SkinSurface
+
+
+class ShapedSurface(SkinSurface):
+    """Distances of data to the tangent planes of a `ShapedSkin`, whose normals must be on the side of the data's.
+
+    Args:
+        skin: samples of the surface, with three corners each.
+        normals: (B, M, 3) of the data; zero where they are not known.
+        reach: two spacings of the samples or so, metres, off the rim of which planes mean little.
+    """
+
+    # A datum whose normal opposes that of the surface at this cosine or below lies on another part of it.
+    opposed = 0.0
+    # Distance of such data, metres: beyond every kernel.
+    elsewhere = 1e3
+
+    def __init__(self, skin: ShapedSkin, normals: Tensor, reach: float) -> None:
+        self.shaped, self.normals, self.reach = skin, normals, reach
+        self.first = torch.arange(len(skin), device=skin.points.device)
+
+    def with_normals(self, normals: Tensor) -> ShapedSurface:
+        """Return the surface for other data, with normals (B, M, 3)."""
+        return ShapedSurface(self.shaped, normals, self.reach)
+
+    def distance(self, points: Tensor, pose: Tensor) -> Tensor:
+        """Return the signed distances (B, M) of the data (B, M, 3) in states (B, D + K), metres."""
+        return self._oriented_distance(points, *self.shaped.oriented(pose))[0]
+
+    def distance_jacobian(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Return distances (B, M) and their Jacobian (B, M, D + K) in tangent coordinates."""
+        posed, normals, jacobian = self.shaped.normal_jacobian(pose)
+        distance, nearest = self._oriented_distance(points, posed, normals)
+        return distance, -jacobian.gather(-2, nearest.unsqueeze(-1).expand(*nearest.shape, jacobian.shape[-1]))
+
+    def _oriented_distance(self, points: Tensor, posed: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+        distance, nearest, normal = self._plane_distance(points, posed, normals)
+        opposed = (normal * self.normals).sum(-1) < self.opposed
+        return torch.where(opposed, self.elsewhere, distance), nearest
