@@ -57,7 +57,7 @@ def view(
 ) -> None:
     """Show a result in the browser: shapes, clouds, bones, weights, spines, with a timeline where something moves.
 
-    The page is served to this machine alone, until Ctrl-C. Needs the extra: pip install 'torchreg[viewer]'.
+    The page is served to this machine alone, until Ctrl-C. Needs the extra: pip install 'torchreg-articulated[viewer]'.
 
     Exit codes: 0, also after Ctrl-C; 2 for an error.
     """
