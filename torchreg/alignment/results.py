@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
 from torchreg.result import Result, Status, stored_as
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
-from torchreg.shapes.record import build_shape, record_shape
+from torchreg.shapes.posed_tree import named_pose
+from torchreg.shapes.record import build_kept_shape, build_shape, record_kept_shape, record_shape
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ class AlignResult(Result):
             posterior are those of ``frame.cropped(crop).points``. None where what was aligned to was given.
         origin: (3,) float64 about which it was computed, where the data lie so far from that of coordinates that the
             shape's precision would round them; pose, registered points and keypoints are float64 then. None elsewhere.
+        shape: that was aligned. A file keeps it without its mesh where that takes more than 4 MB.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -85,6 +87,12 @@ class AlignResult(Result):
     doubt: str | tuple[str, ...] | None = None
     crop: Tensor | None = None
     origin: Tensor | None = None
+    shape: ArticulatedShape | None = field(default=None, metadata=stored_as(record_kept_shape, build_kept_shape))
+
+    @property
+    def named_pose(self) -> dict[str, Any]:
+        """The pose by name of degree of freedom: numbers, metres and radians; tensors (B,) for a batch."""
+        return named_pose(self.shape, self.pose)
 
     def moved(self, origin: Tensor) -> Self:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
@@ -181,6 +189,7 @@ class PoseStarts(Result):
         poses: (S, num_dofs), metres and radians; duplicates of a better one come last.
         costs: (S,) data that a pose leaves unexplained, softly counted, and a weak prior; lower is better.
         confidence: () from 0 to 1, in the first pose; low too where no data show a limb.
+        shape: that was looked for, see `AlignResult`.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {"poses": "S D", "costs": "S", "confidence": ""}
@@ -188,6 +197,7 @@ class PoseStarts(Result):
     poses: Tensor
     costs: Tensor
     confidence: Tensor
+    shape: ArticulatedShape | None = field(default=None, metadata=stored_as(record_kept_shape, build_kept_shape))
 
     @property
     def best(self) -> Tensor:
@@ -196,4 +206,4 @@ class PoseStarts(Result):
 
     def row(self, index: int) -> PoseStarts:
         """Return the starts of one cloud of a batch."""
-        return PoseStarts(poses=self.poses[index], costs=self.costs[index], confidence=self.confidence[index])
+        return replace(self, poses=self.poses[index], costs=self.costs[index], confidence=self.confidence[index])
