@@ -37,8 +37,8 @@ from torchreg.datasets.videos import shape_video
 
 # Fields that hold wall times.
 CLOCKS = {"seconds"}
-# What results keep of their input; of a calibration it is an output.
-GIVEN = {"shape"}
+# What results keep of their input; of a calibration the shape is an output.
+GIVEN = {"shape", "up"}
 CAMERA = torch.zeros(3)
 
 
