@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchreg.cli.outputs import Force, check_outputs
+from torchreg.cli.outputs import Force, check_outputs, counted
 from torchreg.cli.reporting import interruption, reporting
 
 if TYPE_CHECKING:
@@ -31,11 +31,6 @@ def demo(
     Writes poses.json, poses by name of degree of freedom, metres and radians; track.safetensors, all that was found
     (torchreg.load reads it, torchreg view shows it); hand.glb and tracking.gif. Ctrl-C ends the sequence early; what
     was done is written.
-
-    Examples:
-      torchreg demo --frames 20 --seed 3
-
-      torchreg view torchreg_demo/track.safetensors
     """
     track, poses = output / "track.safetensors", output / "poses.json"
     scene, movie = output / "hand.glb", output / "tracking.gif"
@@ -73,7 +68,7 @@ def demo(
 def _speed(result: DemoResult) -> str:
     sizes, seconds = sorted(len(cloud) for cloud in result.clouds), result.track.seconds
     points = f"{sizes[0]} to {sizes[-1]} points" if sizes[0] < sizes[-1] else f"{sizes[0]} points"
-    text = f"{len(seconds)} frames of {points}: {float(seconds[0]):.1f} s to find the hand in the first"
+    text = f"{counted(len(seconds), 'frame')} of {points}: {float(seconds[0]):.1f} s to find the hand in the first"
     return text if len(seconds) == 1 else f"{text}, then {1 / float(seconds[1:].mean()):.1f} frames/s"
 
 

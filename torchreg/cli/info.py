@@ -30,13 +30,7 @@ def info(
     free_base: FreeBase = None,
     skin: Skin = None,
 ) -> None:
-    """Show the degrees of freedom of a shape with their limits, and its parts; or what a result holds.
-
-    Examples:
-      torchreg info robot.urdf --fixed-base
-
-      torchreg info moving.safetensors
-    """
+    """Show the degrees of freedom of a shape with their limits, and its parts; or what a result holds."""
     if is_result(Path(what)):
         _tell_result(Path(what))
     else:

@@ -83,7 +83,7 @@ def register(
 
     Exit codes: 0; 1 if too few points match to mean anything; 2 for an error; 130 for Ctrl-C.
     """
-    output = with_ending(output, (".glb", ".safetensors"))
+    output = with_ending(output, (".glb", ".safetensors"), add=True)
     result = output.with_suffix(".safetensors")
     scene = output if output.suffix.lower() == ".glb" else None
     weights, errors = with_ending(weights, (".ply",)), with_ending(errors, (".ply",))

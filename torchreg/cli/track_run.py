@@ -6,7 +6,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -46,7 +46,8 @@ class TrackFiles:
     @classmethod
     def at(cls, result: Path, movie: str, gltf: bool, overlay: Path | None) -> TrackFiles:
         """Return them for a result, and what else is asked for."""
-        moving = None if movie == "none" else result.with_suffix(f".{movie}")
+        named = Path(movie).suffix.lower() in (".gif", ".mp4")
+        moving = Path(movie) if named else None if movie == "none" else result.with_suffix(f".{movie}")
         scene = result.with_suffix(".glb") if gltf else None
         return cls(result, result.with_suffix(".progress"), moving, scene, overlay)
 
@@ -264,7 +265,7 @@ class TrackRun:
                 f"without --resume to begin anew"
             )
         self.tracker.state = self.state = progress.state
-        self.parts = [progress.result]
+        self.parts = [replace(progress.result, shape=self.tracker.shape)]
         self.report.usable = progress.result.statuses[-1].usable
         self.report.bar.update(done)
 
