@@ -34,7 +34,7 @@ print(robot)
 cloud = tr.load_points(sys.argv[2]).points if len(sys.argv) > 2 else made_up_cloud(robot)
 
 free = tr.align(robot, cloud)  # searched for
-print("searched:", free.status.value, {name: round(free.named_pose[name], 2) for name in robot.dof_names[6:]})
+print("searched:", free.status, {name: round(free.named_pose[name], 2) for name in robot.dof_names[6:]})
 
 if len(sys.argv) < 3:  # encoders that are 3 degrees off, known to 5 degrees; the base is bolted down
     read = {"shoulder": 0.45, "elbow": -1.05}

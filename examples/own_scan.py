@@ -32,7 +32,7 @@ print(f"{len(scan.points)} points, {size[0]:.2f} x {size[1]:.2f} x {size[2]:.2f}
 hand = tr.Hand()
 found = tr.align(hand, scan.points)  # no start: it is searched for, among all rotations
 rms = found.distances[found.inliers].square().mean().sqrt()
-print(f"{found.status.value}, confidence {found.confidence:.1f}, {found.doubt or 'nothing doubtful'}")
+print(f"{found.status}, confidence {found.confidence:.1f}, {found.doubt or 'nothing doubtful'}")
 print(f"{int(found.inliers.sum())} inliers, {1000 * rms:.1f} mm off the surface")
 
 std = dict(zip(hand.dof_names, found.covariance.diagonal().sqrt().tolist(), strict=True))

@@ -20,7 +20,7 @@ else:
 
 found = tr.register(source, target, num_bones=10, grid_resolution=40)
 diagonal = (source.points.amax(0) - source.points.amin(0)).norm()
-print(f"{found.status.value}: {found.matched.float().mean():.0%} of the points match")
+print(f"{found.status}: {found.matched.float().mean():.0%} of the points match")
 print(f"{found.model.num_bones} bones, {int(found.parts().max()) + 1} parts that moved")
 print(f"distance from the target, median {found.distances.nanmedian() / diagonal:.2%} of the diagonal")
 if truth is not None:

@@ -40,7 +40,7 @@ class PointNet(nn.Module):
         return self.head(self.last(self.features(10 * (clouds - middle)).amax(1)))
 
 
-truth = hand_motion(hand, "bend", 24)
+truth = hand_motion(hand, "bend", 12)
 clouds = clouds_of(truth)
 with torch.no_grad():  # labels: what the initializer finds from a start nearby, and how far it can be trusted
     labels = tr.PoseInitializer(hand)(clouds, start=hand.clamp(truth + 0.05 * (torch.arange(27) > 5)))

@@ -38,6 +38,7 @@ def test_every_field_is_documented(record):
 
 def test_a_status_has_one_spelling_in_files():
     assert [Status(status.value) for status in Status] == list(Status)
+    assert str(Status.FEW_INLIERS) == f"{Status.FEW_INLIERS}" == "few_inliers"
     assert {status.value for status in Status} >= {"converged", "max_steps", "few_inliers", "no_data"}
 
 

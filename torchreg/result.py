@@ -211,6 +211,10 @@ class Status(Enum):
     DOUBTFUL = "doubtful"  # a result that its own evidence speaks against
     DEGENERATE = "degenerate"  # data at one place, on a line or on a plane, which determine no pose
 
+    def __str__(self) -> str:
+        """Return the one spelling that files, pages and the command line have too."""
+        return str(self.value)
+
     @property
     def usable(self) -> bool:
         """Whether the result rests on data that support it, converged or not."""

@@ -244,9 +244,11 @@ class _AlignRun:
         import torch
 
         from torchreg.cli.outputs import shifted_to, tell_origin
+        from torchreg.geometry.upright import guess_up
         from torchreg.viz.gltf import save_shape_animation
 
         origin = self.results[0].origin
         poses = torch.stack([shifted_to(origin, result.pose) for result in self.results])
-        save_shape_animation(path, self.shape, poses, skin=self.surface)
+        near = list(self.shape.keypoints(poses.to(self.shape.rest)).detach())
+        save_shape_animation(path, self.shape, poses, skin=self.surface, up=guess_up(near))
         tell_origin(path, origin)

@@ -41,6 +41,7 @@ def demo(
     from tqdm import tqdm
 
     from torchreg.cli.pose_files import write_poses
+    from torchreg.geometry.upright import guess_up
     from torchreg.shapes.hand import Hand
     from torchreg.tracking.demo import DEMO_FPS, run_demo
     from torchreg.viz.tracking import animate_track, save_track_gltf
@@ -53,7 +54,7 @@ def demo(
     typer.echo(_speed(result))
     _print_tip_errors("all", result.tip_errors.flatten())
     _print_tip_errors("seen by the cameras", result.tip_errors[result.tips_seen])
-    save_track_gltf(scene, hand, result.track)
+    save_track_gltf(scene, hand, result.track, up=guess_up(list(result.track.keypoints)))
     if picture:
         with tqdm(total=count, unit="frame", desc="drawing", leave=False) as bar:
             animate_track(

@@ -243,7 +243,7 @@ def _write(
     near, mesh = found.local(), meshes[found.reference]
     if found.origin is not None:
         mesh = TriangleMesh(mesh.vertices - found.origin, mesh.faces)
-    save_spine_animation(glb, near.model, mesh, found.reference, fps=fps)
+    save_spine_animation(glb, near.model, mesh, found.reference, fps=fps, up=found.up)
     tell_origin(glb, found.origin)
     for frame, path in enumerate(swc):
         if path is not None:

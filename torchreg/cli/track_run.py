@@ -322,11 +322,12 @@ class TrackRun:
 
     def write(self, on_frame: Callable[[int, int], None]) -> None:
         """Write the moving shape and the moving picture, where asked for."""
+        from torchreg.geometry.upright import guess_up
         from torchreg.viz.tracking import animate_track, save_track_gltf
 
         result, shape = self.result, self.tracker.shape
         if self.files.gltf is not None and bool(result.poses.isfinite().all(-1).any()):
-            save_track_gltf(self.files.gltf, shape, result)
+            save_track_gltf(self.files.gltf, shape, result, up=guess_up(list(result.keypoints)))
             tell_origin(self.files.gltf, self.clouds.origin)
         if self.files.movie is not None:
             animate_track(

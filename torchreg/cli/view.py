@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchreg.cli.align_options import Scale
 from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
 from torchreg.cli.reporting import reporting
 from torchreg.cli.shape_argument import HANDS, FreeBase, PackageDir, Parents, Skin, load_shape, near_shape
@@ -60,6 +61,7 @@ def view(
     port: Port = 8080,
     browser: Browser = True,
     up: Up = None,
+    scale: Scale = 1.0,
     parents: Parents = None,
     package_dir: PackageDir = None,
     free_base: FreeBase = None,
@@ -88,10 +90,10 @@ def view(
     if is_result(result):
         found = load(result if result.suffix else result.with_suffix(".safetensors"))
     else:
-        found, guessed = _shown(result, parents, package_dir, free_base, skin)
+        found, guessed = _shown(result, scale, parents, package_dir, free_base, skin)
         up_direction = up_direction or guessed
     model = None if shape is None else load_shape(shape, parents, package_dir, free_base, skin)
-    scene = with_up(result_scene(found, shape=model, data=_read(data or [])), up_direction)
+    scene = with_up(result_scene(found, shape=model, data=_read(data or [], scale)), up_direction)
     if html is not None:
         scene_html(html, scene)
         if not quiet:
@@ -108,8 +110,13 @@ def is_result(name: Path) -> bool:
 
 
 def _shown(
-    name: Path, parents: Path | None, package_dir: list[Path] | None, free_base: bool | None, skin: str | None
-) -> tuple[Any, tuple[float, float, float] | None]:
+    name: Path,
+    scale: float,
+    parents: Path | None,
+    package_dir: list[Path] | None,
+    free_base: bool | None,
+    skin: str | None,
+) -> tuple[Any, tuple[float, float, float] | None]:  # fmt: skip
     """Return a shape, mesh or cloud by name or file, and what is upright in its format."""
     from torchreg.errors import FormatError
     from torchreg.geometry.upright import Y_UP_ENDINGS
@@ -127,7 +134,7 @@ def _shown(
                 raise
     if not name.exists() and not ending:
         raise InputError(f"there is no result {name}.safetensors, and no file {name}; {near_shape(str(name))}")
-    return load_points(name), up
+    return load_points(name, scale=scale), up
 
 
 def check_up(up: str | None) -> tuple[float, float, float] | None:
@@ -171,7 +178,7 @@ def _serve(scene: Scene, port: int, browser: bool, quiet: bool) -> None:
         wait_for_interrupt(viewer.url, browser, quiet)
 
 
-def _read(paths: list[Path]) -> list[Tensor | TriangleMesh]:
+def _read(paths: list[Path], scale: float = 1.0) -> list[Tensor | TriangleMesh]:
     """Return the meshes or clouds of files, or the frames of a folder or one .npz, in their order."""
     from torchreg.geometry.mesh import TriangleMesh
     from torchreg.io.frames import load_frames
@@ -179,10 +186,10 @@ def _read(paths: list[Path]) -> list[Tensor | TriangleMesh]:
 
     if not paths:
         return []
-    frames = load_frames(paths[0] if len(paths) == 1 else paths)
+    frames = load_frames(paths[0] if len(paths) == 1 else paths, scale=scale)
     if any(path.suffix.lower() == ".npz" for path in paths):
         return list(frames)
-    clouds = [load_points(name) for name in frames.names]
+    clouds = [load_points(name, scale=scale) for name in frames.names]
     return [
         cloud.points if cloud.faces is None or not len(cloud.faces) else TriangleMesh(cloud.points, cloud.faces)
         for cloud in clouds

@@ -55,6 +55,19 @@ def guess_up(frames: Sequence[Tensor]) -> Direction:
     return 0.0, 0.0, 1.0
 
 
+def to_y_up(up: Direction) -> Tensor:
+    """Return the rotation (4, 4), float64, that takes an axis to +y, as glTF wants it, about x unless it is along x."""
+    length = sum(value * value for value in up) ** 0.5
+    x, y, z = (value / length for value in up)
+    turn = torch.eye(4, dtype=torch.float64)
+    if abs(x) > 0.5:
+        sign = 1.0 if x > 0 else -1.0
+        turn[:2, :2] = torch.tensor([[0.0, -sign], [sign, 0.0]])
+    else:
+        turn[1:3, 1:3] = torch.tensor([[y, z], [-z, y]])
+    return turn
+
+
 def _is_steadier(frames: Sequence[Tensor], lower: Tensor) -> bool:
     """Return whether the lowest points (T, 3) and the middles of frames move less along y than along z."""
     if len(frames) < 3:

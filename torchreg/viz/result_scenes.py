@@ -99,7 +99,21 @@ def _align_scene(result: AlignResult, shape: ArticulatedShape | None, data: Data
     if clouds:
         paints = [inlier_paint(mask, share) for mask, share in zip(masks, posterior, strict=True)]
         layers.append(_cloud("data", clouds, paints))
-    return Scene(f"alignment: {', '.join(sorted({status.value for status in result.statuses}))}", tuple(layers))
+    title = f"alignment: {', '.join(sorted({status.value for status in result.statuses}))}"
+    return Scene(title, tuple(layers), facts=_align_facts(result))
+
+
+def _align_facts(result: AlignResult) -> dict[str, str]:
+    """Return confidence, inliers and residual of a single alignment in words."""
+    if isinstance(result.status, tuple):
+        return {}
+    near = result.distances[result.inliers]
+    facts = {"inliers": f"{len(near):,} of {len(result.distances):,}"}
+    if len(near):
+        facts["residual"] = f"{1e3 * float(near.square().mean().sqrt()):.1f} mm"
+    if result.confidence is not None:
+        facts["confidence"] = f"{float(result.confidence):.2f}"
+    return facts | ({"doubtful": str(result.doubt)} if result.doubt else {})
 
 
 @_scene.register
@@ -111,7 +125,9 @@ def _track_scene(result: TrackResult, shape: ArticulatedShape | None, data: Data
         layers.append(
             _cloud("data", clouds, [_nearness(shape, *pair) for pair in zip(clouds, result.poses, strict=True)])
         )
-    return Scene(counted(len(result.poses), "tracked frame"), tuple(layers), result.times)
+    kinds = [status.value for status in result.statuses]
+    facts = {kind: counted(kinds.count(kind), "frame") for kind in sorted(set(kinds))}
+    return Scene(counted(len(result.poses), "tracked frame"), tuple(layers), result.times, facts=facts)
 
 
 @_scene.register
@@ -165,7 +181,8 @@ def _registration_scene(result: ScanRegistration, shape: None, data: Data) -> Sc
         points, over = (target.vertices, target.faces) if isinstance(target, TriangleMesh) else (target, None)
         layers.append(_scan("target", points, over, _STYLE.target, opacity=0.5))
     title = f"{counted(result.model.num_bones, 'bone')}, {float(result.matched.float().mean()):.0%} of the points match"
-    return Scene(title, tuple(layers), torch.linspace(0, 2, _STYLE.num_steps))
+    facts = {"status": result.status.value, "distance, median": f"{float(errors.median()):.3g}"}
+    return Scene(title, tuple(layers), torch.linspace(0, 2, _STYLE.num_steps), facts=facts)
 
 
 @_scene.register

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -232,6 +232,7 @@ class Scene:
         layers: with different names; moving ones have T frames each.
         times: (T,) seconds, strictly increasing; one frame every 1 / 20 second by default.
         up: upright direction; by default as `geometry.upright.guess_up` tells it.
+        facts: key figures in words, by name, shown beside the scene.
 
     Raises:
         InputError: if there is no layer, two have one name, or numbers of frames differ.
@@ -241,6 +242,7 @@ class Scene:
     layers: tuple[Layer, ...]
     times: Tensor | None = None
     up: Direction | None = None
+    facts: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         names = [layer.name for layer in self.layers]
