@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import pytest
 import torch
 
@@ -22,10 +20,6 @@ def test_first_and_moved_keep_the_rest():
     moved = few.moved(few.points + 1, -few.normals)
     torch.testing.assert_close(moved.points, all_.points[:4] + 1)
     assert moved.features is few.features
-    assert not all_.cut_off.any()
-    cut = replace(all_, cut_off=torch.arange(6) > 1)
-    assert cut.first(3).cut_off.tolist() == [False, False, True]
-    assert cut.moved(cut.points, cut.normals).cut_off is cut.cut_off
 
 
 def test_embedded_distances_are_sums():
@@ -52,7 +46,5 @@ def test_bad_input_is_named():
         OrientedSamples(good.points, good.normals, good.features[:2], good.boundary)
     with pytest.raises(InputError, match="boundary must have shape"):
         OrientedSamples(good.points, good.normals, good.features, good.boundary[:2])
-    with pytest.raises(InputError, match="cut_off must have shape"):
-        replace(good, cut_off=good.boundary[:2])
     with pytest.raises(InputTypeError, match=r"features is torch.float32"):
         OrientedSamples(good.points, good.normals, good.features.float(), good.boundary)

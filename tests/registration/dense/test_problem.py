@@ -1,12 +1,8 @@
-from dataclasses import replace
-
 import pytest
 import torch
 
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import walking_figure
-from torchreg.geometry.neighbors import k_nearest
-from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import se3_exp
 from torchreg.registration.dense.config import ScanAlignConfig
 from torchreg.registration.dense.problem import describe
@@ -43,29 +39,6 @@ def test_frames_and_units_change_nothing(pair, problem):
     assert torch.equal(moved.samples, problem.samples)
     assert torch.equal(moved.nodes, problem.nodes)
     torch.testing.assert_close(moved.target.features, problem.target.features, rtol=0, atol=1e-3)
-
-
-def test_samples_beside_what_hides_the_rest_are_cut_off(pair, problem):
-    target = pair.target
-    assert target.viewpoint is not None
-    cut = problem.target.cut_off
-    assert 0.02 < float(cut.double().mean()) < 0.3
-    # An arm before the body leaves a shadow on it; where the body turns away, nothing is cut off.
-    near = k_nearest(problem.target.points[cut], problem.unit.normalize(target.points[target.boundary]), 1)[1]
-    assert float(near.max()) < 0.1
-    unknown = RangeScan(target.points, target.faces, target.normals)
-    guessed = describe(pair.source, unknown, CONFIG).target.cut_off
-    assert float((guessed == cut).double().mean()) > 0.85
-    none = describe(pair.source, target, replace(CONFIG, occluder_reach=0.0)).target.cut_off
-    assert not none.any()
-
-
-def test_a_whole_surface_is_not_cut_off(pair):
-    ball = torch.nn.functional.normalize(torch.randn(900, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
-    whole = describe(pair.source, RangeScan(ball, normals=ball), CONFIG)
-    assert not whole.target.cut_off.any()
-    # Nor is there a side from which it was seen.
-    assert whole.free is None
 
 
 def test_moved_samples_are_those_of_the_graph(problem):

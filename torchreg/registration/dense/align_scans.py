@@ -30,21 +30,15 @@ from torchreg.registration.dense.problem import NORMAL_SCALE, ScanAlignProblem, 
 from torchreg.registration.dense.stages import (
     Reporter,
     agree,
-    follow_regions,
     judge,
-    loses_limb,
     refine,
     soft_matches,
-    used_samples,
 )
 
 _One = TypeVar("_One")
 _Other = TypeVar("_Other")
 # How a graph is taken to where points are expected: that may be wrong in parts, and limbs turn far.
 _EXPECTED_STIFFNESS, _EXPECTED_FITS = 0.02, 4
-# What the slow end may cost more than the quick one: cloth that follows its folds looks better by its features.
-# Between the two it counts so much more that the target is left bare: from far back, what bends strongly can be lost.
-_SLOW_COSTS_MORE, _BARE = 0.05, 15.0
 
 
 @torch.no_grad()
@@ -63,15 +57,10 @@ def align_scans(
     Both scans are described by even samples, their curvature at several sizes, and what a learnt `ScanMatcher` says of
     their matches. Hypotheses start from rest; from where points are expected, if that is known; and from the matcher's
     matches, to which a stiff graph is fitted by an EM in which they are the prior, see `fit_coarsely`. Each goes on by
-    an EM with an outlier class in which they still are, while edges of the graph give where its parts disagree, matches
-    beside what something nearer hides hold across the surface alone, and samples where the target's camera saw nothing
-    are taken back into its picture. Then, unless the two best agree and leave little of both scans over, each part
-    moves as in the hypothesis that suits it, and the EM goes on from there as well. The best covers the target, most of
-    all where its camera would have seen it, is covered by it, is like it, bends least, leaves the larger part of each
-    wide region rigid, is nearest to what is expected, and takes no two limbs to one place; its EM is taken to the end,
-    and beside that, unless two agreed, run anew, slowly, with matches that may slide, while what is unlike the target
-    all around follows the wide regions it is in: that end is kept unless it is clearly worse or leaves more of the
-    target bare.
+    an EM with an outlier class in which they still are, less and less, while edges of the graph give where its parts
+    disagree. Unless the two best agree, each part then moves as in the hypothesis that suits it, and the EM goes on
+    from there as well. The best covers the target, is covered by it, is like it, bends least, and is nearest to what is
+    expected.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -136,26 +125,17 @@ def align_problem(
 ) -> tuple[Tensor, tuple[Hypothesis, ...]]:
     """Return the motions (J, 4, 4) of the nodes, and all hypotheses, the best first; see `align_scans`."""
     found = sorted(_candidates(problem, config, on_step), key=_energy)
-    unsure = not _confirmed(problem, found, config)
-    if unsure:
+    if not agree(problem, found[0].transforms, found[1].transforms, config.choice):
         found = sorted([*found, _fused(problem, found, config, on_step)], key=_energy)
-    transforms = _finished(problem, found[0], config, unsure, on_step)
-    return transforms, tuple(candidate.hypothesis for candidate in found)
+    return found[0].transforms, tuple(candidate.hypothesis for candidate in found)
 
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """Motions (J, 4, 4) on their way.
-
-    Args:
-        hypothesis: how they compare.
-        transforms: the motions.
-        sigma: with which their EM began.
-    """
+    """Motions (J, 4, 4), and how they compare with others."""
 
     hypothesis: Hypothesis
     transforms: Tensor
-    sigma: float
 
 
 def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
@@ -166,7 +146,7 @@ def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnS
 
 def _near(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
     """Return the candidates from rest and, if that is known, from where points are expected."""
-    sigma, rest = config.refine.near_sigma, problem.graph.rest()
+    sigma, rest = config.refine.sigma[0], problem.graph.rest()
     found = [_compared(problem, rest, sigma, config, Reporter("rest", problem.unit.scale, on_step))]
     if problem.expected is not None:
         there = GraphMatches.of_places(problem.expected)
@@ -179,7 +159,7 @@ def _by_matches(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnS
     """Return the candidate from the matches of the matcher."""
     reporter = Reporter("matches", problem.unit.scale, on_step)
     begin = fit_coarsely(problem, config.coarse, reporter)
-    return _compared(problem, begin, config.refine.near_sigma, config, reporter)
+    return _compared(problem, begin, config.refine.sigma[0], config, reporter)
 
 
 def _both_told(
@@ -213,44 +193,9 @@ def _fused(
 def _compared(
     problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: ScanAlignConfig, reporter: Reporter
 ) -> _Candidate:
-    """Return the candidate after the first steps of its EM."""
-    steps = slice(config.refine.compared_after)
-    transforms = refine(problem, transforms, config.refine, reporter, sigma, steps)
-    return _Candidate(judge(problem, reporter.name, transforms, config.choice), transforms, sigma)
-
-
-def _finished(
-    problem: ScanAlignProblem, candidate: _Candidate, config: ScanAlignConfig, unsure: bool, on_step: OnStep
-) -> Tensor:
-    """Return the motions (J, 4, 4) after the last steps; if unsure, those of a slower EM unless they are worse."""
-    name, refining = candidate.hypothesis.name, config.refine
-
-    def to_the_end(told: OnStep) -> Tensor:
-        steps, reporter = slice(refining.compared_after, None), Reporter(name, problem.unit.scale, told)
-        return refine(problem, candidate.transforms, refining, reporter, candidate.sigma, steps)
-
-    def slowly(told: OnStep) -> Tensor:
-        slow, reporter = refining.slower(), Reporter(name, problem.unit.scale, told)
-        follow = None
-        if refining.regions > 0:
-            follow = follow_regions(problem, candidate.transforms, refining, config.choice)
-        return refine(problem, candidate.transforms, slow, reporter, refining.near_sigma, stage="slide", follow=follow)
-
-    if not unsure or refining.slow_steps == 0:
-        return to_the_end(on_step)
-    slow, quick = _both_told(on_step, slowly, to_the_end)
-    return slow if _slow_is_kept(*(judge(problem, name, end, config.choice) for end in (slow, quick))) else quick
-
-
-def _slow_is_kept(slow: Hypothesis, quick: Hypothesis) -> bool:
-    """Return whether the end of the slower EM is kept."""
-    return slow.energy + _BARE * slow.backward < quick.energy + _BARE * quick.backward + _SLOW_COSTS_MORE
-
-
-def _confirmed(problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig) -> bool:
-    """Return whether the best of several candidates is believed: the next best goes there too, and no limb is lost."""
-    best, second = (candidate.transforms for candidate in found[:2])
-    return agree(problem, best, second, config.choice) and not loses_limb(problem, best, config.choice)
+    """Return the candidate after its EM."""
+    transforms = refine(problem, transforms, config.refine, reporter, sigma)
+    return _Candidate(judge(problem, reporter.name, transforms, config.choice), transforms)
 
 
 def _energy(candidate: _Candidate) -> float:
@@ -260,7 +205,7 @@ def _energy(candidate: _Candidate) -> float:
 def _confidence(problem: ScanAlignProblem, transforms: Tensor, config: ScanAlignConfig, points: Tensor) -> Tensor:
     """Return the posterior mass (N,) of matches at points, by that of the nearest samples."""
     sigma = config.refine.sigma[1]
-    moved = used_samples(problem, transforms, sigma, config.refine)
+    moved = problem.moved(transforms, problem.num_used(sigma))
     own = soft_matches(problem, moved, sigma, config.refine).posterior
     index, _ = k_nearest(problem.unit.normalize(points), problem.graph.points[: len(own)], min(3, len(own)))
     return own[index].mean(1)

@@ -13,7 +13,7 @@ from torchreg.registration.dense.config import CoarseConfig
 from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
 from torchreg.registration.dense.match_prior import MatchPrior
 from torchreg.registration.dense.problem import ScanAlignProblem
-from torchreg.registration.dense.stages import Reporter, num_used
+from torchreg.registration.dense.stages import Reporter
 from torchreg.solvers.robust import geman_mcclure_weight
 
 # Rounds in which matches that do not fit a rigid motion count less and less.
@@ -66,8 +66,8 @@ def _expected_matches(
     problem: ScanAlignProblem, transforms: Tensor, sigma: float, share: float, config: CoarseConfig
 ) -> GraphMatches:
     """Return the E-step of as many samples as the sigma asks for."""
-    count = min(len(problem.samples), num_used(sigma, config.density, config.least_samples))
-    target = problem.target.first(num_used(sigma, 2 * config.density, config.least_samples))
+    count = min(len(problem.samples), problem.num_used(sigma))
+    target = problem.target.first(2 * problem.num_used(sigma))
     moved, normals = problem.graph.move_with_normals(transforms, slice(0, count))
     near = torch.cdist(moved, target.points).square().mul_(-1 / (2 * sigma**2))
     near = near.add_(normals @ target.normals.mT - 1, alpha=config.normal_weight * share).exp_()

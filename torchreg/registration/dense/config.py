@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
@@ -26,8 +26,6 @@ class CoarseConfig:
         doubt: share of the prior of a match that does not rest on the matcher, first and last.
         outliers: samples that no match explains although the matcher calls them visible, as a share.
         area: over which outliers are spread, squared length.
-        density: samples used per squared sigma.
-        least_samples: used of each scan, where there are as many.
     """
 
     num_steps: int = 14
@@ -38,15 +36,12 @@ class CoarseConfig:
     doubt: tuple[float, float] = (0.02, 0.3)
     outliers: float = 0.03
     area: float = 0.5
-    density: float = 0.3
-    least_samples: int = 300
 
     def __post_init__(self) -> None:
-        for name in ("num_steps", "least_samples"):
-            check_count(getattr(self, name), name, 1)
+        check_count(self.num_steps, "num_steps", 1)
         for name in ("sigma", "stiffness", "give", "doubt"):
             check_ends(getattr(self, name), name)
-        for name in ("outliers", "area", "density"):
+        for name in ("outliers", "area"):
             check_positive(getattr(self, name), name)
         check_positive(self.normal_weight, "normal_weight", allow_zero=True)
 
@@ -56,90 +51,43 @@ class EMConfig:
     """How the graph is fitted to soft matches, by EM with an annealed sigma.
 
     Args:
-        num_steps: while sigma shrinks.
-        final_steps: at the last sigma.
-        compared_after: steps after which hypotheses are compared; the rest are for the best alone.
-        slow_steps: instead of num_steps when the best of hypotheses that disagree is refined once more, see `slower`; 0
-            leaves that out.
-        sigma: first and last, length; the first from a rough start, and
-        near_sigma: from one that should be near,
-        fused_sigma: from motions that have been refined and put together.
+        num_steps: in which sigma shrinks; the last is at the last sigma.
+        sigma: first and last, length; the first as far as a start may be off,
+        fused_sigma: and from motions that have been refined and put together.
         stiffness: of the graph, first and last.
         give: nodes that disagree by more than this hold each other less, length.
         doubt: support at first of a match that the matcher calls impossible, beside one of a sure match; at the last
             sigma, far below what its tokens are apart, all count alike.
         feature_weight: see `ScanEMConfig`, first and last: bending and hidden surroundings change features a little.
-        slide: how much misses along the surface count, squared, first and last.
-        regions: how much it counts in that, while sigma shrinks, that a sample leaves the wide regions it follows, see
-            `WideRegions`; with 0 none follows any.
-        unlike: from which median squared difference of the features around it a sample follows wide regions, and from
-            which it does wholly.
-        surrounding: samples around each of which that is the median.
+        slide: how much misses along the surface count, squared, first and last: cloth and round limbs have far to go.
         fits_per_step: rounds of matching and fitting at each sigma.
-        both_ways_above: sigma from which targets choose among sources too, length.
-        boundary_above: sigma from which targets on a boundary may be matched, and matches beside what hides the rest of
-            the target hold along the surface too, length.
-        beyond: how much it counts, beside a match, that a sample is where the target's camera saw nothing.
-        beyond_below: sigma below which that counts, length: before, a limb on its way may leave the outline.
-        beyond_scale: those farther from the outline than this count ever less, length.
-        beyond_margin: spacings of the target's samples up to which that is nothing.
         expected: how much it counts, beside a match, that a sample without one leaves where it was expected, if that is
             known; those farther off count ever less:
         expected_scale: length.
-        density: samples used per squared sigma.
-        least_samples: used of each scan, where there are as many.
         compatible: see `ScanEMConfig`; its feature weight gives way to the one above.
     """
 
-    num_steps: int = 6
-    final_steps: int = 1
-    compared_after: int = 5
-    slow_steps: int = 12
-    sigma: tuple[float, float] = (0.025, 0.006)
-    near_sigma: float = 0.02
+    num_steps: int = 10
+    sigma: tuple[float, float] = (0.02, 0.006)
     fused_sigma: float = 0.012
     stiffness: tuple[float, float] = (0.2, 0.006)
     give: float = 0.01
     doubt: float = 0.05
     feature_weight: tuple[float, float] = (8.0, 1.0)
-    slide: tuple[float, float] = (1.0, 0.03)
-    regions: float = 0.1
-    unlike: tuple[float, float] = (0.6, 1.0)
-    surrounding: int = 30
+    slide: tuple[float, float] = (0.2, 0.03)
     fits_per_step: int = 2
-    both_ways_above: float = 0.012
-    boundary_above: float = 0.02
-    beyond: float = 1.0
-    beyond_below: float = 0.012
-    beyond_scale: float = 0.05
-    beyond_margin: float = 1.5
     expected: float = 0.002
     expected_scale: float = 0.05
-    density: float = 0.3
-    least_samples: int = 300
     compatible: ScanEMConfig = field(default_factory=ScanEMConfig)
 
     def __post_init__(self) -> None:
-        for name in ("num_steps", "compared_after", "fits_per_step", "least_samples", "surrounding"):
+        for name in ("num_steps", "fits_per_step"):
             check_count(getattr(self, name), name, 1)
-        for name in ("final_steps", "slow_steps"):
-            check_count(getattr(self, name), name, 0)
-        for name in ("sigma", "stiffness", "slide", "feature_weight", "unlike"):
+        for name in ("sigma", "stiffness", "slide", "feature_weight"):
             check_ends(getattr(self, name), name)
-        if self.unlike[0] >= self.unlike[1]:
-            raise InputError(f"unlike must grow, got {self.unlike[0]:g} and {self.unlike[1]:g}")
-        for name in ("near_sigma", "fused_sigma", "give", "doubt", "beyond_scale", "expected_scale"):
+        for name in ("fused_sigma", "give", "doubt", "expected_scale"):
             check_positive(getattr(self, name), name)
-        weights, limits = ("regions", "beyond", "expected"), ("both_ways_above", "boundary_above")
-        for name in (*weights, *limits, "beyond_below", "beyond_margin", "density"):
-            check_positive(getattr(self, name), name, allow_zero=True)
-
-    def slower(self) -> EMConfig:
-        """Return the settings of a second, slower EM: matches slide along the surface from its beginning.
-
-        Held along the surface, samples go where the first matches were; cloth and round limbs have farther to go.
-        """
-        return replace(self, num_steps=self.slow_steps, slide=(self.slide[1], self.slide[1]))
+        check_positive(self.expected, "expected", allow_zero=True)
 
 
 @dataclass(frozen=True)
@@ -149,43 +97,30 @@ class ChoiceConfig:
     Args:
         cap: distances count up to this, length.
         normal_scale: how many caps normals count as that are one apart.
-        seen: what it costs that samples are off the target by a cap or more where its camera would have seen them,
-        behind: unless a sample of it is nearer to the camera by more than this, length.
         unlike: what it costs that features differ by one, squared, where the moved source lies on the target.
         bend: what it costs that neighboring nodes disagree by one size in the mean,
         slack: of which less than this hardly counts, length.
-        strain: what it costs that samples leave the wide regions they are in, see `WideRegions.strain`.
-        leap: what it costs that samples are far from where they were expected, if that is known, squared,
+        leap: what it costs that samples are far from where they were expected, if that is known, squared, at
+            most as much as one off the target:
         leap_cap: up to this distance, length.
-        overlap: what it costs that samples far from each other along the surface come together, facing the same way:
-            two limbs cannot be in one place,
-        overlap_cap: from this distance on, length.
         same: hypotheses agree where their samples are this near each other, length,
-        same_share: for at least this share of the samples,
-        lost_share: unless more of the samples of both scans are as far as the cap from the other scan: of one alone
-            they may be hidden, of both a limb went elsewhere; or they overlap by more in the mean.
+        same_share: for at least this share of the samples.
     """
 
     cap: float = 0.03
     normal_scale: float = 0.5
-    seen: float = 2.0
-    behind: float = 0.02
     unlike: float = 2.0
     bend: float = 20.0
     slack: float = 1e-3
-    strain: float = 2.5
-    leap: float = 3.0
+    leap: float = 1.0
     leap_cap: float = 0.1
-    overlap: float = 1.0
-    overlap_cap: float = 0.02
     same: float = 0.005
     same_share: float = 0.95
-    lost_share: float = 0.02
 
     def __post_init__(self) -> None:
-        for name in ("cap", "behind", "leap_cap", "overlap_cap", "same", "same_share"):
+        for name in ("cap", "leap_cap", "same", "same_share"):
             check_positive(getattr(self, name), name)
-        for name in ("normal_scale", "seen", "unlike", "bend", "slack", "strain", "leap", "overlap", "lost_share"):
+        for name in ("normal_scale", "unlike", "bend", "slack", "leap"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
 
@@ -198,16 +133,9 @@ class ScanAlignConfig:
         num_target_samples: of the target.
         num_nodes: of the graph.
         num_nearest: nodes that each sample hangs on.
-        region_samples: of the source, that wide regions hold.
-        region_reach: radius of those along the surface, length.
-        region_give: samples off a region's rigid motion by more than this are free, length.
-        overlap_samples: of the source, that must not come together
-        overlap_reach: if they are farther apart than this along the surface, length.
         curvature_radii: of the features, lengths.
-        occluder_depth: a surface this much nearer to the camera beside an edge hides what is behind, length.
-        occluder_reach: spacings of samples within which of such an edge matches hold across the surface alone.
-        most_cut: share of its outline at which a target may face the camera, if what the camera did not see is to count
-            as empty: with more, the target lacks data.
+        density: samples used per squared sigma.
+        least_samples: used of each scan, where there are as many.
         coarse: the EM that begins with the matches of the matcher.
         refine: the EM that ends every hypothesis.
         choice: among the hypotheses.
@@ -220,35 +148,18 @@ class ScanAlignConfig:
     num_target_samples: int = 2500
     num_nodes: int = 60
     num_nearest: int = 4
-    region_samples: int = 200
-    region_reach: float = 0.5
-    region_give: float = 0.05
-    overlap_samples: int = 600
-    overlap_reach: float = 0.1
     curvature_radii: tuple[float, ...] = (0.02, 0.035, 0.06)
-    occluder_depth: float = 0.03
-    occluder_reach: float = 2.5
-    most_cut: float = 0.125
+    density: float = 0.3
+    least_samples: int = 300
     coarse: CoarseConfig = field(default_factory=CoarseConfig)
     refine: EMConfig = field(default_factory=EMConfig)
     choice: ChoiceConfig = field(default_factory=ChoiceConfig)
 
     def __post_init__(self) -> None:
-        for name in (
-            "num_samples",
-            "num_target_samples",
-            "num_nodes",
-            "num_nearest",
-            "region_samples",
-            "overlap_samples",
-        ):
+        for name in ("num_samples", "num_target_samples", "num_nodes", "num_nearest", "least_samples"):
             check_count(getattr(self, name), name, 1)
-        for name in ("region_reach", "region_give", "overlap_reach"):
-            check_positive(getattr(self, name), name)
+        check_positive(self.density, "density")
         _check_values(self.curvature_radii, "curvature_radii")
-        check_positive(self.occluder_depth, "occluder_depth")
-        check_positive(self.most_cut, "most_cut")
-        check_positive(self.occluder_reach, "occluder_reach", allow_zero=True)
 
 
 @dataclass(frozen=True)
@@ -257,7 +168,7 @@ class ScanAlignRecord:
 
     Args:
         hypothesis: name of what is being followed, such as "rest" or "matches".
-        stage: "match", "refine" or, once more and slowly, "slide".
+        stage: "match" or "refine".
         step: number of the step in its stage.
         num_steps: steps planned in the stage.
         width: sigma, in the user's unit.
@@ -292,31 +203,21 @@ class Hypothesis:
 
     Args:
         name: what it started from.
-        energy: ``forward + seen + backward + unlike + bend + strain + leap + overlap``, by which hypotheses are
-            compared; lower is better.
-        forward: mean squared distance of moved samples to the target, capped at one.
-        seen: weighted mean distance of moved samples to the target, from 0 at a quarter of the cap to one at the cap; 0
-            where its camera would not have seen them, and everywhere if it is not known where that was.
+        energy: ``forward + backward + bend + leap``, by which hypotheses are compared; lower is better.
+        forward: mean of what moved samples cost, by squared distance from the target and by unlike features there, each
+            at most as much as an outlier.
         backward: mean squared distance of target samples to the moved source, capped at one.
-        unlike: weighted mean squared difference of features of moved samples and the target.
         bend: weighted disagreement of neighboring nodes.
-        strain: weighted share by which wide regions do not move rigidly.
         leap: weighted mean squared distance of samples from where they were expected, capped at one; 0 if that is not
             known.
-        overlap: weighted mean over samples, from 0 to 1 where another, far from it along the surface, lies in the same
-            place and faces the same way.
     """
 
     name: str
     energy: float
     forward: float
-    seen: float
     backward: float
-    unlike: float
     bend: float
-    strain: float
     leap: float = 0.0
-    overlap: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Soft matches of two scans, with an outlier class: EM over nearest compatible samples, in both directions."""
+"""Soft matches of two scans, with an outlier class: an E-step over the nearest compatible samples."""
 
 from __future__ import annotations
 
@@ -52,18 +52,14 @@ class SoftMatches:
     """What source samples match.
 
     Args:
-        weights: (S,) posterior mass, that of the other direction included: how much each match counts.
+        posterior: (S,) in [0, 1], mass of all matches of a sample: how much it counts.
         targets: (S, 3) mean places of the matches.
         normals: (S, 3) unit mean normals of the matches; zero where there is none.
-        posterior: (S,) in [0, 1], mass by the samples' own choice alone.
-        cut_off: (S,) in [0, 1], share of that on targets near which the scan ends behind something nearer.
     """
 
-    weights: Tensor
+    posterior: Tensor
     targets: Tensor
     normals: Tensor
-    posterior: Tensor
-    cut_off: Tensor
 
 
 def match_softly(
@@ -72,24 +68,19 @@ def match_softly(
     sigma: float,
     config: ScanEMConfig | None = None,
     *,
-    both_ways: bool = True,
-    boundary: bool = True,
     prior: MatchPrior | None = None,
     doubt: float = 1.0,
 ) -> SoftMatches:
     """Return the expected matches of source samples, by an E-step in which every sample may be an outlier.
 
     ``a_ij = e_ij / (sum_k e_ik + c)`` with ``e_ij = exp(-|x_i - y_j|^2 / 2 sigma^2 - normal_weight (1 - n_i . n_j) -
-    feature_weight |f_i - f_j|^2 / 2)``. Both ways, targets choose among sources alike, which pulls a limb to a target
-    that no source would choose.
+    feature_weight |f_i - f_j|^2 / 2)``.
 
     Args:
         source: (S) samples where they are now.
         target: (T) samples.
         sigma: width of the kernel, in the unit of the points.
         config: see `ScanEMConfig`.
-        both_ways: see above.
-        boundary: whether samples may match targets on a boundary, behind which the surface may go on.
         prior: what a matcher says of matches, by which ``e_ij`` are multiplied; None if nothing is known.
         doubt: see `MatchPrior.logarithm`.
 
@@ -109,29 +100,14 @@ def match_softly(
     config = ScanEMConfig() if config is None else config
     scales = (sigma * math.sqrt(config.normal_weight), sigma * math.sqrt(config.feature_weight))
     here, there = source.embedded(*scales), target.embedded(*scales)
-    index, chosen = _choices(here, there, sigma, config, _support(prior, doubt, by_target=False))
-    if not boundary:
-        chosen = chosen * ~target.boundary[index]
+    support = None if prior is None else lambda index: prior.logarithm(index, doubt)
+    index, chosen = _choices(here, there, sigma, config, support)
     posterior = chosen.sum(1)
-    tiny = torch.finfo(posterior.dtype).tiny
-    cut_off = (chosen * target.cut_off[index]).sum(1) / posterior.clamp_min(tiny)
     ends = torch.cat((target.points, target.normals), dim=1)
     sums = torch.einsum("sk,skd->sd", chosen, ends[index])
-    weights = posterior
-    if both_ways:
-        index, chosen = _choices(there, here, sigma, config, _support(prior, doubt, by_target=True))
-        chosen = chosen * (len(source) / len(target))
-        flat = index.reshape(-1)
-        weights = weights.index_add(0, flat, chosen.reshape(-1))
-        sums = sums.index_add(0, flat, (chosen.unsqueeze(-1) * ends.unsqueeze(1)).flatten(0, 1))
-    targets = sums[:, :3] / weights.clamp_min(tiny).unsqueeze(-1)
-    targets = torch.where(weights.unsqueeze(-1) > 0, targets, source.points)
-    return SoftMatches(weights, targets, torch.nn.functional.normalize(sums[:, 3:], dim=-1), posterior, cut_off)
-
-
-def _support(prior: MatchPrior | None, doubt: float, *, by_target: bool) -> Callable[[Tensor], Tensor] | None:
-    """Return what tells the logarithms of the prior of matches."""
-    return None if prior is None else lambda index: prior.logarithm(index, doubt, by_target=by_target)
+    targets = sums[:, :3] / posterior.clamp_min(torch.finfo(posterior.dtype).tiny).unsqueeze(-1)
+    targets = torch.where(posterior.unsqueeze(-1) > 0, targets, source.points)
+    return SoftMatches(posterior, targets, torch.nn.functional.normalize(sums[:, 3:], dim=-1))
 
 
 def _choices(

@@ -25,10 +25,8 @@ _LEAST_GAIN = 1e-4
 def fuse_motions(problem: ScanAlignProblem, options: Tensor, config: ChoiceConfig) -> Tensor:
     """Return motions of the nodes, each as in one of several hypotheses.
 
-    The energy is that by which hypotheses are compared, without the strain of wide regions and without overlaps, every
-    sample moved by the node that it hangs on most: where limbs overlap, the way to where they do not leads through
-    worse. Starting from the first hypothesis, the patch and hypothesis that lower it most change hands, until none
-    does.
+    The energy is that by which hypotheses are compared, every sample moved by the node that it hangs on most. Starting
+    from the first hypothesis, the patch and hypothesis that lower it most change hands, until none does.
 
     Args:
         problem: the scans.
@@ -94,7 +92,7 @@ class _Energy:
         costs, covers, by = [], [], []
         for option in options:
             moved = problem.moved(option)
-            costs.append(torch.stack(mismatch(problem, moved, config)).sum(0) + leaps(problem, moved.points, config))
+            costs.append(mismatch(problem, moved, config) + leaps(problem, moved.points, config))
             index, apart = k_nearest(there, embedded(moved, config), min(_NUM_COVERS, len(owner)))
             covers.append((apart / config.cap).clamp(max=1).square())
             by.append(owner[index])

@@ -58,14 +58,10 @@ class MatchPrior:
         return cls.of_logits(logits, source.points[:count], target.points)
 
     @cached_property
-    def _offers(self) -> tuple[tuple[Tensor, tuple[Tensor, Tensor]], tuple[Tensor, tuple[Tensor, Tensor]]]:
-        """What each sample (S, B) makes of the other scan's tokens, and the few tokens about each of its samples."""
-        count = min(_ABOUT, *self.by_source.shape)
-        near, there = self.source.topk(count, dim=1), self.target.topk(count, dim=1)
-        return (self.source @ self.by_source, (there[0], there[1])), (
-            self.target @ self.by_target.mT,
-            (near[0], near[1]),
-        )
+    def _offers(self) -> tuple[Tensor, Tensor, Tensor]:
+        """What samples of the source (S, B) make of the target's tokens, and the few about each of its samples."""
+        weight, about = self.target.topk(min(_ABOUT, self.by_source.shape[1]), dim=1)
+        return self.source @ self.by_source, weight, about
 
     @cached_property
     def visible(self) -> Tensor:
@@ -88,15 +84,14 @@ class MatchPrior:
         other = (here / here.sum(0).clamp_min(tiny)) @ self.by_target @ there.mT
         return one, other
 
-    def logarithm(self, index: Tensor, doubt: float, *, by_target: bool = False) -> Tensor:
+    def logarithm(self, index: Tensor, doubt: float) -> Tensor:
         """Return the logarithm (n, K) of how far matches are supported: zero for a sure one.
 
         Args:
-            index: (n, K) samples of the other scan that each of the first samples may match.
+            index: (n, K) samples of the target that each of the first samples of the source may match.
             doubt: support of what the matcher calls impossible.
-            by_target: whether the target's samples choose among the source's, instead of the other way.
         """
-        chances, (weight, about) = self._offers[int(by_target)]
+        chances, weight, about = self._offers
         rows = torch.arange(len(index), device=index.device)[:, None, None]
         # A sure match of samples between tokens has the share of one token.
         support = _ABOUT * (chances[rows, about[index]] * weight[index]).sum(-1)

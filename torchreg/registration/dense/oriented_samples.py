@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -19,7 +19,6 @@ class OrientedSamples:
         normals: (S, 3) unit vectors.
         features: (S, D) what motion leaves as it is; the squared distance of two samples at random is two.
         boundary: (S,) bool, where the scan ends.
-        cut_off: (S,) bool, near where it ends although the surface goes on, hidden by something; nowhere by default.
 
     Raises:
         InputError: if a shape does not fit.
@@ -30,16 +29,12 @@ class OrientedSamples:
     normals: Tensor
     features: Tensor
     boundary: Tensor
-    cut_off: Tensor = field(default=None)  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         check_shape(self.points, "points", ("S", 3))
         check_shape(self.normals, "normals", tuple(self.points.shape))
         check_shape(self.features, "features", (len(self.points), "D"))
         check_shape(self.boundary, "boundary", (len(self.points),))
-        if self.cut_off is None:
-            object.__setattr__(self, "cut_off", torch.zeros_like(self.boundary))
-        check_shape(self.cut_off, "cut_off", (len(self.points),))
         check_same_kind(self.normals, "normals", self.points, "points")
         check_same_kind(self.features, "features", self.points, "points")
 
@@ -48,7 +43,7 @@ class OrientedSamples:
 
     def first(self, count: int) -> OrientedSamples:
         """Return the first ``count`` samples."""
-        values = (self.points, self.normals, self.features, self.boundary, self.cut_off)
+        values = (self.points, self.normals, self.features, self.boundary)
         return OrientedSamples(*(value[:count] for value in values))
 
     def moved(self, points: Tensor, normals: Tensor) -> OrientedSamples:

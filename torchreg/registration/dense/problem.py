@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchreg._threads import run_both
-from torchreg.geometry.graphs import Graph
-from torchreg.geometry.neighbors import NeighborTree, sampling_distance
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.sampling import even_order
 from torchreg.registration.dense.config import ScanAlignConfig
 from torchreg.registration.dense.curvature import curvature_features
 from torchreg.registration.dense.deformation_graph import DeformationGraph
-from torchreg.registration.dense.free_space import FreeSpace
 from torchreg.registration.dense.match_prior import MatchPrior
 from torchreg.registration.dense.node_graph import build_node_graph
-from torchreg.registration.dense.occlusion import likely_viewpoint, occlusion_edges
 from torchreg.registration.dense.oriented_samples import OrientedSamples, scaled_together
-from torchreg.registration.dense.rigid_regions import WideRegions
 from torchreg.registration.dense.sample_graph import sample_graph
 from torchreg.registration.normalization import Normalization
 
@@ -38,9 +33,7 @@ class ScanAlignProblem:
         graph: of the source's first samples, which it moves.
         source: samples of the source, evenly spread in any first few of them.
         target: samples of the target.
-        regions: of the graph's first samples, about its nodes, each of which mostly moves rigidly.
-        far: (M, M) which of the graph's first samples are far from each other along the surface.
-        free: where the camera saw nothing when the target was scanned; None if it is not known where the camera was.
+        config: how they are aligned.
         prior: what the matcher says of matches of the graph's samples and those of the target.
         samples: (S,) source points that are samples of the graph.
         nodes: (J,) source points that are nodes.
@@ -51,14 +44,16 @@ class ScanAlignProblem:
     graph: DeformationGraph
     source: OrientedSamples
     target: OrientedSamples
-    regions: WideRegions
-    far: Tensor
-    free: FreeSpace | None
+    config: ScanAlignConfig
     prior: MatchPrior
     samples: Tensor
     nodes: Tensor
     unit: Normalization
     expected: Tensor | None = None
+
+    def num_used(self, sigma: float) -> int:
+        """Return how many samples a sigma asks for: so many per squared sigma, and at least some."""
+        return max(round(self.config.density / sigma**2), self.config.least_samples)
 
     def moved(self, transforms: Tensor, count: int | None = None) -> OrientedSamples:
         """Return the first ``count`` samples of the graph where its nodes take them."""
@@ -102,9 +97,6 @@ def describe(
         OrientedSamples(*pair, feature, scan.boundary[which].cpu())
         for pair, feature, scan, which in zip(places, features, (source, target), (here, there), strict=True)
     )
-    eye = _viewpoint(target, unit, other)
-    free = None if eye is None else FreeSpace.of(other.points, other.normals, eye, config.most_cut)
-    other = replace(other, cut_off=_cut_off(unit.normalize(target.points[target.boundary]), other.points, eye, config))
     samples = here[: config.num_samples].cpu()
     faces = None if source.faces is None else source.faces.cpu()
     normals = source.normals.detach().cpu().double()
@@ -112,39 +104,8 @@ def describe(
     nodes = build_node_graph(ways, 0, config.num_nodes, config.num_nearest)
     graph = DeformationGraph(one.points[: len(samples)], one.normals[: len(samples)], nodes)
     ahead = None if expected is None else unit.normalize(expected)[samples]
-    regions = _wide_regions(graph, ways, nodes.nodes, config)
-    far = _far_apart(ways, config)
     return ScanAlignProblem(
-        graph=graph, source=one, target=other, regions=regions, far=far, free=free,
+        graph=graph, source=one, target=other, config=config,
         prior=MatchPrior.of_samples(one, other, len(samples)),
         samples=samples, nodes=samples[nodes.nodes], unit=unit, expected=ahead,
     )  # fmt: skip
-
-
-def _far_apart(ways: Graph, config: ScanAlignConfig) -> Tensor:
-    """Return which of the first samples (M, M) are far from each other along the surface."""
-    few = torch.arange(min(config.overlap_samples, len(ways)))
-    return ways.distances(few, limit=config.overlap_reach)[:, : len(few)].isinf()
-
-
-def _wide_regions(graph: DeformationGraph, ways: Graph, nodes: Tensor, config: ScanAlignConfig) -> WideRegions:
-    """Return regions about the nodes, samples of the graph."""
-    few = graph.points[: config.region_samples]
-    apart = ways.distances(nodes, limit=config.region_reach)[:, : len(few)].to(few)
-    return WideRegions.of(few, apart, config.region_reach, config.region_give)
-
-
-def _viewpoint(scan: RangeScan, unit: Normalization, samples: OrientedSamples) -> Tensor | None:
-    """Return where the camera (3,) was, if that is known or clear."""
-    if scan.viewpoint is None:
-        return likely_viewpoint(samples.points, samples.normals)
-    return unit.normalize(scan.viewpoint.unsqueeze(0))[0]
-
-
-def _cut_off(edges: Tensor, points: Tensor, eye: Tensor | None, config: ScanAlignConfig) -> Tensor:
-    """Return which samples (S,) are near edges (E, 3) of a scan behind which the surface goes on, hidden."""
-    if eye is not None:
-        edges = edges[occlusion_edges(edges, points, eye, config.occluder_depth)]
-    if eye is None or len(edges) == 0:
-        return torch.zeros(len(points), dtype=torch.bool)
-    return NeighborTree(edges).nearest(points)[1] < config.occluder_reach * sampling_distance(points)
