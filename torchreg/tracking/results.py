@@ -122,7 +122,7 @@ class TrackState(Result):
         cool_down: frames before the next search.
         failed_searches: searches in a row after which the fit was still doubtful.
         pending_checks: how often a pose found by a search everywhere is still to be compared with another search.
-        seed: of all that is drawn.
+        seed: of all random draws.
         origin: (3,) float64 about which all this is, where clouds lie far from that of coordinates; None elsewhere.
     """
 
