@@ -75,6 +75,8 @@ def view(
 
     Exit codes: 0, also after Ctrl-C; 2 for an error.
     """
+    if result.suffix:
+        result.stat()  # a missing file is told before all else
     html = with_ending(html, (".html",))
     check_outputs([html], force)
     up_direction = check_up(up)
