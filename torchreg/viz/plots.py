@@ -22,9 +22,6 @@ from torchreg.viz.strips import facing_mesh
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Points per inch and pixel of a picture: diameters of points are shares of the picture.
-_POINTS_PER_PIXEL = 0.72
-
 
 def plot(
     result: Any,
@@ -109,6 +106,7 @@ def _draw_surface(
 def _draw_cloud(ax: Axes, view: View, layer: Cloud, points: Tensor, colors: Tensor) -> None:
     pixels, depth = view.project(points)
     seen = depth > 0
-    width = max(1.0, layer.size * min(picture_size(view)) * _POINTS_PER_PIXEL)
+    inches = min(picture_size(view)) / ax.figure.dpi
+    width = max(1.0, 72 * layer.size * inches)
     x, y = pixels[seen].mT.numpy()
     ax.scatter(x, y, s=width**2, c=colors[seen].numpy(), linewidths=0, zorder=2)
