@@ -79,7 +79,7 @@ def measured(pair: Pair, matcher: ScanMatcher) -> list[float]:
     figures = [share(right[visible]), share(called[~visible]), share(~visible[called])]
     for known in (logits[0].double(), true_logits(truth, places, visible)):
         prior = MatchPrior.of_logits(known, problem.graph.points, problem.target.points)
-        transforms, _ = align_problem(replace(problem, prior=prior), config, lambda _: None)
+        transforms = align_problem(replace(problem, prior=prior), config, lambda _: None)[0].transforms
         error = (moved_points(problem, transforms, pair.source) - pair.truth).norm(dim=1) / pair.target.diagonal
         figures += [100 * float(error.mean()), float((error < 0.025).double().mean() >= 0.9)]
     return [*figures, time.process_time() - begin]

@@ -127,27 +127,15 @@ def _ablations() -> list[Recipe]:
         Recipe("without label reuse", config=replace(plain, reuse=False)),
         Recipe("without refinement", config=replace(plain, refine_steps=0)),
         Recipe("without settling", config=replace(plain, settle_steps=0)),
-        Recipe("without wide regions", config=replace(plain, align=_no_regions(plain.align))),
-        Recipe("without visibility", config=replace(plain, align=_blind(plain.align))),
-        Recipe("limbs may overlap", config=replace(plain, align=_overlapping(plain.align))),
+        Recipe("without features", config=replace(plain, align=_featureless(plain.align))),
         *(Recipe(f"grid {size}", grid=size) for size in (20, 35, 65, 80)),
         *(Recipe(f"bones {size}", bones=size) for size in (4, 6, 10, 15)),
     ]
 
 
-def _no_regions(align: ScanAlignConfig) -> ScanAlignConfig:
-    """Return settings under which wide regions may move in any way."""
-    return replace(align, refine=replace(align.refine, regions=0.0), choice=replace(align.choice, strain=0.0))
-
-
-def _blind(align: ScanAlignConfig) -> ScanAlignConfig:
-    """Return settings under which hypotheses may take points to where the camera would have seen them."""
-    return replace(align, choice=replace(align.choice, seen=0.0))
-
-
-def _overlapping(align: ScanAlignConfig) -> ScanAlignConfig:
-    """Return settings under which hypotheses may take limbs to one place."""
-    return replace(align, choice=replace(align.choice, overlap=0.0))
+def _featureless(align: ScanAlignConfig) -> ScanAlignConfig:
+    """Return settings under which hypotheses may take points to where the target is unlike them."""
+    return replace(align, choice=replace(align.choice, unlike=0.0))
 
 
 def file_problems(folder: Path) -> Iterator[Problem]:

@@ -210,4 +210,5 @@ def _summary(found: ScanRegistration) -> str:
         for name, value in zip(("setup", "initialization", "align", "refine"), found.seconds.tolist(), strict=True)
     )
     share = float(found.matched.float().mean())
-    return f"{status}: {found.model.num_bones} bones, {share:.0%} of the points match; {seconds}"
+    sure = "" if found.confidence is None else f", confidence {found.confidence:.0%}"
+    return f"{status}{sure}: {found.model.num_bones} bones, {share:.0%} of the points match; {seconds}"

@@ -6,7 +6,7 @@ import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -26,6 +26,7 @@ from torchreg.registration.bones.labels import CellData, labels_of_parts
 from torchreg.registration.bones.sparse_grid import MAX_RESOLUTION, SparseGrid
 from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.align_scans import align_scans
+from torchreg.registration.dense.reliability import SCAN_CALIBRATION
 from torchreg.registration.normalization import Normalization
 from torchreg.registration.paper.algorithm import PaperFit
 from torchreg.registration.results import RegisterRecord, ScanRegistration
@@ -128,7 +129,8 @@ def _registered(
     grid = SparseGrid.from_points(normalized_source.points, grid_resolution)
     data = CellData(grid, normalized_source.points[index], config.num_patches)
     clock.lap()
-    # Line 2: first matches; by default a first alignment of all points.
+    # Line 2: first matches; by default a first alignment of all points, which alone tells how sure it is.
+    sure: float | None = None
     fit: ReducedFit | PaperFit
     if config.printed is not None:
         fit = PaperFit(
@@ -138,7 +140,7 @@ def _registered(
     else:
         if start is None:
             aligned = align_scans(source, target, config.align, generator=generator, on_step=initial_records(on_step))
-            start, confidence = aligned.points, aligned.confidence
+            start, confidence, sure = aligned.points, aligned.point_confidence, aligned.confidence
         samples = _aligned_samples(normalized_source, index, normalization.normalize(start), confidence)
         labels = None if parts is None else labels_of_parts(data, normalized_source.points, parts)
         targets = (normalized_target,)
@@ -150,7 +152,15 @@ def _registered(
     # Line 9: continuous weights.
     converged = fit.refine() and converged
     clock.lap()
-    return _scan_registration(source, normalized_source, normalization, fit, converged, degenerate, clock.seconds)
+    result = _scan_registration(source, normalized_source, normalization, fit, converged, degenerate, clock.seconds)
+    return result if sure is None else _trusted(result, sure, confidence)
+
+
+def _trusted(result: ScanRegistration, sure: float, confidence: Tensor | None) -> ScanRegistration:
+    """Return a result with how far it can be trusted: doubtful where its alignment is."""
+    doubtful = sure < SCAN_CALIBRATION.doubtful and result.status.usable
+    status = Status.DOUBTFUL if doubtful else result.status
+    return replace(result, status=status, confidence=sure, point_confidence=confidence)
 
 
 def _checked_scans(source: Any, target: Any, num_bones: int, grid_resolution: int) -> tuple[RangeScan, RangeScan]:
@@ -196,13 +206,13 @@ def _scan_registration(
         weights=weights.to(like),
         distances=(normalization.scale * nearest_neighbor(moved, matcher.target.points)[1]).to(like),
         matched=matches.kept.to(like.device),
-        status=fit_status(int(matches.kept.sum()) / len(moved), converged, config, degenerate),
+        status=fit_status(int(matches.kept.sum()) / len(moved), converged, config, degenerate=degenerate),
         seconds=seconds,
         history=tuple(fit.history),
     )
 
 
-def fit_status(matched: float, converged: bool, config: BoneConfig, degenerate: bool) -> Status:
+def fit_status(matched: float, converged: bool, config: BoneConfig, *, degenerate: bool) -> Status:
     """Return the status of a fit that matched a share of the points of scans, degenerate ones or not."""
     if matched == 0:
         return Status.NO_DATA

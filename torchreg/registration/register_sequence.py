@@ -231,12 +231,12 @@ def _aligned_frames(
                 generator=generator, on_step=initial_records(on_step),
                 expected=FRAME_TO_FRAME.predict(deformed, frame, step),
             )  # fmt: skip
-            aligned[frame], confidence[frame] = found.points, found.confidence
+            aligned[frame], confidence[frame] = found.points, found.point_confidence
             if frame + step == end:
                 break
             bent = register(
                 source, scans[frame], num_bones, grid_resolution, few_bones, generator,
-                start=found.points, confidence=found.confidence,
+                start=found.points, confidence=found.point_confidence,
             )  # fmt: skip
             deformed[frame] = bent.deformed
             normals = turned_normals(source.normals, bent.weights, bent.transforms)
@@ -273,7 +273,7 @@ def _sequence_registration(
         fused_normals=normals.to(like),
         fused_frames=frames.to(like.device),
         reference=reference,
-        status=fit_status(matched, converged, fit.config, degenerate),
+        status=fit_status(matched, converged, fit.config, degenerate=degenerate),
         history=tuple(fit.history),
     )
 

@@ -58,7 +58,7 @@ def scans(pair):
 
 
 def test_the_result_is_what_its_parts_say(pair, aligned):
-    assert aligned.points.dtype == aligned.confidence.dtype == torch.float32
+    assert aligned.points.dtype == aligned.point_confidence.dtype == torch.float32
     assert aligned.points.shape == pair.source.points.shape
     moved = blend_linear(pair.source.points, aligned.weights, aligned.transforms)
     torch.testing.assert_close(moved, aligned.points, rtol=0, atol=1e-3 * pair.source.diagonal)
@@ -73,9 +73,9 @@ def test_the_result_is_what_its_parts_say(pair, aligned):
 
 
 def test_confidence_tells_the_seen_from_the_hidden(pair, aligned):
-    assert 0 <= float(aligned.confidence.min()) <= float(aligned.confidence.max()) <= 1
-    seen = aligned.confidence[pair.visible].mean()
-    assert float(seen) > float(aligned.confidence[~pair.visible].mean()) + 0.1
+    assert 0 <= float(aligned.point_confidence.min()) <= float(aligned.point_confidence.max()) <= 1
+    seen = aligned.point_confidence[pair.visible].mean()
+    assert float(seen) > float(aligned.point_confidence[~pair.visible].mean()) + 0.1
 
 
 def test_steps_are_reported(pair):

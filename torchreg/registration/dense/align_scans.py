@@ -27,6 +27,7 @@ from torchreg.registration.dense.fusion import fuse_motions
 from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
 from torchreg.registration.dense.node_graph import spread_weights
 from torchreg.registration.dense.problem import NORMAL_SCALE, ScanAlignProblem, describe
+from torchreg.registration.dense.reliability import ScanEvidence, confidence_of, scan_evidence
 from torchreg.registration.dense.stages import (
     Reporter,
     agree,
@@ -97,7 +98,8 @@ def align_scans(
             on_step(record)
 
     problem = describe(source, target, config, generator, None if expected is None else _checked(expected, source))
-    transforms, hypotheses = align_problem(problem, config, report)
+    found = align_problem(problem, config, report)
+    transforms, hypotheses = found[0].transforms, tuple(candidate.hypothesis for candidate in found)
     weights = spread_weights(
         problem.unit.normalize(source.points),
         source.normals.detach().cpu().double(),
@@ -109,7 +111,8 @@ def align_scans(
     moved = blend_linear(problem.unit.normalize(source.points), weights, transforms)
     return ScanAlignment(
         points=problem.unit.denormalize(moved, source.points),
-        confidence=_confidence(problem, transforms, config, source.points).to(source.points),
+        confidence=confidence_of(evidence_against(problem, found, config)),
+        point_confidence=_point_confidence(problem, transforms, config, source.points).to(source.points),
         samples=problem.samples,
         nodes=problem.nodes,
         weights=weights.to(source.points),
@@ -120,31 +123,35 @@ def align_scans(
     )
 
 
-def align_problem(
-    problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep
-) -> tuple[Tensor, tuple[Hypothesis, ...]]:
-    """Return the motions (J, 4, 4) of the nodes, and all hypotheses, the best first; see `align_scans`."""
-    found = sorted(_candidates(problem, config, on_step), key=_energy)
-    if not agree(problem, found[0].transforms, found[1].transforms, config.choice):
-        found = sorted([*found, _fused(problem, found, config, on_step)], key=_energy)
-    return found[0].transforms, tuple(candidate.hypothesis for candidate in found)
-
-
 @dataclass(frozen=True, eq=False)
-class _Candidate:
-    """Motions (J, 4, 4), and how they compare with others."""
+class Candidate:
+    """Motions (J, 4, 4) of the nodes, and how they compare with others."""
 
     hypothesis: Hypothesis
     transforms: Tensor
 
 
-def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
+def align_problem(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[Candidate]:
+    """Return all candidates, two at least, the best first; see `align_scans`."""
+    found = sorted(_candidates(problem, config, on_step), key=_energy)
+    if not agree(problem, found[0].transforms, found[1].transforms, config.choice):
+        found = sorted([*found, _fused(problem, found, config, on_step)], key=_energy)
+    return found
+
+
+def evidence_against(problem: ScanAlignProblem, found: Sequence[Candidate], config: ScanAlignConfig) -> ScanEvidence:
+    """Return what speaks against the first of several candidates."""
+    best, rival, *_ = found
+    return scan_evidence(problem, best.transforms, rival.transforms, best.hypothesis.bend, config.choice)
+
+
+def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[Candidate]:
     """Return the candidates before any are fused."""
     near, matched = _both_told(on_step, partial(_near, problem, config), partial(_by_matches, problem, config))
     return [*near, matched]
 
 
-def _near(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[_Candidate]:
+def _near(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[Candidate]:
     """Return the candidates from rest and, if that is known, from where points are expected."""
     sigma, rest = config.refine.sigma[0], problem.graph.rest()
     found = [_compared(problem, rest, sigma, config, Reporter("rest", problem.unit.scale, on_step))]
@@ -155,7 +162,7 @@ def _near(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -
     return found
 
 
-def _by_matches(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> _Candidate:
+def _by_matches(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> Candidate:
     """Return the candidate from the matches of the matcher."""
     reporter = Reporter("matches", problem.unit.scale, on_step)
     begin = fit_coarsely(problem, config.coarse, reporter)
@@ -182,8 +189,8 @@ def _checked(expected: Any, source: RangeScan) -> Tensor:
 
 
 def _fused(
-    problem: ScanAlignProblem, found: Sequence[_Candidate], config: ScanAlignConfig, on_step: OnStep
-) -> _Candidate:
+    problem: ScanAlignProblem, found: Sequence[Candidate], config: ScanAlignConfig, on_step: OnStep
+) -> Candidate:
     """Return the candidate that takes the best of several."""
     begin = fuse_motions(problem, torch.stack([candidate.transforms for candidate in found]), config.choice)
     reporter = Reporter("fused", problem.unit.scale, on_step)
@@ -192,17 +199,17 @@ def _fused(
 
 def _compared(
     problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: ScanAlignConfig, reporter: Reporter
-) -> _Candidate:
+) -> Candidate:
     """Return the candidate after its EM."""
     transforms = refine(problem, transforms, config.refine, reporter, sigma)
-    return _Candidate(judge(problem, reporter.name, transforms, config.choice), transforms)
+    return Candidate(judge(problem, reporter.name, transforms, config.choice), transforms)
 
 
-def _energy(candidate: _Candidate) -> float:
+def _energy(candidate: Candidate) -> float:
     return candidate.hypothesis.energy
 
 
-def _confidence(problem: ScanAlignProblem, transforms: Tensor, config: ScanAlignConfig, points: Tensor) -> Tensor:
+def _point_confidence(problem: ScanAlignProblem, transforms: Tensor, config: ScanAlignConfig, points: Tensor) -> Tensor:
     """Return the posterior mass (N,) of matches at points, by that of the nearest samples."""
     sigma = config.refine.sigma[1]
     moved = problem.moved(transforms, problem.num_used(sigma))

@@ -226,8 +226,9 @@ class ScanAlignment:
 
     Args:
         points: (N, 3) all source points where they went, in the unit, frame and dtype of the source.
-        confidence: (N,) in [0, 1], posterior mass of each point's match at the last sigma; low where the target shows
-            nothing, and where points follow what is around them.
+        confidence: probability, from 0 to 1, that the alignment is right, see `ScanCalibration`.
+        point_confidence: (N,) in [0, 1], posterior mass of each point's match at the last sigma; low where the target
+            shows nothing, and where points follow what is around them.
         samples: (S,) source points that hang on the nodes.
         nodes: (J,) source points that are nodes.
         weights: (N, J) of the nodes at all points, rows sum to one.
@@ -238,7 +239,8 @@ class ScanAlignment:
     """
 
     points: Tensor
-    confidence: Tensor
+    confidence: float
+    point_confidence: Tensor
     samples: Tensor
     nodes: Tensor
     weights: Tensor

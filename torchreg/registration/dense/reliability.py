@@ -1,0 +1,100 @@
+"""How far an alignment of two scans can be trusted: what speaks against it, and a learnt probability."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.neighbors import NeighborTree
+from torchreg.registration.dense.problem import ScanAlignProblem
+from torchreg.registration.dense.stages import embedded, mismatch
+
+if TYPE_CHECKING:
+    from torchreg.registration.dense.config import ChoiceConfig
+
+# Support of what the matcher calls impossible, when it is asked about an alignment: it errs that often.
+_DOUBT = 0.1
+
+
+@dataclass(frozen=True)
+class ScanEvidence:
+    """What speaks against an alignment.
+
+    Args:
+        forward: mean cost of moved samples that the matcher calls visible, see `mismatch`.
+        backward: mean squared distance of visible target samples from the moved source, in caps, capped at one.
+        bend: of the graph, as it was judged.
+        unsupported: mean of minus the logarithm of the matcher's support of where visible samples ended.
+        hidden: share of samples that the matcher calls hidden.
+        rival: share of samples that the second-best hypothesis takes elsewhere.
+    """
+
+    forward: float
+    backward: float
+    bend: float
+    unsupported: float
+    hidden: float
+    rival: float
+
+    def table(self) -> Tensor:
+        """Return the numbers (E,), float64."""
+        return torch.tensor([getattr(self, item.name) for item in fields(self)], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class ScanCalibration:
+    """The logistic model of the confidence: log-odds of a right alignment, ``bias - sum_k weight_k evidence_k``.
+
+    An alignment is right if 90 % of the points end within 2.5 % of the diagonal of the truth. Fitted to 90 pairs of the
+    kinds that the matcher is trained on by ``benchmarks/scan_confidence.py --calibrate``.
+    """
+
+    bias: float = 7.03
+    weights: tuple[float, ...] = (1.12, 6.19, 2.93, 3.74, 1.13, 6.28)  # in the order of `ScanEvidence`
+    doubtful: float = 0.5  # confidence below which a result is doubtful
+
+
+SCAN_CALIBRATION = ScanCalibration()
+
+
+def confidence_of(evidence: ScanEvidence) -> float:
+    """Return the probability, from 0 to 1, that an alignment with this evidence is right."""
+    calibration = SCAN_CALIBRATION
+    odds = calibration.bias - evidence.table() @ torch.tensor(calibration.weights, dtype=torch.float64)
+    return float(torch.sigmoid(odds))
+
+
+def scan_evidence(
+    problem: ScanAlignProblem, transforms: Tensor, rival: Tensor, bend: float, config: ChoiceConfig
+) -> ScanEvidence:
+    """Return the evidence against motions (J, 4, 4) of the nodes.
+
+    Args:
+        problem: the scans.
+        transforms: the motions.
+        rival: (J, 4, 4) those of the second-best hypothesis.
+        bend: of the graph, see `Hypothesis`.
+        config: by which hypotheses are compared.
+    """
+    moved, prior = problem.moved(transforms), problem.prior
+    here, there = embedded(moved, config), embedded(problem.target, config)
+    index = NeighborTree(there).nearest(here)[0]
+    apart = (NeighborTree(here).nearest(there)[1] / config.cap).clamp(max=1).square()
+    support = prior.logarithm(index[:, None], _DOUBT)[:, 0]
+    elsewhere = (problem.graph(transforms) - problem.graph(rival)).norm(dim=-1) > config.same
+    return ScanEvidence(
+        forward=_mean(mismatch(problem, moved, config), prior.visible),
+        backward=_mean(apart, prior.target_visible),
+        bend=bend,
+        unsupported=-_mean(support, prior.visible),
+        hidden=1 - float(prior.visible.mean()),
+        rival=float(elsewhere.double().mean()),
+    )
+
+
+def _mean(values: Tensor, weights: Tensor) -> float:
+    """Return the weighted mean."""
+    return float((weights * values).sum() / weights.sum().clamp_min(torch.finfo(weights.dtype).tiny))
