@@ -182,6 +182,8 @@ def _registration_scene(result: ScanRegistration, shape: None, data: Data) -> Sc
         layers.append(_scan("target", points, over, _STYLE.target, opacity=0.5))
     title = f"{counted(result.model.num_bones, 'bone')}, {float(result.matched.float().mean()):.0%} of the points match"
     facts = {"status": result.status.value, "distance, median": f"{float(errors.median()):.3g}"}
+    if result.confidence is not None:
+        facts["confidence"] = f"{result.confidence:.2f}"
     return Scene(title, tuple(layers), torch.linspace(0, 2, _STYLE.num_steps), facts=facts)
 
 
