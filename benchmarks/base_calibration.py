@@ -4,7 +4,8 @@ The real arm stands in five depth pictures with its encoders' angles and a base 
 exact). The base is sought from all frames and from each three of them, without a start; then, with the base held, the
 joints of each frame from its encoders plus noise of 0.2 radians, with that prior: how often three standard deviations
 cover the error, and how many joints are told within 5 degrees. Made-up frames are the same arm in random joints before
-a depth camera with 2 mm of noise, once with an offset of 1 degree at each joint in turn.
+a depth camera with 2 mm of noise, once with an offset of 1 degree at each joint in turn; then each frame alone, with
+the base held, from encoders with noise.
 
     python benchmarks/base_calibration.py --data FOLDER       # FOLDER/xarm7: frames, camera.json, truth.json, URDF
 """
@@ -31,7 +32,7 @@ from torchreg.geometry.visibility import sample_visible
 
 # Where the base is told to be off, in base coordinates.
 WORKSPACE = torch.tensor([0.3, 0.0, 0.3, 1.0], dtype=torch.float64)
-ENCODER_STD, TOLD = 0.2, math.radians(5)
+ENCODER_STD, TOLD, SEEN = 0.2, math.radians(5), math.radians(1)
 NUM_POINTS, NOISE, OFFSET = 1500, 0.002, math.radians(1)
 
 
@@ -109,15 +110,20 @@ def show_joints(arm: Arm, seeds: int, config: tr.AlignConfig) -> None:
             seconds += time.process_time() - begin
             errors.append(found.pose[6:].double() - joints)
             stds.append(found.covariance.diagonal()[6:].clamp_min(0).sqrt().double())
-    error, std = torch.stack(errors).abs(), torch.stack(stds)
-    told = (std < TOLD).reshape(seeds, -1).sum(-1).tolist()
-    medians, most = torch.rad2deg(error.median(0).values).tolist(), torch.rad2deg(error.amax(0)).tolist()
     print(
         f"at the encoders' angles data lie {', '.join(f'{value:.1f}' for value in exact)} mm from the meshes (medians)"
     )
+    print_joints(torch.stack(errors), torch.stack(stds), seeds, len(arm.frames), seconds / len(errors))
+
+
+def print_joints(errors: Tensor, std: Tensor, seeds: int, frames: int, seconds: float) -> None:
+    """Print how joints (seeds x frames, J) are off, radians, and how well their standard deviations tell that."""
+    error = errors.abs()
+    told = (std < TOLD).reshape(seeds, -1).sum(-1).tolist()
+    medians, most = torch.rad2deg(error.median(0).values).tolist(), torch.rad2deg(error.amax(0)).tolist()
     print(f"joints: 3 std cover {float((error <= 3 * std).double().mean()):.1%}; std below 5 degrees for {told} of "
-          f"{len(arm.frames) * error.shape[1]}, the worst of them off by {math.degrees(error[std < TOLD].max()):.1f}; "
-          f"{seconds / len(errors):.2f} CPU s a frame")  # fmt: skip
+          f"{frames * error.shape[1]}, the worst of them off by {math.degrees(error[std < TOLD].max()):.1f}; "
+          f"{seconds:.2f} CPU s a frame")  # fmt: skip
     print("off by, per joint: medians " + ", ".join(f"{value:.1f}" for value in medians)
           + " degrees, most " + ", ".join(f"{value:.1f}" for value in most))  # fmt: skip
 
@@ -156,6 +162,26 @@ def show_made_up(arm: Arm, trials: int, frames: int) -> None:
         print(f"made up, {frames} frames: base off {off:.2f} mm {turn:.2f} deg; offsets {', '.join(told)}", flush=True)
 
 
+def show_made_up_joints(arm: Arm, seeds: int, frames: int) -> None:
+    """Print the joints of single made-up frames with the base held, from encoders with noise."""
+    errors, stds, begin = [], [], time.process_time()
+    for seed in range(seeds):
+        generator = torch.Generator().manual_seed(seed)
+        clouds, joints, base = made_up_frames(arm, generator, frames)
+        held = torch.cat([base[:3, 3], so3_log(base[None, :3, :3])[0]])
+        for cloud, row in zip(clouds, joints, strict=True):
+            start = torch.cat([held, row + ENCODER_STD * torch.randn(len(row), generator=generator)]).float()
+            found = tr.align(arm.shape, cloud.float(), start, locked="base", prior=(start, ENCODER_STD))
+            errors.append(found.pose[6:].double() - row)
+            stds.append(found.covariance.diagonal()[6:].clamp_min(0).sqrt().double())
+    error, std = torch.stack(errors), torch.stack(stds)
+    seen = std < SEEN
+    print(f"made up, single frames: {float(seen.double().mean()):.0%} of the joints have a std below "
+          f"{math.degrees(SEEN):.0f} degree, {float((error[seen].abs() < 2 * SEEN).double().mean()):.1%} of these are "
+          f"within 2 degrees, the worst off by {math.degrees(error[seen].abs().max()):.1f}")  # fmt: skip
+    print_joints(error, std, seeds, frames, (time.process_time() - begin) / len(errors))
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Print all figures; return 0."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -173,6 +199,7 @@ def main(arguments: list[str] | None = None) -> int:
         if not options.smoke:
             show_joints(arm, options.seeds, tr.AlignConfig())
             show_made_up(arm, options.trials, 5)
+            show_made_up_joints(arm, options.seeds, 5)
     return 0
 
 

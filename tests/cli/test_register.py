@@ -10,11 +10,14 @@ import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
 from torchreg.geometry.camera import Camera
+from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.visibility import rasterize
 from torchreg.io.calibration import load_depth_camera, save_depth_camera
 from torchreg.io.images import load_image, save_depth
 from torchreg.io.points import load_points, save_points
 from torchreg.registration import register as pipeline
+from torchreg.registration import register_sequence
+from torchreg.registration.robots.model import RobotModel
 
 
 @pytest.fixture(scope="module")
@@ -110,3 +113,44 @@ def test_depth_images_are_registered_and_what_was_seen_is_drawn(run, error_of, d
     assert "no meaning without --depth" in error_of("register", "a.ply", "b.ply", "--smoothing", 0.001, *out)
     far = ("--intrinsics", folder / "k.json", "--depth-range", 900, 901)
     assert "0.png: depth" in error_of(*pair, *far, *out, "--seen", tmp_path / "far")
+
+
+def test_scans_of_a_robot_become_its_description(run, error_of, scans, tmp_path, monkeypatch):
+    folder, _ = scans
+    three = ("register", folder / "source.ply", folder / "target.ply", folder / "bare.ply")
+    arm = KinematicTree((
+        Joint("base", -1, torch.eye(4)),
+        Joint("joint_1", 0, torch.eye(4), "revolute", (0.0, 0.0, 1.0), lower=-1.0, upper=1.0),
+    ))  # fmt: skip
+    robot = RobotModel(
+        arm, torch.zeros(4, dtype=torch.long), torch.tensor([[0.0], [0.25], [-0.5]]), torch.eye(4).repeat(3, 1, 1),
+        torch.tensor([0.0, 0.001, 0.002]), ("joint_1",),
+    )  # fmt: skip
+    asked = []
+
+    class Found:
+        points, status = torch.eye(3), tr.Status.CONVERGED
+
+        def to_urdf(self, path):
+            asked.append(path)
+            return robot
+
+        def save(self, path):
+            asked.append(path)
+
+    def known(given, bones, grid, on_step):
+        asked.append((len(given), bones, grid))
+        return Found()
+
+    monkeypatch.setattr(register_sequence, "register_sequence", known)
+    answer = run(*three, "-o", tmp_path / "robot", "--urdf", "--bones", 8, "--grid", 25)
+    assert answer.exit_code == 0, answer.output
+    assert asked == [(3, 8, 25), tmp_path / "robot.urdf", tmp_path / "robot.safetensors"]
+    assert "2 links, 1 hinges and 0 sliders" in answer.output
+    assert "joint_1 does not explain how its two links move" in answer.output
+    lines = (tmp_path / "robot_joints.csv").read_text().splitlines()
+    assert lines == ["scan,joint_1", "source.ply,0.0", "target.ply,0.25", "bare.ply,-0.5"]
+    assert "exists" in error_of(*three, "-o", tmp_path / "robot.urdf", "--urdf")
+    assert "more need --urdf" in error_of(*three, "-o", tmp_path / "many.glb")
+    assert "--weights has no meaning with --urdf" in error_of(*three, "--urdf", "--weights", tmp_path / "w.ply")
+    assert "--scale is given once" in error_of(*three, "--urdf", "-o", tmp_path / "a", "--scale", 1, "--scale", 2)

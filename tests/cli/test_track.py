@@ -246,14 +246,16 @@ def test_millimeters_taken_for_meters_are_warned_of_once(run, command, sequence,
 def test_options_reach_the_tracker(run, command, monkeypatch):
     seen = []
 
-    def noted(shape, initial_pose=None, *, config=None):
-        seen.append((initial_pose, config))
+    def noted(shape, initial_pose=None, *, config=None, locked=()):
+        seen.append((initial_pose, config, locked))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(track_module, "Tracker", noted)
-    options = ("--prediction", "none", "--points", 300, "--model-points", "data", "--recovery", "starts", "--seed", 4)
+    options = ("--prediction", "none", "--points", 300, "--model-points", "data", "--recovery", "starts", "--seed", 4,
+               "--locked", "base")  # fmt: skip
     run(*command(*options))
-    ((pose, config),) = seen
+    ((pose, config, locked),) = seen
+    assert locked == ("base",)
     assert config == TrackConfig(
         prediction="none", num_model_points=300, model_points="data", recovery="starts", seed=4
     )
@@ -298,6 +300,20 @@ def test_a_robot_is_tracked(run, folder, tmp_path):
     )  # fmt: skip
     assert answer.exit_code == 0, answer.output
     assert abs(load(tmp_path / "r.safetensors").poses[0, 0].item() - 0.02) < 0.005
+
+
+def test_encoders_tell_joints_of_every_frame(run, error_of, folder, tmp_path):
+    arm = "track", folder / "arm.urdf", folder / "arm.npz", *FAST
+    (tmp_path / "start.json").write_text(json.dumps([0.02] + [0.0] * 7), encoding="utf-8")
+    (tmp_path / "joints.csv").write_text("shoulder\n0.25\n")
+    known = "--locked", "base", "--joints", tmp_path / "joints.csv", "--joint-std", "0.001deg"
+    answer = run(*arm, "-o", tmp_path / "r", "--start", tmp_path / "start.json", *known)
+    poses = load(tmp_path / "r.safetensors").poses
+    torch.testing.assert_close(poses[:, :6], torch.tensor([0.02] + [0.0] * 5).expand(len(poses), -1), atol=1e-6, rtol=0)
+    torch.testing.assert_close(poses[:, 6], torch.full_like(poses[:, 6], 0.25), atol=1e-3, rtol=0)
+    assert answer.exit_code in (0, 1)
+    (tmp_path / "joints.csv").write_text("shoulder\n40\n")
+    assert "beyond its limits" in error_of(*arm, "-o", tmp_path / "s", *known)
 
 
 def test_errors_are_one_line(error_of, command, sequence, tmp_path):

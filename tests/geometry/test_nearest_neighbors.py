@@ -197,3 +197,16 @@ def test_answers_stay_on_the_device_of_the_points():
             assert torch.equal(found.cpu(), expected)
     assert sampling_distance(there) == sampling_distance(points)
     assert torch.equal(nearest_neighbor(there, there + 0.1)[0].cpu(), nearest_neighbor(points, points + 0.1)[0])
+
+
+def test_neighbors_beyond_a_radius_are_not_looked_for():
+    generator = torch.Generator().manual_seed(0)
+    points, targets = (torch.randn(300, 3, generator=generator, dtype=torch.float64) for _ in range(2))
+    index, distance = NeighborTree(targets).nearest_within(points, 0.3)
+    truth = torch.cdist(points, targets).min(-1)
+    near = truth.values < 0.3
+    assert 10 < int(near.sum()) < 290
+    torch.testing.assert_close(index[near], truth.indices[near])
+    torch.testing.assert_close(distance[near], truth.values[near])
+    assert bool(distance[~near].isinf().all())
+    assert index[~near].unique().tolist() == [0]

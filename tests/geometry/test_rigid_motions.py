@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from torch.func import jacfwd, jacrev
 
-from torchreg.geometry.rigid import fit_rigid, invert_rigid, rigid_matrix, se3_exp, transform_points
+from torchreg.geometry.rigid import adjoint, fit_rigid, invert_rigid, rigid_matrix, se3_exp, se3_log, transform_points
 from torchreg.geometry.rigid_moments import least_cost, rigid_moments
 from torchreg.geometry.rotation import so3_exp
 
@@ -202,3 +202,16 @@ def test_costs_are_differentiable():
         lambda x, y, w: least_cost(rigid_moments(x, y, w, labels, 3).sums),
         [value.requires_grad_() for value in (source, target, weights)],
     )
+
+
+def test_twists_come_back_from_their_motions():
+    twist = torch.randn(200, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    twist[:, 3:] *= 0.6
+    twist[:50] *= 1e-5
+    twist[0] = 0
+    assert float(twist[:, 3:].norm(dim=-1).max()) < math.pi
+    torch.testing.assert_close(se3_log(se3_exp(twist)), twist, atol=1e-9, rtol=1e-9)
+    motion = se3_exp(twist[100:])
+    seen = motion @ se3_exp(0.3 * twist[:100]) @ torch.linalg.inv(motion)
+    torch.testing.assert_close(se3_exp((adjoint(motion) @ (0.3 * twist[:100]).unsqueeze(-1)).squeeze(-1)), seen)
+    assert torch.autograd.gradcheck(lambda x: se3_log(se3_exp(x)), twist[100:103].clone().requires_grad_(True))

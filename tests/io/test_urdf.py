@@ -236,7 +236,10 @@ PAIR = links("a", "b")
         (robot(PAIR, joint("j", "a", "b"), joint("k", "b", "a")), "cycle through links a, b"),
         (robot(links("r"), PAIR, joint("j", "a", "b"), joint("k", "b", "a")), "cycle through links a, b"),
         (robot(PAIR, joint("j", "a", "a")), "disconnected|cycle"),
-        (robot(PAIR, joint("j", "a", "b"), joint("k", "a", "b")), "link 'b' has two parents, joints 'j' and 'k'"),
+        (
+            robot(PAIR, joint("j", "a", "b"), joint("k", "a", "b")),
+            "'b' has two parents, joints 'j' and 'k': a closed loop is no tree; leave one",
+        ),
         (robot(PAIR, joint("j", "a", "z")), "joint 'j' has child link 'z'"),
         (robot(PAIR, "<joint name='j' type='fixed'><child link='b'/></joint>"), "joint 'j' has parent link None"),
         (robot(PAIR, joint("j", "a", "b", "helical")), "joint 'j' is of type 'helical'; supported: revolute"),

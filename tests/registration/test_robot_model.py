@@ -9,8 +9,10 @@ import torch
 from torchreg.errors import FormatError, InputError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.range_scan import RangeScan
 from torchreg.io.urdf import UrdfPrimitive
-from torchreg.registration.robot_model import find_robot, write_robot
+from torchreg.registration.robots.model import find_robot, write_robot
+from torchreg.registration.robots.surfaces import Target
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.posed_tree import PosedTree
 from torchreg.shapes.robots import solid_mesh
@@ -66,8 +68,19 @@ def fine(mesh):
 
 @pytest.fixture(scope="module")
 def found(scans):
-    points, _, deformed, part, _ = scans
-    return find_robot(points, deformed, part)
+    points, faces, deformed, part, _ = scans
+    # Registration cuts things into more bones than they have parts: the upper end of every box is a sliver here.
+    height = points[:, 2] - torch.stack([points[part == number, 2].mean() for number in range(5)])[part]
+    bones = part + 5 * (height > 0.08)
+    return find_robot(points, RangeScan(points, faces).normals, deformed, bones)
+
+
+def rand_errors(first, second):
+    """Return the share of points that a labeling puts elsewhere than most points of their true part."""
+    counts = torch.zeros(int(first.max()) + 1, int(second.max()) + 1).index_put_(
+        (first, second), torch.ones(len(first)), accumulate=True
+    )
+    return 1 - float(counts.amax(1).sum()) / len(first)
 
 
 def test_kinds_axes_and_values_of_joints_are_found(scans, found):
@@ -80,11 +93,13 @@ def test_kinds_axes_and_values_of_joints_are_found(scans, found):
         axis = torch.tensor(joint.axis, dtype=torch.float64)
         best = max(abs(float(axis @ torch.tensor(known).double())) for known in truth[joint.kind])
         assert math.degrees(math.acos(min(best, 1.0))) < 1
+    assert rand_errors(torch.tensor([0, 1, 2, 2, 3])[part], found.part) < 0.01
+    assert found.loose == ()
     # Whatever the root, a joint's value is that of the truth but for its sign.
     spread = sorted(float((column - column[0]).abs().max()) for column in found.joint_values.mT)
     expected = sorted(float(poses[:, k].abs().max()) for k in (6, 7, 8))
     assert spread == pytest.approx(expected, abs=0.02)
-    assert float(found.residuals.max()) < 1.1 * math.sqrt(3) * NOISE
+    assert float(found.residuals.max()) < 2 * NOISE
     for joint, column in zip(found.tree.joints[1:], found.joint_values.mT, strict=True):
         assert joint.lower < float(column.min())
         assert joint.upper > float(column.max())
@@ -114,10 +129,25 @@ def test_the_file_moves_as_the_scans_did(scans, found, tmp_path):
 def test_things_that_do_not_move_are_one_link(scans, tmp_path):
     points, faces, _, part, _ = scans
     still = points.expand(3, -1, -1)
-    found = find_robot(points, still, part)
+    found = find_robot(points, RangeScan(points, faces).normals, still, part)
     assert len(found.tree) == 1
     write_robot(tmp_path / "rock.urdf", found, points, faces)
+    assert float(found.residuals.max()) < 1e-9
     with pytest.raises(InputError, match="no triangles, which the meshes of links need"):
         write_robot(tmp_path / "rock.urdf", found, points, None)
     with pytest.raises(FormatError, match=r"must end in \.urdf"):
         write_robot(tmp_path / "rock.xml", found, points, faces)
+
+
+def test_clouds_without_triangles_become_closed_links(scans, found, tmp_path):
+    points, faces, deformed, _, _ = scans
+    generator = torch.Generator().manual_seed(1)
+    shares = torch.rand(len(deformed), len(faces), 3, generator=generator, dtype=torch.float64)
+    places = (deformed[:, faces] * (shares / shares.sum(-1, keepdim=True)).unsqueeze(-1)).sum(-2)
+    clouds = [Target(frame, torch.zeros_like(frame)) for frame in places]
+    write_robot(tmp_path / "robot.urdf", found, points, None, clouds)
+    skin = ArticulatedShape.from_urdf(tmp_path / "robot.urdf", dtype=torch.float64).file_skin()
+    pose = torch.nn.functional.pad(found.joint_values[3], (6, 0))
+    moved = skin(pose) @ found.base[3, :3, :3].mT + found.base[3, :3, 3]
+    assert float(torch.cdist(deformed[3], moved).amin(-1).median()) < 0.02
+    assert float(torch.cdist(moved, deformed[3]).amin(-1).median()) < 0.03

@@ -19,6 +19,8 @@ from torchreg.shapes.pose_algebra import BASE_DOF_NAMES, BASE_DOFS, shifted
 
 # Name for all six degrees of freedom of the base.
 _BASE = "base"
+# Standard deviation of what is held, metres and radians: far below what anything measures.
+_HELD_STD = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +70,11 @@ class KnownDofs:
         if not bool((deviation > 0).all()):
             raise InputError("prior must have positive standard deviations; lock what is known exactly")
         return cls(held, mean.nan_to_num(0.0), deviation)
+
+    def holding(self, pose: Tensor) -> KnownDofs:
+        """Return the same with what is locked held as in a pose (num_dofs,), also where a search begins anew."""
+        mean = torch.where(self.locked, pose.to(self.mean), self.mean)
+        return replace(self, mean=mean, std=torch.where(self.locked, _HELD_STD, self.std))
 
     def start(self, shape: ArticulatedShape, pose: Tensor | None = None) -> Tensor:
         """Return the pose with the prior's mean where it has one; of what is not told, a given pose or that at rest."""

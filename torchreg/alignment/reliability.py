@@ -211,11 +211,30 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
     covariance = pose_covariance(jacobian, near, noise * shared.sqrt(), precision)
     gain = _gain(problem, pose, distance, jacobian, noise, covariance) / shared.square()
     if problem.told_precision is not None:
+        # A fit takes noise for no larger than a share of the size, so that it keeps its hold; what is known must not.
+        error = surface_noise(distance, problem.valid, problem.size, clamped=False)
         # A depth camera sees all surfaces off by one distance, of the order of the noise: it moves what is not held.
         gradient = jacobian.mT @ (near / (noise.square() * shared).unsqueeze(-1)).unsqueeze(-1)
-        moved = covariance @ gradient * noise[:, None, None]
-        covariance = covariance + moved @ moved.mT
+        moved = covariance @ gradient * error[:, None, None]
+        covariance = _of_noisier_data(covariance, precision, (error / noise).square()) + moved @ moved.mT
     return Curvature(covariance + torch.diag_embed(_misplaced_share(problem, pose) / precision), gain)
+
+
+def _of_noisier_data(covariance: Tensor, precision: Tensor, excess: Tensor) -> Tensor:
+    """Return the covariance of a fit whose data err more than it assumed, by the sandwich of its own weights.
+
+    The fit's estimate has the covariance ``F (e A + P) F`` where ``F = (A + P)^-1``: A is what it took the data to
+    tell, P what was told, and e by how much the data's variance is larger, at least one.
+
+    Args:
+        covariance: (B, D, D) F.
+        precision: (B, D) diagonal of P.
+        excess: (B,) e.
+
+    References: Huber 1967; White 1982.
+    """
+    by_data = covariance - (covariance * precision.to(covariance).unsqueeze(-2)) @ covariance
+    return covariance + (excess.clamp_min(1) - 1)[:, None, None] * by_data
 
 
 def _gain(

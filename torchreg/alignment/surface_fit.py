@@ -146,21 +146,24 @@ def residual_noise(problem: AlignProblem, pose: Tensor) -> Tensor:
     return surface_noise(problem.surface.distance(problem.data, pose), problem.valid, problem.size)
 
 
-def surface_noise(distance: Tensor, valid: Tensor, size: float) -> Tensor:
+def surface_noise(distance: Tensor, valid: Tensor, size: float, *, clamped: bool = True) -> Tensor:
     """Return the robust standard deviation (...) of distances (..., M) near the surface of a model of some size.
 
     Args:
         distance: (..., M), metres.
         valid: (..., M) True where the distance counts.
         size: of the model, metres; the answer lies within a range of it, at its upper end where nothing is near.
+        clamped: whether that range holds; without it all data within the first kernel count.
 
     Returns:
         (...), metres.
     """
     distance = distance.abs()
-    near = (distance < SURFACE_FIT.widths[-1] * size) & valid
+    near = (distance < SURFACE_FIT.widths[-1 if clamped else 0] * size) & valid
     median = torch.where(near, distance, torch.nan).nanmedian(-1).values
     lowest, highest = SURFACE_FIT.min_noise(size), SURFACE_FIT.max_noise(size)
+    if not clamped:
+        return torch.nan_to_num(_MAD_TO_STD * median, nan=highest).clamp_min(lowest)
     return torch.nan_to_num(_MAD_TO_STD * median, nan=highest).clamp(lowest, highest)
 
 

@@ -216,7 +216,9 @@ class DepthFrame:
 
 def _pooled(picture: Tensor, radius: int) -> Tensor:
     """Return the largest number of a picture (H, W) within some pixels of each."""
-    return torch.nn.functional.max_pool2d(picture[None], 2 * radius + 1, 1, radius)[0]
+    # Rows after columns: a square at once costs its whole area for each pixel.
+    tall = torch.nn.functional.max_pool2d(picture[None], (2 * radius + 1, 1), 1, (radius, 0))
+    return torch.nn.functional.max_pool2d(tall, (1, 2 * radius + 1), 1, (0, radius))[0]
 
 
 def _grown(mask: Tensor, radius: int) -> Tensor:

@@ -6,13 +6,15 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from torchreg.alignment.results import AlignResult
     from torchreg.shapes.articulated import ArticulatedShape
 
@@ -63,12 +65,23 @@ class Known:
     rows: Sequence[Mapping[str, float]]
     std: float
 
-    def prior(self, number: int) -> tuple[Mapping[str, float], float] | None:
-        """Return the prior of a cloud."""
+    @classmethod
+    def nothing(cls) -> Known:
+        """Return that nothing is known."""
+        return cls((), (), 0.0)
+
+    def prior(self, number: int, origin: Tensor | None = None) -> tuple[Mapping[str, float], float] | None:
+        """Return the prior of a cloud, in coordinates that begin at an origin (3,)."""
         if not self.rows:
             return None
         row = self.rows[number if len(self.rows) > 1 else 0]
-        return {name: value for name, value in row.items() if math.isfinite(value)}, self.std
+        begin = {} if origin is None else dict(zip(("base_x", "base_y", "base_z"), origin.tolist(), strict=True))
+        return {name: value - begin.get(name, 0.0) for name, value in row.items() if math.isfinite(value)}, self.std
+
+    def job(self) -> dict[str, Any]:
+        """Return what is known as plain data; nothing where that is nothing."""
+        told = {"--locked": list(self.locked), "--joints": [dict(row) for row in self.rows]}
+        return {name: value for name, value in told.items() if value} | ({"--joint-std": self.std} if self.rows else {})
 
 
 def read_known(

@@ -29,7 +29,7 @@ _LEAST_SPACE = 256 * 1024
 _BESIDE = (".safetensors", ".json", ".glb", ".progress")
 _OTHER_KINDS = (
     ".swc", ".npz", ".npy", ".csv", ".ply", ".obj", ".stl", ".off", ".pcd", ".xyz", ".gltf", ".gif", ".mp4", ".png",
-    ".pdf", ".svg", ".html",
+    ".pdf", ".svg", ".html", ".urdf",
 )  # fmt: skip
 PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 

@@ -1,4 +1,4 @@
-"""``torchreg register``: one range scan onto another."""
+"""``torchreg register``: one range scan onto another, or scans of a robot to its description."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from torchreg.cli.align_options import NanPolicy
 from torchreg.cli.cameras import DepthRange, Seen, check_used, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, tell_origin, with_ending
 from torchreg.cli.reporting import ExitCode, reporting
+from torchreg.cli.robot import RobotFiles, check_alone, write_scanned_robot
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -29,8 +30,14 @@ _KEPT = ("source.png", "target.png")
 
 @reporting
 def register(
-    source: Annotated[Path, typer.Argument(help="Scan to be moved (.ply, .obj, .npz, ...), in any unit.")],
-    target: Annotated[Path, typer.Argument(help="Scan to be reached, in the same unit and frame.")],
+    scans: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SOURCE TARGET",
+            help="Scan to be moved (.ply, .obj, .npz, ...), in any unit, and scan to be reached, in the same unit and "
+            "frame. With --urdf, any number of scans of one robot, in metres.",
+        ),
+    ],
     output: Annotated[
         Path,
         typer.Option(
@@ -71,10 +78,20 @@ def register(
     errors: Annotated[
         Path | None, typer.Option(help="Also write the moved source, colored by its distance from the target (.ply).")
     ] = None,
+    urdf: Annotated[
+        bool,
+        typer.Option(
+            "--urdf",
+            help="Write what was scanned as a robot: OUT.urdf, a mesh of each link in OUT_meshes, the joint values of "
+            "every scan in OUT_joints.csv and the registration in OUT.safetensors.",
+        ),
+    ] = False,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
     """Register two range scans of something that moves, without a template: bones, weights, the deformation.
+
+    With --urdf scans of a robot become its description: torchreg register S0 S1 S2 ... -o robot --urdf.
 
     With --depth A B --intrinsics FILE the scans are depth images in metres, steps cut and flying pixels left out. What
     was kept of each goes to OUT_seen, red where it was cut, and the moved source over the picture of the target.
@@ -83,6 +100,13 @@ def register(
 
     Exit codes: 0; 1 if too few points match to mean anything; 2 for an error; 130 for Ctrl-C.
     """
+    if urdf:
+        check_alone({"--depth": depth, "--intrinsics": intrinsics, "--depth-range": depth_range, "--seen": seen,
+                     "--smoothing": smoothing, "--weights": weights, "--errors": errors})  # fmt: skip
+        units = _common(scale, "--scale"), _common(time, "--time"), _common(frame, "--frame")
+        _write_robot(scans, output, bones, grid, units, nan_policy, force=force, quiet=quiet)
+        return
+    source, target = _two(scans)
     output = with_ending(output, (".glb", ".safetensors"), add=True)
     result = output.with_suffix(".safetensors")
     scene = output if output.suffix.lower() == ".glb" else None
@@ -119,6 +143,33 @@ def register(
     if not quiet:
         typer.echo(f"{_summary(found)} -> {scene or result}")
     if not found.status.usable:
+        raise typer.Exit(ExitCode.UNUSABLE)
+
+
+def _two(scans: list[Path]) -> tuple[Path, Path]:
+    if len(scans) != 2:
+        raise InputError(f"register takes two scans, source and target, got {len(scans)}; more need --urdf")
+    return scans[0], scans[1]
+
+
+def _write_robot(
+    paths: list[Path], output: Path, bones: int, grid: int, units: tuple[Any, Any, Any], nan_policy: NanPolicy,
+    *, force: bool, quiet: bool,
+) -> None:  # fmt: skip
+    """Read scans of a robot and write its description."""
+    from tqdm import tqdm
+
+    from torchreg.io.scans import load_scan
+
+    files = RobotFiles.named(output, force)
+    scale, time, frame = units
+    scans = [
+        load_scan(path, scale=1.0 if scale is None else scale, nan_policy=nan_policy, time=time, frame=frame)
+        for path in paths
+    ]
+    with tqdm(desc="initialize", unit="step", leave=False, disable=quiet) as bar:
+        usable = write_scanned_robot(scans, paths, bones, grid, files, partial(_show, bar), not quiet)
+    if not usable:
         raise typer.Exit(ExitCode.UNUSABLE)
 
 
@@ -178,6 +229,13 @@ def _cameras(intrinsics: list[Path] | None) -> tuple[Path, Path]:
 
 
 Given = TypeVar("Given")
+
+
+def _common(given: list[Given] | None, option: str) -> Given | None:
+    """Return what an option says about all scans."""
+    if given is not None and len(given) > 1:
+        raise InputError(f"{option} is given once for all scans with --urdf, got {len(given)}")
+    return given[0] if given else None
 
 
 def _pair(given: list[Given] | None, default: Any, option: str) -> tuple[Any, Any]:

@@ -27,6 +27,7 @@ from torchreg.cli.cameras import (
     stereo_job,
     stereo_source,
 )
+from torchreg.cli.known_options import Joints, JointStd, Locked, read_known
 from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, shifted_to, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
@@ -87,6 +88,9 @@ def track(
     matcher: Matcher = None,
     reach: Reach = None,
     seen: Seen = None,
+    locked: Locked = None,
+    joints: Joints = None,
+    joint_std: JointStd = None,
     fps: Annotated[float, typer.Option(help="Frames per second.")] = 20.0,
     scale: Scale = 1.0,
     nan_policy: NanPolicy = "omit",
@@ -166,12 +170,14 @@ def track(
         model_points=model_points, num_model_points=points, prediction=prediction, recovery=recovery, seed=seed
     )
     first = None if start is None else shifted_to(clouds.origin, load_pose(start, model))
-    job = track_job(shape, options, first, config, fps, scale, nan_policy, clouds)
+    known = read_known(model, locked, joints, joint_std, len(clouds))
+    job = track_job(shape, options, first, config, fps, scale, nan_policy, clouds) | known.job()
     with claimed(files.result), ExitStack() as pages, _progress_bar(len(clouds), quiet) as bar:
-        tracker, report = Tracker(model, first, config=config), Report(bar, clouds, quiet)
+        tracker, report = Tracker(model, first, config=config, locked=known.locked), Report(bar, clouds, quiet)
         run = TrackRun(
-            tracker=tracker, clouds=clouds, fps=fps, job=job, files=files, report=report, save_every=save_every
-        )
+            tracker=tracker, clouds=clouds, fps=fps, job=job, files=files, report=report, save_every=save_every,
+            known=known,
+        )  # fmt: skip
         _add_pictures(run, pictures, folder, images)
         if view:
             run.live = _live_page(pages, port, browser, quiet)

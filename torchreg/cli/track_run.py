@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
+from torchreg.cli.known_options import Known
 from torchreg.cli.outputs import check_outputs, tell_origin
 from torchreg.cli.reporting import show_warning
 from torchreg.errors import FormatError, InputError, UnitsWarning
@@ -205,6 +206,7 @@ class TrackRun:
         save_every: frames between two writings.
         seen: draws what the cameras saw of a frame, or None.
         live: shows a frame in the browser, or None.
+        known: what is known of the poses.
         parts: results of the frames done.
         state: after them.
     """
@@ -218,6 +220,7 @@ class TrackRun:
     save_every: int
     seen: Callable[[LinearBlendSkin], OnFrame] | None = None
     live: Callable[[LinearBlendSkin], OnFrame] | None = None
+    known: Known = field(default_factory=Known.nothing)
     parts: list[TrackResult] = field(default_factory=list)
     state: TrackState = field(init=False)
 
@@ -299,8 +302,10 @@ class TrackRun:
             self.state = self.tracker.state
 
         times = [number / self.fps for number in numbers]
+        told = [self.known.prior(number, self.clouds.origin) for number in numbers]
         try:
-            result = self.tracker.run((self.clouds.frame(number) for number in numbers), note, times=times)
+            frames = (self.clouds.frame(number) for number in numbers)
+            result = self.tracker.run(frames, note, times=times, priors=told if any(told) else None)
         except KeyboardInterrupt:
             if not self.parts:
                 raise

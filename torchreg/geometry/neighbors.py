@@ -83,6 +83,15 @@ class NeighborTree:
         distance, index = self._tree.query(_coordinates(points))
         return torch.from_numpy(index).to(points.device), torch.from_numpy(distance).to(points.device)
 
+    def nearest_within(self, points: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+        """Return what `nearest` does; where no target is within the radius, index 0 and an infinite distance.
+
+        Many times quicker than `nearest` where most points are far from all targets.
+        """
+        distance, index = self._tree.query(_coordinates(points), distance_upper_bound=radius)
+        index = np.where(np.isfinite(distance), index, 0)
+        return torch.from_numpy(index).to(points.device), torch.from_numpy(distance).to(points.device)
+
     def k_nearest(self, points: Tensor, count: int) -> tuple[Tensor, Tensor]:
         """Return the ``count`` targets nearest to each point, nearest first.
 

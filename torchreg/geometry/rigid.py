@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.geometry.rotation import left_jacobian, so3_exp
+from torchreg.geometry.rotation import left_jacobian, skew, so3_exp, so3_log
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,37 @@ def se3_exp(twist: Tensor) -> Tensor:
     """
     translation, rotation = twist[..., :3], twist[..., 3:]
     return rigid_matrix(so3_exp(rotation), (left_jacobian(rotation) @ translation.unsqueeze(-1)).squeeze(-1))
+
+
+def se3_log(motion: Tensor) -> Tensor:
+    """Return the twist (..., 6) of a rigid motion (..., 4, 4), of which `se3_exp` is the motion; turns below pi.
+
+    Convention: twists are (translation, rotation).
+
+    Differentiable: in ``motion``, not at turns by pi.
+
+    References: Barfoot 2017, eq. 7.95 for the inverse of the left Jacobian.
+    """
+    turn = so3_log(motion[..., :3, :3])
+    square = turn.square().sum(-1)[..., None, None]
+    cross, eye = skew(turn), torch.eye(3, dtype=turn.dtype, device=turn.device)
+    # (1 - (a/2) cot(a/2)) / a^2, whose series begins with 1/12 + a^2/720.
+    half = 0.5 * torch.where(square > 1e-6, square, 1.0).sqrt()
+    factor = torch.where(square > 1e-6, (1 - half / torch.tan(half)) / (4 * half.square()), 1 / 12 + square / 720)
+    inverse = eye - 0.5 * cross + factor * cross @ cross
+    return torch.cat([(inverse @ motion[..., :3, 3:]).squeeze(-1), turn], -1)
+
+
+def adjoint(motion: Tensor) -> Tensor:
+    """Return the matrices (..., 6, 6) by which twists are seen from where motions (..., 4, 4) take their frame.
+
+    ``T exp(x) T^-1 = exp(adjoint(T) x)``; twists are (translation, rotation).
+
+    Differentiable: in ``motion``.
+    """
+    turn = motion[..., :3, :3]
+    above = torch.cat([turn, skew(motion[..., :3, 3]) @ turn], -1)
+    return torch.cat([above, torch.cat([torch.zeros_like(turn), turn], -1)], -2)
 
 
 def invert_rigid(matrix: Tensor) -> Tensor:

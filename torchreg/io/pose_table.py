@@ -60,7 +60,10 @@ def load_pose_table(
     head = [name.strip() for name in table[0]] if table else []
     known = [(column, name) for column, name in enumerate(head) if name in names]
     if not known or len(table) < 2:
-        raise FormatError(f"{file}: must hold a line of names, such as {', '.join(names[:4])}, and a line of numbers")
+        got = f"; got the names {', '.join(head[:4])}" if head and not known else ""
+        raise FormatError(
+            f"{file}: must hold a line of names, such as {', '.join(names[:4])}, and a line of numbers{got}"
+        )
     return [
         {name: _number(row, column, f"{file}: row {number}, {name}") for column, name in known}
         for number, row in enumerate(table[1:], start=2)

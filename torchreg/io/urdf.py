@@ -181,7 +181,10 @@ def _ordered(
     for name, joint in joints.items():
         parent, child = (_link_of(path, joint, name, role, links) for role in ("parent", "child"))
         if child in carrier:
-            raise ModelError(f"{path}: link {child!r} has two parents, joints {carrier[child]!r} and {name!r}")
+            raise ModelError(
+                f"{path}: link {child!r} has two parents, joints {carrier[child]!r} and {name!r}: a closed loop is no "
+                f"tree; leave one of them out"
+            )
         carrier[child] = name
         children[parent].append(child)
     roots = [name for name in links if name not in carrier]

@@ -1,5 +1,5 @@
 """Scan registration: bones, weights and motions of an articulated thing without a template.
 
 Besides the public names, pictures may use `PoseSolver`, `BoneTree`, `blend_linear` and `check_rigid_motions`, and
-commands `RegisterRecord`.
+commands `RegisterRecord` and `RobotModel`.
 """

@@ -272,6 +272,8 @@ def _sequence_registration(
         fused=normalization.denormalize(fused, like),
         fused_normals=normals.to(like),
         fused_frames=frames.to(like.device),
+        observed=normalization.denormalize(torch.cat([scan.points for scan in scans]), like),
+        observed_normals=torch.cat([scan.normals for scan in scans]).to(like),
         reference=reference,
         status=fit_status(matched, converged, fit.config, degenerate=degenerate),
         history=tuple(fit.history),

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchreg.alignment.annealed_em import ANNEALING
 from torchreg.alignment.inputs import UNITS
+from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.problem import AlignProblem
 from torchreg.alignment.surface_fit import SURFACE_FIT
 from torchreg.capture.depth_frame import DepthFrame
@@ -43,12 +45,19 @@ class Frame:
         finite: (M,) True where a point is finite.
         elapsed: time since the frame before, in intervals.
         picture: whose points the cloud holds, if it is that of a depth camera.
+        known: what is held or told of the pose, or None.
     """
 
     cloud: Tensor
     finite: Tensor
     elapsed: float
     picture: DepthFrame | None = None
+    known: KnownDofs | None = None
+
+    @property
+    def told(self) -> dict[str, Any]:
+        """What is known as `align` and `find_pose` take it."""
+        return {} if self.known is None else {"locked": self.known.locked, "prior": (self.known.mean, self.known.std)}
 
     @property
     def data(self) -> Tensor:

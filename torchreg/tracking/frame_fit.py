@@ -80,7 +80,11 @@ class FrameFitter:
     def view(
         self, state: TrackState, frame: Frame, pose: Tensor, skin: LinearBlendSkin | None = None
     ) -> FrameView | None:
-        """Return the frame as seen from a pose (num_dofs,), with a wide prior about it; None without data in reach."""
+        """Return the frame as seen from a pose (num_dofs,), with a wide prior about it; None without data in reach.
+
+        What is known of the pose takes the place of what would be expected.
+        """
+        pose = pose if frame.known is None else frame.known.start(self.shape, pose)
         origin = pose[:3].clone()
         local = shifted(pose, -origin)
         rows = stacked_rows(self.shape.part_transforms(local))
@@ -99,6 +103,10 @@ class FrameFitter:
             prior=GaussianPosePrior(local[None], self._joint_precision(FILTER.max_joint_std)),
             free_space=self._free_space(frame, origin, num_in_reach / len(data)),
         )  # fmt: skip
+        if frame.known is not None:
+            told = frame.known.near(origin).applied(problem, local[None])
+            prior = replace(told.prior, precision=told.prior.precision[0])
+            problem = replace(told, lower=told.lower[0], upper=told.upper[0], prior=prior)
         return FrameView(problem=problem, origin=origin, rows=rows, in_reach=in_reach)
 
     def _free_space(self, frame: Frame, origin: Tensor, thinning: float) -> FreeSpaceTerm | None:
@@ -125,7 +133,7 @@ class FrameFitter:
 
     def descend(self, view: FrameView, state: TrackState, elapsed: float) -> FrameFit:
         """Return the fit by descent from a predicted view: annealed EM, or many starts for fast limbs; then surface."""
-        problem = replace(view.problem, prior=self._prediction_prior(view.problem.prior, state, elapsed))
+        problem = replace(view.problem, prior=self._prediction_prior(view.problem, state, elapsed))
         view = replace(view, problem=problem)
         if moves_fast(state, self.size):
             return self.fit(view, state, "tracked", self._fit_fast_limbs(view, state, elapsed), widths=())
@@ -198,11 +206,14 @@ class FrameFitter:
         """Return the prior's precision (num_dofs,) for a standard deviation of the joints; zero for the base."""
         return self._template.prior.precision / std**2
 
-    def _prediction_prior(self, prior: GaussianPosePrior, state: TrackState, elapsed: float) -> GaussianPosePrior:
+    def _prediction_prior(self, problem: AlignProblem, state: TrackState, elapsed: float) -> GaussianPosePrior:
         """Return the prior about the prediction, the base included: few data may not turn it away."""
+        prior = problem.prior
         shift, turn, joints = prediction_std(state, elapsed, self.size, self.config.prior_std).tolist()
         precision = self._joint_precision(joints)
         precision[:3], precision[3:6] = shift**-2, turn**-2
+        if problem.told_precision is not None:
+            precision = torch.where(problem.told_precision[0] > 0, prior.precision, precision)
         return GaussianPosePrior(prior.mean, precision, holds_base=True)
 
     def _sigma_schedule(self, state: TrackState, elapsed: float) -> SigmaSchedule:

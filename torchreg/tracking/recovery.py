@@ -109,7 +109,7 @@ class Recovery:
     def _find(self, state: TrackState, frame: Frame, config: FindPoseConfig) -> FrameFit | None:
         shape = self.fitter.shape
         data = subsample(frame.data, _PLAN.max_data, frame_generator(state))
-        starts = find_pose(shape, data if frame.picture is None else frame.picture, config=config)
+        starts = find_pose(shape, data if frame.picture is None else frame.picture, config=config, **frame.told)
         poses = starts.poses
         if state.lost:
             poses = poses[starts.costs <= starts.costs.min() + _PLAN.equivalent * len(data)]

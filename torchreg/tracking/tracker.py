@@ -6,6 +6,7 @@ import math
 import time as clock
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,6 +15,7 @@ from torchreg._checks import as_float_tensor, check_finite, check_shape, warn_ab
 from torchreg._threads import one_thread
 from torchreg.alignment.align import AlignConfig, align
 from torchreg.alignment.inputs import check_skin, floating_origin, warn_about_degenerate, warn_about_units
+from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.loaded import as_points
@@ -59,9 +61,11 @@ class Tracker:
         initial_pose: (num_dofs,) near the first frame; without one, `find_pose` looks for it.
         config: see `TrackConfig`.
         model_points: a skin of the shape, whose points represent its surface; sampled by default (see `sample_skin`).
+        locked: degrees of freedom that are held at the initial pose, or at rest without one; see `align`.
 
     Raises:
-        InputError: if the pose does not fit the shape or is not finite, or the skin is of another shape.
+        InputError: if the pose does not fit the shape or is not finite, a locked name is unknown, or the skin is of
+            another shape.
 
     References: Dewaele et al. 2006, sections 3 and 5.
     """
@@ -73,6 +77,7 @@ class Tracker:
         *,
         config: TrackConfig | None = None,
         model_points: LinearBlendSkin | None = None,
+        locked: Sequence[str] | Tensor = (),
     ) -> None:
         self.shape, self.config = shape, config or TrackConfig()
         if model_points is not None:
@@ -84,6 +89,8 @@ class Tracker:
             # In full precision, for clouds far from the origin.
             self._start = pose if initial_pose is None else torch.as_tensor(initial_pose, dtype=torch.float64)
             self._state = self._initial_state(pose)
+        self._locked = locked
+        KnownDofs.of(shape, locked, None)
 
     @property
     def state(self) -> TrackState:
@@ -107,13 +114,16 @@ class Tracker:
             )
         self._state = state
 
-    def step(self, points: Tensor | DepthFrame, time: float | None = None) -> FrameResult:
+    def step(
+        self, points: Tensor | DepthFrame, time: float | None = None, *, prior: tuple[Any, Any] | None = None
+    ) -> FrameResult:
         """Return the pose of the shape in the next frame, and what is known of it.
 
         Args:
             points: (M, 3), metres; M may be zero. Or a `DepthFrame`, whose free space counts too.
             time: of the frame, in any unit, seconds say; by default one interval after the frame before. Where frames
                 were dropped, it tells how far the shape may have moved.
+            prior: what is known of the pose in this frame, as encoders tell: mean and standard deviation, see `align`.
 
         Returns:
             The frame's result. Its pose rests on data unless its status is NO_DATA, LOST, DEGENERATE or
@@ -135,10 +145,12 @@ class Tracker:
         cloud = self._checked_points(given)
         if picture is not None and self._state.origin is not None:
             picture = picture.near(self._state.origin)
+        known = self._known(prior)
         state, elapsed = advance_clock(self._state, time)
         # A tenth faster than without gradients alone, as most of the time goes to small operations.
         with torch.inference_mode(), one_thread(), self.shape.held_sizes():
-            frame = Frame(cloud=cloud, finite=torch.isfinite(cloud).all(-1), elapsed=elapsed, picture=picture)
+            finite = torch.isfinite(cloud).all(-1)
+            frame = Frame(cloud=cloud, finite=finite, elapsed=elapsed, picture=picture, known=known)
             rejection = self._rejection(frame.data)
             if rejection is not None:
                 result, state = self._hold(state, frame, rejection)
@@ -162,6 +174,7 @@ class Tracker:
         on_frame: OnFrame | None = None,
         *,
         times: Sequence[float] | None = None,
+        priors: Sequence[tuple[Any, Any] | None] | None = None,
     ) -> TrackResult:
         """Return the poses of all given frames, which follow those that the tracker has seen before.
 
@@ -172,18 +185,22 @@ class Tracker:
                 its step.
             on_frame: called with each cloud, or the points of each depth frame, and the result of its `step`.
             times: (T,) of the frames; see `step`.
+            priors: of each frame; see `step`.
 
         Raises:
-            InputError: if there is no frame, times are missing, or a frame cannot be used; see `step`.
+            InputError: if there is no frame, times or priors are missing, or a frame cannot be used; see `step`.
         """
         results: list[FrameResult] = []
         seconds: list[float] = []
         try:
             for number, points in enumerate(frames):
-                if times is not None and number >= len(times):
-                    raise InputError(f"times must hold one entry per frame, got {len(times)} and more frames")
+                for name, values in (("times", times), ("priors", priors)):
+                    if values is not None and number >= len(values):
+                        raise InputError(f"{name} must hold one entry per frame, got {len(values)} and more frames")
+                time = None if times is None else float(times[number])
                 started = clock.perf_counter()
-                result = self.step(points, None if times is None else float(times[number]))
+                told = {} if priors is None else {"prior": priors[number]}
+                result = self.step(points, time, **told)
                 seconds.append(clock.perf_counter() - started)
                 results.append(result)
                 if on_frame is not None:
@@ -222,6 +239,16 @@ class Tracker:
             check_finite(cloud, "points", "drop them or set nan_policy='omit'")
         return cloud
 
+    def _known(self, prior: tuple[Any, Any] | None) -> KnownDofs | None:
+        """Return what is held and told of the pose, in the coordinates of the state; None if that is nothing."""
+        known = KnownDofs.of(self.shape, self._locked, prior)
+        if known is None:
+            return None
+        held = torch.where(self._start.isfinite(), self._start, self.shape.rest.to(self._start))
+        origin = self._state.origin
+        near = known if origin is None else known.near(origin)
+        return near.holding(held if origin is None else shifted(held.double(), -origin))
+
     def _check_time(self, time: float | None) -> None:
         if time is None:
             return
@@ -259,7 +286,7 @@ class Tracker:
             return None
         data = subsample(frame.data, self.config.max_points, frame_generator(state))
         config = AlignConfig(sharpness=self.config.sharpness)
-        pose = align(self.shape, data, state.pose, model_points=self._fitter.skin, config=config).pose
+        pose = align(self.shape, data, state.pose, model_points=self._fitter.skin, config=config, **frame.told).pose
         return self._fitter.fit_at(state, frame, pose, "tracked")
 
     def _is_trusted(self, state: TrackState, frame: Frame, fit: FrameFit | None) -> bool:

@@ -1,0 +1,151 @@
+"""All joints and all frames of a robot fitted to the scans together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.rigid import adjoint, se3_exp
+from torchreg.geometry.rotation import skew
+from torchreg.registration.robots.surfaces import Noise, Surfaces
+
+
+@dataclass(frozen=True)
+class FitNumbers:
+    """Of the fit of all joints."""
+
+    scales: tuple[float, ...] = (6.0, 5.0, 4.0, 3.0, 3.0, 3.0)  # of robust kernels, step by step, standard deviations
+    wide: tuple[float, ...] = (0.04, 0.03, 0.02, 0.01)  # of the thing's size: steps from a neighboring frame's pose
+    damping: float = 1e-3  # of the mean curvature of a part's motion, for what the data do not hold
+
+
+FIT = FitNumbers()
+
+
+@dataclass(frozen=True, eq=False)
+class Mechanism:
+    """Links on a tree of joints, and their values in T frames, in the coordinates of the reference.
+
+    Args:
+        parents: (K,) of each link; -1 for the root, which comes first; parents come before children.
+        axes: (K, 6) twists of the joints about which links move, unit turns or slides; zero for the root.
+        base: (T, 4, 4) motions of the root.
+        values: (T, K), radians or lengths; zero for the root.
+    """
+
+    parents: Sequence[int]
+    axes: Tensor
+    base: Tensor
+    values: Tensor
+
+    def motions(self) -> Tensor:
+        """Return the motions (T, K, 4, 4) of all links."""
+        turns = se3_exp(self.values.unsqueeze(-1) * self.axes)
+        found: list[Tensor] = []
+        for link, parent in enumerate(self.parents):
+            found.append(self.base if parent < 0 else found[parent] @ turns[:, link])
+        return torch.stack(found, 1)
+
+    def stepped(self, base: Tensor, values: Tensor, axes: Tensor) -> Mechanism:
+        """Return the mechanism after steps of the base (T, 6), the values (T, K) and the axes, twists (K, 6)."""
+        moved = (adjoint(se3_exp(axes)) @ self.axes.unsqueeze(-1)).squeeze(-1)
+        return replace(self, base=se3_exp(base) @ self.base, values=self.values + values, axes=moved)
+
+    def jacobians(self, motions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the links' twists by the joint values (T, K, 6, K) and by steps of the axes (T, K, 6, K, 6).
+
+        Twists are those of motions from the left, about the origin; the base's are the links' own.
+        """
+        frames, size = self.values.shape
+        by_value = torch.zeros(frames, size, 6, size, dtype=torch.float64)
+        by_axis = torch.zeros(frames, size, 6, size, 6, dtype=torch.float64)
+        eye = torch.eye(6).double()
+        for link, parent in enumerate(self.parents):
+            if parent < 0:
+                continue
+            by_value[:, link], by_axis[:, link] = by_value[:, parent], by_axis[:, parent]
+            seen = adjoint(motions[:, parent])
+            turn = se3_exp(self.values[:, link].unsqueeze(-1) * self.axes[link])
+            by_value[:, link, :, link] = seen @ self.axes[link]
+            by_axis[:, link, :, link] = seen @ (eye - adjoint(turn))
+        return by_value, by_axis
+
+
+def fitted(
+    surfaces: Surfaces, mechanism: Mechanism, label: Tensor, scales: Sequence[float], *, axes: bool = True
+) -> Mechanism:
+    """Return the mechanism after a Gauss-Newton step of point-to-plane residuals at each of some robust scales.
+
+    Args:
+        surfaces: the data.
+        mechanism: to start from.
+        label: (n,) link of each sample.
+        scales: of the kernels, length.
+        axes: whether the joints' axes move too.
+    """
+    for scale in scales:
+        mechanism = _step(surfaces, mechanism, label, scale, axes)
+    return mechanism
+
+
+def _step(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, scale: float, axes: bool) -> Mechanism:
+    motions = mechanism.motions()
+    blocks = surfaces.blocks(motions, label, scale)
+    frames, size = mechanism.values.shape
+    by_value, by_axis = mechanism.jacobians(motions)
+    # Twists about the origin move a part's center c by v + w x c.
+    change = torch.eye(6).double().repeat(frames, size, 1, 1)
+    change[..., :3, 3:] = -skew(blocks.centers)
+    own = change @ torch.cat([torch.eye(6).double().expand(frames, size, 6, 6), by_value], -1)
+    shared = change @ by_axis.flatten(-2)
+    half = 0.5 * surfaces.size
+    metric = torch.tensor([1.0] * 3 + [half**2] * 3, dtype=torch.float64)
+    weight = blocks.hessian.diagonal(dim1=-2, dim2=-1)[..., :3].mean(-1)
+    hessian = blocks.hessian + torch.diag_embed(FIT.damping * weight.mean() * metric.expand(frames, size, 6))
+    local = (own.mT @ hessian @ own).sum(1)
+    local_gradient = (own.mT @ blocks.gradient.unsqueeze(-1)).sum(1).squeeze(-1)
+    local = local + 1e-9 * torch.diag_embed(local.diagonal(dim1=-2, dim2=-1) + weight.mean())
+    if not axes:
+        step = -torch.linalg.solve(local, local_gradient)
+        return mechanism.stepped(step[:, :6], step[:, 6:], torch.zeros(size, 6).double())
+    mixed = (own.mT @ hessian @ shared).sum(1)
+    outer = (shared.mT @ hessian @ shared).sum((0, 1))
+    outer_gradient = (shared.mT @ blocks.gradient.unsqueeze(-1)).sum((0, 1)).squeeze(-1)
+    # Frames are eliminated first (Schur complement); directions that move no joint are held by a trace of damping.
+    solved = torch.linalg.solve(local, torch.cat([mixed, local_gradient.unsqueeze(-1)], -1))
+    reduced = outer - (mixed.mT @ solved[..., :-1]).sum(0)
+    right = outer_gradient - (mixed.mT @ solved[..., -1:]).sum(0).squeeze(-1)
+    hold = FIT.damping * weight.mean() * metric.repeat(size) + 1e-9
+    step = -torch.linalg.solve(reduced + torch.diag(hold), right)
+    own_step = -(solved[..., -1] + solved[..., :-1] @ step)
+    return mechanism.stepped(own_step[:, :6], own_step[:, 6:], step.reshape(size, 6))
+
+
+def settled(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noise: Noise) -> Mechanism:
+    """Return the mechanism fitted to all scans, also in frames that registration got wrong."""
+    scales = [scale * noise.sigma for scale in FIT.scales]
+    mechanism = _from_neighbors(surfaces, fitted(surfaces, mechanism, label, scales), label, noise)
+    return fitted(surfaces, mechanism, label, scales)
+
+
+def _from_neighbors(surfaces: Surfaces, mechanism: Mechanism, label: Tensor, noise: Noise) -> Mechanism:
+    """Return the mechanism with each frame's pose that of least cost: its own, or one found from a frame beside it.
+
+    A frame that registration got wrong is reached from its neighbors by ICP whose kernel narrows.
+    """
+    scales = [share * surfaces.size for share in FIT.wide] + [scale * noise.sigma for scale in FIT.scales[2:]]
+    kernel = FIT.scales[0] * noise.sigma
+    best, cost = mechanism, surfaces.cost(mechanism.motions(), label, kernel)
+    for shift in (1, -1):
+        order = (torch.arange(len(mechanism.values)) + shift).clamp(0, len(mechanism.values) - 1)
+        start = replace(best, base=best.base[order], values=best.values[order])
+        found = fitted(surfaces, start, label, scales, axes=False)
+        new = surfaces.cost(found.motions(), label, kernel)
+        better = new < cost
+        base = torch.where(better[:, None, None], found.base, best.base)
+        best = replace(best, base=base, values=torch.where(better[:, None], found.values, best.values))
+        cost = torch.minimum(cost, new)
+    return best

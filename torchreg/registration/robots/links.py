@@ -1,0 +1,99 @@
+"""Links of a robot: which samples of its surface move together, by labels that cost what they must save."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.neighbors import NeighborTree
+from torchreg.registration.robots.surfaces import NUMBERS, Noise, Surfaces
+from torchreg.solvers.graph_cut import alpha_expansion
+
+
+@dataclass(frozen=True)
+class LinkNumbers:
+    """Of the search for links."""
+
+    rounds: int = 6  # of labels and motions; most end by themselves
+    splits: int = 2  # of the rounds, in which pieces of parts are proposals too
+    piece: int = 80  # samples of a piece, about
+    scales: tuple[float, ...] = (4.0, 3.0, 3.0)  # of robust kernels of the motions' steps, standard deviations
+
+
+LINKS = LinkNumbers()
+
+
+def labeled(surfaces: Surfaces, motions: Tensor, label: Tensor, noise: Noise, free: float) -> Tensor:
+    """Return the labels (n,) of least description length under given motions (T, K, 4, 4).
+
+    A sample costs half its squared residual in standard deviations, up to that of an outlier, summed over the frames;
+    a border between neighbors costs what its rarity tells (`border_cost`); a label that is used costs its parameters,
+    half the logarithm of the number of residuals each. Samples that err together count once.
+
+    Args:
+        surfaces: the data.
+        motions: proposals.
+        label: to start from.
+        noise: of residuals.
+        free: parameters of a label.
+
+    References: Isack and Boykov 2012 (PEARL); Delong et al. 2012; Schwarz 1978 for the cost of parameters.
+    """
+    squares = surfaces.squares(motions, NUMBERS.cut * noise.sigma) / noise.sigma**2
+    unary = 0.5 * squares.clamp_max(NUMBERS.cut**2).sum(0) / noise.repeats
+    count = len(surfaces.targets) * len(surfaces.samples) / noise.repeats
+    weights = unary.new_full((len(surfaces.edges),), border_cost(surfaces.edges, label))
+    costs = unary.new_full((motions.shape[1],), 0.5 * free * math.log(max(count, 2.0)))
+    return alpha_expansion(unary, surfaces.edges, weights, label_costs=costs, initial=label).labels
+
+
+def border_cost(edges: Tensor, label: Tensor) -> float:
+    """Return minus the log odds of a border between neighbors, from the share of such edges, by Laplace's rule.
+
+    References: Besag 1975, pseudo-likelihood.
+    """
+    borders = float((label[edges[:, 0]] != label[edges[:, 1]]).sum())
+    share = min(0.5, (borders + 1) / (len(edges) + 2))
+    return math.log((1 - share) / share)
+
+
+def without_gaps(motions: Tensor, label: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the motions of labels in use, and the labels numbered from 0 among them."""
+    used, label = label.unique(return_inverse=True)
+    return motions[:, used], label
+
+
+def find_links(surfaces: Surfaces, motions: Tensor, label: Tensor, *, split: bool) -> tuple[Tensor, Tensor, Noise]:
+    """Return motions (T, K, 4, 4) and labels (n,) of links, and the noise: proposals, labels and motions in turn.
+
+    Args:
+        surfaces: the data.
+        motions: (T, K, 4, 4) of the parts to start from.
+        label: (n,) part of each sample.
+        split: whether pieces of parts propose motions too.
+    """
+    splits = LINKS.splits if split else 0
+    free = 6.0 * len(surfaces.targets)
+    for number in range(LINKS.rounds):
+        before, noise = label, surfaces.noise(motions, label)
+        scales = [scale * noise.sigma for scale in LINKS.scales]
+        motions = surfaces.refined(motions, label, scales)
+        proposals = motions
+        if number < splits:
+            proposals = torch.cat([motions, _pieces(surfaces, motions, label, scales)], 1)
+        noise = surfaces.noise(motions, label)
+        motions, label = without_gaps(proposals, labeled(surfaces, proposals, label, noise, free))
+        if number >= splits and torch.equal(before, label):
+            break
+    return motions, label, noise
+
+
+def _pieces(surfaces: Surfaces, motions: Tensor, label: Tensor, scales: list[float]) -> Tensor:
+    """Return the motions (T, G, 4, 4) of pieces of all parts, each fitted by itself."""
+    seeds = surfaces.samples[: max(1, len(surfaces.samples) // LINKS.piece)]
+    nearest = NeighborTree(seeds).nearest(surfaces.samples)[0]
+    key, piece = (nearest * motions.shape[1] + label).unique(return_inverse=True)
+    return surfaces.refined(motions[:, key % motions.shape[1]], piece, scales)

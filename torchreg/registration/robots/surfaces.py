@@ -1,0 +1,223 @@
+"""Samples of a reference scan and the scans they are compared with: residuals, their noise, normal equations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.graphs import component_links, connected_components
+from torchreg.geometry.neighbors import NeighborTree, k_nearest_others, sampling_distance
+from torchreg.registration.blend import turn_about
+from torchreg.solvers.robust import geman_mcclure_loss, geman_mcclure_weight
+
+
+@dataclass(frozen=True)
+class SurfaceNumbers:
+    """How scans are compared."""
+
+    neighbors: int = 6  # of a sample, with which it shares a border
+    roughness: float = 0.02  # least noise, in distances between a scan's points: between them it is not known
+    cut: float = 3.0  # standard deviations from which a residual is an outlier's
+    to_deviation: float = 1.4826  # from the median of absolute values to the standard deviation of a normal law
+    patch: int = 20  # samples in a patch, over which noise is averaged to see how it is correlated
+    reach: float = 4.0  # scales of a robust kernel, beyond which no counterpart is looked for
+    damping: float = 1e-2  # of the mean curvature, added where data do not hold a motion
+
+
+NUMBERS = SurfaceNumbers()
+
+
+class Target:
+    """A scan to be compared with.
+
+    Args:
+        points: (M, 3).
+        normals: (M, 3).
+    """
+
+    def __init__(self, points: Tensor, normals: Tensor) -> None:
+        self.points, self.normals = points, normals
+        self.spacing = sampling_distance(points)
+        self._tree = NeighborTree(points)
+
+    def residuals(self, moved: Tensor, normals: Tensor, reach: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Return signed distances (..., K) of moved points from this scan's planes, its normals, and squared distances.
+
+        The squared distances (..., K) are across the planes and, beyond the spacing of the scan's points, along them;
+        those of points whose normals (..., K, 3) face the other way, or that no point of the scan is within reach of,
+        are infinite.
+        """
+        found, distance = self._tree.nearest_within(moved.reshape(-1, 3), reach + self.spacing)
+        index = found.reshape(moved.shape[:-1])
+        near = distance.reshape(moved.shape[:-1]).isfinite()
+        offset, facing = moved - self.points[index], self.normals[index]
+        across = (offset * facing).sum(-1)
+        along = (offset.square().sum(-1) - across.square()).clamp_min(0).sqrt()
+        square = across.square() + (along - self.spacing).clamp_min(0).square()
+        return across, facing, torch.where(near & ((facing * normals).sum(-1) > 0), square, torch.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Of residuals.
+
+    Args:
+        sigma: standard deviation, unit of length.
+        repeats: how many samples tell as much as one that erred by itself (the design effect of survey statistics).
+    """
+
+    sigma: float
+    repeats: float
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """Normal equations of the motions of K parts in T frames: ``0.5 d' H d + g' d``, d the twist about the centers.
+
+    Args:
+        hessian: (T, K, 6, 6).
+        gradient: (T, K, 6).
+        centers: (T, K, 3).
+        count: (T, K) samples that count.
+    """
+
+    hessian: Tensor
+    gradient: Tensor
+    centers: Tensor
+    count: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Samples of the reference, and the scans of the other frames.
+
+    Args:
+        samples: (n, 3), every beginning of which covers the surface evenly.
+        normals: (n, 3).
+        edges: (E, 2) pairs of neighbors, which connect all samples.
+        patch: (n,) patch of each sample.
+        targets: T scans.
+        size: diagonal of the samples.
+    """
+
+    samples: Tensor
+    normals: Tensor
+    edges: Tensor
+    patch: Tensor
+    targets: tuple[Target, ...]
+    size: float
+
+    @classmethod
+    def of(cls, samples: Tensor, normals: Tensor, targets: Sequence[Target]) -> Surfaces:
+        """Return the samples with their neighbors and patches."""
+        near = k_nearest_others(samples, NUMBERS.neighbors)[0]
+        start = torch.arange(len(samples)).unsqueeze(1).expand_as(near)
+        edges = torch.stack([start, near], -1).reshape(-1, 2).sort(-1).values.unique(dim=0)
+        links = component_links(samples, connected_components(edges, len(samples)))[0]
+        edges = torch.cat([edges, links]).unique(dim=0)
+        seeds = samples[: max(1, len(samples) // NUMBERS.patch)]
+        patch = NeighborTree(seeds).nearest(samples)[0]
+        size = float((samples.amax(0) - samples.amin(0)).norm())
+        return cls(samples, normals, edges, patch, tuple(targets), size)
+
+    def moved(self, transforms: Tensor) -> tuple[Tensor, Tensor]:
+        """Return samples and normals (..., n, 3) under motions (..., n, 4, 4)."""
+        turn = transforms[..., :3, :3]
+        points = (turn @ self.samples.unsqueeze(-1)).squeeze(-1) + transforms[..., :3, 3]
+        return points, (turn @ self.normals.unsqueeze(-1)).squeeze(-1)
+
+    def squares(self, motions: Tensor, reach: float) -> Tensor:
+        """Return squared distances (T, n, K) of the samples from the scans, under K motions (T, K, 4, 4)."""
+        rows = []
+        for target, frame in zip(self.targets, motions, strict=True):
+            points, normals = self.moved(frame.unsqueeze(1))
+            rows.append(target.residuals(points, normals, reach)[2].mT)
+        return torch.stack(rows)
+
+    def noise(self, motions: Tensor, label: Tensor) -> Noise:
+        """Return the noise of the samples' residuals under the motions (T, K, 4, 4) of their parts (n,)."""
+        moved = [self.moved(frame[label]) for frame in motions]
+        found = [t.residuals(*m, self.size) for t, m in zip(self.targets, moved, strict=True)]
+        across, square = torch.stack([f[0] for f in found]), torch.stack([f[2] for f in found])
+        spacing = sum(target.spacing for target in self.targets) / len(self.targets)
+        near = square.isfinite()
+        typical = float(square[near].sqrt().median()) if bool(near.any()) else 0.0
+        sigma = max(NUMBERS.to_deviation * typical, NUMBERS.roughness * spacing)
+        inlier = square < (NUMBERS.cut * sigma) ** 2
+        return Noise(sigma, self._repeats(torch.where(inlier, across, 0.0), inlier, label))
+
+    def _repeats(self, across: Tensor, inlier: Tensor, label: Tensor) -> float:
+        """Return the growth of the variance of means over patches, beyond that of independent residuals (T, n)."""
+        key = (self.patch * (int(label.max()) + 1) + label).unique(return_inverse=True)[1]
+        blank = across.new_zeros(len(across), int(key.max()) + 1)
+        count = blank.index_add(1, key, inlier.to(across))
+        sums = blank.index_add(1, key, across)
+        variance = across.square().sum() / inlier.sum().clamp_min(1)
+        return max(1.0, float(sums.square().sum() / (variance * count.sum()).clamp_min(1e-300)))
+
+    def blocks(self, motions: Tensor, label: Tensor, scale: float) -> Blocks:
+        """Return the normal equations of robust squared residuals at the motions (T, K, 4, 4) of parts (n,).
+
+        Args:
+            motions: of the parts.
+            label: part of each sample.
+            scale: of the robust kernel, length.
+        """
+        size = motions.shape[1]
+        member = torch.nn.functional.one_hot(label, size).to(self.samples)
+        middle = (member.mT @ self.samples) / member.sum(0).clamp_min(1).unsqueeze(-1)
+        centers = (motions[..., :3, :3] @ middle.unsqueeze(-1)).squeeze(-1) + motions[..., :3, 3]
+        rows = []
+        for target, frame, center in zip(self.targets, motions, centers, strict=True):
+            points, normals = self.moved(frame[label])
+            across, facing, square = target.residuals(points, normals, NUMBERS.reach * scale)
+            weight = geman_mcclure_weight(square / scale**2)
+            jacobian = torch.cat([facing, torch.linalg.cross(points - center[label], facing)], -1)
+            outer = (jacobian.unsqueeze(-1) * jacobian.unsqueeze(-2)).flatten(-2)
+            values = torch.cat([outer, jacobian * across.unsqueeze(-1), torch.ones_like(across).unsqueeze(-1)], -1)
+            rows.append(values.new_zeros(size, 43).index_add(0, label, weight.unsqueeze(-1) * values))
+        sums = torch.stack(rows)
+        return Blocks(sums[..., :36].unflatten(-1, (6, 6)), sums[..., 36:42], centers, sums[..., 42])
+
+    def cost(self, motions: Tensor, label: Tensor, scale: float) -> Tensor:
+        """Return the robust cost (T,) of the samples' squared residuals, in squared scales."""
+        rows = []
+        for target, frame in zip(self.targets, motions, strict=True):
+            square = target.residuals(*self.moved(frame[label]), NUMBERS.reach * scale)[2]
+            rows.append(geman_mcclure_loss((square / scale**2).clamp_max(1e12)).sum())
+        return torch.stack(rows)
+
+    def travel(self, motions: Tensor, label: Tensor) -> Tensor:
+        """Return how far the samples of each part (K,) are from the reference, on average over samples and frames."""
+        moved = torch.stack([self.moved(frame[label])[0] for frame in motions])
+        paths = (moved - self.samples).norm(dim=-1).mean(0)
+        member = torch.nn.functional.one_hot(label, motions.shape[1]).to(paths)
+        return (paths @ member) / member.sum(0).clamp_min(1)
+
+    def distances(self, motions: Tensor, label: Tensor) -> Tensor:
+        """Return the median distances (T,) of the samples from the scans."""
+        found = [
+            target.residuals(*self.moved(frame[label]), self.size)[2].sqrt().median()
+            for target, frame in zip(self.targets, motions, strict=True)
+        ]
+        return torch.stack(found)
+
+    def refined(self, motions: Tensor, label: Tensor, scales: Sequence[float]) -> Tensor:
+        """Return the motions (T, K, 4, 4) of all parts after a step of point-to-plane ICP at each of some scales."""
+        for scale in scales:
+            blocks = self.blocks(motions, label, scale)
+            motions = turn_about(motions, solved(blocks, self.size), blocks.centers)
+        return motions
+
+
+def solved(blocks: Blocks, size: float) -> Tensor:
+    """Return the twists (T, K, 6) of least quadratic cost; directions that the data do not hold stay."""
+    unit = torch.ones(6, dtype=torch.float64)
+    unit[3:] = 2 / size
+    hessian = unit.unsqueeze(-1) * blocks.hessian * unit
+    ridge = NUMBERS.damping * hessian.diagonal(dim1=-2, dim2=-1).mean(-1) + 1e-9
+    hessian = hessian + ridge[..., None, None] * torch.eye(6).double()
+    return -unit * torch.linalg.solve(hessian, unit * blocks.gradient)
