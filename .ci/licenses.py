@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import re
 import sys
+import tomllib
 from collections import deque
 from collections.abc import Iterator
 from importlib import metadata
+from pathlib import Path
 
 # Licenses whose terms would reach torchreg's own code; the Lesser GPL leaves what merely imports a library alone.
 _REFUSED = re.compile(r"(?<!L)(?<!Lesser )(?<!Library )\b(A?GPL|GNU (Affero )?General Public)", re.IGNORECASE)
+ROOT = "torchreg-articulated"
 _NAME = re.compile(r"[A-Za-z0-9._-]+")
 # Distributions, by the beginning of their names, whose metadata tell no license, or more than one that does not matter.
 KNOWN = {
@@ -21,9 +24,19 @@ KNOWN = {
 }
 
 
-def dependencies(root: str) -> Iterator[tuple[metadata.Distribution, str]]:
-    """Yield each installed distribution that another one needs, with the name of that one; of the root, all extras."""
-    waiting, seen = deque([(root, "")]), set[str]()
+def requirements() -> list[str]:
+    """Return what pyproject.toml asks for, with every extra."""
+    text = (Path(__file__).resolve().parents[1] / "pyproject.toml").read_text(encoding="utf-8")
+    project = tomllib.loads(text)["project"]
+    extras = project["optional-dependencies"].values()
+    rows = [*project["dependencies"], *(row for extra in extras for row in extra)]
+    return [row for row in rows if not row.startswith(ROOT)]
+
+
+def dependencies() -> Iterator[tuple[metadata.Distribution, str]]:
+    """Yield each installed distribution that torchreg or another one needs, with the name of that one."""
+    asked_for = (_NAME.match(row) for row in requirements())
+    waiting, seen = deque((found.group(), ROOT) for found in asked_for if found is not None), set[str]()
     while waiting:
         name, asked = waiting.popleft()
         key = re.sub(r"[-_.]+", "-", name).lower()
@@ -34,11 +47,10 @@ def dependencies(root: str) -> Iterator[tuple[metadata.Distribution, str]]:
             found = metadata.distribution(name)
         except metadata.PackageNotFoundError:
             continue  # of another system, or an extra that is not installed
-        if asked:
-            yield found, asked
+        yield found, asked
         for row in found.requires or ():
             matched = _NAME.match(row)
-            if matched is not None and (not asked or "extra ==" not in row):
+            if matched is not None and "extra ==" not in row:
                 waiting.append((matched.group(), name))
 
 
@@ -71,7 +83,7 @@ def _by_file(found: metadata.Distribution) -> str:
 def main() -> int:
     """Print all licenses; return 1 if one is refused or unknown."""
     bad = []
-    for found, asked in sorted(dependencies("torchreg"), key=lambda pair: pair[0].metadata["Name"].lower()):
+    for found, asked in sorted(dependencies(), key=lambda pair: pair[0].metadata["Name"].lower()):
         name, told = found.metadata["Name"], license_of(found)
         print(f"{name:32} {found.version:18} {told or 'UNKNOWN':50.50} for {asked}")
         if not told or _REFUSED.search(told):

@@ -37,6 +37,8 @@ from torchreg.datasets.videos import shape_video
 
 # Fields that hold wall times.
 CLOCKS = {"seconds"}
+# What results keep of their input; of a calibration the shape is an output.
+GIVEN = {"shape", "up"}
 CAMERA = torch.zeros(3)
 
 
@@ -191,7 +193,7 @@ def outputs(value: Any, name: str) -> Iterator[tuple[str, Tensor | str]]:
             yield from outputs(entry, f"{name}.{key}")
     elif is_dataclass(value):
         for item in fields(value):
-            if item.name not in CLOCKS:
+            if item.name not in CLOCKS and not (item.name in GIVEN and not isinstance(value, tr.Calibration)):
                 yield from outputs(getattr(value, item.name), f"{name}.{item.name}")
     elif isinstance(value, dict) and value:
         for key, entry in value.items():

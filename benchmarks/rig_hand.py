@@ -3,7 +3,7 @@
 The truth is the file's mesh posed with the file's own skin weights. The data are 2,000 points of it with 0.5 mm noise,
 and 10 % outliers, uniform in the bounding box grown by 2 cm. The error is the distance of every vertex from its true
 place. Rigid ICP (small_gicp) and coherent point drift (pycpd) get the same data, the rest mesh and no skeleton; they
-come with `pip install "torchreg[benchmark]"`.
+come with `pip install "torchreg-articulated[benchmark]"`.
 
     python benchmarks/rig_hand.py --data FOLDER     FOLDER holds webxr_hand_right.glb
 """
@@ -167,7 +167,7 @@ def compare(shape: tr.ArticulatedShape, angles: tuple[int, ...], seeds: int, *, 
             moved = method(problems[0])
             seconds = time.perf_counter() - begin
             if moved is None:
-                print(f'{name} is not installed and left out; pip install "torchreg[benchmark]" brings it')
+                print(f'{name} is not installed and left out; pip install "torchreg-articulated[benchmark]" brings it')
                 continue
             rows.append(_row(name, angle, [(moved - problems[0].truth).norm(dim=-1)], [seconds]))
     return rows

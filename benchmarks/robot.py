@@ -1,10 +1,10 @@
 """Joint angles of public robots from one noisy view, read from their URDF files.
 
-The robots come with example-robot-data (`pip install "torchreg[benchmark]"`, which also brings the reader of their
-meshes): two arms and a hand, their bases bolted to the ground, and the hand again with a free base. The truth is a
-random pose within the limits; the start has every joint 20 degrees off (sliding joints 1 cm, a free base 2 % of the
-size and 10 degrees). The data are 1,000 points of the side of the file's meshes that a camera at a random place sees,
-with 2 mm noise and 10 % outliers, uniform in the bounding box grown by 5 % of the size.
+The robots come with example-robot-data (`pip install "torchreg-articulated[benchmark]"`, which also brings the reader
+of their meshes): two arms and a hand, their bases bolted to the ground, and the hand again with a free base. The truth
+is a random pose within the limits; the start has every joint 20 degrees off (sliding joints 1 cm, a free base 2 % of
+the size and 10 degrees). The data are 1,000 points of the side of the file's meshes that a camera at a random place
+sees, with 2 mm noise and 10 % outliers, uniform in the bounding box grown by 5 % of the size.
 
 Some joints cannot be measured: a flange that is round about its own axis, a part that is hidden. Which these are
 follows from truth and data alone: the least standard deviation that noise and points leave to a joint, with the true
@@ -213,7 +213,7 @@ def main(arguments: list[str] | None = None) -> int:
         {} if folder is None else {name: folder / file for name, file in ROBOTS.items() if (folder / file).is_file()}
     )
     if not files:
-        print('skipped: no robots found; pip install "torchreg[benchmark]" brings example-robot-data')
+        print('skipped: no robots found; pip install "torchreg-articulated[benchmark]" brings example-robot-data')
         return 0
     jobs = [(name, False) for name in files] + [(name, True) for name in FREE_BASE if name in files]
     if options.smoke:

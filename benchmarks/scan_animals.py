@@ -1,11 +1,11 @@
 """Range scans of animals whose skins hang on dozens of bones, registered with the defaults.
 
-Dog and rodent are those of dm_control, posed by MuJoCo (`pip install "torchreg[benchmark]"` brings both). Each pair is
-two random poses: in the first every joint is off by a twelfth of its range (standard deviation), and in the second from
-there by the share of its range that the row names; the animal as a whole turns by 7 degrees and shifts a little. No
-motion of an animal does that: spine, tail and toes move as far as legs. One depth camera at a random place sees both,
-about 7,500 points each. A pair counts as registered when at least 90 % of its source points end within 2.5 % of the
-diagonal of their true place, visible in the target or not.
+Dog and rodent are those of dm_control, posed by MuJoCo (`pip install "torchreg-articulated[benchmark]"` brings both).
+Each pair is two random poses: in the first every joint is off by a twelfth of its range (standard deviation), and in
+the second from there by the share of its range that the row names; the animal as a whole turns by 7 degrees and shifts
+a little. No motion of an animal does that: spine, tail and toes move as far as legs. One depth camera at a random place
+sees both, about 7,500 points each. A pair counts as registered when at least 90 % of its source points end within 2.5 %
+of the diagonal of their true place, visible in the target or not.
 
     python benchmarks/scan_animals.py            # --smoke: one pair per animal and motion
 """
@@ -138,7 +138,7 @@ def main(arguments: list[str] | None = None) -> int:
     with torch.no_grad():
         found = [] if folder is None else list(animals(folder))
         if not found:
-            print('skipped: no animals found; pip install "torchreg[benchmark]" brings them')
+            print('skipped: no animals found; pip install "torchreg-articulated[benchmark]" brings them')
             return 0
         print_rows(found, 1 if options.smoke else options.pairs, options.seed)
     return 0

@@ -1,11 +1,11 @@
 """Range scans of other kinds of things, public robots and a rigged hand, registered with the defaults.
 
-The robots come with example-robot-data (`pip install "torchreg[benchmark]"`; those with COLLADA meshes need the extra
-`urdf` too), the hand with ``--data FOLDER``, which holds webxr_hand_right.glb. Each pair is two random poses: the first
-14 degrees (standard deviation) from rest in every joint, the second 8, 16 or 26 degrees from the first, in turn; the
-hand's fingers are flexed by up to 12, 24 or 36 degrees in both. One depth camera at a random place sees both, about
-7,500 points each. The truth is the mesh posed by the file's own joints. A pair counts as registered when at least 90 %
-of its source points end within 2.5 % of the diagonal of their true place, visible in the target or not.
+The robots come with example-robot-data (`pip install "torchreg-articulated[benchmark]"`; those with COLLADA meshes need
+the extra `urdf` too), the hand with ``--data FOLDER``, which holds webxr_hand_right.glb. Each pair is two random poses:
+the first 14 degrees (standard deviation) from rest in every joint, the second 8, 16 or 26 degrees from the first, in
+turn; the hand's fingers are flexed by up to 12, 24 or 36 degrees in both. One depth camera at a random place sees both,
+about 7,500 points each. The truth is the mesh posed by the file's own joints. A pair counts as registered when at least
+90 % of its source points end within 2.5 % of the diagonal of their true place, visible in the target or not.
 
     python benchmarks/scan_robots.py --data FOLDER
 """
@@ -170,7 +170,8 @@ def main(arguments: list[str] | None = None) -> int:
             things.append(hand(options.data / HAND))
         if not things:
             print(
-                f'skipped: no robots found, pip install "torchreg[benchmark]" brings them; no {HAND} in --data either'
+                'skipped: no robots found, pip install "torchreg-articulated[benchmark]" brings them; '
+                f"no {HAND} in --data either"
             )
             return 0
         if options.smoke:

@@ -63,7 +63,7 @@ def draw_registration(folder, smoke):
 
 
 def draw_spine(folder, smoke):
-    """A starfish meshed anew in every frame: its limbs keep their names."""
+    """A starfish meshed anew in every frame: consistent limb identities."""
     creature = creature_sequence(num_frames=3 if smoke else 16, resolution=48 if smoke else 96, seed=1)
     meshes = list(creature.meshes)
     spine = tr.extract_spine(meshes, workers=1)

@@ -88,7 +88,7 @@ def _several_values(text: str) -> list[Any] | None:
         from hydra.core.override_parser.types import QuotedString, Transformer
         from hydra.errors import HydraException
     except ImportError as error:
-        raise ExperimentError("hydra is not installed: pip install 'torchreg[experiments]'") from error
+        raise ExperimentError("hydra is not installed: pip install 'torchreg-articulated[experiments]'") from error
     try:
         parsed = OverridesParser.create().parse_override(_whole_key(text))
     except HydraException:
@@ -161,7 +161,7 @@ def _composed(path: Path, overrides: list[str]) -> dict[str, Any]:
         from omegaconf import OmegaConf
         from omegaconf.errors import OmegaConfBaseException
     except ImportError as error:
-        raise ExperimentError("hydra is not installed: pip install 'torchreg[experiments]'") from error
+        raise ExperimentError("hydra is not installed: pip install 'torchreg-articulated[experiments]'") from error
     _check_text(path)
     try:
         with (

@@ -16,7 +16,7 @@ try:
     import pyarrow as pa
     import pyarrow.parquet as pq
 except ImportError as error:
-    raise ExperimentError(f"{error.name} is not installed: pip install 'torchreg[experiments]'") from error
+    raise ExperimentError(f"{error.name} is not installed: pip install 'torchreg-articulated[experiments]'") from error
 
 # Columns whose fields become columns of their own, with dotted names.
 _NESTED = ("config", "metrics", "seconds", "curves", "artifacts")

@@ -1,5 +1,6 @@
 """Result records: frozen, complete, and independent of the pipelines that fill them."""
 
+import json
 from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 
 import pytest
@@ -7,6 +8,7 @@ import torch
 
 from torchreg.alignment import results as alignment
 from torchreg.alignment.results import AlignRecord, Calibration, PoseStarts
+from torchreg.errors import InputError
 from torchreg.registration import results as registration
 from torchreg.result import Result, Status
 from torchreg.spines import results as spines
@@ -36,6 +38,7 @@ def test_every_field_is_documented(record):
 
 def test_a_status_has_one_spelling_in_files():
     assert [Status(status.value) for status in Status] == list(Status)
+    assert str(Status.FEW_INLIERS) == f"{Status.FEW_INLIERS}" == "few_inliers"
     assert {status.value for status in Status} >= {"converged", "max_steps", "few_inliers", "no_data"}
 
 
@@ -68,3 +71,36 @@ def test_notebooks_show_a_table(result):
     assert table.count("<tr>") == 10
     odd = PoseStarts(torch.zeros(1, 3), torch.zeros(1), "<b>")
     assert "&lt;b&gt;" in odd._repr_html_()
+
+
+def test_results_move_between_dtypes_with_all_they_hold(result, plain_hand):
+    record = AlignRecord("em", 0, 5, torch.ones(1), torch.ones(1), torch.zeros(1, 27), torch.zeros(1))
+    whole = replace(result, history=(record,), shape=plain_hand)
+    moved = whole.to(torch.float64)
+    assert {moved.pose.dtype, moved.history[0].pose.dtype, moved.shape.rest.dtype} == {torch.float64}
+    assert moved.inliers.dtype == torch.bool
+    assert plain_hand.rest.dtype == torch.float32
+    there = whole.to("cpu", torch.float64)
+    assert torch.equal(there.pose, moved.pose)
+    assert moved.to("cpu").pose.dtype == torch.float64
+
+
+def test_results_as_arrays_and_plain_data(result, plain_hand):
+    whole = replace(result, shape=plain_hand)
+    arrays = whole.numpy()
+    assert arrays["pose"].shape == (27,)
+    assert arrays["status"] == "converged"
+    assert "shape" not in arrays
+    plain = json.loads(json.dumps(whole.to_dict()))
+    assert plain["pose"] == [0.0] * 27
+    assert plain["inliers"] == [True] * 4
+    assert plain["status"] == "converged"
+
+
+def test_poses_by_name(result, plain_hand):
+    whole = replace(result, pose=torch.arange(27.0), shape=plain_hand)
+    assert whole.named_pose["base_z"] == 2.0
+    assert list(whole.named_pose) == list(plain_hand.dof_names)
+    assert torch.equal(plain_hand.pose_from_dict(whole.named_pose), whole.pose)
+    with pytest.raises(InputError, match=r"keeps no shape; name its poses with shape\.pose_to_dict"):
+        _ = result.named_pose

@@ -62,6 +62,10 @@ def same(a, b):
         return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
     if hasattr(a, "__dataclass_fields__"):
         return all(same(getattr(a, item.name), getattr(b, item.name)) for item in fields(a))
+    if isinstance(a, torch.nn.Module):
+        return a.state_dict().keys() == b.state_dict().keys() and all(
+            map(same, *[tuple(x.state_dict().values()) for x in (a, b)])
+        )
     return a is b or a == b
 
 

@@ -62,6 +62,7 @@ _NAMES = {
     "tracking.results": "DemoResult FrameResult TrackResult TrackState",
     "tracking.tracker": "Tracker",
     "viz.conversions": "to_open3d to_pyvista to_trimesh",
+    "viz.plots": "plot",
 }
 _MODULES = ("errors", "metrics")
 _HOMES = {name: home for home, names in _NAMES.items() for name in names.split()}

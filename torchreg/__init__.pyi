@@ -77,6 +77,7 @@ from torchreg.tracking.tracker import Tracker as Tracker
 from torchreg.viz.conversions import to_open3d as to_open3d
 from torchreg.viz.conversions import to_pyvista as to_pyvista
 from torchreg.viz.conversions import to_trimesh as to_trimesh
+from torchreg.viz.plots import plot as plot
 
 __version__: str
 __all__ = [
@@ -149,6 +150,7 @@ __all__ = [
     "load_points",
     "load_scan",
     "metrics",
+    "plot",
     "register",
     "register_sequence",
     "sample_skin",

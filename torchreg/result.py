@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import fields, is_dataclass, replace
 from enum import Enum
 from html import escape
 from importlib import import_module
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -55,6 +56,35 @@ def _field_summary(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
+def _moved(value: Any, device: torch.device | str | None, dtype: torch.dtype | None) -> Any:
+    """Return a value whose tensors, however deep, are on a device, and those of floating point of a dtype."""
+    if isinstance(value, Tensor):
+        return value.to(device=device, dtype=dtype if value.is_floating_point() else None)
+    if isinstance(value, nn.Module):
+        return copy.deepcopy(value).to(device=device, dtype=dtype)
+    if isinstance(value, tuple):
+        return tuple(_moved(item, device, dtype) for item in value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return replace(value, **{item.name: _moved(getattr(value, item.name), device, dtype) for item in fields(value)})
+    return value
+
+
+def _plain(value: Any, of_tensor: Callable[[Tensor], Any]) -> Any:
+    """Return a value as dictionaries, lists, numbers and words; modules become None."""
+    if isinstance(value, Tensor):
+        return of_tensor(value.detach().cpu())
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, (tuple, list)):
+        return [_plain(item, of_tensor) for item in value]
+    if isinstance(value, dict):
+        return {key: _plain(item, of_tensor) for key, item in value.items()}
+    if is_dataclass(value):
+        found = {item.name: _plain(getattr(value, item.name), of_tensor) for item in fields(value)}
+        return {name: entry for name, entry in found.items() if entry is not None}
+    return None if isinstance(value, nn.Module) else value
+
+
 # Different words in a tuple up to which each is printed with its count.
 _MAX_KINDS = 6
 
@@ -98,20 +128,58 @@ class Result:
         cls.__repr__ = Result.__repr__  # type: ignore[method-assign]
 
     def __repr__(self) -> str:
-        parts = ", ".join(f"{name}={text}" for name, text in self._summaries())
+        parts = ", ".join(f"{name}={text}" for name, text in self.summary())
         return f"{type(self).__name__}({parts})"
 
     def _repr_html_(self) -> str:
         """Return a table of the fields, for notebooks."""
         rows = "".join(
             f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:left'>{escape(text)}</td></tr>"
-            for name, text in self._summaries()
+            for name, text in self.summary()
         )
         return f"<table><caption>{type(self).__name__}</caption>{rows}</table>"
 
-    def _summaries(self) -> list[tuple[str, str]]:
+    def summary(self) -> list[tuple[str, str]]:
+        """Return names and few words of the fields that are not None, as they are printed."""
         values = ((item.name, getattr(self, item.name)) for item in fields(self))  # type: ignore[arg-type]
         return [(name, _field_summary(value)) for name, value in values if value is not None]
+
+    def to(self, device: torch.device | str | torch.dtype | None = None, dtype: torch.dtype | None = None) -> Self:
+        """Return the result with all tensors on a device and those of floating point in a dtype, as `Tensor.to` does.
+
+        Args:
+            device: such as "cpu" or "cuda"; or a dtype alone.
+            dtype: of numbers in floating point; whole numbers and masks keep theirs.
+        """
+        if isinstance(device, torch.dtype):
+            device, dtype = None, device
+        moved: Self = _moved(self, device, dtype)
+        return moved
+
+    def numpy(self) -> dict[str, Any]:
+        """Return the fields by name: arrays for tensors, words for statuses, dictionaries for records inside.
+
+        Fields that are None, and shapes, are left out.
+        """
+        found: dict[str, Any] = _plain(self, Tensor.numpy)
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields by name in plain Python: lists of numbers, words, dictionaries; what `json.dumps` takes.
+
+        Fields that are None, and shapes, are left out. NaN stays NaN, which strict JSON does not know.
+        """
+        found: dict[str, Any] = _plain(self, Tensor.tolist)
+        return found
+
+    def plot(self, data: Any = None, **options: Any) -> Any:
+        """Return matplotlib axes with a picture of the result; see `torchreg.plot`.
+
+        Args:
+            data: what was measured: a cloud or mesh, or one per frame.
+            options: of `torchreg.plot`.
+        """
+        return public("plot")(self, data, **options)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result to ``path``, which ends in .safetensors, and a JSON file beside it.
@@ -142,6 +210,10 @@ class Status(Enum):
     OTHER_UNITS = "other_units"
     DOUBTFUL = "doubtful"  # a result that its own evidence speaks against
     DEGENERATE = "degenerate"  # data at one place, on a line or on a plane, which determine no pose
+
+    def __str__(self) -> str:
+        """Return the one spelling that files, pages and the command line have too."""
+        return str(self.value)
 
     @property
     def usable(self) -> bool:

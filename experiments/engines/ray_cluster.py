@@ -34,7 +34,7 @@ class RayEngine:
         try:
             import ray
         except ImportError as error:
-            raise ExperimentError("ray is not installed: pip install 'torchreg[ray]'") from error
+            raise ExperimentError("ray is not installed: pip install 'torchreg-articulated[ray]'") from error
         self.config, self._ray = config, ray
         self._started = not ray.is_initialized()
         if self._started:

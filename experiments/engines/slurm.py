@@ -49,7 +49,7 @@ class SlurmEngine:
         try:
             import submitit
         except ImportError as error:
-            raise ExperimentError("submitit is not installed: pip install 'torchreg[slurm]'") from error
+            raise ExperimentError("submitit is not installed: pip install 'torchreg-articulated[slurm]'") from error
         self.config, self._submitit = config, submitit
         self.cluster = config.options.get("cluster", "slurm")
         if self.cluster == "slurm" and shutil.which("sbatch") is None:

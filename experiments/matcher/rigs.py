@@ -68,7 +68,9 @@ def _anny() -> Any:
     try:
         import anny
     except ImportError as error:
-        raise MissingExtraError("people need anny; install it with: pip install 'torchreg[anny]'") from error
+        raise MissingExtraError(
+            "people need anny; install it with: pip install 'torchreg-articulated[anny]'"
+        ) from error
     return anny.Anny()
 
 

@@ -135,7 +135,7 @@ def _render(shown: list[Shown], notes: list[str]) -> str:
     try:
         from jinja2 import Environment, FileSystemLoader, StrictUndefined
     except ImportError as error:
-        raise ExperimentError("jinja2 is not installed: pip install 'torchreg[experiments]'") from error
+        raise ExperimentError("jinja2 is not installed: pip install 'torchreg-articulated[experiments]'") from error
     loader = FileSystemLoader(_TEMPLATES)
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True

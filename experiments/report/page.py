@@ -74,7 +74,9 @@ def _render(page: dict[str, Any]) -> str:
         from jinja2 import Environment, FileSystemLoader, StrictUndefined
         from plotly.offline import get_plotlyjs
     except ImportError as error:
-        raise ExperimentError(f"{error.name} is not installed: pip install 'torchreg[experiments]'") from error
+        raise ExperimentError(
+            f"{error.name} is not installed: pip install 'torchreg-articulated[experiments]'"
+        ) from error
     loader = FileSystemLoader(_TEMPLATES)
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True

@@ -28,7 +28,7 @@ def peer(method: str) -> Any:
     try:
         return import_module(package)
     except ImportError as error:
-        how = "skeletor (under the GPL)" if method == "skeletor" else "'torchreg[benchmark]'"
+        how = "skeletor (under the GPL)" if method == "skeletor" else "'torchreg-articulated[benchmark]'"
         raise SkippedTrial(f"{package} is not installed: pip install {how}") from error
 
 

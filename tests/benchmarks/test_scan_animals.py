@@ -75,7 +75,7 @@ def test_without_mujoco_there_are_no_animals(benchmark, tmp_path, capsys, monkey
     (tmp_path / "dog.xml").write_text("<mujoco/>")
     monkeypatch.setattr(benchmark.importlib.util, "find_spec", lambda name: None)
     assert benchmark.main(["--animals", str(tmp_path)]) == 0
-    assert "torchreg[benchmark]" in capsys.readouterr().out
+    assert "torchreg-articulated[benchmark]" in capsys.readouterr().out
 
 
 def test_skins_follow_their_bones_as_mujoco_draws_them(benchmark):

@@ -55,3 +55,26 @@ def test_main_runs_the_application_on_one_thread_unless_told_otherwise(monkeypat
     monkeypatch.delenv("OMP_NUM_THREADS")
     application.main()
     assert calls == [({"prog_name": "torchreg"}, "3"), ({"prog_name": "torchreg"}, "1")]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("register", "a", "b", "--num-bones", "3"), "No such option: --num-bones; did you mean --bones?"),
+        (("spine", "a", "--num-tips=5"), "No such option: --num-tips; did you mean --tips?"),
+        (("align", "hand", "a", "--serch", "never"), "No such option: --serch; did you mean --search?"),
+        (("spine", "a", "--seed", "3"), "it gives the same result every time"),
+        (("info", "hand", "--qqqq"), "No such option: --qqqq; --help shows all"),
+    ],
+)
+def test_near_misses_of_options_are_answered(run, words, told):
+    answer = run(*words)
+    assert answer.exit_code == 2
+    assert told in " ".join(answer.output.split())
+
+
+def test_every_help_ends_with_two_examples(run):
+    for command in COMMANDS:
+        lines = run(command, "--help").output.rstrip().splitlines()
+        assert lines[-3].strip() == "Examples:"
+        assert all(line.strip().startswith(f"torchreg {command}") for line in lines[-2:])

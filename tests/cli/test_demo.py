@@ -1,5 +1,6 @@
 """The demonstration: what it prints and writes, also when it is interrupted."""
 
+import json
 import subprocess
 import sys
 
@@ -19,9 +20,12 @@ def test_the_demonstration_runs(run, tmp_path):
     command = [sys.executable, "-m", "torchreg", "demo", "--frames", "3", "-o", str(out)]
     answer = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path)
     assert answer.returncode == 0, answer.stderr
-    names = ["hand.glb", "poses.json", "poses.safetensors", "tracking.gif"]
+    names = ["hand.glb", "poses.json", "track.json", "track.safetensors", "tracking.gif"]
     assert sorted(path.name for path in out.iterdir()) == names
-    result = load(out / "poses.safetensors")
+    result = load(out / "track.safetensors")
+    poses = json.loads((out / "poses.json").read_text(encoding="utf-8"))
+    assert tuple(poses["poses"]) == Hand().dof_names
+    assert poses["poses"]["index_pip_flexion"] == result.track.named_poses["index_pip_flexion"].tolist()
     lines = answer.stdout.splitlines()
     first, second, third = result.track.seconds.tolist()
     sizes = [len(cloud) for cloud in result.clouds]
@@ -56,5 +60,6 @@ def test_an_interrupted_demonstration_writes_what_is_done(run, tmp_path, monkeyp
     answer = run("demo", "--frames", "2", "-o", tmp_path, "--no-picture")
     assert answer.exit_code == 130
     assert "torchreg: interrupted; 1 of 2 frames are done" in answer.output
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["hand.glb", "poses.json", "poses.safetensors"]
-    assert load(tmp_path / "poses.safetensors").track.poses.shape == (1, 27)
+    names = ["hand.glb", "poses.json", "track.json", "track.safetensors"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == names
+    assert load(tmp_path / "track.safetensors").track.poses.shape == (1, 27)

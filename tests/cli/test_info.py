@@ -1,4 +1,6 @@
-"""What a shape consists of, in degrees and meters."""
+"""What a shape consists of, in degrees and meters, and what a result holds."""
+
+from dataclasses import replace
 
 
 def test_info_shows_limits_in_degrees_and_meters(run, folder):
@@ -10,3 +12,21 @@ def test_info_shows_limits_in_degrees_and_meters(run, folder):
     answer = run("info", "hand-left").output
     assert "16 parts, 27 degrees of freedom, fused solids" in answer
     assert "base_rz               free" in answer
+
+
+def test_info_tells_what_a_result_holds(run, folder, tmp_path, result, plain_hand):
+    replace(result, shape=plain_hand).save(tmp_path / "r.safetensors")
+    for name in ("r.safetensors", "r"):
+        lines = [line.split() for line in run("info", tmp_path / name).output.splitlines()]
+        assert lines[0][1:] == ["AlignResult"]
+        assert ["status", "converged"] in lines
+        assert ["shape", "Hand"] in lines
+        assert ["index_pip_flexion", "0", "deg"] in lines
+
+
+def test_near_misses_of_shapes_are_answered(error_of):
+    assert "did you mean 'hand'?" in error_of("info", "Hand")
+    assert "did you mean 'hand'?" in error_of("info", "hand-right")
+    assert "did you mean 'hand-left'?" in error_of("info", "left-hand")
+    assert "from_skinned_mesh" in error_of("info", "mano_right.pkl")
+    assert "URDF" in error_of("info", "robot.xacro")

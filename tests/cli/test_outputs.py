@@ -47,3 +47,21 @@ def test_outputs_need_a_folder_a_name_of_their_own_and_leave(tmp_path):
         check_outputs([free, free], force=True)
     with pytest.raises(FileNotFoundError, match="does not exist; create it first"):
         check_outputs([tmp_path / "none" / "a.ply"], force=True)
+
+
+@pytest.mark.parametrize(
+    ("given", "made"),
+    [
+        ("out", "out.safetensors"),
+        ("out.json", "out.safetensors"),
+        ("out.glb", "out.safetensors"),
+        ("a.v2", "a.v2.safetensors"),
+    ],
+)
+def test_names_of_results_get_their_ending(given, made):
+    assert with_ending(Path(given), (".safetensors",), add=True) == Path(made)
+
+
+def test_a_result_is_not_called_like_another_kind_of_file():
+    with pytest.raises(InputError, match=r"s5\.swc must end in \.glb; rename the output"):
+        with_ending(Path("s5.swc"), (".glb",), add=True)

@@ -40,7 +40,7 @@ def test_everything_is_written(run, frames, tmp_path):
     options = [tmp_path / option if not option.startswith("--") else option for option in options]
     answer = run("spine", frames, "-o", tmp_path / "a.glb", *options)
     assert answer.exit_code == 0, answer.output
-    assert "5 tips, 1 junctions, 5 limbs; 3 of 3 frames" in answer.output
+    assert "5 tips, 1 junction, 5 limbs; 3 of 3 frames" in answer.output
     found = load(tmp_path / "a.safetensors")
     assert found.num_tips == 5
     trees = [load_swc(tmp_path / f"a_{number}.swc") for number in (1, 2, 3)]
@@ -87,7 +87,7 @@ def test_masks_of_several_cameras_become_a_spine(run, error_of, masks, tmp_path)
     command = ("spine", "--silhouettes", *folders, "--calibration", calibration, "--resolution", 48)
     answer = run(*command, "-o", tmp_path / "s.glb", "--progress", tmp_path / "kept")
     assert answer.exit_code == 0, answer.output
-    assert "5 tips, 1 junctions, 5 limbs" in answer.output
+    assert "5 tips, 1 junction, 5 limbs" in answer.output
     whole = load(tmp_path / "s.safetensors")
     assert whole.num_tips == 5
     assert [path.name for path in (tmp_path / "s_seen").iterdir()] == ["hull_0000.png"]

@@ -58,3 +58,25 @@ def test_what_does_not_fit_is_refused(error_of, result, tmp_path):
     assert "must end in" in error_of("view", result / "starts", "--html", tmp_path / "a.txt")
     assert "about a --shape" in error_of("view", result / "starts", "--fixed-base")
     assert "nowhere" in error_of("view", result / "nowhere", "--shape", "hand")
+
+
+def test_shapes_and_scans_are_viewed_too(run, error_of, result, folder, tmp_path):
+    for number, (name, told) in enumerate(
+        [
+            ("hand", "16 parts, 27 degrees of freedom"),
+            (folder / "arm.urdf", "degrees of freedom"),
+            (result / "cloud.ply", "21 points"),
+            (result / "mesh.ply", "3 points, 1 triangle"),
+        ]
+    ):
+        answer = run("view", name, "--html", tmp_path / f"{number}.html")
+        assert answer.exit_code == 0, answer.output
+        assert told in answer.output
+    assert "did you mean 'hand'?" in error_of("view", "hands", "--html", tmp_path / "x.html")
+
+
+def test_results_are_shown_with_the_shape_that_they_keep(run, result, tmp_path):
+    rest = Hand().rest_pose()
+    PoseStarts(rest[None], torch.zeros(1), torch.tensor(1.0), Hand()).save(tmp_path / "s.safetensors")
+    answer = run("view", tmp_path / "s", "--html", tmp_path / "s.html")
+    assert answer.exit_code == 0, answer.output

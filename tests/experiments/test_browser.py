@@ -3,6 +3,8 @@ import shutil
 import pytest
 from PIL import Image
 
+pytest.importorskip("jinja2", reason="experiments take the extra experiments")
+
 from experiments.driver import run_sweep
 from experiments.errors import ExperimentError
 from experiments.report import browser

@@ -4,6 +4,8 @@ import sys
 import pytest
 from typer.testing import CliRunner
 
+pytest.importorskip("hydra", reason="experiments take the extra experiments")
+
 from experiments import command_line
 from experiments.command_line import application, main
 from experiments.errors import ConfigError

@@ -2,6 +2,8 @@ import dataclasses
 
 import pytest
 
+pytest.importorskip("hydra", reason="experiments take the extra experiments")
+
 from experiments.compose import CONFIGS, from_data, known_configs, load_sweep
 from experiments.errors import ConfigError
 from experiments.plan import planned_trials

@@ -5,6 +5,8 @@ import time
 
 import pytest
 
+pytest.importorskip("duckdb", reason="experiments take the extra experiments")
+
 from experiments.command_line import main
 from experiments.compose import load_sweep
 from experiments.driver import run_sweep

@@ -3,6 +3,8 @@ import json
 import pytest
 import torch
 
+pytest.importorskip("hydra", reason="experiments take the extra experiments")
+
 from experiments.matcher.shards import PairStore, make_shards, stacked, tokens_of_pair
 from experiments.matcher.train import TrainConfig, assignment_loss, train, validate
 from experiments.matcher.weights import export_weights

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -247,11 +246,3 @@ def test_the_summary_compares_with_the_mean_of_the_baseline(tmp_path, capsys):
     with pytest.raises(SystemExit):
         summary.main([str(other.root)])
     assert "holds no finished trial of the variant scratch" in capsys.readouterr().err
-
-
-def test_the_lines_that_the_readme_prints_run(capsys):
-    text = (Path(__file__).resolve().parents[2] / "README.md").read_text(encoding="utf-8")
-    example = text.split("<!-- neural example -->\n```python\n")[1].split("```")[0]
-    assert len([line for line in example.splitlines() if line.strip()]) <= 12
-    exec(compile(example, "README.md", "exec"), {})
-    assert "torch.Size([2, 27])" in capsys.readouterr().out

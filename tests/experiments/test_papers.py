@@ -4,6 +4,8 @@ import math
 
 import pytest
 
+pytest.importorskip("jinja2", reason="experiments take the extra experiments")
+
 from experiments.compose import known_configs, load_sweep
 from experiments.driver import run_sweep
 from experiments.report.page import write_report

@@ -6,6 +6,8 @@ from html.parser import HTMLParser
 
 import pytest
 
+pytest.importorskip("plotly", reason="experiments take the extra experiments")
+
 from experiments.driver import run_sweep
 from experiments.errors import ConfigError, StoreError
 from experiments.plan import planned_trials

@@ -1,8 +1,11 @@
 import json
 
+import pytest
+
+pytest.importorskip("duckdb", reason="experiments take the extra experiments")
+
 import duckdb
 import pyarrow.parquet as pq
-import pytest
 
 from experiments.driver import run_sweep
 from experiments.errors import ConfigError

@@ -112,7 +112,7 @@ def test_other_programs_find_a_small_motion(method, package):
 
 def test_a_missing_program_skips_the_trial(monkeypatch, bench):
     monkeypatch.setitem(peers.PACKAGES, "cpd", "no_such_package")
-    with pytest.raises(SkippedTrial, match="no_such_package is not installed: pip install 'torchreg"):
+    with pytest.raises(SkippedTrial, match="no_such_package is not installed: pip install 'torchreg-articulated"):
         alignment.run(replace(SMALL, solver=replace(SMALL.solver, method="cpd")), bench)
     monkeypatch.setitem(peers.PACKAGES, "skeletor", "no_such_package")
     with pytest.raises(SkippedTrial, match="no_such_package is not installed"):

@@ -5,6 +5,8 @@ from html.parser import HTMLParser
 
 import pytest
 
+pytest.importorskip("jinja2", reason="experiments take the extra experiments")
+
 from experiments.errors import SkippedTrial
 from experiments.papers import command
 from experiments.papers.blocks import BLOCK_IDS, BLOCKS, PAIR_SETS

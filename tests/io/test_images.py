@@ -53,7 +53,7 @@ def test_depth_exr(tmp_path):
 def test_exr_without_its_extra_names_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     (tmp_path / "d.exr").write_bytes(b"v/1\x01")
-    with pytest.raises(MissingExtraError, match=r"torchreg\[exr\]"):
+    with pytest.raises(MissingExtraError, match=r"torchreg-articulated\[exr\]"):
         load_depth(tmp_path / "d.exr")
 
 

@@ -81,7 +81,7 @@ def test_missing_files_are_left_out_if_they_may_be(folder):
 def test_collada_needs_its_extra(folder, monkeypatch):
     (folder / "box.dae").write_bytes(b"<COLLADA/>")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match=r"a: .*torchreg\[urdf\]"):
+    with pytest.raises(MissingExtraError, match=r"a: .*torchreg-articulated\[urdf\]"):
         files(folder).read("box.dae", "a")
     assert files(folder, require=False).read("box.dae", "a") is None
 

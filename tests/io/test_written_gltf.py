@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
+from torchreg.geometry.upright import to_y_up
 from torchreg.io.gltf_morph import save_vertex_animation
 from torchreg.io.gltf_write import save_animated_parts, save_animated_skin
 from torchreg.io.points import load_points
@@ -413,3 +414,18 @@ def test_bad_input_is_named(frames, tmp_path, change, message):
     arguments["path"] = tmp_path / arguments["path"]
     with pytest.raises(InputError, match=message):
         save_vertex_animation(**arguments)
+
+
+@pytest.mark.parametrize("up", [(0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0)])
+def test_what_is_upright_becomes_gltfs_y(tmp_path, up):
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.1]]) + torch.tensor(up).float()
+    frames = torch.eye(4).expand(1, 1, 4, 4)
+    save_animated_skin(
+        tmp_path / "a.glb", points, torch.tensor([[0, 1, 2]]), torch.ones(3, 1), ["root"], [-1], frames[0], frames,
+        torch.zeros(1), up=up,
+    )  # fmt: skip
+    read = load_points(tmp_path / "a.glb").points
+    turn = to_y_up(up)
+    assert torch.allclose(turn[:3, :3] @ torch.tensor(up).double(), torch.tensor([0.0, 1.0, 0.0]).double())
+    assert float(torch.linalg.det(turn[:3, :3])) == 1.0
+    torch.testing.assert_close(read, (points.double() @ turn[:3, :3].T).to(read), atol=1e-6, rtol=0)

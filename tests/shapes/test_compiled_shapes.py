@@ -12,6 +12,11 @@ from torchreg.shapes.hand import Hand
 
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
 
+new_torch = pytest.mark.skipif(
+    tuple(int(word) for word in torch.__version__.split(".")[:2]) < (2, 10),
+    reason="shapes are compiled and exported by torch 2.10 and newer",
+)
+
 
 class Distance(nn.Module):
     """The distance of points from a shape, as a layer."""
@@ -60,12 +65,14 @@ def test_grids_are_compiled_as_one_graph(points, blend):
     torch.testing.assert_close(compiled(model)(points), model(points))
 
 
+@new_torch
 def test_skins_and_distances_are_compiled_as_one_graph(plain_hand, plain_hand_skin, points, poses):
     torch.testing.assert_close(compiled(plain_hand_skin)(poses), plain_hand_skin(poses))
     layer = Distance(plain_hand)
     torch.testing.assert_close(compiled(layer)(points, poses[0]), layer(points, poses[0]))
 
 
+@new_torch
 def test_the_forward_pass_of_a_shape_is_compiled_as_one_graph_and_trained(poses):
     hand = Hand().requires_grad_(True)
     assert_same(compiled(hand)(poses), hand(poses))
@@ -77,6 +84,7 @@ def test_the_forward_pass_of_a_shape_is_compiled_as_one_graph_and_trained(poses)
     torch.testing.assert_close(*gradients)
 
 
+@new_torch
 def test_exported_shapes_take_any_number_of_poses(plain_hand, poses):
     program = export(plain_hand, (poses,), dynamic_shapes=({0: Dim.AUTO},)).module()
     for count in (3, 2):
@@ -106,12 +114,14 @@ def test_exported_grids_take_any_number_of_points(points, blend):
         torch.testing.assert_close(program(points[:count]), model(points[:count]))
 
 
+@new_torch
 def test_exported_skins_take_any_number_of_poses(plain_hand_skin, poses):
     program = export(plain_hand_skin, (poses,), dynamic_shapes=({0: Dim.AUTO},)).module()
     for count in (3, 2):
         torch.testing.assert_close(program(poses[:count]), plain_hand_skin(poses[:count]))
 
 
+@new_torch
 def test_exported_distances_take_any_number_of_points(plain_hand, points, poses):
     layer = Distance(plain_hand)
     program = export(layer, (points, poses[0]), dynamic_shapes=({0: Dim.AUTO}, None)).module()

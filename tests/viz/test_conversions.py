@@ -94,7 +94,7 @@ def test_what_does_not_fit_is_refused(monkeypatch, sequence, spine):
         to_trimesh("mesh.ply")
     for name, convert in (("open3d", to_open3d), ("pyvista", to_pyvista)):
         monkeypatch.setitem(sys.modules, name, None)
-        with pytest.raises(MissingExtraError, match=rf"pip install 'torchreg\[{name}\]'"):
+        with pytest.raises(MissingExtraError, match=rf"pip install 'torchreg-articulated\[{name}\]'"):
             convert(BALL)
 
 

@@ -30,7 +30,7 @@ def spine():
     curves = ends[:, None] * torch.linspace(0.9, 0, 5)[:, None]
     turned = curves.roll(1, -1)
     own = torch.tensor([[True, True, True], [True, False, True]])
-    return SimpleNamespace(curves=torch.stack((curves, turned)), num_tips=3, own=own)
+    return SimpleNamespace(curves=torch.stack((curves, turned)), num_tips=3, own=own, up=None)
 
 
 def test_limbs_keep_their_colors_and_transferred_ones_are_dashed(spine):

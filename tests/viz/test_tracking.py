@@ -215,9 +215,9 @@ def test_the_moving_shape_begins_where_it_was_found(plain_hand, skin, tracked, t
     calls = []
     original = tracking.save_shape_animation
 
-    def noted(path, shape, poses, times, *, skin):
+    def noted(path, shape, poses, times, **options):
         calls.append((poses, times))
-        return original(path, shape, poses, times, skin=skin)
+        return original(path, shape, poses, times, **options)
 
     monkeypatch.setattr(tracking, "save_shape_animation", noted)
     path = save_track_gltf(tmp_path / "a.glb", plain_hand, late, skin=skin)

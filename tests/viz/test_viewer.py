@@ -9,8 +9,8 @@ import torch
 
 from torchreg.errors import InputError
 from torchreg.viz.result_scenes import result_scene
-from torchreg.viz.scene import Scene
-from torchreg.viz.viewer import SceneViewer, scene_html
+from torchreg.viz.scene import Cloud, Scene
+from torchreg.viz.viewer import SceneViewer, description, scene_html
 from torchreg.viz.viser_server import HOST
 
 pytest.importorskip("viser", reason="the viewer needs viser")
@@ -88,3 +88,16 @@ def test_one_file_holds_it_all(spine, tmp_path):
         scene_html(tmp_path / "spine.htm", scene)
     with pytest.raises(FileNotFoundError):
         scene_html(tmp_path / "nowhere" / "spine.html", scene)
+
+
+def test_pages_tell_what_they_show(tmp_path):
+    cloud = Cloud("points <b>", [torch.eye(3)], (0.0, 0.0, 1.0))
+    scene = Scene("a *title*", (cloud,), facts={"status": "converged"})
+    told = description(scene)
+    assert told.startswith("### a  title ")
+    assert "status: converged" in told
+    assert '<span style="color:#0000ff">&#9632;</span> points  b' in told
+    page = scene_html(tmp_path / "a.html", scene).read_text(encoding="utf-8")
+    assert "<title>a *title*</title>" in page
+    assert "status: converged" in page
+    assert "points &lt;b&gt;" in page

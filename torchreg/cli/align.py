@@ -300,10 +300,12 @@ class _AlignRun:
         import torch
 
         from torchreg.cli.outputs import shifted_to, tell_origin
+        from torchreg.geometry.upright import guess_up
         from torchreg.viz.gltf import save_shape_animation
 
         origin = self.results[0].origin
         poses = torch.stack([shifted_to(origin, result.pose) for result in self.results])
         shape, surface = self.fitted(self.results[-1])
-        save_shape_animation(path, shape, poses, skin=surface)
+        near = list(shape.keypoints(poses.to(shape.rest)).detach())
+        save_shape_animation(path, shape, poses, skin=surface, up=guess_up(near))
         tell_origin(path, origin)

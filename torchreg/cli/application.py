@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -15,6 +16,7 @@ from torchreg.cli.figure import figure
 from torchreg.cli.formats import formats
 from torchreg.cli.info import info
 from torchreg.cli.label import label
+from torchreg.cli.near_options import Command
 from torchreg.cli.pose import pose
 from torchreg.cli.register import register
 from torchreg.cli.spine import spine
@@ -56,15 +58,32 @@ def _options(
     """
 
 
-app.command(short_help="Align a shape to point clouds.")(align)
-app.command(short_help="Find a robot's base in a camera, or the size of a hand.")(calibrate)
-app.command(short_help="Run the main job on built-in data.")(demo)
-app.command(short_help="Draw the bending skin, or the picture of the README.")(figure)
-app.command(short_help="Show the formats of files that are read.")(formats)
-app.command(short_help="Show the degrees of freedom and the parts of a shape.")(info)
-app.command(short_help="Label point clouds with poses, to train networks on.")(label)
-app.command(short_help="Extract the moving skeleton of a sequence of meshes.")(spine)
-app.command(short_help="Pose a registered scan by dragging points.")(pose)
-app.command(short_help="Register two range scans of something that moves.")(register)
-app.command(short_help="Follow a shape through a sequence of clouds.")(track)
-app.command(short_help="Show a result in the browser, or write it as one HTML file.")(view)
+# Each command with a line on it and two examples, which end its help.
+_COMMANDS: tuple[tuple[Callable[..., None], str, tuple[str, str]], ...] = (
+    (align, "Align a shape to point clouds.",
+     ("align hand scan.ply --scale 0.001 -o result", "align hand depth/ --depth --intrinsics camera.json")),
+    (calibrate, "Find a robot's base in a camera, or the size of a hand.",
+     ("calibrate robot.urdf clouds/ --joints joints.csv -o base", "calibrate hand frames/ -o my_hand")),
+    (demo, "Run the main job on built-in data.", ("demo", "demo --frames 20 --seed 3 -o here")),
+    (figure, "Draw the bending skin, or the picture of the README.", ("figure bending", "figure readme -o readme.svg")),
+    (formats, "Show the formats of files that are read.", ("formats", "formats | grep -A 3 Cameras")),
+    (info, "Show the degrees of freedom and parts of a shape, or what a result holds.",
+     ("info robot.urdf --fixed-base", "info result.safetensors")),
+    (label, "Label point clouds with poses, to train networks on.",
+     ("label hand frames/ -o labels", "label hand frames.npz --start pose.json --trusted 0.8")),
+    (spine, "Extract the moving skeleton of a sequence of meshes.",
+     ("spine meshes/ -o spine.glb --table limbs.csv", "spine meshes/*.obj --movie spine.gif --up y")),
+    (pose, "Pose a registered scan by dragging points.",
+     ("pose moved.safetensors", "pose moved.safetensors --handle 0.1,0,2 --to 0.2,0,2 -o posed.ply")),
+    (register, "Register two range scans of something that moves.",
+     ("register a.ply b.ply -o moved.glb", "register --depth a.png b.png --intrinsics camera.json")),
+    (track, "Follow a shape through a sequence of clouds.",
+     ("track hand frames/ -o moving --poses poses.csv", "track hand depth/ --depth --intrinsics camera.json")),
+    (view, "Show a result, a shape or a scan in the browser, or write one HTML file.",
+     ("view moving.safetensors --data frames/", "view scan.obj --html scan.html")),
+)  # fmt: skip
+
+for _command, _help, _examples in _COMMANDS:
+    # The control character keeps the lines as they are.
+    _lines = "\n".join(f"  torchreg {example}" for example in _examples)
+    app.command(cls=Command, short_help=_help, epilog=f"\b\nExamples:\n{_lines}")(_command)

@@ -222,7 +222,7 @@ def _draw_over(picture: Path, frame: DepthFrame, vertices: Tensor, faces: Tensor
 
 
 def _summary(shape: ArticulatedShape, found: BaseCalibration, paths: Sequence[Path]) -> str:
-    """Return what was found in one line: how sure it is, which frames do not fit, which offsets were told."""
+    """Return what was found in one line: its uncertainty, outlier frames, offsets."""
     import math
 
     std = found.covariance.diagonal().sqrt()

@@ -46,8 +46,8 @@ Matcher = Annotated[
 Reach = Annotated[
     float | None,
     typer.Option(
-        help="What comes in through the border of the picture, as an arm, is cut off so far from its far end, metres; "
-        "0 keeps it. By default the length of a hand; other shapes keep all."
+        help="Crop what crosses the border of the picture, as a forearm, at this distance from its far end, metres; 0 "
+        "keeps it. By default the length of a hand; other shapes keep all."
     ),
 ]
 Seen = Annotated[

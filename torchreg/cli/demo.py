@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchreg.cli.outputs import Force, check_outputs
+from torchreg.cli.outputs import Force, check_outputs, counted
 from torchreg.cli.reporting import interruption, reporting
 
 if TYPE_CHECKING:
@@ -28,16 +28,20 @@ def demo(
 ) -> None:
     """Run the main job on built-in data: find a hand and follow it, as a noisy pair of cameras sees it, with outliers.
 
-    Writes poses.safetensors (read it with torchreg.load), hand.glb and tracking.gif. Ctrl-C ends the sequence early;
-    what was done is written.
+    Writes poses.json, poses by name of degree of freedom, metres and radians; track.safetensors, all that was found
+    (torchreg.load reads it, torchreg view shows it); hand.glb and tracking.gif. Ctrl-C ends the sequence early; what
+    was done is written.
     """
-    poses, scene, movie = output / "poses.safetensors", output / "hand.glb", output / "tracking.gif"
-    wanted = [poses, poses.with_suffix(".json"), *([movie] if picture else []), scene]
+    track, poses = output / "track.safetensors", output / "poses.json"
+    scene, movie = output / "hand.glb", output / "tracking.gif"
+    wanted = [poses, track, track.with_suffix(".json"), *([movie] if picture else []), scene]
     check_outputs([path for path in wanted if output.exists()], force)
     output.mkdir(parents=True, exist_ok=True)
 
     from tqdm import tqdm
 
+    from torchreg.cli.pose_files import write_poses
+    from torchreg.geometry.upright import guess_up
     from torchreg.shapes.hand import Hand
     from torchreg.tracking.demo import DEMO_FPS, run_demo
     from torchreg.viz.tracking import animate_track, save_track_gltf
@@ -45,11 +49,12 @@ def demo(
     with tqdm(total=frames, unit="frame", desc="tracking", leave=False) as bar:
         result = run_demo(frames, seed, on_frame=lambda done, planned: bar.update())
     count, hand = len(result.clouds), Hand()
-    result.save(poses)
+    result.save(track)
+    write_poses(poses, result.track)
     typer.echo(_speed(result))
     _print_tip_errors("all", result.tip_errors.flatten())
     _print_tip_errors("seen by the cameras", result.tip_errors[result.tips_seen])
-    save_track_gltf(scene, hand, result.track)
+    save_track_gltf(scene, hand, result.track, up=guess_up(list(result.track.keypoints)))
     if picture:
         with tqdm(total=count, unit="frame", desc="drawing", leave=False) as bar:
             animate_track(
@@ -64,7 +69,7 @@ def demo(
 def _speed(result: DemoResult) -> str:
     sizes, seconds = sorted(len(cloud) for cloud in result.clouds), result.track.seconds
     points = f"{sizes[0]} to {sizes[-1]} points" if sizes[0] < sizes[-1] else f"{sizes[0]} points"
-    text = f"{len(seconds)} frames of {points}: {float(seconds[0]):.1f} s to find the hand in the first"
+    text = f"{counted(len(seconds), 'frame')} of {points}: {float(seconds[0]):.1f} s to find the hand in the first"
     return text if len(seconds) == 1 else f"{text}, then {1 / float(seconds[1:].mean()):.1f} frames/s"
 
 

@@ -25,6 +25,12 @@ except ImportError:  # on Windows, where files that are written cannot be opened
 
 # Bytes without which no output is worth to be begun.
 _LEAST_SPACE = 256 * 1024
+# Endings of the files that lie beside a result, and of those that options name.
+_BESIDE = (".safetensors", ".json", ".glb", ".progress")
+_OTHER_KINDS = (
+    ".swc", ".npz", ".npy", ".csv", ".ply", ".obj", ".stl", ".off", ".pcd", ".xyz", ".gltf", ".gif", ".mp4", ".png",
+    ".pdf", ".svg", ".html", ".urdf",
+)  # fmt: skip
 PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 
 Force = Annotated[bool, typer.Option("--force", help="Overwrite outputs that exist.")]
@@ -38,10 +44,16 @@ def with_ending(path: None, endings: Sequence[str], *, add: bool = ...) -> None:
 @overload
 def with_ending(path: Path | None, endings: Sequence[str], *, add: bool = ...) -> Path | None: ...
 def with_ending(path: Path | None, endings: Sequence[str], *, add: bool = False) -> Path | None:
-    """Return the path, with the first ending added if ``add``; InputError if its ending is not allowed."""
-    if path is None or path.suffix.lower() in endings:
+    """Return the path of an output; InputError if its ending is not allowed.
+
+    With ``add`` the path names a result, whose files have several endings: one of these is exchanged for the first of
+    ``endings``, another kind of file's is refused, and a name without an ending, or with a dot in it, gets it.
+    """
+    if path is None or (ending := path.suffix.lower()) in endings:
         return path
-    if add:
+    if add and ending in _BESIDE:
+        return path.with_suffix(endings[0])
+    if add and ending not in _OTHER_KINDS:
         return path.with_name(path.name + endings[0])
     raise InputError(f"{path} must end in {', '.join(endings)}; rename the output")
 
@@ -57,6 +69,11 @@ def numbered(path: Path | None, index: int, count: int) -> Path | None:
     if path is None or count == 1:
         return path
     return path.with_name(f"{path.stem}_{index + 1:0{len(str(count))}}{path.suffix}")
+
+
+def counted(number: int, thing: str) -> str:
+    """Return a number with its noun, in the plural unless it is one."""
+    return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 def shifted_to(origin: Tensor | None, pose: Tensor) -> Tensor:

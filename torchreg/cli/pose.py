@@ -45,7 +45,7 @@ def pose(
 
     With --handle and --to once and for all; without them on a page in the browser, where points are clicked and
     dragged, pinned, undone, and kept as key poses. The page writes OUT.safetensors, OUT.ply and OUT.glb, numbered where
-    they exist, needs the extra torchreg[viewer], and is served to this machine alone until Ctrl-C.
+    they exist, needs the extra torchreg-articulated[viewer], and is served to this machine alone until Ctrl-C.
 
     Exit codes: 0; 2 for an error.
     """

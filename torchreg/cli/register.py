@@ -107,7 +107,7 @@ def register(
         _write_robot(scans, output, bones, grid, units, nan_policy, force=force, quiet=quiet)
         return
     source, target = _two(scans)
-    output = with_ending(output, (".glb", ".safetensors"))
+    output = with_ending(output, (".glb", ".safetensors"), add=True)
     result = output.with_suffix(".safetensors")
     scene = output if output.suffix.lower() == ".glb" else None
     weights, errors = with_ending(weights, (".ply",)), with_ending(errors, (".ply",))

@@ -14,8 +14,8 @@ from torchreg.errors import FormatError, InputError
 if TYPE_CHECKING:
     from torchreg.shapes.articulated import ArticulatedShape
 
-_HANDS = {"hand": "right", "hand-left": "left"}
-_PEOPLE = {"anny-body": "body", "anny-hand": "hand.R", "anny-hand-left": "hand.L"}
+HANDS = {"hand": "right", "hand-left": "left"}
+PEOPLE = {"anny-body": "body", "anny-hand": "hand.R", "anny-hand-left": "hand.L"}
 _HELP = (
     "hand, hand-left, a robot (.urdf) or a rigged character (.glb, .gltf); or a person of anny: anny-body, anny-hand, "
     "anny-hand-left."
@@ -50,26 +50,39 @@ def load_shape(
         "--parents": parents, "--package-dir": package_dirs or None, "--free-base/--fixed-base": free_base,
         "--skin": skin,
     }  # fmt: skip
-    if name not in _HANDS and name not in _PEOPLE and ending not in uses:
+    if name not in HANDS and name not in PEOPLE and ending not in uses:
         raise InputError(
-            f"SHAPE must be hand, hand-left or a file ending in .urdf, .glb or .gltf, or one of {', '.join(_PEOPLE)}; "
-            f"got {name!r}"
+            f"SHAPE must be hand, hand-left or a file ending in .urdf, .glb or .gltf, or one of {', '.join(PEOPLE)}; "
+            f"got {name!r}; {near_shape(name)}"
         )
     for option, value in given.items():
         if value is not None and option not in uses.get(ending, set()):
             raise InputError(f"{option} has no meaning for {name}; leave it out")
-    if name in _HANDS:
+    if name in HANDS:
         from torchreg.shapes.hand import Hand
 
-        return Hand(_HANDS[name])
+        return Hand(HANDS[name])
     from torchreg.shapes.articulated import ArticulatedShape
 
-    if name in _PEOPLE:
-        return ArticulatedShape.from_anny(_PEOPLE[name])
+    if name in PEOPLE:
+        return ArticulatedShape.from_anny(PEOPLE[name])
     if ending == ".urdf":
         return ArticulatedShape.from_urdf(name, package_dirs=package_dirs or (), free_base=free_base is not False)
     chosen = int(skin) if skin is not None and skin.isdecimal() else skin
     return ArticulatedShape.from_gltf(name, parents=None if parents is None else _read_parents(parents), skin=chosen)
+
+
+def near_shape(name: str) -> str:
+    """Return what to do with a name that is no shape's, as a hint."""
+    plain = name.lower().replace("_", "-")
+    if Path(name).suffix.lower() in (".pkl", ".npz") or plain.startswith(("smpl", "mano", "flame")):
+        return "arrays of SMPL or MANO are taken in Python, by ArticulatedShape.from_skinned_mesh"
+    if Path(name).suffix.lower() in (".xacro", ".sdf", ".mjcf", ".xml"):
+        return "turn it into a URDF first, as xacro does"
+    near = [hand for hand in HANDS if hand in plain.replace("right", "").strip("-") or plain in hand]
+    if plain in ("left", "hand-left", "left-hand", "lefthand"):
+        near = ["hand-left"]
+    return f"did you mean {near[0]!r}?" if near else "`torchreg info hand` shows what a shape is"
 
 
 def _read_parents(path: Path) -> dict[str, str | None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,8 +12,9 @@ import typer
 
 from torchreg.cli.align_options import NanPolicy, Scale
 from torchreg.cli.cameras import Calibration, Seen, check_used, load_calibration, seen_folder
-from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, numbered, tell_origin, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, counted, numbered, tell_origin, with_ending
 from torchreg.cli.reporting import interruption, reporting
+from torchreg.cli.view import UPS, Up, check_up
 
 if TYPE_CHECKING:
     from torchreg.capture.silhouette_frames import SilhouetteFrames
@@ -65,6 +67,7 @@ def spine(
     pictures: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Also draw each frame (frame_0000.png).")
     ] = None,
+    up: Up = None,
     prior: Annotated[
         Path | None,
         typer.Option(
@@ -102,7 +105,7 @@ def spine(
     swc, npz, table = with_ending(swc, (".swc",)), with_ending(npz, (".npz",)), with_ending(table, (".csv",))
     hulls = {"--calibration": calibration, "--screen": screen, "--resolution": resolution, "--seen": seen}
     check_used(silhouettes, "--silhouettes", hulls)
-    known = _read_prior(prior)
+    known, upright = _read_prior(prior), check_up(up) or _up_of(frames)
     if silhouettes:
         source = _silhouettes(frames, calibration, bool(screen), resolution, scale)
         count, names = len(source), source.names
@@ -123,6 +126,7 @@ def spine(
         if silhouettes:
             meshes = _hulls(source, seen_folder(seen, glb, force), progress, quiet)
         found = _extracted(meshes, known, config, workers, progress, quiet)
+        found = found if upright is None else replace(found, up=upright)
         found.save(result)
         _write(found, meshes, glb, curves, npz, fps)
         if table is not None:
@@ -143,7 +147,8 @@ def _kept(progress: Path | None) -> Iterator[None]:
         if progress is None:
             raise interruption("nothing was kept; --progress FOLDER keeps each frame that is done") from None
         done = len(list(progress.glob("frame_*.safetensors"))) if progress.is_dir() else 0
-        raise interruption(f"{done} frames are kept in {progress}; the same command goes on from there") from None
+        kept = f"{counted(done, 'frame')} {'is' if done == 1 else 'are'} kept in {progress}"
+        raise interruption(f"{kept}; the same command goes on from there") from None
 
 
 def _extracted(
@@ -195,6 +200,14 @@ def _read(frames: list[Path], scale: float, nan_policy: str) -> tuple[list[Trian
     return [as_surface(cloud, name)[0] for name, cloud in clouds], names
 
 
+def _up_of(frames: list[Path]) -> tuple[float, float, float] | None:
+    """Return what is upright in the format of the frames, None where it does not say."""
+    from torchreg.geometry.upright import Y_UP_ENDINGS
+
+    files = [path for frame in frames for path in (sorted(frame.iterdir())[:1] if frame.is_dir() else [frame])]
+    return UPS["y"] if any(path.suffix.lower() in Y_UP_ENDINGS for path in files) else None
+
+
 def _silhouettes(
     folders: list[Path], calibration: Path | None, screen: bool, resolution: int | None, scale: float
 ) -> SilhouetteFrames:
@@ -230,7 +243,7 @@ def _write(
     near, mesh = found.local(), meshes[found.reference]
     if found.origin is not None:
         mesh = TriangleMesh(mesh.vertices - found.origin, mesh.faces)
-    save_spine_animation(glb, near.model, mesh, found.reference, fps=fps)
+    save_spine_animation(glb, near.model, mesh, found.reference, fps=fps, up=found.up)
     tell_origin(glb, found.origin)
     for frame, path in enumerate(swc):
         if path is not None:
@@ -259,5 +272,6 @@ def _named(warning: str, names: tuple[str, ...]) -> str:
 
 def _summary(found: SpineSequence, glb: Path) -> str:
     agreeing = sum(pair[0] == pair[1] for pair in zip(found.own_topologies, found.topologies, strict=True))
-    counts = f"{found.num_tips} tips, {found.junctions.shape[1]} junctions, {len(found.graph)} limbs"
-    return f"{counts}; {agreeing} of {len(found.curves)} frames have this tree by themselves -> {glb}"
+    parts = (found.num_tips, "tip"), (found.junctions.shape[1], "junction"), (len(found.graph), "limb")
+    counts = ", ".join(counted(*part) for part in parts)
+    return f"{counts}; {agreeing} of {counted(len(found.curves), 'frame')} with this tree by themselves -> {glb}"

@@ -122,7 +122,7 @@ def track(
         Path | None,
         typer.Option(metavar="OUT.csv", help="Also write a table: frame, time, status, and the pose by name."),
     ] = None,
-    movie: Annotated[str, typer.Option(help="The moving picture: gif, mp4 (needs ffmpeg), or none.")] = "gif",
+    movie: Annotated[str, typer.Option(help="The moving picture: gif, mp4 (needs ffmpeg), none, or a path.")] = "gif",
     gltf: Annotated[bool, typer.Option("--gltf/--no-gltf", help="Whether to write the moving shape.")] = True,
     save_every: Annotated[int, typer.Option(min=1, help="Frames after which RESULT.progress is written anew.")] = 50,
     resume: Annotated[
@@ -229,7 +229,8 @@ def _files(
     """Return the outputs, after a check that they are writable, and whether an earlier run is resumed."""
     from torchreg._checks import check_choice
 
-    check_choice(movie, "--movie", MOVIES)
+    if Path(movie).suffix.lower() not in (".gif", ".mp4"):
+        check_choice(movie, "--movie", MOVIES)
     files = TrackFiles.at(with_ending(output, (".safetensors",), add=True), movie, gltf, overlay)
     resumed = resume and files.progress.exists()
     files.check(force or resumed)

@@ -7,7 +7,7 @@ import json
 import os
 import tempfile
 import zipfile
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ _RESULT, _STATE, _JOB = "result.safetensors", "state.safetensors", "job.json"
 # The entry of the job that holds the digests of the frames.
 _CONTENTS = "contents of frames"
 _MEMBERS = (_RESULT, "result.json", _STATE, "state.json", _JOB)
+# Fields of a `TrackResult` that belong to all frames.
+_NOT_BY_FRAME = {"origin", "shape"}
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,8 @@ def save_progress(path: str | os.PathLike[str], progress: TrackProgress) -> None
     content = io.BytesIO()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        save_result(progress.result, folder / _RESULT)
+        # The shape is the command's own, and may be large.
+        save_result(replace(progress.result, shape=None), folder / _RESULT)
         save_result(progress.state, folder / _STATE)
         (folder / _JOB).write_text(json.dumps({**progress.job, _CONTENTS: progress.contents}), encoding="utf-8")
         with zipfile.ZipFile(content, "w") as archive:
@@ -109,8 +112,8 @@ def first_frames(result: TrackResult, count: int) -> TrackResult:
     if not 0 <= count <= len(result.statuses):
         raise InputError(f"count must be from 0 to {len(result.statuses)}, got {count}")
     values = {item.name: getattr(result, item.name) for item in fields(result)}
-    cut = {name: value[:count] for name, value in values.items() if name != "origin"}
-    return TrackResult(**cut, origin=result.origin)
+    cut = {name: value[:count] for name, value in values.items() if name not in _NOT_BY_FRAME}
+    return replace(result, **cut)
 
 
 def join_frames(first: TrackResult, second: TrackResult) -> TrackResult:
@@ -128,6 +131,6 @@ def join_frames(first: TrackResult, second: TrackResult) -> TrackResult:
     def joined(one: Any, other: Any) -> Any:
         return torch.cat([one, other]) if isinstance(one, Tensor) else one + other
 
-    names = [item.name for item in fields(first) if item.name != "origin"]
+    names = [item.name for item in fields(first) if item.name not in _NOT_BY_FRAME]
     parts = {name: joined(getattr(first, name), getattr(second, name)) for name in names}
-    return TrackResult(**parts, origin=second.origin)
+    return replace(second, **parts)

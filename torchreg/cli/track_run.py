@@ -6,7 +6,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -48,7 +48,8 @@ class TrackFiles:
     @classmethod
     def at(cls, result: Path, movie: str, gltf: bool, overlay: Path | None) -> TrackFiles:
         """Return them for a result, and what else is asked for."""
-        moving = None if movie == "none" else result.with_suffix(f".{movie}")
+        named = Path(movie).suffix.lower() in (".gif", ".mp4")
+        moving = Path(movie) if named else None if movie == "none" else result.with_suffix(f".{movie}")
         scene = result.with_suffix(".glb") if gltf else None
         return cls(result, result.with_suffix(".progress"), moving, scene, overlay)
 
@@ -270,7 +271,7 @@ class TrackRun:
                 f"without --resume to begin anew"
             )
         self.tracker.state = self.state = progress.state
-        self.parts = [progress.result]
+        self.parts = [replace(progress.result, shape=self.tracker.shape)]
         self.report.usable = progress.result.statuses[-1].usable
         self.report.bar.update(done)
 
@@ -330,11 +331,12 @@ class TrackRun:
 
     def write(self, on_frame: Callable[[int, int], None]) -> None:
         """Write the moving shape and the moving picture, where asked for."""
+        from torchreg.geometry.upright import guess_up
         from torchreg.viz.tracking import animate_track, save_track_gltf
 
         result, shape = self.result, self.tracker.shape
         if self.files.gltf is not None and bool(result.poses.isfinite().all(-1).any()):
-            save_track_gltf(self.files.gltf, shape, result)
+            save_track_gltf(self.files.gltf, shape, result, up=guess_up(list(result.keypoints)))
             tell_origin(self.files.gltf, self.clouds.origin)
         if self.files.movie is not None:
             animate_track(

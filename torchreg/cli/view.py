@@ -1,16 +1,17 @@
-"""``torchreg view``: results of all systems in the browser, or as one HTML file."""
+"""``torchreg view``: results of all systems, shapes and scans in the browser, or as one HTML file."""
 
 from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from torchreg.cli.align_options import Scale
 from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
 from torchreg.cli.reporting import reporting
-from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Skin, load_shape
+from torchreg.cli.shape_argument import HANDS, FreeBase, PackageDir, Parents, Skin, load_shape, near_shape
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,18 +26,30 @@ UPS |= {f"-{name}": (-up[0], -up[1], -up[2]) for name, up in UPS.items()}
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Where to listen on 127.0.0.1; if taken, a later one.")]
 Browser = Annotated[bool, typer.Option("--browser/--no-browser", help="Whether to open a window of the browser.")]
 Up = Annotated[
-    str | None, typer.Option(help="What is upright: x, y, z, -x, -y or -z; by default -y before a camera, else z.")
+    str | None,
+    typer.Option(
+        help="What is upright: x, y, z, -x, -y or -z; by default -y before a camera, y of .obj, .glb and .gltf, "
+        "else told from what stands and moves."
+    ),
 ]
 
 
 @reporting
 def view(
     result: Annotated[
-        Path, typer.Argument(metavar="RESULT", help="What a command or Result.save wrote (.safetensors).")
+        Path,
+        typer.Argument(
+            metavar="WHAT",
+            help="A result (.safetensors); or hand, hand-left, a robot (.urdf), a rig or mesh (.glb, .gltf), a scan or "
+            "cloud of any format that `torchreg formats` shows.",
+        ),
     ],
     shape: Annotated[
         str | None,
-        typer.Option(help="What was aligned or tracked: hand, hand-left, a robot (.urdf) or a rig (.glb, .gltf)."),
+        typer.Option(
+            help="What was aligned or tracked: hand, hand-left, a robot (.urdf) or a rig (.glb, .gltf); by default the "
+            "one that the result keeps."
+        ),
     ] = None,
     data: Annotated[
         list[Path] | None,
@@ -48,6 +61,7 @@ def view(
     port: Port = 8080,
     browser: Browser = True,
     up: Up = None,
+    scale: Scale = 1.0,
     parents: Parents = None,
     package_dir: PackageDir = None,
     free_base: FreeBase = None,
@@ -55,16 +69,18 @@ def view(
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
-    """Show a result in the browser: shapes, clouds, bones, weights, spines, with a timeline where something moves.
+    """Show a result, a shape or a scan in the browser: with layers to switch, and a timeline where something moves.
 
-    The page is served to this machine alone, until Ctrl-C. Needs the extra: pip install 'torchreg[viewer]'.
+    The page is served to this machine alone, until Ctrl-C. Needs the extra: pip install 'torchreg-articulated[viewer]'.
 
     Exit codes: 0, also after Ctrl-C; 2 for an error.
     """
+    if result.suffix:
+        result.stat()  # a missing file is told before all else
     html = with_ending(html, (".html",))
     check_outputs([html], force)
     up_direction = check_up(up)
-    if shape is None and (parents or package_dir or skin or free_base is not None):
+    if shape is None and is_result(result) and (parents or package_dir or skin or free_base is not None):
         raise InputError("--parents, --package-dir, --skin and --free-base are about a --shape, which was not given")
     from torchreg.storage import load
     from torchreg.viz.result_scenes import result_scene
@@ -72,15 +88,55 @@ def view(
     from torchreg.viz.viser_server import import_viser
 
     import_viser()
-    found = load(result if result.suffix else result.with_suffix(".safetensors"))
+    found: Any
+    if is_result(result):
+        found = load(result if result.suffix else result.with_suffix(".safetensors"))
+    else:
+        found, guessed = _shown(result, scale, parents, package_dir, free_base, skin)
+        up_direction = up_direction or guessed
     model = None if shape is None else load_shape(shape, parents, package_dir, free_base, skin)
-    scene = with_up(result_scene(found, shape=model, data=_read(data or [])), up_direction)
+    scene = with_up(result_scene(found, shape=model, data=_read(data or [], scale)), up_direction)
     if html is not None:
         scene_html(html, scene)
         if not quiet:
             typer.echo(f"{scene.title} -> {html}")
         return
     _serve(scene, port, browser, quiet)
+
+
+def is_result(name: Path) -> bool:
+    """Return whether a name is that of a result, with or without its ending."""
+    if name.suffix.lower() in (".safetensors", ".json"):
+        return True
+    return not name.exists() and name.with_suffix(".safetensors").exists()
+
+
+def _shown(
+    name: Path,
+    scale: float,
+    parents: Path | None,
+    package_dir: list[Path] | None,
+    free_base: bool | None,
+    skin: str | None,
+) -> tuple[Any, tuple[float, float, float] | None]:  # fmt: skip
+    """Return a shape, mesh or cloud by name or file, and what is upright in its format."""
+    from torchreg.errors import FormatError
+    from torchreg.geometry.upright import Y_UP_ENDINGS
+    from torchreg.io.points import load_points
+
+    ending = name.suffix.lower()
+    up = UPS["y"] if ending in Y_UP_ENDINGS else None
+    if str(name) in HANDS or ending == ".urdf":
+        return load_shape(str(name), parents, package_dir, free_base, skin), up
+    if ending in (".glb", ".gltf"):
+        try:
+            return load_shape(str(name), parents, package_dir, free_base, skin), up
+        except FormatError:  # no rig, but maybe a mesh
+            if parents is not None or skin is not None:
+                raise
+    if not name.exists() and not ending:
+        raise InputError(f"there is no result {name}.safetensors, and no file {name}; {near_shape(str(name))}")
+    return load_points(name, scale=scale), up
 
 
 def check_up(up: str | None) -> tuple[float, float, float] | None:
@@ -124,7 +180,7 @@ def _serve(scene: Scene, port: int, browser: bool, quiet: bool) -> None:
         wait_for_interrupt(viewer.url, browser, quiet)
 
 
-def _read(paths: list[Path]) -> list[Tensor | TriangleMesh]:
+def _read(paths: list[Path], scale: float = 1.0) -> list[Tensor | TriangleMesh]:
     """Return the meshes or clouds of files, or the frames of a folder or one .npz, in their order."""
     from torchreg.geometry.mesh import TriangleMesh
     from torchreg.io.frames import load_frames
@@ -132,10 +188,10 @@ def _read(paths: list[Path]) -> list[Tensor | TriangleMesh]:
 
     if not paths:
         return []
-    frames = load_frames(paths[0] if len(paths) == 1 else paths)
+    frames = load_frames(paths[0] if len(paths) == 1 else paths, scale=scale)
     if any(path.suffix.lower() == ".npz" for path in paths):
         return list(frames)
-    clouds = [load_points(name) for name in frames.names]
+    clouds = [load_points(name, scale=scale) for name in frames.names]
     return [
         cloud.points if cloud.faces is None or not len(cloud.faces) else TriangleMesh(cloud.points, cloud.faces)
         for cloud in clouds

@@ -376,7 +376,7 @@ def _archive(clouds: list[Tensor]) -> bytes:
     for frame, cloud in zip(points, clouds, strict=True):
         frame[: len(cloud)] = cloud.to(torch.float64).numpy()
     stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, points=points, counts=counts)
+    np.savez(stream, points=points, counts=counts)
     return stream.getvalue()
 
 

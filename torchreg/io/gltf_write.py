@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.upright import Direction, to_y_up
 from torchreg.io.gltf_builder import (
     DEFAULT_COLOR,
     Array,
@@ -51,6 +52,7 @@ def save_animated_skin(
     colors: Tensor | None = None,
     *,
     most_weights: int | None = None,
+    up: Direction | None = None,
 ) -> Path:
     """Return the path of a .glb file with a mesh that linear blend skinning moves over time.
 
@@ -74,6 +76,7 @@ def save_animated_skin(
         normals: (V, 3) at the vertices; zero rows become +z, which viewers need to be of unit length.
         colors: (V, 3) or (V, 4) in [0, 1].
         most_weights: 4 or 8, or None to decide by the weights.
+        up: the axis that is upright, turned to glTF's y by the root node; left as it is by default.
 
     Returns:
         The path written.
@@ -110,7 +113,7 @@ def save_animated_skin(
         if parents[index] >= 0:
             document.gltf.nodes[joint_nodes[parents[index]]].children.append(joint_nodes[index])
     # Skins with several roots need one common ancestor; the position of a skinned mesh is that of its joints alone.
-    armature = document.add_node("armature", None)
+    armature = document.add_node("armature", None if up is None else to_y_up(up).numpy())
     document.gltf.nodes[armature].children = [joint_nodes[index] for index in order if parents[index] < 0]
     skin = pygltflib.Skin(name="skin", joints=joint_nodes, skeleton=armature)
     skin.inverseBindMatrices = document.add(_column_major(inverse_bind))

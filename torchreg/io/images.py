@@ -325,7 +325,9 @@ def _read_exr(content: bytes, file: Path) -> Any:
     try:
         import OpenEXR
     except ImportError as error:
-        raise MissingExtraError(f"{file}: EXR files take the extra exr: pip install 'torchreg[exr]'") from error
+        raise MissingExtraError(
+            f"{file}: EXR files take the extra exr: pip install 'torchreg-articulated[exr]'"
+        ) from error
     try:
         with OpenEXR.File(str(file), header_only=True) as header:
             first, last = (corner.tolist() for corner in header.header()["dataWindow"])

@@ -89,7 +89,10 @@ class MeshFiles:
         kind = _FORMATS.get(found.suffix.lower())
         if kind is not None and kind.module is not None and importlib.util.find_spec(kind.module[0]) is None:
             self._missing(
-                MissingExtraError(f"{what}: reading COLLADA mesh {found} needs pycollada; install torchreg[urdf]")
+                MissingExtraError(
+                    f"{what}: COLLADA mesh {found} needs pycollada; install it with: "
+                    "pip install 'torchreg-articulated[urdf]'"
+                )
             )
             return None
         if found not in self._cache:

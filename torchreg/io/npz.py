@@ -8,7 +8,7 @@ import math
 import os
 import zipfile
 from collections.abc import Mapping, Sequence
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 import torch
@@ -191,7 +191,7 @@ def write_npz(cloud: RawCloud) -> bytes:
     """Return an archive with the arrays of a cloud."""
     arrays = {name: getattr(cloud, name) for name in ("points", "normals", "colors", "faces")}
     stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **{name: array for name, array in arrays.items() if array is not None})
+    np.savez(stream, **{name: array for name, array in arrays.items() if array is not None})
     return stream.getvalue()
 
 
@@ -210,5 +210,6 @@ def save_arrays(path: str | os.PathLike[str], arrays: Mapping[str, Tensor]) -> N
     if file.suffix.lower() != ".npz":
         raise InputError(f"path must end in .npz, got {file.name!r}; rename the output file")
     stream = io.BytesIO()
-    np.savez(stream, allow_pickle=False, **{name: value.detach().cpu().numpy() for name, value in arrays.items()})
+    plain: dict[str, Any] = {name: value.detach().cpu().numpy() for name, value in arrays.items()}
+    np.savez(stream, **plain)
     write_atomic(file, stream.getvalue())

@@ -139,7 +139,7 @@ def register_sequence(
     From the reference outward, the reference as moved to one frame is aligned with the next, its points predicted from
     their last step, and a few bones are fitted to that alignment: every frame is reached by deforming the reference
     itself, so that errors do not pile up. Then labels, weights and the motions of all frames are solved together, from
-    the alignments; bones that share weight pay for turning about more than one axis over the frames.
+    the alignments; a hinge prior penalizes rotation between bones that share weight about more than one axis.
 
     Args:
         scans: T scans of one thing, two at least, in one unit and frame; motions between neighbors as in `register`.

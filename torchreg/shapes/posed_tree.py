@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import difflib
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from torchreg._checks import as_float_tensor, check_choice, check_shape
-from torchreg.errors import ModelError
+from torchreg.errors import InputError, ModelError
 from torchreg.geometry.kinematic_tree import KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import left_jacobian, so3_exp, wrap_rotation_vector
@@ -107,6 +108,19 @@ class PosedTree(nn.Module):
         offsets[:, :3, 3] *= self._offset_scales().detach().unsqueeze(-1)
         return build_chain(tree, [names[index] for index in range(len(tree))], offsets)
 
+    def __repr__(self) -> str:
+        """Return three lines: what it is, its degrees of freedom, its size at rest."""
+        joints = self.num_dofs - BASE_DOFS
+        ends = self.keypoints(self.rest_pose()).detach()
+        size = float((ends.amax(0) - ends.amin(0)).norm())
+        first = ", ".join(self.dof_names[BASE_DOFS : BASE_DOFS + 3])
+        kind = f"{str(self.rest.dtype).removeprefix('torch.')} on {self.rest.device}"
+        return (
+            f"{type(self).__name__}: {self.num_parts} parts, {self.num_dofs} degrees of freedom\n"
+            f"  {BASE_DOFS} of the base, {joints} of joints{f': {first}, ...' if first else ''}\n"
+            f"  {size:.3g} m across at rest, {kind}"
+        )
+
     def rest_pose(self) -> Tensor:
         """Return the pose (num_dofs,) with every joint at zero, or at the limit nearest to zero."""
         return self.rest.clone()
@@ -116,6 +130,37 @@ class PosedTree(nn.Module):
         pose = as_float_tensor(pose, name, like=self.rest)
         check_shape(pose, name, (self.num_dofs,), batch=True)
         return pose
+
+    def pose_to_dict(self, pose: Tensor) -> dict[str, Any]:
+        """Return a pose (num_dofs,) as numbers by name of degree of freedom, metres and radians.
+
+        Of poses (..., num_dofs) a dictionary of tensors (...).
+        """
+        pose = as_float_tensor(pose, "pose")  # in its own precision: far from the origin that matters
+        check_shape(pose, "pose", (self.num_dofs,), batch=True)
+        columns = pose.tolist() if pose.ndim == 1 else pose.unbind(-1)
+        return dict(zip(self.dof_names, columns, strict=True))
+
+    def pose_from_dict(self, values: Mapping[str, Tensor | float]) -> Tensor:
+        """Return the pose (..., num_dofs) of values by name of degree of freedom; what is not named stays at rest.
+
+        Args:
+            values: numbers or tensors (...) that broadcast, metres and radians.
+
+        Raises:
+            InputError: if a name is unknown; it tells the nearest one.
+
+        Differentiable: in the values.
+        """
+        for name in values:
+            if name not in self.dof_names:
+                near = difflib.get_close_matches(str(name), self.dof_names, 1)
+                hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(self.dof_names)}"
+                raise InputError(f"the shape has no degree of freedom {name!r}; {hint}")
+        given = {name: as_float_tensor(value, name, like=self.rest) for name, value in values.items()}
+        rest = self.rest_pose().unbind()
+        columns = [given.get(name, rest[index]) for index, name in enumerate(self.dof_names)]
+        return torch.stack(torch.broadcast_tensors(*columns), dim=-1)
 
     def clamp(self, pose: Tensor) -> Tensor:
         """Return the pose with joints moved to their nearest limit and the base rotation wrapped to at most pi."""
@@ -281,6 +326,13 @@ class PosedTree(nn.Module):
     def _offset_scales(self) -> Tensor:
         """Return the factors (F,) on the length of each frame's offset from its parent."""
         return nn.functional.pad(self.log_length_scales, (1, 0)).index_select(0, self._owners).exp()
+
+
+def named_pose(shape: PosedTree | None, pose: Tensor) -> dict[str, Any]:
+    """Return poses (..., num_dofs) of a result by name of degree of freedom; InputError where it keeps no shape."""
+    if shape is None:
+        raise InputError("this result keeps no shape; name its poses with shape.pose_to_dict(...)")
+    return shape.pose_to_dict(pose)
 
 
 def frozen(value: Tensor) -> nn.Parameter:

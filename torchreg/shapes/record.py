@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +12,8 @@ from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.spec import ShapeSpec
 
+# Bytes of a mesh beyond which the files of results keep the solids alone.
+_MOST_SURFACE = 4_000_000
 # Tensors of a record that earlier releases did not have: nu and sharpness.
 _NUM_NEW = 2
 
@@ -116,6 +118,28 @@ def build_shape(record: ShapeRecord) -> ArticulatedShape:
             if isinstance(tensor, nn.Parameter) and not is_early:
                 tensor.requires_grad_(learnable)
     return shape
+
+
+def record_kept_shape(shape: ArticulatedShape | None) -> ShapeRecord | None:
+    """Return a shape as the file of a result keeps it: without its mesh where that takes more than 4 MB.
+
+    None for None, and for a shape of a class that this release does not know how to build.
+    """
+    if shape is None or type(shape) not in (Hand, ArticulatedShape):
+        return None
+    record = record_shape(shape)
+    surface = record.spec.surface if isinstance(record.spec, ShapeSpec) else None
+    if surface is None or isinstance(record.spec, HandSpec):
+        return record
+    held = (surface.vertices, surface.faces, surface.weights)
+    if sum(tensor.numel() * tensor.element_size() for tensor in held) <= _MOST_SURFACE:
+        return record
+    return replace(record, spec=replace(record.spec, surface=None))
+
+
+def build_kept_shape(record: ShapeRecord | None) -> ArticulatedShape | None:
+    """Return the shape that the file of a result keeps, if it keeps one."""
+    return None if record is None else build_shape(record)
 
 
 def _tensors(shape: ArticulatedShape) -> list[Tensor]:

@@ -15,6 +15,7 @@ from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
+from torchreg.geometry.upright import guess_up
 from torchreg.result import Status
 from torchreg.spines.frame_skeletons import FrameSkeleton, skeletonize_frames
 from torchreg.spines.labeled_tree import LimbGraph, most_frequent_splits, skeleton_splits
@@ -177,6 +178,7 @@ def _joined_spine(
         reference=names.reference,
         topologies=tuple(topologies),
         own_topologies=tuple(skeleton.topology for skeleton in skeletons),
+        up=guess_up([surface.vertices for surface in surfaces]),
         **_told([_notes(*rows) for rows in zip(skeletons, told, shown, own, strict=True)]),
     )
 

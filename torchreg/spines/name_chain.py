@@ -1,4 +1,4 @@
-"""Names of tips over a whole sequence at once: the most probable chain of assignments, and how sure it is."""
+"""Names of tips over a whole sequence at once: the most probable chain of assignments, and the posterior of each."""
 
 from __future__ import annotations
 

@@ -59,6 +59,7 @@ class SpineSequence(Result):
             coordinates; None elsewhere.
         confidence: (T, K) probability, given all frames, that a name is right: that of the tip, or where the frame's
             own skeleton lacks the tip, that it does. None in files of earlier releases.
+        up: the likely upright direction, for pictures, see `geometry.upright.guess_up`.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -82,6 +83,7 @@ class SpineSequence(Result):
     warnings: tuple[str, ...]
     origin: Tensor | None = None
     confidence: Tensor | None = None
+    up: tuple[float, float, float] | None = None
 
     def moved(self, origin: Tensor) -> SpineSequence:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""

@@ -23,7 +23,7 @@ class EvidenceLimits:
 
     min_regained: float = 0.12  # inliers after a loss
     min_inliers: float = 0.5  # inliers after a large deviation, and inlier ratio in reach
-    max_residual: float = 1.8  # beyond, the surface was drawn to another object
+    max_residual: float = 1.8  # beyond, the surface was fitted to another object
     doubtful_residual: float = 1.5  # of a doubtful fit, and of one after a loss, when other objects are as near
     fine_residual: float = 0.006  # residual, as a share of the size, that noise and model error explain anyhow
     new_share: float = 0.012  # new unexplained data, as a share of the inliers

@@ -75,7 +75,7 @@ def _frame_result(
     inliers = distances.abs() < fitter.inlier_distance
     return FrameResult(
         distances=distances, inliers=inliers, inlier_ratio=int(inliers.sum()) / max(1, int(frame.finite.sum())),
-        history=(), frame=state.frame - 1, time=state.time, **values,
+        history=(), frame=state.frame - 1, time=state.time, shape=fitter.shape, **values,
     )  # fmt: skip
 
 
@@ -92,4 +92,5 @@ def track_result(results: Sequence[FrameResult], seconds: Sequence[float]) -> Tr
         statuses=tuple(result.statuses[0] for result in results),
         acquired=tuple(result.acquired for result in results),
         origin=results[-1].origin,
+        shape=results[-1].shape,
     )

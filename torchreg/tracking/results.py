@@ -9,8 +9,11 @@ from typing import ClassVar
 from torch import Tensor
 
 from torchreg.alignment.results import AlignResult
-from torchreg.result import Result, Status, formerly
+from torchreg.result import Result, Status, formerly, stored_as
+from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
+from torchreg.shapes.posed_tree import named_pose
+from torchreg.shapes.record import build_kept_shape, record_kept_shape
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +64,7 @@ class TrackResult(Result):
         statuses: how each frame ended.
         acquired: what led to each pose, see `FrameResult`.
         origin: see `AlignResult`.
+        shape: that was followed, see `AlignResult`.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -78,6 +82,12 @@ class TrackResult(Result):
     statuses: tuple[Status, ...]
     acquired: tuple[str, ...]
     origin: Tensor | None = None
+    shape: ArticulatedShape | None = field(default=None, metadata=stored_as(record_kept_shape, build_kept_shape))
+
+    @property
+    def named_poses(self) -> dict[str, Tensor]:
+        """The poses by name of degree of freedom, (T,) each, metres and radians."""
+        return named_pose(self.shape, self.poses)
 
     def moved(self, origin: Tensor) -> TrackResult:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
@@ -112,7 +122,7 @@ class TrackState(Result):
         cool_down: frames before the next search.
         failed_searches: searches in a row after which the fit was still doubtful.
         pending_checks: how often a pose found by a search everywhere is still to be compared with another search.
-        seed: of all that is drawn.
+        seed: of all random draws.
         origin: (3,) float64 about which all this is, where clouds lie far from that of coordinates; None elsewhere.
     """
 

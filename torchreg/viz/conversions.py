@@ -109,7 +109,9 @@ def _extra(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise MissingExtraError(f"this needs {name}; install it with: pip install 'torchreg[{name}]'") from error
+        raise MissingExtraError(
+            f"this needs {name}; install it with: pip install 'torchreg-articulated[{name}]'"
+        ) from error
 
 
 def _cloud(value: Any, frame: int) -> PointCloud:

@@ -18,13 +18,13 @@ from torchreg.errors import InputError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh, interpolate
 from torchreg.geometry.rigid import rigid_matrix
+from torchreg.geometry.upright import is_before_camera
 from torchreg.geometry.visibility import View, aim, rasterize, visible_points
 from torchreg.io.atomic import write_atomic
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.skin import BendingSkin, LinearBlendSkin
-from torchreg.viz.scene import is_before_camera
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -168,10 +168,18 @@ def watch(
             away = float(middle.norm())
             camera = points.new_tensor([0.35 * away, -0.25 * away, 0.0])
         else:
-            camera = middle + 3 * length * nn.functional.normalize(points.new_tensor([0.6, -1.0, 0.5]), dim=0)
-            up = points.new_tensor([0.0, 0.0, 1.0]) if up is None else up
+            up = points.new_tensor([0.0, 0.0, 1.0]) if up is None else as_float_tensor(up, "up", like=points)
+            camera = middle + 3 * length * _from_before(up)
     width, height = size
     return aim(points, camera, up=up, size=(_OVERSAMPLING * width, _OVERSAMPLING * height), margin=margin)
+
+
+def _from_before(up: Tensor) -> Tensor:
+    """Return the direction (3,) from which an upright thing is seen: from before, a little to the right and above."""
+    along_z = -1.0 if float(up[1]) < 0 else 1.0  # a camera's y points down, and it looks along z
+    front = up.new_tensor([0.0, -1.0, 0.0] if abs(float(up[2])) > 0.5 else [0.0, 0.0, along_z])
+    right = torch.linalg.cross(up, front)
+    return nn.functional.normalize(0.6 * right + front + 0.5 * up, dim=0)
 
 
 def new_figure(width: int, height: int, columns: int = 1) -> tuple[Figure, list[Axes]]:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_positive, check_shape
 from torchreg.datasets.hand import faces_of, surface_skin
 from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.upright import Direction
 from torchreg.io.gltf_write import save_animated_skin
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
@@ -23,6 +24,7 @@ def save_shape_animation(
     *,
     fps: float = 20.0,
     skin: LinearBlendSkin | None = None,
+    up: Direction | None = None,
 ) -> Path:
     """Return the path of a .glb file in which the shape's skinned surface moves through poses.
 
@@ -36,6 +38,7 @@ def save_shape_animation(
         times: (T,) seconds, not negative, strictly increasing; one frame every 1 / fps by default.
         fps: frames per second where no times are given.
         skin: the surface, with faces; by default `surface_skin`, which is made anew at every call.
+        up: the axis that is upright, turned to glTF's y; left as it is by default.
 
     Raises:
         InputError: if sizes do not fit, the suffix is not .glb or the skin has no faces.
@@ -61,4 +64,5 @@ def save_shape_animation(
         joint_transforms=moving,
         times=seconds,
         normals=TriangleMesh(skin.points, faces).vertex_normals(),
+        up=up,
     )

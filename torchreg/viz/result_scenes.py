@@ -1,10 +1,11 @@
-"""Scenes of results: of an alignment, a tracked sequence, registered scans, a spine."""
+"""Scenes of results - an alignment, a tracked sequence, registered scans, a spine - and of shapes, scans and clouds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import singledispatch
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,10 +15,11 @@ from torchreg.alignment.results import AlignResult, Calibration, PoseStarts
 from torchreg.datasets.hand import faces_of
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import transform_points
+from torchreg.io.points import PointCloud
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.results import ScanRegistration, SequenceRegistration
-from torchreg.result import Result
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.spines.results import SpineSequence
@@ -49,13 +51,20 @@ class _SceneStyle:
 _STYLE = _SceneStyle()
 
 
-def result_scene(result: Result, *, shape: ArticulatedShape | None = None, data: Data = ()) -> Scene:
-    """Return the scene of a result.
+def counted(number: int, thing: str) -> str:
+    """Return a number with its noun, in the plural unless it is one."""
+    return f"{number:,} {thing}{'' if number == 1 else 's'}"
+
+
+def result_scene(result: Any, *, shape: ArticulatedShape | None = None, data: Data = ()) -> Scene:
+    """Return the scene of a result, or of a shape at rest, a mesh, a scan or a cloud.
 
     Args:
         result: of any system: an `AlignResult`, `TrackResult`, `DemoResult`, `PoseStarts`, `Calibration`,
-            `ScanRegistration`, `SequenceRegistration` or `SpineSequence`.
-        shape: that was aligned or tracked; without it keypoints and registered points alone are shown.
+            `ScanRegistration`, `SequenceRegistration` or `SpineSequence`; or an `ArticulatedShape`, `TriangleMesh`,
+            `RangeScan`, `PointCloud` or tensor (N, 3).
+        shape: that was aligned or tracked, by default the one that the result keeps; where there is none, keypoints and
+            registered points alone are shown.
         data: measurements, one cloud or mesh per frame: the clouds of alignments and sequences, the target of a
             registration, the surfaces of a spine; optional.
 
@@ -65,11 +74,15 @@ def result_scene(result: Result, *, shape: ArticulatedShape | None = None, data:
     """
     if shape is not None and isinstance(result, (ScanRegistration, SequenceRegistration, SpineSequence)):
         raise InputError(f"shape has no meaning for a {type(result).__name__}; leave it out")
+    if shape is None and isinstance(result, (AlignResult, TrackResult, PoseStarts)):
+        shape = result.shape
+    if shape is None and isinstance(result, DemoResult):
+        shape = result.track.shape
     return _scene(result, shape, data)
 
 
 @singledispatch
-def _scene(result: Result, shape: ArticulatedShape | None, data: Data) -> Scene:
+def _scene(result: Any, shape: ArticulatedShape | None, data: Data) -> Scene:
     raise InputTypeError(f"result must be one that can be shown, not a {type(result).__name__}")
 
 
@@ -86,7 +99,21 @@ def _align_scene(result: AlignResult, shape: ArticulatedShape | None, data: Data
     if clouds:
         paints = [inlier_paint(mask, share) for mask, share in zip(masks, posterior, strict=True)]
         layers.append(_cloud("data", clouds, paints))
-    return Scene(f"alignment: {', '.join(sorted({status.value for status in result.statuses}))}", tuple(layers))
+    title = f"alignment: {', '.join(sorted({status.value for status in result.statuses}))}"
+    return Scene(title, tuple(layers), facts=_align_facts(result))
+
+
+def _align_facts(result: AlignResult) -> dict[str, str]:
+    """Return confidence, inliers and residual of a single alignment in words."""
+    if isinstance(result.status, tuple):
+        return {}
+    near = result.distances[result.inliers]
+    facts = {"inliers": f"{len(near):,} of {len(result.distances):,}"}
+    if len(near):
+        facts["residual"] = f"{1e3 * float(near.square().mean().sqrt()):.1f} mm"
+    if result.confidence is not None:
+        facts["confidence"] = f"{float(result.confidence):.2f}"
+    return facts | ({"doubtful": str(result.doubt)} if result.doubt else {})
 
 
 @_scene.register
@@ -98,7 +125,9 @@ def _track_scene(result: TrackResult, shape: ArticulatedShape | None, data: Data
         layers.append(
             _cloud("data", clouds, [_nearness(shape, *pair) for pair in zip(clouds, result.poses, strict=True)])
         )
-    return Scene(f"{len(result.poses)} tracked frames", tuple(layers), result.times)
+    kinds = [status.value for status in result.statuses]
+    facts = {kind: counted(kinds.count(kind), "frame") for kind in sorted(set(kinds))}
+    return Scene(counted(len(result.poses), "tracked frame"), tuple(layers), result.times, facts=facts)
 
 
 @_scene.register
@@ -151,8 +180,11 @@ def _registration_scene(result: ScanRegistration, shape: None, data: Data) -> Sc
     for target in data[:1]:
         points, over = (target.vertices, target.faces) if isinstance(target, TriangleMesh) else (target, None)
         layers.append(_scan("target", points, over, _STYLE.target, opacity=0.5))
-    title = f"{result.model.num_bones} bones, {float(result.matched.float().mean()):.0%} of the points match"
-    return Scene(title, tuple(layers), torch.linspace(0, 2, _STYLE.num_steps))
+    title = f"{counted(result.model.num_bones, 'bone')}, {float(result.matched.float().mean()):.0%} of the points match"
+    facts = {"status": result.status.value, "distance, median": f"{float(errors.median()):.3g}"}
+    if result.confidence is not None:
+        facts["confidence"] = f"{result.confidence:.2f}"
+    return Scene(title, tuple(layers), torch.linspace(0, 2, _STYLE.num_steps), facts=facts)
 
 
 @_scene.register
@@ -167,7 +199,7 @@ def _sequence_scene(result: SequenceRegistration, shape: None, data: Data) -> Sc
         layers.append(_cloud("fused, by frame", [result.fused], [hue], visible=False))
     if clouds:
         layers.append(_cloud("scans", clouds, _STYLE.target))
-    return Scene(f"{len(result.deformed)} scans, {result.model.num_bones} bones", tuple(layers))
+    return Scene(f"{counted(len(result.deformed), 'scan')}, {counted(result.model.num_bones, 'bone')}", tuple(layers))
 
 
 @_scene.register
@@ -178,7 +210,39 @@ def _spine_scene(result: SpineSequence, shape: None, data: Data) -> Scene:
     if data and len(data) != len(result.curves):
         raise InputError(f"data must hold one surface per frame ({len(result.curves)}), got {len(data)}")
     layers += _surface_frames(data)
-    return Scene(f"{result.num_tips} tips, {len(result.graph)} limbs", tuple(layers), result.times)
+    return Scene(
+        f"{counted(result.num_tips, 'tip')}, {counted(len(result.graph), 'limb')}",
+        tuple(layers),
+        result.times,
+        result.up,
+    )
+
+
+@_scene.register
+def _shape_scene(result: ArticulatedShape, shape: None, data: Data) -> Scene:
+    title = f"{counted(result.num_parts, 'part')}, {result.num_dofs} degrees of freedom"
+    return Scene(title, tuple(_shape_layers(result, result.rest_pose()[None])))
+
+
+@_scene.register
+def _mesh_scene(result: TriangleMesh, shape: None, data: Data) -> Scene:
+    title = f"{result.num_vertices:,} vertices, {counted(len(result.faces), 'triangle')}"
+    return Scene(title, (_scan("mesh", result.vertices, result.faces, _STYLE.body),))
+
+
+@_scene.register(RangeScan)
+@_scene.register(PointCloud)
+def _scan_scene(result: RangeScan | PointCloud, shape: None, data: Data) -> Scene:
+    colors = getattr(result, "colors", None)
+    paint = _STYLE.target if colors is None else colors.detach().cpu().float()
+    triangles = "" if result.faces is None or not len(result.faces) else f", {counted(len(result.faces), 'triangle')}"
+    title = f"{counted(len(result.points), 'point')}{triangles}"
+    return Scene(title, (_scan("scan", result.points, result.faces, paint),))
+
+
+@_scene.register
+def _points_scene(result: Tensor, shape: None, data: Data) -> Scene:
+    return Scene(counted(len(result), "point"), (_cloud("points", [result], _STYLE.target),))
 
 
 def _surface_frames(data: Data) -> list[Layer]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_shape
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.upright import Direction, guess_up, is_before_camera
 
 Color = tuple[float, float, float]
 
@@ -22,17 +23,12 @@ FIELD_OF_VIEW = math.radians(45)
 class _CameraRule:
     """Choice of the camera."""
 
-    far_share: float = 0.75  # points were measured from the origin if their middle is farther, in diagonals
     one_sided: float = 0.3  # surfaces were seen from one side if the mean of their normals is longer
     num_points: int = 4000  # from which the bounds of the scene are taken
+    num_frames: int = 24  # from which the upright direction is told
 
 
 _CAMERA = _CameraRule()
-
-
-def is_before_camera(lower: Tensor, upper: Tensor) -> bool:
-    """Return whether points with bounds (3,) lie away from the origin, as if measured by a camera there."""
-    return bool(((lower + upper) / 2).norm() > _CAMERA.far_share * (upper - lower).norm().clamp(min=1e-6))
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +231,8 @@ class Scene:
         title: of the page.
         layers: with different names; moving ones have T frames each.
         times: (T,) seconds, strictly increasing; one frame every 1 / 20 second by default.
-        up: upright direction; by default -y for measurements of a camera at the origin, else z.
+        up: upright direction; by default as `geometry.upright.guess_up` tells it.
+        facts: key figures in words, by name, shown beside the scene.
 
     Raises:
         InputError: if there is no layer, two have one name, or numbers of frames differ.
@@ -244,7 +241,8 @@ class Scene:
     title: str
     layers: tuple[Layer, ...]
     times: Tensor | None = None
-    up: tuple[float, float, float] | None = None
+    up: Direction | None = None
+    facts: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         names = [layer.name for layer in self.layers]
@@ -285,7 +283,7 @@ class Scene:
         middle = (lower + upper) / 2
         size = (upper - lower).norm().clamp(min=1e-9)
         from_camera = is_before_camera(lower, upper)
-        up = torch.tensor(self.up or ((0.0, -1.0, 0.0) if from_camera else (0.0, 0.0, 1.0))).to(middle)
+        up = torch.tensor(self.up or self._guessed_up()).to(middle)
         facing = self._facing()
         side = torch.linalg.cross(up, facing)
         if facing.norm() > _CAMERA.one_sided and side.norm() > 0.2 * facing.norm():
@@ -299,9 +297,17 @@ class Scene:
         direction = direction / direction.norm()
         return middle - 0.5 * size / math.sin(field_of_view / 2) * direction, middle, up
 
+    def _guessed_up(self) -> Direction:
+        """Return the likely upright direction, told from what moves, or else from all that is seen."""
+        layers = self._shown()
+        count = max(layer.num_frames for layer in layers)
+        moving = [layer for layer in layers if layer.num_frames == count]
+        frames = range(0, count, max(1, count // _CAMERA.num_frames))
+        return guess_up([torch.cat([layer.points(frame).reshape(-1, 3) for layer in moving]) for frame in frames])
+
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Return the lower and upper corner (3,) of all visible layers in all frames."""
-        points = self._sample()
+        points = self.sample()
         return points.amin(0), points.amax(0)
 
     @property
@@ -320,12 +326,14 @@ class Scene:
                 total, area = total + normal.sum(0), area + float(normal.norm(dim=-1).sum())
         return total / area if area > 0 else total
 
-    def _sample(self) -> Tensor:
-        """Return evenly chosen points (N, 3) of the visible layers."""
-        # Outliers reach far: clouds count only if there are no other layers.
+    def _shown(self) -> list[Layer]:
+        """Return the visible layers; clouds, whose outliers reach far, only if there are no others."""
         visible = [layer for layer in self.layers if layer.visible] or list(self.layers)
-        shown = [layer for layer in visible if not isinstance(layer, Cloud)] or visible
-        found = [points for layer in shown for points in _all_points(layer)]
+        return [layer for layer in visible if not isinstance(layer, Cloud)] or visible
+
+    def sample(self) -> Tensor:
+        """Return evenly chosen points (N, 3) of the visible layers."""
+        found = [points for layer in self._shown() for points in _all_points(layer)]
         points = torch.cat(found) if found else torch.zeros(1, 3)
         points = points[points.isfinite().all(-1)]
         return points[:: max(1, len(points) // _CAMERA.num_points)] if len(points) else torch.zeros(1, 3)

@@ -13,6 +13,7 @@ from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, concatenate
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.skeleton import Skeleton
+from torchreg.geometry.upright import Direction
 from torchreg.io.gltf_write import save_animated_skin
 from torchreg.spines.labeled_tree import path_lengths
 from torchreg.spines.spine import Spine
@@ -34,7 +35,7 @@ _STYLE = _SpineStyle()
 @torch.no_grad()
 def save_spine_animation(
     path: str | Path, spine: Spine, mesh: TriangleMesh | None = None, frame: int = 0, *, num_joints: int = 7,
-    fps: float = 20.0,
+    fps: float = 20.0, up: Direction | None = None,
 ) -> Path:  # fmt: skip
     """Return the path of a .glb file in which a spine moves, and with it the surface of one of its frames.
 
@@ -49,6 +50,7 @@ def save_spine_animation(
         frame: number of the surface's frame.
         num_joints: per limb, at least 2.
         fps: frames per unit of `Spine.times`.
+        up: the axis that is upright, turned to glTF's y; left as it is by default.
 
     Raises:
         InputError: if the suffix is another, or there is no such frame.
@@ -84,6 +86,7 @@ def save_spine_animation(
         normals=surface.vertex_normals(),
         colors=paint,
         most_weights=4,  # all that many viewers read
+        up=up,
     )
 
 

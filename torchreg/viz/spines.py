@@ -151,7 +151,8 @@ def _drawings(
     """Return functions that draw each frame, and the size of the pictures."""
     if len(meshes) != len(spine.curves):
         raise InputError(f"meshes must hold one surface per frame ({len(spine.curves)}), got {len(meshes)}")
-    shown = spine_view(meshes) if view is None else view
+    up = None if spine.up is None else torch.tensor(spine.up)
+    shown = spine_view(meshes, up=up) if view is None else view
 
     def drawing(number: int) -> Callable[[Axes], object]:
         return lambda ax: draw_spine_frame(

@@ -139,7 +139,7 @@ def registration_strip(
         view = watch(points, size=(_STYLE.panel, _STYLE.panel))
     figure, axes = _row([label for label, _, _ in panels], margin=_STYLE.bar)
     for ax, (_, mesh, paint) in zip(axes, panels, strict=True):
-        draw_mesh(ax, _facing(mesh, view), view, paint)
+        draw_mesh(ax, facing_mesh(mesh, view), view, paint)
     _color_bar(axes[-1], largest, unit)
     return save_picture(figure, path)
 
@@ -169,7 +169,8 @@ def spine_strip(
         raise InputError(f"meshes must hold one surface per frame ({len(spine.curves)}), got {len(meshes)}")
     chosen = [int(number) for number in np.unique(np.linspace(0, len(meshes) - 1, columns).round())]
     size = _STYLE.panel, _STYLE.panel
-    shown = spine_view([meshes[number] for number in chosen], size=size) if view is None else view
+    up = None if spine.up is None else torch.tensor(spine.up)
+    shown = spine_view([meshes[number] for number in chosen], up=up, size=size) if view is None else view
     figure, axes = _row([f"frame {number}" for number in chosen])
     for ax, number in zip(axes, chosen, strict=True):
         curves, transferred = spine.curves[number], ~spine.own[number]
@@ -239,7 +240,7 @@ def _plain(mesh: TriangleMesh, color: tuple[float, float, float]) -> Tensor:
     return torch.tensor(color).expand(mesh.num_vertices, 3)
 
 
-def _facing(mesh: TriangleMesh, view: View) -> TriangleMesh:
+def facing_mesh(mesh: TriangleMesh, view: View) -> TriangleMesh:
     """Return a scan with all triangles turned to the camera, whatever their orientation in the file."""
     vertices = mesh.vertices.detach().cpu().double()
     corner, second, third = vertices[mesh.faces].unbind(1)

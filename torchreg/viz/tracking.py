@@ -12,6 +12,7 @@ from torch import Tensor
 from torchreg._checks import check_positive, check_shape
 from torchreg.alignment.problem import INLIER_SHARE
 from torchreg.errors import InputError
+from torchreg.geometry.upright import Direction
 from torchreg.geometry.visibility import View
 from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
@@ -203,8 +204,9 @@ def animate_track(
 
 
 def save_track_gltf(
-    path: str | Path, shape: ArticulatedShape, result: TrackResult, *, skin: LinearBlendSkin | None = None
-) -> Path:
+    path: str | Path, shape: ArticulatedShape, result: TrackResult, *, skin: LinearBlendSkin | None = None,
+    up: Direction | None = None,
+) -> Path:  # fmt: skip
     """Return the path of a .glb file in which the shape's skinned surface moves as tracked, in frames with a pose.
 
     Args:
@@ -212,6 +214,7 @@ def save_track_gltf(
         shape: the articulated shape.
         result: of a tracker of it, with times in seconds, counted from the first.
         skin: the surface, with faces; by default `surface_skin`, which is made anew at every call.
+        up: the axis that is upright, turned to glTF's y; left as it is by default.
 
     Raises:
         InputError: if sizes do not fit, the suffix is not .glb, the skin has no faces or the shape was never found.
@@ -221,7 +224,7 @@ def save_track_gltf(
     if not bool(found.any()):
         raise InputError("result must hold a pose to be written, but the shape was never found")
     times = (result.times - result.times[0])[found]
-    return save_shape_animation(path, shape, result.poses[found], times, skin=skin)
+    return save_shape_animation(path, shape, result.poses[found], times, skin=skin, up=up)
 
 
 def _near(shape: ArticulatedShape, pose: Tensor, data: Tensor, reach: float) -> Tensor:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from html import escape
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from torch import Tensor
 
 from torchreg.errors import InputError
 from torchreg.io.atomic import write_atomic
-from torchreg.viz.scene import Layer, Scene
+from torchreg.viz.scene import Cloud, Layer, Meshes, Scene
 from torchreg.viz.viser_nodes import DrawnScene
 from torchreg.viz.viser_server import page_url, point_camera, start_server, stop_server
 
@@ -53,6 +56,7 @@ class SceneViewer:
         self.scene = scene
         self.server = start_server(scene.title, port)
         self._drawn = DrawnScene(self.server.scene, scene)
+        self.server.gui.add_markdown(description(scene))
         self._timeline = Timeline(self.server, scene.seconds, self._drawn.show) if scene.num_frames > 1 else None
         with self.server.gui.add_folder("Layers"):
             for layer in scene.layers:
@@ -93,6 +97,37 @@ class SceneViewer:
     def _add_toggle(self, layer: Layer) -> None:
         box = self.server.gui.add_checkbox(layer.name, initial_value=layer.visible)
         box.on_update(lambda _: self._drawn.set_visible(layer.name, box.value))
+
+
+def description(scene: Scene) -> str:
+    """Return title, key figures and a legend of the layers as Markdown."""
+    facts = [f"{_plain(name)}: {_plain(text)}" for name, text in scene.facts.items()]
+    legend = []
+    for layer in scene.layers:
+        legend.append(f"- {_mark(layer)} {_plain(layer.name)}")
+    return "\n\n".join([f"### {_plain(scene.title)}", *facts, "\n".join(legend)])
+
+
+def _mark(layer: Layer) -> str:
+    """Return a square in the color of a layer, an open circle where it has several."""
+    color = _one_color(layer)
+    return "&#9676;" if color is None else f'<span style="color:{color}">&#9632;</span>'
+
+
+def _one_color(layer: Layer) -> str | None:
+    """Return the color of a layer as pages write it, None if it has several."""
+    if isinstance(layer, Meshes):
+        color: Any = layer.color
+    elif isinstance(layer, Cloud):
+        color = layer.paints if layer.one_color else None
+    else:
+        color = None if isinstance(layer.paint, Tensor) else layer.paint
+    return None if color is None else "#" + "".join(f"{round(255 * share):02x}" for share in color)
+
+
+def _plain(text: str) -> str:
+    """Return text of a file without what Markdown or a page would take for its own."""
+    return re.sub(r"[<>&`*_\[\]#\\]", " ", text)
 
 
 class Timeline:
@@ -183,7 +218,7 @@ def scene_html(path: str | Path, scene: Scene) -> Path:
     path = Path(path)
     if path.suffix.lower() != ".html":
         raise InputError(f"path must end in .html, got {path.name!r}; rename the output file")
-    shown = Scene(scene.title, tuple(layer for layer in scene.layers if layer.visible), None, scene.up)
+    shown = replace(scene, layers=tuple(layer for layer in scene.layers if layer.visible), times=None)
     server = start_server(scene.title, 0)
     try:
         drawn = DrawnScene(server.scene, shown)
@@ -192,11 +227,27 @@ def scene_html(path: str | Path, scene: Scene) -> Path:
         for frame, seconds in _durations(scene.seconds) if shown.num_frames > 1 else ():
             drawn.show(frame)
             record.insert_sleep(seconds)
-        content = record.as_html()
+        content = _titled(record.as_html(), scene)
     finally:
         stop_server(server)
     write_atomic(path, content.encode("utf-8"))
     return path
+
+
+def _titled(page: str, scene: Scene) -> str:
+    """Return a page with the title of a scene, its key figures and a legend in a corner."""
+    facts = (f"{escape(name)}: {escape(text)}" for name, text in scene.facts.items())
+    rows = [f"<b>{escape(scene.title)}</b>", *facts]
+    for layer in scene.layers:
+        if layer.visible:
+            rows.append(f"{_mark(layer)} {escape(layer.name)}")
+    box = (
+        '<div style="position:fixed;left:12px;bottom:64px;z-index:9;font:13px sans-serif;background:#ffffffcc;'
+        f'padding:8px;border-radius:6px;pointer-events:none">{"<br>".join(rows)}</div>'
+    )
+    page = re.sub(r"<title>.*?</title>", lambda _: f"<title>{escape(scene.title)}</title>", page, count=1, flags=re.S)
+    before, body, after = page.rpartition("</body>")
+    return f"{before}{box}{body}{after}" if body else page + box
 
 
 def _durations(seconds: list[float]) -> Iterator[tuple[int, float]]:

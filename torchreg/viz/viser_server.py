@@ -26,7 +26,9 @@ def import_viser() -> Any:
     try:
         import viser
     except ImportError as error:
-        raise MissingExtraError("the viewer needs viser; install it with: pip install 'torchreg[viewer]'") from error
+        raise MissingExtraError(
+            "the viewer needs viser; install it with: pip install 'torchreg-articulated[viewer]'"
+        ) from error
     return viser
 
 

@@ -127,9 +127,9 @@ def relabel(
     ``sum_C W(C, f_C) + sum_{(C, D)} (mu [f_C != f_D] + nu min(|T_{f_C} x_CD - T_{f_D} x_CD|, cap)) + h |used labels|``
     with W the sum of truncated squared residuals of the cell's samples under the motion of a bone, in all frames, and
     x_CD in the middle between two cells; correspondences stay while labels change. Near a joint both bones move a
-    sample alike, so that residuals alone put the border anywhere there: unlike in the paper, a border where two bones
-    would tear the surface apart costs more, so that it passes through the joint. Where parts touch that are not joined
-    this is capped.
+    sample alike, so that residuals alone put the border anywhere there. Unlike in the paper, the pairwise term is the
+    discontinuity of the deformation across the border, so that it passes through the joint; it is truncated, as not
+    all parts that touch are joined.
 
     Args:
         data: the grid and its samples.

@@ -1,0 +1,77 @@
+"""Which direction is upright: files of points do not say, so it is told from where things stand and how they move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+Direction = tuple[float, float, float]
+
+# Endings of formats whose y axis points up, by their specification or by use.
+Y_UP_ENDINGS = (".glb", ".gltf", ".obj")
+
+
+@dataclass(frozen=True)
+class _UprightRule:
+    """Evidence of the upright direction."""
+
+    far_share: float = 0.75  # points were measured from the origin if their middle is farther, in diagonals
+    tall: float = 1.2  # what stands on y is taller than it is wide and deep by this factor
+    steadier: float = 1.5  # factor by which what moves on the ground y = 0 moves less along y than along z
+    num_points: int = 2000  # of a frame that are looked at
+
+
+_RULE = _UprightRule()
+
+
+def is_before_camera(lower: Tensor, upper: Tensor) -> bool:
+    """Return whether points with bounds (3,) lie away from the origin, as if measured by a camera there."""
+    return bool(((lower + upper) / 2).norm() > _RULE.far_share * (upper - lower).norm().clamp(min=1e-6))
+
+
+def guess_up(frames: Sequence[Tensor]) -> Direction:
+    """Return the likely upright direction of points over time, one of -y, y and z.
+
+    What lies before a camera at the origin hangs from -y, as cameras look along z with y down. Else y is upright where
+    things are tallest along y, or where they bob less along y than along z: feet stay on the ground. Otherwise z.
+
+    Args:
+        frames: T clouds (N_t, 3), in any unit; those without a finite point are passed over.
+    """
+    found = [frame[:: max(1, len(frame) // _RULE.num_points)].detach().double().cpu() for frame in frames]
+    found = [points for frame in found if len(points := frame[frame.isfinite().all(-1)])]
+    if not found:
+        return 0.0, 0.0, 1.0
+    lower = torch.stack([points.amin(0) for points in found])
+    upper = torch.stack([points.amax(0) for points in found])
+    if is_before_camera(lower.amin(0), upper.amax(0)):
+        return 0.0, -1.0, 0.0
+    width, height, depth = (upper - lower).median(0).values.tolist()
+    if height > _RULE.tall * max(width, depth) or _is_steadier(found, lower):
+        return 0.0, 1.0, 0.0
+    return 0.0, 0.0, 1.0
+
+
+def to_y_up(up: Direction) -> Tensor:
+    """Return the rotation (4, 4), float64, that takes an axis to +y, as glTF wants it, about x unless it is along x."""
+    length = sum(value * value for value in up) ** 0.5
+    x, y, z = (value / length for value in up)
+    turn = torch.eye(4, dtype=torch.float64)
+    if abs(x) > 0.5:
+        sign = 1.0 if x > 0 else -1.0
+        turn[:2, :2] = torch.tensor([[0.0, -sign], [sign, 0.0]])
+    else:
+        turn[1:3, 1:3] = torch.tensor([[y, z], [-z, y]])
+    return turn
+
+
+def _is_steadier(frames: Sequence[Tensor], lower: Tensor) -> bool:
+    """Return whether the lowest points (T, 3) and the middles of frames move less along y than along z."""
+    if len(frames) < 3:
+        return False
+    middle = torch.stack([points.mean(0) for points in frames])
+    motion = lower.std(0) * middle.std(0)
+    return bool(_RULE.steadier * motion[1] < motion[2])
