@@ -235,7 +235,7 @@ def main() -> int:
     parser.add_argument("--rivals", type=int, default=0, help="seeds that the rivals get too")
     options = parser.parse_args()
     if find_spec("anny") is None:
-        print("skipped: anny is not installed; pip install 'torchreg[anny]'")
+        print("skipped: anny is not installed; pip install 'torchreg-articulated[anny]'")
         return 0
     if options.part == "speed":
         return 0 if speed() else 1
