@@ -4,7 +4,7 @@ The truth is anny's own forward with random phenotypes (each uniform from 0 to 1
 rotations (12 degrees, standard deviation, about a random axis each, the root too). A scan is what a camera at a random
 azimuth sees of it: 4,000 points with noise (3 mm for a body, 1 mm for a hand), and 5 % outliers, uniform in the box
 around, grown by a tenth. The place is known to 10 cm (1 cm for a hand). The error is the distance of every vertex,
-hidden ones too, from its true place. Needs `pip install "torchreg[anny]"`.
+hidden ones too, from its true place. Needs `pip install "torchreg-articulated[anny]"`.
 
     python benchmarks/shape_fit.py                             # bodies, 10 seeds
     python benchmarks/shape_fit.py --kind hand.R

@@ -18,7 +18,6 @@ def test_smoke_prints_every_part(bench, capsys):
         "whole: left out",
         "clouds: 1 cases",
         "landmarks, both",
-        "few fingers, clouds",
     ):
         assert part in printed
     assert printed.count("track, ") == 2

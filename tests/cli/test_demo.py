@@ -47,10 +47,10 @@ def test_the_demonstration_runs(run, tmp_path):
 def test_an_interrupted_demonstration_writes_what_is_done(run, tmp_path, monkeypatch):
     step = Tracker.step
 
-    def interrupted(self, points, time=None):
+    def interrupted(self, points, time=None, **told):
         if self.state.frame == 1:
             raise KeyboardInterrupt
-        return step(self, points, time)
+        return step(self, points, time, **told)
 
     # Where the hand is in the first frame is told, not searched for.
     truth = hand_motion(Hand(), "bending_palm", 2)[:1]

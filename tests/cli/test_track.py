@@ -86,10 +86,10 @@ def stop_at(monkeypatch, frame, error=KeyboardInterrupt):
     """Let the tracker be stopped while it works on a frame."""
     step = Tracker.step
 
-    def stopped(self, points, time=None):
+    def stopped(self, points, time=None, **told):
         if self.state.frame == frame:
             raise error
-        return step(self, points, time)
+        return step(self, points, time, **told)
 
     monkeypatch.setattr(Tracker, "step", stopped)
 

@@ -289,7 +289,7 @@ def _align(
             found = _search_where_needed(batch, found, config)
             judged = without_cut(batch.problem, found.pose, seen.frames)
             found = _refit(batch, judged, found, config)
-            found = _finished(batch, judged, found, config)
+            found = _finished(judged, found, config)
         result = _result(batch, found, config, lead, judged)  # inliers by eq. 2, the posterior by eq. 17
         return normal_copy(_unbatched(result) if clouds.ndim == 2 else result)
 
@@ -516,7 +516,7 @@ def _refit(batch: _Batch, judged: AlignProblem, found: StageResult, config: Alig
     return replace(refined, sigma=found.sigma)
 
 
-def _finished(batch: _Batch, judged: AlignProblem, found: StageResult, config: AlignConfig) -> StageResult:
+def _finished(judged: AlignProblem, found: StageResult, config: AlignConfig) -> StageResult:
     """Return the poses after more steps of the last fit, where another would still gain; not of a plain descent."""
     if config.surface_steps == 0 or config.search == "never":
         return found
@@ -524,9 +524,8 @@ def _finished(batch: _Batch, judged: AlignProblem, found: StageResult, config: A
     rows = rows[~curvature(judged.rows(rows), found.pose[rows]).converged] if len(rows) else rows
     if len(rows) == 0:
         return found
-    refined = fit_surface(
-        judged.rows(rows), found.pose[rows], steps=_LIMITS.more_steps, widths=(), on_step=batch.record
-    )  # fmt: skip
+    # Records are of whole batches: those of some rows have no place among them.
+    refined = fit_surface(judged.rows(rows), found.pose[rows], steps=_LIMITS.more_steps, widths=())
     pose, change = found.pose.clone(), found.change.clone()
     pose[rows], change[rows] = refined.pose, refined.change
     return replace(found, pose=pose, change=change)
