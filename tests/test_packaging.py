@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 # An extra of the other project's, or an installation of it by name.
-WRONG = re.compile(r"\btorchreg\[\w|\bpip install\b[^\n;`]*?[\s'\"]torchreg(?![\w./-])")
+WRONG = re.compile(r"\btorchreg\[\w|\bpip install\b[^\n;&`]*?[ '\"]torchreg(?![\w./-])")
 NAMED = re.compile(r"torchreg-articulated\[([\w,]+)\]")
 
 
@@ -39,6 +39,8 @@ def texts():
         ("pip install torchreg" + "", True),
         ("pip install 'torchreg-articulated[viewer]'", False),
         ("pip install . && .venv/bin/torchreg demo", False),
+        ("pip install 'torchreg-articulated[viewer]' && torchreg demo", False),
+        ("pip install 'torchreg-articulated[viewer]'\ntorchreg demo", False),
         ("pip install torchreg-articulated", False),
     ],
 )

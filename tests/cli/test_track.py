@@ -128,7 +128,9 @@ def test_an_interrupted_run_goes_on_to_the_same_end(run, command, whole, tmp_pat
     assert len(part.statuses) == len(part.poses) == frame
     done = []
     step = Tracker.step
-    monkeypatch.setattr(Tracker, "step", lambda self, points, time: done.append(time) or step(self, points, time))
+    monkeypatch.setattr(
+        Tracker, "step", lambda self, points, time, **told: done.append(time) or step(self, points, time, **told)
+    )
     answer = run(*command("--save-every", 2, "--resume", *FAST))
     assert answer.exit_code == 0, answer.output
     assert len(done) == FRAMES - frame

@@ -81,7 +81,8 @@ def load_anny(kind: str) -> tuple[ShapeSpec, LinearSpace]:
     try:
         version = metadata.version("anny")
     except metadata.PackageNotFoundError:
-        raise MissingExtraError("anny is not installed; install it with: pip install 'torchreg-articulated[anny]'") from None
+        hint = "install it with: pip install 'torchreg-articulated[anny]'"
+        raise MissingExtraError(f"anny is not installed; {hint}") from None
     folder = Path(os.environ.get("ANNY_CACHE_DIR") or Path.home() / ".cache" / "anny")
     kept = folder / f"torchreg-{_RELEASE}-{version}-{kind}.safetensors"
     try:
