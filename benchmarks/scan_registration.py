@@ -135,7 +135,7 @@ def _ablations() -> list[Recipe]:
 
 def _featureless(align: ScanAlignConfig) -> ScanAlignConfig:
     """Return settings under which hypotheses may take points to where the target is unlike them."""
-    return replace(align, choice=replace(align.choice, unlike=0.0))
+    return replace(align, choice=replace(align.choice, feature_distance=0.0))
 
 
 def file_problems(folder: Path) -> Iterator[Problem]:

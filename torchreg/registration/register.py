@@ -253,8 +253,8 @@ def initial_records(on_step: OnRegisterStep | None) -> Callable[[Any], None] | N
             stage="initialize",
             step=record.step,
             num_steps=record.num_steps,
-            distance=record.misses,
-            joint=record.gaps,
+            distance=record.residual,
+            joint=record.smoothness,
         )
     )
 

@@ -67,9 +67,9 @@ def test_the_result_is_what_its_parts_say(pair, aligned):
     assert aligned.chosen == aligned.hypotheses[0]
     assert [each.energy for each in aligned.hypotheses] == sorted(each.energy for each in aligned.hypotheses)
     ahead = align_scans(pair.source, pair.target, QUICK, expected=aligned.points).chosen
-    assert aligned.chosen.leap == 0
+    assert aligned.chosen.deviation == 0
     for one in (aligned.chosen, ahead):
-        assert one.energy == pytest.approx(one.forward + one.backward + one.bend + one.leap)
+        assert one.energy == pytest.approx(one.forward + one.backward + one.smoothness + one.deviation)
 
 
 def test_confidence_tells_the_seen_from_the_hidden(pair, aligned):
@@ -88,7 +88,7 @@ def test_steps_are_reported(pair):
         assert 0 <= record.step < record.num_steps
         assert record.width > 0
         assert record.matched >= 0
-        assert record.energy == pytest.approx(record.misses + record.stiffness * record.gaps)
+        assert record.energy == pytest.approx(record.residual + record.stiffness * record.smoothness)
 
 
 def test_hypotheses_are_fused_unless_two_agree(pair):
@@ -138,11 +138,13 @@ def test_where_scans_do_not_tell_what_is_expected_does(angle):
     plain = align_scans(source, target, QUICK)
     assert float((known.points - expected).norm(dim=-1).mean()) < 0.02 * source.diagonal
     assert float((plain.points - expected).norm(dim=-1).mean()) > 0.03 * source.diagonal
-    leaps = {each.name: each.leap for each in known.hypotheses}
-    assert leaps["expected"] < 0.1 * leaps["rest"]
-    assert {each.leap for each in plain.hypotheses} == {0.0}
-    unmoved = align_scans(source, target, replace(QUICK, choice=replace(QUICK.choice, leap=0.0)), expected=expected)
-    assert {each.leap for each in unmoved.hypotheses} == {0.0}
+    deviations = {each.name: each.deviation for each in known.hypotheses}
+    assert deviations["expected"] < 0.1 * deviations["rest"]
+    assert {each.deviation for each in plain.hypotheses} == {0.0}
+    unmoved = align_scans(
+        source, target, replace(QUICK, choice=replace(QUICK.choice, deviation=0.0)), expected=expected
+    )
+    assert {each.deviation for each in unmoved.hypotheses} == {0.0}
 
 
 def test_expectations_that_are_wrong_do_not_harm(pair):

@@ -28,7 +28,7 @@ def test_rest_moves_nothing(graph):
     moved, normals = graph.move_with_normals(graph.rest())
     torch.testing.assert_close(moved, graph.points)
     torch.testing.assert_close(normals, graph.normals)
-    assert float(graph.bend(graph.rest())) == 0
+    assert float(graph.smoothness(graph.rest())) == 0
 
 
 def test_samples_follow_their_nodes(graph):
@@ -47,17 +47,17 @@ def test_rigid_motions_turn_normals_and_bend_nothing(graph):
     moved, normals = graph.move_with_normals(whole)
     torch.testing.assert_close(moved, transform_points(whole[0], graph.points))
     torch.testing.assert_close(normals, graph.normals @ whole[0, :3, :3].mT)
-    assert float(graph.bend(whole)) < 1e-12
-    assert float(graph.bend(motions(graph))) > 0.1
+    assert float(graph.smoothness(whole)) < 1e-12
+    assert float(graph.smoothness(motions(graph))) > 0.1
 
 
 def test_slack_forgives_small_gaps(graph):
     transforms = motions(graph, 1e-3)
     gap = torch.linalg.vector_norm(graph.edge_gaps(transforms), dim=-1)
     expected = (graph.edge_weights * gap.sum(-1)).sum() / len(graph.edges)
-    torch.testing.assert_close(graph.bend(transforms), expected)
-    assert float(graph.bend(transforms, 0.1)) < 0.1 * float(expected)
-    assert float(graph.bend(graph.rest(), 0.1)) == 0
+    torch.testing.assert_close(graph.smoothness(transforms), expected)
+    assert float(graph.smoothness(transforms, 0.1)) < 0.1 * float(expected)
+    assert float(graph.smoothness(graph.rest(), 0.1)) == 0
 
 
 def test_gaps_are_where_neighbors_disagree(graph):
@@ -85,7 +85,7 @@ def test_batches_are_loops(graph):
         torch.testing.assert_close(both, graph.edge_gaps(one))
     torch.testing.assert_close(graph(transforms)[1], graph(transforms[1]))
     torch.testing.assert_close(graph.move_with_normals(transforms)[1][1], graph.move_with_normals(transforms[1])[1])
-    torch.testing.assert_close(graph.bend(transforms)[1], graph.bend(transforms[1]))
+    torch.testing.assert_close(graph.smoothness(transforms)[1], graph.smoothness(transforms[1]))
 
 
 def test_gradients(graph):
@@ -98,7 +98,7 @@ def test_one_node_has_no_neighbors():
     points = torch.rand(5, 3, generator=torch.Generator().manual_seed(0), dtype=F64)
     graph = DeformationGraph(points, points, build_node_graph(GeodesicGraph.from_points(points, 4), 0, 1))
     assert graph.edges.shape == (0, 2)
-    assert float(graph.bend(graph.rest())) == 0
+    assert float(graph.smoothness(graph.rest())) == 0
 
 
 def test_bad_input_is_named(graph):

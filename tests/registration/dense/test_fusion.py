@@ -59,7 +59,7 @@ def test_what_nothing_improves_is_left(problem, halves):
 
 def test_of_one_hypothesis_alone_the_energy_is_that_of_the_choice(problem, halves):
     scans, options = problem[0], halves[1]
-    for config in (CHOICE, replace(CHOICE, bend=0.0, unlike=0.0)):
+    for config in (CHOICE, replace(CHOICE, smoothness=0.0, feature_distance=0.0)):
         energy = _Energy.of(scans, options, config)
         labels = torch.arange(2)[:, None].expand(2, scans.graph.num_nodes)
         judged = [judge(scans, "", option, config).energy for option in options]

@@ -35,17 +35,19 @@ def problem(graph, seed=1):
 def energy(graph, transforms, matches, stiffness):
     """Return the energy as the docstring has it, for autograd."""
     miss = graph(transforms, matches.which) - matches.targets
-    metric = matches.normals.unsqueeze(-1) * matches.normals.unsqueeze(-2) + matches.slide * torch.eye(3, dtype=F64)
-    misses = (matches.weights * (miss.unsqueeze(-2) @ metric @ miss.unsqueeze(-1))[:, 0, 0]).mean()
-    gaps = (graph.edge_weights * graph.edge_gaps(transforms).square().sum((-1, -2))).sum() / graph.num_nodes
-    return misses, gaps, misses + stiffness * gaps
+    metric = matches.normals.unsqueeze(-1) * matches.normals.unsqueeze(-2) + matches.tangential_weight * torch.eye(
+        3, dtype=F64
+    )
+    residual = (matches.weights * (miss.unsqueeze(-2) @ metric @ miss.unsqueeze(-1))[:, 0, 0]).mean()
+    smoothness = (graph.edge_weights * graph.edge_gaps(transforms).square().sum((-1, -2))).sum() / graph.num_nodes
+    return residual, smoothness, residual + stiffness * smoothness
 
 
 @pytest.mark.parametrize("each", [False, True])
 def test_steps_are_those_of_a_dense_gauss_newton(graph, each):
     transforms, matches = problem(graph)
-    slide = torch.linspace(0, 0.6, 40, dtype=F64) if each else torch.full((40,), 0.3, dtype=F64)
-    matches = replace(matches, slide=slide if each else 0.3)
+    tangential_weight = torch.linspace(0, 0.6, 40, dtype=F64) if each else torch.full((40,), 0.3, dtype=F64)
+    matches = replace(matches, tangential_weight=tangential_weight if each else 0.3)
     middles = transform_points(transforms, graph.centers.unsqueeze(1)).squeeze(1)
 
     def residuals(twists):
@@ -54,7 +56,9 @@ def test_steps_are_those_of_a_dense_gauss_newton(graph, each):
         root = (matches.weights / 40).sqrt().unsqueeze(-1)
         across = root * (miss * matches.normals).sum(-1, keepdim=True)
         gap = graph.edge_gaps(moved).flatten(1) * (0.7 / 6 * graph.edge_weights).sqrt().unsqueeze(-1)
-        return torch.cat([across.reshape(-1), (root * slide.sqrt().unsqueeze(-1) * miss).reshape(-1), gap.reshape(-1)])
+        return torch.cat(
+            [across.reshape(-1), (root * tangential_weight.sqrt().unsqueeze(-1) * miss).reshape(-1), gap.reshape(-1)]
+        )
 
     zero = torch.zeros(36, dtype=F64)
     jacobian = torch.autograd.functional.jacobian(residuals, zero)
@@ -66,9 +70,9 @@ def test_steps_are_those_of_a_dense_gauss_newton(graph, each):
 def test_energies_are_those_reported(graph):
     transforms, matches = problem(graph)
     fit = fit_graph(graph, transforms, matches, 0.7)
-    misses, gaps, _ = energy(graph, transforms, matches, 0.7)
-    assert fit.misses == pytest.approx(float(misses))
-    assert fit.gaps == pytest.approx(float(gaps))
+    residual, smoothness, _ = energy(graph, transforms, matches, 0.7)
+    assert fit.residual == pytest.approx(float(residual))
+    assert fit.smoothness == pytest.approx(float(smoothness))
 
 
 def test_steps_end_where_the_gradient_vanishes(graph):
@@ -97,7 +101,7 @@ def test_turning_everything_turns_the_answer(graph):
     turned = DeformationGraph(transform_points(whole, graph.points), graph.normals @ whole[:3, :3].mT, nodes)
     moved = GraphMatches(
         matches.which, transform_points(whole, matches.targets), matches.weights,
-        matches.normals @ whole[:3, :3].mT, matches.slide,
+        matches.normals @ whole[:3, :3].mT, matches.tangential_weight,
     )  # fmt: skip
     start = whole @ transforms @ torch.linalg.inv(whole)
     expected = transform_points(whole, graph(fit_graph(graph, transforms, matches, 0.3, 3).transforms))
@@ -117,9 +121,9 @@ def test_samples_without_weight_leave_nodes_with_their_neighbors(graph):
 def test_edges_that_give_count_less(graph):
     transforms, matches = problem(graph)
     gap = graph.edge_gaps(transforms).square().sum(-1).mean(-1)
-    fit = fit_graph(graph, transforms, matches, 0.7, give=0.05)
+    fit = fit_graph(graph, transforms, matches, 0.7, edge_scale=0.05)
     expected = (graph.edge_weights / (1 + gap / 0.05**2) * 2 * gap).sum() / graph.num_nodes
-    assert fit.gaps == pytest.approx(float(expected))
+    assert fit.smoothness == pytest.approx(float(expected))
     # A weight fixed before the step, as if the graph had it from the start.
     nodes = build_node_graph(GeodesicGraph.from_points(graph.points, 8), 0, 6, 3)
     softer = DeformationGraph(
@@ -157,8 +161,8 @@ def test_bad_input_is_named(graph):
     transforms, matches = problem(graph)
     with pytest.raises(InputError, match="stiffness must be"):
         fit_graph(graph, transforms, matches, -1.0)
-    with pytest.raises(InputError, match="give must be positive"):
-        fit_graph(graph, transforms, matches, 1.0, give=0.0)
+    with pytest.raises(InputError, match="edge_scale must be positive"):
+        fit_graph(graph, transforms, matches, 1.0, edge_scale=0.0)
     with pytest.raises(InputError, match="num_steps must be at least 1"):
         fit_graph(graph, transforms, matches, 1.0, 0)
 
@@ -173,9 +177,9 @@ def test_joined_matches_cost_what_all_cost(graph):
     along = GraphMatches(slice(0, 30), targets[:30], random(30), normals, random(30))
     points = GraphMatches(torch.arange(5, 15), targets[30:], random(10))
     rest = graph.rest()
-    costs = [fit_graph(graph, rest, matches, 1.0).misses for matches in (along, points)]
+    costs = [fit_graph(graph, rest, matches, 1.0).residual for matches in (along, points)]
     both = joined(along, points)
-    assert fit_graph(graph, rest, both, 1.0).misses == pytest.approx(costs[0] + costs[1] * 10 / 30)
+    assert fit_graph(graph, rest, both, 1.0).residual == pytest.approx(costs[0] + costs[1] * 10 / 30)
     assert joined(along) is along
 
 

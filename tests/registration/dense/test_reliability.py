@@ -11,7 +11,7 @@ from torchreg.registration.dense.problem import describe
 from torchreg.registration.dense.reliability import SCAN_CALIBRATION, ScanEvidence, confidence_of, scan_evidence
 
 CONFIG = ScanAlignConfig(num_samples=400, num_target_samples=800, num_nodes=30)
-GOOD = ScanEvidence(forward=0.7, backward=0.05, bend=0.1, unsupported=0.8, hidden=0.05, rival=0.0)
+GOOD = ScanEvidence(forward=0.7, backward=0.05, smoothness=0.1, unsupported=0.8, hidden=0.05, rival=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def problem():
     return describe(pair.source, pair.target, CONFIG)
 
 
-@pytest.mark.parametrize("name", ["forward", "backward", "bend", "unsupported", "hidden", "rival"])
+@pytest.mark.parametrize("name", ["forward", "backward", "smoothness", "unsupported", "hidden", "rival"])
 def test_what_speaks_against_an_alignment_lowers_its_confidence(name):
     assert confidence_of(replace(GOOD, **{name: 0.5 + getattr(GOOD, name)})) < confidence_of(GOOD)
     assert 0.8 < confidence_of(GOOD) < 1

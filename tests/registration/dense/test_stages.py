@@ -16,8 +16,8 @@ from torchreg.registration.dense.problem import describe
 from torchreg.registration.dense.stages import (
     Reporter,
     agree,
+    deviations,
     judge,
-    leaps,
     mismatch,
     refine,
 )
@@ -41,7 +41,7 @@ def reporter():
     return Reporter("some", 2.0, records.append), records
 
 
-def misses(pair, problem, transforms):
+def residual(pair, problem, transforms):
     truth = problem.unit.normalize(pair.truth[problem.samples])
     return (problem.graph(transforms) - truth).norm(dim=-1)
 
@@ -49,7 +49,7 @@ def misses(pair, problem, transforms):
 def test_steps_come_nearer_and_report(pair, problem, reporter):
     rest = problem.graph.rest()
     moved = refine(problem, rest, EMConfig(num_steps=4), reporter[0])
-    assert float(misses(pair, problem, moved).mean()) < float(misses(pair, problem, rest).mean())
+    assert float(residual(pair, problem, moved).mean()) < float(residual(pair, problem, rest).mean())
     assert len(reporter[1]) == 4
     widths = [record.width for record in reporter[1]]
     assert widths == sorted(widths, reverse=True)
@@ -84,13 +84,13 @@ def test_samples_without_a_match_stay_about_where_they_are_expected(problem, rep
 
 
 def test_leaps_cost_their_distance_up_to_a_cap(problem):
-    config, rest = ChoiceConfig(leap=2.0, leap_cap=0.1), problem.graph.rest()
+    config, rest = ChoiceConfig(deviation=2.0, deviation_cap=0.1), problem.graph.rest()
     places = problem.graph(rest)
-    assert float(leaps(problem, places, config).max()) == 0
+    assert float(deviations(problem, places, config).max()) == 0
     for distance, cost in ((0.0, 0.0), (0.05, 0.5), (0.1, 2.0), (7.0, 2.0)):
         away = replace(problem, expected=places + distance * torch.tensor([0.6, 0.0, -0.8]))
-        torch.testing.assert_close(leaps(away, places, config), torch.full_like(places[:, 0], cost))
-        assert judge(away, "", rest, config).leap == pytest.approx(cost)
+        torch.testing.assert_close(deviations(away, places, config), torch.full_like(places[:, 0], cost))
+        assert judge(away, "", rest, config).deviation == pytest.approx(cost)
 
 
 def test_better_hypotheses_are_judged_better(problem, reporter):
@@ -99,26 +99,26 @@ def test_better_hypotheses_are_judged_better(problem, reporter):
     config = ChoiceConfig()
     still, better = judge(problem, "still", rest, config), judge(problem, "better", moved, config)
     assert better.energy < still.energy
-    assert still.bend == 0
+    assert still.smoothness == 0
     assert still.energy == pytest.approx(still.forward + still.backward)
     far = rest.clone()
     far[:, :3, 3] += 10
     lost = judge(problem, "lost", far, config)
     # Where nothing lies on the target, features are as unlike as they usually are.
-    assert (lost.forward, lost.backward) == (pytest.approx(1 + 0.4 * config.unlike), 1)
+    assert (lost.forward, lost.backward) == (pytest.approx(1 + 0.4 * config.feature_distance), 1)
 
 
 def test_likeness_counts_where_surfaces_meet(problem):
     config, target = ChoiceConfig(), problem.target
-    assert float(mismatch(problem, target, config).max()) == 0
+    assert float(mismatch(problem, target, config)[0].max()) == 0
     other = OrientedSamples(target.points, target.normals, target.features + 0.05, target.boundary)
     alike = target.features.shape[1] * 0.05**2
-    torch.testing.assert_close(mismatch(problem, other, config), torch.full_like(target.points[:, 0], 2 * alike))
+    torch.testing.assert_close(mismatch(problem, other, config)[0], torch.full_like(target.points[:, 0], 2 * alike))
     # Neither what is unlike nor what is away costs more than what leaves the target.
     for features, places in ((10, 0), (0, 10), (10, 10)):
         outlier = OrientedSamples(target.points + places, target.normals, target.features + features, target.boundary)
-        cost = mismatch(problem, outlier, config)
-        torch.testing.assert_close(cost, torch.full_like(cost, 1 + 0.4 * config.unlike))
+        cost, _ = mismatch(problem, outlier, config)
+        torch.testing.assert_close(cost, torch.full_like(cost, 1 + 0.4 * config.feature_distance))
 
 
 def test_hypotheses_agree_where_nearly_all_samples_do(problem):

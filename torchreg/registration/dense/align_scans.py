@@ -58,10 +58,9 @@ def align_scans(
     Both scans are described by even samples, their curvature at several sizes, and what a learnt `ScanMatcher` says of
     their matches. Hypotheses start from rest; from where points are expected, if that is known; and from the matcher's
     matches, to which a stiff graph is fitted by an EM in which they are the prior, see `fit_coarsely`. Each goes on by
-    an EM with an outlier class in which they still are, less and less, while edges of the graph give where its parts
-    disagree. Unless the two best agree, each part then moves as in the hypothesis that suits it, and the EM goes on
-    from there as well. The best covers the target, is covered by it, is like it, bends least, and is nearest to what is
-    expected.
+    an EM with an outlier class in which they still are, less and less, while edges of the graph count robustly. Unless
+    the two best agree, each part then moves as in the hypothesis that suits it, and the EM goes on from there as well.
+    The best covers the target, is covered by it, is like it, deforms most smoothly, and is nearest to what is expected.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -142,7 +141,7 @@ def align_problem(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: O
 def evidence_against(problem: ScanAlignProblem, found: Sequence[Candidate], config: ScanAlignConfig) -> ScanEvidence:
     """Return what speaks against the first of several candidates."""
     best, rival, *_ = found
-    return scan_evidence(problem, best.transforms, rival.transforms, best.hypothesis.bend, config.choice)
+    return scan_evidence(problem, best.transforms, rival.transforms, best.hypothesis.smoothness, config.choice)
 
 
 def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[Candidate]:

@@ -112,7 +112,7 @@ class BlendSums:
 
 
 def upper_triangles(scales: Tensor, normals: Tensor | None, slides: Tensor | float) -> Tensor:
-    """Return upper triangles (n, 6) of ``scale (n n^T + slide I)``; without normals of ``scale slide I``."""
+    """Upper triangles (n, 6) of ``scale (n n^T + slide I)``; without normals of ``scale slide I``."""
     diagonal = (_UPPER_SIX[0] == _UPPER_SIX[1]).to(scales)
     triangle = torch.as_tensor(slides).to(scales).reshape(-1, 1) * diagonal
     if normals is not None:

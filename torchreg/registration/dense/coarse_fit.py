@@ -36,7 +36,9 @@ def fit_coarsely(problem: ScanAlignProblem, config: CoarseConfig, reporter: Repo
         share = step / max(config.num_steps - 1, 1)
         sigma, stiffness = geometric_at(config.sigma, share), geometric_at(config.stiffness, share)
         matches = _expected_matches(problem, transforms, sigma, share, config)
-        fit = fit_graph(problem.graph, transforms, matches, stiffness, give=geometric_at(config.give, share))
+        fit = fit_graph(
+            problem.graph, transforms, matches, stiffness, edge_scale=geometric_at(config.edge_scale, share)
+        )
         transforms = fit.transforms
         reporter.report("match", step, config.num_steps, sigma, fit, stiffness, float(matches.weights.mean()))
     return transforms

@@ -21,7 +21,7 @@ class CoarseConfig:
         num_steps: while sigma shrinks.
         sigma: first and last, length: from the motion of a limb to what tokens are apart.
         stiffness: of the graph, first and last: parts hardly bend.
-        give: nodes that disagree by more than this hold each other less, first and last, length.
+        edge_scale: nodes that disagree by more than this hold each other less, first and last, length.
         normal_weight: exponent lost by normals at right angles, at the end.
         doubt: share of the prior of a match that does not rest on the matcher, first and last.
         outliers: samples that no match explains although the matcher calls them visible, as a share.
@@ -31,7 +31,7 @@ class CoarseConfig:
     num_steps: int = 14
     sigma: tuple[float, float] = (0.35, 0.03)
     stiffness: tuple[float, float] = (6.0, 1.0)
-    give: tuple[float, float] = (0.03, 0.02)
+    edge_scale: tuple[float, float] = (0.03, 0.02)
     normal_weight: float = 3.0
     doubt: tuple[float, float] = (0.02, 0.3)
     outliers: float = 0.03
@@ -39,7 +39,7 @@ class CoarseConfig:
 
     def __post_init__(self) -> None:
         check_count(self.num_steps, "num_steps", 1)
-        for name in ("sigma", "stiffness", "give", "doubt"):
+        for name in ("sigma", "stiffness", "edge_scale", "doubt"):
             check_ends(getattr(self, name), name)
         for name in ("outliers", "area"):
             check_positive(getattr(self, name), name)
@@ -55,11 +55,12 @@ class EMConfig:
         sigma: first and last, length; the first as far as a start may be off,
         fused_sigma: and from motions that have been refined and put together.
         stiffness: of the graph, first and last.
-        give: nodes that disagree by more than this hold each other less, length.
+        edge_scale: nodes that disagree by more than this hold each other less, length.
         doubt: support at first of a match that the matcher calls impossible, beside one of a sure match; at the last
             sigma, far below what its tokens are apart, all count alike.
         feature_weight: see `ScanEMConfig`, first and last: bending and hidden surroundings change features a little.
-        slide: how much misses along the surface count, squared, first and last: cloth and round limbs have far to go.
+        tangential_weight: how much residuals along the surface count, squared, first and last: cloth and round
+            limbs have far to go.
         fits_per_step: rounds of matching and fitting at each sigma.
         expected: how much it counts, beside a match, that a sample without one leaves where it was expected, if that is
             known; those farther off count ever less:
@@ -71,10 +72,10 @@ class EMConfig:
     sigma: tuple[float, float] = (0.02, 0.006)
     fused_sigma: float = 0.012
     stiffness: tuple[float, float] = (0.2, 0.006)
-    give: float = 0.01
+    edge_scale: float = 0.01
     doubt: float = 0.05
     feature_weight: tuple[float, float] = (8.0, 1.0)
-    slide: tuple[float, float] = (0.2, 0.03)
+    tangential_weight: tuple[float, float] = (0.2, 0.03)
     fits_per_step: int = 2
     expected: float = 0.002
     expected_scale: float = 0.05
@@ -83,9 +84,9 @@ class EMConfig:
     def __post_init__(self) -> None:
         for name in ("num_steps", "fits_per_step"):
             check_count(getattr(self, name), name, 1)
-        for name in ("sigma", "stiffness", "slide", "feature_weight"):
+        for name in ("sigma", "stiffness", "tangential_weight", "feature_weight"):
             check_ends(getattr(self, name), name)
-        for name in ("fused_sigma", "give", "doubt", "expected_scale"):
+        for name in ("fused_sigma", "edge_scale", "doubt", "expected_scale"):
             check_positive(getattr(self, name), name)
         check_positive(self.expected, "expected", allow_zero=True)
 
@@ -97,30 +98,30 @@ class ChoiceConfig:
     Args:
         cap: distances count up to this, length.
         normal_scale: how many caps normals count as that are one apart.
-        unlike: what it costs that features differ by one, squared, where the moved source lies on the target.
-        bend: what it costs that neighboring nodes disagree by one size in the mean,
+        feature_distance: what it costs that features differ by one, squared, where the moved source lies on the target.
+        smoothness: what it costs that neighboring nodes disagree by one size in the mean,
         slack: of which less than this hardly counts, length.
-        leap: what it costs that samples are far from where they were expected, if that is known, squared, at
+        deviation: what it costs that samples are far from where they were expected, if that is known, squared, at
             most as much as one off the target:
-        leap_cap: up to this distance, length.
+        deviation_cap: up to this distance, length.
         same: hypotheses agree where their samples are this near each other, length,
         same_share: for at least this share of the samples.
     """
 
     cap: float = 0.03
     normal_scale: float = 0.5
-    unlike: float = 2.0
-    bend: float = 20.0
+    feature_distance: float = 2.0
+    smoothness: float = 20.0
     slack: float = 1e-3
-    leap: float = 1.0
-    leap_cap: float = 0.1
+    deviation: float = 1.0
+    deviation_cap: float = 0.1
     same: float = 0.005
     same_share: float = 0.95
 
     def __post_init__(self) -> None:
-        for name in ("cap", "leap_cap", "same", "same_share"):
+        for name in ("cap", "deviation_cap", "same", "same_share"):
             check_positive(getattr(self, name), name)
-        for name in ("normal_scale", "unlike", "bend", "slack", "leap"):
+        for name in ("normal_scale", "feature_distance", "smoothness", "slack", "deviation"):
             check_positive(getattr(self, name), name, allow_zero=True)
 
 
@@ -172,8 +173,8 @@ class ScanAlignRecord:
         step: number of the step in its stage.
         num_steps: steps planned in the stage.
         width: sigma, in the user's unit.
-        misses: weighted mean squared miss of the matches, squared shares of the size.
-        gaps: disagreement of neighboring nodes, squared shares of the size.
+        residual: weighted mean squared residual of the matches, squared shares of the size.
+        smoothness: disagreement of neighboring nodes, squared shares of the size.
         stiffness: weight of the latter.
         matched: weight of the matches over the number of samples.
     """
@@ -183,15 +184,15 @@ class ScanAlignRecord:
     step: int
     num_steps: int
     width: float
-    misses: float
-    gaps: float
+    residual: float
+    smoothness: float
     stiffness: float
     matched: float
 
     @property
     def energy(self) -> float:
         """Both terms together."""
-        return self.misses + self.stiffness * self.gaps
+        return self.residual + self.stiffness * self.smoothness
 
 
 OnStep = Callable[[ScanAlignRecord], None]
@@ -203,21 +204,21 @@ class Hypothesis:
 
     Args:
         name: what it started from.
-        energy: ``forward + backward + bend + leap``, by which hypotheses are compared; lower is better.
+        energy: ``forward + backward + smoothness + deviation``, by which hypotheses are compared; lower is better.
         forward: mean of what moved samples cost, by squared distance from the target and by unlike features there, each
             at most as much as an outlier.
         backward: mean squared distance of target samples to the moved source, capped at one.
-        bend: weighted disagreement of neighboring nodes.
-        leap: weighted mean squared distance of samples from where they were expected, capped at one; 0 if that is not
-            known.
+        smoothness: weighted disagreement of neighboring nodes.
+        deviation: weighted mean squared distance of samples from where they were expected, capped at one; 0 if that is
+            not known.
     """
 
     name: str
     energy: float
     forward: float
     backward: float
-    bend: float
-    leap: float = 0.0
+    smoothness: float
+    deviation: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -128,7 +128,7 @@ class DeformationGraph(nn.Module):
         both = self.centers[self.edges]
         return transform_points(one, both) - transform_points(other, both)
 
-    def bend(self, transforms: Tensor, slack: float = 0.0) -> Tensor:
+    def smoothness(self, transforms: Tensor, slack: float = 0.0) -> Tensor:
         """Return the weighted mean over edges of both gaps' lengths, (...), in the unit of the points.
 
         Args:

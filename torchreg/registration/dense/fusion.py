@@ -12,7 +12,7 @@ from torchreg.geometry.rigid import transform_points
 from torchreg.registration.dense.config import ChoiceConfig
 from torchreg.registration.dense.deformation_graph import DeformationGraph
 from torchreg.registration.dense.problem import ScanAlignProblem
-from torchreg.registration.dense.stages import embedded, leaps, mismatch
+from torchreg.registration.dense.stages import deviations, embedded, mismatch
 
 # Target samples looked at, and for each of them moved samples that may cover it.
 _NUM_TARGETS, _NUM_COVERS = 400, 2
@@ -72,7 +72,7 @@ class _Energy:
         cover: (T, H K) what a target costs when a sample covers it,
         by: (T, H K) if that sample's node
         under: (H K,) has this label.
-        bends: (E, H, H) what an edge costs under the labels of its ends.
+        smoothness: (E, H, H) what an edge costs under the labels of its ends.
         edges: (E, 2).
     """
 
@@ -80,7 +80,7 @@ class _Energy:
     cover: Tensor
     by: Tensor
     under: Tensor
-    bends: Tensor
+    smoothness: Tensor
     edges: Tensor
 
     @classmethod
@@ -92,7 +92,7 @@ class _Energy:
         costs, covers, by = [], [], []
         for option in options:
             moved = problem.moved(option)
-            costs.append(mismatch(problem, moved, config) + leaps(problem, moved.points, config))
+            costs.append(mismatch(problem, moved, config)[0] + deviations(problem, moved.points, config))
             index, apart = k_nearest(there, embedded(moved, config), min(_NUM_COVERS, len(owner)))
             covers.append((apart / config.cap).clamp(max=1).square())
             by.append(owner[index])
@@ -100,8 +100,8 @@ class _Energy:
         own.index_add_(0, owner, torch.stack(costs, dim=1) / len(owner))
         under = torch.arange(len(options), dtype=torch.uint8, device=owner.device)
         under = under.repeat_interleave(covers[0].shape[1])
-        bends = config.bend * _edge_bends(graph, options, config.slack)
-        return cls(own, torch.cat(covers, dim=1), torch.cat(by, dim=1), under, bends, graph.edges)
+        smoothness = config.smoothness * _edge_smoothness(graph, options, config.slack)
+        return cls(own, torch.cat(covers, dim=1), torch.cat(by, dim=1), under, smoothness, graph.edges)
 
     def __call__(self, labels: Tensor) -> Tensor:
         """Return energies (C,)."""
@@ -109,11 +109,11 @@ class _Energy:
         # Labels are few: as bytes they are gathered in half the time.
         covered = torch.where(labels.to(torch.uint8)[:, self.by] == self.under, self.cover, 1.0).amin(-1).mean(-1)
         one, other = labels[:, self.edges].unbind(-1)
-        return own + covered + self.bends[torch.arange(len(self.edges)), one, other].sum(-1)
+        return own + covered + self.smoothness[torch.arange(len(self.edges)), one, other].sum(-1)
 
 
-def _edge_bends(graph: DeformationGraph, options: Tensor, slack: float) -> Tensor:
-    """Return (E, H, H): the share of `DeformationGraph.bend` of each edge, under two of the motions (H, J, 4, 4)."""
+def _edge_smoothness(graph: DeformationGraph, options: Tensor, slack: float) -> Tensor:
+    """Return (E, H, H): the share of `DeformationGraph.smoothness` of each edge, under two of motions (H, J, 4, 4)."""
     both = graph.centers[graph.edges]
     one, other = (transform_points(options[:, ends], both) for ends in graph.edges.unbind(-1))
     gap = (one.unsqueeze(1) - other).square().sum(-1)

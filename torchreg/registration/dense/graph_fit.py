@@ -28,15 +28,15 @@ class GraphMatches:
         targets: (n, 3).
         weights: (n,) how much each counts, not negative.
         normals: (n, 3) of the targets, or None for targets that hold in all directions alike.
-        slide: how much a miss along the surface counts against one across it, squared; one number, or (n,) of each; 1
-            without normals.
+        tangential_weight: how much a residual along the surface counts against one across it, squared; one number, or
+            (n,) of each; 1 without normals.
     """
 
     which: Tensor | slice
     targets: Tensor
     weights: Tensor
     normals: Tensor | None = None
-    slide: float | Tensor = 1.0
+    tangential_weight: float | Tensor = 1.0
 
     @classmethod
     def of_places(cls, places: Tensor) -> GraphMatches:
@@ -49,9 +49,9 @@ def joined(first: GraphMatches, *others: GraphMatches) -> GraphMatches:
     if not others:
         return first
     parts = zip(*(_tensors(matches) for matches in (first, *others)), strict=True)
-    which, targets, weights, normals, slide = (torch.cat(values) for values in parts)
+    which, targets, weights, normals, tangential_weight = (torch.cat(values) for values in parts)
     # What is fitted is a mean over the matches.
-    return GraphMatches(which, targets, weights * (len(which) / max(1, len(first.weights))), normals, slide)
+    return GraphMatches(which, targets, weights * (len(which) / max(1, len(first.weights))), normals, tangential_weight)
 
 
 def _tensors(matches: GraphMatches) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -61,8 +61,8 @@ def _tensors(matches: GraphMatches) -> tuple[Tensor, Tensor, Tensor, Tensor, Ten
         stop = count if which.stop is None else which.stop
         which = torch.arange(*which.indices(stop), device=matches.targets.device)
     normals = torch.zeros_like(matches.targets) if matches.normals is None else matches.normals
-    slide = torch.as_tensor(matches.slide).to(matches.weights).expand(count)
-    return which, matches.targets, matches.weights, normals, slide
+    tangential_weight = torch.as_tensor(matches.tangential_weight).to(matches.weights).expand(count)
+    return which, matches.targets, matches.weights, normals, tangential_weight
 
 
 @dataclass(frozen=True)
@@ -71,13 +71,13 @@ class GraphFit:
 
     Args:
         transforms: (J, 4, 4).
-        misses: weighted mean squared miss before the last step.
-        gaps: weighted sum of squared gaps between neighbors, over the number of nodes, before the last step.
+        residual: weighted mean squared residual before the last step.
+        smoothness: weighted sum of squared gaps between neighbors, over the number of nodes, before the last step.
     """
 
     transforms: Tensor
-    misses: float
-    gaps: float
+    residual: float
+    smoothness: float
 
 
 def fit_graph(
@@ -87,15 +87,15 @@ def fit_graph(
     stiffness: float,
     num_steps: int = 1,
     *,
-    give: float | None = None,
+    edge_scale: float | None = None,
 ) -> GraphFit:
     """Return the motions after Gauss-Newton steps on matches and stiffness.
 
-    ``E = mean_i w_i (d_i^T (n_i n_i^T + slide I) d_i) + stiffness / J sum_e w_e |gap_e|^2``, d_i a sample's miss and
-    gap_e how far neighboring nodes disagree about each other, see `DeformationGraph.edge_gaps`. With a ``give``, w_e is
-    divided by ``1 + r_e^2 / give^2`` before each step, r_e the root mean square of the edge's two gaps: parts stay
-    rigid, and what they do not share, joints take up. No step shifts a node by more than the
-    diagonal of the samples or the farthest miss.
+    ``E = mean_i w_i (d_i^T (n_i n_i^T + t I) d_i) + stiffness / J sum_e w_e |gap_e|^2``, d_i a sample's residual, t the
+    tangential weight, and gap_e how far neighboring nodes disagree about each other, see `DeformationGraph.edge_gaps`.
+    With an ``edge_scale``, w_e is divided by ``1 + r_e^2 / edge_scale^2`` before each step, r_e the root mean square of
+    the edge's two gaps: parts stay rigid, and what they do not share, joints take up. No step shifts a node by more
+    than the diagonal of the samples or the largest residual.
 
     Args:
         graph: what is moved, float64 on the CPU.
@@ -103,7 +103,7 @@ def fit_graph(
         matches: see `GraphMatches`.
         stiffness: see above.
         num_steps: linear systems, at least one, none of them tested: the caller finds new matches before long.
-        give: see above, in the unit of the points; None for edges that never give.
+        edge_scale: see above, in the unit of the points; None for edges that are never let go.
 
     Returns:
         a `GraphFit`.
@@ -116,37 +116,41 @@ def fit_graph(
     """
     check_count(num_steps, "num_steps", 1)
     check_positive(stiffness, "stiffness", allow_zero=True)
-    if give is not None:
-        check_positive(give, "give")
-    misses = gaps = 0.0
+    if edge_scale is not None:
+        check_positive(edge_scale, "edge_scale")
+    residual = smoothness = 0.0
     size = float((graph.points.amax(0) - graph.points.amin(0)).norm())
     for _ in range(num_steps):
         middles = transform_points(transforms, graph.centers.unsqueeze(1)).squeeze(1)
-        metrics, pulls, misses, gaps, farthest = _costs(graph, graph.sums.places(transforms), matches, stiffness, give)
+        metrics, pulls, residual, smoothness, farthest = _costs(
+            graph, graph.sums.places(transforms), matches, stiffness, edge_scale
+        )
         twists = _solved(*graph.sums.normal_equations(transforms, middles, metrics, pulls), max(size, farthest))
         transforms = turn_about(transforms, twists, middles)
-    return GraphFit(transforms, misses, gaps)
+    return GraphFit(transforms, residual, smoothness)
 
 
 def _costs(
-    graph: DeformationGraph, places: Tensor, matches: GraphMatches, stiffness: float, give: float | None
+    graph: DeformationGraph, places: Tensor, matches: GraphMatches, stiffness: float, edge_scale: float | None
 ) -> tuple[Tensor, Tensor, float, float, float]:
-    """Return metrics (S + 2 E, 6) and pulls (S + 2 E, 3) of samples and gaps, both in all, and the farthest miss."""
+    """Return metrics (S + 2 E, 6), pulls (S + 2 E, 3), costs of samples and of gaps, and the largest residual."""
     count, shares = len(graph.points), matches.weights / max(1, len(matches.weights))
     metrics, pulls = places.new_zeros(len(places), 6), places.new_zeros(len(places), 3)
     miss = places[:count][matches.which] - matches.targets
-    pull = torch.as_tensor(matches.slide).to(miss).reshape(-1, 1) * miss
+    pull = torch.as_tensor(matches.tangential_weight).to(miss).reshape(-1, 1) * miss
     if matches.normals is not None:
         pull = pull + matches.normals * (matches.normals * miss).sum(-1, keepdim=True)
     pull = shares.unsqueeze(1) * pull
-    for sums, part in ((metrics, upper_triangles(shares, matches.normals, matches.slide)), (pulls, pull)):
+    for sums, part in ((metrics, upper_triangles(shares, matches.normals, matches.tangential_weight)), (pulls, pull)):
         if isinstance(matches.which, slice):
             sums[:count][matches.which] = part
         else:
             sums.index_add_(0, matches.which, part)
     gap = places[count:].view(-1, 2, 3)
     apart = gap.square().sum((1, 2))
-    weights = graph.edge_weights if give is None else graph.edge_weights * cauchy_weight(apart / (2 * give**2))
+    weights = (
+        graph.edge_weights if edge_scale is None else graph.edge_weights * cauchy_weight(apart / (2 * edge_scale**2))
+    )
     held = (stiffness / graph.num_nodes * weights).repeat_interleave(2)
     metrics[count:] = upper_triangles(held, None, 1.0)
     pulls[count:] = held.unsqueeze(1) * places[count:]

@@ -15,9 +15,6 @@ from torchreg.registration.dense.stages import embedded, mismatch
 if TYPE_CHECKING:
     from torchreg.registration.dense.config import ChoiceConfig
 
-# Support of what the matcher calls impossible, when it is asked about an alignment: it errs that often.
-_DOUBT = 0.1
-
 
 @dataclass(frozen=True)
 class ScanEvidence:
@@ -26,7 +23,7 @@ class ScanEvidence:
     Args:
         forward: mean cost of moved samples that the matcher calls visible, see `mismatch`.
         backward: mean squared distance of visible target samples from the moved source, in caps, capped at one.
-        bend: of the graph, as it was judged.
+        smoothness: of the graph, as it was judged.
         unsupported: mean of minus the logarithm of the matcher's support of where visible samples ended.
         hidden: share of samples that the matcher calls hidden.
         rival: share of samples that the second-best hypothesis takes elsewhere.
@@ -34,7 +31,7 @@ class ScanEvidence:
 
     forward: float
     backward: float
-    bend: float
+    smoothness: float
     unsupported: float
     hidden: float
     rival: float
@@ -55,6 +52,7 @@ class ScanCalibration:
     bias: float = 7.03
     weights: tuple[float, ...] = (1.12, 6.19, 2.93, 3.74, 1.13, 6.28)  # in the order of `ScanEvidence`
     doubtful: float = 0.5  # confidence below which a result is doubtful
+    doubt: float = 0.1  # support of what the matcher calls impossible, see `MatchPrior.logarithm`: it errs that often
 
 
 SCAN_CALIBRATION = ScanCalibration()
@@ -68,7 +66,7 @@ def confidence_of(evidence: ScanEvidence) -> float:
 
 
 def scan_evidence(
-    problem: ScanAlignProblem, transforms: Tensor, rival: Tensor, bend: float, config: ChoiceConfig
+    problem: ScanAlignProblem, transforms: Tensor, rival: Tensor, smoothness: float, config: ChoiceConfig
 ) -> ScanEvidence:
     """Return the evidence against motions (J, 4, 4) of the nodes.
 
@@ -76,19 +74,19 @@ def scan_evidence(
         problem: the scans.
         transforms: the motions.
         rival: (J, 4, 4) those of the second-best hypothesis.
-        bend: of the graph, see `Hypothesis`.
+        smoothness: of the graph, see `Hypothesis`.
         config: by which hypotheses are compared.
     """
     moved, prior = problem.moved(transforms), problem.prior
     here, there = embedded(moved, config), embedded(problem.target, config)
-    index = NeighborTree(there).nearest(here)[0]
+    cost, index = mismatch(problem, moved, config)
     apart = (NeighborTree(here).nearest(there)[1] / config.cap).clamp(max=1).square()
-    support = prior.logarithm(index[:, None], _DOUBT)[:, 0]
+    support = prior.logarithm(index[:, None], SCAN_CALIBRATION.doubt)[:, 0]
     elsewhere = (problem.graph(transforms) - problem.graph(rival)).norm(dim=-1) > config.same
     return ScanEvidence(
-        forward=_mean(mismatch(problem, moved, config), prior.visible),
+        forward=_mean(cost, prior.visible),
         backward=_mean(apart, prior.target_visible),
-        bend=bend,
+        smoothness=smoothness,
         unsupported=-_mean(support, prior.visible),
         hidden=1 - float(prior.visible.mean()),
         rival=float(elsewhere.double().mean()),

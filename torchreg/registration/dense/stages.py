@@ -22,8 +22,8 @@ from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.registration.dense.problem import ScanAlignProblem
 from torchreg.solvers.robust import geman_mcclure_weight
 
-# Right matches differ by so much in their features, squared, in the mean.
-_USUALLY_UNLIKE = 0.4
+# Squared feature distance of right matches, in the mean.
+_USUAL_FEATURE_DISTANCE = 0.4
 # With less posterior mass a sample has no match: it may be hidden.
 _HARDLY_MATCHED = 0.05
 
@@ -53,8 +53,8 @@ class Reporter:
                 step=step,
                 num_steps=num_steps,
                 width=width * self.size,
-                misses=fit.misses,
-                gaps=fit.gaps,
+                residual=fit.residual,
+                smoothness=fit.smoothness,
                 stiffness=stiffness,
                 matched=matched,
             )
@@ -80,13 +80,15 @@ def refine(
     widths = (config.sigma[0] if first_sigma is None else first_sigma, config.sigma[1])
     for step in range(config.num_steps):
         share = step / max(config.num_steps - 1, 1)
-        sigma, stiffness, slide = (geometric_at(ends, share) for ends in (widths, config.stiffness, config.slide))
+        ends = (widths, config.stiffness, config.tangential_weight)
+        sigma, stiffness, tangential = (geometric_at(each, share) for each in ends)
         for _ in range(config.fits_per_step):
             moved = problem.moved(transforms, problem.num_used(sigma))
             found = soft_matches(problem, moved, sigma, config, share)
-            matches = GraphMatches(slice(0, len(moved)), found.targets, found.posterior, found.normals, slide)
+            matches = GraphMatches(slice(0, len(moved)), found.targets, found.posterior, found.normals, tangential)
             waiting = _as_expected(problem, moved, found, config)
-            fit = fit_graph(problem.graph, transforms, joined(matches, *waiting), stiffness, give=config.give)
+            matches = joined(matches, *waiting)
+            fit = fit_graph(problem.graph, transforms, matches, stiffness, edge_scale=config.edge_scale)
             transforms = fit.transforms
         matched = float(found.posterior.mean())
         reporter.report("refine", step, config.num_steps, sigma, fit, stiffness, matched)
@@ -117,32 +119,32 @@ def _as_expected(
 
 
 def judge(problem: ScanAlignProblem, name: str, transforms: Tensor, config: ChoiceConfig) -> Hypothesis:
-    """Return how well the moved source and the target cover each other, how alike they are there, and bend."""
+    """Return how well moved source and target cover each other, how alike they are there, and how smooth it is."""
     moved = problem.moved(transforms)
-    forward = float(mismatch(problem, moved, config).mean())
+    forward = float(mismatch(problem, moved, config)[0].mean())
     apart = NeighborTree(embedded(moved, config)).nearest(embedded(problem.target, config))[1]
     backward = float((apart / config.cap).clamp(max=1).square().mean())
-    bend = config.bend * float(problem.graph.bend(transforms, config.slack))
-    leap = float(leaps(problem, moved.points, config).mean())
-    costs = (forward, backward, bend, leap)
+    smoothness = config.smoothness * float(problem.graph.smoothness(transforms, config.slack))
+    deviation = float(deviations(problem, moved.points, config).mean())
+    costs = (forward, backward, smoothness, deviation)
     return Hypothesis(name, sum(costs), *costs)
 
 
-def leaps(problem: ScanAlignProblem, places: Tensor, config: ChoiceConfig) -> Tensor:
+def deviations(problem: ScanAlignProblem, places: Tensor, config: ChoiceConfig) -> Tensor:
     """Return what it costs samples (S,) to be elsewhere than expected."""
     if problem.expected is None:
         return torch.zeros_like(places[:, 0])
-    apart = (places - problem.expected).norm(dim=-1) / config.leap_cap
-    return config.leap * apart.clamp(max=1).square()
+    apart = (places - problem.expected).norm(dim=-1) / config.deviation_cap
+    return config.deviation * apart.clamp(max=1).square()
 
 
-def mismatch(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> Tensor:
-    """Return what moved samples cost (S,): distance from the target and unlike features, at most as outliers."""
+def mismatch(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> tuple[Tensor, Tensor]:
+    """Return costs (S,) of moved samples by distance and features, at most those of outliers, and the nearest targets."""
     index, apart = NeighborTree(embedded(problem.target, config)).nearest(embedded(moved, config))
-    unlike = (moved.features - problem.target.features[index]).square().sum(-1)
+    feature_distance = (moved.features - problem.target.features[index]).square().sum(-1)
     # An outlier is as unlike as right matches usually are: leaving the target must not pay.
-    most = 1 + config.unlike * _USUALLY_UNLIKE
-    return ((apart / config.cap).square() + config.unlike * unlike).clamp(max=most)
+    most = 1 + config.feature_distance * _USUAL_FEATURE_DISTANCE
+    return ((apart / config.cap).square() + config.feature_distance * feature_distance).clamp(max=most), index
 
 
 def embedded(samples: OrientedSamples, config: ChoiceConfig) -> Tensor:
