@@ -139,7 +139,7 @@ def deviations(problem: ScanAlignProblem, places: Tensor, config: ChoiceConfig) 
 
 
 def mismatch(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> tuple[Tensor, Tensor]:
-    """Return costs (S,) of moved samples by distance and features, at most those of outliers, and the nearest targets."""
+    """Return costs (S,) of moved samples by distance and features, capped at outliers, and the nearest targets."""
     index, apart = NeighborTree(embedded(problem.target, config)).nearest(embedded(moved, config))
     feature_distance = (moved.features - problem.target.features[index]).square().sum(-1)
     # An outlier is as unlike as right matches usually are: leaving the target must not pay.
