@@ -98,7 +98,7 @@ def register(
 
     OMP_NUM_THREADS=2 in the environment makes a second core help to find where the source goes.
 
-    Exit codes: 0; 1 if too few points match to mean anything; 2 for an error; 130 for Ctrl-C.
+    Exit codes: 0; 1 if the result is doubtful or too few points match; 2 for an error; 130 for Ctrl-C.
     """
     if urdf:
         check_alone({"--depth": depth, "--intrinsics": intrinsics, "--depth-range": depth_range, "--seen": seen,

@@ -31,30 +31,3 @@ def assign(costs: Tensor, unmatched_cost: Tensor | float | None = None) -> Tenso
     chosen = torch.full((rows,), -1, dtype=torch.int64)
     chosen[torch.from_numpy(first)] = torch.from_numpy(second)
     return torch.where(chosen < columns, chosen, -1).to(costs.device)
-
-
-def assign_within(costs: Tensor, limit: float) -> Tensor:
-    """Return the column of each row in the assignment of least total cost in which pairs cost less than ``limit``.
-
-    An unmatched row costs the limit. The table is a part of that of `assign`, which takes a cost for each row.
-
-    Args:
-        costs: (N, M), finite.
-        limit: see above, positive.
-
-    Returns:
-        Columns (N,) int64, -1 for unmatched rows.
-
-    Differentiable: no.
-
-    Cost: O(min(N, M)^2 max(N, M)) at worst; 5 ms for 400 x 400.
-
-    References: Crouse 2016.
-    """
-    costs = costs.detach()
-    chosen = torch.full((costs.shape[0],), -1, dtype=torch.int64)
-    rows, columns = linear_sum_assignment(costs.clamp(max=limit).cpu().numpy())
-    first, second = torch.from_numpy(rows), torch.from_numpy(columns)
-    within = costs.cpu()[first, second] < limit
-    chosen[first[within]] = second[within]
-    return chosen.to(costs.device)
