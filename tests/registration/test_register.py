@@ -9,7 +9,7 @@ import trimesh
 import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
-from torchreg.errors import InputError, InputTypeError
+from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError
 from torchreg.geometry.rigid import rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.metrics import adjusted_rand
@@ -135,6 +135,15 @@ def test_disjoint_scans_say_so(pair):
 def sheet(count, seed=0, flat=True):
     points = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
     return points * torch.tensor([1.0, 0.7, 0.0 if flat else 0.5])
+
+
+def test_a_plane_is_degenerate_even_where_its_normals_look_the_other_way():
+    flat = sheet(400)
+    up = torch.tensor([0.0, 0.0, 1.0]).expand_as(flat)
+    with pytest.warns(DegenerateDataWarning):
+        found = register(tr.RangeScan(flat, normals=up), tr.RangeScan(flat, normals=-up), 3, 10)
+    assert found.status is Status.DEGENERATE
+    assert not found.matched.any()
 
 
 @pytest.mark.filterwarnings("ignore:the points of scan 0 lie on a plane")

@@ -214,12 +214,12 @@ def _scan_registration(
 
 def fit_status(matched: float, converged: bool, config: BoneConfig, *, degenerate: bool) -> Status:
     """Return the status of a fit that matched a share of the points of scans, degenerate ones or not."""
+    if degenerate:
+        return Status.DEGENERATE
     if matched == 0:
         return Status.NO_DATA
     if matched < config.min_matched:
         return Status.FEW_INLIERS
-    if degenerate:
-        return Status.DEGENERATE
     return Status.CONVERGED if converged else Status.MAX_STEPS
 
 
