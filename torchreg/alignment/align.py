@@ -13,7 +13,16 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_choice, check_count, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
-from torchreg.alignment.annealed_em import ANNEALING, CORRESPONDENCES, OnStep, StageResult, anneal, outlier_level
+from torchreg.alignment.align_stages import (
+    AlignBatch,
+    anneal_batch,
+    best_start,
+    fit_batch_surface,
+    fit_to_the_end,
+    refit_without_cut,
+    search_where_needed,
+)
+from torchreg.alignment.annealed_em import CORRESPONDENCES, OnStep, StageResult, outlier_level
 from torchreg.alignment.find_pose import FindPoseConfig, FoundStarts, search_everywhere
 from torchreg.alignment.in_picture import surest_crop
 from torchreg.alignment.inputs import (
@@ -26,7 +35,6 @@ from torchreg.alignment.inputs import (
 )
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmark_fit import align_keypoints, measured_alone
-from torchreg.alignment.local_search import explore, needs_search
 from torchreg.alignment.problem import (
     INLIER_SHARE,
     AlignProblem,
@@ -47,7 +55,6 @@ from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES
 from torchreg.alignment.shape_fit import fit_coefficients, fitted_rig
 from torchreg.alignment.sigma_schedule import SigmaSchedule
-from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, UnitsWarning
 from torchreg.geometry.camera import Camera
@@ -64,7 +71,6 @@ class _Limits:
 
     min_inliers: int = 10  # fewer inliers, and the pose means nothing
     min_share: float = 0.02  # the same, as a share of the data
-    more_steps: int = 5  # of a fit that has not converged, as a multiple of those at its last width
     many_data: int = 10_000  # in a batch, from which all threads of torch are of use
 
 
@@ -283,13 +289,13 @@ def _align(
         warn_about_rounding(clouds, "data", batch.problem.size, stacklevel=3)
         warn_about_units(batch.problem.data, batch.problem.valid, batch.problem.size, stacklevel=3)
         with one_thread(batch.problem.valid.numel() < _LIMITS.many_data):
-            found = _register(batch, config)  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3
-            found = _fit_surface(batch, found, config)  # eqs. 21 and 22: section 3.4
-            batch, found = _best_start(batch, found) if several else (batch, found)
-            found = _search_where_needed(batch, found, config)
+            found = anneal_batch(batch, config)  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3
+            found = fit_batch_surface(batch, found, config)  # eqs. 21 and 22: section 3.4
+            batch, found = best_start(batch, found) if several else (batch, found)
+            found = search_where_needed(batch, found, config)
             judged = without_cut(batch.problem, found.pose, seen.frames)
-            found = _refit(batch, judged, found, config)
-            found = _finished(judged, found, config)
+            found = refit_without_cut(batch, judged, found, config)
+            found = fit_to_the_end(batch, judged, found, config)
         result = _result(batch, found, config, lead, judged)  # inliers by eq. 2, the posterior by eq. 17
         return normal_copy(_unbatched(result) if clouds.ndim == 2 else result)
 
@@ -380,37 +386,6 @@ def _found_pose(
         return search_everywhere(shape, seen, 1, DEFAULT_SOURCES, model_points, search, known)
 
 
-@dataclass(frozen=True)
-class _Batch:
-    """Alignments in centered coordinates.
-
-    Args:
-        problem: of B clouds.
-        start: (B, num_dofs).
-        origin: (B, 3) of the coordinates.
-        on_step: the caller's.
-        history: records of all stages, to which those of any rows are added.
-    """
-
-    problem: AlignProblem
-    start: Tensor
-    origin: Tensor
-    on_step: OnStep | None
-    history: list[AlignRecord]
-
-    def record(self, step: AlignRecord) -> None:
-        """Keep the record of a step and pass it on, with poses in the coordinates of the data."""
-        step = normal_copy(replace(step, pose=shifted(step.pose, self.origin)))
-        self.history.append(step)
-        if self.on_step is not None:
-            with torch.inference_mode(False), torch.no_grad():
-                self.on_step(step)
-
-    def rows(self, index: Tensor) -> _Batch:
-        """Return some rows of the batch."""
-        return replace(self, problem=self.problem.rows(index), start=self.start[index], origin=self.origin[index])
-
-
 def _check_start(shape: ArticulatedShape, initial_pose: Tensor | None, clouds: Tensor) -> tuple[Tensor, bool]:
     """Return starts (B, num_dofs) within the limits, and whether they are several starts of a single cloud."""
     pose = shape.rest_pose() if initial_pose is None else shape.check_pose(initial_pose, "initial_pose")
@@ -446,7 +421,7 @@ def _centered_batch(
     config: AlignConfig,
     on_step: OnStep | None,
     seen: Observation,
-) -> _Batch:
+) -> AlignBatch:
     """Return the alignments of clouds ((B,) M, 3) from starts (B, num_dofs), each about the mean of its data."""
     data, valid = clouds.expand(len(pose), *clouds.shape[-2:]), valid.expand(len(pose), valid.shape[-1])
     origin = masked_mean(data, valid)
@@ -458,81 +433,11 @@ def _centered_batch(
         outlier=config.outlier, debias=config.debias, correspondence=config.correspondence, free_space=free_space,
         keypoints=seen.keypoints,
     )  # fmt: skip
-    return _Batch(problem=problem, start=shifted(pose, -origin), origin=origin, on_step=on_step, history=[])
-
-
-def _register(batch: _Batch, config: AlignConfig) -> StageResult:
-    schedule = config.schedule or ANNEALING.schedule(batch.problem.size)
-    return anneal(
-        batch.problem, batch.start, schedule, em_steps=config.em_steps, m_steps=config.m_steps, on_step=batch.record
-    )
-
-
-def _fit_surface(batch: _Batch, found: StageResult, config: AlignConfig) -> StageResult:
-    """Return the poses after a surface fit; sigma stays that of the registration, at which the posterior is told."""
-    if config.surface_steps == 0:
-        return found
-    fitted = fit_surface(batch.problem, found.pose, steps=config.surface_steps, on_step=batch.record)
-    return replace(fitted, sigma=found.sigma)
-
-
-def _best_start(batch: _Batch, found: StageResult) -> tuple[_Batch, StageResult]:
-    best = alignment_cost(batch.problem, found.pose).argmin().unsqueeze(0)
-    return batch.rows(best), found.rows(best)
-
-
-def _search_where_needed(batch: _Batch, found: StageResult, config: AlignConfig) -> StageResult:
-    """Return the result with better poses where a search found any."""
-    if config.search == "never":
-        return found
-    wanted = torch.ones_like(found.change, dtype=torch.bool)
-    if config.search == "auto":
-        wanted = needs_search(batch.problem, batch.start, found.pose)
-    rows = wanted.nonzero()[:, 0]
-    if len(rows) == 0:
-        return found
-    part, before = batch.rows(rows), found.rows(rows)
-    generator = torch.Generator().manual_seed(config.seed)
-    explored = explore(
-        part.problem, part.start, before.pose, candidates=config.num_candidates, rounds=config.search_rounds,
-        generator=generator,
-    )  # fmt: skip
-    steps = max(config.surface_steps, SURFACE_FIT.search_steps)
-    widths = SURFACE_FIT.widths[-1:]
-    refined = fit_surface(part.problem, explored, steps=steps, widths=widths, on_step=part.record)
-    better = alignment_cost(part.problem, refined.pose) < alignment_cost(part.problem, before.pose)
-    pose, change = found.pose.clone(), found.change.clone()
-    pose[rows] = torch.where(better.unsqueeze(-1), refined.pose, before.pose)
-    change[rows] = torch.where(better, refined.change, before.change)
-    return replace(found, pose=pose, change=change)
-
-
-def _refit(batch: _Batch, judged: AlignProblem, found: StageResult, config: AlignConfig) -> StageResult:
-    """Return the poses fitted without what a crop cuts off, as a forearm, where there is any."""
-    if config.surface_steps == 0 or bool((judged.valid == batch.problem.valid).all()):
-        return found
-    steps = max(config.surface_steps, SURFACE_FIT.search_steps)
-    refined = fit_surface(judged, found.pose, steps=steps, widths=SURFACE_FIT.widths[-1:], on_step=batch.record)
-    return replace(refined, sigma=found.sigma)
-
-
-def _finished(judged: AlignProblem, found: StageResult, config: AlignConfig) -> StageResult:
-    """Return the poses after more steps of the last fit, where another would still gain; not of a plain descent."""
-    if config.surface_steps == 0 or config.search == "never":
-        return found
-    rows = (found.change > config.pose_atol).nonzero()[:, 0]
-    rows = rows[~curvature(judged.rows(rows), found.pose[rows]).converged] if len(rows) else rows
-    if len(rows) == 0:
-        return found
-    # Records are of whole batches: those of some rows have no place among them.
-    refined = fit_surface(judged.rows(rows), found.pose[rows], steps=_LIMITS.more_steps, widths=())
-    pose, change = found.pose.clone(), found.change.clone()
-    pose[rows], change[rows] = refined.pose, refined.change
-    return replace(found, pose=pose, change=change)
+    return AlignBatch(problem=problem, start=shifted(pose, -origin), origin=origin, on_step=on_step, history=[])
 
 
 def _result(
-    batch: _Batch, found: StageResult, config: AlignConfig, lead: Tensor | None, judged: AlignProblem
+    batch: AlignBatch, found: StageResult, config: AlignConfig, lead: Tensor | None, judged: AlignProblem
 ) -> AlignResult:
     problem, pose = batch.problem, found.pose
     distances = problem.surface.distance(problem.data, pose)

@@ -27,6 +27,7 @@ class SurfaceFit:
     width_per_noise: float = 2.5  # at which a Welsch kernel is almost as efficient as least squares on Gaussian noise
     last_steps: int = 3  # at the last width, as a multiple of those at the others
     search_steps: int = 4  # at each width after a search, to whose time they hardly add
+    more_steps: int = 5  # of a fit that has not converged, as a multiple of those at its last width
     refine_damping: float = 1e-5  # of untested steps from a pose that is known to a few degrees
     lever: float = 0.25  # typical distance of the surface from the base's axis of rotation
 

@@ -1,0 +1,125 @@
+"""The stages of the alignments of a batch: annealed EM, surface fit, a search where needed, steps to the end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchreg.alignment.annealed_em import ANNEALING, OnStep, StageResult, anneal
+from torchreg.alignment.local_search import explore, needs_search
+from torchreg.alignment.problem import AlignProblem, alignment_cost
+from torchreg.alignment.reliability import curvature
+from torchreg.alignment.results import AlignRecord
+from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
+from torchreg.result import normal_copy
+from torchreg.shapes.pose_algebra import shifted
+
+if TYPE_CHECKING:
+    from torchreg.alignment.align import AlignConfig
+
+
+@dataclass(frozen=True)
+class AlignBatch:
+    """Alignments in centered coordinates.
+
+    Args:
+        problem: of B clouds.
+        start: (B, num_dofs).
+        origin: (B, 3) of the coordinates.
+        on_step: the caller's.
+        history: records of all stages, to which those of any rows are added.
+    """
+
+    problem: AlignProblem
+    start: Tensor
+    origin: Tensor
+    on_step: OnStep | None
+    history: list[AlignRecord]
+
+    def record(self, step: AlignRecord) -> None:
+        """Keep the record of a step and pass it on, with poses in the coordinates of the data."""
+        step = normal_copy(replace(step, pose=shifted(step.pose, self.origin)))
+        self.history.append(step)
+        if self.on_step is not None:
+            with torch.inference_mode(False), torch.no_grad():
+                self.on_step(step)
+
+    def rows(self, index: Tensor) -> AlignBatch:
+        """Return some rows of the batch."""
+        return replace(self, problem=self.problem.rows(index), start=self.start[index], origin=self.origin[index])
+
+
+def anneal_batch(batch: AlignBatch, config: AlignConfig) -> StageResult:
+    """Return the poses after the annealed EM from the starts."""
+    schedule = config.schedule or ANNEALING.schedule(batch.problem.size)
+    return anneal(
+        batch.problem, batch.start, schedule, em_steps=config.em_steps, m_steps=config.m_steps, on_step=batch.record
+    )
+
+
+def fit_batch_surface(batch: AlignBatch, found: StageResult, config: AlignConfig) -> StageResult:
+    """Return the poses after a surface fit; sigma stays that of the registration, at which the posterior is told."""
+    if config.surface_steps == 0:
+        return found
+    fitted = fit_surface(batch.problem, found.pose, steps=config.surface_steps, on_step=batch.record)
+    return replace(fitted, sigma=found.sigma)
+
+
+def best_start(batch: AlignBatch, found: StageResult) -> tuple[AlignBatch, StageResult]:
+    """Return the alignment of least cost, where all are of one cloud."""
+    best = alignment_cost(batch.problem, found.pose).argmin().unsqueeze(0)
+    return batch.rows(best), found.rows(best)
+
+
+def search_where_needed(batch: AlignBatch, found: StageResult, config: AlignConfig) -> StageResult:
+    """Return the result with better poses where a search found any."""
+    if config.search == "never":
+        return found
+    wanted = torch.ones_like(found.change, dtype=torch.bool)
+    if config.search == "auto":
+        wanted = needs_search(batch.problem, batch.start, found.pose)
+    rows = wanted.nonzero()[:, 0]
+    if len(rows) == 0:
+        return found
+    part, before = batch.rows(rows), found.rows(rows)
+    generator = torch.Generator().manual_seed(config.seed)
+    explored = explore(
+        part.problem, part.start, before.pose, candidates=config.num_candidates, rounds=config.search_rounds,
+        generator=generator,
+    )  # fmt: skip
+    steps = max(config.surface_steps, SURFACE_FIT.search_steps)
+    widths = SURFACE_FIT.widths[-1:]
+    refined = fit_surface(part.problem, explored, steps=steps, widths=widths, on_step=part.record)
+    better = alignment_cost(part.problem, refined.pose) < alignment_cost(part.problem, before.pose)
+    pose, change = found.pose.clone(), found.change.clone()
+    pose[rows] = torch.where(better.unsqueeze(-1), refined.pose, before.pose)
+    change[rows] = torch.where(better, refined.change, before.change)
+    return replace(found, pose=pose, change=change)
+
+
+def refit_without_cut(batch: AlignBatch, judged: AlignProblem, found: StageResult, config: AlignConfig) -> StageResult:
+    """Return the poses fitted without what a crop cuts off, as a forearm, where there is any."""
+    if config.surface_steps == 0 or bool((judged.valid == batch.problem.valid).all()):
+        return found
+    steps = max(config.surface_steps, SURFACE_FIT.search_steps)
+    refined = fit_surface(judged, found.pose, steps=steps, widths=SURFACE_FIT.widths[-1:], on_step=batch.record)
+    return replace(refined, sigma=found.sigma)
+
+
+def fit_to_the_end(batch: AlignBatch, judged: AlignProblem, found: StageResult, config: AlignConfig) -> StageResult:
+    """Return the poses after more steps of the last fit, where another would still gain; not of a plain descent."""
+    if config.surface_steps == 0 or config.search == "never":
+        return found
+    rows = (found.change > config.pose_atol).nonzero()[:, 0]
+    rows = rows[~curvature(judged.rows(rows), found.pose[rows]).converged] if len(rows) else rows
+    if len(rows) == 0:
+        return found
+    part, start = judged.rows(rows), found.pose[rows]
+    record = batch.rows(rows).record
+    refined = fit_surface(part, start, steps=SURFACE_FIT.more_steps, widths=(), on_step=record)
+    pose, change = found.pose.clone(), found.change.clone()
+    pose[rows], change[rows] = refined.pose, refined.change
+    return replace(found, pose=pose, change=change)
