@@ -1,5 +1,7 @@
 """One thread for torch: the problems here are small, and the tests may run beside others. Hands that take a second."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -13,6 +15,16 @@ from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.skin import sample_skin
 
 torch.set_num_threads(1)
+
+# Long runs of everything together. Tracing slows them most, and their parts have tests of their own, which are traced.
+UNTRACED = {"benchmarks", "experiments", "docs"}
+
+
+def pytest_collection_modifyitems(items):
+    """Leave coverage out of long runs."""
+    for item in items:
+        if UNTRACED.intersection(item.path.relative_to(Path(__file__).parent).parts):
+            item.add_marker("no_cover")
 
 
 @pytest.fixture(scope="session")
