@@ -280,16 +280,16 @@ def print_sequence(kind: str, sequence: ScanSequence, recipe: Recipe) -> None:
     print(f"parts: adjusted Rand index {rand:.2f}; joints within {JOINT:.0%}: {right:.0%} of {len(joints)}", flush=True)
 
 
-def sequences_of(kind: str, count: int, frames: int) -> Iterator[ScanSequence]:
+def sequences_of(kind: str, count: int, frames: int, scanner: DepthScanner | None = None) -> Iterator[ScanSequence]:
     """Yield sequences of one kind with seeds from 0 on; toys are of random forms."""
     for seed in range(count):
         if kind == "toy":
-            yield jointed_toy(frames, seed, toy=random_toy(torch.Generator().manual_seed(seed)))
+            yield jointed_toy(frames, seed, toy=random_toy(torch.Generator().manual_seed(seed)), scanner=scanner)
         else:
-            yield {"figure": walking_figure, "animal": walking_animal}[kind](frames, seed)
+            yield {"figure": walking_figure, "animal": walking_animal}[kind](frames, seed, scanner=scanner)
 
 
-def print_many_sequences(count: int, frames: int, recipe: Recipe) -> None:
+def print_many_sequences(count: int, frames: int, recipe: Recipe, scanner: DepthScanner | None = None) -> None:
     """Print mean errors of the first frame's points in all frames and in the last, and how often they are there.
 
     Beside that errors of adjacent pairs, and parts and joints.
@@ -298,7 +298,7 @@ def print_many_sequences(count: int, frames: int, recipe: Recipe) -> None:
     print(f"{'':8s} mean %  last %  pair %  last/pair  frames  last registered   rand joints")
     for kind in ("figure", "toy", "animal"):
         rows, rands, joints = [], [], []
-        for sequence in sequences_of(kind, count, frames):
+        for sequence in sequences_of(kind, count, frames, scanner):
             scans = list(sequence)
             size = scans[0].diagonal
             found = tr.register_sequence(scans, recipe.bones, recipe.grid, recipe.config)
@@ -342,12 +342,14 @@ def main(arguments: list[str] | None = None) -> int:
     if options.sequences and not options.frames:
         parser.error("--sequences needs --frames, how long they are")
     if options.smoke:
-        small = [Recipe("default", 6, 20, tr.RegisterConfig(num_samples=500))]
+        align = ScanAlignConfig(num_samples=400, num_target_samples=800, num_nodes=30)
+        small = [Recipe("default", 6, 20, tr.RegisterConfig(num_samples=500, align=align))]
         toys = list(made_up_problems("toy", 1, 600))
         print_set("toy", toys, small, options.verbose)
         print_set("toy, moved", [moved(toy) for toy in toys], small, options.verbose)
-        print_sequence("figure", walking_figure(2, scanner=DepthScanner(num_points=600)), small[0])
-        print_many_sequences(1, 2, small[0])
+        scanner = DepthScanner(num_points=600)
+        print_sequence("figure", walking_figure(2, scanner=scanner), small[0])
+        print_many_sequences(1, 2, small[0], scanner)
         return 0
     sets: dict[str, list[Problem]] = {}
     if options.data is None or not options.data.is_dir():
