@@ -17,7 +17,11 @@ from torchreg.shapes.skin import sample_skin
 torch.set_num_threads(1)
 
 # Long runs of everything together. Tracing slows them most, and their parts have tests of their own, which are traced.
-UNTRACED = {"benchmarks", "experiments", "docs"}
+UNTRACED = {
+    "benchmarks", "docs", "experiments", "web", "test_align_scans.py", "test_calibrate.py", "test_default_dtypes.py",
+    "test_em_loss.py", "test_extract_spine.py", "test_far_coordinates.py", "test_find_pose.py", "test_loaded_data.py",
+    "test_prior.py", "test_search.py",
+}  # fmt: skip
 
 
 def pytest_collection_modifyitems(items):
