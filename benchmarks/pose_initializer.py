@@ -298,7 +298,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
         return {}
     torch.set_num_threads(options.threads)
     counts = (1, 1) if options.smoke else (options.clouds, options.full_clouds)
-    config = tr.PoseInitializerConfig(search=QUICK) if options.smoke else tr.PoseInitializerConfig()
+    config = tr.PoseInitializerConfig(find_pose=QUICK) if options.smoke else tr.PoseInitializerConfig()
     batches = [1, 2] if options.smoke else options.batches
     print(
         f"device {device.type}, {options.threads} threads, seed {options.seed}; right: tips within {1e3 * RIGHT:g} mm"

@@ -112,7 +112,7 @@ def calibrate(dtype):
 
 def initialize(dtype):
     shape, cloud = finger(dtype), finger_cloud().to(dtype)
-    layer = tr.PoseInitializer(shape, tr.PoseInitializerConfig(search=SEARCH))
+    layer = tr.PoseInitializer(shape, tr.PoseInitializerConfig(find_pose=SEARCH))
     start = shape.rest_pose() + 0.01
     return [layer(cloud[None]).pose, layer(cloud[None], start=start[None]).pose]
 

@@ -72,7 +72,7 @@ def test_nothing_is_confident(finger, cloud):
     data, where = cloud
     with pytest.warns(DegenerateDataWarning, match=where):
         assert float(tr.find_pose(finger, data, config=SEARCH).confidence) == 0
-    layer = tr.PoseInitializer(finger, tr.PoseInitializerConfig(search=SEARCH))
+    layer = tr.PoseInitializer(finger, tr.PoseInitializerConfig(find_pose=SEARCH))
     assert float(layer(data, start=finger.rest_pose()).confidence) == 0
 
 

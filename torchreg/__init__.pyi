@@ -12,12 +12,17 @@ from torchreg.alignment.find_pose import find_pose as find_pose
 from torchreg.alignment.pose_initializer import InitialPose as InitialPose
 from torchreg.alignment.pose_initializer import PoseInitializer as PoseInitializer
 from torchreg.alignment.pose_initializer import PoseInitializerConfig as PoseInitializerConfig
+from torchreg.alignment.pose_proposer import PoseProposer as PoseProposer
+from torchreg.alignment.pose_proposer import ProposerSize as ProposerSize
 from torchreg.alignment.results import AlignResult as AlignResult
 from torchreg.alignment.results import BaseCalibration as BaseCalibration
 from torchreg.alignment.results import Calibration as Calibration
 from torchreg.alignment.results import PoseStarts as PoseStarts
 from torchreg.alignment.sigma_schedule import SigmaSchedule as SigmaSchedule
 from torchreg.alignment.skeleton_source import SpineLimbs as SpineLimbs
+from torchreg.alignment.train_initializer import TrainingRow as TrainingRow
+from torchreg.alignment.train_initializer import TrainInitializerConfig as TrainInitializerConfig
+from torchreg.alignment.train_initializer import train_initializer as train_initializer
 from torchreg.capture.depth import depth_scan as depth_scan
 from torchreg.capture.depth import fuse_scans as fuse_scans
 from torchreg.capture.depth import load_depth_scan as load_depth_scan
@@ -104,8 +109,10 @@ __all__ = [
     "PoseInitializer",
     "PoseInitializerConfig",
     "PosePrior",
+    "PoseProposer",
     "PoseSolution",
     "PoseStarts",
+    "ProposerSize",
     "RangeScan",
     "RegisterConfig",
     "RegistrationEnergy",
@@ -132,6 +139,8 @@ __all__ = [
     "TrackResult",
     "TrackState",
     "Tracker",
+    "TrainInitializerConfig",
+    "TrainingRow",
     "TriangleMesh",
     "__version__",
     "align",
@@ -160,5 +169,6 @@ __all__ = [
     "to_open3d",
     "to_pyvista",
     "to_trimesh",
+    "train_initializer",
     "visual_hull",
 ]

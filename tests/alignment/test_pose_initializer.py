@@ -277,7 +277,7 @@ def test_hands_are_found_from_scratch(plain_hand, plain_hand_skin, plain_hand_su
         generator=torch.Generator().manual_seed(0),
     ).points  # fmt: skip
     quick = FindPoseConfig(num_candidates=16, num_placed=5, num_searched=2, search_rounds=1)
-    layer = PoseInitializer(plain_hand, PoseInitializerConfig(search=quick), model_points=plain_hand_skin)
+    layer = PoseInitializer(plain_hand, PoseInitializerConfig(find_pose=quick), model_points=plain_hand_skin)
     leaf = cloud.clone().requires_grad_()
     result = layer(leaf)
     error = (result.keypoints - plain_hand.keypoints(pose)).norm(dim=-1)
@@ -290,7 +290,7 @@ def test_hands_are_found_from_scratch(plain_hand, plain_hand_skin, plain_hand_su
 
 def test_from_scratch_a_cloud_of_a_batch_may_be_empty(shape, skin, points):
     quick = FindPoseConfig(num_candidates=4, num_placed=2, num_searched=1, search_rounds=1)
-    layer = PoseInitializer(shape, PoseInitializerConfig(search=quick), model_points=skin)
+    layer = PoseInitializer(shape, PoseInitializerConfig(find_pose=quick), model_points=skin)
     mask = torch.ones(3, 60, dtype=torch.bool)
     mask[1] = False
     with torch.no_grad():
@@ -312,7 +312,7 @@ def test_a_copy_on_any_device_finds_the_same(shape, skin, points, start, device)
     """From starts with gradients, and from scratch without."""
     other = finger().requires_grad_(False).to(device)
     quick = FindPoseConfig(num_candidates=4, num_placed=2, num_searched=1, search_rounds=1)
-    config = replace(EXACT, search=quick)
+    config = replace(EXACT, find_pose=quick)
     layer, there = PoseInitializer(shape, config, model_points=skin), PoseInitializer(other, config)
     there.skin = LinearBlendSkin(other, skin.points.to(device), skin.weights.to(device), other.rest_pose())
     leaf, leaf_there = points.clone().requires_grad_(), points.to(device).requires_grad_()

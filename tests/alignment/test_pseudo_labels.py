@@ -31,7 +31,7 @@ def layer():
         Primitive("ellipsoid", (0.012, 0.015, 0.04), offset(0, 0, 0.04)),
     ]
     shape = ArticulatedShape(tree, ["body", "finger"], solids, nu=0.004).requires_grad_(False)
-    return PoseInitializer(shape, PoseInitializerConfig(search=QUICK), model_points=sample_skin(shape, 80))
+    return PoseInitializer(shape, PoseInitializerConfig(find_pose=QUICK), model_points=sample_skin(shape, 80))
 
 
 @pytest.fixture(scope="module")

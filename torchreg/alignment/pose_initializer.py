@@ -11,11 +11,13 @@ from torchreg._checks import check_choice, check_count, check_positive, check_sh
 from torchreg.alignment.align import AlignConfig
 from torchreg.alignment.annealed_em import ANNEALING, anneal
 from torchreg.alignment.clusters import clustered_data
-from torchreg.alignment.confidence import EVIDENCE
+from torchreg.alignment.confidence import EVIDENCE, pose_confidence
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
+from torchreg.alignment.fit_proposals import best_proposal
 from torchreg.alignment.implicit_gradient import FixedPoint, attach_gradients
 from torchreg.alignment.inputs import are_degenerate, check_clouds, check_skin
 from torchreg.alignment.objectives import GaussianPosePrior
+from torchreg.alignment.pose_proposer import PoseProposer, shipped_proposer
 from torchreg.alignment.problem import (
     BROAD_PRIOR,
     AlignProblem,
@@ -36,6 +38,7 @@ from torchreg.shapes.surface import FusedSurface
 class _Batching:
     """Number of clouds in one batch."""
 
+    cpu_proposed: int = 32  # of a network and the fits of its poses on a CPU
     cpu_searched: int = 1  # of a search on a CPU, whose caches hold no more
     searched: int = 256  # of a search on other devices, which these keep busy
     cpu_fitted: int = 64  # of fits without gradients on a CPU, where more are no faster
@@ -43,6 +46,8 @@ class _Batching:
 
 
 _BATCHING = _Batching()
+# Poses of a network that are less sure are searched for where "doubtful" ones are: as likely wrong as right.
+_LEAST_CONFIDENCE = 0.5
 
 
 @dataclass(frozen=True)
@@ -61,7 +66,9 @@ class PoseInitializerConfig:
         noise: standard deviation of the data about the surface, metres; by default estimated, cloud by cloud, and then
             held when gradients are taken.
         num_model_points: points sampled on the shape for the EM.
-        search: of poses from scratch.
+        search: for poses from scratch: "never", where a network proposes them; "doubtful", where that is less sure than
+            one half; "always"; by default "never" with a network and "always" without.
+        find_pose: settings of the search.
         chunk: clouds that are searched at a time; by default one on a CPU, whose caches hold no more, else 256.
         nan_policy: "raise", or "omit" to leave out non-finite data.
     """
@@ -74,12 +81,15 @@ class PoseInitializerConfig:
     prior_std: float = 0.3
     noise: float | None = None
     num_model_points: int = 300
-    search: FindPoseConfig = field(default_factory=lambda: FindPoseConfig(num_retries=3))
+    search: str | None = None
+    find_pose: FindPoseConfig = field(default_factory=lambda: FindPoseConfig(num_retries=3))
     chunk: int | None = None
     nan_policy: str = "raise"
 
     def __post_init__(self) -> None:
         check_choice(self.nan_policy, "nan_policy", ("raise", "omit"))
+        if self.search is not None:
+            check_choice(self.search, "search", ("never", "doubtful", "always"))
         for name in ("sigma_steps", "em_steps", "surface_steps", "newton_steps"):
             check_count(getattr(self, name), name, int(name == "em_steps"))
         for name in ("fit_steps", "num_model_points"):
@@ -113,9 +123,10 @@ class PoseInitializer(nn.Module):
     """Finds the poses in which a shape lies on a batch of clouds; also a layer, with exact gradients.
 
     With starts, as from a network or the frame before, an annealed EM and a surface fit take all clouds to their poses
-    together; without, `find_pose` searches first. Under ``torch.no_grad`` that is all. Otherwise the pose, a stationary
-    point of the last fit, takes its gradients from the implicit function: in the points, the starts, and the shape's
-    parameters that require them, in memory that does not grow with the iterations.
+    together; without, a network proposes poses, the best of which is fitted, or `find_pose` searches. Under
+    ``torch.no_grad`` that is all. Otherwise the pose, a stationary point of the last fit, takes its gradients from the
+    implicit function: in the points, the starts, and the shape's parameters that require them, in memory that does not
+    grow with the iterations.
 
     The last fit is to the shape's solids, also where its file has a mesh: `align` then fits more closely.
 
@@ -125,9 +136,11 @@ class PoseInitializer(nn.Module):
         shape: the articulated shape, in metres; its parameters get gradients where they require them.
         config: see `PoseInitializerConfig`.
         model_points: a skin of the shape to reuse; sampled on the surface by default.
+        proposer: a network that proposes its poses, see `train_initializer`; of the built-in hand one comes with
+            torchreg.
 
     Raises:
-        InputError: if ``model_points`` is a skin of another shape.
+        InputError: if ``model_points`` is a skin of another shape, or a search that needs a network has none.
 
     References: Dewaele et al. 2006, section 3.
     """
@@ -138,10 +151,17 @@ class PoseInitializer(nn.Module):
         config: PoseInitializerConfig | None = None,
         *,
         model_points: LinearBlendSkin | None = None,
+        proposer: PoseProposer | None = None,
     ) -> None:
         super().__init__()
         self.config = config or PoseInitializerConfig()
         self.shape = shape
+        self.proposer = shipped_proposer(shape) if proposer is None else proposer
+        if self.proposer is None and self.config.search in ("never", "doubtful"):
+            raise InputError(
+                f"search={self.config.search!r} needs a network for this shape; train one with tr.train_initializer or "
+                "torchreg train-initializer, and give it as proposer="
+            )
         count = self.config.num_model_points
         self.skin = check_skin(shape, sample_skin(shape, count) if model_points is None else model_points)
 
@@ -163,7 +183,8 @@ class PoseInitializer(nn.Module):
         Differentiable: in ``points``, ``start`` and the shape's parameters, once; not in which points are outliers to
             be ignored, nor in the estimated noise.
 
-        Cost: of the forward pass O(B M) per step; from scratch about two seconds per hand on one CPU core.
+        Cost: of the forward pass O(B M) per step; from scratch .03 s per hand on one CPU core in batches, and seconds
+            where it is searched for.
         """
         with torch.autocast(device_type=self.shape.rest.device.type, enabled=False):
             clouds, valid = check_clouds(self.shape, points, mask, self.config.nan_policy, name="points")
@@ -195,10 +216,7 @@ class PoseInitializer(nn.Module):
     def _poses(self, data: Tensor, valid: Tensor, start: Tensor | None, origin: Tensor) -> tuple[Tensor, Tensor]:
         """Return poses (B, num_dofs) and confidences (B,)."""
         if start is None:
-            found, confidence = self._search(data.detach(), valid)
-            # The prior draws to a typical pose, which does not change with the data.
-            joints = typical_poses(self.shape).mean(0)[BASE_DOFS:].expand(len(found), -1)
-            mean = torch.cat([found[:, :BASE_DOFS], joints], dim=-1)
+            found, mean, confidence = self._find(data.detach(), valid)
         else:
             mean, confidence = start, torch.ones_like(start[:, 0]).detach()
         with torch.no_grad():
@@ -222,19 +240,52 @@ class PoseInitializer(nn.Module):
             pose = attach_gradients(fixed, pose, centered, mean)
         return shifted(pose, origin), confidence
 
+    def _find(self, data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return poses (B, num_dofs) from scratch, the prior's means, and confidences (B,), zero without points."""
+        if self.proposer is None or self.config.search == "always":
+            return self._search(data, valid)
+        pose, confidence = self._propose(self.proposer, data, valid)
+        if self.config.search != "doubtful":
+            return pose, pose, confidence
+        doubtful = valid & (confidence < _LEAST_CONFIDENCE).unsqueeze(-1)
+        searched, typical, sureness = self._search(data, doubtful)
+        surer = (sureness > confidence).unsqueeze(-1)
+        poses, means = torch.where(surer, searched, pose), torch.where(surer, typical, pose)
+        return poses, means, torch.maximum(confidence, sureness)
+
     @torch.no_grad()
-    def _search(self, data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the best poses (B, num_dofs) that a search finds, and confidences (B,), zero without points."""
+    def _propose(self, proposer: PoseProposer, data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the best poses (B, num_dofs) among those that a network proposes, and confidences (B,)."""
+        size = _BATCHING.cpu_proposed if data.device.type == "cpu" else _BATCHING.fitted
+        typical = typical_poses(self.shape).mean(0)
+        parts = []
+        for rows in torch.arange(len(data), device=data.device).split(size):
+            cloud, known = data[rows], valid[rows]
+            origin = masked_mean(cloud, known)
+            problem = centered_problem(
+                self.skin, cloud, known, shifted(typical.expand(len(rows), -1), origin), origin,
+                prior_std=self.config.find_pose.prior_std, pose_atol=0.0,
+            )  # fmt: skip
+            pose, lead = best_proposal(problem, proposer.propose(problem.data, known))
+            confidence = torch.where(known.any(-1), pose_confidence(problem, pose, lead), 0.0)
+            parts.append((shifted(pose, origin), confidence))
+        poses, confidences = zip(*parts, strict=True)
+        return torch.cat(poses), torch.cat(confidences)
+
+    @torch.no_grad()
+    def _search(self, data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `_find` does of a search; its prior draws joints to a typical pose."""
         pose = typical_poses(self.shape).mean(0).repeat(len(data), 1)
         confidence = torch.zeros_like(pose[:, 0])
         size = _BATCHING.cpu_searched if data.device.type == "cpu" else _BATCHING.searched
         for rows in valid.any(-1).nonzero()[:, 0].split(self.config.chunk or size):
             starts = find_pose(
                 self.shape, data[rows], mask=valid[rows], num_starts=1, model_points=self.skin,
-                config=self.config.search,
+                config=self.config.find_pose,
             )  # fmt: skip
             pose[rows], confidence[rows] = starts.poses[:, 0], starts.confidence
-        return pose, confidence
+        joints = typical_poses(self.shape).mean(0)[BASE_DOFS:].expand(len(pose), -1)
+        return pose, torch.cat([pose[:, :BASE_DOFS], joints], dim=-1), confidence
 
     def _anneal(self, problem: AlignProblem, pose: Tensor) -> Tensor:
         if not self.config.sigma_steps:

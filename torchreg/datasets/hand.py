@@ -233,13 +233,10 @@ def random_hand_pose(
     quaternion = _normal((4,), generator, hand.rest)
     offset = _uniform((3,), generator, hand.rest)
     pose = hand.rest_pose()
-    curls, share = _curl_groups(hand), bend * draws[0]
     if isinstance(hand, Hand):
-        # One draw per finger, and a little of one per joint.
-        share = bend * (0.8 * draws[1][curls] + 0.2 * draws[0])
-        pose[6:] = _hand_joints(hand, share, 2 * draws[2] - 1, bend)
+        pose[6:] = hand_joints(hand, draws[0], draws[1], 2 * draws[2] - 1, bend)
     else:
-        lower, upper = _joint_ranges(hand)
+        lower, upper = joint_ranges(hand)
         pose[6:] = pose[6:] + bend * torch.where(draws[1] < 0.5, lower, upper) * draws[0]
     axis_length = quaternion[1:].norm()
     pose[3:6] = 2 * torch.atan2(axis_length, quaternion[0].abs()) * quaternion[1:] / axis_length * quaternion[0].sign()
@@ -327,7 +324,7 @@ def hand_motion(
     if isinstance(shape, Hand):
         pose[:, 6:] = _hand_joints(shape, share, 2 * draws[1] - 1, bend)
     else:
-        lower, upper = _joint_ranges(shape)
+        lower, upper = joint_ranges(shape)
         pose[:, 6:] = pose[:, 6:] + share * torch.where(draws[2] < 0.5, lower, upper)
     tilts, shifts = torch.sin(2 * math.pi * (seconds[:, None] / _PERIODS.sway + sway.view(2, 1, 3)))
     pose[:, 3:6] = _base_rotations(kind, seconds, tilts, chance)
@@ -397,7 +394,7 @@ def _check_share(value: float, name: str) -> None:
         raise InputError(f"{name} must be between 0 and 1, got {value}")
 
 
-def _joint_ranges(shape: ArticulatedShape) -> tuple[Tensor, Tensor]:
+def joint_ranges(shape: ArticulatedShape) -> tuple[Tensor, Tensor]:
     """Return the ranges (D,) of each joint below and above its rest angle."""
     rest = shape.rest[6:]
     lower = shape.lower[6:].clamp(min=-_STAGE.open_limit) - rest
@@ -414,7 +411,21 @@ def _curl_groups(shape: ArticulatedShape) -> Tensor:
     return torch.tensor([known.index(finger) for finger in fingers], device=shape.rest.device)
 
 
-def _hand_joints(hand: Hand, share: Tensor, spread: Tensor, bend: float) -> Tensor:
+def hand_joints(hand: Hand, own: Tensor, finger: Tensor, spread: Tensor, bend: float | Tensor) -> Tensor:
+    """Return joint angles (..., 21) of a hand whose fingers curl, and spread so that they do not meet.
+
+    Args:
+        hand: the hand.
+        own: (..., 21) draw of each joint, 0 to 1.
+        finger: (..., 21) draws of which each finger takes one.
+        spread: (..., 21) draw of the abductions, -1 to 1.
+        bend: share of the way to their limits that joints move at most, 0 to 1; (..., 1) or one for all.
+    """
+    # One draw per finger, and a little of one per joint.
+    return _hand_joints(hand, bend * (0.8 * finger[..., _curl_groups(hand)] + 0.2 * own), spread, bend)
+
+
+def _hand_joints(hand: Hand, share: Tensor, spread: Tensor, bend: float | Tensor) -> Tensor:
     """Return joint angles (..., 21) of a hand: flexions at a share of their limits, abductions by a spread -1 to 1."""
     names = hand.dof_names[6:]
     # Away from the middle finger: thumb and index towards the thumb side, ring and little finger away from it.

@@ -1,0 +1,191 @@
+"""Made-up clouds of an articulated shape in batches, on any device: what a network learns poses from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg._checks import check_count
+from torchreg.datasets.hand import hand_joints, joint_ranges, placed
+from torchreg.errors import InputError
+from torchreg.geometry.rotation_representations import rotation_vector_from_quaternion
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.hand import Hand
+from torchreg.shapes.pose_algebra import BASE_DOFS
+from torchreg.shapes.skin import LinearBlendSkin, stacked_rows
+
+
+@dataclass(frozen=True)
+class _Variety:
+    """What differs between clouds; lengths are shares of the shape's size."""
+
+    noise: tuple[float, float] = (0.001, 0.012)  # standard deviation of a point
+    outliers: float = 0.4  # largest share of the points
+    margin: float = 0.25  # by which the box of outliers is larger than the shape, on each side
+    clumped: float = 0.4  # of the clouds, in which outliers lie about one place
+    clump: float = 0.1  # standard deviation about it
+    whole: float = 0.15  # of the clouds, seen from all sides
+    hole: float = 0.4  # of the clouds, with a ball without points
+    hole_radius: tuple[float, float] = (0.05, 0.25)
+    thinned: float = 0.5  # of the clouds, of which some points lack
+    least: float = 0.3  # share of the points that are kept then, at least
+    distance: tuple[float, float] = (2.5, 12.0)  # of the camera
+    cells: int = 40  # of the grid of depths, along each side of the picture
+    behind: float = 0.025  # behind the nearest point of its cell a point is hidden
+    alone: float = 0.5  # of the hands, whose joints bend independently; in the others fingers curl
+    open_std: float = 0.3  # of joints that turn by more than half a turn, radians
+
+
+_VARIETY = _Variety()
+
+
+@dataclass(frozen=True, eq=False)
+class CloudBatch:
+    """Clouds of one shape, and the truth.
+
+    Args:
+        points: (B, M, 3), metres, the shape about the origin.
+        mask: (B, M), False where there is no point.
+        poses: (B, num_dofs).
+        index: (B, M) int64 point of the skin that was seen, -1 for outliers.
+    """
+
+    points: Tensor
+    mask: Tensor
+    poses: Tensor
+    index: Tensor
+
+
+def random_poses(shape: ArticulatedShape, count: int, generator: torch.Generator) -> Tensor:
+    """Return poses (count, num_dofs) within the joint limits, turned at random, their middle at the origin.
+
+    Fingers of a hand curl together in half of the poses; all other joints move independently, each pose by up to a
+    share of their ranges of its own.
+
+    Args:
+        shape: whose base can move.
+        count: of poses.
+        generator: on the device on which to draw.
+
+    Raises:
+        InputError: if the base cannot move.
+    """
+    check_count(count, "count", 1)
+    if not bool(torch.isinf(shape.lower[:3]).all()):
+        raise InputError("shape must have a base that can move; where it is bolted down, align needs no start")
+
+    def uniform(*size: int) -> Tensor:
+        return torch.rand(size, generator=generator, device=generator.device).to(shape.rest)
+
+    joints = shape.num_dofs - BASE_DOFS
+    bend = uniform(count, 1).sqrt()
+    share, other, side = uniform(count, joints), uniform(count, joints), 2 * uniform(count, joints) - 1
+    pose = shape.rest_pose().repeat(count, 1)
+    if isinstance(shape, Hand):
+        curled = hand_joints(shape, share, other, side, bend)
+        flexion = torch.tensor([name.endswith("flexion") for name in shape.dof_names[BASE_DOFS:]], device=share.device)
+        single = torch.where(flexion, share, side) * bend * shape.upper[BASE_DOFS:]
+        pose[:, BASE_DOFS:] = torch.where(uniform(count, 1) < _VARIETY.alone, single, curled)
+    else:
+        lower, upper = joint_ranges(shape)
+        drawn = torch.where(side < 0, lower, upper) * bend * share
+        turned = _VARIETY.open_std * _normal((count, joints), generator, shape.rest)
+        pose[:, BASE_DOFS:] += torch.where(upper - lower >= math.pi, turned, drawn)
+    pose[:, 3:BASE_DOFS] = rotation_vector_from_quaternion(_normal((count, 4), generator, shape.rest))
+    return placed(shape, pose, torch.zeros_like(pose[:, :3]))
+
+
+@torch.no_grad()
+def random_clouds(
+    skin: LinearBlendSkin, size: float, poses: Tensor, num_points: int, generator: torch.Generator
+) -> CloudBatch:
+    """Return a cloud of each pose: one-sided or whole, noisy, with outliers and holes, thinned or not.
+
+    Args:
+        skin: many points of the surface, with normals.
+        size: of the shape, metres.
+        poses: (B, num_dofs), the shape about the origin.
+        num_points: of each cloud, at most.
+        generator: on the device of the skin.
+    """
+    rows = stacked_rows(skin.shape.part_transforms(poses))
+    surface, normals = skin.place(rows), skin.turn_normals(rows)
+    draw = _Draw(generator, surface, size)
+    seen, slant = draw.visible(surface, normals)
+    whole = draw.uniform(len(poses), 1) < _VARIETY.whole
+    weight = torch.where(whole, 1.0, torch.where(seen, slant, 0.0))
+    # Without replacement, by the largest of the logarithms and Gumbel noise.
+    ranks = weight.log() - draw.uniform(*weight.shape).clamp_min(1e-12).log().neg().clamp_min(1e-12).log()
+    score, index = ranks.topk(min(num_points, ranks.shape[1]), dim=1)
+    points = surface.gather(1, index.unsqueeze(-1).expand(-1, -1, 3))
+    points, outlier = draw.disturbed(points)
+    mask = score.isfinite() & draw.kept(points)
+    return CloudBatch(points, mask, poses, torch.where(outlier, -1, index))
+
+
+@dataclass(frozen=True, eq=False)
+class _Draw:
+    """Draws what differs between clouds of a batch.
+
+    Args:
+        generator: of all numbers.
+        like: a tensor whose dtype and device the draws have.
+        size: of the shape, metres.
+    """
+
+    generator: torch.Generator
+    like: Tensor
+    size: float
+
+    def uniform(self, *size: int) -> Tensor:
+        return torch.rand(size, generator=self.generator, device=self.generator.device).to(self.like)
+
+    def between(self, limits: tuple[float, float], *size: int) -> Tensor:
+        """Return numbers whose logarithms are drawn evenly."""
+        low, high = map(math.log, limits)
+        return (low + (high - low) * self.uniform(*size)).exp()
+
+    def visible(self, surface: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+        """Return which points (B, N) a camera before the shape sees, and the cosine of their slant."""
+        away = self.size * self.between(_VARIETY.distance, len(surface), 1)
+        ray = torch.cat([surface[..., :2], (surface[..., 2] + away).unsqueeze(-1)], dim=-1)
+        slant = -(ray * normals).sum(-1) / ray.norm(dim=-1).clamp_min(1e-9 * self.size)
+        cells = _VARIETY.cells
+        place = (ray[..., :2] * (away / ray[..., 2]).unsqueeze(-1) / self.size + 0.5).clamp(0, 1)
+        column, row = (cells * place).long().clamp_max(cells - 1).unbind(-1)
+        cell = row * cells + column
+        nearest = torch.full_like(surface[:, :1, 0].expand(-1, cells * cells), torch.inf).clone()
+        nearest = nearest.scatter_reduce(1, cell, ray[..., 2], "amin").gather(1, cell)
+        return (slant > 0) & (ray[..., 2] <= nearest + _VARIETY.behind * self.size), slant.clamp_min(0)
+
+    def disturbed(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Return points (B, M, 3) with noise, some of them outliers, and which ones (B, M)."""
+        batch, count = points.shape[:2]
+        noise = self.size * self.between(_VARIETY.noise, batch, 1, 1)
+        lower, upper = points.amin(1, keepdim=True), points.amax(1, keepdim=True)
+        margin = _VARIETY.margin * self.size
+        box = lower - margin + self.uniform(batch, count, 3) * (upper - lower + 2 * margin)
+        place = lower - margin + self.uniform(batch, 1, 3) * (upper - lower + 2 * margin)
+        clump = place + _VARIETY.clump * self.size * _normal((batch, count, 3), self.generator, self.like)
+        clutter = torch.where(self.uniform(batch, 1, 1) < _VARIETY.clumped, clump, box)
+        outlier = self.uniform(batch, count) < _VARIETY.outliers * self.uniform(batch, 1)
+        noisy = points + noise * _normal((batch, count, 3), self.generator, self.like)
+        return torch.where(outlier.unsqueeze(-1), clutter, noisy), outlier
+
+    def kept(self, points: Tensor) -> Tensor:
+        """Return which points (B, M) lie in no hole and are not left out at random."""
+        batch, count = points.shape[:2]
+        pick = (count * self.uniform(batch)).long().clamp_max(count - 1)
+        center = points[torch.arange(batch, device=points.device), pick].unsqueeze(1)
+        radius = self.size * self.between(_VARIETY.hole_radius, batch, 1)
+        hole = ((points - center).norm(dim=-1) < radius) & (self.uniform(batch, 1) < _VARIETY.hole)
+        share = _VARIETY.least + (1 - _VARIETY.least) * self.uniform(batch, 1)
+        thinned = (self.uniform(batch, count) > share) & (self.uniform(batch, 1) < _VARIETY.thinned)
+        return ~hole & ~thinned
+
+
+def _normal(size: tuple[int, ...], generator: torch.Generator, like: Tensor) -> Tensor:
+    return torch.randn(size, generator=generator, device=generator.device).to(like)
