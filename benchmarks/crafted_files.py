@@ -144,13 +144,13 @@ def _many_cameras(count: int) -> bytes:
     return json.dumps({"format": "torchreg-cameras", "version": 1, "cameras": cameras}).encode()
 
 
-def _byte_polygons() -> bytes:
+def _byte_polygons(count: int) -> bytes:
     """Return a PLY file of polygons whose corners take a byte each."""
-    rows = np.zeros((38_000, 256), np.uint8)
+    rows = np.zeros((count, 256), np.uint8)
     rows[:, 0] = 255
     head = (
         "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-        "element face 38000\nproperty list uchar uchar vertex_indices\nend_header\n"
+        f"element face {count}\nproperty list uchar uchar vertex_indices\nend_header\n"
     )
     return head.encode() + struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0) + rows.tobytes()
 
@@ -171,43 +171,62 @@ def _glb_in_robot(folder: Path) -> Path:
     return _write(folder, "glb.urdf", _robot(body))
 
 
-def crafted(folder: Path) -> Iterator[tuple[Path, Read]]:
-    """Yield files with their readers, written one at a time into a folder."""
+def crafted(folder: Path, share: float = 1.0) -> Iterator[tuple[Path, Read, float]]:
+    """Yield files with their readers and sizes, written one at a time into a folder.
 
-    def made(name: str, content: bytes, read: Read) -> tuple[Path, Read]:
-        return _write(folder, name, content), read
+    Args:
+        folder: to write to.
+        share: of their size that files have which are read to the end; what is refused by its size stays as it is.
+    """
+    for name, content, read in _refused():
+        yield _write(folder, name, content), read, 1.0
+    yield _glb_in_robot(folder), load_urdf, 1.0
+    for name, content, read in _read_to_the_end(share):
+        yield _write(folder, name, content), read, share
 
-    yield made("frames_without_points.npz", _zip({"points.npy": _npy((100_000_000, 0, 3))}), load_frames)
-    zeros = _zip({"points.npy": _npy((20_000_000, 3), bytes(240_000_000))})
-    yield made("zeros.npz", zeros, load_points)
-    noise = np.random.default_rng(0).integers(0, 2, 9_000_000, dtype=np.uint8).tobytes()
-    yield made("ratio_60.npz", _zip({"points.npy": _npy((3_000_000, 3), noise * 4)}), load_points)
-    yield made("members.npz", _zip({f"f_{k}.npy": _npy((0, 3)) for k in range(30_000)}), load_frames)
-    yield made("rig_sparse_178M.gltf", _sparse_gltf(178_000_000), load_rig)
-    yield made("rig_sparse_19M.gltf", _sparse_gltf(19_000_000), load_rig)
-    yield made("rig_400_primitives.gltf", _sparse_gltf(300_000, 400), load_rig)
-    yield made("sparse_19M.gltf", _sparse_gltf(19_000_000, skinned=False), load_mesh)
-    yield made("primitives_400.gltf", _sparse_gltf(300_000, 400, skinned=False), load_points)
-    yield made("nodes_300k.gltf", _many_nodes(300_000, chain=False), load_points)
-    yield made("nodes_100k.gltf", _many_nodes(100_000, chain=False), load_points)
-    yield made("chain_100k.gltf", _many_nodes(100_000, chain=True), load_points)
-    yield made("rig_dense.gltf", _dense_rig(), load_rig)
-    yield _glb_in_robot(folder), load_urdf
-    yield made("mimics.urdf", _mimic_chain(1999), load_urdf)
-    yield made("elements.urdf", _robot("<a/>" * 2_400_000), load_urdf)
-    yield made("text.urdf", _robot("<link name='a'>" + "x" * 9_500_000 + "</link>"), load_urdf)
-    yield made("cameras_100k.json", _many_cameras(100_000), load_cameras)
-    yield made("cameras_2k.json", _many_cameras(2_000), load_cameras)
-    yield made("digits.json", b'{"width": ' + b"9" * 4400 + b"}", load_cameras)
-    yield made("brackets.json", b"[" * 9_000_000, load_cameras)
-    yield made("lists.json", b'{"cameras": [' + b"[]," * 3_000_000 + b"[]]}", load_cameras)
-    yield made("one_bit.png", _png(8000, 7990, 8, 0, 1), load_mask)
-    yield made("depth.png", _png(4000, 4000, 16, 0, 2), load_depth)
-    yield made("too_many_pixels.png", _png(9000, 9000, 8, 0, 1), load_mask)
-    yield made("polygons.ply", _byte_polygons(), load_mesh)
-    yield made("corners.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf" + b" 1 2 3" * 1_600_000 + b"\n", load_mesh)
-    yield made("faces.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n" + b"f 1 2 3\n" * 1_200_000, load_mesh)
-    yield made("rows.xyz", b"0 0 0\n" * 1_600_000, load_points)
-    yield made("blank.xyz", b"\n" * 9_900_000, load_points)
-    yield made("nodes.swc", b"".join(b"%d 2 0 0 0 1 %d\n" % (k, k - 1 or -1) for k in range(1, 300_000)), load_swc)
-    yield made("points.npy.npz", _zip({"points.npy": _npy((700_000, 3), bytes(12 * 700_000))}, 0), load_points)
+
+def _refused() -> Iterator[tuple[str, bytes, Read]]:
+    """Yield what readers refuse when they see how large it is."""
+    yield "frames_without_points.npz", _zip({"points.npy": _npy((100_000_000, 0, 3))}), load_frames
+    yield "zeros.npz", _zip({"points.npy": _npy((20_000_000, 3), bytes(240_000_000))}), load_points
+    yield "members.npz", _zip({f"f_{k}.npy": _npy((0, 3)) for k in range(30_000)}), load_frames
+    yield "rig_sparse_178M.gltf", _sparse_gltf(178_000_000), load_rig
+    yield "rig_sparse_19M.gltf", _sparse_gltf(19_000_000), load_rig
+    yield "rig_400_primitives.gltf", _sparse_gltf(300_000, 400), load_rig
+    yield "sparse_19M.gltf", _sparse_gltf(19_000_000, skinned=False), load_mesh
+    yield "primitives_400.gltf", _sparse_gltf(300_000, 400, skinned=False), load_points
+    yield "nodes_300k.gltf", _many_nodes(300_000, chain=False), load_points
+    yield "rig_dense.gltf", _dense_rig(), load_rig
+    yield "elements.urdf", _robot("<a/>" * 2_400_000), load_urdf
+    yield "cameras_100k.json", _many_cameras(100_000), load_cameras
+    yield "digits.json", b'{"width": ' + b"9" * 4400 + b"}", load_cameras
+    yield "brackets.json", b"[" * 9_000_000, load_cameras
+    yield "depth.png", _png(4000, 4000, 16, 0, 2), load_depth
+    yield "too_many_pixels.png", _png(9000, 9000, 8, 0, 1), load_mask
+
+
+def _read_to_the_end(share: float) -> Iterator[tuple[str, bytes, Read]]:
+    """Yield what has the size that readers allow, or a share of it."""
+
+    def part(count: int) -> int:
+        return round(share * count)
+
+    noise = np.random.default_rng(0).integers(0, 2, part(9_000_000), dtype=np.uint8).tobytes()
+    yield "ratio_60.npz", _zip({"points.npy": _npy((part(3_000_000), 3), noise * 4)}), load_points
+    yield "nodes_100k.gltf", _many_nodes(part(100_000), chain=False), load_points
+    yield "chain_100k.gltf", _many_nodes(part(100_000), chain=True), load_points
+    yield "mimics.urdf", _mimic_chain(part(1999)), load_urdf
+    yield "text.urdf", _robot("<link name='a'>" + "x" * part(9_500_000) + "</link>"), load_urdf
+    yield "cameras_2k.json", _many_cameras(part(2_000)), load_cameras
+    yield "lists.json", b'{"cameras": [' + b"[]," * part(3_000_000) + b"[]]}", load_cameras
+    yield "one_bit.png", _png(8000, part(7990), 8, 0, 1), load_mask
+    yield "polygons.ply", _byte_polygons(part(38_000)), load_mesh
+    triangle = b"v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+    yield "corners.obj", triangle + b"f" + b" 1 2 3" * part(1_600_000) + b"\n", load_mesh
+    yield "faces.obj", triangle + b"f 1 2 3\n" * part(1_200_000), load_mesh
+    yield "rows.xyz", b"0 0 0\n" * part(1_600_000), load_points
+    yield "blank.xyz", b"\n" * part(9_900_000), load_points
+    nodes = (b"%d 2 0 0 0 1 %d\n" % (k, k - 1 or -1) for k in range(1, part(300_000)))
+    yield "nodes.swc", b"".join(nodes), load_swc
+    count = part(700_000)
+    yield "points.npy.npz", _zip({"points.npy": _npy((count, 3), bytes(12 * count))}, 0), load_points

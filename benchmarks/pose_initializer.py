@@ -24,6 +24,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 
 import torch
@@ -219,13 +220,18 @@ def device_limits(device: torch.device) -> dict[str, float]:
 
 @torch.no_grad()
 def roofline(
-    hand: tr.Hand, batch: int, generator: torch.Generator, device: torch.device, cases: Sequence[str]
+    hand: tr.Hand,
+    batch: int,
+    generator: torch.Generator,
+    device: torch.device,
+    cases: Sequence[str],
+    config: tr.PoseInitializerConfig,
 ) -> tuple[dict[str, float], list[str]]:
     """Return evaluations per second in the cases "start" and "scratch" beside the limits, and where the time goes."""
     clouds, poses = draw(hand, batch, generator)
     starts = disturbed(hand, poses, generator)
     hand, clouds, starts = hand.to(device), clouds.to(device), starts.to(device)
-    layer = tr.PoseInitializer(hand)
+    layer = tr.PoseInitializer(hand, config)
     activities = [torch.profiler.ProfilerActivity.CPU]
     if device.type == "cuda":
         activities.append(torch.profiler.ProfilerActivity.CUDA)
@@ -259,7 +265,7 @@ def gradient_error(generator: torch.Generator, num_points: int = NUM_POINTS) -> 
     hand = tr.Hand(dtype=torch.float64).requires_grad_(False)
     points, poses = draw(hand, 1, generator, front=False, num_points=num_points)
     start = disturbed(hand, poses, generator)
-    config = tr.PoseInitializerConfig(fit_steps=10, newton_steps=3, noise=0.002)
+    config = tr.PoseInitializerConfig(fit_steps=10, noise=0.002)
     layer = tr.PoseInitializer(hand, config)
     weights = torch.randn(1, 21, 3, generator=generator, dtype=torch.float64)
     direction = torch.randn(points.shape, generator=generator, dtype=torch.float64)
@@ -314,10 +320,11 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
     show("gradient", figures["gradient"])
     figures["start"] = from_starts(hand(), batches, generator(1), device)
     show("start", figures["start"])
-    # The profile of a search holds so many operations that a smoke run leaves it out.
+    # Profiles of many operations take long to evaluate: a smoke run leaves out that of a search, and most steps.
     cases = ("start",) if options.smoke else ("start", "scratch")
     batch = 2 if options.smoke else PROFILED[device.type]
-    figures["roofline"], profile = roofline(hand(), batch, generator(2), device, cases)
+    profiled = replace(config, sigma_steps=1, em_steps=1, surface_steps=0, fit_steps=1) if options.smoke else config
+    figures["roofline"], profile = roofline(hand(), batch, generator(2), device, cases, profiled)
     show("roofline", figures["roofline"])
     print("\n".join(profile), flush=True)
     for case, count, bend, number in (("scratch", counts[0], HALF, 3), ("full", counts[1], FULL, 4)):

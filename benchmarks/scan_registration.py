@@ -43,6 +43,7 @@ from torchreg.registration.dense.config import ScanAlignConfig
 
 NEAR, REGISTERED, JOINT, APART = 0.025, 0.9, 0.05, 0.005
 SCALE = 100
+SMOKE_POINTS = 300  # of each scan
 STAGES = ("setup", "initialization", "align", "refine")
 
 
@@ -342,12 +343,12 @@ def main(arguments: list[str] | None = None) -> int:
     if options.sequences and not options.frames:
         parser.error("--sequences needs --frames, how long they are")
     if options.smoke:
-        align = ScanAlignConfig(num_samples=400, num_target_samples=800, num_nodes=30)
-        small = [Recipe("default", 6, 20, tr.RegisterConfig(num_samples=500, align=align))]
-        toys = list(made_up_problems("toy", 1, 600))
+        align = ScanAlignConfig(num_samples=200, num_target_samples=400, num_nodes=20)
+        small = [Recipe("default", 6, 20, tr.RegisterConfig(num_samples=200, align=align))]
+        toys = list(made_up_problems("toy", 1, SMOKE_POINTS))
         print_set("toy", toys, small, options.verbose)
         print_set("toy, moved", [moved(toy) for toy in toys], small, options.verbose)
-        scanner = DepthScanner(num_points=600)
+        scanner = DepthScanner(num_points=SMOKE_POINTS)
         print_sequence("figure", walking_figure(2, scanner=scanner), small[0])
         print_many_sequences(1, 2, small[0], scanner)
         return 0

@@ -71,9 +71,9 @@ def rate_batched(hand: tr.Hand, clouds: torch.Tensor, starts: torch.Tensor, repe
     return len(clouds) / best_time(lambda: tr.align(hand, clouds, starts, model_points=skin, config=config), repeats)
 
 
-def print_profile(hand: tr.Hand, clouds: torch.Tensor, starts: torch.Tensor) -> None:
+def print_profile(hand: tr.Hand, clouds: torch.Tensor, starts: torch.Tensor, config: tr.AlignConfig) -> None:
     """Print which operations the time of single alignments goes to."""
-    skin, config = tr.sample_skin(hand, 500), tr.AlignConfig(search="never")
+    skin = tr.sample_skin(hand, 500)
     with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
         for cloud, start in zip(clouds, starts, strict=True):
             tr.align(hand, cloud, start, model_points=skin, config=config)
@@ -113,7 +113,9 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(
             f"{f'batch of {size}':24s} {batched:7.1f} alignments/s, {batched / singly:.2f} of the default one at a time"
         )
-    print_profile(hand, clouds[:2], starts[:2])
+    # A profile of few operations is quickly evaluated.
+    profiled = replace(descent, schedule=tr.SigmaSchedule.geometric(0.01, 0.005, 2), surface_steps=0)
+    print_profile(hand, clouds[:2], starts[:2], profiled if arguments.smoke else descent)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from torchreg.datasets.scan_sequences import jointed_toy
 Call = Callable[[], list[Tensor]]
 
 
-def make_calls(seed: int, hand: tr.Hand, num_frames: int, num_points: int) -> list[Call]:
+def make_calls(seed: int, hand: tr.Hand, num_frames: int, num_points: int, workers: int) -> list[Call]:
     """Return calls of three systems on the data of one seed; all use the same hand."""
     meshes = creature_sequence(STARFISH, num_frames + seed, resolution=28).meshes[seed:]
     pose = random_hand_pose(hand, torch.Generator().manual_seed(seed))
@@ -33,7 +33,7 @@ def make_calls(seed: int, hand: tr.Hand, num_frames: int, num_points: int) -> li
     pair = jointed_toy(2, seed=seed, scanner=DepthScanner(num_points=num_points), step=math.radians(20)).pair(0, 1)
 
     def spine() -> list[Tensor]:
-        found = tr.extract_spine(meshes, workers=2)
+        found = tr.extract_spine(meshes, workers=workers)
         return [found.curves, found.radii]
 
     def align() -> list[Tensor]:
@@ -75,8 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     rounds = 1 if options.smoke else options.rounds
     hand = tr.Hand()
-    frames, points = (3, 300) if options.smoke else (4, 1000)
-    pairs = [make_calls(seed, hand, frames, points) for seed in (0, 1)]
+    frames, points, workers = (3, 200, 1) if options.smoke else (4, 1000, 2)
+    pairs = [make_calls(seed, hand, frames, points, workers) for seed in (0, 1)]
     begin = time.perf_counter()
     alone = [[call() for call in calls] for calls in pairs]
     before = torch.get_num_threads()

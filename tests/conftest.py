@@ -1,5 +1,6 @@
 """One thread for torch: the problems here are small, and the tests may run beside others. Hands that take a second."""
 
+import gc
 from pathlib import Path
 
 import pytest
@@ -18,9 +19,11 @@ torch.set_num_threads(1)
 
 # Long runs of everything together. Tracing slows them most, and their parts have tests of their own, which are traced.
 UNTRACED = {
-    "benchmarks", "docs", "experiments", "web", "test_align_scans.py", "test_calibrate.py", "test_default_dtypes.py",
+    "benchmarks", "docs", "experiments", "web", "test_align_scans.py", "test_bad_input.py", "test_calibrate.py",
+    "test_clouds.py", "test_compiled_shapes.py", "test_default_dtypes.py", "test_degenerate_data.py", "test_descent.py",
     "test_em_loss.py", "test_extract_spine.py", "test_far_coordinates.py", "test_find_pose.py", "test_loaded_data.py",
-    "test_prior.py", "test_search.py",
+    "test_poses_from_skeletons.py", "test_prior.py", "test_search.py", "test_shapes_as_modules.py", "test_storage.py",
+    "test_tip_correspondences.py", "test_track.py",
 }  # fmt: skip
 
 
@@ -29,6 +32,12 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if UNTRACED.intersection(item.path.relative_to(Path(__file__).parent).parts):
             item.add_marker("no_cover")
+
+
+def pytest_collection_finish():
+    """Keep the collector from looking through modules and tests again and again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -90,12 +90,13 @@ def test_a_skin_must_be_of_the_same_shape(plain_hand_skin, function):
 def test_other_units_are_warned_of(plain_hand, plain_hand_skin, function, scale):
     """At the line of the caller; what a pose or a crop may do to the size is not."""
     data = plain_hand_skin.points
+    start = {"initial_pose": plain_hand.rest_pose()} if function is align else {}
     with pytest.warns(UnitsWarning, match="times the model's size of .* m: are they in metres") as caught:
-        function(plain_hand, plain_hand_skin, scale * data)
-    assert caught[0].filename == __file__
+        function(plain_hand, plain_hand_skin, scale * data, **start)
+    assert [warning.filename for warning in caught] == [__file__]
     # Warnings are errors here: neither of these warns.
-    function(plain_hand, plain_hand_skin, 10 * data)
-    function(plain_hand, plain_hand_skin, scale * data[:5])
+    function(plain_hand, plain_hand_skin, 10 * data, **start)
+    function(plain_hand, plain_hand_skin, scale * data[:5], **start)
 
 
 # Single functions

@@ -216,11 +216,11 @@ def test_float32_is_right_far_from_the_origin():
     assert float(shifted) == pytest.approx(float(exact), rel=1e-4)
 
 
-def test_twenty_thousand_by_twenty_thousand_backpropagates_in_two_gigabytes():
+def test_backpropagation_holds_no_matrix_of_all_pairs():
     code = """
 import resource, torch
 from torchreg.alignment.em_loss import EMLoss
-posed, data = torch.rand(20_000, 3, requires_grad=True), torch.rand(20_000, 3)
+posed, data = torch.rand(8000, 3, requires_grad=True), torch.rand(8000, 3)
 loss = EMLoss(0.05)
 loss(posed[:10], data[:10]).backward()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -230,9 +230,8 @@ print(before, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
     before, after = (int(kilobytes) / 1024 for kilobytes in run.stdout.split())
-    assert after < 2048
-    # The dense matrix alone would add 1,600 MB, and autograd would keep several.
-    assert after - before < 250
+    # The dense matrix alone would add 256 MB, and autograd would keep several.
+    assert after - before < 100
 
 
 # --- the module ---

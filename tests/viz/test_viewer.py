@@ -1,6 +1,7 @@
 """The viewer without a browser: nodes, controls and files; `tests/web` looks at it through a browser."""
 
 import socket
+import threading
 import time
 
 import numpy as np
@@ -75,6 +76,28 @@ def test_play_and_pause(sequence):
         shown = viewer.frame
         time.sleep(0.7)
         assert viewer.frame == shown
+
+
+def test_closing_ends_a_timeline_that_a_page_pauses_meanwhile(sequence):
+    scene = result_scene(sequence)
+    viewer = SceneViewer(Scene(scene.title, scene.layers, torch.tensor([0.0, 0.02])), port=0)
+    timeline, shown, go_on = viewer._timeline, threading.Event(), threading.Event()
+
+    def show_slowly(_):
+        shown.set()
+        go_on.wait(5)
+
+    timeline._show = show_slowly
+    timeline.play()
+    assert shown.wait(5)
+    closing = threading.Thread(target=viewer.close, daemon=True)
+    closing.start()
+    assert timeline._stopped.wait(5)
+    time.sleep(0.01)
+    timeline.pause()
+    go_on.set()
+    closing.join(5)
+    assert not closing.is_alive()
 
 
 def test_one_file_holds_it_all(spine, tmp_path):

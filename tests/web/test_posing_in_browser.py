@@ -9,7 +9,7 @@ import torch
 from torchreg.viz.pose_app import PoseApp
 from torchreg.viz.pose_editor import PoseEditor
 
-MOVES = 40
+MOVES = 30
 # One picture of a page at 30 per second.
 FRAME = 1 / 30
 # Columns left of the controls.
@@ -83,7 +83,7 @@ def test_a_mouse_drags_a_handle(app, record, pictures):
     page.wait_for_timeout(300)
     page.mouse.down()
     for move in range(MOVES):
-        page.mouse.move(*(grip - 2 * move * direction))
+        page.mouse.move(*(grip - 3 * move * direction))
         time.sleep(FRAME / 2)
     page.screenshot(path=pictures / "pose_dragged.png")
     page.mouse.up()

@@ -53,14 +53,16 @@ def drawn(page):
 
 
 def wait_until_drawn(page):
+    """Return the mask of the scene once it no longer changes."""
     page.wait_for_selector("canvas")
-    page.wait_for_timeout(1500)
+    before = drawn(page)
     for _ in range(60):
         page.wait_for_timeout(250)
         mask = drawn(page)
-        if mask.mean() > 0.005:
-            return mask
-    return drawn(page)
+        if mask.mean() > 0.005 and (mask == before).all():
+            break
+        before = mask
+    return mask
 
 
 def wait_until_moved(page, first):

@@ -169,10 +169,11 @@ class Timeline:
         self._show(frame)
 
     def close(self) -> None:
-        """End the thread that plays."""
+        """End the thread that plays, also if a page presses its button meanwhile."""
         self._stopped.set()
-        self._playing.set()
-        self._thread.join()
+        while self._thread.is_alive():
+            self._playing.set()
+            self._thread.join(_PACE.tick)
 
     @property
     def _frame(self) -> int:
