@@ -127,15 +127,9 @@ def _ablations() -> list[Recipe]:
         Recipe("without label reuse", config=replace(plain, reuse=False)),
         Recipe("without refinement", config=replace(plain, refine_steps=0)),
         Recipe("without settling", config=replace(plain, settle_steps=0)),
-        Recipe("without features", config=replace(plain, align=_featureless(plain.align))),
         *(Recipe(f"grid {size}", grid=size) for size in (20, 35, 65, 80)),
         *(Recipe(f"bones {size}", bones=size) for size in (4, 6, 10, 15)),
     ]
-
-
-def _featureless(align: ScanAlignConfig) -> ScanAlignConfig:
-    """Return settings under which hypotheses may take points to where the target is unlike them."""
-    return replace(align, choice=replace(align.choice, feature_distance=0.0))
 
 
 def file_problems(folder: Path) -> Iterator[Problem]:
@@ -342,7 +336,7 @@ def main(arguments: list[str] | None = None) -> int:
     if options.sequences and not options.frames:
         parser.error("--sequences needs --frames, how long they are")
     if options.smoke:
-        align = ScanAlignConfig(num_samples=400, num_target_samples=800, num_nodes=30)
+        align = ScanAlignConfig(num_samples=400, num_nodes=30)
         small = [Recipe("default", 6, 20, tr.RegisterConfig(num_samples=500, align=align))]
         toys = list(made_up_problems("toy", 1, 600))
         print_set("toy", toys, small, options.verbose)

@@ -19,8 +19,8 @@ from torchreg.registration.register import register
 from torchreg.registration.results import ScanRegistration
 from torchreg.result import Status
 
-QUICK = RegisterConfig(align=ScanAlignConfig(num_samples=400, num_target_samples=600), num_samples=800)
-FEW = RegisterConfig(align=ScanAlignConfig(num_samples=150, num_target_samples=200, num_nodes=15))
+QUICK = RegisterConfig(align=ScanAlignConfig(num_samples=400), num_samples=800)
+FEW = RegisterConfig(align=ScanAlignConfig(num_samples=150, num_nodes=15))
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.config import ScanAlignConfig
 from torchreg.registration.register_sequence import ALL_FRAMES, FRAME_TO_FRAME, register_sequence
 
-QUICK = RegisterConfig(align=ScanAlignConfig(num_samples=300, num_target_samples=400), num_samples=500)
+QUICK = RegisterConfig(align=ScanAlignConfig(num_samples=300), num_samples=500)
 
 
 @pytest.fixture(scope="module")

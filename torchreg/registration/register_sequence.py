@@ -21,6 +21,7 @@ from torchreg.registration.bones.labels import CellData
 from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.align_scans import align_scans
+from torchreg.registration.dense.reliability import SCAN_CALIBRATION
 from torchreg.registration.normalization import Normalization
 from torchreg.registration.register import (
     check_inputs,
@@ -31,6 +32,7 @@ from torchreg.registration.register import (
     warn_about_flat_scans,
 )
 from torchreg.registration.results import SequenceRegistration
+from torchreg.result import Status
 
 
 @dataclass(frozen=True)
@@ -191,7 +193,7 @@ def register_sequence(
     source = scans[reference]
     index = source_samples(source, config, generator)
     normalization = Normalization.from_points(source.points[index])
-    moved, confidence = _aligned_frames(
+    moved, confidence, sure = _aligned_frames(
         scans, reference, num_bones, grid_resolution, config, generator=generator, on_step=on_step
     )
     normalized = [normalization.normalize_scan(scan) for scan in scans]
@@ -202,7 +204,9 @@ def register_sequence(
     fit = ReducedFit(data, samples, normalized, config, num_bones=num_bones, on_step=on_step)
     converged = fit.fit_labels()
     converged = fit.refine() and converged
-    return _sequence_registration(source, reference, normalized, normalization, fit, converged, degenerate)
+    found = _sequence_registration(source, reference, normalized, normalization, fit, converged, degenerate)
+    doubtful = bool((sure < SCAN_CALIBRATION.doubtful).any()) and found.status.usable
+    return replace(found, confidence=sure, status=Status.DOUBTFUL if doubtful else found.status)
 
 
 def _aligned_frames(
@@ -214,15 +218,15 @@ def _aligned_frames(
     *,
     generator: torch.Generator | None,
     on_step: OnRegisterStep | None,
-) -> tuple[Tensor, Tensor]:
-    """Return the reference's points aligned with every frame, (T, N, 3), and their confidence, (T, N).
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the reference's points aligned with every frame, (T, N, 3), their confidence (T, N), and that of frames.
 
     Those of the dense alignments: small parts move in them for which the few bones have no room that move the reference
     on from frame to frame.
     """
     source, few_bones = scans[reference], FRAME_TO_FRAME.apply(config)
     aligned, confidence = {reference: source.points}, {reference: torch.ones(len(source)).to(source.points)}
-    deformed = {reference: source.points}
+    deformed, sure = {reference: source.points}, torch.ones(len(scans)).to(source.points)
     for step, end in ((1, len(scans)), (-1, -1)):
         current = source
         for frame in range(reference + step, end, step):
@@ -231,7 +235,7 @@ def _aligned_frames(
                 generator=generator, on_step=initial_records(on_step),
                 expected=FRAME_TO_FRAME.predict(deformed, frame, step),
             )  # fmt: skip
-            aligned[frame], confidence[frame] = found.points, found.point_confidence
+            aligned[frame], confidence[frame], sure[frame] = found.points, found.point_confidence, found.confidence
             if frame + step == end:
                 break
             bent = register(
@@ -242,7 +246,8 @@ def _aligned_frames(
             normals = turned_normals(source.normals, bent.weights, bent.transforms)
             current = RangeScan(bent.deformed, source.faces, normals)
     frames = range(len(scans))
-    return torch.stack([aligned[frame] for frame in frames]), torch.stack([confidence[frame].cpu() for frame in frames])
+    points, confident = ([each[frame] for frame in frames] for each in (aligned, confidence))
+    return torch.stack(points), torch.stack(confident).cpu(), sure
 
 
 def _sequence_registration(

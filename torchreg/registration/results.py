@@ -177,11 +177,16 @@ class SequenceRegistration(Result):
         origin: see `ScanRegistration`.
         observed: (K, 3) the points of all scans where they were seen; None in files of earlier releases.
         observed_normals: (K, 3) their unit normals there.
+        confidence: (T,) probability, from 0 to 1, that 90 % of the points are within 2.5 % of the diagonal of where
+            they are in each scan, by the model of `ScanRegistration.confidence` from the alignment with that scan, its
+            start the reference as moved to the scan before; one for the reference. Where any is below one half the
+            status is DOUBTFUL. None in files of earlier releases.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
         "points": "N 3", "faces": "F 3", "deformed": "T N 3", "labels": "N", "transforms": "T B 4 4", "weights": "N B",
         "fused": "Q 3", "fused_normals": "Q 3", "fused_frames": "Q", "observed": "Q 3", "observed_normals": "Q 3",
+        "confidence": "T",
     }  # fmt: skip
 
     model: GridLBS = field(metadata=stored_as(GridLBS.record, GridLBS.from_record))
@@ -200,6 +205,7 @@ class SequenceRegistration(Result):
     origin: Tensor | None = None
     observed: Tensor | None = None
     observed_normals: Tensor | None = None
+    confidence: Tensor | None = None
 
     def moved(self, origin: Tensor) -> SequenceRegistration:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
