@@ -121,7 +121,6 @@ def _ablations() -> list[Recipe]:
         Recipe("without joint term", config=replace(plain, joint_weight=(0.0, 0.0))),
         Recipe("joints 0.01 all along", config=replace(plain, joint_weight=(0.01, 0.01))),
         Recipe("joints 1 to 0.05", config=replace(plain, joint_weight=(1.0, 0.05))),
-        Recipe("all that meets held", config=replace(plain, joint_scale=(1e3, 1e3))),
         Recipe("without turns held", config=replace(plain, turn_weight=0.0)),
         Recipe("borders anywhere", config=replace(plain, seam=0.0, smoothness=0.05)),
         Recipe("without label reuse", config=replace(plain, reuse=False)),

@@ -11,7 +11,9 @@ from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.neighbors import nearest_neighbor
+from torchreg.registration import register_sequence as module
 from torchreg.registration.config import RegisterConfig
+from torchreg.registration.dense.align_scans import align_scans
 from torchreg.registration.dense.config import ScanAlignConfig
 from torchreg.registration.register_sequence import ALL_FRAMES, FRAME_TO_FRAME, register_sequence
 
@@ -51,10 +53,31 @@ def test_all_points_meet_in_the_pose_of_the_reference(toy, found):
     assert float(distance.median()) < 0.01
 
 
+def test_confidence_falls_away_from_the_reference(found):
+    assert found.confidence.shape == (3,)
+    assert found.confidence[1] == 1
+    assert 0.5 < float(found.confidence.min()) <= float(found.confidence.max()) <= 1
+
+
+def test_frames_beyond_a_doubtful_one_are_doubtful(toy, monkeypatch):
+    sure = iter((0.9, 0.2, 0.7))
+
+    def judged(source, *args, **kwargs):
+        plain = align_scans(source, *args, **kwargs)
+        return replace(plain, confidence=next(sure))
+
+    monkeypatch.setattr(module, "align_scans", judged)
+    scans = [toy[0].subset(torch.arange(0, len(toy[0]), 2))] * 4
+    found = register_sequence(scans, 2, 10, replace(QUICK, label_steps=1, refine_steps=0))
+    assert found.confidence.tolist() == pytest.approx([1.0, 0.9, 0.2, 0.2])
+    assert found.status is tr.Status.DOUBTFUL
+    assert not found.status.usable
+
+
 def test_results_are_the_same_on_disk(found, tmp_path):
     found.save(tmp_path / "all.safetensors")
     back = tr.load(tmp_path / "all.safetensors")
-    for name in ("deformed", "transforms", "weights", "fused", "fused_frames"):
+    for name in ("deformed", "transforms", "weights", "fused", "fused_frames", "confidence"):
         assert torch.equal(getattr(back, name), getattr(found, name))
     assert back.history == found.history
 

@@ -235,7 +235,9 @@ def _aligned_frames(
                 generator=generator, on_step=initial_records(on_step),
                 expected=FRAME_TO_FRAME.predict(deformed, frame, step),
             )  # fmt: skip
-            aligned[frame], confidence[frame], sure[frame] = found.points, found.point_confidence, found.confidence
+            aligned[frame], confidence[frame] = found.points, found.point_confidence
+            # A frame is reached through those before it.
+            sure[frame] = min(found.confidence, float(sure[frame - step]))
             if frame + step == end:
                 break
             bent = register(

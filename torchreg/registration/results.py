@@ -177,9 +177,8 @@ class SequenceRegistration(Result):
         origin: see `ScanRegistration`.
         observed: (K, 3) the points of all scans where they were seen; None in files of earlier releases.
         observed_normals: (K, 3) their unit normals there.
-        confidence: (T,) probability, from 0 to 1, that 90 % of the points are within 2.5 % of the diagonal of where
-            they are in each scan, by the model of `ScanRegistration.confidence` from the alignment with that scan, its
-            start the reference as moved to the scan before; one for the reference. Where any is below one half the
+        confidence: (T,) of each scan, from 0 to 1: the least `ScanRegistration.confidence` of the alignments by which
+            the reference, moved from scan to scan, came there; one for the reference. Where any is below one half the
             status is DOUBTFUL. None in files of earlier releases.
     """
 

@@ -64,7 +64,7 @@ def test_labels_then_weights_come_nearer_to_the_truth(toy):
         assert record.smoothness > 0
     assert records[-1].distance < records[0].distance
     energies = [sum(record.energies.values()) for record in records]
-    assert energies[-1] < 0.7 * energies[0]
+    assert energies[-1] < 0.8 * energies[0]
     assert max(later / before for before, later in pairwise(energies)) < 1.05
 
 
@@ -211,7 +211,7 @@ def test_matches_may_converge_before_labels_change(toy, problems):
 
 
 def test_joints_are_held_first_and_let_go_later(toy, problems):
-    reduced, _ = fit(toy[1], noise=0.005, config=RegisterConfig(joint_scale=(1e5, 1e-5), rtol=0.0))
+    reduced, _ = fit(toy[1], noise=0.005, config=RegisterConfig(max_distance=(1e5, 1e-5), rtol=0.0))
     reduced.fit_labels()
     reduced.refine()
     torch.testing.assert_close(problems[0].pair_weights, torch.ones_like(problems[0].pair_weights))

@@ -56,7 +56,7 @@ def test_leaps_cost_their_distance_up_to_a_cap(problem):
     rest = problem.graph.rest()
     places = problem.graph(rest)
     assert float(deviations(problem, places).max()) == 0
-    for distance, cost in ((0.0, 0.0), (0.05, 0.25), (0.1, 1.0), (7.0, 1.0)):
+    for distance, cost in ((0.0, 0.0), (0.015, 0.25), (0.03, 1.0), (7.0, 1.0)):
         away = replace(problem, expected=places + distance * torch.tensor([0.6, 0.0, -0.8]))
         torch.testing.assert_close(deviations(away, places), torch.full_like(places[:, 0], cost))
         assert judge(away, "", rest).deviation == pytest.approx(cost)

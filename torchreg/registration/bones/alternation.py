@@ -102,7 +102,6 @@ class ReducedFit:
         self._costs = LabelCosts(
             smoothness=config.smoothness,
             label=data.grid.num_cells * (config.label_cost / data.grid.spacing) ** 2,
-            truncation=config.truncation,
             seam=config.seam,
             seam_cap=config.seam_cap,
         )
@@ -181,7 +180,7 @@ class ReducedFit:
         if joints is None:
             fit = fit_bones(problem, transforms, max_steps=self.config.motion_steps)
         else:
-            rotations, scale = transforms[..., :3, :3], geometric_at(self.config.joint_scale, self._progress)
+            rotations, scale = transforms[..., :3, :3], geometric_at(self.config.max_distance, self._progress)
             problem = replace(
                 problem,
                 moments=with_stiffness(self.moments, rotations, self.config, self._joint_weight),
@@ -213,7 +212,7 @@ class ReducedFit:
         self.correspondences = Correspondences(
             targets=torch.where(matched, aligned + to_plane, aligned),
             normals=torch.where(matched, target_normals, normals),
-            weights=torch.where(kept, 1.0, self.config.unmatched * self.samples.confidence),
+            weights=torch.where(kept, 1.0, self.samples.confidence),
             point_to_point=self.config.point_to_point,
         )
 

@@ -40,25 +40,22 @@ class BoneConfig:
         seam_cap: gap in cells beyond which it costs no more, so that what merely touches can part.
         label_cost: root of the mean squared distance that a label must save to be used; ``num_bones`` is a cap, and
             `ScanRegistration.parts` joins bones that moved as one.
-        truncation: largest distance of a sample in the W-step, in cells.
         reuse: whether labels that lost all their cells are given to the regions with the largest residuals.
         joint_weight: beta, the weight of the joints against the mean squared distance, over the rounds of labels; zeros
             leave out joints and the costs of turns, and the paper's (1, 0.05) holds bones together where matches do
             not, which here the dense alignment does, so that joints that are wrong need not resist.
-        joint_scale: robust scale of the gaps that motions tear open at joints, since not all that meets is joined; it
-            starts wide, as labels are coarse at first and tear joints.
         turn_weight: cost per squared radian by which bones that share weight turn against each other, so that the twist
             of a round limb, which scans do not tell, stays as it was.
         turn_scale: robust scale of those turns, radians.
         hinge_weight: cost per squared radian of turns about other axes than the one about which two bones mostly turn,
             where three frames or more tell it, since most joints are hinges.
         hinge_scale: robust scale of the turns about other axes, radians.
-        max_distance: largest distance of a match, never below two sampling distances of the target.
+        max_distance: largest distance of a match, never below two sampling distances of the target; and the robust
+            scale of the gaps that motions tear open at joints, since not all that meets is joined.
         max_angle: largest angle between the normals of a match, radians.
         normal_scale: distance that counts as much as normals 60 degrees apart.
         point_to_point: weight of the distance to where the dense alignment moves a sample, against that along the
             normal.
-        unmatched: weight of samples without a match, which stay where the dense alignment moves them.
         min_matched: share of samples with a match below which the scans count as not registered.
         rtol: relative change of the energy over a round below which rounds end.
         refine: refinement of the weights.
@@ -81,10 +78,8 @@ class BoneConfig:
     seam: float = 0.2
     seam_cap: float = 0.5
     label_cost: float = 0.0003
-    truncation: float = 4.0
     reuse: bool = True
     joint_weight: tuple[float, float] = (0.01, 0.001)
-    joint_scale: tuple[float, float] = (0.01, 0.005)
     turn_weight: float = 6e-7
     turn_scale: float = 0.1
     hinge_weight: float = 1e-5
@@ -93,7 +88,6 @@ class BoneConfig:
     max_angle: tuple[float, float] = (1.05, 0.52)
     normal_scale: float = 0.025
     point_to_point: float = 0.003
-    unmatched: float = 0.3
     min_matched: float = 0.1
     rtol: float = 0.2
     refine: WeightsConfig = field(default_factory=_refinement)
@@ -104,7 +98,7 @@ class BoneConfig:
             check_count(getattr(self, name), name, 1)
         for name in ("refine_steps", "settle_steps"):
             check_count(getattr(self, name), name, 0)
-        for name in ("truncation", "unmatched", "seam_cap", "turn_scale", "hinge_scale"):
+        for name in ("seam_cap", "turn_scale", "hinge_scale"):
             check_positive(getattr(self, name), name)
         for name in ("smoothness", "seam", "label_cost", "turn_weight", "hinge_weight", "normal_scale", "rtol"):
             check_positive(getattr(self, name), name, allow_zero=True)
@@ -112,7 +106,7 @@ class BoneConfig:
             check_share(getattr(self, name), name)
         if self.point_to_point == 0:
             raise InputError("point_to_point must be positive: along flat parts nothing else holds samples")
-        for name in ("joint_scale", "max_distance", "max_angle"):
+        for name in ("max_distance", "max_angle"):
             check_ends(getattr(self, name), name)
         check_ends(self.joint_weight, "joint_weight", allow_zero=True)
         if min(self.joint_weight) == 0 < max(self.joint_weight):

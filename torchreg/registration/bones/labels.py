@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -76,7 +77,7 @@ class LabelCosts:
     Args:
         smoothness: mu, of two neighboring cells with different labels.
         label: of each label in use: the number of bones is a cap, not a goal.
-        truncation: largest distance of a sample, in cells.
+        truncation: largest distance of a sample, in cells; the paper's.
         seam: nu, of two neighboring cells with different labels, per cell of the gap that their motions open at the
             side between them.
         seam_cap: cells, beyond which that gap costs no more.
@@ -84,7 +85,7 @@ class LabelCosts:
 
     smoothness: float
     label: float
-    truncation: float
+    truncation: float = math.inf
     seam: float = 0.0
     seam_cap: float = 0.5
 
@@ -125,7 +126,7 @@ def relabel(
     """Return labels (C,) of least energy, and the energy: the W-step.
 
     ``sum_C W(C, f_C) + sum_{(C, D)} (mu [f_C != f_D] + nu min(|T_{f_C} x_CD - T_{f_D} x_CD|, cap)) + h |used labels|``
-    with W the sum of truncated squared residuals of the cell's samples under the motion of a bone, in all frames, and
+    with W the sum of squared residuals of the cell's samples under the motion of a bone, in all frames, and
     x_CD in the middle between two cells; correspondences stay while labels change. Near a joint both bones move a
     sample alike, so that residuals alone put the border anywhere there. Unlike in the paper, the pairwise term is the
     discontinuity of the deformation across the border, so that it passes through the joint; it is truncated, as not

@@ -48,9 +48,9 @@ class ScanAlignConfig:
             apart: cloth and round limbs have far to go.
         outliers: expected outliers, as a share of what a sample in the middle of its matches gets.
         doubt: support of a match that the matcher calls impossible, beside one of a sure match.
-        cap: distances count up to this in the choice among the hypotheses, length.
+        cap: distances, from the target and from where samples were expected, if that is known, count up to this in the
+            choice among the hypotheses, length.
         smoothness: what it costs there that neighboring nodes disagree by one size in the mean.
-        deviation_cap: distances from where samples were expected, if that is known, count there up to this, length.
 
     Raises:
         InputError: if a value is out of range.
@@ -67,12 +67,11 @@ class ScanAlignConfig:
     doubt: float = 0.1
     cap: float = 0.03
     smoothness: float = 20.0
-    deviation_cap: float = 0.1
 
     def __post_init__(self) -> None:
         for name in ("num_samples", "num_nodes"):
             check_count(getattr(self, name), name, 1)
-        for name in ("edge_scale", "tangential_weight", "outliers", "doubt", "cap", "deviation_cap"):
+        for name in ("edge_scale", "tangential_weight", "outliers", "doubt", "cap"):
             check_positive(getattr(self, name), name)
         for name in ("normal_weight", "smoothness"):
             check_positive(getattr(self, name), name, allow_zero=True)

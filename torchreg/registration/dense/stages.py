@@ -98,10 +98,10 @@ def judge(problem: ScanAlignProblem, name: str, transforms: Tensor) -> Hypothesi
 
 
 def deviations(problem: ScanAlignProblem, places: Tensor) -> Tensor:
-    """Return what it costs samples (S,) to be elsewhere than expected."""
+    """Return squared distances of samples (S,) from where they are expected, in caps, at most one."""
     if problem.expected is None:
         return torch.zeros_like(places[:, 0])
-    apart = (places - problem.expected).norm(dim=-1) / problem.config.deviation_cap
+    apart = (places - problem.expected).norm(dim=-1) / problem.config.cap
     return apart.clamp(max=1).square()
 
 
