@@ -58,7 +58,7 @@ class FrameToFrame:
     momentum: float = 0.5
 
     def apply(self, config: RegisterConfig) -> RegisterConfig:
-        """Return the settings within the bounds; motions need not converge."""
+        """Return the settings within the bounds."""
         first, last = config.joint_weight
         return replace(
             config,
@@ -66,7 +66,6 @@ class FrameToFrame:
             smoothness=max(config.smoothness, self.smoothness),
             point_to_point=max(config.point_to_point, self.point_to_point),
             joint_weight=(min(first, self.joint_weight), min(last, self.joint_weight)),
-            settle_steps=0,
         )
 
     def predict(self, positions: dict[int, Tensor], frame: int, step: int) -> Tensor | None:
@@ -83,8 +82,7 @@ class AllFrames:
         num_patches: lower bound; parts may start from smaller patches.
         match_steps: lower bound; borders between parts are drawn by motions, which should have converged.
         refine_steps: lower bound, unless there are none.
-        settle_steps: lower bound; displacements along the surface converge slowly.
-        rtol: upper bound, for the same reason.
+        rtol: upper bound; displacements along the surface converge slowly.
         joint_weight: lower bound, unless joints are left out; many frames determine joints well, so that these may be
             firm.
         turn_scale: lower bound, radians; bones hold each other in wide turns too, since twists that scans do not show
@@ -96,7 +94,6 @@ class AllFrames:
     num_patches: int = 200
     match_steps: int = 4
     refine_steps: int = 3
-    settle_steps: int = 4
     rtol: float = 0.02
     joint_weight: float = 0.01
     turn_scale: float = 0.5
@@ -111,7 +108,6 @@ class AllFrames:
             num_patches=max(config.num_patches, self.num_patches),
             match_steps=max(config.match_steps, self.match_steps),
             refine_steps=max(config.refine_steps, self.refine_steps) if config.refine_steps > 0 else 0,
-            settle_steps=max(config.settle_steps, self.settle_steps),
             rtol=min(config.rtol, self.rtol),
             joint_weight=(first, last),
             turn_scale=max(config.turn_scale, self.turn_scale),

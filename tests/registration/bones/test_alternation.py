@@ -71,7 +71,7 @@ def test_labels_then_weights_come_nearer_to_the_truth(toy):
 def test_records_hold_the_energy_of_the_paper_by_terms(toy):
     """That of eqs. 2 and 8 at the weights and matches of the step, however many frames."""
     for pairs in (toy[1][:1], toy[1]):
-        reduced, _ = fit(pairs, noise=0.005, config=RegisterConfig(label_steps=1, settle_steps=0))
+        reduced, _ = fit(pairs, noise=0.005, config=RegisterConfig(label_steps=1))
         reduced.fit_labels()
         labels = reduced.model.weights.detach()
         (first,) = reduced.history
@@ -218,9 +218,7 @@ def test_joints_are_held_first_and_let_go_later(toy, problems):
     assert problems[-1].pair_weights.max() < 0.5
 
 
-@pytest.mark.parametrize(
-    "settings", [{"reuse": False}, {"refine_steps": 0}, {"joint_weight": (0.0, 0.0)}, {"blend": "dual_quaternion"}]
-)
+@pytest.mark.parametrize("settings", [{"refine_steps": 0}, {"joint_weight": (0.0, 0.0)}, {"blend": "dual_quaternion"}])
 def test_every_step_can_be_left_out(toy, settings):
     reduced, truth = fit(toy[1][:1], config=RegisterConfig(**settings))
     reduced.fit_labels()

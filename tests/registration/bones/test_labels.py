@@ -7,7 +7,7 @@ from torchreg.geometry.rigid import rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.metrics import adjusted_rand
 from torchreg.registration.bones.correspondences import Correspondences
-from torchreg.registration.bones.labels import CellData, LabelCosts, first_labels, reinitialize_labels, relabel
+from torchreg.registration.bones.labels import CellData, LabelCosts, first_labels, relabel
 from torchreg.registration.bones.sparse_grid import SparseGrid
 
 COSTS = LabelCosts(smoothness=0.2, label=4.0, truncation=4.0)
@@ -136,21 +136,6 @@ def test_labels_that_cost_too_much_are_not_used(bar):
     start = torch.zeros(data.grid.num_cells, dtype=torch.int64)
     labels, _ = relabel(data, Correspondences(moved, None, weights), motions[None], start, LabelCosts(0.2, 1e6, 4.0))
     assert len(labels.unique()) == 1
-
-
-def test_lost_labels_are_used_again_where_two_motions_fit_better(bar):
-    data, moved, weights, part, _ = bar
-    pairs = Correspondences(moved, None, weights)
-    merged = (data.grid.cell_centers()[:, 0] > 4).long()
-    labels = reinitialize_labels(data, pairs, merged, 3, COSTS)
-    assert labels.unique().tolist() == [0, 1, 2]
-    assert float(adjusted_rand(labels[data.cell], part)) > 0.9
-    assert torch.equal(reinitialize_labels(data, pairs, merged, 2, COSTS), merged)
-    # Nothing is split that moves as one already.
-    assert torch.equal(reinitialize_labels(data, pairs, labels, 9, LabelCosts(0.2, 50.0, 4.0)), labels)
-    tiny = torch.zeros(data.grid.num_cells, dtype=torch.int64)
-    tiny[0] = 1
-    assert reinitialize_labels(data, pairs, tiny, 2, COSTS).unique().tolist() == [0, 1]
 
 
 def test_frames_decide_together(bar):

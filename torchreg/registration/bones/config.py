@@ -33,14 +33,12 @@ class BoneConfig:
         label_steps: most rounds of T-steps, correspondences and W-step.
         match_steps: T-steps, each followed by new correspondences, before a W-step.
         refine_steps: rounds of refining weights, T-step and correspondences.
-        settle_steps: rounds of T-step and correspondences after those.
         motion_steps: most linear systems of a T-step.
         smoothness: mu of the W-step, the cost of neighboring cells with different labels, in squared cells.
         seam: cost of neighboring cells with different labels per cell of the gap that these tear open between them.
         seam_cap: gap in cells beyond which it costs no more, so that what merely touches can part.
         label_cost: root of the mean squared distance that a label must save to be used; ``num_bones`` is a cap, and
             `ScanRegistration.parts` joins bones that moved as one.
-        reuse: whether labels that lost all their cells are given to the regions with the largest residuals.
         joint_weight: beta, the weight of the joints against the mean squared distance, over the rounds of labels; zeros
             leave out joints and the costs of turns, and the paper's (1, 0.05) holds bones together where matches do
             not, which here the dense alignment does, so that joints that are wrong need not resist.
@@ -72,13 +70,11 @@ class BoneConfig:
     label_steps: int = 4
     match_steps: int = 1
     refine_steps: int = 1
-    settle_steps: int = 2
     motion_steps: int = 5
     smoothness: float = 0.01
     seam: float = 0.2
     seam_cap: float = 0.5
     label_cost: float = 0.0003
-    reuse: bool = True
     joint_weight: tuple[float, float] = (0.01, 0.001)
     turn_weight: float = 6e-7
     turn_scale: float = 0.1
@@ -96,8 +92,7 @@ class BoneConfig:
     def __post_init__(self) -> None:
         for name in ("num_samples", "num_patches", "label_steps", "match_steps", "motion_steps"):
             check_count(getattr(self, name), name, 1)
-        for name in ("refine_steps", "settle_steps"):
-            check_count(getattr(self, name), name, 0)
+        check_count(self.refine_steps, "refine_steps", 0)
         for name in ("seam_cap", "turn_scale", "hinge_scale"):
             check_positive(getattr(self, name), name)
         for name in ("smoothness", "seam", "label_cost", "turn_weight", "hinge_weight", "normal_scale", "rtol"):
