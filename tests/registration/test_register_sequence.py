@@ -106,9 +106,9 @@ def test_from_frame_to_frame_bones_are_held_along_the_surface_and_not_by_joints(
 @pytest.mark.parametrize(
     ("given", "expected"),
     [
-        ({}, {"turn_scale": 0.5, "joint_weight": (0.01, 0.01), "point_to_point": 0.001, "seam_cap": 1.0}),
+        ({}, {"turn_scale": 0.5, "joint_weight": (0.01, 0.01), "point_to_point": 0.001}),
         ({"turn_scale": 2.0, "joint_weight": (1.0, 0.05)}, {"turn_scale": 2.0, "joint_weight": (1.0, 0.05)}),
-        ({"joint_weight": (0.0, 0.0), "num_patches": 300}, {"joint_weight": (0.0, 0.0), "num_patches": 300}),
+        ({"joint_weight": (0.0, 0.0)}, {"joint_weight": (0.0, 0.0)}),
         ({}, {"match_steps": 4, "refine_steps": 3, "rtol": 0.02}),
         ({"match_steps": 6, "refine_steps": 0, "rtol": 0.0}, {"match_steps": 6, "refine_steps": 0, "rtol": 0.0}),
     ],

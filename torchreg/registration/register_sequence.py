@@ -79,7 +79,6 @@ class AllFrames:
     """Bounds on the settings by which all frames are fitted together.
 
     Args:
-        num_patches: lower bound; parts may start from smaller patches.
         match_steps: lower bound; borders between parts are drawn by motions, which should have converged.
         refine_steps: lower bound, unless there are none.
         rtol: upper bound; displacements along the surface converge slowly.
@@ -88,31 +87,26 @@ class AllFrames:
         turn_scale: lower bound, radians; bones hold each other in wide turns too, since twists that scans do not show
             would be lost in every frame anew.
         point_to_point: upper bound; positions along the surface drift.
-        seam_cap: lower bound, cells; wide motions tear more where parts meet.
     """
 
-    num_patches: int = 200
     match_steps: int = 4
     refine_steps: int = 3
     rtol: float = 0.02
     joint_weight: float = 0.01
     turn_scale: float = 0.5
     point_to_point: float = 0.001
-    seam_cap: float = 1.0
 
     def apply(self, config: RegisterConfig) -> RegisterConfig:
         """Return the settings within the bounds."""
         first, last = (max(weight, self.joint_weight) if weight > 0 else weight for weight in config.joint_weight)
         return replace(
             config,
-            num_patches=max(config.num_patches, self.num_patches),
             match_steps=max(config.match_steps, self.match_steps),
             refine_steps=max(config.refine_steps, self.refine_steps) if config.refine_steps > 0 else 0,
             rtol=min(config.rtol, self.rtol),
             joint_weight=(first, last),
             turn_scale=max(config.turn_scale, self.turn_scale),
             point_to_point=min(config.point_to_point, self.point_to_point),
-            seam_cap=max(config.seam_cap, self.seam_cap),
         )
 
 
@@ -195,7 +189,7 @@ def register_sequence(
     normalized = [normalization.normalize_scan(scan) for scan in scans]
     normalized_source, config = normalized[reference], ALL_FRAMES.apply(config)
     grid = SparseGrid.from_points(normalized_source.points, grid_resolution)
-    data = CellData(grid, normalized_source.points[index], config.num_patches, linked=True)
+    data = CellData(grid, normalized_source.points[index], CellData.PER_BONE * num_bones, linked=True)
     samples = Samples.from_alignment(normalized_source, index, normalization.normalize(moved), confidence)
     fit = ReducedFit(data, samples, normalized, config, num_bones=num_bones, on_step=on_step)
     converged = fit.fit_labels()

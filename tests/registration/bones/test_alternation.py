@@ -193,7 +193,7 @@ def test_what_turns_about_one_axis_in_all_frames_does_not_twist_in_some(rod, wei
     data = CellData(SparseGrid.from_points(points, 30), points, 60)
     samples = Samples(points, normals, moved, torch.ones_like(moved[..., 0]))
     labels = (data.grid.cell_centers()[:, 0] > 0).long()
-    config = RegisterConfig(joint_weight=(1e-4, 1e-4), turn_weight=0.0, hinge_weight=weight, hinge_scale=10.0)
+    config = RegisterConfig(joint_weight=(1e-4, 1e-4), turn_weight=0.0, hinge_weight=weight)
     reduced = ReducedFit(data, samples, targets, config, num_bones=2, labels=labels)
     for _ in range(8):
         reduced.update_correspondences(0.5)

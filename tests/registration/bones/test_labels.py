@@ -80,14 +80,14 @@ def test_seams_cost_what_two_bones_tear_apart_up_to_a_cap(bar):
     pairs = Correspondences(frames, None, weights.expand(2, -1))
     start = (data.grid.cell_centers()[:, 0] > 3).long()
     spacing, cells = data.grid.spacing, data.grid.neighbors()
-    plain, seamed = (LabelCosts(0.2, 4.0, 4.0, seam=seam, seam_cap=0.5) for seam in (0.0, 0.3))
+    plain, seamed = (LabelCosts(0.2, 4.0, 4.0, seam=seam) for seam in (0.0, 0.3))
     labels, energy = relabel(data, pairs, both, start, seamed)
     centers, seams = data.grid.cell_centers(), 0.0
     for one, other in cells[labels[cells[:, 0]] != labels[cells[:, 1]]].tolist():
         middle = torch.cat([0.5 * (centers[one] + centers[other]), torch.ones(1, dtype=torch.float64)])
         gaps = [(motion[labels[one], :3] - motion[labels[other], :3]) @ middle for motion in both]
         apart = torch.stack(gaps).square().sum(-1).mean().sqrt() / spacing
-        seams += 0.3 * min(float(apart), 0.5)
+        seams += 0.3 * min(float(apart), 1.0)
     own = both[:, labels[data.cell], :3, :3] @ data.points[..., None]
     squares = (own[..., 0] + both[:, labels[data.cell], :3, 3] - frames).square().sum(-1)
     distance = data.grid.num_cells * squares.clamp(max=(4 * spacing) ** 2).mean() / spacing**2
@@ -127,7 +127,7 @@ def test_what_merely_touches_can_part():
         data, Correspondences(moved[None], None, weights), motions[None], start, LabelCosts(0.02, 4.0, 4.0, seam=0.2)
     )
     assert float(adjusted_rand(labels[data.cell], lower)) > 0.8
-    stuck = LabelCosts(0.02, 4.0, 4.0, seam=50.0, seam_cap=20.0)
+    stuck = LabelCosts(0.02, 4.0, 4.0, seam=1000.0)
     assert len(relabel(data, Correspondences(moved[None], None, weights), motions[None], start, stuck)[0].unique()) == 1
 
 

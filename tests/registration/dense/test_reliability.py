@@ -11,7 +11,7 @@ from torchreg.registration.dense.problem import describe
 from torchreg.registration.dense.reliability import SCAN_CALIBRATION, ScanEvidence, confidence_of, scan_evidence
 
 CONFIG = ScanAlignConfig(num_samples=400, num_nodes=30)
-GOOD = ScanEvidence(forward=0.7, backward=0.05, smoothness=0.1, unsupported=0.8, hidden=0.05, rival=0.0)
+GOOD = ScanEvidence(forward=0.1, backward=0.05, smoothness=0.1, unsupported=0.8, hidden=0.05, rival=0.0)
 
 
 @pytest.fixture(scope="module")

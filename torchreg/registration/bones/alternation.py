@@ -103,7 +103,6 @@ class ReducedFit:
             smoothness=config.smoothness,
             label=data.grid.num_cells * (config.label_cost / data.grid.spacing) ** 2,
             seam=config.seam,
-            seam_cap=config.seam_cap,
         )
         # Before the first T-step samples correspond to their positions in the alignment, which also gives the motions.
         self.correspondences = Correspondences(samples.moved, None, samples.confidence)

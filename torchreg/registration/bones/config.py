@@ -29,14 +29,13 @@ class BoneConfig:
 
     Args:
         num_samples: source points that are matched, evenly spread.
-        num_patches: patches of the grid, from which parts are merged.
         label_steps: most rounds of T-steps, correspondences and W-step.
         match_steps: T-steps, each followed by new correspondences, before a W-step.
         refine_steps: rounds of refining weights, T-step and correspondences.
         motion_steps: most linear systems of a T-step.
         smoothness: mu of the W-step, the cost of neighboring cells with different labels, in squared cells.
-        seam: cost of neighboring cells with different labels per cell of the gap that these tear open between them.
-        seam_cap: gap in cells beyond which it costs no more, so that what merely touches can part.
+        seam: cost of neighboring cells with different labels per cell of the gap that these tear open between them, of
+            one cell at most, so that what merely touches can part.
         label_cost: root of the mean squared distance that a label must save to be used; ``num_bones`` is a cap, and
             `ScanRegistration.parts` joins bones that moved as one.
         joint_weight: beta, the weight of the joints against the mean squared distance, over the rounds of labels; zeros
@@ -47,7 +46,6 @@ class BoneConfig:
         turn_scale: robust scale of those turns, radians.
         hinge_weight: cost per squared radian of turns about other axes than the one about which two bones mostly turn,
             where three frames or more tell it, since most joints are hinges.
-        hinge_scale: robust scale of the turns about other axes, radians.
         max_distance: largest distance of a match, never below two sampling distances of the target; and the robust
             scale of the gaps that motions tear open at joints, since not all that meets is joined.
         max_angle: largest angle between the normals of a match, radians.
@@ -66,20 +64,17 @@ class BoneConfig:
     """
 
     num_samples: int = 4000
-    num_patches: int = 100
     label_steps: int = 4
     match_steps: int = 1
     refine_steps: int = 1
     motion_steps: int = 5
     smoothness: float = 0.01
-    seam: float = 0.2
-    seam_cap: float = 0.5
+    seam: float = 0.1
     label_cost: float = 0.0003
     joint_weight: tuple[float, float] = (0.01, 0.001)
     turn_weight: float = 6e-7
     turn_scale: float = 0.1
     hinge_weight: float = 1e-5
-    hinge_scale: float = 0.2
     max_distance: tuple[float, float] = (0.03, 0.01)
     max_angle: tuple[float, float] = (1.05, 0.52)
     normal_scale: float = 0.025
@@ -90,10 +85,10 @@ class BoneConfig:
     blend: str = "linear"
 
     def __post_init__(self) -> None:
-        for name in ("num_samples", "num_patches", "label_steps", "match_steps", "motion_steps"):
+        for name in ("num_samples", "label_steps", "match_steps", "motion_steps"):
             check_count(getattr(self, name), name, 1)
         check_count(self.refine_steps, "refine_steps", 0)
-        for name in ("seam_cap", "turn_scale", "hinge_scale"):
+        for name in ("turn_scale",):
             check_positive(getattr(self, name), name)
         for name in ("smoothness", "seam", "label_cost", "turn_weight", "hinge_weight", "normal_scale", "rtol"):
             check_positive(getattr(self, name), name, allow_zero=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -28,6 +29,9 @@ class CellData:
         linked: whether labels of separate regions should agree with those of the cells nearest to them.
         gap: most empty cells between regions that count as connected: holes of scans cut limbs in two.
     """
+
+    # Patches for each bone, which may then begin and end nearly anywhere.
+    PER_BONE: ClassVar[int] = 10
 
     grid: SparseGrid
     points: Tensor
@@ -79,15 +83,13 @@ class LabelCosts:
         label: of each label in use: the number of bones is a cap, not a goal.
         truncation: largest distance of a sample, in cells; the paper's.
         seam: nu, of two neighboring cells with different labels, per cell of the gap that their motions open at the
-            side between them.
-        seam_cap: cells, beyond which that gap costs no more.
+            side between them, of one cell at most.
     """
 
     smoothness: float
     label: float
     truncation: float = math.inf
     seam: float = 0.0
-    seam_cap: float = 0.5
 
 
 def labels_of_parts(data: CellData, points: Tensor, parts: Tensor) -> Tensor:
@@ -125,7 +127,7 @@ def relabel(
 ) -> tuple[Tensor, float]:
     """Return labels (C,) of least energy, and the energy: the W-step.
 
-    ``sum_C W(C, f_C) + sum_{(C, D)} (mu [f_C != f_D] + nu min(|T_{f_C} x_CD - T_{f_D} x_CD|, cap)) + h |used labels|``
+    ``sum_C W(C, f_C) + sum_{(C, D)} (mu [f_C != f_D] + nu min(|T_{f_C} x_CD - T_{f_D} x_CD|, 1)) + h |used labels|``
     with W the sum of squared residuals of the cell's samples under the motion of a bone, in all frames, and
     x_CD in the middle between two cells; correspondences stay while labels change. Near a joint both bones move a
     sample alike, so that residuals alone put the border anywhere there. Unlike in the paper, the pairwise term is the
@@ -151,8 +153,8 @@ def relabel(
         unary,
         data.neighbors,
         unary.new_full((count,), costs.smoothness),
-        positions=_seam_positions(data, transforms, costs.seam_cap),
-        position_weights=unary.new_full((count,), costs.seam * costs.seam_cap),
+        positions=_seam_positions(data, transforms),
+        position_weights=unary.new_full((count,), costs.seam),
         label_costs=unary.new_full((size,), costs.label),
         initial=labels,
         # The rounds of labels and motions repeat it.
@@ -161,11 +163,11 @@ def relabel(
     return found.labels, found.energy
 
 
-def _seam_positions(data: CellData, transforms: Tensor, cap: float) -> Tensor:
-    """Return images (A, B, 3 F) of the middles between neighboring cells under motions (F, B, 4, 4), in caps.
+def _seam_positions(data: CellData, transforms: Tensor) -> Tensor:
+    """Return images (A, B, 3 F) of the middles between neighboring cells under motions (F, B, 4, 4), in cells.
 
     Distances between them are root mean squares over the frames.
     """
     middles = data.grid.cell_centers()[data.neighbors].mean(1)
-    images = transform_points(transforms, middles) / (cap * data.grid.spacing * len(transforms) ** 0.5)
+    images = transform_points(transforms, middles) / (data.grid.spacing * len(transforms) ** 0.5)
     return images.permute(2, 1, 0, 3).flatten(2)

@@ -45,8 +45,8 @@ class ScanCalibration:
     kinds that the matcher is trained on by ``benchmarks/scan_confidence.py --calibrate``.
     """
 
-    bias: float = 7.03
-    weights: tuple[float, ...] = (1.12, 6.19, 2.93, 3.74, 1.13, 6.28)  # in the order of `ScanEvidence`
+    bias: float = 6.94
+    weights: tuple[float, ...] = (3.79, 6.29, 5.54, 3.88, 2.42, 0.05)  # in the order of `ScanEvidence`
     doubtful: float = 0.5  # confidence below which a result is doubtful
 
 
