@@ -10,7 +10,7 @@ of repeated calls, and the fastest in brackets: on a busy machine the two differ
 - deform: 10,000 points moved.
 - T-step: one Gauss-Newton step of all bones with joints, 2,000 matches point to plane, weights binary or blended at the
   borders.
-- refine: weights from labels, 1,500 matches, by the active set and by gradients, and how far their objectives differ.
+- refine: weights from labels, 1,500 matches.
 - pose: four handles; "far": the tube bent on by 40 degrees; "drag": warm-started, by 2 degrees.
 """
 
@@ -33,7 +33,7 @@ from torchreg.registration.bones.correspondences import Correspondences
 from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
 from torchreg.registration.bones.motions import fit_bones
 from torchreg.registration.bones.sparse_grid import SparseGrid
-from torchreg.registration.bones.weights import WeightsConfig, refine_weights
+from torchreg.registration.bones.weights import refine_weights
 from torchreg.registration.solve_pose import PoseSolver
 
 
@@ -121,16 +121,7 @@ def refinement_scene(tube: Tube, few: Tensor) -> tuple[tr.GridLBS, Tensor, Corre
 
 def refinement_rows(tube: Tube, few: Tensor, repeats: int) -> list[tuple[str, str]]:
     model, points, pairs = refinement_scene(tube, few)
-    rows, objectives = [], []
-    for method in ("active_set", "gradient"):
-        config = WeightsConfig(method=method)
-
-        def run(config: WeightsConfig = config) -> float:
-            return refine_weights(model, points, pairs, config).objective
-
-        rows.append((f"refine, {method}", milliseconds(run, repeats)))
-        objectives.append(run())
-    return [*rows, ("objectives differ by", f"{100 * (objectives[1] / objectives[0] - 1):7.4f} %")]
+    return [("refine", milliseconds(lambda: refine_weights(model, points, pairs).objective, repeats))]
 
 
 def pose_rows(tube: Tube, repeats: int) -> list[tuple[str, str]]:

@@ -136,7 +136,7 @@ def main(arguments: list[str] | None = None) -> int:
     print(f"* marks pairs with fewer than {REGISTERED:.0%} of the points within {NEAR:.1%} of the diagonal")
     config = ScanAlignConfig()
     if options.smoke:
-        config = ScanAlignConfig(num_samples=300, num_target_samples=500, num_nodes=25)
+        config = ScanAlignConfig(num_samples=300, num_nodes=25)
     for name, pairs in groups(options.data, options.pairs, options.smoke):
         if options.pairs or "apart" not in name:
             print_group(name, pairs, config)

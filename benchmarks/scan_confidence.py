@@ -41,14 +41,14 @@ class Case:
 @torch.no_grad()
 def aligned(pairs: Iterable[Pair]) -> list[Case]:
     """Return the cases of pairs."""
-    config, found = ScanAlignConfig(), []
+    found = []
     for pair in pairs:
-        problem = describe(pair.source, pair.target, config)
-        candidates = align_problem(problem, config, lambda _: None)
+        problem = describe(pair.source, pair.target, ScanAlignConfig())
+        candidates = align_problem(problem, lambda _: None)
         moved = moved_points(problem, candidates[0].transforms, pair.source)
         error = (moved - pair.truth).norm(dim=1) / pair.target.diagonal
         right = float((error < NEAR).double().mean()) >= SHARE
-        found.append(Case(right, evidence_against(problem, candidates, config)))
+        found.append(Case(right, evidence_against(problem, candidates)))
     return found
 
 

@@ -65,8 +65,8 @@ def moved_points(problem: ScanAlignProblem, transforms: Tensor, scan: tr.RangeSc
 @torch.no_grad()
 def measured(pair: Pair, matcher: ScanMatcher) -> list[float]:
     """Return the figures of one pair, in the order of the columns; NaN where there is nothing hidden or called so."""
-    begin, config = time.process_time(), ScanAlignConfig()
-    problem = describe(pair.source, pair.target, config)
+    begin = time.process_time()
+    problem = describe(pair.source, pair.target, ScanAlignConfig())
     scans = (problem.source, problem.target)
     logits = matcher(*(ScanTokens.from_even(scan.points, scan.normals, scan.boundary) for scan in scans))
     (probability,), (hidden,), _ = (value.double() for value in match_probabilities(logits))
@@ -79,7 +79,7 @@ def measured(pair: Pair, matcher: ScanMatcher) -> list[float]:
     figures = [share(right[visible]), share(called[~visible]), share(~visible[called])]
     for known in (logits[0].double(), true_logits(truth, places, visible)):
         prior = MatchPrior.of_logits(known, problem.graph.points, problem.target.points)
-        transforms = align_problem(replace(problem, prior=prior), config, lambda _: None)[0].transforms
+        transforms = align_problem(replace(problem, prior=prior), lambda _: None)[0].transforms
         error = (moved_points(problem, transforms, pair.source) - pair.truth).norm(dim=1) / pair.target.diagonal
         figures += [100 * float(error.mean()), float((error < 0.025).double().mean() >= 0.9)]
     return [*figures, time.process_time() - begin]

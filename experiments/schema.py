@@ -167,7 +167,6 @@ class RegistrationTrial:
         num_bones: at most.
         grid_resolution: cells along the longest axis.
         joint_weight: of the joint term in the end, from ten times as much on; 0 leaves it out.
-        reuse: whether lost labels are reborn.
         refine_steps: rounds of refining weights.
         num_samples: source points that are matched.
         retries: times that "paper" tries again with other parameters where a pair was not registered, as the truth
@@ -182,7 +181,6 @@ class RegistrationTrial:
     num_bones: int = 20
     grid_resolution: int = 50
     joint_weight: float = 0.001
-    reuse: bool = True
     refine_steps: int = 1
     num_samples: int = 4000
     retries: int = 0

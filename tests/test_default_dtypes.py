@@ -18,7 +18,7 @@ from torchreg.geometry.mesh import unit_sphere
 from torchreg.registration.dense.config import ScanAlignConfig
 from torchreg.shapes.primitives import Primitive
 
-QUICK = tr.RegisterConfig(align=ScanAlignConfig(num_samples=200, num_target_samples=250), num_samples=300)
+QUICK = tr.RegisterConfig(align=ScanAlignConfig(num_samples=200), num_samples=300)
 SEARCH = tr.FindPoseConfig(num_candidates=8, num_placed=4, num_searched=2, search_rounds=1, num_model_points=120)
 FLOATS = (torch.float32, torch.float64)
 

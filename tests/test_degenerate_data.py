@@ -13,7 +13,7 @@ from torchreg.geometry.spread import spread_dimensions
 from torchreg.registration.dense.config import ScanAlignConfig
 from torchreg.shapes.primitives import Primitive
 
-QUICK = tr.RegisterConfig(align=ScanAlignConfig(num_samples=100, num_target_samples=100), num_samples=150)
+QUICK = tr.RegisterConfig(align=ScanAlignConfig(num_samples=100), num_samples=150)
 SEARCH = tr.FindPoseConfig(num_candidates=4, num_placed=2, num_searched=1, search_rounds=1, num_model_points=60)
 DRAWN = torch.rand(200, 3, generator=torch.Generator().manual_seed(0))
 CLOUDS = {

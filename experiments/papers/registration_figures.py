@@ -164,9 +164,7 @@ def _refinement(config: PaperTrial, bench: Bench) -> TrialOutcome:
     found = {
         "labels": tr.register(problem.source, problem.target, 7, 50, replace(printed, refine_steps=0)),
         "refined": tr.register(problem.source, problem.target, 7, 50, printed),
-        "default, labels": tr.register(
-            problem.source, problem.target, config=tr.RegisterConfig(refine_steps=0, settle_steps=0)
-        ),
+        "default, labels": tr.register(problem.source, problem.target, config=tr.RegisterConfig(refine_steps=0)),
         "default": tr.register(problem.source, problem.target),
     }
     metrics = _scores(problem, found)

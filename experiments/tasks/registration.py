@@ -102,9 +102,10 @@ def _settings(config: RegistrationTrial) -> tr.RegisterConfig:
     if config.method == "paper":
         return with_settings(tr.RegisterConfig.paper(), config.config)
     settings = tr.RegisterConfig(
-        joint_weight=(10 * config.joint_weight, config.joint_weight), reuse=config.reuse,
-        refine_steps=config.refine_steps, num_samples=config.num_samples,
-    )  # fmt: skip
+        joint_weight=(10 * config.joint_weight, config.joint_weight),
+        refine_steps=config.refine_steps,
+        num_samples=config.num_samples,
+    )
     return with_settings(settings, config.config)
 
 

@@ -65,7 +65,7 @@ def test_tables_are_printed_for_files_and_without(benchmark, problem, capsys, tm
     monkeypatch.setattr(benchmark.tr, "register", known)
     assert benchmark.main(["--data", str(tmp_path), "--pairs", "0", "--ablations"]) == 0
     printed = capsys.readouterr().out
-    assert "without label reuse" in printed
+    assert "without turns held" in printed
     assert "bones 15" in printed
     assert benchmark.main(["--pairs", "0"]) == 0
     assert "skipped: pairs from files" in capsys.readouterr().out

@@ -129,7 +129,7 @@ def test_scans_of_a_robot_become_its_description(run, error_of, scans, tmp_path,
     asked = []
 
     class Found:
-        points, status = torch.eye(3), tr.Status.CONVERGED
+        points, status, confidence = torch.eye(3), tr.Status.CONVERGED, torch.tensor([1.0, 0.9, 0.7])
 
         def to_urdf(self, path):
             asked.append(path)
@@ -146,7 +146,7 @@ def test_scans_of_a_robot_become_its_description(run, error_of, scans, tmp_path,
     answer = run(*three, "-o", tmp_path / "robot", "--urdf", "--bones", 8, "--grid", 25)
     assert answer.exit_code == 0, answer.output
     assert asked == [(3, 8, 25), tmp_path / "robot.urdf", tmp_path / "robot.safetensors"]
-    assert "2 links, 1 hinges and 0 sliders" in answer.output
+    assert "converged, confidence 70% in the worst scan: 2 links, 1 hinges and 0 sliders" in answer.output
     assert "joint_1 does not explain how its two links move" in answer.output
     lines = (tmp_path / "robot_joints.csv").read_text().splitlines()
     assert lines == ["scan,joint_1", "source.ply,0.0", "target.ply,0.25", "bare.ply,-0.5"]

@@ -11,11 +11,13 @@ from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.neighbors import nearest_neighbor
+from torchreg.registration import register_sequence as module
 from torchreg.registration.config import RegisterConfig
+from torchreg.registration.dense.align_scans import align_scans
 from torchreg.registration.dense.config import ScanAlignConfig
 from torchreg.registration.register_sequence import ALL_FRAMES, FRAME_TO_FRAME, register_sequence
 
-QUICK = RegisterConfig(align=ScanAlignConfig(num_samples=300, num_target_samples=400), num_samples=500)
+QUICK = RegisterConfig(align=ScanAlignConfig(num_samples=300), num_samples=500)
 
 
 @pytest.fixture(scope="module")
@@ -51,10 +53,31 @@ def test_all_points_meet_in_the_pose_of_the_reference(toy, found):
     assert float(distance.median()) < 0.01
 
 
+def test_confidence_falls_away_from_the_reference(found):
+    assert found.confidence.shape == (3,)
+    assert found.confidence[1] == 1
+    assert 0.5 < float(found.confidence.min()) <= float(found.confidence.max()) <= 1
+
+
+def test_frames_beyond_a_doubtful_one_are_doubtful(toy, monkeypatch):
+    sure = iter((0.9, 0.2, 0.7))
+
+    def judged(source, *args, **kwargs):
+        plain = align_scans(source, *args, **kwargs)
+        return replace(plain, confidence=next(sure))
+
+    monkeypatch.setattr(module, "align_scans", judged)
+    scans = [toy[0].subset(torch.arange(0, len(toy[0]), 2))] * 4
+    found = register_sequence(scans, 2, 10, replace(QUICK, label_steps=1, refine_steps=0))
+    assert found.confidence.tolist() == pytest.approx([1.0, 0.9, 0.2, 0.2])
+    assert found.status is tr.Status.DOUBTFUL
+    assert not found.status.usable
+
+
 def test_results_are_the_same_on_disk(found, tmp_path):
     found.save(tmp_path / "all.safetensors")
     back = tr.load(tmp_path / "all.safetensors")
-    for name in ("deformed", "transforms", "weights", "fused", "fused_frames"):
+    for name in ("deformed", "transforms", "weights", "fused", "fused_frames", "confidence"):
         assert torch.equal(getattr(back, name), getattr(found, name))
     assert back.history == found.history
 
@@ -78,16 +101,15 @@ def test_points_are_predicted_by_half_their_last_step():
 def test_from_frame_to_frame_bones_are_held_along_the_surface_and_not_by_joints(given, expected):
     config = FRAME_TO_FRAME.apply(RegisterConfig(**given))
     assert (config.point_to_point, config.joint_weight) == expected
-    assert config.settle_steps == 0
 
 
 @pytest.mark.parametrize(
     ("given", "expected"),
     [
-        ({}, {"turn_scale": 0.5, "joint_weight": (0.01, 0.01), "point_to_point": 0.001, "seam_cap": 1.0}),
+        ({}, {"turn_scale": 0.5, "joint_weight": (0.01, 0.01), "point_to_point": 0.001}),
         ({"turn_scale": 2.0, "joint_weight": (1.0, 0.05)}, {"turn_scale": 2.0, "joint_weight": (1.0, 0.05)}),
-        ({"joint_weight": (0.0, 0.0), "num_patches": 300}, {"joint_weight": (0.0, 0.0), "num_patches": 300}),
-        ({}, {"match_steps": 4, "refine_steps": 3, "settle_steps": 4, "rtol": 0.02}),
+        ({"joint_weight": (0.0, 0.0)}, {"joint_weight": (0.0, 0.0)}),
+        ({}, {"match_steps": 4, "refine_steps": 3, "rtol": 0.02}),
         ({"match_steps": 6, "refine_steps": 0, "rtol": 0.0}, {"match_steps": 6, "refine_steps": 0, "rtol": 0.0}),
     ],
 )
@@ -98,13 +120,12 @@ def test_all_frames_together_are_fitted_more_thoroughly_and_bones_hold_each_othe
 
 def test_far_frames_are_reached_step_by_step_as_the_config_says(toy):
     records = []
-    config = replace(QUICK, refine_steps=0, joint_weight=(0.0, 0.0), settle_steps=5)
+    config = replace(QUICK, refine_steps=0, joint_weight=(0.0, 0.0))
     found = register_sequence([toy[frame] for frame in range(3)], 8, 30, config, on_step=records.append)
     errors = (found.deformed[2] - toy.truth(0, 2)).norm(dim=-1) / toy[0].diagonal
     assert float((errors < 0.025).float().mean()) > 0.8
     assert records[-len(found.history) :] == list(found.history)
-    assert {record.stage for record in records} == {"initialize", "align", "refine"}
-    assert [record.num_steps for record in found.history if record.stage == "refine"] == [5] * 5
+    assert {record.stage for record in records} == {"initialize", "align"}
     assert all(record.joint == 0 for record in found.history)
 
 

@@ -69,8 +69,9 @@ def check_alone(options: dict[str, Any]) -> None:
 def _summary(found: SequenceRegistration, robot: RobotModel) -> str:
     kinds = [joint.kind for joint in robot.tree.joints[1:]]
     size = float((found.points.amax(0) - found.points.amin(0)).norm())
+    sure = "" if found.confidence is None else f", confidence {float(found.confidence.min()):.0%} in the worst scan"
     return (
-        f"{found.status.value.replace('_', ' ')}: {len(robot.tree)} links, {kinds.count('revolute')} hinges and "
+        f"{found.status.value.replace('_', ' ')}{sure}: {len(robot.tree)} links, {kinds.count('revolute')} hinges and "
         f"{kinds.count('prismatic')} sliders; the joints leave the scans a median of "
         f"{100 * float(robot.residuals.max()) / size:.2g} % of the size apart in the worst scan"
     )

@@ -36,7 +36,7 @@ class RegisterConfig(BoneConfig):
         from stiff joints to loose ones (1 to 0.05 in five rounds), angles between normals from 80 to 20 degrees,
         correspondences up to 20 sampling distances long; unused labels for random halves of the worst regions; and
         continuous weights last, unless ``refine_steps`` is zero. Of `BoneConfig` it also uses ``num_samples``,
-        ``motion_steps``, ``smoothness``, ``reuse``, ``joint_weight``, ``max_angle``, ``normal_scale``, ``min_matched``
+        ``motion_steps``, ``smoothness``, ``joint_weight``, ``max_angle``, ``normal_scale``, ``min_matched``
         and ``refine``.
 
         Read into the text: the distance is a sum over correspondences and every cell has a joint term of its own, as

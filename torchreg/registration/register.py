@@ -127,7 +127,7 @@ def _registered(
     normalized_source, normalized_target = (normalization.normalize_scan(scan) for scan in (source, target))
     # Line 1 of the algorithm: the grid.
     grid = SparseGrid.from_points(normalized_source.points, grid_resolution)
-    data = CellData(grid, normalized_source.points[index], config.num_patches)
+    data = CellData(grid, normalized_source.points[index], CellData.PER_BONE * num_bones)
     clock.lap()
     # Line 2: first matches; by default a first alignment of all points, which alone tells how sure it is.
     sure: float | None = None

@@ -21,6 +21,7 @@ from torchreg.registration.bones.labels import CellData
 from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.align_scans import align_scans
+from torchreg.registration.dense.reliability import SCAN_CALIBRATION
 from torchreg.registration.normalization import Normalization
 from torchreg.registration.register import (
     check_inputs,
@@ -31,6 +32,7 @@ from torchreg.registration.register import (
     warn_about_flat_scans,
 )
 from torchreg.registration.results import SequenceRegistration
+from torchreg.result import Status
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class FrameToFrame:
     momentum: float = 0.5
 
     def apply(self, config: RegisterConfig) -> RegisterConfig:
-        """Return the settings within the bounds; motions need not converge."""
+        """Return the settings within the bounds."""
         first, last = config.joint_weight
         return replace(
             config,
@@ -64,7 +66,6 @@ class FrameToFrame:
             smoothness=max(config.smoothness, self.smoothness),
             point_to_point=max(config.point_to_point, self.point_to_point),
             joint_weight=(min(first, self.joint_weight), min(last, self.joint_weight)),
-            settle_steps=0,
         )
 
     def predict(self, positions: dict[int, Tensor], frame: int, step: int) -> Tensor | None:
@@ -78,43 +79,34 @@ class AllFrames:
     """Bounds on the settings by which all frames are fitted together.
 
     Args:
-        num_patches: lower bound; parts may start from smaller patches.
         match_steps: lower bound; borders between parts are drawn by motions, which should have converged.
         refine_steps: lower bound, unless there are none.
-        settle_steps: lower bound; displacements along the surface converge slowly.
-        rtol: upper bound, for the same reason.
+        rtol: upper bound; displacements along the surface converge slowly.
         joint_weight: lower bound, unless joints are left out; many frames determine joints well, so that these may be
             firm.
         turn_scale: lower bound, radians; bones hold each other in wide turns too, since twists that scans do not show
             would be lost in every frame anew.
         point_to_point: upper bound; positions along the surface drift.
-        seam_cap: lower bound, cells; wide motions tear more where parts meet.
     """
 
-    num_patches: int = 200
     match_steps: int = 4
     refine_steps: int = 3
-    settle_steps: int = 4
     rtol: float = 0.02
     joint_weight: float = 0.01
     turn_scale: float = 0.5
     point_to_point: float = 0.001
-    seam_cap: float = 1.0
 
     def apply(self, config: RegisterConfig) -> RegisterConfig:
         """Return the settings within the bounds."""
         first, last = (max(weight, self.joint_weight) if weight > 0 else weight for weight in config.joint_weight)
         return replace(
             config,
-            num_patches=max(config.num_patches, self.num_patches),
             match_steps=max(config.match_steps, self.match_steps),
             refine_steps=max(config.refine_steps, self.refine_steps) if config.refine_steps > 0 else 0,
-            settle_steps=max(config.settle_steps, self.settle_steps),
             rtol=min(config.rtol, self.rtol),
             joint_weight=(first, last),
             turn_scale=max(config.turn_scale, self.turn_scale),
             point_to_point=min(config.point_to_point, self.point_to_point),
-            seam_cap=max(config.seam_cap, self.seam_cap),
         )
 
 
@@ -191,18 +183,20 @@ def register_sequence(
     source = scans[reference]
     index = source_samples(source, config, generator)
     normalization = Normalization.from_points(source.points[index])
-    moved, confidence = _aligned_frames(
+    moved, confidence, sure = _aligned_frames(
         scans, reference, num_bones, grid_resolution, config, generator=generator, on_step=on_step
     )
     normalized = [normalization.normalize_scan(scan) for scan in scans]
     normalized_source, config = normalized[reference], ALL_FRAMES.apply(config)
     grid = SparseGrid.from_points(normalized_source.points, grid_resolution)
-    data = CellData(grid, normalized_source.points[index], config.num_patches, linked=True)
+    data = CellData(grid, normalized_source.points[index], CellData.PER_BONE * num_bones, linked=True)
     samples = Samples.from_alignment(normalized_source, index, normalization.normalize(moved), confidence)
     fit = ReducedFit(data, samples, normalized, config, num_bones=num_bones, on_step=on_step)
     converged = fit.fit_labels()
     converged = fit.refine() and converged
-    return _sequence_registration(source, reference, normalized, normalization, fit, converged, degenerate)
+    found = _sequence_registration(source, reference, normalized, normalization, fit, converged, degenerate)
+    doubtful = bool((sure < SCAN_CALIBRATION.doubtful).any()) and found.status.usable
+    return replace(found, confidence=sure, status=Status.DOUBTFUL if doubtful else found.status)
 
 
 def _aligned_frames(
@@ -214,15 +208,15 @@ def _aligned_frames(
     *,
     generator: torch.Generator | None,
     on_step: OnRegisterStep | None,
-) -> tuple[Tensor, Tensor]:
-    """Return the reference's points aligned with every frame, (T, N, 3), and their confidence, (T, N).
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the reference's points aligned with every frame, (T, N, 3), their confidence (T, N), and that of frames.
 
     Those of the dense alignments: small parts move in them for which the few bones have no room that move the reference
     on from frame to frame.
     """
     source, few_bones = scans[reference], FRAME_TO_FRAME.apply(config)
     aligned, confidence = {reference: source.points}, {reference: torch.ones(len(source)).to(source.points)}
-    deformed = {reference: source.points}
+    deformed, sure = {reference: source.points}, torch.ones(len(scans)).to(source.points)
     for step, end in ((1, len(scans)), (-1, -1)):
         current = source
         for frame in range(reference + step, end, step):
@@ -232,6 +226,8 @@ def _aligned_frames(
                 expected=FRAME_TO_FRAME.predict(deformed, frame, step),
             )  # fmt: skip
             aligned[frame], confidence[frame] = found.points, found.point_confidence
+            # A frame is reached through those before it.
+            sure[frame] = min(found.confidence, float(sure[frame - step]))
             if frame + step == end:
                 break
             bent = register(
@@ -242,7 +238,8 @@ def _aligned_frames(
             normals = turned_normals(source.normals, bent.weights, bent.transforms)
             current = RangeScan(bent.deformed, source.faces, normals)
     frames = range(len(scans))
-    return torch.stack([aligned[frame] for frame in frames]), torch.stack([confidence[frame].cpu() for frame in frames])
+    points, confident = ([each[frame] for frame in frames] for each in (aligned, confidence))
+    return torch.stack(points), torch.stack(confident).cpu(), sure
 
 
 def _sequence_registration(

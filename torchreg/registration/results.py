@@ -177,11 +177,15 @@ class SequenceRegistration(Result):
         origin: see `ScanRegistration`.
         observed: (K, 3) the points of all scans where they were seen; None in files of earlier releases.
         observed_normals: (K, 3) their unit normals there.
+        confidence: (T,) of each scan, from 0 to 1: the least `ScanRegistration.confidence` of the alignments by which
+            the reference, moved from scan to scan, came there; one for the reference. Where any is below one half the
+            status is DOUBTFUL. None in files of earlier releases.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
         "points": "N 3", "faces": "F 3", "deformed": "T N 3", "labels": "N", "transforms": "T B 4 4", "weights": "N B",
         "fused": "Q 3", "fused_normals": "Q 3", "fused_frames": "Q", "observed": "Q 3", "observed_normals": "Q 3",
+        "confidence": "T",
     }  # fmt: skip
 
     model: GridLBS = field(metadata=stored_as(GridLBS.record, GridLBS.from_record))
@@ -200,6 +204,7 @@ class SequenceRegistration(Result):
     origin: Tensor | None = None
     observed: Tensor | None = None
     observed_normals: Tensor | None = None
+    confidence: Tensor | None = None
 
     def moved(self, origin: Tensor) -> SequenceRegistration:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""

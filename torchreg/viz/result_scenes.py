@@ -199,7 +199,11 @@ def _sequence_scene(result: SequenceRegistration, shape: None, data: Data) -> Sc
         layers.append(_cloud("fused, by frame", [result.fused], [hue], visible=False))
     if clouds:
         layers.append(_cloud("scans", clouds, _STYLE.target))
-    return Scene(f"{counted(len(result.deformed), 'scan')}, {counted(result.model.num_bones, 'bone')}", tuple(layers))
+    title = f"{counted(len(result.deformed), 'scan')}, {counted(result.model.num_bones, 'bone')}"
+    facts = {"status": result.status.value}
+    if result.confidence is not None:
+        facts["confidence, worst scan"] = f"{float(result.confidence.min()):.2f}"
+    return Scene(title, tuple(layers), facts=facts)
 
 
 @_scene.register

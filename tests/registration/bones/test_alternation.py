@@ -64,14 +64,14 @@ def test_labels_then_weights_come_nearer_to_the_truth(toy):
         assert record.smoothness > 0
     assert records[-1].distance < records[0].distance
     energies = [sum(record.energies.values()) for record in records]
-    assert energies[-1] < 0.7 * energies[0]
+    assert energies[-1] < 0.8 * energies[0]
     assert max(later / before for before, later in pairwise(energies)) < 1.05
 
 
 def test_records_hold_the_energy_of_the_paper_by_terms(toy):
     """That of eqs. 2 and 8 at the weights and matches of the step, however many frames."""
     for pairs in (toy[1][:1], toy[1]):
-        reduced, _ = fit(pairs, noise=0.005, config=RegisterConfig(label_steps=1, settle_steps=0))
+        reduced, _ = fit(pairs, noise=0.005, config=RegisterConfig(label_steps=1))
         reduced.fit_labels()
         labels = reduced.model.weights.detach()
         (first,) = reduced.history
@@ -193,7 +193,7 @@ def test_what_turns_about_one_axis_in_all_frames_does_not_twist_in_some(rod, wei
     data = CellData(SparseGrid.from_points(points, 30), points, 60)
     samples = Samples(points, normals, moved, torch.ones_like(moved[..., 0]))
     labels = (data.grid.cell_centers()[:, 0] > 0).long()
-    config = RegisterConfig(joint_weight=(1e-4, 1e-4), turn_weight=0.0, hinge_weight=weight, hinge_scale=10.0)
+    config = RegisterConfig(joint_weight=(1e-4, 1e-4), turn_weight=0.0, hinge_weight=weight)
     reduced = ReducedFit(data, samples, targets, config, num_bones=2, labels=labels)
     for _ in range(8):
         reduced.update_correspondences(0.5)
@@ -211,16 +211,14 @@ def test_matches_may_converge_before_labels_change(toy, problems):
 
 
 def test_joints_are_held_first_and_let_go_later(toy, problems):
-    reduced, _ = fit(toy[1], noise=0.005, config=RegisterConfig(joint_scale=(1e5, 1e-5), rtol=0.0))
+    reduced, _ = fit(toy[1], noise=0.005, config=RegisterConfig(max_distance=(1e5, 1e-5), rtol=0.0))
     reduced.fit_labels()
     reduced.refine()
     torch.testing.assert_close(problems[0].pair_weights, torch.ones_like(problems[0].pair_weights))
     assert problems[-1].pair_weights.max() < 0.5
 
 
-@pytest.mark.parametrize(
-    "settings", [{"reuse": False}, {"refine_steps": 0}, {"joint_weight": (0.0, 0.0)}, {"blend": "dual_quaternion"}]
-)
+@pytest.mark.parametrize("settings", [{"refine_steps": 0}, {"joint_weight": (0.0, 0.0)}, {"blend": "dual_quaternion"}])
 def test_every_step_can_be_left_out(toy, settings):
     reduced, truth = fit(toy[1][:1], config=RegisterConfig(**settings))
     reduced.fit_labels()

@@ -51,13 +51,11 @@ def test_rigid_motions_turn_normals_and_bend_nothing(graph):
     assert float(graph.smoothness(motions(graph))) > 0.1
 
 
-def test_slack_forgives_small_gaps(graph):
+def test_smoothness_is_the_mean_gap(graph):
     transforms = motions(graph, 1e-3)
     gap = torch.linalg.vector_norm(graph.edge_gaps(transforms), dim=-1)
     expected = (graph.edge_weights * gap.sum(-1)).sum() / len(graph.edges)
     torch.testing.assert_close(graph.smoothness(transforms), expected)
-    assert float(graph.smoothness(transforms, 0.1)) < 0.1 * float(expected)
-    assert float(graph.smoothness(graph.rest(), 0.1)) == 0
 
 
 def test_gaps_are_where_neighbors_disagree(graph):

@@ -8,7 +8,7 @@ from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.registration.blend import turn_about
 from torchreg.registration.dense.deformation_graph import DeformationGraph
-from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph, joined
+from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
 from torchreg.registration.dense.node_graph import build_node_graph
 
 F64 = torch.float64
@@ -165,22 +165,6 @@ def test_bad_input_is_named(graph):
         fit_graph(graph, transforms, matches, 1.0, edge_scale=0.0)
     with pytest.raises(InputError, match="num_steps must be at least 1"):
         fit_graph(graph, transforms, matches, 1.0, 0)
-
-
-def test_joined_matches_cost_what_all_cost(graph):
-    generator = torch.Generator().manual_seed(1)
-
-    def random(*shape):
-        return torch.rand(*shape, generator=generator, dtype=F64)
-
-    targets, normals = random(40, 3), torch.nn.functional.normalize(random(30, 3), dim=-1)
-    along = GraphMatches(slice(0, 30), targets[:30], random(30), normals, random(30))
-    points = GraphMatches(torch.arange(5, 15), targets[30:], random(10))
-    rest = graph.rest()
-    costs = [fit_graph(graph, rest, matches, 1.0).residual for matches in (along, points)]
-    both = joined(along, points)
-    assert fit_graph(graph, rest, both, 1.0).residual == pytest.approx(costs[0] + costs[1] * 10 / 30)
-    assert joined(along) is along
 
 
 def test_matches_with_places_pull_the_first_samples_there_alike(graph):

@@ -18,7 +18,7 @@ from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.bones.joint_moments import JointMoments
 from torchreg.registration.bones.joint_prior import joint_weights, with_stiffness
 from torchreg.registration.bones.joints import REGULARIZATION, Joints, find_joints
-from torchreg.registration.bones.labels import CellData, LabelCosts, first_labels, reinitialize_labels, relabel
+from torchreg.registration.bones.labels import CellData, LabelCosts, first_labels, relabel
 from torchreg.registration.bones.motion_problem import Binding, BoneBodies, BoneProblem
 from torchreg.registration.bones.motions import BoneFit, fit_bones
 from torchreg.registration.bones.motions_and_joints import JointFit, fit_bones_and_joints
@@ -93,7 +93,7 @@ class ReducedFit:
         on_step: OnRegisterStep | None = None,
     ) -> None:
         self.data, self.samples, self.config = data, samples, config
-        self._num_bones, self._on_step = num_bones, on_step
+        self._on_step = on_step
         self.history: list[RegisterRecord] = []
         self._edges = data.grid.edges()
         self._term_weights = reported_weights(config)
@@ -102,9 +102,7 @@ class ReducedFit:
         self._costs = LabelCosts(
             smoothness=config.smoothness,
             label=data.grid.num_cells * (config.label_cost / data.grid.spacing) ** 2,
-            truncation=config.truncation,
             seam=config.seam,
-            seam_cap=config.seam_cap,
         )
         # Before the first T-step samples correspond to their positions in the alignment, which also gives the motions.
         self.correspondences = Correspondences(samples.moved, None, samples.confidence)
@@ -126,8 +124,6 @@ class ReducedFit:
                 self.update_correspondences(0.5 * self._progress)  # line 5
             energy = self.solve_labels()  # line 6
             converged = energy >= (1 - self.config.rtol) * lowest
-            if self.config.reuse and not converged and step + 1 < steps:
-                self._reinitialize_labels()
             self._report("align", step, steps)
             if converged:
                 return True
@@ -135,21 +131,8 @@ class ReducedFit:
         return False
 
     def refine(self) -> bool:
-        """Alternate continuous weights, T-steps and correspondences, and return whether the energy converged.
-
-        In the last rounds weights stay, while motions and joints converge.
-        """
+        """Alternate continuous weights, T-steps and correspondences, and return whether the energy converged."""
         self._progress = 1.0
-        rounds = self.config.refine_steps + self.config.settle_steps
-        converged = self._refine_weights(rounds)
-        for step in range(self.config.refine_steps, rounds):
-            self.solve_motions()
-            self.update_correspondences(1.0)
-            self._report("refine", step, rounds)
-        return converged
-
-    def _refine_weights(self, rounds: int) -> bool:
-        """Refine weights in the first of so many rounds, and return whether the energy converged."""
         steps = self.config.refine_steps
         energy = self.solve_motions()
         for step in range(steps):
@@ -160,7 +143,7 @@ class ReducedFit:
             self._shared = self.model.joint_moments()
             before, energy = energy, self.solve_motions()
             self.update_correspondences(0.5 + 0.5 * (step + 1) / steps)
-            self._report("refine", step, rounds)
+            self._report("refine", step, steps)
             if energy >= (1 - self.config.rtol) * before:
                 return True
         return steps == 0
@@ -181,7 +164,7 @@ class ReducedFit:
         if joints is None:
             fit = fit_bones(problem, transforms, max_steps=self.config.motion_steps)
         else:
-            rotations, scale = transforms[..., :3, :3], geometric_at(self.config.joint_scale, self._progress)
+            rotations, scale = transforms[..., :3, :3], geometric_at(self.config.max_distance, self._progress)
             problem = replace(
                 problem,
                 moments=with_stiffness(self.moments, rotations, self.config, self._joint_weight),
@@ -213,7 +196,7 @@ class ReducedFit:
         self.correspondences = Correspondences(
             targets=torch.where(matched, aligned + to_plane, aligned),
             normals=torch.where(matched, target_normals, normals),
-            weights=torch.where(kept, 1.0, self.config.unmatched * self.samples.confidence),
+            weights=torch.where(kept, 1.0, self.samples.confidence),
             point_to_point=self.config.point_to_point,
         )
 
@@ -224,13 +207,6 @@ class ReducedFit:
         used, labels = labels.unique(return_inverse=True)
         self._set_labels(labels, transforms[:, used])
         return energy
-
-    def _reinitialize_labels(self) -> None:
-        """Use lost labels again; a bone that takes over half of another's region starts from the other's motion."""
-        before = self.labels
-        labels = reinitialize_labels(self.data, self.correspondences, before, self._num_bones, self._costs)
-        origin = torch.stack([before[labels == label][0] for label in range(int(labels.max()) + 1)])
-        self._set_labels(labels, self.model.transforms.detach()[:, origin])
 
     def moved(self, points: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
         """Return points (N, 3) and their unit normals moved in every frame, (F, N, 3) each."""

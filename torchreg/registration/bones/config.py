@@ -29,36 +29,29 @@ class BoneConfig:
 
     Args:
         num_samples: source points that are matched, evenly spread.
-        num_patches: patches of the grid, from which parts are merged.
         label_steps: most rounds of T-steps, correspondences and W-step.
         match_steps: T-steps, each followed by new correspondences, before a W-step.
         refine_steps: rounds of refining weights, T-step and correspondences.
-        settle_steps: rounds of T-step and correspondences after those.
         motion_steps: most linear systems of a T-step.
         smoothness: mu of the W-step, the cost of neighboring cells with different labels, in squared cells.
-        seam: cost of neighboring cells with different labels per cell of the gap that these tear open between them.
-        seam_cap: gap in cells beyond which it costs no more, so that what merely touches can part.
+        seam: cost of neighboring cells with different labels per cell of the gap that these tear open between them, of
+            one cell at most, so that what merely touches can part.
         label_cost: root of the mean squared distance that a label must save to be used; ``num_bones`` is a cap, and
             `ScanRegistration.parts` joins bones that moved as one.
-        truncation: largest distance of a sample in the W-step, in cells.
-        reuse: whether labels that lost all their cells are given to the regions with the largest residuals.
         joint_weight: beta, the weight of the joints against the mean squared distance, over the rounds of labels; zeros
             leave out joints and the costs of turns, and the paper's (1, 0.05) holds bones together where matches do
             not, which here the dense alignment does, so that joints that are wrong need not resist.
-        joint_scale: robust scale of the gaps that motions tear open at joints, since not all that meets is joined; it
-            starts wide, as labels are coarse at first and tear joints.
         turn_weight: cost per squared radian by which bones that share weight turn against each other, so that the twist
             of a round limb, which scans do not tell, stays as it was.
         turn_scale: robust scale of those turns, radians.
         hinge_weight: cost per squared radian of turns about other axes than the one about which two bones mostly turn,
             where three frames or more tell it, since most joints are hinges.
-        hinge_scale: robust scale of the turns about other axes, radians.
-        max_distance: largest distance of a match, never below two sampling distances of the target.
+        max_distance: largest distance of a match, never below two sampling distances of the target; and the robust
+            scale of the gaps that motions tear open at joints, since not all that meets is joined.
         max_angle: largest angle between the normals of a match, radians.
         normal_scale: distance that counts as much as normals 60 degrees apart.
         point_to_point: weight of the distance to where the dense alignment moves a sample, against that along the
             normal.
-        unmatched: weight of samples without a match, which stay where the dense alignment moves them.
         min_matched: share of samples with a match below which the scans count as not registered.
         rtol: relative change of the energy over a round below which rounds end.
         refine: refinement of the weights.
@@ -71,40 +64,31 @@ class BoneConfig:
     """
 
     num_samples: int = 4000
-    num_patches: int = 100
     label_steps: int = 4
     match_steps: int = 1
     refine_steps: int = 1
-    settle_steps: int = 2
     motion_steps: int = 5
     smoothness: float = 0.01
-    seam: float = 0.2
-    seam_cap: float = 0.5
+    seam: float = 0.1
     label_cost: float = 0.0003
-    truncation: float = 4.0
-    reuse: bool = True
     joint_weight: tuple[float, float] = (0.01, 0.001)
-    joint_scale: tuple[float, float] = (0.01, 0.005)
     turn_weight: float = 6e-7
     turn_scale: float = 0.1
     hinge_weight: float = 1e-5
-    hinge_scale: float = 0.2
     max_distance: tuple[float, float] = (0.03, 0.01)
     max_angle: tuple[float, float] = (1.05, 0.52)
     normal_scale: float = 0.025
     point_to_point: float = 0.003
-    unmatched: float = 0.3
     min_matched: float = 0.1
     rtol: float = 0.2
     refine: WeightsConfig = field(default_factory=_refinement)
     blend: str = "linear"
 
     def __post_init__(self) -> None:
-        for name in ("num_samples", "num_patches", "label_steps", "match_steps", "motion_steps"):
+        for name in ("num_samples", "label_steps", "match_steps", "motion_steps"):
             check_count(getattr(self, name), name, 1)
-        for name in ("refine_steps", "settle_steps"):
-            check_count(getattr(self, name), name, 0)
-        for name in ("truncation", "unmatched", "seam_cap", "turn_scale", "hinge_scale"):
+        check_count(self.refine_steps, "refine_steps", 0)
+        for name in ("turn_scale",):
             check_positive(getattr(self, name), name)
         for name in ("smoothness", "seam", "label_cost", "turn_weight", "hinge_weight", "normal_scale", "rtol"):
             check_positive(getattr(self, name), name, allow_zero=True)
@@ -112,7 +96,7 @@ class BoneConfig:
             check_share(getattr(self, name), name)
         if self.point_to_point == 0:
             raise InputError("point_to_point must be positive: along flat parts nothing else holds samples")
-        for name in ("joint_scale", "max_distance", "max_angle"):
+        for name in ("max_distance", "max_angle"):
             check_ends(getattr(self, name), name)
         check_ends(self.joint_weight, "joint_weight", allow_zero=True)
         if min(self.joint_weight) == 0 < max(self.joint_weight):

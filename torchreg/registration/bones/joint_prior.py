@@ -63,11 +63,10 @@ def with_stiffness(moments: JointMoments, rotations: Tensor, config: BoneConfig,
 def _hinge_spread(squares: Tensor, config: BoneConfig) -> Tensor:
     """Return spreads (P, 3, 3) along hinge axes, of means (P, 3, 3) of ``(R_i - R_j)^T (R_i - R_j)``.
 
-    A hinge is a pin along its axis, which both bones must keep to. It holds less, the more the bones turn about other
-    axes, and the less their motions tell the axis.
+    A hinge is a pin along its axis, which both bones must keep to. It holds less, the less their motions tell the axis.
     """
     chords, axes = torch.linalg.eigh(squares)
     axis, (least, second, _) = axes[..., 0], chords.clamp(min=0).unbind(-1)
     clarity = (second - least) / (second + _HINGES.clear_turn**2)
-    weight = config.hinge_weight * (clarity * geman_mcclure_weight(least / config.hinge_scale**2))
+    weight = config.hinge_weight * clarity
     return weight[:, None, None] * axis.unsqueeze(-1) * axis.unsqueeze(-2)

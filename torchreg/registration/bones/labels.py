@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -27,6 +29,9 @@ class CellData:
         linked: whether labels of separate regions should agree with those of the cells nearest to them.
         gap: most empty cells between regions that count as connected: holes of scans cut limbs in two.
     """
+
+    # Patches for each bone, which may then begin and end nearly anywhere.
+    PER_BONE: ClassVar[int] = 10
 
     grid: SparseGrid
     points: Tensor
@@ -76,17 +81,15 @@ class LabelCosts:
     Args:
         smoothness: mu, of two neighboring cells with different labels.
         label: of each label in use: the number of bones is a cap, not a goal.
-        truncation: largest distance of a sample, in cells.
+        truncation: largest distance of a sample, in cells; the paper's.
         seam: nu, of two neighboring cells with different labels, per cell of the gap that their motions open at the
-            side between them.
-        seam_cap: cells, beyond which that gap costs no more.
+            side between them, of one cell at most.
     """
 
     smoothness: float
     label: float
-    truncation: float
+    truncation: float = math.inf
     seam: float = 0.0
-    seam_cap: float = 0.5
 
 
 def labels_of_parts(data: CellData, points: Tensor, parts: Tensor) -> Tensor:
@@ -124,8 +127,8 @@ def relabel(
 ) -> tuple[Tensor, float]:
     """Return labels (C,) of least energy, and the energy: the W-step.
 
-    ``sum_C W(C, f_C) + sum_{(C, D)} (mu [f_C != f_D] + nu min(|T_{f_C} x_CD - T_{f_D} x_CD|, cap)) + h |used labels|``
-    with W the sum of truncated squared residuals of the cell's samples under the motion of a bone, in all frames, and
+    ``sum_C W(C, f_C) + sum_{(C, D)} (mu [f_C != f_D] + nu min(|T_{f_C} x_CD - T_{f_D} x_CD|, 1)) + h |used labels|``
+    with W the sum of squared residuals of the cell's samples under the motion of a bone, in all frames, and
     x_CD in the middle between two cells; correspondences stay while labels change. Near a joint both bones move a
     sample alike, so that residuals alone put the border anywhere there. Unlike in the paper, the pairwise term is the
     discontinuity of the deformation across the border, so that it passes through the joint; it is truncated, as not
@@ -150,8 +153,8 @@ def relabel(
         unary,
         data.neighbors,
         unary.new_full((count,), costs.smoothness),
-        positions=_seam_positions(data, transforms, costs.seam_cap),
-        position_weights=unary.new_full((count,), costs.seam * costs.seam_cap),
+        positions=_seam_positions(data, transforms),
+        position_weights=unary.new_full((count,), costs.seam),
         label_costs=unary.new_full((size,), costs.label),
         initial=labels,
         # The rounds of labels and motions repeat it.
@@ -160,67 +163,11 @@ def relabel(
     return found.labels, found.energy
 
 
-def _seam_positions(data: CellData, transforms: Tensor, cap: float) -> Tensor:
-    """Return images (A, B, 3 F) of the middles between neighboring cells under motions (F, B, 4, 4), in caps.
+def _seam_positions(data: CellData, transforms: Tensor) -> Tensor:
+    """Return images (A, B, 3 F) of the middles between neighboring cells under motions (F, B, 4, 4), in cells.
 
     Distances between them are root mean squares over the frames.
     """
     middles = data.grid.cell_centers()[data.neighbors].mean(1)
-    images = transform_points(transforms, middles) / (cap * data.grid.spacing * len(transforms) ** 0.5)
+    images = transform_points(transforms, middles) / (data.grid.spacing * len(transforms) ** 0.5)
     return images.permute(2, 1, 0, 3).flatten(2)
-
-
-def reinitialize_labels(
-    data: CellData, correspondences: Correspondences, labels: Tensor, num_bones: int, costs: LabelCosts
-) -> Tensor:
-    """Return labels (C,) in which bones without cells take over half of the regions with the largest residuals.
-
-    The region is split where two motions fit best, not at random as in the paper, if it saves more than a label costs.
-
-    Args:
-        data: the grid and its samples.
-        correspondences: of the samples in F frames.
-        labels: (C,) from 0 without gaps.
-        num_bones: most labels.
-        costs: see `LabelCosts`.
-
-    References: Chang and Zwicker 2009, section 4.2, "Reusing Labels".
-    """
-    labels, used = labels.clone(), int(labels.max()) + 1
-    if used >= num_bones:
-        return labels
-    targets, weights = correspondences.targets, correspondences.weights
-    per_cell = data.per_cell(weights)
-    costs_of_regions = rigid_moments(data.points, targets, weights, labels[data.cell], used).cost().sum(0)
-    splits = []
-    # No split saves more than all that a region costs.
-    for label in (costs_of_regions * per_cell > costs.label).nonzero()[:, 0].tolist():
-        gain, second = _split(data, correspondences, labels == label)
-        if gain * per_cell > costs.label:
-            splits.append((gain, label, second))
-    splits.sort(key=lambda split: (-split[0], split[1]))
-    for number, (_, _, second) in enumerate(splits[: num_bones - used]):
-        labels[second] = used + number
-    return labels
-
-
-def _split(data: CellData, correspondences: Correspondences, region: Tensor) -> tuple[float, Tensor]:
-    """Return the cost that two motions save in a region (C,) bool, and the cells (C,) bool that follow the second."""
-    patches = data.patches[region].unique()
-    sampled = region[data.cell]
-    if len(patches) < 2 or not bool(sampled.any()):
-        return 0.0, torch.zeros_like(region)
-    local = patches.new_zeros(data.patch_count)
-    local[patches] = torch.arange(len(patches), device=region.device)
-    moments = rigid_moments(
-        data.points[sampled],
-        correspondences.targets[:, sampled],
-        correspondences.weights[:, sampled],
-        local[data.patches[data.cell[sampled]]],
-        len(patches),
-    )
-    pairs = data.bridged[region[data.bridged].all(1)]
-    part = merge_rigid(moments, local[data.patches[pairs]], 2).clamp(max=1)
-    together = float(moments.joined(torch.zeros_like(part), 1).cost().sum())
-    gain = together - float(moments.joined(part, 2).cost().sum())
-    return gain, region & (part[local[data.patches]] == 1)

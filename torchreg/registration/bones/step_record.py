@@ -17,7 +17,6 @@ def reported_weights(config: BoneConfig) -> dict[str, float]:
     """Return the weights of the terms of eq. 2 in records: the same in all steps, so that energies compare."""
     refine = config.refine
     return term_weights(
-        distance=refine.distance,
         smoothness=refine.smoothness,
         norm=refine.normalization,
         discontinuity=refine.closeness,

@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_choice, check_count, check_positive
+from torchreg._checks import check_count, check_positive
 from torchreg.geometry.rigid import transform_points
 from torchreg.registration.bones.correspondences import Correspondences
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.bones.grid_losses import closeness_energy, normalization_energy, smoothness_energy
 from torchreg.solvers.nnls import nnls
-from torchreg.solvers.projected_gradient import projected_gradient
 
 
 @dataclass(frozen=True)
 class WeightsConfig:
-    """Weights of the terms of the refinement, and how it is solved.
+    """Weights of the terms of the refinement, beside that of the mean squared residual, in cells, per cell of the grid.
 
     Args:
-        distance: of the mean squared residual, in cells and per cell of the grid.
         smoothness: mu, of the squared differences between neighboring corners.
         normalization: nu, of the squared deviations of the sums from one.
         closeness: of the squared differences from the labels.
         reach: a bone may get weight at corners up to that many edges from where it has a label.
-        method: "active_set", see `nnls`, or "gradient", see `projected_gradient`; both lead to the same weights.
-        max_steps: of the method; 50 rounds or 2,000 gradient steps by default.
 
     Raises:
         InputError: if a value is out of range.
@@ -37,24 +32,17 @@ class WeightsConfig:
     References: Chang and Zwicker 2009, section 5, for the values in cells: mu 0.5 to 1, nu 1, closeness 0.1 to 0.5.
     """
 
-    distance: float = 1.0
     smoothness: float = 0.5
     normalization: float = 1.0
     closeness: float = 0.2
     reach: int = 3
-    method: str = "active_set"
-    max_steps: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("distance", "smoothness"):
-            check_positive(getattr(self, name), name, allow_zero=True)
+        check_positive(self.smoothness, "smoothness", allow_zero=True)
         # With these two there is one solution, whatever the matches say.
         check_positive(self.normalization, "normalization")
         check_positive(self.closeness, "closeness")
         check_count(self.reach, "reach", 0)
-        check_choice(self.method, "method", tuple(_METHODS))
-        if self.max_steps is not None:
-            check_count(self.max_steps, "max_steps", 1)
 
 
 @dataclass(frozen=True)
@@ -64,7 +52,7 @@ class RefinedWeights:
     Args:
         weights: (K, B) rows divided by their sums.
         objective: least value found, before that division.
-        converged: whether the method met its tolerance.
+        converged: whether the solver met its tolerance.
     """
 
     weights: Tensor
@@ -97,18 +85,17 @@ def refine_weights(
 
     Differentiable: no.
 
-    Cost: 0.15 s for 1,000 cells, 10 bones and 1,500 matches by the active set, three times that by gradients.
+    Cost: 0.15 s for 1,000 cells, 10 bones and 1,500 matches.
 
     References: Chang and Zwicker 2009, eqs. 8 and 13.
     """
     config = WeightsConfig() if config is None else config
     problem = _WeightsProblem(model, points, correspondences, config)
-    method = _METHODS[config.method]
-    x, converged = method.solve(problem, config.max_steps or method.max_steps, method.tol)
-    weights = problem.corner_weights(x)
+    solved = nnls(*problem.least_squares(), start=problem.start)
+    weights = problem.corner_weights(solved.x)
     total = weights.sum(-1, keepdim=True)
     weights = torch.where(total > 0, weights / total.clamp_min(1e-30), problem.labels)
-    return RefinedWeights(weights.to(model.weights), float(problem.cost(x)), converged)
+    return RefinedWeights(weights.to(model.weights), float(problem.cost(solved.x)), solved.converged)
 
 
 class _Rows(NamedTuple):
@@ -142,7 +129,7 @@ class _WeightsProblem:
         self._corners, self._coefficients = grid.cell_corners[location.cell], location.coefficients.double()
         moved = transform_points(model.transforms.detach(), points.unsqueeze(-3)).double().transpose(-2, -3)
         offsets = (moved - correspondences.targets.unsqueeze(-2)) / grid.spacing
-        residuals = _weighted_residuals(offsets, correspondences, config.distance * grid.num_cells)
+        residuals = _weighted_residuals(offsets, correspondences, float(grid.num_cells))
         self._residuals = residuals.reshape(-1, *residuals.shape[-3:])
 
     def corner_weights(self, x: Tensor) -> Tensor:
@@ -230,35 +217,3 @@ def _in_reach(present: Tensor, edges: Tensor, steps: int) -> Tensor:
         count = present.to(torch.uint8).index_add(0, edges[:, 0], either).index_add(0, edges[:, 1], either)
         present = count > 0
     return present
-
-
-def _by_active_set(problem: _WeightsProblem, max_steps: int, tol: float) -> tuple[Tensor, bool]:
-    solved = nnls(*problem.least_squares(), start=problem.start, max_steps=max_steps, tol=tol)
-    return solved.x, solved.converged
-
-
-def _by_gradient(problem: _WeightsProblem, max_steps: int, tol: float) -> tuple[Tensor, bool]:
-    matrix, _ = problem.least_squares()
-    curvature = torch.sparse.sum(matrix * matrix, dim=0).to_dense()
-    found = projected_gradient(problem.cost, problem.start, scale=1 / curvature, max_steps=max_steps, tol=tol)
-    return found.x, bool(found.converged)
-
-
-class _Method(NamedTuple):
-    """One way to solve the refinement.
-
-    Args:
-        solve: problem, most steps and tolerance to the variables (V,), and whether they converged.
-        max_steps: by default.
-        tol: of the method.
-    """
-
-    solve: Callable[[_WeightsProblem, int, float], tuple[Tensor, bool]]
-    max_steps: int
-    tol: float
-
-
-_METHODS = {
-    "active_set": _Method(_by_active_set, max_steps=50, tol=1e-6),
-    "gradient": _Method(_by_gradient, max_steps=2000, tol=1e-5),
-}

@@ -55,12 +55,12 @@ def align_scans(
 ) -> ScanAlignment:
     """Return the source moved onto the target: a deformation graph of many small nodes, without bones yet.
 
-    Both scans are described by even samples, their curvature at several sizes, and what a learnt `ScanMatcher` says of
-    their matches. Hypotheses start from rest; from where points are expected, if that is known; and from the matcher's
-    matches, to which a stiff graph is fitted by an EM in which they are the prior, see `fit_coarsely`. Each goes on by
-    an EM with an outlier class in which they still are, less and less, while edges of the graph count robustly. Unless
-    the two best agree, each part then moves as in the hypothesis that suits it, and the EM goes on from there as well.
-    The best covers the target, is covered by it, is like it, deforms most smoothly, and is nearest to what is expected.
+    Both scans are described by even samples and what a learnt `ScanMatcher` says of their matches. Hypotheses start
+    from rest; from where points are expected, if that is known; and from the matcher's matches, to which a stiff graph
+    is fitted by an EM in which they are the prior, see `fit_coarsely`. Each goes on by an EM with an outlier class in
+    which they still are, less and less, while edges of the graph count robustly. Unless the two best agree, each part
+    then moves as in the hypothesis that suits it, and the EM goes on from there as well.
+    The best covers the target, is covered by it, deforms most smoothly, and is nearest to what is expected.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -97,7 +97,7 @@ def align_scans(
             on_step(record)
 
     problem = describe(source, target, config, generator, None if expected is None else _checked(expected, source))
-    found = align_problem(problem, config, report)
+    found = align_problem(problem, report)
     transforms, hypotheses = found[0].transforms, tuple(candidate.hypothesis for candidate in found)
     weights = spread_weights(
         problem.unit.normalize(source.points),
@@ -110,8 +110,8 @@ def align_scans(
     moved = blend_linear(problem.unit.normalize(source.points), weights, transforms)
     return ScanAlignment(
         points=problem.unit.denormalize(moved, source.points),
-        confidence=confidence_of(evidence_against(problem, found, config)),
-        point_confidence=_point_confidence(problem, transforms, config, source.points).to(source.points),
+        confidence=confidence_of(evidence_against(problem, found)),
+        point_confidence=_point_confidence(problem, transforms, source.points).to(source.points),
         samples=problem.samples,
         nodes=problem.nodes,
         weights=weights.to(source.points),
@@ -130,42 +130,41 @@ class Candidate:
     transforms: Tensor
 
 
-def align_problem(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[Candidate]:
+def align_problem(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]:
     """Return all candidates, two at least, the best first; see `align_scans`."""
-    found = sorted(_candidates(problem, config, on_step), key=_energy)
-    if not agree(problem, found[0].transforms, found[1].transforms, config.choice):
-        found = sorted([*found, _fused(problem, found, config, on_step)], key=_energy)
+    found = sorted(_candidates(problem, on_step), key=_energy)
+    if not agree(problem, found[0].transforms, found[1].transforms):
+        found = sorted([*found, _fused(problem, found, on_step)], key=_energy)
     return found
 
 
-def evidence_against(problem: ScanAlignProblem, found: Sequence[Candidate], config: ScanAlignConfig) -> ScanEvidence:
+def evidence_against(problem: ScanAlignProblem, found: Sequence[Candidate]) -> ScanEvidence:
     """Return what speaks against the first of several candidates."""
     best, rival, *_ = found
-    return scan_evidence(problem, best.transforms, rival.transforms, best.hypothesis.smoothness, config.choice)
+    return scan_evidence(problem, best.transforms, rival.transforms, best.hypothesis.smoothness)
 
 
-def _candidates(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[Candidate]:
+def _candidates(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]:
     """Return the candidates before any are fused."""
-    near, matched = _both_told(on_step, partial(_near, problem, config), partial(_by_matches, problem, config))
+    near, matched = _both_told(on_step, partial(_near, problem), partial(_by_matches, problem))
     return [*near, matched]
 
 
-def _near(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> list[Candidate]:
+def _near(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]:
     """Return the candidates from rest and, if that is known, from where points are expected."""
-    sigma, rest = config.refine.sigma[0], problem.graph.rest()
-    found = [_compared(problem, rest, sigma, config, Reporter("rest", problem.unit.scale, on_step))]
+    rest = problem.graph.rest()
+    found = [_compared(problem, rest, Reporter("rest", problem.unit.scale, on_step))]
     if problem.expected is not None:
         there = GraphMatches.of_places(problem.expected)
         ahead = fit_graph(problem.graph, rest, there, _EXPECTED_STIFFNESS, _EXPECTED_FITS).transforms
-        found.append(_compared(problem, ahead, sigma, config, Reporter("expected", problem.unit.scale, on_step)))
+        found.append(_compared(problem, ahead, Reporter("expected", problem.unit.scale, on_step)))
     return found
 
 
-def _by_matches(problem: ScanAlignProblem, config: ScanAlignConfig, on_step: OnStep) -> Candidate:
+def _by_matches(problem: ScanAlignProblem, on_step: OnStep) -> Candidate:
     """Return the candidate from the matches of the matcher."""
     reporter = Reporter("matches", problem.unit.scale, on_step)
-    begin = fit_coarsely(problem, config.coarse, reporter)
-    return _compared(problem, begin, config.refine.sigma[0], config, reporter)
+    return _compared(problem, fit_coarsely(problem, reporter), reporter)
 
 
 def _both_told(
@@ -187,31 +186,24 @@ def _checked(expected: Any, source: RangeScan) -> Tensor:
     return expected.detach()
 
 
-def _fused(
-    problem: ScanAlignProblem, found: Sequence[Candidate], config: ScanAlignConfig, on_step: OnStep
-) -> Candidate:
+def _fused(problem: ScanAlignProblem, found: Sequence[Candidate], on_step: OnStep) -> Candidate:
     """Return the candidate that takes the best of several."""
-    begin = fuse_motions(problem, torch.stack([candidate.transforms for candidate in found]), config.choice)
-    reporter = Reporter("fused", problem.unit.scale, on_step)
-    return _compared(problem, begin, config.refine.fused_sigma, config, reporter)
+    begin = fuse_motions(problem, torch.stack([candidate.transforms for candidate in found]))
+    return _compared(problem, begin, Reporter("fused", problem.unit.scale, on_step))
 
 
-def _compared(
-    problem: ScanAlignProblem, transforms: Tensor, sigma: float, config: ScanAlignConfig, reporter: Reporter
-) -> Candidate:
+def _compared(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) -> Candidate:
     """Return the candidate after its EM."""
-    transforms = refine(problem, transforms, config.refine, reporter, sigma)
-    return Candidate(judge(problem, reporter.name, transforms, config.choice), transforms)
+    transforms = refine(problem, transforms, reporter)
+    return Candidate(judge(problem, reporter.name, transforms), transforms)
 
 
 def _energy(candidate: Candidate) -> float:
     return candidate.hypothesis.energy
 
 
-def _point_confidence(problem: ScanAlignProblem, transforms: Tensor, config: ScanAlignConfig, points: Tensor) -> Tensor:
+def _point_confidence(problem: ScanAlignProblem, transforms: Tensor, points: Tensor) -> Tensor:
     """Return the posterior mass (N,) of matches at points, by that of the nearest samples."""
-    sigma = config.refine.sigma[1]
-    moved = problem.moved(transforms, problem.num_used(sigma))
-    own = soft_matches(problem, moved, sigma, config.refine).posterior
+    own = soft_matches(problem, problem.moved(transforms), problem.config.refine.sigma[1]).posterior
     index, _ = k_nearest(problem.unit.normalize(points), problem.graph.points[: len(own)], min(3, len(own)))
     return own[index].mean(1)

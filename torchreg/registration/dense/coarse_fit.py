@@ -9,7 +9,6 @@ from torch import Tensor
 
 from torchreg.geometry.rigid import fit_rigid, transform_points
 from torchreg.registration.annealing import geometric_at
-from torchreg.registration.dense.config import CoarseConfig
 from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
 from torchreg.registration.dense.match_prior import MatchPrior
 from torchreg.registration.dense.problem import ScanAlignProblem
@@ -20,38 +19,37 @@ from torchreg.solvers.robust import geman_mcclure_weight
 _ROUNDS = 5
 
 
-def fit_coarsely(problem: ScanAlignProblem, config: CoarseConfig, reporter: Reporter) -> Tensor:
+def fit_coarsely(problem: ScanAlignProblem, reporter: Reporter) -> Tensor:
     """Return motions (J, 4, 4) of the nodes, however far the source moved or was turned.
 
     A sample i matches a target j with ``q_ij = p_ij N_ij / (sum_k p_ik N_ik + h_i / A)``, N_ij a Gaussian of their
     distance: the matcher's posterior p stays the prior of every match to the end, and what it calls hidden, h, is the
-    outlier class, spread over an area A. Targets choose among samples alike. While sigma shrinks, normals count ever
-    more, the matcher is doubted ever more, and the graph softens.
+    outlier class, spread over the squared size A. Targets choose among samples alike. While sigma shrinks, normals
+    count ever more, and the graph softens.
 
     References: Myronenko and Song 2010, for the EM with an outlier class.
     """
-    transforms = rigid_start(problem.prior, problem.source.points, problem.target.points, config)
+    plan = problem.config.coarse
+    transforms = rigid_start(problem.prior, problem.source.points, problem.target.points, plan.sigma[0])
     transforms = transforms.repeat(problem.graph.num_nodes, 1, 1)
-    for step in range(config.num_steps):
-        share = step / max(config.num_steps - 1, 1)
-        sigma, stiffness = geometric_at(config.sigma, share), geometric_at(config.stiffness, share)
-        matches = _expected_matches(problem, transforms, sigma, share, config)
-        fit = fit_graph(
-            problem.graph, transforms, matches, stiffness, edge_scale=geometric_at(config.edge_scale, share)
-        )
+    for step in range(plan.num_steps):
+        share = step / max(plan.num_steps - 1, 1)
+        sigma, stiffness = geometric_at(plan.sigma, share), geometric_at(plan.stiffness, share)
+        matches = _expected_matches(problem, transforms, sigma, share)
+        fit = fit_graph(problem.graph, transforms, matches, stiffness, edge_scale=problem.config.edge_scale)
         transforms = fit.transforms
-        reporter.report("match", step, config.num_steps, sigma, fit, stiffness, float(matches.weights.mean()))
+        reporter.report("match", step, plan.num_steps, sigma, fit, stiffness, float(matches.weights.mean()))
     return transforms
 
 
-def rigid_start(prior: MatchPrior, source: Tensor, target: Tensor, config: CoarseConfig) -> Tensor:
+def rigid_start(prior: MatchPrior, source: Tensor, target: Tensor, width: float) -> Tensor:
     """Return the motion (4, 4) of all of a source that suits most of the matches of the matcher.
 
     Args:
         prior: of the matches.
         source: (S, 3) samples, the first of which are tokens.
         target: (T, 3) the same of the target.
-        config: matches off by more than the first sigma count ever less.
+        width: matches off by more than this count ever less.
     """
     mass = prior.by_source.sum(1)
     targets = prior.by_source @ target[: prior.by_source.shape[1]]
@@ -60,28 +58,28 @@ def rigid_start(prior: MatchPrior, source: Tensor, target: Tensor, config: Coars
     for _ in range(_ROUNDS):
         motion = fit_rigid(tokens, targets, weights)
         apart = (transform_points(motion, tokens) - targets).square().sum(-1)
-        weights = mass * geman_mcclure_weight(apart / config.sigma[0] ** 2)
+        weights = mass * geman_mcclure_weight(apart / width**2)
     return motion
 
 
-def _expected_matches(
-    problem: ScanAlignProblem, transforms: Tensor, sigma: float, share: float, config: CoarseConfig
-) -> GraphMatches:
-    """Return the E-step of as many samples as the sigma asks for."""
-    count = min(len(problem.samples), problem.num_used(sigma))
-    target = problem.target.first(2 * problem.num_used(sigma))
+def _expected_matches(problem: ScanAlignProblem, transforms: Tensor, sigma: float, share: float) -> GraphMatches:
+    """Return the E-step of the samples that are tokens, a share of the way through."""
+    # As fine as the matcher; the target twice as much, for places between its tokens.
+    count, seen = problem.prior.by_source.shape
+    target = problem.target.first(2 * seen)
     moved, normals = problem.graph.move_with_normals(transforms, slice(0, count))
     near = torch.cdist(moved, target.points).square().mul_(-1 / (2 * sigma**2))
-    near = near.add_(normals @ target.normals.mT - 1, alpha=config.normal_weight * share).exp_()
-    prior, doubt = problem.prior, geometric_at(config.doubt, share)
+    near = near.add_(normals @ target.normals.mT - 1, alpha=problem.config.normal_weight * share).exp_()
+    prior, doubt = problem.prior, problem.config.doubt
     visible, shown = prior.visible[:count, None], prior.target_visible[: len(target)]
     by_source, by_target = prior.tables(count, len(target))
-    # A density per area, as that of the Gaussian along the surface.
-    outlier = 2 * math.pi * sigma**2 / config.area
+    # A density per area, as that of the Gaussian along the surface, the squared size being one.
+    outlier = 2 * math.pi * sigma**2
+    hidden, unshown = ((1 - share).clamp_min(torch.finfo(share.dtype).eps) for share in (visible, shown))
     chosen = near * torch.lerp(by_source, visible / len(target), doubt)
-    choice = chosen / (chosen.sum(1, keepdim=True) + outlier * (1 - visible + config.outliers))
+    choice = chosen / (chosen.sum(1, keepdim=True) + outlier * hidden)
     chosen = near * torch.lerp(by_target, shown / count, doubt)
-    choice += (count / len(target)) * chosen / (chosen.sum(0) + outlier * (1 - shown + config.outliers))
+    choice += (count / len(target)) * chosen / (chosen.sum(0) + outlier * unshown)
     weights = choice.sum(1)
     targets = choice @ target.points / weights.clamp_min(torch.finfo(weights.dtype).tiny).unsqueeze(1)
     return GraphMatches(slice(0, count), torch.where(weights.unsqueeze(1) > 0, targets, moved), weights)

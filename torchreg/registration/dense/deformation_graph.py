@@ -128,14 +128,13 @@ class DeformationGraph(nn.Module):
         both = self.centers[self.edges]
         return transform_points(one, both) - transform_points(other, both)
 
-    def smoothness(self, transforms: Tensor, slack: float = 0.0) -> Tensor:
+    def smoothness(self, transforms: Tensor) -> Tensor:
         """Return the weighted mean over edges of both gaps' lengths, (...), in the unit of the points.
 
         Args:
             transforms: (..., J, 4, 4).
-            slack: gaps below this count less, ``sqrt(gap^2 + slack^2) - slack``.
         """
         if len(self.edges) == 0:
             return transforms.new_zeros(transforms.shape[:-3])
-        gap = (self.edge_gaps(transforms).square().sum(-1) + slack**2).sqrt().sum(-1) - 2 * slack
+        gap = self.edge_gaps(transforms).norm(dim=-1).sum(-1)
         return (gap * self.edge_weights).sum(-1) / len(self.edges)

@@ -9,10 +9,9 @@ from torch import Tensor
 
 from torchreg.geometry.neighbors import k_nearest
 from torchreg.geometry.rigid import transform_points
-from torchreg.registration.dense.config import ChoiceConfig
 from torchreg.registration.dense.deformation_graph import DeformationGraph
 from torchreg.registration.dense.problem import ScanAlignProblem
-from torchreg.registration.dense.stages import deviations, embedded, mismatch
+from torchreg.registration.dense.stages import deviations, mismatch
 
 # Target samples looked at, and for each of them moved samples that may cover it.
 _NUM_TARGETS, _NUM_COVERS = 400, 2
@@ -22,7 +21,7 @@ _RINGS, _MAX_ROUNDS = 4, 30
 _LEAST_GAIN = 1e-4
 
 
-def fuse_motions(problem: ScanAlignProblem, options: Tensor, config: ChoiceConfig) -> Tensor:
+def fuse_motions(problem: ScanAlignProblem, options: Tensor) -> Tensor:
     """Return motions of the nodes, each as in one of several hypotheses.
 
     The energy is that by which hypotheses are compared, every sample moved by the node that it hangs on most. Starting
@@ -31,7 +30,6 @@ def fuse_motions(problem: ScanAlignProblem, options: Tensor, config: ChoiceConfi
     Args:
         problem: the scans.
         options: (H, J, 4, 4) motions, the best first.
-        config: the energy.
 
     Returns:
         (J, 4, 4).
@@ -40,7 +38,7 @@ def fuse_motions(problem: ScanAlignProblem, options: Tensor, config: ChoiceConfi
 
     References: Lempitsky, Rother, Roth, Blake 2010, on fusing proposals into one labeling.
     """
-    energy = _Energy.of(problem, options, config)
+    energy = _Energy.of(problem, options)
     patches, count = _patches(problem.graph), len(options)
     patches, offers = patches.repeat(count, 1), torch.arange(count).to(patches.device).repeat_interleave(len(patches))
     labels = torch.zeros_like(options[0, :, 0, 0], dtype=torch.long)
@@ -84,23 +82,22 @@ class _Energy:
     edges: Tensor
 
     @classmethod
-    def of(cls, problem: ScanAlignProblem, options: Tensor, config: ChoiceConfig) -> _Energy:
+    def of(cls, problem: ScanAlignProblem, options: Tensor) -> _Energy:
         """Return the energy of mosaics of motions (H, J, 4, 4)."""
         graph, targets = problem.graph, problem.target.first(_NUM_TARGETS)
-        there = embedded(targets, config)
         owner = graph.dense_weights.argmax(1)
         costs, covers, by = [], [], []
         for option in options:
             moved = problem.moved(option)
-            costs.append(mismatch(problem, moved, config)[0] + deviations(problem, moved.points, config))
-            index, apart = k_nearest(there, embedded(moved, config), min(_NUM_COVERS, len(owner)))
-            covers.append((apart / config.cap).clamp(max=1).square())
+            costs.append(mismatch(problem, moved)[0] + deviations(problem, moved.points))
+            index, apart = k_nearest(targets.points, moved.points, min(_NUM_COVERS, len(owner)))
+            covers.append((apart / problem.config.cap).clamp(max=1).square())
             by.append(owner[index])
         own = torch.zeros(graph.num_nodes, len(options)).to(options)
         own.index_add_(0, owner, torch.stack(costs, dim=1) / len(owner))
         under = torch.arange(len(options), dtype=torch.uint8, device=owner.device)
         under = under.repeat_interleave(covers[0].shape[1])
-        smoothness = config.smoothness * _edge_smoothness(graph, options, config.slack)
+        smoothness = problem.config.smoothness * _edge_smoothness(graph, options)
         return cls(own, torch.cat(covers, dim=1), torch.cat(by, dim=1), under, smoothness, graph.edges)
 
     def __call__(self, labels: Tensor) -> Tensor:
@@ -112,12 +109,11 @@ class _Energy:
         return own + covered + self.smoothness[torch.arange(len(self.edges)), one, other].sum(-1)
 
 
-def _edge_smoothness(graph: DeformationGraph, options: Tensor, slack: float) -> Tensor:
+def _edge_smoothness(graph: DeformationGraph, options: Tensor) -> Tensor:
     """Return (E, H, H): the share of `DeformationGraph.smoothness` of each edge, under two of motions (H, J, 4, 4)."""
     both = graph.centers[graph.edges]
     one, other = (transform_points(options[:, ends], both) for ends in graph.edges.unbind(-1))
-    gap = (one.unsqueeze(1) - other).square().sum(-1)
-    lengths = (gap + slack**2).sqrt().sum(-1) - 2 * slack
+    lengths = (one.unsqueeze(1) - other).norm(dim=-1).sum(-1)
     return (lengths * graph.edge_weights / max(1, len(graph.edges))).movedim(-1, 0)
 
 

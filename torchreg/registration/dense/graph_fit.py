@@ -44,27 +44,6 @@ class GraphMatches:
         return cls(slice(0, len(places)), places, torch.ones_like(places[:, 0]))
 
 
-def joined(first: GraphMatches, *others: GraphMatches) -> GraphMatches:
-    """Return matches that cost what several cost, all of them over the number of the first."""
-    if not others:
-        return first
-    parts = zip(*(_tensors(matches) for matches in (first, *others)), strict=True)
-    which, targets, weights, normals, tangential_weight = (torch.cat(values) for values in parts)
-    # What is fitted is a mean over the matches.
-    return GraphMatches(which, targets, weights * (len(which) / max(1, len(first.weights))), normals, tangential_weight)
-
-
-def _tensors(matches: GraphMatches) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Return samples, targets, weights, normals and slides of matches, one of each per match."""
-    which, count = matches.which, len(matches.weights)
-    if isinstance(which, slice):
-        stop = count if which.stop is None else which.stop
-        which = torch.arange(*which.indices(stop), device=matches.targets.device)
-    normals = torch.zeros_like(matches.targets) if matches.normals is None else matches.normals
-    tangential_weight = torch.as_tensor(matches.tangential_weight).to(matches.weights).expand(count)
-    return which, matches.targets, matches.weights, normals, tangential_weight
-
-
 @dataclass(frozen=True)
 class GraphFit:
     """Where steps have led.

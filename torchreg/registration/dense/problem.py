@@ -1,4 +1,4 @@
-"""Two scans made comparable: one size and middle, even samples, what is alike on both, and the graph that moves one."""
+"""Two scans made comparable: one size and middle, even samples, and the graph that moves one."""
 
 from __future__ import annotations
 
@@ -7,22 +7,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg._threads import run_both
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.sampling import even_order
 from torchreg.registration.dense.config import ScanAlignConfig
-from torchreg.registration.dense.curvature import curvature_features
 from torchreg.registration.dense.deformation_graph import DeformationGraph
 from torchreg.registration.dense.match_prior import MatchPrior
 from torchreg.registration.dense.node_graph import build_node_graph
-from torchreg.registration.dense.oriented_samples import OrientedSamples, scaled_together
+from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.registration.dense.sample_graph import sample_graph
 from torchreg.registration.normalization import Normalization
 
 # What opposite normals count as where a point takes over from the samples around it, length.
 NORMAL_SCALE = 0.03
-# Neighbors that curvature looks at.
-_AROUND = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,14 +47,9 @@ class ScanAlignProblem:
     unit: Normalization
     expected: Tensor | None = None
 
-    def num_used(self, sigma: float) -> int:
-        """Return how many samples a sigma asks for: so many per squared sigma, and at least some."""
-        return max(round(self.config.density / sigma**2), self.config.least_samples)
-
-    def moved(self, transforms: Tensor, count: int | None = None) -> OrientedSamples:
-        """Return the first ``count`` samples of the graph where its nodes take them."""
-        count = min(len(self.samples) if count is None else count, len(self.samples))
-        return self.source.first(count).moved(*self.graph.move_with_normals(transforms, slice(0, count)))
+    def moved(self, transforms: Tensor) -> OrientedSamples:
+        """Return the samples of the graph where its nodes take them."""
+        return self.source.first(len(self.samples)).moved(*self.graph.move_with_normals(transforms))
 
 
 def describe(
@@ -79,29 +70,20 @@ def describe(
 
     Cost: 0.3 s for scans of 8,000 points.
     """
-    count = max(config.num_samples, config.num_target_samples)
-    here = source.uniform_subsample(count, generator=generator)
-    there = target.uniform_subsample(config.num_target_samples, generator=generator)
+    here, there = (scan.uniform_subsample(2 * config.num_samples, generator=generator) for scan in (source, target))
     here, there = here[even_order(source.points[here])], there[even_order(target.points[there])]
     unit = Normalization.from_points(source.points[here])
-    places = [
-        (unit.normalize(scan.points[which]), scan.normals[which].detach().cpu().double())
-        for scan, which in ((source, here), (target, there))
-    ]
-
-    def curvature(pair: tuple[Tensor, Tensor]) -> Tensor:
-        return curvature_features(*pair, *pair, config.curvature_radii, num_neighbors=_AROUND)
-
-    features = scaled_together(*run_both(lambda: curvature(places[0]), lambda: curvature(places[1])))
     one, other = (
-        OrientedSamples(*pair, feature, scan.boundary[which].cpu())
-        for pair, feature, scan, which in zip(places, features, (source, target), (here, there), strict=True)
+        OrientedSamples(
+            unit.normalize(scan.points[which]), scan.normals[which].detach().cpu().double(), scan.boundary[which].cpu()
+        )
+        for scan, which in ((source, here), (target, there))
     )
     samples = here[: config.num_samples].cpu()
     faces = None if source.faces is None else source.faces.cpu()
     normals = source.normals.detach().cpu().double()
     ways = sample_graph(unit.normalize(source.points), samples, faces, normals=normals, normal_scale=NORMAL_SCALE)
-    nodes = build_node_graph(ways, 0, config.num_nodes, config.num_nearest)
+    nodes = build_node_graph(ways, 0, config.num_nodes)
     graph = DeformationGraph(one.points[: len(samples)], one.normals[: len(samples)], nodes)
     ahead = None if expected is None else unit.normalize(expected)[samples]
     return ScanAlignProblem(

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from torchreg.geometry.neighbors import NeighborTree
 from torchreg.registration.dense.problem import ScanAlignProblem
-from torchreg.registration.dense.stages import embedded, mismatch
-
-if TYPE_CHECKING:
-    from torchreg.registration.dense.config import ChoiceConfig
+from torchreg.registration.dense.stages import mismatch
 
 
 @dataclass(frozen=True)
@@ -49,10 +45,9 @@ class ScanCalibration:
     kinds that the matcher is trained on by ``benchmarks/scan_confidence.py --calibrate``.
     """
 
-    bias: float = 7.03
-    weights: tuple[float, ...] = (1.12, 6.19, 2.93, 3.74, 1.13, 6.28)  # in the order of `ScanEvidence`
+    bias: float = 6.94
+    weights: tuple[float, ...] = (3.79, 6.29, 5.54, 3.88, 2.42, 0.05)  # in the order of `ScanEvidence`
     doubtful: float = 0.5  # confidence below which a result is doubtful
-    doubt: float = 0.1  # support of what the matcher calls impossible, see `MatchPrior.logarithm`: it errs that often
 
 
 SCAN_CALIBRATION = ScanCalibration()
@@ -65,9 +60,7 @@ def confidence_of(evidence: ScanEvidence) -> float:
     return float(torch.sigmoid(odds))
 
 
-def scan_evidence(
-    problem: ScanAlignProblem, transforms: Tensor, rival: Tensor, smoothness: float, config: ChoiceConfig
-) -> ScanEvidence:
+def scan_evidence(problem: ScanAlignProblem, transforms: Tensor, rival: Tensor, smoothness: float) -> ScanEvidence:
     """Return the evidence against motions (J, 4, 4) of the nodes.
 
     Args:
@@ -75,14 +68,12 @@ def scan_evidence(
         transforms: the motions.
         rival: (J, 4, 4) those of the second-best hypothesis.
         smoothness: of the graph, see `Hypothesis`.
-        config: by which hypotheses are compared.
     """
-    moved, prior = problem.moved(transforms), problem.prior
-    here, there = embedded(moved, config), embedded(problem.target, config)
-    cost, index = mismatch(problem, moved, config)
-    apart = (NeighborTree(here).nearest(there)[1] / config.cap).clamp(max=1).square()
-    support = prior.logarithm(index[:, None], SCAN_CALIBRATION.doubt)[:, 0]
-    elsewhere = (problem.graph(transforms) - problem.graph(rival)).norm(dim=-1) > config.same
+    moved, prior, config = problem.moved(transforms), problem.prior, problem.config
+    cost, index = mismatch(problem, moved)
+    apart = (NeighborTree(moved.points).nearest(problem.target.points)[1] / config.cap).clamp(max=1).square()
+    support = prior.logarithm(index[:, None], config.doubt)[:, 0]
+    elsewhere = (problem.graph(transforms) - problem.graph(rival)).norm(dim=-1) > config.refine.sigma[1]
     return ScanEvidence(
         forward=_mean(cost, prior.visible),
         backward=_mean(apart, prior.target_visible),

@@ -2,30 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchreg.geometry.neighbors import NeighborTree
 from torchreg.registration.annealing import geometric_at
-from torchreg.registration.dense.config import (
-    ChoiceConfig,
-    EMConfig,
-    Hypothesis,
-    OnStep,
-    ScanAlignRecord,
-)
+from torchreg.registration.dense.config import Hypothesis, OnStep, ScanAlignRecord
 from torchreg.registration.dense.e_step import SoftMatches, match_softly
-from torchreg.registration.dense.graph_fit import GraphFit, GraphMatches, fit_graph, joined
+from torchreg.registration.dense.graph_fit import GraphFit, GraphMatches, fit_graph
 from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.registration.dense.problem import ScanAlignProblem
-from torchreg.solvers.robust import geman_mcclure_weight
-
-# Squared feature distance of right matches, in the mean.
-_USUAL_FEATURE_DISTANCE = 0.4
-# With less posterior mass a sample has no match: it may be hidden.
-_HARDLY_MATCHED = 0.05
 
 
 @dataclass(frozen=True)
@@ -61,98 +49,69 @@ class Reporter:
         )
 
 
-def refine(
-    problem: ScanAlignProblem,
-    transforms: Tensor,
-    config: EMConfig,
-    reporter: Reporter,
-    first_sigma: float | None = None,
-) -> Tensor:
-    """Return motions refined by EM: sigma shrinks, the graph softens, matches may slide along the surface ever more.
+def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) -> Tensor:
+    """Return motions refined by EM: sigma shrinks, and the graph softens.
 
     Args:
         problem: the scans.
         transforms: (J, 4, 4) to start from.
-        config: see `EMConfig`.
         reporter: takes a record of each step.
-        first_sigma: instead of that of the configuration.
     """
-    widths = (config.sigma[0] if first_sigma is None else first_sigma, config.sigma[1])
-    for step in range(config.num_steps):
-        share = step / max(config.num_steps - 1, 1)
-        ends = (widths, config.stiffness, config.tangential_weight)
-        sigma, stiffness, tangential = (geometric_at(each, share) for each in ends)
-        for _ in range(config.fits_per_step):
-            moved = problem.moved(transforms, problem.num_used(sigma))
-            found = soft_matches(problem, moved, sigma, config, share)
-            matches = GraphMatches(slice(0, len(moved)), found.targets, found.posterior, found.normals, tangential)
-            waiting = _as_expected(problem, moved, found, config)
-            matches = joined(matches, *waiting)
-            fit = fit_graph(problem.graph, transforms, matches, stiffness, edge_scale=config.edge_scale)
-            transforms = fit.transforms
+    config, plan = problem.config, problem.config.refine
+    for step in range(plan.num_steps):
+        share = step / max(plan.num_steps - 1, 1)
+        sigma, stiffness = geometric_at(plan.sigma, share), geometric_at(plan.stiffness, share)
+        moved = problem.moved(transforms)
+        found = soft_matches(problem, moved, sigma, share)
+        matches = GraphMatches(
+            slice(0, len(moved)), found.targets, found.posterior, found.normals, config.tangential_weight
+        )
+        fit = fit_graph(problem.graph, transforms, matches, stiffness, edge_scale=config.edge_scale)
+        transforms = fit.transforms
         matched = float(found.posterior.mean())
-        reporter.report("refine", step, config.num_steps, sigma, fit, stiffness, matched)
+        reporter.report("refine", step, plan.num_steps, sigma, fit, stiffness, matched)
     return transforms
 
 
-def soft_matches(
-    problem: ScanAlignProblem, moved: OrientedSamples, sigma: float, config: EMConfig, share: float = 1.0
-) -> SoftMatches:
-    """Return the matches of an E-step, a share of the way through, of moved samples."""
-    first, last = config.feature_weight
-    compatible = replace(config.compatible, feature_weight=first + (last - first) * share)
-    target, doubt = problem.target.first(problem.num_used(sigma)), geometric_at((config.doubt, 1.0), share)
-    return match_softly(moved, target, sigma, compatible, prior=problem.prior, doubt=doubt)
+def soft_matches(problem: ScanAlignProblem, moved: OrientedSamples, sigma: float, share: float = 1.0) -> SoftMatches:
+    """Return the matches of an E-step, a share of the way through, of moved samples.
+
+    The matcher is doubted ever more: sigma falls far below what its tokens are apart.
+    """
+    config = problem.config
+    return match_softly(
+        moved, problem.target, sigma, normal_weight=config.normal_weight, outliers=config.outliers,
+        prior=problem.prior, doubt=geometric_at((config.doubt, 1.0), share),
+    )  # fmt: skip
 
 
-def _as_expected(
-    problem: ScanAlignProblem, moved: OrientedSamples, found: SoftMatches, config: EMConfig
-) -> tuple[GraphMatches, ...]:
-    """Return what holds samples without a match near where they are expected."""
-    if problem.expected is None or config.expected == 0:
-        return ()
-    count = len(moved)
-    expected = problem.expected[:count]
-    apart = (moved.points - expected).square().sum(-1) / config.expected_scale**2
-    weights = config.expected * (1 - found.posterior / _HARDLY_MATCHED).clamp(min=0) * geman_mcclure_weight(apart)
-    return (GraphMatches(slice(0, count), expected, weights),)
-
-
-def judge(problem: ScanAlignProblem, name: str, transforms: Tensor, config: ChoiceConfig) -> Hypothesis:
-    """Return how well moved source and target cover each other, how alike they are there, and how smooth it is."""
-    moved = problem.moved(transforms)
-    forward = float(mismatch(problem, moved, config)[0].mean())
-    apart = NeighborTree(embedded(moved, config)).nearest(embedded(problem.target, config))[1]
+def judge(problem: ScanAlignProblem, name: str, transforms: Tensor) -> Hypothesis:
+    """Return how well moved source and target cover each other, and how smooth it is."""
+    moved, config = problem.moved(transforms), problem.config
+    forward = float(mismatch(problem, moved)[0].mean())
+    apart = NeighborTree(moved.points).nearest(problem.target.points)[1]
     backward = float((apart / config.cap).clamp(max=1).square().mean())
-    smoothness = config.smoothness * float(problem.graph.smoothness(transforms, config.slack))
-    deviation = float(deviations(problem, moved.points, config).mean())
+    smoothness = config.smoothness * float(problem.graph.smoothness(transforms))
+    deviation = float(deviations(problem, moved.points).mean())
     costs = (forward, backward, smoothness, deviation)
     return Hypothesis(name, sum(costs), *costs)
 
 
-def deviations(problem: ScanAlignProblem, places: Tensor, config: ChoiceConfig) -> Tensor:
-    """Return what it costs samples (S,) to be elsewhere than expected."""
+def deviations(problem: ScanAlignProblem, places: Tensor) -> Tensor:
+    """Return squared distances of samples (S,) from where they are expected, in caps, at most one."""
     if problem.expected is None:
         return torch.zeros_like(places[:, 0])
-    apart = (places - problem.expected).norm(dim=-1) / config.deviation_cap
-    return config.deviation * apart.clamp(max=1).square()
+    apart = (places - problem.expected).norm(dim=-1) / problem.config.cap
+    return apart.clamp(max=1).square()
 
 
-def mismatch(problem: ScanAlignProblem, moved: OrientedSamples, config: ChoiceConfig) -> tuple[Tensor, Tensor]:
-    """Return costs (S,) of moved samples by distance and features, capped at outliers, and the nearest targets."""
-    index, apart = NeighborTree(embedded(problem.target, config)).nearest(embedded(moved, config))
-    feature_distance = (moved.features - problem.target.features[index]).square().sum(-1)
-    # An outlier is as unlike as right matches usually are: leaving the target must not pay.
-    most = 1 + config.feature_distance * _USUAL_FEATURE_DISTANCE
-    return ((apart / config.cap).square() + config.feature_distance * feature_distance).clamp(max=most), index
+def mismatch(problem: ScanAlignProblem, moved: OrientedSamples) -> tuple[Tensor, Tensor]:
+    """Return squared distances (S,) of moved samples from the target, in caps, at most one, and the nearest targets."""
+    index, apart = NeighborTree(problem.target.points).nearest(moved.points)
+    return (apart / problem.config.cap).clamp(max=1).square(), index
 
 
-def embedded(samples: OrientedSamples, config: ChoiceConfig) -> Tensor:
-    """Return (S, 6): places and normals, whose distances count for a choice."""
-    return torch.cat((samples.points, config.normal_scale * config.cap * samples.normals), dim=1)
-
-
-def agree(problem: ScanAlignProblem, one: Tensor, other: Tensor, config: ChoiceConfig) -> bool:
-    """Return whether two hypotheses take nearly all samples to nearly the same places."""
-    apart = (problem.graph(one) - problem.graph(other)).norm(dim=-1)
-    return float((apart < config.same).double().mean()) >= config.same_share
+def agree(problem: ScanAlignProblem, one: Tensor, other: Tensor) -> bool:
+    """Return whether two hypotheses take samples to the same places, up to the last sigma, root mean square."""
+    apart = (problem.graph(one) - problem.graph(other)).square().sum(-1)
+    return float(apart.mean()) < problem.config.refine.sigma[1] ** 2

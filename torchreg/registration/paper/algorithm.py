@@ -107,7 +107,7 @@ class PaperFit:
             self._report("align", step, paper.max_rounds)
             if step >= paper.annealing_rounds and energy >= (1 - paper.rtol) * lowest:
                 return True
-            if self.config.reuse and step + 1 < paper.max_rounds:
+            if step + 1 < paper.max_rounds:
                 self._reuse_labels()
             lowest = min(lowest, energy) if step >= paper.annealing_rounds else lowest
         return False
