@@ -77,7 +77,7 @@ def judged(spine: tr.SpineSequence, plant: GrowingPlant, step: int) -> dict[str,
         "births": float((((births - first).abs() <= WITHIN) & (own >= 0)).double().mean()),
         "ends": float((((ends - last).abs() <= WITHIN) & (own >= 0)).double().mean()),
         "right": float(right[alive].double().mean()),
-        "shown": float(right.sum() / (near.any(2) & spine.found).sum()),
+        "shown": float((right & spine.found[:, own.clamp_min(0)]).sum() / (near.any(2) & spine.found).sum()),
     }
 
 
