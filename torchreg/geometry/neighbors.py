@@ -175,7 +175,7 @@ def _all_differ(values: np.ndarray) -> bool:
     bits = np.ascontiguousarray(values).view(np.uint64)
     hashes = np.zeros(len(bits), dtype=np.uint64)
     for column in bits.T:
-        hashes = (hashes ^ column) * np.uint64(0x9E3779B97F4A7C15)  # Fibonacci hashing, as of 2^64 over the golden ratio
+        hashes = (hashes ^ column) * np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: Fibonacci hashing
         hashes ^= hashes >> np.uint64(29)
     hashes.sort()
     return not bool((hashes[1:] == hashes[:-1]).any())

@@ -13,6 +13,8 @@ from torchreg.geometry.mesh import TriangleMesh, distinct_faces
 from torchreg.geometry.neighbors import NeighborTree, weld
 
 PIECES = ("largest", "bridge", "error")
+# How the note begins on pieces that are left out and large.
+ANOTHER_BODY = "another body left out"
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,8 @@ class _Repair:
 
     # Share of the faces below which a piece is dust: never bridged to, and no reason for an error.
     dust: float = 1e-3
+    # Area of a piece, in those of the largest one, from which on it is a body of its own rather than a fragment.
+    body: float = 0.5
     # Pieces with the nearest boxes to which bridges are searched.
     near_pieces: int = 12
     # Edge of a cell whose vertices are merged, in square roots of the wanted area per vertex.
@@ -182,8 +186,15 @@ def _kept_pieces(
         raise InputError(f"mesh must be one piece, got {count} (area {shares}); choose pieces='largest' or 'bridge'")
     keep = large if pieces == "bridge" else torch.arange(len(number)) == areas.argmax()
     dropped = int((number > 0).sum()) - int(keep.sum())
-    notes = (f"{dropped} fragment(s) left out, {1 - float(number[keep].sum()) / len(faces):.2%} of the faces",)
-    return faces[keep[piece]], int(keep.sum()), notes if dropped else (), labels
+    notes: tuple[str, ...] = (
+        f"{dropped} fragment(s) left out, {1 - float(number[keep].sum()) / len(faces):.2%} of the faces",
+    )
+    if not dropped:
+        return faces[keep[piece]], int(keep.sum()), (), labels
+    share = float((areas[~keep].max() / areas[keep].max()).nan_to_num())
+    if share >= _REPAIR.body:
+        notes += (f"{ANOTHER_BODY}, with {share:.0%} of the area of the one that is kept",)
+    return faces[keep[piece]], int(keep.sum()), notes, labels
 
 
 def _bridges(vertices: Tensor, labels: Tensor, count: int) -> Tensor:

@@ -32,6 +32,7 @@ from torchreg.spines.observed_limbs import (
     smooth_rough_limbs,
 )
 from torchreg.spines.paper.rigid_tracking import track_tips_rigidly
+from torchreg.spines.passed_over import check_sizes, frames_to_pass_over, with_frames_between
 from torchreg.spines.prior import PriorSkeleton
 from torchreg.spines.results import SpineRecord, SpineSequence
 from torchreg.spines.skeletonize import SkeletonizeConfig
@@ -132,12 +133,14 @@ def extract_spine(
         progress: folder in which skeletons are kept, so that a call that was interrupted goes on where it ended.
 
     Returns:
-        A `SpineSequence`; `warnings` tell the irregularities frame by frame.
+        A `SpineSequence`; `warnings` tell the irregularities frame by frame. Frames without a body, or with another
+        one that is half as large or more, are passed over if most are not so: limbs are interpolated in time.
 
     Raises:
         InputError: if there is no frame, one of them has no surface (names it), no frame shows ``num_tips`` limbs,
             ``times`` do not fit, the prior has fewer tips than most frames and ``num_tips`` does not say so, a prior
-            is given to the paper's way, or a prior, ``num_tips`` or the paper's way to what grows.
+            is given to the paper's way, a prior, ``num_tips`` or the paper's way to what grows, or a frame is eight
+            times as large or small as most, as of another unit.
         InputTypeError: if something else than meshes is given, or another prior than a skeleton or a spine.
         SolverError: if a worker process is killed twice.
 
@@ -154,16 +157,25 @@ def extract_spine(
     origin = far_origin([mesh.vertices for mesh in surfaces])
     if origin is not None:
         surfaces = [TriangleMesh(mesh.vertices - origin.to(mesh.vertices), mesh.faces) for mesh in surfaces]
+    check_sizes(surfaces, growing=growing)
     known = None if prior is None else PriorSkeleton.from_given(prior, config.num_tips)
     first = surfaces[0].vertices
     warn_about_rounding(first, "meshes", float((first.amax(0) - first.amin(0)).norm()), stacklevel=2)
     with torch.no_grad():
         # Section 4.1: the second factor of eq. 3, frame by frame.
         found = skeletonize_frames(surfaces, config.skeletons, workers=workers, on_step=on_step, progress=progress)
+    passed = frames_to_pass_over([skeleton for skeleton, _ in found])
+    kept = [number for number in range(len(found)) if number not in passed]
+    when = torch.arange(len(found)).to(first) if times is None else times
+    if passed:
+        surfaces, told, times = [surfaces[number] for number in kept], [told[number] for number in kept], when[kept]
+    shown = [found[number] for number in kept]
     if growing:
-        spine = growing_spine(surfaces, found, told, times, config.num_samples)
+        spine = growing_spine(surfaces, shown, told, times, config.num_samples)
     else:
-        spine = _joined_spine(surfaces, found, told, known, times, config)
+        spine = _joined_spine(surfaces, shown, told, known, times, config)
+    if passed:
+        spine = with_frames_between(spine, kept, when, {number: found[number][0] for number in passed})
     return spine if origin is None else spine.moved(origin)
 
 

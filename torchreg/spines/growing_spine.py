@@ -23,6 +23,8 @@ from torchreg.spines.results import SpineSequence
 from torchreg.spines.spine import Spine
 from torchreg.spines.tip_features import observe_tips
 
+_NO_TIP = -50.0  # log-odds that no place on tracks makes up for
+
 
 @torch.no_grad()
 def growing_spine(
@@ -35,8 +37,7 @@ def growing_spine(
         InputError: if fewer than two organs are found.
     """
     skeletons = [smooth_rough_limbs(skeleton) for skeleton, _ in found]
-    # The confidence of a tip is that of twice the log-odds.
-    certainties = [torch.logit(skeleton.confidence.cpu().double(), eps=1e-3) / 2 for skeleton, _ in found]
+    certainties = [_certainty(skeleton.confidence.cpu().double()) for skeleton, _ in found]
     tracks = track_organs(observe_tips(skeletons, [relations for _, relations in found]), certainties)
     num_organs = tracks.labels.shape[1]
     if num_organs < 2:
@@ -67,6 +68,11 @@ def growing_spine(
         ends=tracks.ends,
         **told_statuses(_notes(skeletons, told, tracks, limbs)),
     )
+
+
+def _certainty(confidence: Tensor) -> Tensor:
+    """Return log-odds (M,) of tips, which are half of what their confidences say; a ball has none."""
+    return torch.where(confidence > 0, torch.logit(confidence, eps=1e-3) / 2, _NO_TIP)
 
 
 def _notes(

@@ -30,6 +30,8 @@ from torchreg.spines.surfaces import as_surface
 from torchreg.spines.tip_relations import TipRelations, surface_relations
 from torchreg.spines.tip_trees import TipTree, consensus_junctions, estimate_junction, grow_tip_tree
 
+FLAT = "the surface is flat"  # how the note on it begins
+
 
 @dataclass(frozen=True)
 class SkeletonizeConfig:
@@ -161,7 +163,7 @@ def _prepared(mesh: TriangleMesh, config: SkeletonizeConfig) -> _Body:
         raise InputError("mesh must have a finite area, got coordinates whose products overflow; use a larger unit")
     extent = float((piece.mesh.vertices.amax(0) - piece.mesh.vertices.amin(0)).norm())
     if int(spread_dimensions(piece.mesh.vertices, extent)) < len(SPREADS):
-        notes += ("the surface is flat: it encloses no body",)
+        notes += (f"{FLAT}: it encloses no body",)
     coarse = coarsened(piece.mesh, config.max_vertices)
     if coarse is not piece.mesh:
         # Coarsening leaves pinholes where patches meet.
