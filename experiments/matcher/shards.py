@@ -168,11 +168,12 @@ class PairStore:
 
     Args:
         files: made by `make_shards`.
+        device: where they are held, a quarter of a megabyte each, and given out.
     """
 
-    def __init__(self, files: list[Path]) -> None:
+    def __init__(self, files: list[Path], device: str = "cpu") -> None:
         shards = [torch.load(file, weights_only=True) for file in files]
-        self._values = {name: torch.cat([shard[name] for shard in shards]) for name in shards[0]}
+        self._values = {name: torch.cat([shard[name] for shard in shards]).to(device) for name in shards[0]}
 
     def __len__(self) -> int:
         return len(self._values["kinds"])
@@ -180,6 +181,7 @@ class PairStore:
     def batch(self, rows: Tensor, swapped: Tensor | None = None) -> PairBatch:
         """Return pairs by their numbers (B,), source and target exchanged where ``swapped`` (B,) says so."""
         swapped = torch.zeros(len(rows), dtype=torch.bool) if swapped is None else swapped
+        rows, swapped = (value.to(self._values["kinds"].device) for value in (rows, swapped))
 
         def both(name: str) -> tuple[Tensor, Tensor]:
             first, second = self._values[f"source.{name}"][rows], self._values[f"target.{name}"][rows]
@@ -201,7 +203,7 @@ class PairStore:
 
 
 def _unpacked(values: dict[str, Tensor]) -> ScanTokens:
-    count = len(values["points"])
+    count, device = len(values["points"]), values["points"].device
     return ScanTokens(
         points=values["points"].float(),
         normals=values["normals"].float(),
@@ -209,7 +211,7 @@ def _unpacked(values: dict[str, Tensor]) -> ScanTokens:
         tokens=values["tokens"].long(),
         neighbors=values["neighbors"].long(),
         geodesic=values["geodesic"].float() / _LEVELS,
-        index=torch.arange(values["points"].shape[1]).expand(count, -1),
-        center=torch.zeros(count, 3),
-        scale=torch.ones(count),
+        index=torch.arange(values["points"].shape[1], device=device).expand(count, -1),
+        center=torch.zeros(count, 3, device=device),
+        scale=torch.ones(count, device=device),
     )

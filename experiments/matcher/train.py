@@ -187,8 +187,8 @@ def _work(
         distributed.init_process_group("gloo", init_method=meeting, rank=rank, world_size=config.processes)
     run = _Run(output, config, begin)
     # Every process holds its own share of the pairs.
-    pairs = PairStore(files[rank :: config.processes])
-    others = PairStore(held_out) if rank == 0 else None
+    pairs = PairStore(files[rank :: config.processes], config.device)
+    others = PairStore(held_out, config.device) if rank == 0 else None
     generator = torch.Generator().manual_seed(config.seed + 1000 * rank + run.step)
     order, losses = torch.empty(0, dtype=torch.int64), []
     count = config.batch // config.processes

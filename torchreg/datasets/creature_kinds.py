@@ -106,6 +106,25 @@ def draw_person(draw: Draw) -> Creature:
     return body.finish()
 
 
+def draw_mannequin(draw: Draw) -> Creature:
+    """Draw a bare doll of few, round parts, of which nothing but their places tells left from right."""
+    u, body = draw.uniform, Builder(draw)
+    girth, height, limb = u(0.08, 0.16), u(0.3, 0.6), u(0.035, 0.08)
+    hips, waist = body.add(-1, at(0, 0, 0), Y, height / 2, (girth, girth), limit=20)
+    chest, top = body.add(hips, waist, Y, height / 2, (girth, girth * u(0.9, 1.2)), limit=25)
+    size = u(0.07, 0.13)
+    body.add(chest, top + at(0, 0.05, 0), Y, size, (size, size), limit=35)
+    arm, leg, foot = u(0.4, 0.8), u(0.5, 1.0), draw.chance(0.6)
+    for side in LEFT_RIGHT:
+        shoulder = top + at(side * (girth + limb), -limb, 0)
+        body.chain(chest, shoulder, [towards(u(-75, -30), side * 90)] * 2, [arm / 2] * 2, [limb] * 3)
+        steps, lengths = [at(side * 0.1, -1, 0)] * 2, [leg / 2] * 2
+        if foot:
+            steps, lengths = [*steps, at(0, -0.2, 1)], [*lengths, u(0.1, 0.2)]
+        body.chain(hips, at(side * 0.7 * girth, -0.3 * girth, 0), steps, lengths, [1.1 * limb] * (len(steps) + 1))
+    return body.finish()
+
+
 def _persons_head(draw: Draw, body: Builder, chest: int, top: Tensor) -> None:
     u = draw.uniform
     neck, chin = body.add(chest, top, at(0, 1, 0.1), u(0.06, 0.2), (0.07, 0.06), limit=35)
@@ -442,8 +461,9 @@ def draw_crane(draw: Draw) -> Creature:
 Kind = Callable[[Draw], Creature]
 # With the share of each in what is drawn: most of what is scanned are people and animals.
 TRAINING_KINDS: dict[str, tuple[Kind, float]] = {
-    "quadruped": (draw_quadruped, 0.27),
-    "person": (draw_person, 0.23),
+    "quadruped": (draw_quadruped, 0.24),
+    "person": (draw_person, 0.2),
+    "mannequin": (draw_mannequin, 0.06),
     "hand": (draw_hand, 0.06),
     "plant": (draw_plant, 0.04),
     "arm": (draw_arm, 0.05),

@@ -33,6 +33,8 @@ class _Variety:
     stretch: tuple[float, float] = (0.75, 1.35)  # of each axis, in half of the creatures
     folds: float = 0.012  # amplitude of folds that differ between both poses, in a third of the creatures
     first_pose: float = 35.0  # largest angle of a joint in the first pose, degrees
+    half_step: float = 0.2  # share of the pairs whose second pose begins as the first one in a mirror
+    symmetric: float = 0.05  # a joint has a partner where its place in the mirror is this near to it
     motion: tuple[float, float] = (6.0, 80.0)  # largest change of a joint from the first pose to the second, degrees
     largest_angle: float = 95.0  # of any joint, degrees
     distance: tuple[float, float] = (2.2, 6.0)  # of the camera, in radii of the creature
@@ -208,7 +210,9 @@ def _two_poses(body: PosableBody, draw: Draw) -> tuple[TriangleMesh, TriangleMes
         return axis * share * body.limits.clamp(max=math.radians(largest)).unsqueeze(-1) * moving
 
     first = angles(draw.uniform(0, _VARIETY.first_pose), 0.8)
-    second = first + angles(draw.log_uniform(*_VARIETY.motion), draw.uniform(0.35, 1))
+    # As after half a step: left limbs are where right ones were.
+    start = _mirrored(first, body) if draw.chance(_VARIETY.half_step) else first
+    second = start + angles(draw.log_uniform(*_VARIETY.motion), draw.uniform(0.35, 1))
     size = second.norm(dim=-1, keepdim=True)
     second = second * (math.radians(_VARIETY.largest_angle) / size.clamp_min(1e-9)).clamp(max=1)
     rests = [figure.mesh, figure.mesh]
@@ -219,6 +223,15 @@ def _two_poses(body: PosableBody, draw: Draw) -> tuple[TriangleMesh, TriangleMes
         for mesh, turns in zip(rests, (first, second), strict=True)
     ]
     return TriangleMesh(posed[0], figure.mesh.faces), TriangleMesh(posed[1], figure.mesh.faces)
+
+
+def _mirrored(turns: Tensor, body: PosableBody) -> Tensor:
+    """Return the rotation vectors (P, 3) of a pose seen in a mirror: joints without a partner turn as they did."""
+    reflected = body.figure.joints * torch.tensor([-1.0, 1.0, 1.0]).to(body.figure.joints)
+    distance, partner = torch.cdist(reflected, body.figure.joints).min(1)
+    # Turns are axial: of one in a mirror across x, the part about x stays.
+    mirrored = turns[partner] * torch.tensor([1.0, -1.0, -1.0]).to(turns)
+    return torch.where((distance < _VARIETY.symmetric).unsqueeze(-1), mirrored, turns)
 
 
 def _folded(mesh: TriangleMesh, draw: Draw) -> TriangleMesh:
