@@ -45,7 +45,7 @@ OWNERS = {
     "scipy": {"solvers", "geometry", "registration/dense/blend_sums.py"},
     "scipy.spatial": {"geometry/neighbors.py"},
     "scipy.ndimage": {"geometry/distance_transform.py"},
-    "scipy.sparse.csgraph": {"geometry/graphs.py", "solvers/graph_cut.py"},
+    "scipy.sparse.csgraph": {"geometry/graphs.py", "solvers/graph_cut.py", "solvers/tracks.py"},
     "skimage": {"capture"},
     "cv2": {"capture"},
     "PIL": {"io", "viz"},

@@ -114,3 +114,12 @@ def test_a_prior_gives_the_names(run, frames, tmp_path):
         answer = run("spine", frames, *kept, tmp_path / "d.glb", "--prior", tmp_path / name)
         assert answer.exit_code == 2
         assert "--prior must be a spine (.safetensors) or a skeleton (.swc)" in " ".join(answer.output.split())
+
+
+def test_numbers_of_tips_do_not_go_with_growth(run, error_of, frames, tmp_path):
+    for option in (("--tips", 5), ("--prior", tmp_path / "a.swc")):
+        assert f"--growing cannot be used with {option[0]}" in error_of("spine", frames, "--growing", *option)
+    answer = run("spine", frames, "-o", tmp_path / "a.glb", "--growing", "--swc", tmp_path / "a.swc", "--quiet")
+    assert answer.exit_code == 0, answer.output
+    assert load(tmp_path / "a.safetensors").births.tolist() == [0] * 5
+    assert load_swc(tmp_path / "a_2.swc").topology == "(()()()()())"

@@ -6,7 +6,7 @@ import torch
 from torchreg.errors import InputError
 from torchreg.geometry.graphs import connected_components
 from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
-from torchreg.geometry.surface_graph import close_holes, coarsened, one_piece, unique_edges
+from torchreg.geometry.surface_graph import _edge_keys, _is_closed, close_holes, coarsened, one_piece, unique_edges
 
 
 def ball(subdivisions=2, radius=1.0, at=(0.0, 0.0, 0.0)):
@@ -122,3 +122,14 @@ def test_sheets_closer_than_a_cell_stay_apart_and_thin_tubes_stay_tubes():
     labels = connected_components(torch.cat((few.faces[:, :2], few.faces[:, 1:])), few.num_vertices)
     assert len(labels.unique()) == 3
     assert few.vertices[:, 2].max() == pytest.approx(7.0, abs=0.06)
+
+
+def test_holes_are_seen_whatever_the_winding():
+    closed = ball()
+    assert _is_closed(closed.faces, _edge_keys(closed.faces)[0])
+    flipped = torch.where(torch.arange(closed.num_faces)[:, None] % 3 == 0, closed.faces.flip(1), closed.faces)
+    assert not _is_closed(flipped, _edge_keys(flipped)[0])  # sorting tells
+    assert close_holes(closed.vertices, flipped)[2] == 0
+    for faces in (closed.faces[1:], flipped[1:]):
+        assert not _is_closed(faces, _edge_keys(faces)[0])
+        assert close_holes(closed.vertices, faces)[2] == 1

@@ -76,6 +76,10 @@ def spine(
         ),
     ] = None,
     tips: Annotated[int | None, typer.Option(min=2, help="Number of tips; without it the most frequent one.")] = None,
+    growing: Annotated[
+        bool,
+        typer.Option("--growing", help="Tips may appear and end, as those of a plant; names live as long."),
+    ] = False,
     samples: Annotated[int, typer.Option(min=3, help="Points along each limb.")] = 24,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,
     fps: Annotated[float, typer.Option(help="Frames per second.")] = 20.0,
@@ -105,6 +109,8 @@ def spine(
     swc, npz, table = with_ending(swc, (".swc",)), with_ending(npz, (".npz",)), with_ending(table, (".csv",))
     hulls = {"--calibration": calibration, "--screen": screen, "--resolution": resolution, "--seen": seen}
     check_used(silhouettes, "--silhouettes", hulls)
+    if growing:
+        _check_free(prior, tips)
     known, upright = _read_prior(prior), check_up(up) or _up_of(frames)
     if silhouettes:
         source = _silhouettes(frames, calibration, bool(screen), resolution, scale)
@@ -121,11 +127,11 @@ def spine(
 
     from torchreg.spines.extract_spine import SpineConfig
 
-    config = SpineConfig(num_tips=tips, num_samples=samples)
+    config = SpineConfig.growing(num_samples=samples) if growing else SpineConfig(num_tips=tips, num_samples=samples)
     with claimed(glb), _kept(progress):
         if silhouettes:
             meshes = _hulls(source, seen_folder(seen, glb, force), progress, quiet)
-        found = _extracted(meshes, known, config, workers, progress, quiet)
+        found = _extracted(meshes, known, config, workers, progress, quiet, growing=growing)
         found = found if upright is None else replace(found, up=upright)
         found.save(result)
         _write(found, meshes, glb, curves, npz, fps)
@@ -136,6 +142,15 @@ def spine(
         for warning in found.warnings:
             typer.echo(f"torchreg: warning: {_named(warning, names)}", err=True)
         typer.echo(_summary(found, glb))
+
+
+def _check_free(prior: Path | None, tips: int | None) -> None:
+    """Raise InputError if the number of limbs is given of what grows."""
+    from torchreg.errors import InputError
+
+    for name, value in (("--prior", prior), ("--tips", tips)):
+        if value is not None:
+            raise InputError(f"--growing cannot be used with {name}, which fixes the number of limbs; leave out either")
 
 
 @contextmanager
@@ -158,6 +173,8 @@ def _extracted(
     workers: int | None,
     progress: Path | None,
     quiet: bool,
+    *,
+    growing: bool,
 ) -> SpineSequence:
     from tqdm import tqdm
 
@@ -165,8 +182,9 @@ def _extracted(
 
     with tqdm(total=len(meshes), unit="frame", desc="skeletons", leave=False, disable=quiet) as bar:
         return extract_spine(
-            meshes, prior=known, config=config, workers=workers, on_step=lambda _: bar.update(), progress=progress
-        )
+            meshes, prior=known, growing=growing, config=config, workers=workers, on_step=lambda _: bar.update(),
+            progress=progress,
+        )  # fmt: skip
 
 
 def _read_prior(path: Path | None) -> Skeleton | SpineSequence | None:
@@ -247,9 +265,10 @@ def _write(
     tell_origin(glb, found.origin)
     for frame, path in enumerate(swc):
         if path is not None:
-            save_swc(path, found.model.skeleton(float(found.times[frame])), f"frame {frame}")
+            save_swc(path, found.skeleton(frame), f"frame {frame}")
     if npz is not None:
-        names = ("tips", "junctions", "graph", "curves", "radii", "frames", "times", "found", "own", "confidence")
+        names = ["tips", "junctions", "graph", "curves", "radii", "frames", "times", "found", "own", "confidence"]
+        names += ["births", "ends"] if found.births is not None else []
         save_arrays(npz, {name: getattr(found, name) for name in names})
 
 

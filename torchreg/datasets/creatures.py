@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_choice, check_count, check_positive
-from torchreg.geometry.marching_cubes import marching_cubes
+from torchreg.datasets.ball_surface import ball_surface
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import so3_exp
 
@@ -29,15 +29,7 @@ class _ArmMotion:
     touch_distance: float = 1.5  # between the axes of arms that touch, in their radii
 
 
-@dataclass(frozen=True)
-class _Painting:
-    """Filling of voxels."""
-
-    reach: int = 3  # voxels outside of the surface up to which the field is known
-    batch: int = 24  # balls of nearly one radius that are painted at a time
-
-
-_MOTION, _PAINTING = _ArmMotion(), _Painting()
+_MOTION = _ArmMotion()
 
 
 @dataclass(frozen=True)
@@ -128,7 +120,9 @@ def creature_sequence(
     curves, headings, merged = _moving_axes(form, num_frames, touching, generator)
     share = torch.linspace(0, 1, _MOTION.num_samples, dtype=torch.float64)
     radii = (form.root + share * (form.end - form.root)).expand(form.num_arms, -1)
-    meshes = [_surface(axes, radii, form.body, resolution, noise, generator, dtype) for axes in curves]
+    sizes = torch.cat((radii.flatten(), radii.new_tensor([form.body])))
+    bodies = [torch.cat((axes.flatten(0, 1), axes[:1, 0])) for axes in curves]
+    meshes = [ball_surface(balls, sizes, resolution, noise, generator, dtype) for balls in bodies]
     return CreatureSequence(
         meshes=tuple(meshes),
         tips=(curves[:, :, -1] + form.end * headings).to(dtype),
@@ -201,39 +195,3 @@ def _bring_together(
     amount = 0.5 + 0.5 * (math.pi * off).cos()
     amount = torch.where(merged, amount, 0.85 * amount)[:, None, None]
     turned[:, :2] = start[:, :2] + amount * high * signs * bend
-
-
-def _surface(
-    axes: Tensor, radii: Tensor, body: float, resolution: int, noise: float, generator: torch.Generator,
-    dtype: torch.dtype,
-) -> TriangleMesh:  # fmt: skip
-    """Return the surface around arms (K, S, 3) and the body in their middle, on a randomly shifted grid."""
-    balls = torch.cat((axes.flatten(0, 1), axes[:1, 0]))
-    sizes = torch.cat((radii.flatten(), radii.new_tensor([body])))
-    lower, upper = (balls - sizes[:, None]).amin(0), (balls + sizes[:, None]).amax(0)
-    spacing = float((upper - lower).max()) / resolution
-    origin = lower - spacing * (2 + torch.rand(3, generator=generator, dtype=lower.dtype))
-    counts = ((upper - origin) / spacing).ceil().long() + 3
-    # In steps of the grid: numbers of one size, so that float32 serves.
-    centers, widths = ((balls - origin) / spacing).to(dtype), (sizes / spacing).to(dtype)
-    field = torch.full(tuple(counts.tolist()), float(_PAINTING.reach), dtype=dtype)
-    for part in widths.argsort().split(_PAINTING.batch):
-        _paint(field, centers[part], widths[part])
-    if noise:
-        shaken = torch.randn(field.shape, generator=generator, dtype=torch.float64).to(dtype)
-        inner = (slice(1, -1),) * 3  # the border stays outside
-        field[inner] += noise * shaken[inner] * (field[inner] < 1 + 3 * noise)
-    return marching_cubes(field, origin.to(dtype), spacing)
-
-
-def _paint(field: Tensor, centers: Tensor, radii: Tensor) -> None:
-    """Lower a field (X, Y, Z), in place, to the signed distance to balls (N, 3), up to the reach outside of them."""
-    half = math.ceil(float(radii.max())) + _PAINTING.reach
-    reach = torch.arange(-half, half + 1)
-    offsets = torch.stack(torch.meshgrid(reach, reach, reach, indexing="ij"), -1).reshape(-1, 3)
-    cells = centers.round().long().unsqueeze(1) + offsets
-    distance = (cells - centers.unsqueeze(1)).norm(dim=-1) - radii.unsqueeze(-1)
-    sizes = torch.tensor(field.shape)
-    within = ((cells >= 0) & (cells < sizes)).all(-1)
-    flat = cells[within] @ torch.tensor([field.shape[1] * field.shape[2], field.shape[2], 1])
-    field.view(-1).scatter_reduce_(0, flat, distance[within], "amin")

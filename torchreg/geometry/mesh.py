@@ -230,6 +230,8 @@ def even_samples(mesh: TriangleMesh, count: int) -> tuple[Tensor, Tensor]:
     return interpolate(mesh.vertices, mesh.faces, face, weights), face
 
 
+# Three numbers below it make one of 63 bits.
+_MOST_KEYED = 2**21
 # Powers of the inverse of the plastic number.
 _R2_STEPS = (0.7548776662466927, 0.5698402909980532)
 
@@ -273,12 +275,18 @@ def unit_sphere(subdivisions: int = 3, *, dtype: torch.dtype | None = None) -> T
 
 def distinct_faces(faces: Tensor) -> Tensor:
     """Return the faces (F, 3) with three different corners, each once."""
-    low, middle, high = faces.sort(dim=1).values.unbind(1)
+    first, second, third = faces.unbind(1)
+    low, high = (combine(combine(first, second), third) for combine in (torch.minimum, torch.maximum))
+    middle = first + second + third - low - high
     proper = (low != middle) & (middle != high)
     faces, low, middle, high = (values[proper] for values in (faces, low, middle, high))
     if len(faces) == 0:
         return faces
     count = int(high.max()) + 1
+    if count < _MOST_KEYED:
+        keys = ((low * count + middle) * count + high).sort().values
+        if not bool((keys[1:] == keys[:-1]).any()):
+            return faces
     # Two numbers per face instead of three: three might not fit into 64 bits.
     pair = (low * count + middle).unique(return_inverse=True)[1]
     key, order = (pair * count + high).sort(stable=True)

@@ -13,6 +13,8 @@ from torchreg.geometry.mesh import TriangleMesh, distinct_faces
 from torchreg.geometry.neighbors import NeighborTree, weld
 
 PIECES = ("largest", "bridge", "error")
+# How the note begins on pieces that are left out and large.
+ANOTHER_BODY = "another body left out"
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,8 @@ class _Repair:
 
     # Share of the faces below which a piece is dust: never bridged to, and no reason for an error.
     dust: float = 1e-3
+    # Area of a piece, in those of the largest one, from which on it is a body of its own rather than a fragment.
+    body: float = 0.5
     # Pieces with the nearest boxes to which bridges are searched.
     near_pieces: int = 12
     # Edge of a cell whose vertices are merged, in square roots of the wanted area per vertex.
@@ -55,10 +59,26 @@ def unique_edges(faces: Tensor) -> tuple[Tensor, Tensor]:
     """
     if faces.numel() == 0:
         return faces.new_zeros(0, 2), faces
-    sides = torch.stack((faces, faces.roll(-1, dims=1)), dim=-1)
-    count = int(faces.max()) + 1
-    keys, which = (sides.amin(-1) * count + sides.amax(-1)).unique(return_inverse=True)
+    keys, count = _edge_keys(faces)
+    keys, which = keys.unique(return_inverse=True)
     return torch.stack((keys // count, keys % count), dim=-1), which
+
+
+def _edge_keys(faces: Tensor) -> tuple[Tensor, int]:
+    """Return a number for each edge 01, 12, 20 (F, 3) of triangles: the smaller index times a count, and the larger."""
+    following, count = faces.roll(-1, dims=1), int(faces.max()) + 1
+    return torch.minimum(faces, following) * count + torch.maximum(faces, following), count
+
+
+def _is_closed(faces: Tensor, keys: Tensor) -> bool:
+    """Return whether every edge (F, 3) of triangles is used as often in one direction as in the other.
+
+    Edges have pseudo-random numbers, added in one direction and subtracted in the other: a sum of zero tells, without
+    sorting, but for one chance in 2^64. False also of closed surfaces whose triangles are not wound alike.
+    """
+    numbers = keys * -7046029254386353131  # the odd integer nearest to 2^64 over the golden ratio, as a signed one
+    numbers = (numbers ^ (numbers >> 29)) * numbers
+    return int(torch.where(faces < faces.roll(-1, dims=1), numbers, -numbers).sum()) == 0
 
 
 def one_piece(mesh: TriangleMesh, pieces: str = "largest") -> OnePiece:
@@ -82,15 +102,16 @@ def one_piece(mesh: TriangleMesh, pieces: str = "largest") -> OnePiece:
     faces = position[mesh.faces.cpu()]
     if not bool((faces != faces.roll(1, dims=1)).all(1).any()):
         raise InputError(f"mesh must have a triangle with three different corners, got {mesh.num_faces} faces without")
-    if not float(TriangleMesh(mesh.vertices.detach().cpu().double(), mesh.faces.cpu()).face_areas().sum()) > 0:
-        raise InputError("mesh must have a surface, got triangles without area")
     # A face used twice would make its edges look shared.
     faces = distinct_faces(faces)
     original = torch.zeros(int(position.max()) + 1, dtype=torch.int64)
     original = original.index_copy(0, position, torch.arange(len(position)))
     vertices = mesh.vertices.detach().cpu().double()[original]
-    faces, kept, notes, labels = _kept_pieces(vertices, faces, pieces)
-    used, faces = faces.unique(return_inverse=True)
+    areas = TriangleMesh(vertices, faces).face_areas()
+    if not float(areas.sum()) > 0:
+        raise InputError("mesh must have a surface, got triangles without area")
+    faces, kept, notes, labels = _kept_pieces(vertices, faces, areas, pieces)
+    used, faces = _used_vertices(faces, len(vertices))
     vertices, original = vertices[used], original[used]
     bridges = _bridges(vertices, labels[used], kept) if kept > 1 else faces.new_zeros(0, 2)
     if kept > 1:
@@ -100,6 +121,13 @@ def one_piece(mesh: TriangleMesh, pieces: str = "largest") -> OnePiece:
         notes += (f"{holes} hole(s) closed",)
     original = torch.cat((original, original.new_full((holes,), -1)))
     return OnePiece(TriangleMesh(vertices, faces), original, bridges, notes)
+
+
+def _used_vertices(faces: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Return the vertices (M,) of a number that faces (F, 3) use, ascending, and the faces in terms of these."""
+    flags = torch.zeros(count, dtype=torch.bool)
+    flags[faces.reshape(-1)] = True
+    return flags.nonzero()[:, 0], (flags.cumsum(0) - 1)[faces]
 
 
 def coarsened(mesh: TriangleMesh, count: int) -> TriangleMesh:
@@ -125,8 +153,11 @@ def coarsened(mesh: TriangleMesh, count: int) -> TriangleMesh:
     cells = ((vertices - vertices.amin(0)) / size).floor().long()
     number = cells.amax(0) + 1
     cell = (cells[:, 0] * number[1] + cells[:, 1]) * number[2] + cells[:, 2]
-    edges, _ = unique_edges(faces)
-    edges = edges[cell[edges[:, 0]] == cell[edges[:, 1]]]
+    # Each edge of a closed surface belongs to two triangles: only those within a cell are made unique.
+    sides = torch.stack((faces, faces.roll(-1, dims=1)), dim=-1).reshape(-1, 2)
+    sides = sides[cell[sides[:, 0]] == cell[sides[:, 1]]]
+    keys = (torch.minimum(*sides.unbind(1)) * len(vertices) + torch.maximum(*sides.unbind(1))).unique()
+    edges = torch.stack((keys // len(vertices), keys % len(vertices)), dim=-1)
     patch = connected_components(edges, len(vertices))
     inner = patch[faces[(patch[faces] == patch[faces[:, :1]]).all(1), 0]]
     most = int(patch.max()) + 1
@@ -140,12 +171,14 @@ def coarsened(mesh: TriangleMesh, count: int) -> TriangleMesh:
     return TriangleMesh(total / torch.bincount(patch)[:, None], faces)
 
 
-def _kept_pieces(vertices: Tensor, faces: Tensor, pieces: str) -> tuple[Tensor, int, tuple[str, ...], Tensor]:
+def _kept_pieces(
+    vertices: Tensor, faces: Tensor, areas: Tensor, pieces: str
+) -> tuple[Tensor, int, tuple[str, ...], Tensor]:
     """Return the faces of the pieces to keep, the number of these, notes and the piece (V,) of each vertex."""
     labels = connected_components(torch.cat((faces[:, :2], faces[:, 1:])), len(vertices))
     piece = labels[faces[:, 0]]
     number = torch.bincount(piece)
-    areas = torch.bincount(piece, TriangleMesh(vertices, faces).face_areas(), minlength=len(number))
+    areas = torch.bincount(piece, areas, minlength=len(number))
     large = number >= _REPAIR.dust * len(faces)
     count = int(large.sum())
     if count > 1 and pieces == "error":
@@ -153,8 +186,15 @@ def _kept_pieces(vertices: Tensor, faces: Tensor, pieces: str) -> tuple[Tensor, 
         raise InputError(f"mesh must be one piece, got {count} (area {shares}); choose pieces='largest' or 'bridge'")
     keep = large if pieces == "bridge" else torch.arange(len(number)) == areas.argmax()
     dropped = int((number > 0).sum()) - int(keep.sum())
-    notes = (f"{dropped} fragment(s) left out, {1 - float(number[keep].sum()) / len(faces):.2%} of the faces",)
-    return faces[keep[piece]], int(keep.sum()), notes if dropped else (), labels
+    notes: tuple[str, ...] = (
+        f"{dropped} fragment(s) left out, {1 - float(number[keep].sum()) / len(faces):.2%} of the faces",
+    )
+    if not dropped:
+        return faces[keep[piece]], int(keep.sum()), (), labels
+    share = float((areas[~keep].max() / areas[keep].max()).nan_to_num())
+    if share >= _REPAIR.body:
+        notes += (f"{ANOTHER_BODY}, with {share:.0%} of the area of the one that is kept",)
+    return faces[keep[piece]], int(keep.sum()), notes, labels
 
 
 def _bridges(vertices: Tensor, labels: Tensor, count: int) -> Tensor:
@@ -192,11 +232,14 @@ def close_holes(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, int]:
 
     The means come after the old vertices, in no particular order.
     """
-    sides, which = unique_edges(faces)
-    rim = torch.bincount(which.reshape(-1), minlength=len(sides)) == 1
-    if not bool(rim.any()):
+    keys, _ = _edge_keys(faces)
+    if _is_closed(faces, keys):
         return vertices, faces, 0
-    face, corner = rim[which].nonzero().unbind(1)
+    ordered = torch.nn.functional.pad(keys.reshape(-1).sort().values, (1, 1), value=-1)
+    rim = ordered[1:-1][(ordered[1:-1] != ordered[:-2]) & (ordered[1:-1] != ordered[2:])]
+    if not len(rim):
+        return vertices, faces, 0
+    face, corner = torch.isin(keys, rim).nonzero().unbind(1)
     edges = torch.stack((faces[face, corner], faces[face, (corner + 1) % 3]), dim=-1)
     around, ends = edges.unique(return_inverse=True)
     label = connected_components(ends, len(around))

@@ -16,8 +16,9 @@ from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.geometry.upright import guess_up
-from torchreg.result import Status
+from torchreg.spines.frame_notes import frame_notes, told_statuses
 from torchreg.spines.frame_skeletons import FrameSkeleton, skeletonize_frames
+from torchreg.spines.growing_spine import growing_spine
 from torchreg.spines.labeled_tree import LimbGraph, most_frequent_splits, skeleton_splits
 from torchreg.spines.limb_transfer import complete_from_prior, transfer_missing_limbs, transported_frames
 from torchreg.spines.name_chain import TipNames
@@ -31,6 +32,7 @@ from torchreg.spines.observed_limbs import (
     smooth_rough_limbs,
 )
 from torchreg.spines.paper.rigid_tracking import track_tips_rigidly
+from torchreg.spines.passed_over import check_sizes, frames_to_pass_over, with_frames_between
 from torchreg.spines.prior import PriorSkeleton
 from torchreg.spines.results import SpineRecord, SpineSequence
 from torchreg.spines.skeletonize import SkeletonizeConfig
@@ -77,11 +79,21 @@ class SpineConfig:
         """
         return replace(cls(skeletons=SkeletonizeConfig(printed=True), printed=True), **changes)
 
+    @classmethod
+    def growing(cls, **changes: Any) -> SpineConfig:
+        """Return spines of things that grow: half as large protrusions are limbs, as time tells them from noise.
+
+        Args:
+            changes: fields by name.
+        """
+        return replace(cls(skeletons=SkeletonizeConfig(min_protrusion=0.025)), **changes)
+
 
 def extract_spine(
     meshes: Sequence[TriangleMesh | Tensor],
     *,
     prior: Skeleton | SpineSequence | None = None,
+    growing: bool = False,
     times: Tensor | None = None,
     config: SpineConfig | None = None,
     workers: int | None = None,
@@ -104,23 +116,31 @@ def extract_spine(
     fits, in the frame that it fits best. It may be of any size, anywhere and in another pose. Tips that it lacks are
     left out; a limb that no frame shows is the prior's, moved with the others and into the body.
 
+    Of things that grow (``growing``), like plants, K is the number of all organs that are ever there. Each has its
+    birth and its end; names are those of the tracks that explain the tips of all frames best, see `track_organs`. The
+    graph is the tree of all organs, which agrees with most of what frames show. Limbs have no length before and after
+    their lives (`Spine`), and `SpineSequence.curves` and `tips` are NaN there.
+
     Args:
         meshes: T surfaces, of any numbers of vertices, in one unit; or points (N, 3) of them, clouds or scans without
             faces, see `skeletonize`.
         prior: a skeleton with all limbs, or another spine, whose names (numbers of tips) and graph are kept.
+        growing: whether tips may appear and end.
         times: (T,) of the frames, strictly increasing; 0, 1, 2, ... by default.
-        config: see `SpineConfig`.
+        config: see `SpineConfig`; by default `SpineConfig.growing()` of what grows.
         workers: processes for the skeletons; by default one per core.
         on_step: called with every frame that is skeletonized.
         progress: folder in which skeletons are kept, so that a call that was interrupted goes on where it ended.
 
     Returns:
-        A `SpineSequence`; `warnings` tell the irregularities frame by frame.
+        A `SpineSequence`; `warnings` tell the irregularities frame by frame. Frames without a body, or with another
+        one that is half as large or more, are passed over if most are not so: limbs are interpolated in time.
 
     Raises:
         InputError: if there is no frame, one of them has no surface (names it), no frame shows ``num_tips`` limbs,
-            ``times`` do not fit, the prior has fewer tips than most frames and ``num_tips`` does not say so, or a prior
-            is given to the paper's way.
+            ``times`` do not fit, the prior has fewer tips than most frames and ``num_tips`` does not say so, a prior
+            is given to the paper's way, a prior, ``num_tips`` or the paper's way to what grows, or a frame is eight
+            times as large or small as most, as of another unit.
         InputTypeError: if something else than meshes is given, or another prior than a skeleton or a spine.
         SolverError: if a worker process is killed twice.
 
@@ -131,19 +151,31 @@ def extract_spine(
 
     References: Brostow, Essa, Steedly and Kwatra 2004; a prior skeleton is its section 6's.
     """
-    config = config or SpineConfig()
+    config = config or (SpineConfig.growing() if growing else SpineConfig())
     surfaces, told = _check_surfaces(meshes)
-    _check_settings(config, prior, workers)
+    _check_settings(config, prior, workers, growing=growing)
     origin = far_origin([mesh.vertices for mesh in surfaces])
     if origin is not None:
         surfaces = [TriangleMesh(mesh.vertices - origin.to(mesh.vertices), mesh.faces) for mesh in surfaces]
+    check_sizes(surfaces, growing=growing)
     known = None if prior is None else PriorSkeleton.from_given(prior, config.num_tips)
     first = surfaces[0].vertices
     warn_about_rounding(first, "meshes", float((first.amax(0) - first.amin(0)).norm()), stacklevel=2)
     with torch.no_grad():
         # Section 4.1: the second factor of eq. 3, frame by frame.
         found = skeletonize_frames(surfaces, config.skeletons, workers=workers, on_step=on_step, progress=progress)
-    spine = _joined_spine(surfaces, found, told, known, times, config)
+    passed = frames_to_pass_over([skeleton for skeleton, _ in found])
+    kept = [number for number in range(len(found)) if number not in passed]
+    when = torch.arange(len(found)).to(first) if times is None else times
+    if passed:
+        surfaces, told, times = [surfaces[number] for number in kept], [told[number] for number in kept], when[kept]
+    shown = [found[number] for number in kept]
+    if growing:
+        spine = growing_spine(surfaces, shown, told, times, config.num_samples)
+    else:
+        spine = _joined_spine(surfaces, shown, told, known, times, config)
+    if passed:
+        spine = with_frames_between(spine, kept, when, {number: found[number][0] for number in passed})
     return spine if origin is None else spine.moved(origin)
 
 
@@ -179,26 +211,24 @@ def _joined_spine(
         topologies=tuple(topologies),
         own_topologies=tuple(skeleton.topology for skeleton in skeletons),
         up=guess_up([surface.vertices for surface in surfaces]),
-        **_told([_notes(*rows) for rows in zip(skeletons, told, shown, own, strict=True)]),
+        **told_statuses(
+            [frame_notes(*rows) for rows in zip(skeletons, told, shown.sum(1).tolist(), ~shown, ~own, strict=True)]
+        ),
     )
 
 
-def _told(notes: Sequence[Sequence[str]]) -> dict[str, Any]:
-    """Return the statuses of the frames and of all, and the warnings, from the notes on each frame."""
-    return {
-        "statuses": tuple(Status.WITH_WARNINGS if rows else Status.CONVERGED for rows in notes),
-        "status": Status.WITH_WARNINGS if any(notes) else Status.CONVERGED,
-        "warnings": tuple(f"frame {frame}: {row}" for frame, rows in enumerate(notes) for row in rows),
-    }
-
-
-def _check_settings(config: SpineConfig, prior: Skeleton | SpineSequence | None, workers: int | None) -> None:
+def _check_settings(
+    config: SpineConfig, prior: Skeleton | SpineSequence | None, workers: int | None, *, growing: bool
+) -> None:
     if workers is not None:
         check_count(workers, "workers", 1)
     if prior is not None and config.printed:
         raise InputError(
             "prior cannot be used by SpineConfig.paper(), which knows of none; leave it out, or use SpineConfig()"
         )
+    if growing and (prior is not None or config.num_tips is not None or config.printed):
+        what = "prior" if prior is not None else "SpineConfig.paper()" if config.printed else "num_tips"
+        raise InputError(f"growing=True cannot be used with {what}, which fixes the number of limbs; leave out either")
 
 
 def _check_surfaces(meshes: Sequence[TriangleMesh | Tensor]) -> tuple[list[TriangleMesh], list[tuple[str, ...]]]:
@@ -266,21 +296,3 @@ def _all_limbs(
         limbs = prior.limbs(frames[0].curves.shape[1])
         frames = complete_from_prior(frames, graph, meshes, limbs, reference)
     return transfer_missing_limbs(frames, graph, meshes)
-
-
-def _notes(skeleton: Skeleton, notes: Sequence[str], found: Tensor, observed: Tensor) -> list[str]:
-    """Return the irregularities of a frame, given which tips (K,) were found and which limbs (L,) observed."""
-    rows = [*notes, *skeleton.notes]
-    superfluous = len(skeleton.tips) - int(found.sum())
-    if superfluous > 0:
-        rows.append(f"{superfluous} superfluous tip(s) left out")
-    if not bool(found.all()):
-        rows.append(f"tips {_true_numbers(~found)} not found")
-    if not bool(observed.all()):
-        rows.append(f"limbs {_true_numbers(~observed)} carried over from other frames")
-    return rows
-
-
-def _true_numbers(flags: Tensor) -> str:
-    """Return the numbers of flags (n,) that are True, as a list in words."""
-    return ", ".join(str(number) for number in flags.nonzero()[:, 0].tolist())

@@ -7,9 +7,10 @@ import multiprocessing
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import astuple
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +35,8 @@ _RELATIONS = ("geodesics", "volumes")
 _Packed = tuple[dict[str, np.ndarray[Any, Any]], tuple[str, ...], float]
 # A skeleton and the relations of its tips along the surface.
 FrameSkeleton = tuple[Skeleton, TipRelations]
-# What a forked process works on, set in that process alone: it inherits them, so that no surface is copied.
-_meshes: Sequence[TriangleMesh] = ()
+# Surfaces that wait for each process: it is never idle, and few are copied at a time.
+_QUEUED = 2
 
 
 def skeletonize_frames(
@@ -123,26 +124,36 @@ def _forked(
     meshes: Sequence[TriangleMesh], config: SkeletonizeConfig, frames: Sequence[int], count: int
 ) -> Iterator[tuple[int, _Packed]]:
     """Yield frames and their skeletons, computed by a number of forked processes."""
-    context = multiprocessing.get_context("fork")
-    with ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker, initargs=(meshes,)) as pool:
-        waiting = {pool.submit(_compute_forked, frame, config): frame for frame in frames}
+    context, remaining = multiprocessing.get_context("fork"), iter(frames)
+    with ProcessPoolExecutor(count, mp_context=context, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+
+        def submitted(most: int) -> dict[Future[_Packed], int]:
+            # Arrays, which pass between processes without shared memory.
+            return {
+                pool.submit(_compute_packed, *_packed(meshes[frame]), frame, config): frame
+                for frame in islice(remaining, most)
+            }
+
+        waiting = submitted(count * _QUEUED)
         try:
-            for future in as_completed(waiting):
-                yield waiting[future], future.result()
+            while waiting:
+                for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                    frame = waiting.pop(future)
+                    waiting |= submitted(1)
+                    yield frame, future.result()
         finally:
             for future in waiting:
                 future.cancel()
 
 
-def _start_worker(meshes: Sequence[TriangleMesh]) -> None:
-    """Prepare a forked process, whose arguments are inherited rather than copied."""
-    global _meshes
-    _meshes = meshes
-    torch.set_num_threads(1)
+def _packed(mesh: TriangleMesh) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    return mesh.vertices.detach().numpy(), mesh.faces.numpy()
 
 
-def _compute_forked(frame: int, config: SkeletonizeConfig) -> _Packed:
-    return _compute(_meshes[frame], frame, config)
+def _compute_packed(
+    vertices: np.ndarray[Any, Any], faces: np.ndarray[Any, Any], frame: int, config: SkeletonizeConfig
+) -> _Packed:
+    return _compute(TriangleMesh(torch.tensor(vertices), torch.tensor(faces)), frame, config)
 
 
 def _compute(mesh: TriangleMesh, frame: int, config: SkeletonizeConfig) -> _Packed:

@@ -28,6 +28,8 @@ class SpineMeasurements:
         pairs: (A, 2) limbs that meet in a junction.
         angles: (T, A) between them, radians: of the directions from the junction to a third of each limb; NaN where a
             limb has no length.
+
+    Of what grows, numbers are NaN where a limb is not there.
     """
 
     times: Tensor
@@ -74,9 +76,10 @@ def measure_limbs(curves: Tensor, radii: Tensor, graph: Tensor, times: Tensor) -
     sine, cosine = torch.linalg.cross(first, second, dim=-1).norm(dim=-1), (first * second).sum(-1)
     known = (first.norm(dim=-1) > 0) & (second.norm(dim=-1) > 0)
     angles = torch.where(known, torch.atan2(sine, cosine), torch.nan)
+    absent = curves.isnan().flatten(2).any(-1)
     return SpineMeasurements(
         times=times,
-        lengths=curve_lengths(curves),
+        lengths=torch.where(absent, torch.nan, curve_lengths(curves)),
         radii=radii.mean(-1),
         pairs=pairs.to(graph.device),
         angles=angles,

@@ -196,11 +196,11 @@ class NameModel:
             turns.append(float(turn))
         mean_turn = (sum(turns) + PRIORS.turn_samples * PRIORS.turn) / (len(turns) + PRIORS.turn_samples)
         squares = torch.stack((torch.cat(moved), torch.cat(still))) if moved else torch.zeros(2, 0)
-        displacement = _mixture_scales(squares) if squares.numel() else self.displacement
+        displacement = mixture_scales(squares) if squares.numel() else self.displacement
         return {"displacement": displacement, "turn": max(mean_turn, PRIORS.noise)}
 
 
-def _mixture_scales(squares: Tensor) -> Tensor:
+def mixture_scales(squares: Tensor) -> Tensor:
     """Return the scales (S,) of t-distributed displacements of which each has one of two squared lengths (2, n, S)."""
     scale = (squares.amin(0).median(0).values / 3).sqrt().clamp_min(PRIORS.min_displacement)
     for _ in range(TAILS.num_rounds):

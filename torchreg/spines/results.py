@@ -8,6 +8,8 @@ from typing import ClassVar
 
 from torch import Tensor
 
+from torchreg.errors import InputError
+from torchreg.geometry.skeleton import Skeleton
 from torchreg.result import Result, Status, stored_as
 from torchreg.spines.measurements import SpineMeasurements, measure_limbs
 from torchreg.spines.spine import Spine
@@ -58,13 +60,18 @@ class SpineSequence(Result):
         origin: (3,) float64 about which it was computed, where the surfaces, in float64, lie far from that of
             coordinates; None elsewhere.
         confidence: (T, K) probability, given all frames, that a name is right: that of the tip, or where the frame's
-            own skeleton lacks the tip, that it does. None in files of earlier releases.
+            own skeleton lacks the tip, that it does. None in files of earlier releases. NaN where an organ of
+            what grows is not there.
         up: the likely upright direction, for pictures, see `geometry.upright.guess_up`.
+        births: (K,) first frame of each tip of what grows; None of what does not. Outside of a limb's life `curves`,
+            `frames`, `tips` and `confidence` are NaN; those of the model have no length there.
+        ends: (K,) last frame of each tip of what grows.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
         "graph": "L 2", "curves": "T L S 3", "radii": "T L S", "frames": "T L S 3 3", "times": "T", "found": "T K",
         "confidence": "T K", "own": "T L", "topologies": "T", "own_topologies": "T", "statuses": "T",
+        "births": "K", "ends": "K",
     }  # fmt: skip
 
     model: Spine = field(metadata=stored_as(Spine.record, Spine.from_record))
@@ -84,12 +91,18 @@ class SpineSequence(Result):
     origin: Tensor | None = None
     confidence: Tensor | None = None
     up: tuple[float, float, float] | None = None
+    births: Tensor | None = None
+    ends: Tensor | None = None
 
     def moved(self, origin: Tensor) -> SpineSequence:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
         curves = self.curves.double() + origin
         radii, frames = self.radii.double(), self.frames.double()
-        model = Spine(curves, self.graph, radii=radii, frames=frames, times=self.times.double())
+        own = self.model.record()
+        model = Spine(
+            own.curves.double() + origin, self.graph, radii=own.radii.double(), frames=own.frames.double(),
+            times=self.times.double(),
+        )  # fmt: skip
         return replace(self, model=model, curves=curves, radii=radii, frames=frames, origin=origin)
 
     def local(self) -> SpineSequence:
@@ -112,6 +125,17 @@ class SpineSequence(Result):
         flat = self.graph.reshape(-1)
         first = [int((flat == node).nonzero()[0, 0]) for node in range(self.num_tips, len(self.graph) + 1)]
         return self.curves[:, :, [0, -1]].flatten(1, 2)[:, first]
+
+    def skeleton(self, frame: int) -> Skeleton:
+        """Return the limbs that are there in a frame as a tree of nodes with radii and frames.
+
+        Raises:
+            InputError: if there is no such frame.
+        """
+        if not 0 <= frame < len(self.curves):
+            raise InputError(f"frame must be from 0 to {len(self.curves) - 1}, got {frame}")
+        there = ~self.curves[frame].isnan().flatten(1).any(1)
+        return self.model.skeleton(float(self.times[frame]), there)
 
     def measurements(self) -> SpineMeasurements:
         """Return the lengths, radii and angles of the limbs over time, which can be written as a table."""

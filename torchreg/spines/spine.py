@@ -161,13 +161,20 @@ class Spine(nn.Module):
         mixed = self.rest_frames[index] + share * (self.rest_frames[after] - self.rest_frames[index])
         return align_frames(nearest_rotation(mixed), tangents(self(t)))
 
-    def skeleton(self, t: float) -> Skeleton:
-        """Return the curves at one time as a tree of nodes with radii and frames."""
+    def skeleton(self, t: float, limbs: Tensor | None = None) -> Skeleton:
+        """Return the curves at one time as a tree of nodes with radii and frames.
+
+        Args:
+            t: see `forward`.
+            limbs: (L,) bool, those that are wanted, which make a tree; all by default.
+        """
         with torch.no_grad():
-            nodes = self.nodes_at(t)
-            steps = torch.stack((self.limb_nodes[:, :-1], self.limb_nodes[:, 1:]), dim=-1).reshape(-1, 2)
-            radii = gather_nodes(self.radii(t)[None], self.limb_nodes)[0]
-            return Skeleton(nodes, steps, radii, frames=gather_nodes(self.frames(t)[None], self.limb_nodes)[0])
+            chains = self.limb_nodes if limbs is None else self.limb_nodes[limbs]
+            kept, places = chains.unique(return_inverse=True)
+            steps = torch.stack((places[:, :-1], places[:, 1:]), dim=-1).reshape(-1, 2)
+            radii = gather_nodes(self.radii(t)[None], self.limb_nodes)[0, kept]
+            frames = gather_nodes(self.frames(t)[None], self.limb_nodes)[0, kept]
+            return Skeleton(self.nodes_at(t)[kept], steps, radii, frames=frames)
 
     def lengths(self, t: float | Tensor) -> Tensor:
         """Return the lengths (..., L) of the limbs at times ``t`` (...,)."""

@@ -147,10 +147,12 @@ def _lines(value: Any, frame: int) -> tuple[Array, Array, Array] | None:
     if not isinstance(value, SpineSequence):
         return None
     curves = value.curves[_in(frame, len(value.curves))]
+    there = ~curves.isnan().flatten(1).any(1)
+    hues, curves = bone_palette(len(curves))[there], curves[there]
     limbs, samples = curves.shape[:2]
     index = torch.arange(limbs * samples).reshape(limbs, samples)
     edges = torch.stack([index[:, :-1], index[:, 1:]], dim=-1).reshape(-1, 2)
-    colors = bone_palette(limbs).repeat_interleave(samples - 1, dim=0)
+    colors = hues.repeat_interleave(samples - 1, dim=0)
     return _array(curves.reshape(-1, 3)), _array(edges), _opaque(colors)
 
 

@@ -210,7 +210,9 @@ def _sequence_scene(result: SequenceRegistration, shape: None, data: Data) -> Sc
 def _spine_scene(result: SpineSequence, shape: None, data: Data) -> Scene:
     paint = bone_palette(len(result.graph))
     tips = tuple(str(number) for number in range(result.num_tips))
-    layers: list[Layer] = [Curves("limbs", result.curves, paint, labels=tips, thickness=0.009)]
+    # Organs that are not there have no length.
+    curves = torch.where(result.curves.isnan(), result.model(result.times).detach(), result.curves)
+    layers: list[Layer] = [Curves("limbs", curves, paint, labels=tips, thickness=0.009)]
     if data and len(data) != len(result.curves):
         raise InputError(f"data must hold one surface per frame ({len(result.curves)}), got {len(data)}")
     layers += _surface_frames(data)

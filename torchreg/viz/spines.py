@@ -59,6 +59,8 @@ def draw_spine_frame(
     picture[..., 3] *= _STYLE.opacity
     draw_rendered(ax, picture, view)
     for limb, (curve, color) in enumerate(zip(curves, bone_palette(len(curves)).tolist(), strict=True)):
+        if bool(curve.isnan().any()):
+            continue  # an organ that is not there
         pixels, _ = view.project(curve)
         style = "-" if transferred is None or not bool(transferred[limb]) else "--"
         ax.plot(*pixels.mT.numpy(), style, color=color, linewidth=2.2, zorder=2)

@@ -1,0 +1,65 @@
+"""Surfaces of unions of balls, meshed from voxels on randomly shifted grids."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg.geometry.marching_cubes import marching_cubes
+from torchreg.geometry.mesh import TriangleMesh
+
+
+@dataclass(frozen=True)
+class _Painting:
+    """Filling of voxels."""
+
+    reach: int = 3  # voxels outside of the surface up to which the field is known
+    batch: int = 24  # balls of nearly one radius that are painted at a time
+
+
+_PAINTING = _Painting()
+
+
+def ball_surface(
+    balls: Tensor, sizes: Tensor, resolution: int, noise: float, generator: torch.Generator, dtype: torch.dtype
+) -> TriangleMesh:
+    """Return the surface around balls, meshed on a randomly shifted grid.
+
+    Args:
+        balls: (N, 3) their centers, float64.
+        sizes: (N,) their radii.
+        resolution: voxels along the longest side of the box.
+        noise: standard deviation of the field at each voxel, in voxels.
+        generator: of the shift and the noise.
+        dtype: of the mesh.
+    """
+    lower, upper = (balls - sizes[:, None]).amin(0), (balls + sizes[:, None]).amax(0)
+    spacing = float((upper - lower).max()) / resolution
+    origin = lower - spacing * (2 + torch.rand(3, generator=generator, dtype=lower.dtype))
+    counts = ((upper - origin) / spacing).ceil().long() + 3
+    # In steps of the grid: numbers of one size, so that float32 serves.
+    centers, widths = ((balls - origin) / spacing).to(dtype), (sizes / spacing).to(dtype)
+    field = torch.full(tuple(counts.tolist()), float(_PAINTING.reach), dtype=dtype)
+    for part in widths.argsort().split(_PAINTING.batch):
+        _paint(field, centers[part], widths[part])
+    if noise:
+        shaken = torch.randn(field.shape, generator=generator, dtype=torch.float64).to(dtype)
+        inner = (slice(1, -1),) * 3  # the border stays outside
+        field[inner] += noise * shaken[inner] * (field[inner] < 1 + 3 * noise)
+    return marching_cubes(field, origin.to(dtype), spacing)
+
+
+def _paint(field: Tensor, centers: Tensor, radii: Tensor) -> None:
+    """Lower a field (X, Y, Z), in place, to the signed distance to balls (N, 3), up to the reach outside of them."""
+    half = math.ceil(float(radii.max())) + _PAINTING.reach
+    reach = torch.arange(-half, half + 1)
+    offsets = torch.stack(torch.meshgrid(reach, reach, reach, indexing="ij"), -1).reshape(-1, 3)
+    cells = centers.round().long().unsqueeze(1) + offsets
+    distance = (cells - centers.unsqueeze(1)).norm(dim=-1) - radii.unsqueeze(-1)
+    sizes = torch.tensor(field.shape)
+    within = ((cells >= 0) & (cells < sizes)).all(-1)
+    flat = cells[within] @ torch.tensor([field.shape[1] * field.shape[2], field.shape[2], 1])
+    field.view(-1).scatter_reduce_(0, flat, distance[within], "amin")
