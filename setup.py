@@ -20,7 +20,8 @@ setup(
     ],
     package_dir={EXPERIMENTS: "experiments", **CONFIGS},
     package_data={
-        "torchreg": ["py.typed", "*.pyi", "registration/dense/*.json", "registration/dense/*.safetensors"],
+        # With the weights of networks, wherever they stand.
+        "torchreg": ["py.typed", "*.pyi", "**/*.json", "**/*.safetensors"],
         EXPERIMENTS: ["report/*.j2", "papers/*.j2"],
         **{name: ["*.yaml"] for name in CONFIGS},
     },

@@ -23,7 +23,7 @@ _NAMES = {
     "alignment.results": "AlignResult BaseCalibration Calibration PoseStarts",
     "alignment.sigma_schedule": "SigmaSchedule",
     "alignment.skeleton_source": "SpineLimbs",
-    "alignment.train_initializer": "TrainInitializerConfig TrainingRow train_initializer",
+    "alignment.train_initializer": "TrainingRow TrainInitializerConfig train_initializer",
     "capture.depth": "depth_scan fuse_scans load_depth_scan",
     "capture.depth_frame": "DepthFrame",
     "capture.silhouette_frames": "SilhouetteFrames",

@@ -20,8 +20,8 @@ from torchreg.alignment.results import Calibration as Calibration
 from torchreg.alignment.results import PoseStarts as PoseStarts
 from torchreg.alignment.sigma_schedule import SigmaSchedule as SigmaSchedule
 from torchreg.alignment.skeleton_source import SpineLimbs as SpineLimbs
-from torchreg.alignment.train_initializer import TrainInitializerConfig as TrainInitializerConfig
 from torchreg.alignment.train_initializer import TrainingRow as TrainingRow
+from torchreg.alignment.train_initializer import TrainInitializerConfig as TrainInitializerConfig
 from torchreg.alignment.train_initializer import train_initializer as train_initializer
 from torchreg.capture.depth import depth_scan as depth_scan
 from torchreg.capture.depth import fuse_scans as fuse_scans
