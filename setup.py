@@ -20,7 +20,7 @@ setup(
     ],
     package_dir={EXPERIMENTS: "experiments", **CONFIGS},
     package_data={
-        # With the weights of networks, wherever they stand.
+        # Weights of networks lie beside the modules that read them.
         "torchreg": ["py.typed", "*.pyi", "**/*.json", "**/*.safetensors"],
         EXPERIMENTS: ["report/*.j2", "papers/*.j2"],
         **{name: ["*.yaml"] for name in CONFIGS},

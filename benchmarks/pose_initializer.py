@@ -9,8 +9,13 @@ rotation, each joint bent by up to half its range. A cloud is right if its finge
 average.
 
 - start: from starts that are off by 0.1 rad in every joint and 5 mm in place; clouds per second by size of the batch.
-- scratch: without starts. Bars: 85 % right, and confidence that ranks the failures, AUROC of 0.9. Beside it, without a
-  bar, fingers bent over their full range. The second table says of how many clouds of a confidence are right.
+- proposed: without starts, by the network that comes with torchreg: 600 points, 15 % of them outliers, fingers that
+  curl (`random_hand_pose`), right within 15 mm; clouds per CPU second. Bars: 92 % right, 20 a second.
+- pictures: the same on SHARED/hand_depth, real depth pictures cut to what is within 19 cm of the marked middle
+  fingertip, as in `depth_frames.py`; beside it by the search. ``--data SHARED``; skipped without.
+- scratch: without starts, by a search alone. Bars: 85 % right, and confidence that ranks the failures, AUROC of 0.9.
+  Beside it, without a bar, fingers bent over their full range. The second table says of how many clouds of a
+  confidence are right.
 - roofline: evaluations of a point against a solid per second, beside the exponentials per second that the device
   reaches, one of which each evaluation needs; and the operations that take most time.
 - gradient: of a random function of the keypoints in the points of one whole hand, float64, against central differences
@@ -20,18 +25,21 @@ average.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import torch
+from depth_frames import REACH, marked_tips
 from torch import Tensor
 
 import torchreg as tr
-from torchreg.datasets.hand import make_hand_cloud, surface_skin
+from torchreg.datasets.hand import make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.geometry.rotation import so3_log
 from torchreg.geometry.rotation_representations import rotation_from_quaternion
 
@@ -46,6 +54,9 @@ QUICK = tr.FindPoseConfig(num_candidates=8, num_placed=2, num_searched=1, search
 # Clouds of a profile.
 PROFILED = {"cpu": 8, "cuda": 512}
 BAR_RIGHT, BAR_AUROC, BAR_GRADIENT = 0.85, 0.9, 1e-5
+PICTURE_POINTS = 2000
+PROPOSED_POINTS, PROPOSED_OUTLIERS, PROPOSED_RIGHT = 510, 90, 0.015
+BAR_PROPOSED, BAR_RATE = 0.92, 20.0
 
 
 def draw(
@@ -162,6 +173,57 @@ def from_scratch(
         "auroc_error": auroc_error(area, num_right, count - num_right),
     }
     return figures, found.confidence.cpu(), right.cpu()
+
+
+@torch.no_grad()
+def proposed(hand: tr.Hand, count: int, generator: torch.Generator, device: torch.device) -> dict[str, float]:
+    """Return how good and how fast poses are that a network proposes."""
+    surface, share = surface_skin(hand), PROPOSED_OUTLIERS / (PROPOSED_POINTS + PROPOSED_OUTLIERS)
+    poses = torch.stack([random_hand_pose(hand, generator) for _ in range(count)])
+    clouds = torch.stack([
+        make_hand_cloud(hand, pose, num_points=PROPOSED_POINTS, outlier_ratio=share, camera=torch.zeros(3).to(pose),
+                        skin=surface, generator=generator).points for pose in poses
+    ])  # fmt: skip
+    hand, clouds, poses = hand.to(device), clouds.to(device), poses.to(device)
+    layer = tr.PoseInitializer(hand, tr.PoseInitializerConfig(search="never"))
+    layer(clouds[:2])
+    wall, cpu = now(device), time.process_time()
+    found = layer(clouds)
+    wall, cpu = now(device) - wall, time.process_time() - cpu
+    error = tip_errors(hand, found.pose, poses)
+    right = error <= PROPOSED_RIGHT
+    return {
+        "clouds": float(count),
+        "per_cpu_second": count / cpu,
+        "per_second": count / wall,
+        "median_mm": 1e3 * float(error.median()),
+        "right": float(right.double().mean()),
+        "auroc": auroc(found.confidence, right),
+        "sure": float((found.confidence >= 0.5).double().mean()),
+        "right_if_sure": float(right[found.confidence >= 0.5].double().mean()),
+    }
+
+
+@torch.no_grad()
+def real_pictures(hand: tr.Hand, folder: Path, search: str) -> dict[str, float]:
+    """Return errors of the marked fingertips of real pictures, cut to the hand."""
+    layer, errors = tr.PoseInitializer(hand, tr.PoseInitializerConfig(search=search)), []
+    begin = time.process_time()
+    for name, marks in json.loads((folder / "fingertips_px.json").read_text(encoding="utf-8")).items():
+        frame = tr.DepthFrame.load(folder / f"{name}.png", folder / "camera.json")
+        tips = marked_tips(frame, marks)
+        points = frame.camera.unproject(frame.camera.pixel_grid(), frame.depth.double())
+        cut = points[(frame.depth > 0) & ((points - tips[2]).norm(dim=-1) < REACH)]
+        some = cut[torch.randperm(len(cut), generator=torch.Generator().manual_seed(0))[:PICTURE_POINTS]]
+        errors.append((layer(some).keypoints[TIPS] - tips.to(hand.rest)).norm(dim=-1))
+    error = torch.stack(errors)
+    return {
+        "pictures": float(len(error)),
+        "tips_right": float((error <= PROPOSED_RIGHT).double().mean()),
+        "whole": float((error <= PROPOSED_RIGHT).all(1).sum()),
+        "largest_mm": 1e3 * float(error.max()),
+        "seconds": (time.process_time() - begin) / len(error),
+    }
 
 
 def reliability(confidence: Tensor, right: Tensor) -> str:
@@ -285,13 +347,16 @@ def gradient_error(generator: torch.Generator, num_points: int = NUM_POINTS) -> 
 
 
 def show(case: str, row: dict[str, float]) -> None:
-    print(f"{case:9}" + "  ".join(f"{name} {value:.4g}" for name, value in row.items()), flush=True)
+    print(f"{case:9} " + "  ".join(f"{name} {value:.4g}" for name, value in row.items()), flush=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--clouds", type=int, default=500, help="from scratch, bent half (default 500)")
     parser.add_argument("--full-clouds", type=int, default=100, help="from scratch, bent fully (default 100)")
+    parser.add_argument("--proposed-clouds", type=int, default=200, help="from scratch, by the network (default 200)")
+    parser.add_argument("--only-proposed", action="store_true", help="the parts by the network alone")
+    parser.add_argument("--data", type=Path, help="folder that holds hand_depth; skipped without")
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 8, 64, 512, 4096], help="sizes, from starts")
     parser.add_argument("--threads", type=int, default=2, help="of torch (default 2)")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
@@ -304,7 +369,8 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
         return {}
     torch.set_num_threads(options.threads)
     counts = (1, 1) if options.smoke else (options.clouds, options.full_clouds)
-    config = tr.PoseInitializerConfig(find_pose=QUICK) if options.smoke else tr.PoseInitializerConfig()
+    config = tr.PoseInitializerConfig(search="always")
+    config = replace(config, find_pose=QUICK) if options.smoke else config
     batches = [1, 2] if options.smoke else options.batches
     print(
         f"device {device.type}, {options.threads} threads, seed {options.seed}; right: tips within {1e3 * RIGHT:g} mm"
@@ -316,7 +382,17 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
     def hand() -> tr.Hand:
         return tr.Hand().requires_grad_(False)
 
-    figures = {"gradient": gradient_error(generator(0), 150 if options.smoke else NUM_POINTS)}
+    figures: dict[str, dict[str, float]] = {}
+    figures["proposed"] = proposed(hand(), 4 if options.smoke else options.proposed_clouds, generator(5), device)
+    show("proposed", figures["proposed"])
+    if options.data is None:
+        print("pictures: skipped; pass the folder that holds hand_depth as --data")
+    else:
+        for search in ("never", "doubtful", "always"):
+            show(f"pictures, search {search}", real_pictures(hand(), options.data / "hand_depth", search))
+    if options.only_proposed:
+        return tell_bars(figures)
+    figures["gradient"] = gradient_error(generator(0), 150 if options.smoke else NUM_POINTS)
     show("gradient", figures["gradient"])
     figures["start"] = from_starts(hand(), batches, generator(1), device)
     show("start", figures["start"])
@@ -331,12 +407,22 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
         figures[case], confidence, right = from_scratch(hand(), count, generator(number), device, bend, config)
         show(case, figures[case])
         print(reliability(confidence, right), flush=True)
+    return tell_bars(figures)
+
+
+def tell_bars(figures: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+    """Print which bars are reached, and return the figures."""
     passed = {
-        f"gradient within {BAR_GRADIENT:g}": figures["gradient"]["relative_error"] <= BAR_GRADIENT,
-        f"right from scratch >= {BAR_RIGHT:.0%}": figures["scratch"]["right"] >= BAR_RIGHT,
-        # Without a failure there is nothing to rank.
-        f"AUROC >= {BAR_AUROC:g}": not figures["scratch"]["auroc"] < BAR_AUROC,
+        f"right by the network >= {BAR_PROPOSED:.0%}": figures["proposed"]["right"] >= BAR_PROPOSED,
+        f"clouds per CPU second >= {BAR_RATE:g}": figures["proposed"]["per_cpu_second"] >= BAR_RATE,
     }
+    if "scratch" in figures:
+        passed |= {
+            f"gradient within {BAR_GRADIENT:g}": figures["gradient"]["relative_error"] <= BAR_GRADIENT,
+            f"right from scratch >= {BAR_RIGHT:.0%}": figures["scratch"]["right"] >= BAR_RIGHT,
+            # Without a failure there is nothing to rank.
+            f"AUROC >= {BAR_AUROC:g}": not figures["scratch"]["auroc"] < BAR_AUROC,
+        }
     for bar, reached in passed.items():
         print(f"{bar}: {'pass' if reached else 'FAIL'}")
     return figures

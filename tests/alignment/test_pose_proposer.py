@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.pose_initializer import PoseInitializer, PoseInitializerConfig
-from torchreg.alignment.pose_proposer import PoseProposer, ProposerSize
+from torchreg.alignment.pose_proposer import HAND_WEIGHTS, PoseProposer, ProposerSize
 from torchreg.alignment.train_initializer import TrainInitializerConfig, train_initializer
 from torchreg.datasets.cloud_batches import random_clouds, random_poses
 from torchreg.errors import FormatError, InputError
@@ -32,12 +33,65 @@ def test_poses_are_within_limits_and_points_on_the_posed_surface(plain_hand, clo
 
 
 def test_hands_at_any_rotation_are_found_without_a_search(plain_hand, plain_hand_skin, clouds):
-    layer = PoseInitializer(plain_hand, model_points=plain_hand_skin)
+    layer = PoseInitializer(plain_hand, PoseInitializerConfig(search="never"), model_points=plain_hand_skin)
     with torch.no_grad():
         found = layer(clouds.points, clouds.mask)
     error = (found.keypoints - plain_hand.keypoints(clouds.poses)).norm(dim=-1).mean(-1)
     assert (error < 0.02).double().mean() >= 0.8
     assert ((found.confidence >= 0) & (found.confidence <= 1)).all()
+
+
+def test_a_left_hand_is_found_as_the_right_one_in_a_mirror(plain_hand, clouds):
+    right, left = PoseInitializer(plain_hand).proposer, PoseInitializer(Hand(side="left")).proposer
+    flip = torch.tensor([-1.0, 1.0, 1.0])
+    found, seen = right.propose(clouds.points, clouds.mask), left.propose(clouds.points * flip, clouds.mask)
+    posed = Hand(side="left").keypoints(seen.poses[:, 0])
+    torch.testing.assert_close(posed, plain_hand.keypoints(found.poses[:, 0]) * flip, atol=1e-4, rtol=0)
+    torch.testing.assert_close(seen.surface, found.surface * flip, atol=1e-4, rtol=0)
+    with pytest.raises(FormatError, match="another shape"):
+        PoseProposer.load(HAND_WEIGHTS, Hand(side="left"))
+
+
+def test_a_hand_as_large_as_a_house_is_found_by_the_same_network(plain_hand, clouds):
+    large = Hand(scale=50.0)
+    found = PoseInitializer(large).proposer.propose(50 * clouds.points, clouds.mask)
+    small = PoseInitializer(plain_hand).proposer.propose(clouds.points, clouds.mask)
+    torch.testing.assert_close(found.poses[..., 6:], small.poses[..., 6:], atol=1e-3, rtol=0)
+    torch.testing.assert_close(found.poses[..., :3], 50 * small.poses[..., :3], atol=1e-2, rtol=0)
+
+
+def test_dense_clouds_are_as_good_as_those_that_it_was_trained_with(plain_hand):
+    net, skin = PoseInitializer(plain_hand).proposer, sample_skin(plain_hand, 6000)
+    errors = []
+    for count in (400, 2400):
+        generator = torch.Generator().manual_seed(6)
+        drawn = random_clouds(skin, 0.26, random_poses(plain_hand, 16, generator), count, generator)
+        found = plain_hand.keypoints(net.propose(drawn.points, drawn.mask).poses[:, 0])
+        errors.append((found - plain_hand.keypoints(drawn.poses)).norm(dim=-1).mean(-1).median())
+    assert errors[1] < 1.3 * errors[0]
+
+
+def test_only_what_is_doubtful_is_searched_for(plain_hand, plain_hand_skin, clouds, monkeypatch):
+    searched = []
+
+    def find(shape, data, **options):
+        searched.append(len(data))
+        return find_pose(shape, data, **options)
+
+    monkeypatch.setattr("torchreg.alignment.pose_initializer.find_pose", find)
+    quick = FindPoseConfig(num_candidates=4, num_placed=2, num_searched=1, search_rounds=1)
+    poses = [PoseInitializer(plain_hand, PoseInitializerConfig(search=search, find_pose=quick),
+                             model_points=plain_hand_skin) for search in ("never", "doubtful")]  # fmt: skip
+    with torch.no_grad():
+        never = poses[0](clouds.points, clouds.mask)
+        assert not searched
+        sure = never.confidence.argmax()
+        poses[1](clouds.points[sure : sure + 1], clouds.mask[sure : sure + 1])
+        assert len(searched) == int(never.confidence[sure] < 0.5)
+        least = never.confidence.argmin()
+        found = poses[1](clouds.points[least : least + 1], clouds.mask[least : least + 1])
+    assert searched
+    assert found.confidence[0] >= never.confidence[least] - 1e-6
 
 
 def test_a_cloud_gives_alone_what_it_gives_in_a_batch_and_moved(plain_hand, plain_hand_skin, clouds):
@@ -50,15 +104,18 @@ def test_a_cloud_gives_alone_what_it_gives_in_a_batch_and_moved(plain_hand, plai
 
 
 def test_training_goes_on_where_it_ended_and_files_are_for_their_shape(plain_hand, arm, tmp_path):
-    path, rows = tmp_path / "hand.safetensors", []
+    path, rows, hand = tmp_path / "hand.safetensors", [], Hand().requires_grad_(True)
     for steps in (2, 4):
         config = TrainInitializerConfig(steps=steps, batch=4, every=2)
-        trained = train_initializer(Hand(), path, config, size=TINY, progress=rows.append)
+        trained = train_initializer(hand, path, config, size=TINY, progress=rows.append)
     assert [row.step for row in rows] == [2, 4]
+    assert all(parameter.requires_grad for parameter in hand.parameters())
     again = PoseProposer.load(path, plain_hand)
     points, mask = torch.randn(2, 30, 3) / 20, torch.ones(2, 30, dtype=torch.bool)
     torch.testing.assert_close(again.propose(points, mask).poses, trained.propose(points, mask).poses)
-    with pytest.raises(FormatError, match="other degrees of freedom"):
+    with pytest.raises(FormatError, match="another shape"):
         PoseProposer.load(path, arm)
+    with pytest.raises(FormatError, match="of another shape or network"):
+        train_initializer(Hand(), path, TrainInitializerConfig(steps=5, batch=4))
     with pytest.raises(InputError, match="needs a network"):
         PoseInitializer(arm, PoseInitializerConfig(search="never"))

@@ -14,7 +14,7 @@ def benchmark(loaded_benchmark):
 
 def test_a_smoke_run_tells_every_figure(benchmark, capsys):
     figures = benchmark.main(["--smoke", "--threads", "1"])
-    assert set(figures) == {"gradient", "start", "roofline", "scratch", "full"}
+    assert set(figures) == {"proposed", "gradient", "start", "roofline", "scratch", "full"}
     assert figures["gradient"]["relative_error"] < 1e-5
     assert figures["start"]["median_mm"] < figures["start"]["start_mm"]
     assert figures["start"]["per_second_2"] > 0

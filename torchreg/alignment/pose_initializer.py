@@ -25,6 +25,7 @@ from torchreg.alignment.problem import (
     masked_mean,
     soft_inliers,
 )
+from torchreg.alignment.reliability import CALIBRATION
 from torchreg.alignment.rough_poses import typical_poses
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface, residual_noise, surface_objective
 from torchreg.errors import InputError
@@ -46,8 +47,6 @@ class _Batching:
 
 
 _BATCHING = _Batching()
-# Poses of a network that are less sure are searched for where "doubtful" ones are: as likely wrong as right.
-_LEAST_CONFIDENCE = 0.5
 
 
 @dataclass(frozen=True)
@@ -62,12 +61,13 @@ class PoseInitializerConfig:
         newton_steps: exact Newton steps after it where gradients are wanted, which make them exact; num_dofs + 1
             backward passes each.
         prior_std: standard deviation of the prior that holds joints near the start, radians; from scratch it draws
-            them to a typical pose.
+            them to what the network proposed, or to a typical pose.
         noise: standard deviation of the data about the surface, metres; by default estimated, cloud by cloud, and then
             held when gradients are taken.
         num_model_points: points sampled on the shape for the EM.
-        search: for poses from scratch: "never", where a network proposes them; "doubtful", where that is less sure than
-            one half; "always"; by default "never" with a network and "always" without.
+        search: for poses from scratch: "doubtful", the default where a network proposes them, searches where its pose
+            is doubtful, less sure than one half; "never" is fast in batches and tells it by the confidence alone;
+            "always", the only way without a network.
         find_pose: settings of the search.
         chunk: clouds that are searched at a time; by default one on a CPU, whose caches hold no more, else 256.
         nan_policy: "raise", or "omit" to leave out non-finite data.
@@ -183,7 +183,7 @@ class PoseInitializer(nn.Module):
         Differentiable: in ``points``, ``start`` and the shape's parameters, once; not in which points are outliers to
             be ignored, nor in the estimated noise.
 
-        Cost: of the forward pass O(B M) per step; from scratch .03 s per hand on one CPU core in batches, and seconds
+        Cost: of the forward pass O(B M) per step; from scratch .04 s per hand on one CPU core in batches, and seconds
             where it is searched for.
         """
         with torch.autocast(device_type=self.shape.rest.device.type, enabled=False):
@@ -245,9 +245,9 @@ class PoseInitializer(nn.Module):
         if self.proposer is None or self.config.search == "always":
             return self._search(data, valid)
         pose, confidence = self._propose(self.proposer, data, valid)
-        if self.config.search != "doubtful":
+        if self.config.search == "never":
             return pose, pose, confidence
-        doubtful = valid & (confidence < _LEAST_CONFIDENCE).unsqueeze(-1)
+        doubtful = valid & (confidence < CALIBRATION.doubtful).unsqueeze(-1)
         searched, typical, sureness = self._search(data, doubtful)
         surer = (sureness > confidence).unsqueeze(-1)
         poses, means = torch.where(surer, searched, pose), torch.where(surer, typical, pose)
@@ -278,7 +278,8 @@ class PoseInitializer(nn.Module):
         pose = typical_poses(self.shape).mean(0).repeat(len(data), 1)
         confidence = torch.zeros_like(pose[:, 0])
         size = _BATCHING.cpu_searched if data.device.type == "cpu" else _BATCHING.searched
-        for rows in valid.any(-1).nonzero()[:, 0].split(self.config.chunk or size):
+        found = valid.any(-1).nonzero()[:, 0]
+        for rows in found.split(self.config.chunk or size) if len(found) else ():
             starts = find_pose(
                 self.shape, data[rows], mask=valid[rows], num_starts=1, model_points=self.skin,
                 config=self.config.find_pose,

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from torchreg._checks import check_count
+from torchreg.alignment.landmarks import keypoint_extent
 from torchreg.alignment.problem import masked_mean, model_size
-from torchreg.errors import FormatError
+from torchreg.errors import FormatError, InputError
 from torchreg.geometry.rotation_representations import rotation_from_6d, rotation_vector_from_rotation
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 from torchreg.io.tensors import load_tensors, save_tensors
@@ -25,8 +27,9 @@ from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 _KIND = "PoseProposer"
 # Of the built-in hand.
 HAND_WEIGHTS = Path(__file__).with_name("hand_poses.safetensors")
-# Points whose bounding box tells the shape's size.
-_SIZE_POINTS = 500
+# Keypoints of a shape for which a network was trained are so near to those of the trained one, in their extent, on
+# average: between hands of other proportions, and a hand and its mirror image.
+_SAME_SHAPE = 0.15
 # Joints that turn by more have no limits to speak of; a network's output moves them about the rest pose.
 _OPEN = math.pi
 
@@ -36,6 +39,7 @@ class ProposerSize:
     """Sizes of the network; a million parameters, two megabytes in half precision.
 
     Args:
+        points: of a cloud, at most; of more so many are drawn, as surroundings are known at one density.
         tokens: points whose surroundings are described.
         neighbors: points that describe them.
         width: of descriptions.
@@ -46,6 +50,7 @@ class ProposerSize:
         waves: frequencies in which a place enters.
     """
 
+    points: int = 512
     tokens: int = 160
     neighbors: int = 16
     width: int = 128
@@ -54,6 +59,12 @@ class ProposerSize:
     decoder: int = 2
     hypotheses: int = 8
     waves: int = 4
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            check_count(value, name, 1)
+        if self.width % (2 * self.heads):
+            raise InputError(f"width must be a multiple of twice the heads, got {self.width} and {self.heads}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +116,7 @@ class PoseProposer(nn.Module):
     Args:
         shape: whose poses are proposed; its limits bound the joints.
         size: see `ProposerSize`.
+        shape_size: diagonal of its bounding box at rest, metres; measured on its surface by default.
 
     Shape of ``forward(points, mask)``: points (B, M, 3) in metres, at least as many as are neighbors, and their mask
     (B, M); see `RawPoses`.
@@ -120,11 +132,15 @@ class PoseProposer(nn.Module):
     rest: Tensor
     frequencies: Tensor
 
-    def __init__(self, shape: Articulation, size: ProposerSize | None = None) -> None:
+    def __init__(
+        self, shape: Articulation, size: ProposerSize | None = None, *, shape_size: float | None = None
+    ) -> None:
         super().__init__()
         self.size = size or ProposerSize()
         self.dof_names = tuple(shape.dof_names)
-        self.shape_size = model_size(sample_skin(shape, _SIZE_POINTS))
+        self.keypoints = shape.keypoints(shape.rest_pose()).detach().double().cpu()
+        self.shape_size = model_size(sample_skin(shape)) if shape_size is None else shape_size
+        self.mirrored = False
         width, joints = self.size.width, shape.num_dofs - BASE_DOFS
         rest = shape.rest[BASE_DOFS:].detach().float()
         lower, upper = shape.lower[BASE_DOFS:].detach().float(), shape.upper[BASE_DOFS:].detach().float()
@@ -186,18 +202,23 @@ class PoseProposer(nn.Module):
             mask: (B, M), False where points are padding.
         """
         short = self.size.neighbors - points.shape[1]
-        if short > 0:
+        if points.shape[1] > self.size.points:
+            index = _drawn(points, mask, self.size.points)
+            points, mask = _rows(points, index), mask.gather(1, index)
+        elif short > 0:
             points, mask = nn.functional.pad(points, (0, 0, 0, short)), nn.functional.pad(mask, (0, short))
-        raw = self(points.to(self.queries), mask)
-        base = rotation_vector_from_rotation(raw.rotation)
-        poses = torch.cat([raw.position, base, raw.joints], dim=-1).to(points)
+        # A mirror across x; turns are axial.
+        flip = points.new_tensor([-1.0 if self.mirrored else 1.0, 1.0, 1.0])
+        raw = self((points * flip).to(self.queries), mask)
+        base = rotation_vector_from_rotation(raw.rotation).to(points) * flip * flip[0]
+        poses = torch.cat([raw.position.to(points) * flip, base, raw.joints.to(points)], dim=-1)
         weights, order = raw.logits.softmax(-1).to(points).sort(dim=-1, descending=True)
         known = mask.gather(1, raw.token_index)
         return Proposals(
             poses=poses.gather(1, order.unsqueeze(-1).expand_as(poses)),
             weights=weights,
             points=_rows(points, raw.token_index),
-            surface=(self.shape_size * raw.surface[..., :3]).to(points),
+            surface=self.shape_size * raw.surface[..., :3].to(points) * flip,
             inlier=(known * (-raw.surface[..., 3]).sigmoid()).to(points),
         )
 
@@ -209,21 +230,19 @@ class PoseProposer(nn.Module):
             training: what to remember of the training.
         """
         state = {name: value.half() for name, value in self.state_dict().items()}
-        sizes = {name: int(value) for name, value in vars(self.size).items()}
         record = {
             "kind": _KIND,
             "dof_names": list(self.dof_names),
             "shape_size": self.shape_size,
-            "sizes": sizes,
+            "keypoints": self.keypoints.tolist(),
+            "sizes": asdict(self.size),
             "training": dict(training or {}),
         }
         save_tensors(path, state, record)
 
-    @classmethod
-    def load(
-        cls, path: str | os.PathLike[str], shape: Articulation, *, limits: FileLimits = DEFAULT_LIMITS
-    ) -> PoseProposer:
-        """Return the network of a file for the shape that it was trained for.
+    @staticmethod
+    def load(path: str | os.PathLike[str], shape: Articulation, *, limits: FileLimits = DEFAULT_LIMITS) -> PoseProposer:
+        """Return the network of a file for the shape that it was trained for, which may be larger or smaller.
 
         Raises:
             FileNotFoundError: if there is no such file.
@@ -232,18 +251,16 @@ class PoseProposer(nn.Module):
         tensors, record = load_tensors(path, limits=limits)
         if record.get("kind") != _KIND:
             raise FormatError(f"{path}: holds no {_KIND}, got {record.get('kind')!r}")
-        names = record.get("dof_names", [])
-        if names != list(shape.dof_names):
-            raise FormatError(
-                f"{path}: was trained for a shape of other degrees of freedom: it has {len(names)}, the shape "
-                f"{shape.num_dofs}; train one for this shape with torchreg train-initializer"
-            )
         try:
-            found = cls(shape, ProposerSize(**record["sizes"]))
-            found.load_state_dict({name: value.float() for name, value in tensors.items()})
-        except (KeyError, TypeError, RuntimeError) as error:
+            found = _restored(tensors, record, shape)
+        except (KeyError, TypeError, ValueError, RuntimeError, InputError) as error:
             raise FormatError(f"{path}: holds no {_KIND} of this version ({error})") from error
-        return found.to(shape.rest.device).eval()
+        if found is None:
+            raise FormatError(
+                f"{path}: was trained for another shape, of other degrees of freedom or keypoints; train one for this "
+                "shape with torchreg train-initializer"
+            )
+        return found.to(shape.rest.device).requires_grad_(False).eval()
 
     def _rest_logit(self) -> Tensor:
         """Return what the sigmoid takes to the rest pose, or near it where that is at a limit."""
@@ -252,9 +269,7 @@ class PoseProposer(nn.Module):
 
     def _tokens(self, places: Tensor, mask: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return descriptions (B, T, C) of drawn points, which of them are points (B, T), and their numbers (B, T)."""
-        generator = torch.Generator().manual_seed(0)
-        rank = torch.rand(places.shape[1], generator=generator).to(places)
-        index = torch.where(mask, rank, -1.0).topk(min(self.size.tokens, places.shape[1]), dim=1).indices
+        index = _drawn(places, mask, self.size.tokens)
         known = mask.gather(1, index)
         centers = _rows(places, index)
         distance = torch.cdist(centers, places).masked_fill(~mask.unsqueeze(1), torch.inf)
@@ -295,6 +310,12 @@ def _rows(values: Tensor, index: Tensor) -> Tensor:
     return values.gather(1, index.unsqueeze(-1).expand(-1, -1, values.shape[-1]))
 
 
+def _drawn(values: Tensor, mask: Tensor, count: int) -> Tensor:
+    """Return the numbers (B, T) of at most ``count`` rows of values (B, M, C), those that the mask shows first."""
+    rank = torch.rand(values.shape[1], generator=torch.Generator().manual_seed(0)).to(values)
+    return torch.where(mask, rank, -1.0).topk(min(count, values.shape[1]), dim=1).indices
+
+
 def posed_points(raw: RawPoses, skin: LinearBlendSkin) -> Tensor:
     """Return the points (B, K, N, 3) of a skin in proposed poses.
 
@@ -304,6 +325,31 @@ def posed_points(raw: RawPoses, skin: LinearBlendSkin) -> Tensor:
     return skin(still) @ raw.rotation.mT + raw.position.unsqueeze(-2)
 
 
+def _restored(tensors: Mapping[str, Tensor], record: Mapping[str, Any], shape: Articulation) -> PoseProposer | None:
+    """Return the network of a file, None if it was trained for another shape."""
+    if record["dof_names"] != list(shape.dof_names):
+        return None
+    size = ProposerSize(**record["sizes"])
+    if tensors["queries"].shape != (size.hypotheses, size.width) or size.encoder + size.decoder > len(tensors):
+        raise InputError("its sizes are not those of its tensors")
+    trained = torch.tensor(record["keypoints"], dtype=torch.float64)
+    extent = (trained.amax(0) - trained.amin(0)).norm().clamp_min(1e-9)
+    scale = keypoint_extent(shape) / float(extent) if len(trained) > 1 else 1.0
+    found = PoseProposer(shape, size, shape_size=scale * record["shape_size"])
+    # As seen from the base, whose place and turn a pose tells.
+    if float((found.keypoints / scale - trained).norm(dim=-1).mean()) > _SAME_SHAPE * extent:
+        return None
+    found.load_state_dict({name: value.float() for name, value in tensors.items()})
+    return found
+
+
 def shipped_proposer(shape: Articulation) -> PoseProposer | None:
     """Return the network that comes with torchreg for a shape: of the built-in hand; None for others."""
-    return PoseProposer.load(HAND_WEIGHTS, shape) if isinstance(shape, Hand) else None
+    if not isinstance(shape, Hand):
+        return None
+    if shape.side == "right":
+        return PoseProposer.load(HAND_WEIGHTS, shape)
+    # A left hand's joints are a right one's in a mirror.
+    right = PoseProposer.load(HAND_WEIGHTS, Hand(scale=shape.scale).to(shape.rest.device))
+    right.mirrored = True
+    return right

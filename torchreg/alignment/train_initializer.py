@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 import os
@@ -16,6 +17,7 @@ from torch import Tensor
 from torchreg._checks import check_count, check_positive
 from torchreg.alignment.pose_proposer import PoseProposer, ProposerSize, RawPoses, posed_points
 from torchreg.datasets.cloud_batches import CloudBatch, random_clouds, random_poses
+from torchreg.errors import FormatError
 from torchreg.io.limits import local_path
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
@@ -27,7 +29,6 @@ class _Training:
 
     surface_points: int = 3000  # of which clouds are drawn
     compared: int = 64  # points by which poses are compared
-    num_points: int = 512  # of a cloud, at most
     width: tuple[float, float] = (0.15, 0.02)  # scale of the errors' distribution, from the first step to the last
     surface_weight: float = 1.0  # of what tokens tell, beside the poses
     surface_width: float = 0.05  # error of a token at which its loss turns from squares to absolute values
@@ -114,12 +115,13 @@ def train_initializer(
 
     Raises:
         InputError: if the shape's base cannot move.
+        FormatError: if the checkpoint beside the output is of another shape or network.
 
     Cost: 30 minutes on two cores by default; deterministic by its seed but for when it ends.
     """
     config = config or TrainInitializerConfig()
     path = local_path(output)
-    run = _Run(shape.requires_grad_(False), path, config, size)
+    run = _Run(copy.deepcopy(shape).requires_grad_(False), path, config, size)
     while run.share < 1:
         begun = time.monotonic()
         loss = run.advance()
@@ -141,17 +143,16 @@ class _Run:
     ) -> None:
         torch.manual_seed(config.seed)
         self.config, self.checkpoint, self.curve = config, path.with_suffix(".pt"), path.with_suffix(".jsonl")
-        self.shape = shape
-        self.skin = sample_skin(shape, _TRAINING.surface_points)
-        self.compared = sample_skin(shape, _TRAINING.compared)
-        device = shape.rest.device
+        self.shape, device = shape, shape.rest.device
         self.net = PoseProposer(shape, size).to(device)
         self.optimizer = torch.optim.AdamW(self.net.parameters(), lr=config.rate, weight_decay=_TRAINING.decay)
         self.generator = torch.Generator(device).manual_seed(config.seed)
         self.step, self.seconds, self.total = 0, 0.0, torch.zeros((), device=device)
-        self.validation = self._clouds(_TRAINING.validation, torch.Generator(device).manual_seed(config.seed + 1))
         if self.checkpoint.exists():
             self._resume()
+        self.skin = sample_skin(shape, _TRAINING.surface_points)
+        self.compared = sample_skin(shape, _TRAINING.compared)
+        self.validation = self._clouds(_TRAINING.validation, torch.Generator(device).manual_seed(config.seed + 1))
 
     @property
     def share(self) -> float:
@@ -204,14 +205,19 @@ class _Run:
 
     def _resume(self) -> None:
         state = torch.load(self.checkpoint, weights_only=True, map_location=self.net.queries.device)
-        self.net.load_state_dict(state["net"])
-        self.optimizer.load_state_dict(state["optimizer"])
+        try:
+            self.net.load_state_dict(state["net"])
+            self.optimizer.load_state_dict(state["optimizer"])
+        except (RuntimeError, ValueError) as error:
+            raise FormatError(
+                f"{self.checkpoint}: is of another shape or network; move it away or name another output ({error})"
+            ) from error
         self.step, self.seconds = state["step"], state["seconds"]
         self.generator.set_state(state["generator"].cpu())
 
     def _clouds(self, count: int, generator: torch.Generator) -> CloudBatch:
         poses = random_poses(self.shape, count, generator)
-        return random_clouds(self.skin, self.net.shape_size, poses, _TRAINING.num_points, generator)
+        return random_clouds(self.skin, self.net.shape_size, poses, self.net.size.points, generator)
 
     def _rate(self) -> float:
         """Return the learning rate: a short rise, then half a cosine."""

@@ -21,6 +21,7 @@ from torchreg.cli.pose import pose
 from torchreg.cli.register import register
 from torchreg.cli.spine import spine
 from torchreg.cli.track import track
+from torchreg.cli.train_initializer import train_initializer
 from torchreg.cli.view import view
 
 app = typer.Typer(
@@ -79,6 +80,8 @@ _COMMANDS: tuple[tuple[Callable[..., None], str, tuple[str, str]], ...] = (
      ("register a.ply b.ply -o moved.glb", "register --depth a.png b.png --intrinsics camera.json")),
     (track, "Follow a shape through a sequence of clouds.",
      ("track hand frames/ -o moving --poses poses.csv", "track hand depth/ --depth --intrinsics camera.json")),
+    (train_initializer, "Train a network that proposes poses of a shape.",
+     ("train-initializer rig.glb -o rig.safetensors", "train-initializer hand --device cuda --batch 512 --minutes 5")),
     (view, "Show a result, a shape or a scan in the browser, or write one HTML file.",
      ("view moving.safetensors --data frames/", "view scan.obj --html scan.html")),
 )  # fmt: skip

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_count
-from torchreg.datasets.hand import hand_joints, joint_ranges, placed
+from torchreg.datasets.hand import curled_joints, joint_ranges, placed
 from torchreg.errors import InputError
 from torchreg.geometry.rotation_representations import rotation_vector_from_quaternion
 from torchreg.shapes.articulated import ArticulatedShape
@@ -85,7 +85,7 @@ def random_poses(shape: ArticulatedShape, count: int, generator: torch.Generator
     share, other, side = uniform(count, joints), uniform(count, joints), 2 * uniform(count, joints) - 1
     pose = shape.rest_pose().repeat(count, 1)
     if isinstance(shape, Hand):
-        curled = hand_joints(shape, share, other, side, bend)
+        curled = curled_joints(shape, share, other, side, bend)
         flexion = torch.tensor([name.endswith("flexion") for name in shape.dof_names[BASE_DOFS:]], device=share.device)
         single = torch.where(flexion, share, side) * bend * shape.upper[BASE_DOFS:]
         pose[:, BASE_DOFS:] = torch.where(uniform(count, 1) < _VARIETY.alone, single, curled)

@@ -234,7 +234,7 @@ def random_hand_pose(
     offset = _uniform((3,), generator, hand.rest)
     pose = hand.rest_pose()
     if isinstance(hand, Hand):
-        pose[6:] = hand_joints(hand, draws[0], draws[1], 2 * draws[2] - 1, bend)
+        pose[6:] = curled_joints(hand, draws[0], draws[1], 2 * draws[2] - 1, bend)
     else:
         lower, upper = joint_ranges(hand)
         pose[6:] = pose[6:] + bend * torch.where(draws[1] < 0.5, lower, upper) * draws[0]
@@ -411,7 +411,7 @@ def _curl_groups(shape: ArticulatedShape) -> Tensor:
     return torch.tensor([known.index(finger) for finger in fingers], device=shape.rest.device)
 
 
-def hand_joints(hand: Hand, own: Tensor, finger: Tensor, spread: Tensor, bend: float | Tensor) -> Tensor:
+def curled_joints(hand: Hand, own: Tensor, finger: Tensor, spread: Tensor, bend: float | Tensor) -> Tensor:
     """Return joint angles (..., 21) of a hand whose fingers curl, and spread so that they do not meet.
 
     Args:

@@ -1,0 +1,29 @@
+"""``torchreg train-initializer``: trains, and refuses shapes whose base is bolted down."""
+
+from typer.testing import CliRunner
+
+from torchreg.alignment.pose_proposer import PoseProposer
+from torchreg.cli.application import app
+from torchreg.shapes.hand import Hand
+
+
+def test_weights_are_written_and_loaded(tmp_path):
+    path = tmp_path / "hand.safetensors"
+    command = ["train-initializer", "hand", "-o", str(path), "--minutes", "0.0001", "--batch", "2"]
+    found = CliRunner().invoke(app, command)
+    assert found.exit_code == 0, found.output
+    assert "step 1 " in found.output
+    assert PoseProposer.load(path, Hand()).dof_names == tuple(Hand().dof_names)
+
+
+def test_a_base_that_is_bolted_down_is_refused(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(
+        '<robot name="arm"><link name="base"><visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual></link>'
+        '<link name="hand"><visual><geometry><sphere radius="0.05"/></geometry></visual></link>'
+        '<joint name="hinge" type="revolute"><parent link="base"/><child link="hand"/><origin xyz="0 0 0.2"/>'
+        '<axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="1" velocity="1"/></joint></robot>'
+    )
+    found = CliRunner().invoke(app, ["train-initializer", str(path), "--fixed-base", "-o", str(tmp_path / "arm")])
+    assert found.exit_code == 2
+    assert "base that can move" in found.output
