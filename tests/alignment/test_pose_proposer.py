@@ -1,8 +1,11 @@
 """The network that proposes poses: hands at any rotation, invariances, files, training that goes on."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from torchreg.alignment import train_initializer as train_module
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.pose_initializer import PoseInitializer, PoseInitializerConfig
 from torchreg.alignment.pose_proposer import HAND_WEIGHTS, PoseProposer, ProposerSize
@@ -21,6 +24,12 @@ def clouds(plain_hand):
     generator = torch.Generator().manual_seed(4)
     poses = random_poses(plain_hand, 12, generator)
     return random_clouds(sample_skin(plain_hand, 1500), 0.26, poses, 400, generator)
+
+
+@pytest.fixture
+def small_training(monkeypatch):
+    small = replace(train_module._TRAINING, surface_points=200, validation=8)
+    monkeypatch.setattr(train_module, "_TRAINING", small)
 
 
 def test_poses_are_within_limits_and_points_on_the_posed_surface(plain_hand, clouds):
@@ -61,9 +70,9 @@ def test_a_hand_as_large_as_a_house_is_found_by_the_same_network(plain_hand, clo
 
 
 def test_dense_clouds_are_as_good_as_those_that_it_was_trained_with(plain_hand):
-    net, skin = PoseInitializer(plain_hand).proposer, sample_skin(plain_hand, 6000)
+    net, skin = PoseInitializer(plain_hand).proposer, sample_skin(plain_hand, 2500)
     errors = []
-    for count in (400, 2400):
+    for count in (400, 1000):
         generator = torch.Generator().manual_seed(6)
         drawn = random_clouds(skin, 0.26, random_poses(plain_hand, 16, generator), count, generator)
         found = plain_hand.keypoints(net.propose(drawn.points, drawn.mask).poses[:, 0])
@@ -103,7 +112,7 @@ def test_a_cloud_gives_alone_what_it_gives_in_a_batch_and_moved(plain_hand, plai
     torch.testing.assert_close(together.weights.sum(-1), torch.ones(12))
 
 
-def test_training_goes_on_where_it_ended_and_files_are_for_their_shape(plain_hand, arm, tmp_path):
+def test_training_goes_on_where_it_ended_and_files_are_for_their_shape(plain_hand, arm, tmp_path, small_training):
     path, rows, hand = tmp_path / "hand.safetensors", [], Hand().requires_grad_(True)
     for steps in (2, 4):
         config = TrainInitializerConfig(steps=steps, batch=4, every=2)

@@ -1,13 +1,18 @@
 """``torchreg train-initializer``: trains, and refuses shapes whose base is bolted down."""
 
+from dataclasses import replace
+
 from typer.testing import CliRunner
 
+from torchreg.alignment import train_initializer as train_module
 from torchreg.alignment.pose_proposer import PoseProposer
 from torchreg.cli.application import app
 from torchreg.shapes.hand import Hand
 
 
-def test_weights_are_written_and_loaded(tmp_path):
+def test_weights_are_written_and_loaded(tmp_path, monkeypatch):
+    small = replace(train_module._TRAINING, surface_points=200, validation=8)
+    monkeypatch.setattr(train_module, "_TRAINING", small)
     path = tmp_path / "hand.safetensors"
     command = ["train-initializer", "hand", "-o", str(path), "--minutes", "0.0001", "--batch", "2"]
     found = CliRunner().invoke(app, command)
