@@ -189,3 +189,15 @@ def test_normals_of_one_side_face_the_camera(shape, told):
 
 def test_noise_has_no_normals():
     assert bool((facing_normals(torch.rand(500, 3, generator=torch.Generator().manual_seed(0))) == 0).all())
+
+
+def test_a_person_is_found_without_a_start(shape):
+    coefficients = torch.tensor([0.9, -0.8, 0.4])
+    pose, data = scan(shape, coefficients, seed=3, count=600)
+    pose[3:6], moved = torch.tensor([0.4, 1.9, -0.7]), so3_exp(pose[3:6])
+    turn = so3_exp(pose[3:6]) @ moved.mT
+    data = (data - pose[:3]) @ turn.mT + pose[:3]
+    result = align(shape, data, fit_shape=True, config=QUICK)
+    _, off = nearest_neighbor(shape.vertices(result.pose, result.coefficients), shape.vertices(pose, coefficients))
+    assert float(off.mean()) < 0.02
+    assert float(result.evidence[-1]) < 1, "no rival was compared"

@@ -202,7 +202,8 @@ def align(
             against it as errors that neighbors share, not one by one.
         fit_shape: True to fit the shape's coefficients too, with their prior: a body to a person. "bones" does so for
             any rig, whose coefficients are then the lengths and radii of its parts. For one cloud or depth frame
-            without keypoints, locked degrees of freedom and prior; a start is given for the mean coefficients.
+            without keypoints, locked degrees of freedom and prior; a start is given for the mean coefficients. Without
+            one, people of different sizes are sought everywhere.
         keypoints: where a detector saw the shape's keypoints (of a hand 21, see `AlignResult.keypoints`), as evidence
             beside the data: (K, 3), metres, or with depth frames of one camera (K, 2), pixels as (column, row); NaN for
             those not seen. (B, K, 3) or (B, K, 2) for a batch.
@@ -245,7 +246,7 @@ def align(
             model_size(skin),
             partial(
                 align, shape, model_points=skin, locked=locked, prior=prior, keypoints=keypoints,
-                keypoint_std=keypoint_std, config=config, on_step=on_step,
+                keypoint_std=keypoint_std, fit_shape=fit_shape, config=config, on_step=on_step,
             ),
         )  # fmt: skip
         return replace(found, crop=crop.mask)
@@ -317,9 +318,7 @@ def _align_person(
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
         if clouds.ndim != 2:
             raise InputError("fit_shape takes one cloud; calibrate fits several scans of one person")
-    if initial_pose is None:
-        initial_pose = _found_pose(shape, seen, None, None, config).starts.best
-    pose = _check_start(shape, initial_pose, clouds[None])[0]
+    pose = None if initial_pose is None else _check_start(shape, initial_pose, clouds[None])[0]
     history: list[AlignRecord] = []
 
     def record(step: AlignRecord) -> None:
@@ -336,7 +335,7 @@ def _align_person(
         skin = _model_skin(person, None, fitted.poses, config)
         batch = _centered_batch(skin, clouds, valid, fitted.poses, config, on_step, seen)
         found = StageResult(pose=batch.start, sigma=fitted.sigma, change=fitted.change)
-        result = _unbatched(_result(batch, found, config, None, batch.problem))
+        result = _unbatched(_result(batch, found, config, fitted.lead, batch.problem))
         dofs = shape.num_dofs
         return normal_copy(replace(
             result,

@@ -250,7 +250,7 @@ def _search(problem: AlignProblem, sources: Sequence[PoseSource], config: FindPo
     generator = torch.Generator().manual_seed(config.seed)
     search = PoseSearch(problem, generator)
     rough = torch.cat([source(search.problem, generator) for source in sources], dim=1)
-    rough, rough_costs = register_rigidly(search, search.problem.clamp_candidates(rough), generator)
+    rough, rough_costs = register_rigidly(search.problem, search.problem.clamp_candidates(rough), generator)
     rough = _best_distinct(search.problem, rough, rough_costs, config.num_candidates)
     pool = search.fit_coarsely(rough, _CANDIDATES.fit_steps)[:, : config.num_placed]
     poses, _ = search.refine(search.prune(pool, config.num_searched), config.search_rounds)
