@@ -45,6 +45,8 @@ from torchreg.alignment.problem import (
 )
 from torchreg.alignment.reliability import (
     CALIBRATION,
+    SHAPE_CALIBRATION,
+    SurfaceError,
     confidence_of,
     curvature,
     gather_evidence,
@@ -335,7 +337,7 @@ def _align_person(
         skin = _model_skin(person, None, fitted.poses, config)
         batch = _centered_batch(skin, clouds, valid, fitted.poses, config, on_step, seen)
         found = StageResult(pose=batch.start, sigma=fitted.sigma, change=fitted.change)
-        result = _unbatched(_result(batch, found, config, fitted.lead, batch.problem))
+        result = _unbatched(_result(batch, found, config, fitted.lead, batch.problem, fitted.error))
         dofs = shape.num_dofs
         return normal_copy(replace(
             result,
@@ -436,7 +438,12 @@ def _centered_batch(
 
 
 def _result(
-    batch: AlignBatch, found: StageResult, config: AlignConfig, lead: Tensor | None, judged: AlignProblem
+    batch: AlignBatch,
+    found: StageResult,
+    config: AlignConfig,
+    lead: Tensor | None,
+    judged: AlignProblem,
+    error: SurfaceError | None = None,
 ) -> AlignResult:
     problem, pose = batch.problem, found.pose
     distances = problem.surface.distance(problem.data, pose)
@@ -450,11 +457,14 @@ def _result(
     # What lies off the surface tells nothing of the pose, unless all does.
     told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
     degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=3)
-    around, evidence = curvature(judged, pose), gather_evidence(judged, pose, lead)
+    around, evidence, calibration = curvature(judged, pose), gather_evidence(judged, pose, lead), CALIBRATION
+    if error is not None:
+        evidence, calibration = replace(evidence, unknown=error.unknown(problem.size)), SHAPE_CALIBRATION
     table = evidence.table()
-    confidence = torch.where(degenerate, 0.0, confidence_of(table))
+    confidence = torch.where(degenerate, 0.0, confidence_of(table, calibration))
     converged = found.change <= config.pose_atol
     converged = converged | around.converged if config.surface_steps else converged
+    converged = converged if error is None else error.converged
     rows = (inliers.sum(-1), problem.valid.sum(-1), converged, degenerate, confidence)
     return AlignResult(
         pose=world,
@@ -470,7 +480,7 @@ def _result(
         covariance=around.covariance,
         confidence=confidence,
         evidence=table,
-        doubt=told_doubts(judged, pose, evidence),
+        doubt=told_doubts(judged, pose, evidence, error),
     )
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchreg.alignment.annealed_em import ANNEALING, OnStep, StageResult, anneal
+from torchreg.alignment.confidence import end_variances
 from torchreg.alignment.objectives import GaussianPosePrior, Objective
 from torchreg.alignment.person_search import find_people, lead_over_rivals
 from torchreg.alignment.problem import (
@@ -21,7 +22,7 @@ from torchreg.alignment.problem import (
     masked_mean,
     model_size,
 )
-from torchreg.alignment.reliability import correlated_count, neighbor_correlation
+from torchreg.alignment.reliability import SurfaceError, correlated_count, neighbor_correlation
 from torchreg.alignment.results import AlignRecord
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface, pose_covariance, surface_noise
@@ -82,6 +83,7 @@ class FittedShape:
         cost: () by which people are ranked.
         sigma: (1,) last width of the annealed EM, metres.
         change: (1,) of the last step.
+        error: standard errors of the surface in each scan.
         lead: (1,) cost by which the best of different people is worse, of a search without a start; else None.
     """
 
@@ -91,6 +93,7 @@ class FittedShape:
     cost: Tensor
     sigma: Tensor
     change: Tensor
+    error: SurfaceError
     lead: Tensor | None = None
 
 
@@ -279,10 +282,10 @@ def fit_coefficients(
     problem, state = problem.rows(kept[best]), state[best]
     fine = problem.sample(SHAPE_FIT.fine_data, generator)
     state = fit_surface(fine, state, steps=SHAPE_FIT.fine_steps, on_step=on_step).pose
-    last = fit_surface(
-        problem, state, steps=SHAPE_FIT.fine_steps, widths=SURFACE_FIT.widths[-1:], on_step=on_step
-    )  # fmt: skip
-    return replace(_fitted(problem, replace(last, sigma=sigma), shape.num_dofs), lead=lead)
+    finish = partial(fit_surface, problem, widths=SURFACE_FIT.widths[-1:], on_step=on_step)
+    before = finish(state, steps=SHAPE_FIT.fine_steps).pose
+    last = replace(finish(before, steps=1), sigma=sigma)
+    return replace(_fitted(problem, before, last, shape.num_dofs), lead=lead)
 
 
 def _placed_again(problem: ShapeProblem, state: Tensor, config: AlignConfig, on_step: OnStep | None) -> Tensor:
@@ -304,16 +307,29 @@ def _tell(on_step: OnStep, problem: ShapeProblem, num_dofs: int, record: AlignRe
     on_step(normal_copy(replace(record, pose=record.pose[:, :num_dofs] + origin)))
 
 
-def _fitted(problem: ShapeProblem, found: StageResult, num_dofs: int) -> FittedShape:
+def _fitted(problem: ShapeProblem, before: Tensor, found: StageResult, num_dofs: int) -> FittedShape:
+    """Return the end of a fit, whose last step began in states (T, D + K)."""
     poses, coefficients = found.pose.tensor_split([num_dofs], dim=-1)
+    covariance = _covariance(problem, found.pose)
     return FittedShape(
         poses=poses + pad(problem.origin, (0, num_dofs - 3)),
         coefficients=coefficients[0],
-        covariance=_covariance(problem, found.pose),
+        covariance=covariance,
         cost=problem.cost_of_people(found.pose)[0],
         sigma=found.sigma,
         change=found.change.amax(0, keepdim=True),
+        error=_surface_error(problem, before, found.pose, covariance),
     )
+
+
+def _surface_error(problem: ShapeProblem, before: Tensor, state: Tensor, covariance: Tensor) -> SurfaceError:
+    """Return the standard errors of the surface in states (T, D + K), by their covariance, and their last step."""
+    rows, moves = problem.skin.row_jacobian(state)
+    moved = (problem.skin.place(rows) - problem.skin(before)).square().sum(-1).mean(-1).sqrt()
+    variances = end_variances(moves, covariance)
+    owned = torch.nn.functional.one_hot(problem.skin.weights.argmax(-1), problem.skin.weights.shape[1]).to(variances)
+    by_part = variances @ owned / owned.sum(0).clamp_min(1)
+    return SurfaceError(whole=variances.mean(-1).sqrt(), parts=by_part.sqrt(), moved=moved)
 
 
 def _covariance(problem: ShapeProblem, state: Tensor) -> Tensor:
