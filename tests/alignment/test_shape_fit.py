@@ -217,7 +217,7 @@ def test_a_person_in_what_is_none_is_doubtful(shape):
 
 def test_what_is_not_known_of_a_surface():
     error = SurfaceError(
-        whole=torch.tensor([0.02]), parts=torch.tensor([[0.0, 0.1, 0.0]]), moved=torch.tensor([0.011])
+        whole=torch.tensor([0.02]), parts=torch.tensor([[0.0, 0.1, 0.0]]), moved=torch.tensor([0.021])
     )  # fmt: skip
     assert not bool(error.converged)
     assert float(error.unknown(1.0)) < float(error.unknown(0.5)) < 1

@@ -68,7 +68,6 @@ class _Scales:
         0.008  # standard error of a surface, as a share of the size: where half of the fits are wrong
     )
     loose_error: float = 0.03  # the same of a part that is told to be hardly seen
-    last_step: float = 0.5  # of a fit of pose and shape, in standard errors of the surface
     gain: float = 0.1  # of a further step in log-likelihood: less than half a standard deviation of the pose
 
 
@@ -113,8 +112,8 @@ class SurfaceError:
 
     @property
     def converged(self) -> Tensor:
-        """Whether a further step would hardly matter beside what is not known, (B,)."""
-        return self.moved <= _SCALES.last_step * self.whole
+        """Whether the last step moved the surface by no more than is not known of it, (B,)."""
+        return self.moved <= self.whole
 
     def unknown(self, size: float) -> Tensor:
         """Return the evidence (B,) that the data do not tell where the surface is, from 0 to 1."""
