@@ -23,7 +23,7 @@ from torchreg.alignment.align_stages import (
     search_where_needed,
 )
 from torchreg.alignment.annealed_em import CORRESPONDENCES, OnStep, StageResult, outlier_level
-from torchreg.alignment.find_pose import FindPoseConfig, FoundStarts, search_everywhere
+from torchreg.alignment.find_pose import FindPoseConfig, FoundStarts, StartSource, search_everywhere
 from torchreg.alignment.in_picture import surest_crop
 from torchreg.alignment.inputs import (
     Observation,
@@ -52,7 +52,6 @@ from torchreg.alignment.reliability import (
     without_cut,
 )
 from torchreg.alignment.results import AlignRecord, AlignResult
-from torchreg.alignment.rough_poses import DEFAULT_SOURCES
 from torchreg.alignment.shape_fit import fit_coefficients, fitted_rig
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.capture.depth_frame import DepthFrame
@@ -383,7 +382,7 @@ def _found_pose(
     search = FindPoseConfig(num_model_points=config.num_model_points, nan_policy=config.nan_policy, seed=config.seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnitsWarning)  # the alignment tells it
-        return search_everywhere(shape, seen, 1, DEFAULT_SOURCES, model_points, search, known)
+        return search_everywhere(shape, seen, 1, StartSource.of(shape), model_points, search, known)
 
 
 def _check_start(shape: ArticulatedShape, initial_pose: Tensor | None, clouds: Tensor) -> tuple[Tensor, bool]:

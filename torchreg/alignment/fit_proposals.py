@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.alignment.limb_search import take_rows
+from torchreg.alignment.limb_search import distinct_first, take_rows
 from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective
 from torchreg.alignment.pose_proposer import Proposals
 from torchreg.alignment.pose_search import PoseSearch, fit_candidates, mean_distances, score_candidates
@@ -42,17 +42,42 @@ def best_proposal(problem: AlignProblem, proposals: Proposals) -> tuple[Tensor, 
         problem: the batch.
         proposals: for its data.
     """
-    search = PoseSearch(problem, torch.Generator().manual_seed(0))
-    coarse = search.coarse_problem
-    poses = coarse.clamp_candidates(proposals.poses[:, : _FIT.kept])
-    poses = torch.cat([matched_pose(problem, proposals, poses[:, 0]).unsqueeze(1), poses], dim=1)
-    fitted = fit_candidates(coarse, poses, _FIT.widths, _FIT.steps)
-    scores, order = score_candidates(coarse, fitted, _FIT.score_width).sort(dim=1, stable=True)
-    fitted = take_rows(fitted, order)
+    coarse = PoseSearch(problem, torch.Generator().manual_seed(0)).coarse_problem
+    first = problem.clamp_candidates(proposals.poses[:, : _FIT.kept])
+    matched = matched_pose(problem, proposals, first[:, 0]).unsqueeze(1)
+    fitted, scores = _coarsely_fitted(coarse, torch.cat([matched, first], dim=1))
     apart = mean_distances(coarse, fitted)[:, 0] > _FIT.same * problem.size
     share = problem.valid.sum(-1) / coarse.valid.sum(-1).clamp_min(1)
     lead = torch.where(apart, scores, torch.inf).amin(1) - scores[:, 0]
     return fitted[:, 0], lead * share
+
+
+@torch.no_grad()
+def best_proposals(problem: AlignProblem, proposals: Proposals, count: int) -> Tensor:
+    """Return the ``count`` poses (B, count, num_dofs) that explain most data after a coarse fit, different ones first.
+
+    All that are proposed are fitted, each also to the matches; without as many the last one repeats.
+
+    Args:
+        problem: the batch.
+        proposals: for its data.
+        count: of poses.
+    """
+    coarse = PoseSearch(problem, torch.Generator().manual_seed(0)).coarse_problem
+    poses = problem.clamp_candidates(proposals.poses)
+    number = poses.shape[1]
+    matched = matched_pose(problem.repeated(number), proposals.repeated(number), poses.flatten(0, 1))
+    fitted, _ = _coarsely_fitted(coarse, torch.cat([poses, matched.reshape(poses.shape)], dim=1))
+    close = mean_distances(coarse, fitted) < _FIT.same * problem.size
+    order = distinct_first(close)[:, :count]
+    return take_rows(fitted, torch.cat([order, order[:, -1:].expand(-1, count - order.shape[1])], dim=1))
+
+
+def _coarsely_fitted(coarse: AlignProblem, poses: Tensor) -> tuple[Tensor, Tensor]:
+    """Return poses (B, K, num_dofs) after a coarse fit, best first, and their scores (B, K)."""
+    fitted = fit_candidates(coarse, poses, _FIT.widths, _FIT.steps)
+    scores, order = score_candidates(coarse, fitted, _FIT.score_width).sort(dim=1, stable=True)
+    return take_rows(fitted, order), scores
 
 
 def matched_pose(problem: AlignProblem, proposals: Proposals, pose: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchreg._checks import check_count
 from torchreg.alignment.landmarks import keypoint_extent
 from torchreg.alignment.problem import masked_mean, model_size
-from torchreg.errors import FormatError, InputError
+from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.geometry.rotation_representations import rotation_from_6d, rotation_vector_from_rotation
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 from torchreg.io.tensors import load_tensors, save_tensors
@@ -105,6 +105,10 @@ class Proposals:
     points: Tensor
     surface: Tensor
     inlier: Tensor
+
+    def repeated(self, count: int) -> Proposals:
+        """Return the same with every cloud ``count`` times in a row."""
+        return Proposals(**{item.name: getattr(self, item.name).repeat_interleave(count, 0) for item in fields(self)})
 
 
 class PoseProposer(nn.Module):
@@ -341,6 +345,23 @@ def _restored(tensors: Mapping[str, Tensor], record: Mapping[str, Any], shape: A
         return None
     found.load_state_dict({name: value.float() for name, value in tensors.items()})
     return found
+
+
+def check_proposer(shape: Articulation, proposer: PoseProposer) -> PoseProposer:
+    """Return a network that was given for a shape.
+
+    Raises:
+        InputError: if it proposes other degrees of freedom.
+        InputTypeError: if it is something else.
+    """
+    if not isinstance(proposer, PoseProposer):
+        raise InputTypeError(f"the network must be a PoseProposer, got {type(proposer).__name__}")
+    if proposer.dof_names != tuple(shape.dof_names):
+        raise InputError(
+            f"the network is for a shape with {len(proposer.dof_names)} degrees of freedom of other names than this "
+            f"one's {shape.num_dofs}; train one for it with tr.train_initializer"
+        )
+    return proposer
 
 
 def shipped_proposer(shape: Articulation) -> PoseProposer | None:
