@@ -19,6 +19,7 @@ from torchreg.alignment.align_stages import (
     best_start,
     fit_batch_surface,
     fit_to_the_end,
+    keep_searched,
     refit_without_cut,
     search_where_needed,
 )
@@ -291,6 +292,7 @@ def _align(
             found = anneal_batch(batch, config)  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3
             found = fit_batch_surface(batch, found, config)  # eqs. 21 and 22: section 3.4
             batch, found = best_start(batch, found) if several else (batch, found)
+            found = found if lead is None else keep_searched(batch, found, config)
             found = search_where_needed(batch, found, config)
             judged = without_cut(batch.problem, found.pose, seen.frames)
             found = refit_without_cut(batch, judged, found, config)
