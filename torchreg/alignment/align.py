@@ -24,7 +24,7 @@ from torchreg.alignment.align_stages import (
     search_where_needed,
 )
 from torchreg.alignment.annealed_em import CORRESPONDENCES, OnStep, StageResult, outlier_level
-from torchreg.alignment.find_pose import FindPoseConfig, FoundStarts, StartSource, search_everywhere
+from torchreg.alignment.find_pose import FindPoseConfig, FoundStarts, search_everywhere
 from torchreg.alignment.in_picture import surest_crop
 from torchreg.alignment.inputs import (
     Observation,
@@ -55,6 +55,7 @@ from torchreg.alignment.reliability import (
 from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.shape_fit import fit_coefficients, fitted_rig
 from torchreg.alignment.sigma_schedule import SigmaSchedule
+from torchreg.alignment.start_source import StartSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, UnitsWarning
 from torchreg.geometry.camera import Camera

@@ -347,7 +347,7 @@ def _restored(tensors: Mapping[str, Tensor], record: Mapping[str, Any], shape: A
     return found
 
 
-def check_proposer(shape: Articulation, proposer: PoseProposer) -> PoseProposer:
+def check_proposer(shape: Articulation, proposer: object) -> PoseProposer:
     """Return a network that was given for a shape.
 
     Raises:
@@ -355,11 +355,13 @@ def check_proposer(shape: Articulation, proposer: PoseProposer) -> PoseProposer:
         InputTypeError: if it is something else.
     """
     if not isinstance(proposer, PoseProposer):
-        raise InputTypeError(f"the network must be a PoseProposer, got {type(proposer).__name__}")
+        raise InputTypeError(
+            f"initializer must be a PoseProposer, or a PoseInitializer that has one, got {type(proposer).__name__}"
+        )
     if proposer.dof_names != tuple(shape.dof_names):
         raise InputError(
-            f"the network is for a shape with {len(proposer.dof_names)} degrees of freedom of other names than this "
-            f"one's {shape.num_dofs}; train one for it with tr.train_initializer"
+            f"initializer must be a network for this shape's {shape.num_dofs} degrees of freedom, got one for "
+            f"{len(proposer.dof_names)} that has other names; train one with tr.train_initializer"
         )
     return proposer
 

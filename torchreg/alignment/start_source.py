@@ -1,0 +1,73 @@
+"""Where starts come from: rough poses that a search goes on from, and those that a network proposes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchreg.alignment.fit_proposals import best_proposals
+from torchreg.alignment.known_dofs import KnownDofs
+from torchreg.alignment.pose_proposer import PoseProposer, check_proposer, shipped_proposer
+from torchreg.alignment.problem import AlignProblem
+from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource
+from torchreg.errors import InputError
+from torchreg.shapes.articulated import ArticulatedShape
+
+if TYPE_CHECKING:
+    from torchreg.alignment.pose_initializer import PoseInitializer
+
+
+@dataclass(frozen=True)
+class StartSource:
+    """Where candidates come from.
+
+    Args:
+        sources: of rough poses, which are searched on from.
+        proposer: a network, whose poses need a fit alone, or None.
+        known: what is known beforehand, or None.
+    """
+
+    sources: Sequence[PoseSource]
+    proposer: PoseProposer | None = None
+    known: KnownDofs | None = None
+
+    @classmethod
+    def of(
+        cls,
+        shape: ArticulatedShape,
+        sources: Sequence[PoseSource] | None = None,
+        initializer: PoseInitializer | PoseProposer | None = None,
+    ) -> StartSource:
+        """Return what is given, or else the default for a shape.
+
+        Raises:
+            InputError: if the sources are an empty list, or the network is for another shape.
+            InputTypeError: if the network is none.
+        """
+        if sources is not None and not sources:
+            raise InputError("sources must hold at least one source of rough poses, got none")
+        proposer = shipped_proposer(shape) if sources is None and initializer is None else None
+        if initializer is not None:
+            proposer = check_proposer(shape, getattr(initializer, "proposer", initializer))
+        return cls(DEFAULT_SOURCES if sources is None else sources, proposer)
+
+    def informed(self, known: KnownDofs | None) -> StartSource:
+        """Return the same whose poses are what is known beforehand, as far as that goes."""
+        return replace(self, known=known)
+
+    def rough(self, problem: AlignProblem, generator: torch.Generator) -> Tensor:
+        """Return rough poses (B, K, num_dofs) of all sources."""
+        return self._told(problem, torch.cat([source(problem, generator) for source in self.sources], dim=1))
+
+    def proposed(self, problem: AlignProblem, count: int) -> Tensor | None:
+        """Return poses (B, count, num_dofs) of the network after a coarse fit; None without any."""
+        if self.proposer is None:
+            return None
+        return self._told(problem, best_proposals(problem, self.proposer.propose(problem.data, problem.valid), count))
+
+    def _told(self, problem: AlignProblem, poses: Tensor) -> Tensor:
+        return problem.clamp_candidates(poses if self.known is None else self.known.informed(problem, poses))
