@@ -154,8 +154,8 @@ def test_a_network_of_another_shape_is_refused(plain_hand, arm, clouds):
 def test_an_alignment_is_no_worse_than_the_start_that_was_found(plain_hand, plain_hand_skin):
     """Of a hand seen edge-on an EM would draw the fingers into the palm."""
     cloud = make_hand_cloud(
-        plain_hand, random_hand_pose(plain_hand, torch.Generator().manual_seed(11)), noise=0.001, outlier_ratio=0.15,
-        camera=torch.zeros(3), generator=torch.Generator().manual_seed(11),
+        plain_hand, random_hand_pose(plain_hand, torch.Generator().manual_seed(24)), noise=0.001, outlier_ratio=0.15,
+        camera=torch.zeros(3), generator=torch.Generator().manual_seed(24),
     )  # fmt: skip
     found = find_pose(plain_hand, cloud.points, model_points=plain_hand_skin)
     result = align(plain_hand, cloud.points, model_points=plain_hand_skin)
