@@ -230,9 +230,9 @@ def _find(problem: AlignProblem, source: StartSource, config: FindPoseConfig) ->
 
     The search is of no use where all that is doubtful is where limbs end that no data show.
     """
-    proposed = source.proposed(problem, _CANDIDATES.proposed)
-    if proposed is None:
-        return _search_with_retries(problem, source, config, None)
+    problem, proposed = source.proposed(problem, _CANDIDATES.proposed)
+    if proposed.shape[1] == 0:
+        return _search_with_retries(problem, source, config, proposed)
     poses, costs = _fitted(problem, proposed)
     sure = explains(problem, poses[:, 0], _lead(problem, poses, costs)) >= CALIBRATION.doubtful
     rows = (~sure).nonzero()[:, 0]
@@ -246,7 +246,7 @@ def _find(problem: AlignProblem, source: StartSource, config: FindPoseConfig) ->
 
 
 def _search_with_retries(
-    problem: AlignProblem, source: StartSource, config: FindPoseConfig, proposed: Tensor | None
+    problem: AlignProblem, source: StartSource, config: FindPoseConfig, proposed: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return candidates (B, H, num_dofs), best first, and their costs, after as many searches as each cloud needs."""
     poses, costs = _search(problem, source, config, proposed)
@@ -255,7 +255,7 @@ def _search_with_retries(
         if len(active) == 0:
             break
         part = problem.rows(active)
-        retried, retried_costs = _search(part, source, replace(config, seed=config.seed + number), None)
+        retried, retried_costs = _search(part, source, replace(config, seed=config.seed + number), proposed[active])
         merged, merged_costs = torch.cat([poses[active], retried], 1), torch.cat([costs[active], retried_costs], 1)
         order = merged_costs.argsort(dim=1, stable=True)[:, : poses.shape[1]]
         poses[active], costs[active] = take_rows(merged, order), merged_costs.gather(1, order)
@@ -264,7 +264,7 @@ def _search_with_retries(
 
 
 def _search(
-    problem: AlignProblem, source: StartSource, config: FindPoseConfig, proposed: Tensor | None
+    problem: AlignProblem, source: StartSource, config: FindPoseConfig, proposed: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return candidates (B, H, num_dofs) after one search, best first, and their costs.
 
@@ -272,14 +272,14 @@ def _search(
         problem: the batch.
         source: of rough poses.
         config: of the search.
-        proposed: (B, K, num_dofs) that lie on the data already, or None.
+        proposed: (B, K, num_dofs) that lie on the data already.
     """
     generator = torch.Generator().manual_seed(config.seed)
     search = PoseSearch(problem, generator)
     rough, rough_costs = register_rigidly(search, source.rough(search.problem, generator), generator)
     rough = _best_distinct(search.problem, rough, rough_costs, config.num_candidates)
     pool = search.fit_coarsely(rough, _CANDIDATES.fit_steps)[:, : config.num_placed]
-    pool = pool if proposed is None else torch.cat([proposed, pool], dim=1)[:, : max(config.num_placed, 1)]
+    pool = torch.cat([proposed, pool], dim=1)[:, : config.num_placed]
     poses, _ = search.refine(search.prune(pool, config.num_searched), config.search_rounds)
     return _fitted(problem, poses)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchreg.alignment.fit_proposals import best_proposals
+from torchreg.alignment.fit_proposals import best_proposals, with_proposed_prior
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.pose_proposer import PoseProposer, check_proposer, shipped_proposer
 from torchreg.alignment.problem import AlignProblem
@@ -63,11 +63,16 @@ class StartSource:
         """Return rough poses (B, K, num_dofs) of all sources."""
         return self._told(problem, torch.cat([source(problem, generator) for source in self.sources], dim=1))
 
-    def proposed(self, problem: AlignProblem, count: int) -> Tensor | None:
-        """Return poses (B, count, num_dofs) of the network after a coarse fit; None without any."""
+    def proposed(self, problem: AlignProblem, count: int) -> tuple[AlignProblem, Tensor]:
+        """Return the problem with the network's pose as the prior, and its poses (B, count, num_dofs) after a fit.
+
+        Without a network there are none (B, 0, num_dofs), and the problem stays.
+        """
         if self.proposer is None:
-            return None
-        return self._told(problem, best_proposals(problem, self.proposer.propose(problem.data, problem.valid), count))
+            return problem, problem.prior.mean.new_zeros(len(problem.data), 0, problem.prior.mean.shape[-1])
+        proposals = self.proposer.propose(problem.data, problem.valid)
+        problem = with_proposed_prior(problem, proposals)
+        return problem, self._told(problem, best_proposals(problem, proposals, count))
 
     def _told(self, problem: AlignProblem, poses: Tensor) -> Tensor:
         return problem.clamp_candidates(poses if self.known is None else self.known.informed(problem, poses))

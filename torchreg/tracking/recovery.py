@@ -134,9 +134,7 @@ class Recovery:
             self.fitter.skin, data[None], valid, state.pose[None], origin[None], prior_std=FindPoseConfig.prior_std,
             pose_atol=0.0,
         )  # fmt: skip
-        poses = self.source.proposed(problem, _PLAN.num_proposed)
-        if poses is None:
-            return None
+        _, poses = self.source.proposed(problem, _PLAN.num_proposed)
         fits = [self.fitter.fit_at(state, frame, shifted(pose, origin), "found") for pose in poses[0]]
         return max((fit for fit in fits if fit is not None), key=lambda fit: fit.soft_inliers, default=None)
 
