@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -29,6 +30,7 @@ from torchreg.alignment.reliability import CALIBRATION
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES, typical_poses
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface, residual_noise, surface_objective
 from torchreg.errors import InputError
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import BASE_DOFS, shifted
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
@@ -164,6 +166,29 @@ class PoseInitializer(nn.Module):
             )
         count = self.config.num_model_points
         self.skin = check_skin(shape, sample_skin(shape, count) if model_points is None else model_points)
+
+    @classmethod
+    def load(
+        cls,
+        path: str | os.PathLike[str],
+        shape: ArticulatedShape,
+        config: PoseInitializerConfig | None = None,
+        *,
+        limits: FileLimits = DEFAULT_LIMITS,
+    ) -> PoseInitializer:
+        """Return an initializer with the network of a file, as `train_initializer` writes it.
+
+        Args:
+            path: weights, ``.safetensors``.
+            shape: for which it was trained; it may be larger or smaller.
+            config: see `PoseInitializerConfig`.
+            limits: of what is read, see `FileLimits`.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            FormatError: if the file is damaged, holds no network, or one for another shape.
+        """
+        return cls(shape, config, proposer=PoseProposer.load(path, shape, limits=limits))
 
     def forward(self, points: Tensor, mask: Tensor | None = None, start: Tensor | None = None) -> InitialPose:
         """Return the poses of the shape in clouds.
