@@ -248,6 +248,7 @@ def align(
                 align, shape, model_points=skin, locked=locked, prior=prior, keypoints=keypoints,
                 keypoint_std=keypoint_std, config=config, on_step=on_step,
             ),
+            partial(StartSource.of(shape).shows, skin),
         )  # fmt: skip
         return replace(found, crop=crop.mask)
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)

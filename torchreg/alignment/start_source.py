@@ -9,13 +9,19 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchreg.alignment.fit_proposals import best_proposals, with_proposed_prior
+from torchreg._threads import one_thread
+from torchreg.alignment.confidence import explains
+from torchreg.alignment.fit_proposals import best_proposal, best_proposals, with_proposed_prior
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.pose_proposer import PoseProposer, check_proposer, shipped_proposer
-from torchreg.alignment.problem import AlignProblem
+from torchreg.alignment.problem import AlignProblem, centered_problem
+from torchreg.alignment.reliability import CALIBRATION
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource
+from torchreg.capture.depth_frame import DepthFrame
+from torchreg.capture.free_space import FreeSpace
 from torchreg.errors import InputError
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.skin import LinearBlendSkin
 
 if TYPE_CHECKING:
     from torchreg.alignment.pose_initializer import PoseInitializer
@@ -73,6 +79,22 @@ class StartSource:
         proposals = self.proposer.propose(problem.data, problem.valid)
         problem = with_proposed_prior(problem, proposals)
         return problem, self._told(problem, best_proposals(problem, proposals, count))
+
+    @torch.no_grad()
+    def shows(self, skin: LinearBlendSkin, frame: DepthFrame) -> bool:
+        """Return whether a frame shows the shape of a skin, as the network sees it; True without one, as none tells."""
+        if self.proposer is None:
+            return True
+        near = frame.near(frame.points.double().mean(0))
+        data = near.points[None].to(skin.shape.rest)
+        valid, origin = torch.ones_like(data[..., 0], dtype=torch.bool), torch.zeros_like(data[:, 0])
+        problem = centered_problem(
+            skin, data, valid, skin.shape.rest[None], origin, prior_std=None, pose_atol=0.0,
+            free_space=FreeSpace.stacked([near.free_space]),
+        )  # fmt: skip
+        with one_thread():
+            best = best_proposal(problem, self.proposer.propose(data, valid))
+            return bool(explains(problem, best.pose, best.lead) >= CALIBRATION.doubtful)
 
     def _told(self, problem: AlignProblem, poses: Tensor) -> Tensor:
         return problem.clamp_candidates(poses if self.known is None else self.known.informed(problem, poses))
