@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -25,7 +25,7 @@ from torchreg.alignment.inputs import (
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmark_fit import find_keypoints, measured_alone
 from torchreg.alignment.limb_search import distinct_first, take_rows
-from torchreg.alignment.pose_proposer import PoseProposer
+from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.pose_search import PoseSearch, mean_distances
 from torchreg.alignment.problem import (
     AlignProblem,
@@ -44,9 +44,6 @@ from torchreg.geometry.camera import Camera
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
-
-if TYPE_CHECKING:
-    from torchreg.alignment.pose_initializer import PoseInitializer
 
 
 @dataclass(frozen=True)
@@ -106,7 +103,7 @@ def find_pose(
     num_starts: int = 4,
     mask: Tensor | None = None,
     sources: Sequence[PoseSource] | None = None,
-    initializer: PoseInitializer | PoseProposer | None = None,
+    initializer: PoseProposer | HoldsProposer | None = None,
     model_points: LinearBlendSkin | None = None,
     locked: Sequence[str] | Tensor = (),
     prior: tuple[Any, Any] | None = None,

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -348,13 +348,20 @@ def _restored(tensors: Mapping[str, Tensor], record: Mapping[str, Any], shape: A
     return found
 
 
-def check_proposer(shape: Articulation, proposer: object) -> PoseProposer:
+class HoldsProposer(Protocol):
+    """Something with a network that proposes poses, as a `PoseInitializer`."""
+
+    proposer: PoseProposer | None
+
+
+def check_proposer(shape: Articulation, initializer: PoseProposer | HoldsProposer) -> PoseProposer:
     """Return a network that was given for a shape.
 
     Raises:
         InputError: if it proposes other degrees of freedom.
         InputTypeError: if it is something else.
     """
+    proposer = initializer if isinstance(initializer, PoseProposer) else getattr(initializer, "proposer", initializer)
     if not isinstance(proposer, PoseProposer):
         raise InputTypeError(
             f"initializer must be a PoseProposer, or a PoseInitializer that has one, got {type(proposer).__name__}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,7 +12,7 @@ from torchreg._threads import one_thread
 from torchreg.alignment.confidence import explains
 from torchreg.alignment.fit_proposals import best_proposal, best_proposals, with_proposed_prior
 from torchreg.alignment.known_dofs import KnownDofs
-from torchreg.alignment.pose_proposer import PoseProposer, check_proposer, shipped_proposer
+from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer, check_proposer, shipped_proposer
 from torchreg.alignment.problem import AlignProblem, centered_problem
 from torchreg.alignment.reliability import CALIBRATION
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource
@@ -22,9 +21,6 @@ from torchreg.capture.free_space import FreeSpace
 from torchreg.errors import InputError
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
-
-if TYPE_CHECKING:
-    from torchreg.alignment.pose_initializer import PoseInitializer
 
 
 @dataclass(frozen=True)
@@ -46,7 +42,7 @@ class StartSource:
         cls,
         shape: ArticulatedShape,
         sources: Sequence[PoseSource] | None = None,
-        initializer: PoseInitializer | PoseProposer | None = None,
+        initializer: PoseProposer | HoldsProposer | None = None,
     ) -> StartSource:
         """Return what is given, or else the default for a shape.
 
@@ -58,7 +54,7 @@ class StartSource:
             raise InputError("sources must hold at least one source of rough poses, got none")
         proposer = shipped_proposer(shape) if sources is None and initializer is None else None
         if initializer is not None:
-            proposer = check_proposer(shape, getattr(initializer, "proposer", initializer))
+            proposer = check_proposer(shape, initializer)
         return cls(DEFAULT_SOURCES if sources is None else sources, proposer)
 
     def informed(self, known: KnownDofs | None) -> StartSource:

@@ -159,8 +159,7 @@ def align(
         first = None if start is None else load_pose(start, model)
         points = sample_skin(model, config.num_model_points, sharpness=config.sharpness)
         known = read_known(model, locked, joints, joint_std, len(clouds))
-        seen_side = None if side == "either" else getattr(model, "side", None)
-        measured = read_keypoints(keypoints, keypoint_std, len(clouds), seen_side, pictures)
+        measured = read_keypoints(keypoints, keypoint_std, clouds, None if side == "either" else model, pictures)
         run = _AlignRun(
             model, config, points, scale, time, frame, first, known, measured, pictures=pictures, fit_shape=fit_shape
         )

@@ -11,7 +11,7 @@ import typer
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Sequence, Sized
 
     from torch import Tensor
 
@@ -65,15 +65,15 @@ class MeasuredFrames:
 
 
 def read_keypoints(
-    path: Path | None, std: float | None, count: int, side: str | None, pictures: Sequence[DepthFrame] | None
+    path: Path | None, std: float | None, frames: Sized, shape: Any, pictures: Sequence[DepthFrame] | None
 ) -> MeasuredFrames:
-    """Return the keypoints of ``count`` frames; InputError if there are not as many.
+    """Return the keypoints of all frames; InputError if there are not as many.
 
     Args:
         path: of the file or folder.
         std: standard deviation, or None.
-        count: of frames.
-        side: of the hand, where a detector saw several; None for the surest.
+        frames: as many as there are.
+        shape: whose side tells which hand it is, where a detector saw several; None for the surest.
         pictures: of the frames, if they are pictures.
     """
     if path is None:
@@ -87,7 +87,7 @@ def read_keypoints(
         check_positive(std, "--keypoint-std")
     camera = pictures[0].camera if pictures else None
     size = None if camera is None else (camera.width, camera.height)
-    table = load_keypoints(path, side=side, picture=size)
-    if len(table) != count:
-        raise InputError(f"{path} must hold the keypoints of each of {count} frames; got those of {len(table)}")
+    table = load_keypoints(path, side=getattr(shape, "side", None), picture=size)
+    if len(table) != len(frames):
+        raise InputError(f"{path} must hold the keypoints of each of {len(frames)} frames; got those of {len(table)}")
     return MeasuredFrames(table, std)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from torchreg.errors import FormatError
 
@@ -12,7 +12,6 @@ from torchreg.errors import FormatError
 _HANDS = ("hand_landmarks", "landmarks", "handLandmarks", "multi_hand_landmarks", "multiHandLandmarks")
 _SIDES = ("handedness", "handednesses", "multi_handedness", "multiHandedness")
 _LABELS = ("category_name", "categoryName", "label")
-_NUM_KEYPOINTS = 21
 
 
 @dataclass(frozen=True)
@@ -28,6 +27,7 @@ class _Found:
     points: list[list[Any]]
     side: str | None
     score: float
+    count: ClassVar[int] = 21  # of keypoints: the wrist, and four of each finger
 
 
 def is_detection(frame: Any) -> bool:
@@ -72,7 +72,7 @@ def _of_openpose(people: Sequence[Any], file: object) -> list[_Found]:
             numbers = person.get(f"hand_{side}_keypoints_2d") if isinstance(person, Mapping) else None
             if not numbers:
                 continue
-            if not isinstance(numbers, list) or len(numbers) != 3 * _NUM_KEYPOINTS:
+            if not isinstance(numbers, list) or len(numbers) != 3 * _Found.count:
                 raise FormatError(f"{file}: hand_{side}_keypoints_2d must hold 63 numbers, 21 times x, y, confidence")
             rows = [numbers[k : k + 3] for k in range(0, len(numbers), 3)]
             sureness = [_plain(row[2], file) for row in rows]
@@ -94,7 +94,7 @@ def _of_mediapipe(frame: Mapping[str, Any], file: object, picture: tuple[int, in
     found = []
     for number, hand in enumerate(hands or []):
         landmarks = hand.get("landmark") if isinstance(hand, Mapping) else hand
-        if not isinstance(landmarks, list) or len(landmarks) != _NUM_KEYPOINTS:
+        if not isinstance(landmarks, list) or len(landmarks) != _Found.count:
             raise FormatError(f"{file}: a hand of MediaPipe must have 21 landmarks")
         side, score = _side(sides[number] if number < len(sides) else None)
         found.append(_Found([_in_picture(mark, file, picture) for mark in landmarks], side, score))

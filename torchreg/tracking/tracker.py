@@ -6,7 +6,7 @@ import math
 import time as clock
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from torchreg.alignment.align import AlignConfig, align
 from torchreg.alignment.inputs import check_skin, floating_origin, warn_about_degenerate, warn_about_units
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmarks import MeasuredKeypoints
-from torchreg.alignment.pose_proposer import PoseProposer
+from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.start_source import StartSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, InputTypeError
@@ -35,9 +35,6 @@ from torchreg.tracking.model_points import next_model_points
 from torchreg.tracking.motion_model import advance_clock, decayed_velocity, restart_motion, update_motion
 from torchreg.tracking.recovery import Recovery, after_search
 from torchreg.tracking.results import FrameResult, TrackResult, TrackState
-
-if TYPE_CHECKING:
-    from torchreg.alignment.pose_initializer import PoseInitializer
 
 OnFrame = Callable[[Tensor, FrameResult], None]
 
@@ -85,7 +82,7 @@ class Tracker:
         config: TrackConfig | None = None,
         model_points: LinearBlendSkin | None = None,
         locked: Sequence[str] | Tensor = (),
-        initializer: PoseInitializer | PoseProposer | None = None,
+        initializer: PoseProposer | HoldsProposer | None = None,
     ) -> None:
         self.shape, self.config = shape, config or TrackConfig()
         if model_points is not None:
