@@ -19,6 +19,7 @@ from torchreg.alignment.align_stages import (
     best_start,
     fit_batch_surface,
     fit_to_the_end,
+    keep_searched,
     refit_without_cut,
     search_where_needed,
 )
@@ -54,9 +55,9 @@ from torchreg.alignment.reliability import (
     without_cut,
 )
 from torchreg.alignment.results import AlignRecord, AlignResult
-from torchreg.alignment.rough_poses import DEFAULT_SOURCES
 from torchreg.alignment.shape_fit import fit_coefficients, fitted_rig
 from torchreg.alignment.sigma_schedule import SigmaSchedule
+from torchreg.alignment.start_source import StartSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, UnitsWarning
 from torchreg.geometry.camera import Camera
@@ -250,6 +251,7 @@ def align(
                 align, shape, model_points=skin, locked=locked, prior=prior, keypoints=keypoints,
                 keypoint_std=keypoint_std, fit_shape=fit_shape, config=config, on_step=on_step,
             ),
+            partial(StartSource.of(shape).shows, skin),
         )  # fmt: skip
         return replace(found, crop=crop.mask)
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
@@ -295,6 +297,7 @@ def _align(
             found = anneal_batch(batch, config)  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3
             found = fit_batch_surface(batch, found, config)  # eqs. 21 and 22: section 3.4
             batch, found = best_start(batch, found) if several else (batch, found)
+            found = found if lead is None else keep_searched(batch, found, config)
             found = search_where_needed(batch, found, config)
             judged = without_cut(batch.problem, found.pose, seen.frames)
             found = refit_without_cut(batch, judged, found, config)
@@ -384,7 +387,7 @@ def _found_pose(
     search = FindPoseConfig(num_model_points=config.num_model_points, nan_policy=config.nan_policy, seed=config.seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnitsWarning)  # the alignment tells it
-        return search_everywhere(shape, seen, 1, DEFAULT_SOURCES, model_points, search, known)
+        return search_everywhere(shape, seen, 1, StartSource.of(shape), model_points, search, known)
 
 
 def _check_start(shape: ArticulatedShape, initial_pose: Tensor | None, clouds: Tensor) -> tuple[Tensor, bool]:
