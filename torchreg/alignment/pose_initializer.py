@@ -67,9 +67,9 @@ class PoseInitializerConfig:
         noise: standard deviation of the data about the surface, metres; by default estimated, cloud by cloud, and then
             held when gradients are taken.
         num_model_points: points sampled on the shape for the EM.
-        search: for poses from scratch: "doubtful", the default where a network proposes them, searches where its pose
-            is doubtful, less sure than one half; "never" is fast in batches and tells it by the confidence alone;
-            "always", the only way without a network.
+        search: for poses from scratch: "never", the default where a network proposes them, tells by the confidence
+            which are doubtful; "doubtful" searches where it is below one half, in seconds; "always", the only way
+            without a network.
         find_pose: settings of the search.
         chunk: clouds that are searched at a time; by default one on a CPU, whose caches hold no more, else 256.
         nan_policy: "raise", or "omit" to leave out non-finite data.
@@ -270,7 +270,7 @@ class PoseInitializer(nn.Module):
         if self.proposer is None or self.config.search == "always":
             return self._search(data, valid)
         pose, mean, confidence = self._propose(self.proposer, data, valid)
-        if self.config.search == "never":
+        if self.config.search != "doubtful":
             return pose, mean, confidence
         doubtful = valid & (confidence < CALIBRATION.doubtful).unsqueeze(-1)
         searched, typical, sureness = self._search(data, doubtful)
