@@ -69,7 +69,7 @@ def lifted_legs(num_frames):
 
 
 def test_legs_that_are_lifted_in_turn_keep_their_names():
-    frames, orders = lifted_legs(17)
+    frames, orders = lifted_legs(9)
     found = name_over_time(frames, 2, torch.arange(5))
     names = torch.stack([order[row] for order, row in zip(orders, found.labels, strict=True)])
     assert bool((names == orders[2]).all())
