@@ -8,9 +8,9 @@
   final one before the graph is imposed (bar: 70 %). "after": different trees afterwards (bar: 1). "named": the share of
   frames in which each tip is nearest to the place of its own vertex, the one that it is nearest to in the reference
   frame, of all tips' vertices (bar: 99 %). "inside": curve points inside the surface (bar: 99.5 %).
-- identity: the same sequences, every frame and every second, fourth, eighth and sixteenth. A tip is right in a frame if it is
-  within 6 % of the diagonal of its own vertex, the one nearest to it in the frame that speaks best for it (bar for all
-  frames and for every fourth: 97 % of tips and frames, one tree). Beside it the mean confidence in names.
+- identity: the same sequences, every frame and every second, fourth, eighth and sixteenth. A tip is right in a frame if
+  it is within 6 % of the diagonal of its own vertex, the one nearest to it in the frame that speaks best for it (bar
+  for all frames and for every fourth: 97 % of tips and frames, one tree). Beside it the mean confidence in names.
 - creatures: starfish and octopuses of known tips, with noise and with two arms that touch side by side or end to end.
   Bars: all arms and one junction in every frame, every name right. Where tips of arms touch end to end names are
   judged by the whole arm.

@@ -18,7 +18,7 @@ class SymmetrySearch:
 
     num_tips: tuple[int, int] = (3, 10)  # of two, a mirror tells nothing; of more there are too many: 9,496 of ten
     num_frames: int = 16  # of a sequence, evenly spaced, that are looked at: poses recur
-    least_evidence: float = 3.0  # log-odds of a mirror against none, and against any other
+    least_evidence: float = 5.0  # log-odds of a mirror against none and any other: of stars 4, of animals 6 to 20
     least_difference: float = 1e-3  # squared, in variances of random names, below which none is measured
 
 
