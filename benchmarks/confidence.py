@@ -2,6 +2,7 @@
 
     python benchmarks/confidence.py --data SHARED              # reliability on data not used to calibrate
     python benchmarks/confidence.py --data SHARED --calibrate  # fits the model of the confidence anew
+    python benchmarks/confidence.py --diagram FILE.png         # draws the reliability beside
     python benchmarks/confidence.py --smoke                    # a few alignments, to see that it runs
 
 Each case is drawn: a hand (bones and radii 5 to 15 % off in most of them) as a cloud of the side that a camera
@@ -285,6 +286,36 @@ def render(cases: Sequence[Case]) -> str:
     return "\n".join(lines)
 
 
+def draw(cases: Sequence[Case], file: Path) -> None:
+    """Draw the share that is right over the mean confidence, with 95 % intervals, and how many cases there are."""
+    from matplotlib import pyplot
+
+    right, confidence = is_right(cases).double(), torch.tensor([case.confidence for case in cases], dtype=torch.float64)
+    number = (confidence * BINS).long().clamp_max(BINS - 1)
+    figure, (axis, below) = pyplot.subplots(2, 1, figsize=(4.5, 5.2), height_ratios=(3, 1), sharex=True)
+    axis.fill_between([0, 1], [-0.1, 0.9], [0.1, 1.1], color="0.9", label="within .1")
+    axis.plot([0, 1], [0, 1], color="0.5", linewidth=1)
+    for chosen in (number == bin for bin in number.unique()):
+        count, share, mean = int(chosen.sum()), float(right[chosen].mean()), float(confidence[chosen].mean())
+        low, high = wilson_interval(share, count)
+        axis.errorbar(mean, share, [[share - low], [high - share]], fmt="o", color="C0", capsize=3)
+    below.hist(confidence.numpy(), bins=BINS, range=(0, 1), color="C0")
+    axis.set(xlim=(0, 1), ylim=(-0.02, 1.02), ylabel="share that is right")
+    axis.legend(frameon=False, loc="upper left")
+    below.set(xlabel="confidence", ylabel="cases")
+    figure.tight_layout()
+    figure.savefig(file, dpi=110)
+    pyplot.close(figure)
+
+
+def wilson_interval(share: float, count: int) -> tuple[float, float]:
+    """Return the 95 % interval of a probability of which a share of some trials came out. References: Wilson 1927."""
+    z = 1.96
+    middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
+    reach = z / (1 + z**2 / count) * math.sqrt(share * (1 - share) / count + (z / (2 * count)) ** 2)
+    return min(middle - reach, share), max(middle + reach, share)
+
+
 def line_of(kind: str, cases: Sequence[Case]) -> str:
     """Return a line about the cases of a kind: right, statuses, coverage, seconds."""
     right = is_right(cases)
@@ -304,6 +335,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, help="folder with xarm7 and rigs")
     parser.add_argument("--count", type=int, default=200, help="alignments")
     parser.add_argument("--calibrate", action="store_true", help="fit the model anew to other alignments first")
+    parser.add_argument("--diagram", type=Path, help="picture of the reliability to be written")
     parser.add_argument("--smoke", action="store_true", help="four alignments")
     options = parser.parse_args(arguments)
     things = subjects(None if options.smoke else options.data)
@@ -313,7 +345,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         bias, weights = fitted_model(torch.stack([case.evidence for case in cases]), is_right(cases))
         names = [item.name for item in fields(Evidence)]
         print(f"bias {bias:.2f}, " + ", ".join(f"{name} {weight}" for name, weight in zip(names, weights, strict=True)))
-    print(render(collect(things, count, seed=0)))
+    cases = collect(things, count, seed=0)
+    print(render(cases))
+    if options.diagram is not None:
+        draw(cases, options.diagram)
     return 0
 
 

@@ -398,7 +398,7 @@ def test_misfits_are_searched_for_again(plain_hand, plain_hand_skin, clouds, tru
     """A cloud whose first searches went wrong is saved by one with other draws; the other cloud is left alone."""
     searched = []
 
-    def fail_twice(problem, sources, config):
+    def fail_twice(problem, source, config, proposed):
         searched.append((config.seed, len(problem.data)))
         shift = torch.nn.functional.pad(masked_mean(clouds, torch.ones_like(clouds[..., 0])), (0, 24))
         poses = (truths - shift)[-len(problem.data) :].unsqueeze(1).repeat(1, 2, 1)
@@ -410,7 +410,7 @@ def test_misfits_are_searched_for_again(plain_hand, plain_hand_skin, clouds, tru
 
     monkeypatch.setattr(find_pose_module, "_search", fail_twice)
     config = replace(QUICK, num_retries=5, seed=7)
-    starts = find_pose(plain_hand, clouds, model_points=plain_hand_skin, config=config)
+    starts = find_pose(plain_hand, clouds, sources=FEW, model_points=plain_hand_skin, config=config)
     assert searched == [(7, 2), (8, 1), (9, 1)]
     torch.testing.assert_close(starts.best, truths, atol=1e-5, rtol=0)
     assert bool((starts.costs[:, :1] <= starts.costs).all())

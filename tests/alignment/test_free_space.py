@@ -1,9 +1,12 @@
 """Depth frames in alignment: free space in the objective and in the choice of poses, crops of whole pictures."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
 import torchreg as tr
+from torchreg.alignment import in_picture
 from torchreg.alignment.free_space_term import FreeSpaceTerm
 from torchreg.alignment.inputs import Observation
 from torchreg.alignment.problem import alignment_cost, centered_problem, masked_mean
@@ -135,3 +138,19 @@ def test_what_a_crop_cuts_off_is_told_from_what_stands_alone():
     off = strip & ((frame.pixels[:, 0] > 60) | (frame.pixels[:, 0] < 48))
     cut = beyond_cut(frame, off)
     assert torch.equal(cut, strip & (frame.pixels[:, 0] > 60))
+
+
+def test_of_a_surface_the_crops_that_show_the_shape_at_a_glance_are_tried_first(monkeypatch):
+    tried, sureness = [], {"elbow": 0.1, "hand": 0.9, "wall": 0.6}
+    monkeypatch.setattr(in_picture, "candidate_crops", lambda frame, size: [["elbow", "hand"], ["wall"]])
+
+    def answer(crop):
+        tried.append(crop)
+        return SimpleNamespace(confidence=sureness[crop])
+
+    found, crop = in_picture.surest_crop(None, 0.26, answer, lambda crop: crop == "hand")
+    assert (found.confidence, crop, tried) == (0.9, "hand", ["hand"])
+    sureness["hand"] = 0.4
+    tried.clear()
+    assert in_picture.surest_crop(None, 0.26, answer, lambda crop: crop == "hand")[1] == "wall"
+    assert tried == ["hand", "elbow", "wall"]

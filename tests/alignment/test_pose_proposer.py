@@ -5,13 +5,16 @@ from dataclasses import replace
 import pytest
 import torch
 
+import torchreg.alignment.find_pose as find_pose_module
 from torchreg.alignment import train_initializer as train_module
+from torchreg.alignment.align import align
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.pose_initializer import PoseInitializer, PoseInitializerConfig
 from torchreg.alignment.pose_proposer import HAND_WEIGHTS, PoseProposer, ProposerSize
 from torchreg.alignment.train_initializer import TrainInitializerConfig, train_initializer
 from torchreg.datasets.cloud_batches import random_clouds, random_poses
-from torchreg.errors import FormatError, InputError
+from torchreg.datasets.hand import make_hand_cloud, random_hand_pose
+from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import sample_skin
@@ -110,6 +113,53 @@ def test_a_cloud_gives_alone_what_it_gives_in_a_batch_and_moved(plain_hand, plai
     alone = net.propose(clouds.points[3:4] + offset, clouds.mask[3:4])
     torch.testing.assert_close(alone.poses, shifted(together.poses[3:4], offset), atol=1e-3, rtol=0)
     torch.testing.assert_close(together.weights.sum(-1), torch.ones(12))
+
+
+def keypoint_errors(hand, found, pose):
+    return float((hand.keypoints(found) - hand.keypoints(pose)).norm(dim=-1).mean())
+
+
+def test_where_the_network_is_sure_nothing_is_searched(plain_hand, plain_hand_skin, clouds, monkeypatch):
+    searched = []
+    monkeypatch.setattr(find_pose_module, "_search", lambda *given: searched.append(given))
+    row = int(clouds.mask.sum(-1).argmax())
+    points = clouds.points[row, clouds.mask[row]]
+    found = find_pose(plain_hand, points, model_points=plain_hand_skin)
+    assert not searched
+    assert keypoint_errors(plain_hand, found.best, clouds.poses[row]) < 0.015
+    layer = PoseInitializer(plain_hand, model_points=plain_hand_skin)
+    for network in (layer, layer.proposer):
+        again = find_pose(plain_hand, points, initializer=network, model_points=plain_hand_skin)
+        torch.testing.assert_close(again.poses, found.poses)
+
+
+def test_what_a_poor_network_proposes_does_not_spoil_a_search(plain_hand, plain_hand_skin, clouds):
+    row = int(clouds.mask.sum(-1).argmax())
+    points = clouds.points[row, clouds.mask[row]]
+    quick = FindPoseConfig(num_candidates=16, num_placed=5, num_searched=2, search_rounds=1)
+    untrained = PoseProposer(plain_hand, TINY).eval()
+    found = find_pose(plain_hand, points, initializer=untrained, model_points=plain_hand_skin, config=quick)
+    assert keypoint_errors(plain_hand, found.best, clouds.poses[row]) < 0.02
+    assert (found.costs[0] <= found.costs).all()
+
+
+def test_a_network_of_another_shape_is_refused(plain_hand, arm, clouds):
+    network = PoseProposer(arm, TINY)
+    with pytest.raises(InputError, match="initializer must be a network for this shape's 27 degrees of freedom"):
+        find_pose(plain_hand, clouds.points[0], initializer=network)
+    with pytest.raises(InputTypeError, match=r"initializer must be a PoseProposer, or a PoseInitializer .* NoneType"):
+        find_pose(arm, clouds.points[0], initializer=PoseInitializer(arm))
+
+
+def test_an_alignment_is_no_worse_than_the_start_that_was_found(plain_hand, plain_hand_skin):
+    """Of a hand seen edge-on an EM would draw the fingers into the palm."""
+    cloud = make_hand_cloud(
+        plain_hand, random_hand_pose(plain_hand, torch.Generator().manual_seed(24)), noise=0.001, outlier_ratio=0.15,
+        camera=torch.zeros(3), generator=torch.Generator().manual_seed(24),
+    )  # fmt: skip
+    found = find_pose(plain_hand, cloud.points, model_points=plain_hand_skin)
+    result = align(plain_hand, cloud.points, model_points=plain_hand_skin)
+    assert result.cost <= found.costs[0] + 1.0
 
 
 def test_training_goes_on_where_it_ended_and_files_are_for_their_shape(plain_hand, arm, tmp_path, small_training):

@@ -7,13 +7,16 @@ import torch
 
 from torchreg.alignment.align import AlignConfig, align
 from torchreg.alignment.calibrate import CalibrateConfig, calibrate
+from torchreg.alignment.reliability import SurfaceError
 from torchreg.alignment.shape_fit import different_people
 from torchreg.errors import InputError
 from torchreg.geometry.facing_normals import facing_normals
 from torchreg.geometry.mesh import TriangleMesh, concatenate, sample_surface, unit_sphere
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.rotation import so3_exp
+from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.limbs import Body, Limb
 from torchreg.solvers.e_step import expectation
 from torchreg.solvers.oriented_e_step import oriented_expectation
 from torchreg.storage import load
@@ -86,7 +89,8 @@ def test_one_side_of_a_person_tells_pose_and_shape(shape, tmp_path):
     deviation = result.coefficient_covariance.diagonal().sqrt()
     assert bool(((result.coefficients - coefficients).abs() < 4 * deviation + 0.02).all())
     assert result.covariance.shape == (shape.num_dofs, shape.num_dofs)
-    assert result.status.usable
+    assert result.status is Status.CONVERGED
+    assert float(result.confidence) > 0.8
     mean = torch.zeros(3)
     alone = align(shape.with_coefficients(mean), data, start_near(shape, pose), config=QUICK)
     off = (shape.vertices(alone.pose, mean) - shape.vertices(pose, coefficients)).norm(dim=-1)
@@ -189,3 +193,33 @@ def test_normals_of_one_side_face_the_camera(shape, told):
 
 def test_noise_has_no_normals():
     assert bool((facing_normals(torch.rand(500, 3, generator=torch.Generator().manual_seed(0))) == 0).all())
+
+
+def test_a_person_is_found_without_a_start(shape):
+    coefficients = torch.tensor([0.9, -0.8, 0.4])
+    pose, data = scan(shape, coefficients, seed=3, count=600)
+    pose[3:6], moved = torch.tensor([0.4, 1.9, -0.7]), so3_exp(pose[3:6])
+    turn = so3_exp(pose[3:6]) @ moved.mT
+    data = (data - pose[:3]) @ turn.mT + pose[:3]
+    result = align(shape, data, fit_shape=True, config=QUICK)
+    _, off = nearest_neighbor(shape.vertices(result.pose, result.coefficients), shape.vertices(pose, coefficients))
+    assert float(off.mean()) < 0.02
+    assert float(result.evidence[-1]) < 1, "no rival was compared"
+
+
+def test_a_person_in_what_is_none_is_doubtful(shape):
+    generator = torch.Generator().manual_seed(0)
+    sheet = torch.rand(400, 3, generator=generator) * torch.tensor([1.2, 0.5, 0.02])
+    result = align(shape, sheet, shape.rest_pose(), fit_shape=True, config=QUICK)
+    assert result.status is Status.DOUBTFUL
+    assert float(result.confidence) < 0.2
+
+
+def test_what_is_not_known_of_a_surface():
+    error = SurfaceError(
+        whole=torch.tensor([0.02]), parts=torch.tensor([[0.0, 0.1, 0.0]]), moved=torch.tensor([0.021])
+    )  # fmt: skip
+    assert not bool(error.converged)
+    assert float(error.unknown(1.0)) < float(error.unknown(0.5)) < 1
+    limbs = [Limb((Body((part,), -1, ()),), 0) for part in range(3)]
+    assert [bool(error.loose(limb, 1.0)) for limb in limbs] == [False, True, False]

@@ -21,3 +21,19 @@ def test_the_model_finds_the_odds_that_made_the_cases(bench):
 def test_the_area_under_the_curve_is_that_of_all_pairs(bench):
     confidence, right = torch.tensor([0.9, 0.6, 0.6, 0.2]), torch.tensor([True, True, False, False])
     assert bench.area_under_curve(confidence, right) == pytest.approx((1 + 1 + 0.5 + 1) / 4)
+
+
+def test_the_interval_of_a_share_holds_it_and_shrinks(bench):
+    for share, count in ((0.0, 5), (0.7, 10), (1.0, 40)):
+        low, high = bench.wilson_interval(share, count)
+        assert -1e-9 <= low <= share <= high <= 1 + 1e-9
+        wider = bench.wilson_interval(share, 4 * count)
+        assert wider[1] - wider[0] < high - low
+    # Of 10 trials 7: Wilson's interval by hand.
+    assert bench.wilson_interval(0.7, 10) == pytest.approx((0.397, 0.892), abs=1e-3)
+
+
+def test_the_diagram_is_drawn(bench, tmp_path):
+    case = bench.Case("hand", True, bench.tr.Status.CONVERGED, 0.01, torch.zeros(8), 0.95, True, 0.1)
+    bench.draw([case, bench.replace(case, confidence=0.2, error=1.0)], tmp_path / "r.png")
+    assert (tmp_path / "r.png").stat().st_size > 1000

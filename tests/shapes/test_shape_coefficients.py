@@ -9,6 +9,7 @@ import torch
 from torchreg.errors import FormatError, InputError
 from torchreg.geometry.rotation import so3_exp
 from torchreg.io.npz import save_arrays
+from torchreg.shapes.anny_body import Phenotypes
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.shaped import ShapedSkin, ShapedTree
 from torchreg.shapes.shaped_surface import ShapedSurface
@@ -241,6 +242,17 @@ def test_anny_at_rest():
         expected = model(phenotype_kwargs=phenotypes)["rest_vertices"]
     found = shape.vertices(shape.rest_pose(), phenotypes.float())
     torch.testing.assert_close(found.double(), expected, atol=2e-6, rtol=0)
+
+
+def test_phenotypes_know_their_derivatives():
+    generator = torch.Generator().manual_seed(0)
+    anchors = [torch.tensor([0.0, 0.4, 1.0], dtype=D), torch.tensor([0.0, 1.0], dtype=D)]
+    mask = torch.tensor([[1, 0, 0, 0, 1, 1], [0, 1, 0, 1, 0, 0], [0, 0, 1, 0, 0, 1], [0, 0, 0, 0, 0, 0]], dtype=D)
+    features = Phenotypes(anchors, torch.tensor([0.3], dtype=D), mask, torch.randn(4, 5, generator=generator, dtype=D))
+    # At an anchor too, where the slope jumps.
+    coefficients = torch.tensor([[0.2, 0.7], [0.4, 0.1], [0.9, 1.0]], dtype=D)
+    expected = torch.stack([torch.autograd.functional.jacobian(features, row) for row in coefficients])
+    torch.testing.assert_close(features.jacobian(coefficients), expected)
 
 
 def test_an_unknown_kind_of_anny():

@@ -47,6 +47,14 @@ def test_held_predictions_slow_down(tracker, tracked):
     assert all(later < 0.97 * earlier for earlier, later in pairwise(steps))
 
 
+def test_a_hand_that_leaps_out_of_reach_is_proposed_by_the_network_at_once(tip_errors, tracker, clouds, frames):
+    made, turn, shift = tracker(), torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), torch.tensor([0.4, -0.3, 0.2])
+    made.run(frames[:2])
+    result = made.step(frames[2] @ turn.mT + shift)
+    assert (result.acquired, result.status.usable) == ("found", True)
+    assert tip_errors(((result.keypoints - shift) @ turn)[None], clouds[2:3]).mean() < 0.006
+
+
 def moved(pose, x):
     return torch.cat([pose[:1] + x, pose[1:]])
 

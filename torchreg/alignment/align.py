@@ -19,6 +19,7 @@ from torchreg.alignment.align_stages import (
     best_start,
     fit_batch_surface,
     fit_to_the_end,
+    keep_searched,
     refit_without_cut,
     search_where_needed,
 )
@@ -45,6 +46,8 @@ from torchreg.alignment.problem import (
 )
 from torchreg.alignment.reliability import (
     CALIBRATION,
+    SHAPE_CALIBRATION,
+    SurfaceError,
     confidence_of,
     curvature,
     gather_evidence,
@@ -52,9 +55,9 @@ from torchreg.alignment.reliability import (
     without_cut,
 )
 from torchreg.alignment.results import AlignRecord, AlignResult
-from torchreg.alignment.rough_poses import DEFAULT_SOURCES
 from torchreg.alignment.shape_fit import fit_coefficients, fitted_rig
 from torchreg.alignment.sigma_schedule import SigmaSchedule
+from torchreg.alignment.start_source import StartSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, UnitsWarning
 from torchreg.geometry.camera import Camera
@@ -202,7 +205,8 @@ def align(
             against it as errors that neighbors share, not one by one.
         fit_shape: True to fit the shape's coefficients too, with their prior: a body to a person. "bones" does so for
             any rig, whose coefficients are then the lengths and radii of its parts. For one cloud or depth frame
-            without keypoints, locked degrees of freedom and prior; a start is given for the mean coefficients.
+            without keypoints, locked degrees of freedom and prior; a start is given for the mean coefficients. Without
+            one, people of different sizes are sought everywhere.
         keypoints: where a detector saw the shape's keypoints (of a hand 21, see `AlignResult.keypoints`), as evidence
             beside the data: (K, 3), metres, or with depth frames of one camera (K, 2), pixels as (column, row); NaN for
             those not seen. (B, K, 3) or (B, K, 2) for a batch.
@@ -245,8 +249,9 @@ def align(
             model_size(skin),
             partial(
                 align, shape, model_points=skin, locked=locked, prior=prior, keypoints=keypoints,
-                keypoint_std=keypoint_std, config=config, on_step=on_step,
+                keypoint_std=keypoint_std, fit_shape=fit_shape, config=config, on_step=on_step,
             ),
+            partial(StartSource.of(shape).shows, skin),
         )  # fmt: skip
         return replace(found, crop=crop.mask)
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
@@ -292,6 +297,7 @@ def _align(
             found = anneal_batch(batch, config)  # E-step (17, 18), M-step (20), annealed sigma: sections 3.1 to 3.3
             found = fit_batch_surface(batch, found, config)  # eqs. 21 and 22: section 3.4
             batch, found = best_start(batch, found) if several else (batch, found)
+            found = found if lead is None else keep_searched(batch, found, config)
             found = search_where_needed(batch, found, config)
             judged = without_cut(batch.problem, found.pose, seen.frames)
             found = refit_without_cut(batch, judged, found, config)
@@ -317,9 +323,7 @@ def _align_person(
         clouds, valid = check_clouds(shape, seen.points, seen.mask, config.nan_policy)
         if clouds.ndim != 2:
             raise InputError("fit_shape takes one cloud; calibrate fits several scans of one person")
-    if initial_pose is None:
-        initial_pose = _found_pose(shape, seen, None, None, config).starts.best
-    pose = _check_start(shape, initial_pose, clouds[None])[0]
+    pose = None if initial_pose is None else _check_start(shape, initial_pose, clouds[None])[0]
     history: list[AlignRecord] = []
 
     def record(step: AlignRecord) -> None:
@@ -336,7 +340,7 @@ def _align_person(
         skin = _model_skin(person, None, fitted.poses, config)
         batch = _centered_batch(skin, clouds, valid, fitted.poses, config, on_step, seen)
         found = StageResult(pose=batch.start, sigma=fitted.sigma, change=fitted.change)
-        result = _unbatched(_result(batch, found, config, None, batch.problem))
+        result = _unbatched(_result(batch, found, config, fitted.lead, batch.problem, fitted.error))
         dofs = shape.num_dofs
         return normal_copy(replace(
             result,
@@ -383,7 +387,7 @@ def _found_pose(
     search = FindPoseConfig(num_model_points=config.num_model_points, nan_policy=config.nan_policy, seed=config.seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnitsWarning)  # the alignment tells it
-        return search_everywhere(shape, seen, 1, DEFAULT_SOURCES, model_points, search, known)
+        return search_everywhere(shape, seen, 1, StartSource.of(shape), model_points, search, known)
 
 
 def _check_start(shape: ArticulatedShape, initial_pose: Tensor | None, clouds: Tensor) -> tuple[Tensor, bool]:
@@ -437,7 +441,12 @@ def _centered_batch(
 
 
 def _result(
-    batch: AlignBatch, found: StageResult, config: AlignConfig, lead: Tensor | None, judged: AlignProblem
+    batch: AlignBatch,
+    found: StageResult,
+    config: AlignConfig,
+    lead: Tensor | None,
+    judged: AlignProblem,
+    error: SurfaceError | None = None,
 ) -> AlignResult:
     problem, pose = batch.problem, found.pose
     distances = problem.surface.distance(problem.data, pose)
@@ -451,11 +460,14 @@ def _result(
     # What lies off the surface tells nothing of the pose, unless all does.
     told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
     degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=3)
-    around, evidence = curvature(judged, pose), gather_evidence(judged, pose, lead)
+    around, evidence, calibration = curvature(judged, pose), gather_evidence(judged, pose, lead), CALIBRATION
+    if error is not None:
+        evidence, calibration = replace(evidence, unknown=error.unknown(problem.size)), SHAPE_CALIBRATION
     table = evidence.table()
-    confidence = torch.where(degenerate, 0.0, confidence_of(table))
+    confidence = torch.where(degenerate, 0.0, confidence_of(table, calibration))
     converged = found.change <= config.pose_atol
     converged = converged | around.converged if config.surface_steps else converged
+    converged = converged if error is None else error.converged
     rows = (inliers.sum(-1), problem.valid.sum(-1), converged, degenerate, confidence)
     return AlignResult(
         pose=world,
@@ -471,7 +483,7 @@ def _result(
         covariance=around.covariance,
         confidence=confidence,
         evidence=table,
-        doubt=told_doubts(judged, pose, evidence),
+        doubt=told_doubts(judged, pose, evidence, error),
     )
 
 

@@ -68,6 +68,20 @@ def fit_batch_surface(batch: AlignBatch, found: StageResult, config: AlignConfig
     return replace(fitted, sigma=found.sigma)
 
 
+def keep_searched(batch: AlignBatch, found: StageResult, config: AlignConfig) -> StageResult:
+    """Return the result, or the start on the surface where that is better: a pose that was searched for needs no EM.
+
+    Data of one side draw an EM, whose kernel is wide at first, into the shape.
+    """
+    if config.surface_steps == 0:
+        return found
+    steps, widths = max(config.surface_steps, SURFACE_FIT.search_steps), SURFACE_FIT.widths[-1:]
+    kept = fit_surface(batch.problem, batch.start, steps=steps, widths=widths)
+    better = alignment_cost(batch.problem, kept.pose) < alignment_cost(batch.problem, found.pose)
+    pose = torch.where(better.unsqueeze(-1), kept.pose, found.pose)
+    return replace(found, pose=pose, change=torch.where(better, kept.change, found.change))
+
+
 def best_start(batch: AlignBatch, found: StageResult) -> tuple[AlignBatch, StageResult]:
     """Return the alignment of least cost, where all are of one cloud."""
     best = alignment_cost(batch.problem, found.pose).argmin().unsqueeze(0)

@@ -178,7 +178,7 @@ def _calibrate_person(
     # Each frame tells of the coefficients what it would alone, with its share of the prior; information adds up.
     alone = fitted.covariance[:, shape.num_dofs :, shape.num_dofs :].double()
     shared = torch.linalg.inv(torch.linalg.inv(alone).sum(0))
-    status = Status.CONVERGED if float(fitted.change.max()) <= config.align.pose_atol else Status.MAX_STEPS
+    status = Status.CONVERGED if bool(fitted.error.converged.all()) else Status.MAX_STEPS
     return normal_copy(Calibration(
         shape=person,
         poses=fitted.poses,

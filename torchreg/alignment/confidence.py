@@ -50,10 +50,14 @@ def pose_confidence(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor
         pose: (B, num_dofs), fitted.
         lead: (B,) by how many data more than the best of different poses it explains.
     """
+    return explains(problem, pose, lead) * known_ends(problem, pose)
+
+
+def explains(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor:
+    """Return the same (B,) but for what no data determine, which no search would find either."""
     clustered, near = clustered_data(problem, pose)
     left_over = clustered.to(pose) / near.clamp_min(1) + beside_share(problem, pose)
-    known = known_ends(problem, pose)
-    return (1 - (-lead.clamp_min(0) / EVIDENCE.lead).exp()) * (-left_over / EVIDENCE.left_over).exp() * known
+    return (1 - (-lead.clamp_min(0) / EVIDENCE.lead).exp()) * (-left_over / EVIDENCE.left_over).exp()
 
 
 def is_misfit(problem: AlignProblem, pose: Tensor) -> Tensor:

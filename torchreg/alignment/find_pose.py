@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchreg._checks import check_choice, check_count, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
-from torchreg.alignment.confidence import is_misfit, pose_confidence
+from torchreg.alignment.confidence import explains, is_misfit, pose_confidence
 from torchreg.alignment.in_picture import surest_crop
 from torchreg.alignment.inputs import (
     Observation,
@@ -25,6 +25,7 @@ from torchreg.alignment.inputs import (
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmark_fit import find_keypoints, measured_alone
 from torchreg.alignment.limb_search import distinct_first, take_rows
+from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.pose_search import PoseSearch, mean_distances
 from torchreg.alignment.problem import (
     AlignProblem,
@@ -33,11 +34,12 @@ from torchreg.alignment.problem import (
     masked_mean,
     model_size,
 )
+from torchreg.alignment.reliability import CALIBRATION
 from torchreg.alignment.results import PoseStarts
-from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource, bent_pose, register_rigidly
+from torchreg.alignment.rough_poses import PoseSource, bent_pose, register_rigidly
+from torchreg.alignment.start_source import StartSource
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.capture.depth_frame import DepthFrame
-from torchreg.errors import InputError
 from torchreg.geometry.camera import Camera
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
@@ -53,6 +55,7 @@ class _Candidates:
     same_rough: float = 0.045  # rough poses whose points differ by less are duplicates
     same: float = 0.05  # found poses whose points differ by less are duplicates
     fit_steps: int = 3  # at each width of the coarse fit
+    proposed: int = 4  # of a network, different ones, that are fitted beside those of the search
 
 
 _CANDIDATES = _Candidates()
@@ -99,7 +102,8 @@ def find_pose(
     *,
     num_starts: int = 4,
     mask: Tensor | None = None,
-    sources: Sequence[PoseSource] = DEFAULT_SOURCES,
+    sources: Sequence[PoseSource] | None = None,
+    initializer: PoseProposer | HoldsProposer | None = None,
     model_points: LinearBlendSkin | None = None,
     locked: Sequence[str] | Tensor = (),
     prior: tuple[Any, Any] | None = None,
@@ -109,9 +113,10 @@ def find_pose(
 ) -> PoseStarts:
     """Return the poses in which an articulated shape may lie on 3-D data, best first, and the confidence in the first.
 
-    Rough poses from all sources are registered rigidly in one batch; the best are fitted to the surface, their limbs
-    placed on the data by beam search, first coarsely, then thoroughly, and ranked by the data that they leave
-    unexplained.
+    Where a network proposes poses of the shape, these are fitted first. Without one, or where the best of them is
+    doubtful, rough poses from all sources are registered rigidly in one batch; the best are fitted to the surface, and
+    their limbs placed on the data by beam search, first coarsely, then thoroughly. All are ranked by the data that they
+    leave unexplained.
 
     Args:
         shape: the articulated shape, in metres; where its base is bolted down, only its joints are sought.
@@ -120,7 +125,9 @@ def find_pose(
             keypoints alone, see `align`.
         num_starts: poses returned, at most `FindPoseConfig.num_searched`; fewer where they fall together.
         mask: (M,) or (B, M), False where data are padding.
-        sources: of rough poses, see `PoseSource`.
+        sources: of rough poses, see `PoseSource`; all rotations and the principal axes by default.
+        initializer: a network that proposes poses, as from `train_initializer`, or a `PoseInitializer` that has one; by
+            default, where no sources are given, the one that comes with torchreg for the built-in hand.
         model_points: a skin of the shape to reuse; sampled on the surface by default.
         locked: what is held, see `align`: at the prior's mean where it has one, else as at rest.
         prior: what is known of the pose, see `align`.
@@ -142,11 +149,10 @@ def find_pose(
 
     Differentiable: no.
 
-    Cost: 1 to 2 s for a hand on one CPU core, whatever the number of data.
+    Cost: .3 s for a hand on one CPU core, whatever the number of data; 1 to 2 s where it is searched for.
     """
     check_count(num_starts, "num_starts", 1)
-    if not sources:
-        raise InputError("sources must hold at least one source of rough poses, got none")
+    source = StartSource.of(shape, sources, initializer)
     if data is None or isinstance(data, Camera):
         points = model_points or sample_skin(shape, (config or FindPoseConfig()).num_model_points)
         measured = measured_alone(shape, data, keypoints, keypoint_std)
@@ -154,16 +160,16 @@ def find_pose(
     if isinstance(data, DepthFrame) and data.mask is None:
         skin = model_points or sample_skin(shape, (config or FindPoseConfig()).num_model_points)
         search = partial(
-            find_pose, shape, num_starts=num_starts, sources=sources, model_points=skin, locked=locked, prior=prior,
-            keypoints=keypoints, keypoint_std=keypoint_std, config=config,
+            find_pose, shape, num_starts=num_starts, sources=sources, initializer=initializer, model_points=skin,
+            locked=locked, prior=prior, keypoints=keypoints, keypoint_std=keypoint_std, config=config,
         )  # fmt: skip
-        return surest_crop(data, model_size(skin), search)[0]
+        return surest_crop(data, model_size(skin), search, partial(source.shows, skin))[0]
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
     far = floating_origin(shape, seen.points)
     near = seen if far is None else seen.near(far)
     known = KnownDofs.of(shape, locked, prior)
     known = known if known is None or far is None else known.near(far)
-    starts = search_everywhere(shape, near, num_starts, sources, model_points, config or FindPoseConfig(), known).starts
+    starts = search_everywhere(shape, near, num_starts, source, model_points, config or FindPoseConfig(), known).starts
     poses = starts.poses if far is None else shifted(starts.poses.double(), far.to(starts.poses.device))
     return replace(starts, poses=poses, shape=shape)
 
@@ -172,7 +178,7 @@ def search_everywhere(
     shape: ArticulatedShape,
     seen: Observation,
     num_starts: int,
-    sources: Sequence[PoseSource],
+    source: StartSource,
     model_points: LinearBlendSkin | None,
     config: FindPoseConfig,
     known: KnownDofs | None = None,
@@ -195,23 +201,12 @@ def search_everywhere(
         warn_about_units(problem.data, problem.valid, problem.size, stacklevel=3)
         degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=3)
         with one_thread():
-            poses, costs = _search_with_retries(problem, _informed_sources(sources, known), config)
+            poses, costs = _find(problem, source.informed(known), config)
         lead = _lead(problem, poses, costs)
         starts = _ranked(problem, poses, costs, lead, num_starts)
         confidence = torch.where(degenerate, 0.0, starts.confidence)
         starts = replace(starts, poses=shifted(starts.poses, origin.unsqueeze(1)), confidence=confidence)
     return FoundStarts(starts if clouds.ndim == 3 else starts.row(0), lead)
-
-
-def _informed_sources(sources: Sequence[PoseSource], known: KnownDofs | None) -> Sequence[PoseSource]:
-    """Return sources whose poses are what is known beforehand, as far as that goes."""
-    if known is None:
-        return sources
-
-    def informed(source: PoseSource) -> PoseSource:
-        return lambda problem, generator: known.informed(problem, source(problem, generator))
-
-    return [informed(source) for source in sources]
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,17 +222,37 @@ class FoundStarts:
     lead: Tensor
 
 
+def _find(problem: AlignProblem, source: StartSource, config: FindPoseConfig) -> tuple[Tensor, Tensor]:
+    """Return candidates (B, H, num_dofs), best first, and their costs: a network's, and those of a search if doubtful.
+
+    The search is of no use where all that is doubtful is where limbs end that no data show.
+    """
+    problem, proposed = source.proposed(problem, _CANDIDATES.proposed)
+    if proposed.shape[1] == 0:
+        return _search_with_retries(problem, source, config, proposed)
+    poses, costs = _fitted(problem, proposed)
+    sure = explains(problem, poses[:, 0], _lead(problem, poses, costs)) >= CALIBRATION.doubtful
+    rows = (~sure).nonzero()[:, 0]
+    # The best one again is a duplicate that takes no place.
+    first = torch.zeros(len(poses), min(config.num_searched, config.num_placed), dtype=torch.int64, device=poses.device)
+    searched, searched_costs = take_rows(poses, first), costs.gather(1, first)
+    if len(rows):
+        found, found_costs = _search_with_retries(problem.rows(rows), source, config, poses[rows])
+        searched[rows], searched_costs[rows] = found, found_costs
+    return _best_first(torch.cat([poses, searched], dim=1), torch.cat([costs, searched_costs], dim=1))
+
+
 def _search_with_retries(
-    problem: AlignProblem, sources: Sequence[PoseSource], config: FindPoseConfig
+    problem: AlignProblem, source: StartSource, config: FindPoseConfig, proposed: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return candidates (B, H, num_dofs), best first, and their costs, after as many searches as each cloud needs."""
-    poses, costs = _search(problem, sources, config)
+    poses, costs = _search(problem, source, config, proposed)
     active = is_misfit(problem, poses[:, 0]).nonzero()[:, 0]
     for number in range(1, config.num_retries + 1):
         if len(active) == 0:
             break
         part = problem.rows(active)
-        retried, retried_costs = _search(part, sources, replace(config, seed=config.seed + number))
+        retried, retried_costs = _search(part, source, replace(config, seed=config.seed + number), proposed[active])
         merged, merged_costs = torch.cat([poses[active], retried], 1), torch.cat([costs[active], retried_costs], 1)
         order = merged_costs.argsort(dim=1, stable=True)[:, : poses.shape[1]]
         poses[active], costs[active] = take_rows(merged, order), merged_costs.gather(1, order)
@@ -245,21 +260,39 @@ def _search_with_retries(
     return poses, costs
 
 
-def _search(problem: AlignProblem, sources: Sequence[PoseSource], config: FindPoseConfig) -> tuple[Tensor, Tensor]:
-    """Return candidates (B, H, num_dofs) after one search, best first, and their costs."""
+def _search(
+    problem: AlignProblem, source: StartSource, config: FindPoseConfig, proposed: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return candidates (B, H, num_dofs) after one search, best first, and their costs.
+
+    Args:
+        problem: the batch.
+        source: of rough poses.
+        config: of the search.
+        proposed: (B, K, num_dofs) that lie on the data already.
+    """
     generator = torch.Generator().manual_seed(config.seed)
     search = PoseSearch(problem, generator)
-    rough = torch.cat([source(search.problem, generator) for source in sources], dim=1)
-    rough, rough_costs = register_rigidly(search, search.problem.clamp_candidates(rough), generator)
+    rough = source.rough(search.problem, generator)
+    rough, rough_costs = register_rigidly(search.problem, rough, generator)
     rough = _best_distinct(search.problem, rough, rough_costs, config.num_candidates)
     pool = search.fit_coarsely(rough, _CANDIDATES.fit_steps)[:, : config.num_placed]
+    pool = torch.cat([proposed, pool], dim=1)[:, : config.num_placed]
     poses, _ = search.refine(search.prune(pool, config.num_searched), config.search_rounds)
+    return _fitted(problem, poses)
+
+
+def _fitted(problem: AlignProblem, poses: Tensor) -> tuple[Tensor, Tensor]:
+    """Return candidates (B, K, num_dofs) fitted to all data, best first, and their costs."""
     count = poses.shape[1]
     wide = problem.repeated(count)
     fitted = fit_surface(wide, poses.flatten(0, 1), steps=SURFACE_FIT.search_steps, widths=SURFACE_FIT.widths[-1:]).pose
-    costs = alignment_cost(wide, fitted).reshape(len(poses), count)
+    return _best_first(fitted.reshape(poses.shape), alignment_cost(wide, fitted).reshape(len(poses), count))
+
+
+def _best_first(poses: Tensor, costs: Tensor) -> tuple[Tensor, Tensor]:
     order = costs.argsort(dim=1, stable=True)
-    return take_rows(fitted.reshape(poses.shape), order), costs.gather(1, order)
+    return take_rows(poses, order), costs.gather(1, order)
 
 
 def _best_distinct(problem: AlignProblem, poses: Tensor, costs: Tensor, count: int) -> Tensor:

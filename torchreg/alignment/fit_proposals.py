@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchreg.alignment.limb_search import take_rows
+from torchreg.alignment.limb_search import distinct_first, take_rows
 from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjective
 from torchreg.alignment.pose_proposer import Proposals
 from torchreg.alignment.pose_search import PoseSearch, fit_candidates, mean_distances, score_candidates
@@ -58,20 +58,55 @@ def best_proposal(problem: AlignProblem, proposals: Proposals) -> BestProposal:
         problem: the batch.
         proposals: for its data.
     """
-    search = PoseSearch(problem, torch.Generator().manual_seed(0))
-    poses = search.coarse_problem.clamp_candidates(proposals.poses[:, : _FIT.kept])
-    typical = poses[:, 0]
-    prior = GaussianPosePrior(typical, joint_precision(problem.skin.shape, problem.size, _FIT.joint_std))
-    coarse = replace(search.coarse_problem, prior=prior)
-    poses = torch.cat([matched_pose(replace(problem, prior=prior), proposals).unsqueeze(1), poses], dim=1)
-    fitted = fit_candidates(coarse, poses, _FIT.widths, _FIT.steps)
-    scores, order = score_candidates(coarse, fitted, _FIT.score_width).sort(dim=1, stable=True)
-    fitted = take_rows(fitted, order)
+    told = with_proposed_prior(problem, proposals)
+    coarse = PoseSearch(told, torch.Generator().manual_seed(0)).coarse_problem
+    poses = coarse.clamp_candidates(proposals.poses[:, : _FIT.kept])
+    fitted, scores = _fitted(coarse, torch.cat([matched_pose(told, proposals).unsqueeze(1), poses], dim=1))
     apart = mean_distances(coarse, fitted)[:, 0] > _FIT.same * problem.size
     share = problem.valid.sum(-1) / coarse.valid.sum(-1).clamp_min(1)
     lead = torch.where(apart, scores, torch.inf).amin(1) - scores[:, 0]
     best = fitted[:, 0]
-    return BestProposal(best, torch.cat([best[:, :BASE_DOFS], typical[:, BASE_DOFS:]], dim=-1), lead * share)
+    return BestProposal(best, torch.cat([best[:, :BASE_DOFS], poses[:, 0, BASE_DOFS:]], dim=-1), lead * share)
+
+
+@torch.no_grad()
+def best_proposals(problem: AlignProblem, proposals: Proposals, count: int) -> Tensor:
+    """Return the ``count`` poses (B, count, num_dofs) that explain most data after a coarse fit, different ones first.
+
+    All that are proposed are fitted, each also to the matches; without as many the last one repeats.
+
+    Args:
+        problem: the batch, with a prior as of `with_proposed_prior`.
+        proposals: for its data.
+        count: of poses.
+    """
+    coarse = PoseSearch(problem, torch.Generator().manual_seed(0)).coarse_problem
+    poses = problem.clamp_candidates(proposals.poses)
+    number = poses.shape[1]
+    wide = problem.repeated(number)
+    wide = replace(wide, prior=replace(wide.prior, mean=poses.flatten(0, 1)))
+    matched = matched_pose(wide, proposals.repeated(number)).reshape(poses.shape)
+    fitted, _ = _fitted(coarse, torch.cat([poses, matched], dim=1))
+    order = distinct_first(mean_distances(coarse, fitted) < _FIT.same * problem.size)[:, :count]
+    return take_rows(fitted, torch.cat([order, order[:, -1:].expand(-1, count - order.shape[1])], dim=1))
+
+
+def with_proposed_prior(problem: AlignProblem, proposals: Proposals) -> AlignProblem:
+    """Return a problem whose prior draws joints to the most probable proposal, but those of which something is told."""
+    mean = problem.clamp_candidates(proposals.poses[:, :1])[:, 0]
+    precision = joint_precision(problem.skin.shape, problem.size, _FIT.joint_std)
+    if problem.told_precision is None:
+        return replace(problem, prior=GaussianPosePrior(mean, precision))
+    told, prior = problem.told_precision > 0, problem.prior
+    mean, precision = torch.where(told, prior.mean, mean), torch.where(told, prior.precision, precision)
+    return replace(problem, prior=replace(prior, mean=mean, precision=precision))
+
+
+def _fitted(coarse: AlignProblem, poses: Tensor) -> tuple[Tensor, Tensor]:
+    """Return poses (B, K, num_dofs) after a coarse fit, best first, and their scores (B, K)."""
+    fitted = fit_candidates(coarse, poses, _FIT.widths, _FIT.steps)
+    scores, order = score_candidates(coarse, fitted, _FIT.score_width).sort(dim=1, stable=True)
+    return take_rows(fitted, order), scores
 
 
 def matched_pose(problem: AlignProblem, proposals: Proposals) -> Tensor:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -24,17 +24,20 @@ CHOICE = Choice()
 Answer = TypeVar("Answer", AlignResult, PoseStarts)
 
 
-def surest_crop(frame: DepthFrame, size: float, answer: Callable[[DepthFrame], Answer]) -> tuple[Answer, DepthFrame]:
+def surest_crop(
+    frame: DepthFrame, size: float, answer: Callable[[DepthFrame], Answer], shows: Callable[[DepthFrame], bool]
+) -> tuple[Answer, DepthFrame]:
     """Return the answer of highest confidence for the crops of a frame, and that crop; nearer ones are tried first.
 
     Args:
         frame: the picture.
         size: of the shape, metres.
         answer: what is found in a crop.
+        shows: whether a glance says that a crop shows the shape: of a surface, such crops are tried first.
     """
     best: tuple[Answer, DepthFrame] | None = None
     for crops in candidate_crops(frame, size):
-        for crop in crops:
+        for crop in _likely_first(crops, shows):
             found = answer(crop)
             if best is None or _confidence(found) > _confidence(best[0]):
                 best = found, crop
@@ -47,6 +50,17 @@ def surest_crop(frame: DepthFrame, size: float, answer: Callable[[DepthFrame], A
         return best
     everything = frame.cropped(frame.measured)
     return answer(everything), everything
+
+
+def _likely_first(crops: Iterable[DepthFrame], shows: Callable[[DepthFrame], bool]) -> Iterator[DepthFrame]:
+    """Yield crops, those that need a search to tell whether they show anything last."""
+    others = []
+    for crop in crops:
+        if shows(crop):
+            yield crop
+        else:
+            others.append(crop)
+    yield from others
 
 
 def _confidence(found: Any) -> float:

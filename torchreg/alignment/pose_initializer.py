@@ -27,7 +27,7 @@ from torchreg.alignment.problem import (
     soft_inliers,
 )
 from torchreg.alignment.reliability import CALIBRATION
-from torchreg.alignment.rough_poses import typical_poses
+from torchreg.alignment.rough_poses import DEFAULT_SOURCES, typical_poses
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface, residual_noise, surface_objective
 from torchreg.errors import InputError
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
@@ -303,11 +303,12 @@ class PoseInitializer(nn.Module):
         pose = typical_poses(self.shape).mean(0).repeat(len(data), 1)
         confidence = torch.zeros_like(pose[:, 0])
         size = _BATCHING.cpu_searched if data.device.type == "cpu" else _BATCHING.searched
+        proposer = None if self.config.search == "always" else self.proposer
         found = valid.any(-1).nonzero()[:, 0]
         for rows in found.split(self.config.chunk or size) if len(found) else ():
             starts = find_pose(
-                self.shape, data[rows], mask=valid[rows], num_starts=1, model_points=self.skin,
-                config=self.config.find_pose,
+                self.shape, data[rows], mask=valid[rows], num_starts=1, sources=DEFAULT_SOURCES, initializer=proposer,
+                model_points=self.skin, config=self.config.find_pose,
             )  # fmt: skip
             pose[rows], confidence[rows] = starts.poses[:, 0], starts.confidence
         joints = typical_poses(self.shape).mean(0)[BASE_DOFS:].expand(len(pose), -1)

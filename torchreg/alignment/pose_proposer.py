@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchreg._checks import check_count
 from torchreg.alignment.landmarks import keypoint_extent
 from torchreg.alignment.problem import masked_mean, model_size
-from torchreg.errors import FormatError, InputError
+from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.geometry.rotation_representations import rotation_from_6d, rotation_vector_from_rotation
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 from torchreg.io.tensors import load_tensors, save_tensors
@@ -105,6 +105,10 @@ class Proposals:
     points: Tensor
     surface: Tensor
     inlier: Tensor
+
+    def repeated(self, count: int) -> Proposals:
+        """Return the same with every cloud ``count`` times in a row."""
+        return Proposals(**{item.name: getattr(self, item.name).repeat_interleave(count, 0) for item in fields(self)})
 
 
 class PoseProposer(nn.Module):
@@ -342,6 +346,32 @@ def _restored(tensors: Mapping[str, Tensor], record: Mapping[str, Any], shape: A
         return None
     found.load_state_dict({name: value.float() for name, value in tensors.items()})
     return found
+
+
+class HoldsProposer(Protocol):
+    """Something with a network that proposes poses, as a `PoseInitializer`."""
+
+    proposer: PoseProposer | None
+
+
+def check_proposer(shape: Articulation, initializer: PoseProposer | HoldsProposer) -> PoseProposer:
+    """Return a network that was given for a shape.
+
+    Raises:
+        InputError: if it proposes other degrees of freedom.
+        InputTypeError: if it is something else.
+    """
+    proposer = initializer if isinstance(initializer, PoseProposer) else getattr(initializer, "proposer", initializer)
+    if not isinstance(proposer, PoseProposer):
+        raise InputTypeError(
+            f"initializer must be a PoseProposer, or a PoseInitializer that has one, got {type(proposer).__name__}"
+        )
+    if proposer.dof_names != tuple(shape.dof_names):
+        raise InputError(
+            f"initializer must be a network for this shape's {shape.num_dofs} degrees of freedom, got one for "
+            f"{len(proposer.dof_names)} that has other names; train one with tr.train_initializer"
+        )
+    return proposer
 
 
 def shipped_proposer(shape: Articulation) -> PoseProposer | None:

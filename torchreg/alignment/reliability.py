@@ -64,6 +64,10 @@ class _Scales:
     max_correlation: float = 0.95  # of neighboring residuals
     limb_data: float = 12.0  # that nothing but one limb explains: so many, and it is misplaced with probability 1 / e
     patches: float = 4.0  # of a part, within which the shape's surface errs alike
+    surface_error: float = (
+        0.008  # standard error of a surface, as a share of the size: where half of the fits are wrong
+    )
+    loose_error: float = 0.03  # the same of a part that is told to be hardly seen
     gain: float = 0.1  # of a further step in log-likelihood: less than half a standard deviation of the pose
 
 
@@ -85,6 +89,39 @@ class Calibration:
 
 
 CALIBRATION = Calibration()
+# Of fits of pose and shape together, which are right if all of the surface, hidden parts too, is off by at most that
+# share of the size on average: 25 mm of a body of 1.7 m. What is unknown is then the standard error of the surface,
+# which no shape's limbs or number of parts enter. Fitted by `benchmarks/shape_confidence.py --calibrate` to 59 made-up
+# people and hands from given starts, to which pictures and searches are new: their weights are those of poses.
+SHAPE_CALIBRATION = Calibration(bias=5.37, weights=(0.0, 2.45, 3.1, 2.83, 8.53, 10.78, 1.03, 3.93), right=0.015)
+
+
+@dataclass(frozen=True)
+class SurfaceError:
+    """Standard errors of the surface of a fit of pose and shape together, by their joint covariance.
+
+    Args:
+        whole: (B,) root mean square over the surface, metres.
+        parts: (B, P) the same over each part, zero where it has no points.
+        moved: (B,) root mean square by which the fit's last step moved the surface, metres.
+    """
+
+    whole: Tensor
+    parts: Tensor
+    moved: Tensor
+
+    @property
+    def converged(self) -> Tensor:
+        """Whether the last step moved the surface by no more than is not known of it, (B,)."""
+        return self.moved <= self.whole
+
+    def unknown(self, size: float) -> Tensor:
+        """Return the evidence (B,) that the data do not tell where the surface is, from 0 to 1."""
+        return (-(_SCALES.surface_error * size / self.whole).square()).exp()
+
+    def loose(self, limb: Limb, size: float) -> Tensor:
+        """Return whether the data leave open where a limb is, (B,)."""
+        return self.parts[:, limb.parts].amax(-1) > _SCALES.loose_error * size
 
 
 def without_cut(problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame]) -> AlignProblem:
@@ -168,9 +205,9 @@ def weigh(
     )
 
 
-def confidence_of(evidence: Tensor) -> Tensor:
+def confidence_of(evidence: Tensor, calibration: Calibration = CALIBRATION) -> Tensor:
     """Return the calibrated probabilities (B,) that poses with evidence (B, E) are right."""
-    return torch.sigmoid(CALIBRATION.bias - evidence @ evidence.new_tensor(CALIBRATION.weights))
+    return torch.sigmoid(calibration.bias - evidence @ evidence.new_tensor(calibration.weights))
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,11 +361,15 @@ def neighbor_correlation(data: Tensor, residual: Tensor, weight: Tensor) -> Tens
     return torch.stack(together).clamp(0, _SCALES.max_correlation)
 
 
-def told_doubts(problem: AlignProblem, pose: Tensor, evidence: Evidence) -> tuple[str, ...]:
+def told_doubts(
+    problem: AlignProblem, pose: Tensor, evidence: Evidence, error: SurfaceError | None = None
+) -> tuple[str, ...]:
     """Return what is doubtful about poses (B, num_dofs), a sentence each, empty where nothing is."""
-    spread = end_spreads(problem, pose)
     limbs = [limb for limb, _ in limb_points(problem.skin)]
-    loose = (spread > EVIDENCE.tolerance * problem.size).tolist()
+    if error is None:
+        loose = (end_spreads(problem, pose) > EVIDENCE.tolerance * problem.size).tolist()
+    else:
+        loose = [list(row) for row in zip(*(error.loose(limb, problem.size).tolist() for limb in limbs), strict=True)]
     sentences = []
     for row in range(len(pose)):
         reasons = []

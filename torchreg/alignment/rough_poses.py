@@ -9,7 +9,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchreg.alignment.pose_search import PoseSearch
 from torchreg.alignment.problem import AlignProblem
 from torchreg.geometry.rigid import fit_rigid, rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp, so3_log
@@ -130,17 +129,17 @@ def _at_data_median(problem: AlignProblem, poses: Tensor) -> Tensor:
     return shifted(poses, median.unsqueeze(1) - center)
 
 
-def register_rigidly(search: PoseSearch, poses: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+def register_rigidly(problem: AlignProblem, poses: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Return poses (B, K, num_dofs) after a rigid EM of a few model points to drawn data, and their costs (B, K).
 
     Wide kernels first; the joints stay. A batch of closed-form M-steps costs less than one step of the joints.
     """
-    skin, size = search.problem.skin, search.problem.size
-    drawn = search.problem.draw(_RIGID_EM.num_data, generator)
+    skin, size = problem.skin, problem.size
+    drawn = problem.draw(_RIGID_EM.num_data, generator)
     points = skin(poses)[..., farthest_points(skin.points, min(_RIGID_EM.num_points, len(skin))), :]
     moved, motion = points, torch.eye(4).to(points).expand(*poses.shape[:2], 4, 4)
     data, mask = drawn.data.unsqueeze(1), drawn.valid.unsqueeze(1)
-    for width in () if _has_fixed_base(search.problem) else _RIGID_EM.widths:
+    for width in () if _has_fixed_base(problem) else _RIGID_EM.widths:
         outlier = _RIGID_EM.outlier * OUTLIER_CONSTANT
         matches = expectation(moved, data, moved.new_tensor(width * size), outlier, mask=mask)
         motion = fit_rigid(points, matches.targets, matches.weights)

@@ -11,7 +11,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchreg.alignment.annealed_em import ANNEALING, OnStep, StageResult, anneal
+from torchreg.alignment.confidence import end_variances
 from torchreg.alignment.objectives import GaussianPosePrior, Objective
+from torchreg.alignment.person_search import find_people, lead_over_rivals
 from torchreg.alignment.problem import (
     BROAD_PRIOR,
     AlignProblem,
@@ -20,7 +22,7 @@ from torchreg.alignment.problem import (
     masked_mean,
     model_size,
 )
-from torchreg.alignment.reliability import correlated_count, neighbor_correlation
+from torchreg.alignment.reliability import SurfaceError, correlated_count, neighbor_correlation
 from torchreg.alignment.results import AlignRecord
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface, pose_covariance, surface_noise
@@ -55,6 +57,8 @@ class ShapeFit:
     num_draws: int = 200  # of the coefficients' prior, from which starts of different sizes are taken
     num_starts: int = 6  # sizes of a body are an octave apart, and the annealed EM finds its way over a tenth
     num_kept: int = 2  # starts that are still fitted to the surface
+    num_found: int = 8  # starts that a search without a given one hands on: sizes and turned people
+    num_found_kept: int = 3  # of those: the back of a person looks much like its front
     coarse_data: int = 1000  # of each scan, by which starts are told apart
     fine_data: int = 1500  # of each scan, before all of them count
     surface_points: int = 2000  # samples of the surface
@@ -79,6 +83,8 @@ class FittedShape:
         cost: () by which people are ranked.
         sigma: (1,) last width of the annealed EM, metres.
         change: (1,) of the last step.
+        error: standard errors of the surface in each scan.
+        lead: (1,) cost by which the best of different people is worse, of a search without a start; else None.
     """
 
     poses: Tensor
@@ -87,6 +93,8 @@ class FittedShape:
     cost: Tensor
     sigma: Tensor
     change: Tensor
+    error: SurfaceError
+    lead: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -233,7 +241,7 @@ def fit_coefficients(
     shape: ArticulatedShape,
     data: Tensor,
     valid: Tensor,
-    poses: Tensor,
+    poses: Tensor | None,
     *,
     config: AlignConfig,
     viewpoints: Tensor | None = None,
@@ -248,7 +256,7 @@ def fit_coefficients(
         shape: a rig with coefficients and a mesh.
         data: (T, M, 3), metres.
         valid: (T, M) False where padded.
-        poses: (T, num_dofs) to start from, of the rig at its mean coefficients.
+        poses: (T, num_dofs) to start from, of the rig at its mean coefficients; None to search for one scan's.
         config: of the alignment.
         viewpoints: (T, 3) of the cameras, where they are known.
         on_step: called after each iteration.
@@ -263,18 +271,21 @@ def fit_coefficients(
     widths = config.schedule or ANNEALING.schedule(problem.size, SHAPE_FIT.em_steps)
     found = anneal(coarse, start, widths, em_steps=config.em_steps, m_steps=config.m_steps, on_step=on_step)
     sigma = found.sigma[:1]
-    kept = problem.people(coarse.cost_of_people(found.pose).argsort()[: SHAPE_FIT.num_kept])
+    num_kept = SHAPE_FIT.num_kept if poses is not None else SHAPE_FIT.num_found_kept
+    kept = problem.people(coarse.cost_of_people(found.pose).argsort()[:num_kept])
     coarse, state = coarse.rows(kept), found.pose[kept]
     state = fit_surface(coarse, state, steps=SHAPE_FIT.coarse_steps, on_step=on_step).pose
     state = _placed_again(coarse, state, config, on_step)
-    best = problem.people(coarse.cost_of_people(state).argmin().unsqueeze(0))
+    costs = coarse.cost_of_people(state)
+    lead = lead_over_rivals(coarse, state, costs) if poses is None else None
+    best = problem.people(costs.argmin().unsqueeze(0))
     problem, state = problem.rows(kept[best]), state[best]
     fine = problem.sample(SHAPE_FIT.fine_data, generator)
     state = fit_surface(fine, state, steps=SHAPE_FIT.fine_steps, on_step=on_step).pose
-    last = fit_surface(
-        problem, state, steps=SHAPE_FIT.fine_steps, widths=SURFACE_FIT.widths[-1:], on_step=on_step
-    )  # fmt: skip
-    return _fitted(problem, replace(last, sigma=sigma), shape.num_dofs)
+    finish = partial(fit_surface, problem, widths=SURFACE_FIT.widths[-1:], on_step=on_step)
+    before = finish(state, steps=SHAPE_FIT.fine_steps).pose
+    last = replace(finish(before, steps=1), sigma=sigma)
+    return replace(_fitted(problem, before, last, shape.num_dofs), lead=lead)
 
 
 def _placed_again(problem: ShapeProblem, state: Tensor, config: AlignConfig, on_step: OnStep | None) -> Tensor:
@@ -296,16 +307,29 @@ def _tell(on_step: OnStep, problem: ShapeProblem, num_dofs: int, record: AlignRe
     on_step(normal_copy(replace(record, pose=record.pose[:, :num_dofs] + origin)))
 
 
-def _fitted(problem: ShapeProblem, found: StageResult, num_dofs: int) -> FittedShape:
+def _fitted(problem: ShapeProblem, before: Tensor, found: StageResult, num_dofs: int) -> FittedShape:
+    """Return the end of a fit, whose last step began in states (T, D + K)."""
     poses, coefficients = found.pose.tensor_split([num_dofs], dim=-1)
+    covariance = _covariance(problem, found.pose)
     return FittedShape(
         poses=poses + pad(problem.origin, (0, num_dofs - 3)),
         coefficients=coefficients[0],
-        covariance=_covariance(problem, found.pose),
+        covariance=covariance,
         cost=problem.cost_of_people(found.pose)[0],
         sigma=found.sigma,
         change=found.change.amax(0, keepdim=True),
+        error=_surface_error(problem, before, found.pose, covariance),
     )
+
+
+def _surface_error(problem: ShapeProblem, before: Tensor, state: Tensor, covariance: Tensor) -> SurfaceError:
+    """Return the standard errors of the surface in states (T, D + K), by their covariance, and their last step."""
+    rows, moves = problem.skin.row_jacobian(state)
+    moved = (problem.skin.place(rows) - problem.skin(before)).square().sum(-1).mean(-1).sqrt()
+    variances = end_variances(moves, covariance)
+    owned = torch.nn.functional.one_hot(problem.skin.weights.argmax(-1), problem.skin.weights.shape[1]).to(variances)
+    by_part = variances @ owned / owned.sum(0).clamp_min(1)
+    return SurfaceError(whole=variances.mean(-1).sqrt(), parts=by_part.sqrt(), moved=moved)
 
 
 def _covariance(problem: ShapeProblem, state: Tensor) -> Tensor:
@@ -341,13 +365,17 @@ def _problem(
     shape: ArticulatedShape,
     data: Tensor,
     valid: Tensor,
-    poses: Tensor,
+    poses: Tensor | None,
     viewpoints: Tensor | None,
     *,
     config: AlignConfig,
     generator: torch.Generator,
 ) -> tuple[ShapeProblem, Tensor]:
     """Return the problem of S people in T scans, S T rows about the scans' means, and its start."""
+    if poses is None:
+        rest = shape.rest_pose().unsqueeze(0)
+        problem, start = _problem(shape, data, valid, rest, viewpoints, config=config, generator=generator)
+        return _found(problem, shape, start[:, shape.num_dofs :], generator)
     space, surface = shape.coefficient_space(), shape.file_surface()
     people = different_people(space, generator)
     tree = ShapedTree(shape, space)
@@ -371,6 +399,15 @@ def _problem(
         scans=scans,
     )  # fmt: skip
     return problem, start
+
+
+def _found(
+    problem: ShapeProblem, rig: ArticulatedShape, people: Tensor, generator: torch.Generator
+) -> tuple[ShapeProblem, Tensor]:
+    """Return the problem of one scan in rows for those of people (S, K) who are found in it, and their states."""
+    one = problem.rows(torch.zeros(1, dtype=torch.int64)).sample(SHAPE_FIT.coarse_data, generator)
+    states = find_people(one, rig, people, SHAPE_FIT.num_found, generator)
+    return problem.rows(torch.zeros(len(states), dtype=torch.int64)), states
 
 
 def _start(poses: Tensor, people: Tensor, offsets: Tensor) -> Tensor:

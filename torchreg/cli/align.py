@@ -159,7 +159,7 @@ def align(
         first = None if start is None else load_pose(start, model)
         points = sample_skin(model, config.num_model_points, sharpness=config.sharpness)
         known = read_known(model, locked, joints, joint_std, len(clouds))
-        measured = read_keypoints(keypoints, keypoint_std, len(clouds))
+        measured = read_keypoints(keypoints, keypoint_std, clouds, None if side == "either" else model, pictures)
         run = _AlignRun(
             model, config, points, scale, time, frame, first, known, measured, pictures=pictures, fit_shape=fit_shape
         )

@@ -11,14 +11,19 @@ import typer
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence, Sized
+
     from torch import Tensor
+
+    from torchreg.capture.depth_frame import DepthFrame
 
 Keypoints = Annotated[
     Path | None,
     typer.Option(
         metavar="FILE.json",
         help="Where a detector saw the shape's keypoints, as evidence beside the points: a list of [x, y, z] in metres "
-        "or, with --depth, [column, row] in pixels, null for unseen ones; or a list of such lists, one per frame.",
+        "or, with --depth, [column, row] in pixels, null for unseen ones; or a list of such lists, one per frame. Of "
+        "hands also what MediaPipe or OpenPose wrote, in one file or a folder of one for each frame.",
     ),
 ]
 KeypointStd = Annotated[
@@ -59,8 +64,18 @@ class MeasuredFrames:
         return {"--keypoints": str(self.table.tolist()), "--keypoint-std": self.std}
 
 
-def read_keypoints(path: Path | None, std: float | None, count: int) -> MeasuredFrames:
-    """Return the keypoints of ``count`` frames; InputError if there are not as many."""
+def read_keypoints(
+    path: Path | None, std: float | None, frames: Sized, shape: Any, pictures: Sequence[DepthFrame] | None
+) -> MeasuredFrames:
+    """Return the keypoints of all frames; InputError if there are not as many.
+
+    Args:
+        path: of the file or folder.
+        std: standard deviation, or None.
+        frames: as many as there are.
+        shape: whose side tells which hand it is, where a detector saw several; None for the surest.
+        pictures: of the frames, if they are pictures.
+    """
     if path is None:
         if std is not None:
             raise InputError("--keypoint-std has no meaning without --keypoints; leave it out")
@@ -70,7 +85,9 @@ def read_keypoints(path: Path | None, std: float | None, count: int) -> Measured
 
     if std is not None:
         check_positive(std, "--keypoint-std")
-    table = load_keypoints(path)
-    if len(table) != count:
-        raise InputError(f"{path} must hold the keypoints of each of {count} frames; got those of {len(table)}")
+    camera = pictures[0].camera if pictures else None
+    size = None if camera is None else (camera.width, camera.height)
+    table = load_keypoints(path, side=getattr(shape, "side", None), picture=size)
+    if len(table) != len(frames):
+        raise InputError(f"{path} must hold the keypoints of each of {len(frames)} frames; got those of {len(table)}")
     return MeasuredFrames(table, std)

@@ -175,7 +175,7 @@ def track(
     )
     first = None if start is None else shifted_to(clouds.origin, load_pose(start, model))
     known = read_known(model, locked, joints, joint_std, len(clouds))
-    measured = read_keypoints(keypoints, keypoint_std, len(clouds))
+    measured = read_keypoints(keypoints, keypoint_std, clouds, model, images)
     job = track_job(shape, options, first, config, fps, scale, nan_policy, clouds) | known.job() | measured.job()
     with claimed(files.result), ExitStack() as pages, _progress_bar(len(clouds), quiet) as bar:
         tracker, report = Tracker(model, first, config=config, locked=known.locked), Report(bar, clouds, quiet)

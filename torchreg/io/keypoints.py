@@ -4,37 +4,45 @@ from __future__ import annotations
 
 import json
 import os
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchreg.errors import FormatError
+from torchreg.io.detected_hands import detected_keypoints, is_detection
+from torchreg.io.frames import natural_sorted
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 
 
-def load_keypoints(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Tensor:
+def load_keypoints(
+    path: str | os.PathLike[str],
+    *,
+    side: str | None = None,
+    picture: tuple[int, int] | None = None,
+    limits: FileLimits = DEFAULT_LIMITS,
+) -> Tensor:
     """Return the keypoints (F, K, C) of F frames, float64, NaN for those that were not seen.
 
     The file holds a list of frames, or a single one: a list of K keypoints, each [column, row] in pixels, [x, y, z] in
-    metres, or null where it was not seen. A frame in which none was seen may be null.
+    metres, or null where it was not seen; or what MediaPipe's hand landmarker or OpenPose wrote of the frame. A frame
+    in which none was seen may be null. A folder holds a file for each frame, in the order of the numbers in their
+    names.
 
     Args:
-        path: ends in .json.
-        limits: ``max_bytes`` applies.
+        path: ends in .json, or is a folder of such files.
+        side: "left" or "right", where a detector saw several hands; by default the surest.
+        picture: (width, height), pixels, for keypoints of MediaPipe, which are shares of them.
+        limits: ``max_bytes`` applies to each file.
 
     Raises:
         FormatError: if it is no such list, or frames or keypoints have several sizes; names the file.
         FileNotFoundError: if there is no such file.
     """
     file = local_path(path)
-    if file.suffix.lower() != ".json":
-        raise FormatError(f"{file} must end in .json")
-    try:
-        content = json.loads(read_bytes(file, limits).decode("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise FormatError(f"{file}: cannot be read as JSON ({error})") from error
-    frames = content if _is_several(content) else [content]
+    files = natural_sorted(file.glob("*.json")) if file.is_dir() else [file]
+    frames = [frame for part in files for frame in _frames(part, side, picture, limits)]
     counts = {len(frame) for frame in frames if isinstance(frame, list)}
     rows = [point for frame in frames if isinstance(frame, list) for point in frame if point is not None]
     sizes = {len(point) if isinstance(point, list) else 0 for point in rows}
@@ -48,10 +56,26 @@ def load_keypoints(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT
     return torch.tensor([[[_number(value, file) for value in point] for point in frame] for frame in table]).double()
 
 
+def _frames(file: Path, side: str | None, picture: tuple[int, int] | None, limits: FileLimits) -> list[Any]:
+    """Return the frames of a file, each a list of keypoints or None."""
+    if file.suffix.lower() != ".json":
+        raise FormatError(f"{file} must end in .json")
+    try:
+        content = json.loads(read_bytes(file, limits).decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise FormatError(f"{file}: cannot be read as JSON ({error})") from error
+    return [
+        detected_keypoints(frame, file, side, picture) if is_detection(frame) else frame
+        for frame in (content if _is_several(content) else [content])
+    ]
+
+
 def _is_several(content: Any) -> bool:
     """Return whether a list is one of frames: what its entries hold are keypoints."""
     if not isinstance(content, list):
         return False
+    if any(is_detection(frame) for frame in content):
+        return True
     return any(isinstance(point, list) or point is None for frame in content if frame for point in frame)
 
 

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchreg._checks import check_choice
 from torchreg.errors import FormatError, MissingExtraError
 from torchreg.io.tensors import load_tensors, save_tensors
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.rigs import spec_from_arrays
-from torchreg.shapes.shape_space import CoefficientPrior, LinearSpace
+from torchreg.shapes.shape_space import CoefficientPrior, Features, LinearSpace
 from torchreg.shapes.shaped_rig import frame_joints
 from torchreg.shapes.spec import ShapeSpec
 
@@ -27,7 +27,7 @@ _RELEASE = 1
 _UNIFORM_STD = 12**-0.5
 
 
-class Phenotypes(nn.Module):
+class Phenotypes(Features):
     """The blend weights of anny's phenotypes: products of hat functions, one per phenotype, in a compact basis.
 
     Args:
@@ -58,6 +58,23 @@ class Phenotypes(nn.Module):
         values = torch.cat([*hats, self.fixed.expand(*coefficients.shape[:-1], -1)], dim=-1).unsqueeze(-2)
         return (values * self.mask + (1 - self.mask)).prod(-1) @ self.projection
 
+    def jacobian(self, coefficients: Tensor) -> Tensor:
+        """Return the derivatives (..., L, K) of the features by coefficients (..., K).
+
+        A weight is a product of one hat of each phenotype at most; its derivative has the slope of one of them.
+        """
+        anchors = [self.get_buffer(f"anchors_{k}") for k in range(self.count)]
+        masks = self.mask.split([*(len(values) for values in anchors), len(self.fixed)], dim=-1)
+        constant = (self.fixed * masks[-1] + (1 - masks[-1])).prod(-1)
+        factors, slopes = [], []
+        for k, (values, mask) in enumerate(zip(anchors, masks, strict=False)):
+            hats = _hats(coefficients[..., k], values).unsqueeze(-2)
+            factors.append((hats * mask + (1 - mask)).prod(-1))
+            slopes.append(_hat_slopes(coefficients[..., k], values) @ mask.mT)
+        one = torch.eye(self.count, dtype=torch.bool, device=coefficients.device).unsqueeze(-1)
+        rows = torch.where(one, torch.stack(slopes, dim=-2).unsqueeze(-3), torch.stack(factors, dim=-2).unsqueeze(-3))
+        return ((rows.prod(-2) * constant) @ self.projection).mT
+
 
 def _hats(value: Tensor, anchors: Tensor) -> Tensor:
     """Return the hat functions (..., A) at values (...)."""
@@ -66,6 +83,15 @@ def _hats(value: Tensor, anchors: Tensor) -> Tensor:
     passed = torch.minimum(torch.maximum(share, torch.zeros_like(share)), torch.ones_like(share))
     one = torch.ones_like(passed[..., :1])
     return torch.cat([one, passed], dim=-1) - torch.cat([passed, torch.zeros_like(one)], dim=-1)
+
+
+def _hat_slopes(value: Tensor, anchors: Tensor) -> Tensor:
+    """Return the slopes of `_hats` (..., A) at values (...), at an anchor the mean of those beside it."""
+    share = (value.unsqueeze(-1) - anchors[:-1]) / anchors.diff()
+    inside = torch.heaviside(share, share.new_tensor(0.5)) * torch.heaviside(1 - share, share.new_tensor(0.5))
+    slope = inside / anchors.diff()
+    none = torch.zeros_like(slope[..., :1])
+    return torch.cat([none, slope], dim=-1) - torch.cat([slope, none], dim=-1)
 
 
 def load_anny(kind: str) -> tuple[ShapeSpec, LinearSpace]:

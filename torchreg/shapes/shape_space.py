@@ -88,6 +88,14 @@ class ShapeSpace(nn.Module):
         raise NotImplementedError
 
 
+class Features(nn.Module):
+    """Functions of the coefficients, of which rest states are linear."""
+
+    def jacobian(self, coefficients: Tensor) -> Tensor:
+        """Return the derivatives (..., L, K) of the features (..., L) by coefficients (..., K)."""
+        raise NotImplementedError
+
+
 class LinearSpace(ShapeSpace):
     """Rest states that are linear in features of the coefficients, ``vertices + vertex_dirs @ features(c)``.
 
@@ -112,7 +120,7 @@ class LinearSpace(ShapeSpace):
         frames: Tensor,
         frame_dirs: Tensor,
         prior: CoefficientPrior,
-        features: nn.Module | None = None,
+        features: Features | None = None,
     ) -> None:
         super().__init__(prior)
         self.features = features
@@ -130,8 +138,7 @@ class LinearSpace(ShapeSpace):
         batch = len(coefficients)
         if self.features is None:
             return self.vertex_dirs.expand(batch, -1, -1, -1), self.frame_dirs.expand(batch, -1, -1, -1)
-        features = self.features
-        (slopes,) = _row_jacobians(lambda values: (features(values),), coefficients)
+        slopes = self.features.jacobian(coefficients)
         # One product for the whole batch: the directions, which are many, are read once.
         slopes = slopes.movedim(0, 1).flatten(1)
         by_vertex, by_frame = (

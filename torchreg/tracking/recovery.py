@@ -11,9 +11,11 @@ from torch import Tensor
 
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.pose_search import PoseSearch, fit_candidates, score_candidates
+from torchreg.alignment.problem import centered_problem
+from torchreg.alignment.start_source import StartSource
 from torchreg.alignment.surface_fit import SURFACE_FIT
 from torchreg.geometry.rotation import compose_rotation_vectors
-from torchreg.shapes.pose_algebra import difference
+from torchreg.shapes.pose_algebra import difference, shifted
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.tracking.evidence import is_doubtful, is_supported, lies_beside_data
 from torchreg.tracking.frame import WIDTHS, Frame, FrameFit, FrameView, frame_generator, subsample
@@ -37,6 +39,7 @@ class RecoveryPlan:
     num_steps: int = 2  # at each width of the surface fits from known poses
     num_searched: int = 2  # known poses whose limbs are placed thoroughly
     max_data: int = 3000  # of a search everywhere: more tell no more
+    num_proposed: int = 3  # poses of a network that are fitted, different ones
     equivalent: float = 0.03  # share of the data that a pose explains less than the best and still counts as good
     max_motion: float = 0.4  # of the base from its prediction per interval: on little data much seems to fit
     max_repetitions: int = 3  # of the first search everywhere, with other draws: nothing is known yet
@@ -51,10 +54,12 @@ class Recovery:
 
     Args:
         fitter: of the frames.
+        source: of poses where the shape is lost; the default of the shape by default.
     """
 
-    def __init__(self, fitter: FrameFitter) -> None:
+    def __init__(self, fitter: FrameFitter, source: StartSource | None = None) -> None:
         self.fitter, self.level = fitter, fitter.config.recovery
+        self.source = source or StartSource.of(fitter.shape)
 
     def __call__(
         self, state: TrackState, frame: Frame, view: FrameView | None, fit: FrameFit | None
@@ -110,13 +115,28 @@ class Recovery:
         shape = self.fitter.shape
         data = subsample(frame.data, _PLAN.max_data, frame_generator(state))
         seen = data if frame.picture is None else frame.picture
-        starts = find_pose(shape, seen, config=config, **frame.told, **frame.seen_keypoints)
+        starts = find_pose(
+            shape, seen, initializer=self.source.proposer, config=config, **frame.told, **frame.seen_keypoints
+        )  # fmt: skip
         poses = starts.poses
         if state.lost:
             poses = poses[starts.costs <= starts.costs.min() + _PLAN.equivalent * len(data)]
             distances = (shape.keypoints(poses) - shape.keypoints(state.pose)).norm(dim=-1).mean(-1)
             poses = poses[distances.argsort()]
         return self.fitter.fit_at(state, frame, poses[0], "found")
+
+    def _propose(self, state: TrackState, frame: Frame) -> FrameFit | None:
+        """Return the best fit from poses that a network proposes for all data, wherever the shape was before."""
+        data = subsample(frame.data, _PLAN.max_data, frame_generator(state))
+        valid = torch.ones_like(data[None, :, 0], dtype=torch.bool)
+        origin = data.mean(0)
+        problem = centered_problem(
+            self.fitter.skin, data[None], valid, state.pose[None], origin[None], prior_std=FindPoseConfig.prior_std,
+            pose_atol=0.0,
+        )  # fmt: skip
+        _, poses = self.source.proposed(problem, _PLAN.num_proposed)
+        fits = [self.fitter.fit_at(state, frame, shifted(pose, origin), "found") for pose in poses[0]]
+        return max((fit for fit in fits if fit is not None), key=lambda fit: fit.soft_inliers, default=None)
 
     def _first(self, state: TrackState, frame: Frame) -> tuple[FrameFit | None, TrackState]:
         """Return the fit and the state where the shape was never fitted: only a search everywhere helps."""
@@ -176,8 +196,10 @@ class Recovery:
             fitted = fit_candidates(view.problem, known, WIDTHS.coarse, _PLAN.num_steps)
             best = score_candidates(view.problem, fitted, WIDTHS.stop)[0].argmin()
             yield self.fitter.fit(view, state, "surface", fitted[:, best])
-            if lost or state.failed_searches >= _PLAN.free_failures:
-                yield from self._limb_searches(state, view, known, lost, thorough)
+        if lost and thorough:
+            yield self._propose(state, frame)
+        if view is not None and (lost or state.failed_searches >= _PLAN.free_failures):
+            yield from self._limb_searches(state, view, known, lost, thorough)
         if thorough and _is_due(state, lost, _PLAN.find_lost, _PLAN.find_failed):
             yield self.everywhere(state, frame)
 

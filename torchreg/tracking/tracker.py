@@ -17,6 +17,8 @@ from torchreg.alignment.align import AlignConfig, align
 from torchreg.alignment.inputs import check_skin, floating_origin, warn_about_degenerate, warn_about_units
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmarks import MeasuredKeypoints
+from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
+from torchreg.alignment.start_source import StartSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.loaded import as_points
@@ -63,6 +65,7 @@ class Tracker:
         config: see `TrackConfig`.
         model_points: a skin of the shape, whose points represent its surface; sampled by default (see `sample_skin`).
         locked: degrees of freedom that are held at the initial pose, or at rest without one; see `align`.
+        initializer: a network that proposes poses where the shape is lost, see `find_pose`.
 
     Raises:
         InputError: if the pose does not fit the shape or is not finite, a locked name is unknown, or the skin is of
@@ -79,13 +82,14 @@ class Tracker:
         config: TrackConfig | None = None,
         model_points: LinearBlendSkin | None = None,
         locked: Sequence[str] | Tensor = (),
+        initializer: PoseProposer | HoldsProposer | None = None,
     ) -> None:
         self.shape, self.config = shape, config or TrackConfig()
         if model_points is not None:
             model_points = check_skin(shape, model_points)
         with torch.no_grad():
             self._fitter = FrameFitter(shape, self.config, model_points)
-            self._recover = Recovery(self._fitter)
+            self._recover = Recovery(self._fitter, StartSource.of(shape, initializer=initializer))
             pose = self._checked_pose(initial_pose)
             # In full precision, for clouds far from the origin.
             self._start = pose if initial_pose is None else torch.as_tensor(initial_pose, dtype=torch.float64)

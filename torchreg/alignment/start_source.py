@@ -1,0 +1,96 @@
+"""Where starts come from: rough poses that a search goes on from, and those that a network proposes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchreg._threads import one_thread
+from torchreg.alignment.confidence import explains
+from torchreg.alignment.fit_proposals import best_proposal, best_proposals, with_proposed_prior
+from torchreg.alignment.known_dofs import KnownDofs
+from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer, check_proposer, shipped_proposer
+from torchreg.alignment.problem import AlignProblem, centered_problem
+from torchreg.alignment.reliability import CALIBRATION
+from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource
+from torchreg.capture.depth_frame import DepthFrame
+from torchreg.capture.free_space import FreeSpace
+from torchreg.errors import InputError
+from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.skin import LinearBlendSkin
+
+
+@dataclass(frozen=True)
+class StartSource:
+    """Where candidates come from.
+
+    Args:
+        sources: of rough poses, which are searched on from.
+        proposer: a network, whose poses need a fit alone, or None.
+        known: what is known beforehand, or None.
+    """
+
+    sources: Sequence[PoseSource]
+    proposer: PoseProposer | None = None
+    known: KnownDofs | None = None
+
+    @classmethod
+    def of(
+        cls,
+        shape: ArticulatedShape,
+        sources: Sequence[PoseSource] | None = None,
+        initializer: PoseProposer | HoldsProposer | None = None,
+    ) -> StartSource:
+        """Return what is given, or else the default for a shape.
+
+        Raises:
+            InputError: if the sources are an empty list, or the network is for another shape.
+            InputTypeError: if the network is none.
+        """
+        if sources is not None and not sources:
+            raise InputError("sources must hold at least one source of rough poses, got none")
+        proposer = shipped_proposer(shape) if sources is None and initializer is None else None
+        if initializer is not None:
+            proposer = check_proposer(shape, initializer)
+        return cls(DEFAULT_SOURCES if sources is None else sources, proposer)
+
+    def informed(self, known: KnownDofs | None) -> StartSource:
+        """Return the same whose poses are what is known beforehand, as far as that goes."""
+        return replace(self, known=known)
+
+    def rough(self, problem: AlignProblem, generator: torch.Generator) -> Tensor:
+        """Return rough poses (B, K, num_dofs) of all sources."""
+        return self._told(problem, torch.cat([source(problem, generator) for source in self.sources], dim=1))
+
+    def proposed(self, problem: AlignProblem, count: int) -> tuple[AlignProblem, Tensor]:
+        """Return the problem with the network's pose as the prior, and its poses (B, count, num_dofs) after a fit.
+
+        Without a network there are none (B, 0, num_dofs), and the problem stays.
+        """
+        if self.proposer is None:
+            return problem, problem.prior.mean.new_zeros(len(problem.data), 0, problem.prior.mean.shape[-1])
+        proposals = self.proposer.propose(problem.data, problem.valid)
+        problem = with_proposed_prior(problem, proposals)
+        return problem, self._told(problem, best_proposals(problem, proposals, count))
+
+    @torch.no_grad()
+    def shows(self, skin: LinearBlendSkin, frame: DepthFrame) -> bool:
+        """Return whether a frame shows the shape of a skin, as the network sees it; True without one, as none tells."""
+        if self.proposer is None:
+            return True
+        near = frame.near(frame.points.double().mean(0))
+        data = near.points[None].to(skin.shape.rest)
+        valid, origin = torch.ones_like(data[..., 0], dtype=torch.bool), torch.zeros_like(data[:, 0])
+        problem = centered_problem(
+            skin, data, valid, skin.shape.rest[None], origin, prior_std=None, pose_atol=0.0,
+            free_space=FreeSpace.stacked([near.free_space]),
+        )  # fmt: skip
+        with one_thread():
+            best = best_proposal(problem, self.proposer.propose(data, valid))
+            return bool(explains(problem, best.pose, best.lead) >= CALIBRATION.doubtful)
+
+    def _told(self, problem: AlignProblem, poses: Tensor) -> Tensor:
+        return problem.clamp_candidates(poses if self.known is None else self.known.informed(problem, poses))
