@@ -69,6 +69,52 @@ def person_walk(figure: Figure, phase: Tensor, generator: torch.Generator | None
     return turns.rotations, -0.02 * torch.cos(4 * math.pi * phase)
 
 
+def person_tucks(figure: Figure, phase: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    """Return the rotations of the parts of a person who tucks limbs in, and the heights of the person.
+
+    In the first half of a cycle the left knee comes up to the chest and the right forearm folds before it; in the
+    second half the same happens in the mirror. How far they come differs from cycle to cycle, at random.
+
+    Args:
+        figure: a `person`.
+        phase: (T,) cycles; nothing is tucked in at multiples of a half.
+        generator: of the variations; None draws from a fresh generator with seed 0.
+
+    Returns:
+        Rotations (T, P, 3, 3) for `Figure.transforms`, and heights (T,), metres.
+
+    Raises:
+        InputError: if the figure is no person.
+    """
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    phase = phase.double()
+    wander = _Wander(phase, generator)
+    turns = _Turns(figure, len(phase))
+    turns.add("torso", x=wander(6.0, 4.0), y=wander(8.0), z=wander(4.0))
+    turns.add("head", x=wander(12.0), y=wander(20.0), z=wander(5.0))
+    for side, sign in SIDES.items():
+        cycle = phase if side == "left" else phase + 0.5
+        leg, arm = (wander(0.1, 0.9) * _raised(rows) for rows in (cycle, cycle + 0.5))
+        outward = sign * math.degrees(REST_LEG)
+        turns.add(f"{side} thigh", x=-125 * leg, z=-outward)
+        turns.bend(f"{side} shin", 145 * leg, outward)
+        turns.bend(f"{side} foot", wander(10.0), outward)
+        hanging = sign * math.degrees(REST_ARM - _HANGING_ARM)
+        turns.add(
+            f"{side} upper arm",
+            x=-10 * arm + wander(6.0),
+            y=-60 * sign * arm,
+            z=-hanging + sign * wander(8.0, 8.0) * (1 - arm),
+        )
+        turns.bend(f"{side} forearm", -15 - 125 * arm, hanging)
+    return turns.rotations, torch.zeros_like(phase)
+
+
+def _raised(cycle: Tensor) -> Tensor:
+    """Return how far (T,) a limb is tucked in, from 0 to 1: in the first half of a cycle, and held in its middle."""
+    return (1.4 * torch.sin(2 * math.pi * cycle)).clamp(0, 1)
+
+
 def animal_walk(
     figure: Figure, phase: Tensor, gait: str = "walk", generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor]:

@@ -61,7 +61,10 @@ def name_over_time(frames: Sequence[TipObservations], reference: int, names: Ten
 
     References: Viterbi 1967; Rabiner 1989 for the probabilities of single states.
     """
-    chains = [_Chain(frames, reference, names, *start) for start in SEARCH.starts]
+    model = NameModel.from_frame(frames, reference, names)
+    by_motion = _Chain(frames, reference, names, model.starting(*SEARCH.starts[-1]), num_rounds=1)
+    model = model.mirrored(frames, by_motion.labels)
+    chains = [_Chain(frames, reference, names, model.starting(*start)) for start in SEARCH.starts]
     best = max(chains, key=lambda chain: chain.score)
     return TipNames(labels=best.labels, confidence=best.confidence, reference=reference)
 
@@ -71,18 +74,18 @@ class _Chain:
 
     Args:
         frames, reference, names: see `name_over_time`.
-        displacement: scale of displacements at first.
-        weight: of features at first.
+        model: at first.
+        num_rounds: see `NameSearch`.
     """
 
     def __init__(
-        self, frames: Sequence[TipObservations], reference: int, names: Tensor, displacement: float, weight: float
-    ) -> None:
-        self.frames, self.reference, self.known = frames, reference, names
-        self.model = NameModel.from_frame(frames, reference, names, displacement, weight)
+        self, frames: Sequence[TipObservations], reference: int, names: Tensor, model: NameModel,
+        num_rounds: int = SEARCH.num_rounds,
+    ) -> None:  # fmt: skip
+        self.frames, self.reference, self.known, self.model = frames, reference, names, model
         chosen: list[Tensor | None] = [None] * len(frames)
         labels: Tensor | None = None
-        for _ in range(SEARCH.num_rounds):
+        for _ in range(num_rounds):
             candidates = self._candidates(chosen)
             before, labels = labels, self._most_probable(candidates)
             if before is not None and torch.equal(before, labels):

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchreg.geometry.skeleton import nearest_rotation
+from torchreg.spines.body_mirror import BodyMirror, find_mirror
 from torchreg.spines.student_t import SHRINKAGE, TAILS, GroupedDensity, fit_groups, t_log_density
 from torchreg.spines.tip_features import SAMPLING, TipFeatures, TipObservations
 
@@ -68,6 +69,8 @@ class NameModel:
         turn: mean of 1 - cos of the body's rotation between two frames.
         log_volume: of the space that limbs move in.
         weight: of features against motion: one, but before anything is known of them.
+        mirror: in which the body looks like itself, if it is symmetric. What tells a limb from its mirror image is then
+            its pose, and may be the other way around in other frames.
     """
 
     features: TipFeatures
@@ -81,12 +84,11 @@ class NameModel:
     turn: float
     log_volume: float
     weight: float = 1.0
+    mirror: BodyMirror | None = None
 
     @classmethod
-    def from_frame(
-        cls, frames: Sequence[TipObservations], reference: int, names: Tensor, displacement: float, weight: float
-    ) -> NameModel:
-        """Return the model of which one frame's names (K,) are known, for a scale of displacements and a weight."""
+    def from_frame(cls, frames: Sequence[TipObservations], reference: int, names: Tensor) -> NameModel:
+        """Return the model of which one frame's names (K,) are known, without displacements."""
         with_volumes = any(bool(frame.volumes.any()) for frame in frames)
         features = TipFeatures(len(names), frames[0].limbs.shape[1], with_volumes=with_volumes)
         center, background = _background(features, frames)
@@ -101,10 +103,32 @@ class NameModel:
             background=background,
             correlation=torch.full((len(features.groups),), PRIORS.correlation, dtype=torch.float64),
             usual=usual,
-            displacement=torch.full((SAMPLING.num_points,), displacement, dtype=torch.float64),
+            displacement=torch.zeros(SAMPLING.num_points, dtype=torch.float64),
             turn=PRIORS.turn,
             log_volume=3 * math.log(float((points.amax(0) - points.amin(0)).norm().clamp_min(1e-6))),
-            weight=weight,
+        )
+
+    def starting(self, displacement: float, weight: float) -> NameModel:
+        """Return the model with one scale of displacements, and a weight of features."""
+        return replace(self, displacement=torch.full_like(self.displacement, displacement), weight=weight)
+
+    def mirrored(self, frames: Sequence[TipObservations], names: Tensor) -> NameModel:
+        """Return the model of a symmetric body, if frames show that it is one; itself if not.
+
+        Args:
+            frames: T of them.
+            names: (T, K), see `find_mirror`.
+        """
+        mirror = find_mirror(self.features, self.background, frames, names)
+        if mirror is None:
+            return self
+        levels = mirror.levels.clamp_max(SHRINKAGE.variance)
+        covariances = [level * c for level, c in zip(levels.tolist(), self.background.covariances, strict=True)]
+        return replace(
+            self,
+            mirror=mirror,
+            mean=(self.mean + mirror(self.mean)) / 2,
+            density=GroupedDensity(self.features.groups, covariances),
         )
 
     def of_names(self, frame: TipObservations, maps: Tensor) -> Tensor:
@@ -172,7 +196,8 @@ class NameModel:
         usual = distances.nanmedian(0).values
         usual = torch.where(usual.isnan(), self.usual, usual)
         samples = torch.cat([self.features(frame, row, usual) for frame, row in zip(frames, maps, strict=True)])
-        mean, density = fit_groups(samples, self.background)
+        mirrored = samples if self.mirror is None else torch.cat((samples, self.mirror(samples)))
+        mean, density = fit_groups(mirrored, self.background)
         return replace(
             self,
             mean=mean,

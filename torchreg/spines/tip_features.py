@@ -101,7 +101,7 @@ class TipFeatures:
     """
 
     def __init__(self, num_names: int, num_limb_features: int, *, with_volumes: bool) -> None:
-        self.num_names = num_names
+        self.num_names, self.num_limb_features = num_names, num_limb_features
         self.pairs = torch.tensor(list(combinations(range(num_names), 2))).T
         triples = list(combinations(range(num_names), 3)) if with_volumes else []
         self.triples = torch.tensor(triples, dtype=torch.int64).reshape(-1, 3)
