@@ -210,9 +210,9 @@ def test_frames_that_cannot_be_read_are_dropped(run, command, sequence, tmp_path
     assert answer.exit_code == 1
     assert answer.output.count("torchreg: warning: frame 3 is dropped: ") == 1
     assert "frame_0003.ply: must start with 'ply'" in answer.output
-    assert "frame_0003.ply: no data" in answer.output
+    assert "frame_0003.ply: no_data" in answer.output
     assert "frame_0004.ply: back (" in answer.output
-    assert "6 frames: 5 tracked, 1 no data" in answer.output
+    assert "6 frames: 5 tracked, 1 no_data" in answer.output
     result = load(tmp_path / "r.safetensors")
     assert [status.usable for status in result.statuses] == [True, True, True, False, True, True]
     assert result.poses.shape == (FRAMES, 27)

@@ -227,7 +227,7 @@ def _summary(shape: ArticulatedShape, found: BaseCalibration, paths: Sequence[Pa
 
     std = found.covariance.diagonal().sqrt()
     words = [
-        f"{found.status.value.replace('_', ' ')}: base within {1e3 * float(std[:3].max()):.1f} mm and "
+        f"{found.status}: base within {1e3 * float(std[:3].max()):.1f} mm and "
         f"{math.degrees(float(std[3:].max())):.2f} degrees (one standard deviation)",
         f"data {1e3 * float(found.residuals.median()):.1f} mm from the robot",
     ]

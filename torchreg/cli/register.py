@@ -14,6 +14,7 @@ from torchreg.cli.cameras import DepthRange, Seen, check_used, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, tell_origin, with_ending
 from torchreg.cli.reporting import ExitCode, reporting
 from torchreg.cli.robot import RobotFiles, check_alone, write_scanned_robot
+from torchreg.cli.upright import Up, known_up, remembering
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -78,6 +79,7 @@ def register(
     errors: Annotated[
         Path | None, typer.Option(help="Also write the moved source, colored by its distance from the target (.ply).")
     ] = None,
+    up: Up = None,
     urdf: Annotated[
         bool,
         typer.Option(
@@ -102,7 +104,7 @@ def register(
     """
     if urdf:
         check_alone({"--depth": depth, "--intrinsics": intrinsics, "--depth-range": depth_range, "--seen": seen,
-                     "--smoothing": smoothing, "--weights": weights, "--errors": errors})  # fmt: skip
+                     "--smoothing": smoothing, "--weights": weights, "--errors": errors, "--up": up})  # fmt: skip
         units = _common(scale, "--scale"), _common(time, "--time"), _common(frame, "--frame")
         _write_robot(scans, output, bones, grid, units, nan_policy, force=force, quiet=quiet)
         return
@@ -136,6 +138,7 @@ def register(
         raise InputError(f"{source} has no triangles, which a .glb needs; name an output that ends in .safetensors")
     with tqdm(desc="initialize", unit="step", leave=False, disable=quiet) as bar:
         found = run(first, second, bones, grid, on_step=partial(_show, bar))
+    found = remembering(found, known_up(up, scans, camera=depth))
     _write(found, scene, weights, errors)
     if depth:
         images[1].draw_over(found, folder / "registered.png")
@@ -247,10 +250,11 @@ def _pair(given: list[Given] | None, default: Any, option: str) -> tuple[Any, An
 
 def _write(found: ScanRegistration, scene: Path | None, weights: Path | None, errors: Path | None) -> None:
     if scene is not None and found.faces is not None:
+        from torchreg.geometry.upright import guess_up
         from torchreg.viz.scan_gltf import save_grid_animation
 
         near = found.local()
-        save_grid_animation(scene, near.model, near.points, found.faces)
+        save_grid_animation(scene, near.model, near.points, found.faces, up=found.up or guess_up([found.points]))
         tell_origin(scene, found.origin)
     if weights is not None or errors is not None:
         from torchreg.viz.bone_colors import save_error_ply, save_weight_ply
@@ -262,11 +266,10 @@ def _write(found: ScanRegistration, scene: Path | None, weights: Path | None, er
 
 
 def _summary(found: ScanRegistration) -> str:
-    status = found.status.value.replace("_", " ")
     seconds = ", ".join(
         f"{name} {value:.1f} s"
         for name, value in zip(("setup", "initialization", "align", "refine"), found.seconds.tolist(), strict=True)
     )
     share = float(found.matched.float().mean())
     sure = "" if found.confidence is None else f", confidence {found.confidence:.0%}"
-    return f"{status}{sure}: {found.model.num_bones} bones, {share:.0%} of the points match; {seconds}"
+    return f"{found.status}{sure}: {found.model.num_bones} bones, {share:.0%} of the points match; {seconds}"

@@ -33,6 +33,7 @@ from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, shifted_t
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
 from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary, track_job
+from torchreg.cli.upright import Up, known_up
 from torchreg.cli.view import Browser, Port, tell_url
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 
     from torchreg.capture.depth_frames import DepthFrames
     from torchreg.capture.stereo_frames import StereoFrames
+    from torchreg.geometry.upright import Direction
     from torchreg.shapes.articulated import ArticulatedShape
     from torchreg.shapes.skin import LinearBlendSkin
     from torchreg.tracking.results import FrameResult, TrackResult
@@ -124,6 +126,7 @@ def track(
     ] = None,
     movie: Annotated[str, typer.Option(help="The moving picture: gif, mp4 (needs ffmpeg), none, or a path.")] = "gif",
     gltf: Annotated[bool, typer.Option("--gltf/--no-gltf", help="Whether to write the moving shape.")] = True,
+    up: Up = None,
     save_every: Annotated[int, typer.Option(min=1, help="Frames after which RESULT.progress is written anew.")] = 50,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on where RESULT.progress ends, if it is there; else begin.")
@@ -181,11 +184,11 @@ def track(
         tracker, report = Tracker(model, first, config=config, locked=known.locked), Report(bar, clouds, quiet)
         run = TrackRun(
             tracker=tracker, clouds=clouds, fps=fps, job=job, files=files, report=report, save_every=save_every,
-            known=known, measured=measured,
+            known=known, measured=measured, up=known_up(up, frames, camera=stereo or depth),
         )  # fmt: skip
         _add_pictures(run, pictures, folder, images)
         if view:
-            run.live = _live_page(pages, port, browser, quiet)
+            run.live = _live_page(pages, port, browser, quiet, run.up)
         complete = _run(run, bar, resumed)
     if poses is not None:
         _write_poses(poses, model, run.located)
@@ -257,7 +260,9 @@ def _drawn_pictures(frames: StereoFrames, folder: Path) -> Callable[[LinearBlend
     return lambda skin: StereoPictures(frames, skin, folder)
 
 
-def _live_page(pages: ExitStack, port: int, browser: bool, quiet: bool) -> Callable[[LinearBlendSkin], OnFrame]:
+def _live_page(
+    pages: ExitStack, port: int, browser: bool, quiet: bool, up: Direction | None
+) -> Callable[[LinearBlendSkin], OnFrame]:
     """Return the function that opens a page for a skin, on which each frame is shown; it closes with ``pages``."""
     from torchreg.viz.live_track import LiveTrack
     from torchreg.viz.viser_server import import_viser
@@ -265,7 +270,7 @@ def _live_page(pages: ExitStack, port: int, browser: bool, quiet: bool) -> Calla
     import_viser()  # a missing extra is reported before the first frame
 
     def begin(skin: LinearBlendSkin) -> OnFrame:
-        page = pages.enter_context(LiveTrack(skin, port=port))
+        page = pages.enter_context(LiveTrack(skin, port=port, up=up))
         tell_url(page.url, browser, quiet)
         return page.show
 
