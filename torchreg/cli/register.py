@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from torchreg.cli.align_options import NanPolicy
-from torchreg.cli.cameras import DepthRange, Seen, check_used, seen_folder
+from torchreg.cli.align_options import NanPolicy, cloud_files
+from torchreg.cli.cameras import Depth, DepthRange, Seen, check_used, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, tell_origin, with_ending
 from torchreg.cli.reporting import ExitCode, reporting
 from torchreg.cli.robot import RobotFiles, check_alone, write_scanned_robot
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from torchreg.geometry.range_scan import RangeScan
     from torchreg.registration.results import RegisterRecord, ScanRegistration
 
+_DEFAULT = Path("registered.glb")
 # Pictures of the depth of source and target that was kept.
 _KEPT = ("source.png", "target.png")
 
@@ -36,7 +37,7 @@ def register(
         typer.Argument(
             metavar="SOURCE TARGET",
             help="Scan to be moved (.ply, .obj, .npz, ...), in any unit, and scan to be reached, in the same unit and "
-            "frame. With --urdf, any number of scans of one robot, in metres.",
+            "frame; or a folder or pattern of the two. With --urdf, any number of scans of one robot, in metres.",
         ),
     ],
     output: Annotated[
@@ -46,17 +47,15 @@ def register(
             "-o",
             metavar="OUT.glb",
             help="The moving, skinned source; OUT.safetensors and OUT.json are written beside it. Ending in "
-            ".safetensors: the result alone, which scans without triangles need.",
+            ".safetensors: the result alone, as always of scans without triangles.",
         ),
-    ] = Path("registered.glb"),
+    ] = _DEFAULT,
     bones: Annotated[int, typer.Option(help="Most bones.")] = 20,
     grid: Annotated[int, typer.Option(help="Cells of the grid along the longest side.")] = 50,
-    depth: Annotated[
-        bool, typer.Option("--depth", help="SOURCE and TARGET are depth images (16-bit .png or .tif, .exr, .npy).")
-    ] = False,
+    depth: Depth = False,
     intrinsics: Annotated[
         list[Path] | None,
-        typer.Option(metavar="FILE", help="The camera of the depth images, .json; twice if they have two cameras."),
+        typer.Option(metavar="FILE", help="The camera of the depth pictures, .json; twice if they have two cameras."),
     ] = None,
     depth_range: DepthRange = None,
     smoothing: Annotated[
@@ -95,13 +94,14 @@ def register(
 
     With --urdf scans of a robot become its description: torchreg register S0 S1 S2 ... -o robot --urdf.
 
-    With --depth A B --intrinsics FILE the scans are depth images in metres, steps cut and flying pixels left out. What
-    was kept of each goes to OUT_seen, red where it was cut, and the moved source over the picture of the target.
+    With --depth A B --intrinsics FILE the scans are depth pictures in metres, steps cut and flying pixels left out.
+    What was kept of each goes to OUT_seen, red where it was cut, and the moved source over the picture of the target.
 
     OMP_NUM_THREADS=2 in the environment makes a second core help to find where the source goes.
 
     Exit codes: 0; 1 if the result is doubtful or too few points match; 2 for an error; 130 for Ctrl-C.
     """
+    scans = cloud_files(scans) if not depth else scans
     if urdf:
         check_alone({"--depth": depth, "--intrinsics": intrinsics, "--depth-range": depth_range, "--seen": seen,
                      "--smoothing": smoothing, "--weights": weights, "--errors": errors, "--up": up})  # fmt: skip
@@ -135,7 +135,9 @@ def register(
             for path, unit, seconds, number in zip((source, target), *pairs, strict=True)
         )
     if scene is not None and first.faces is None:
-        raise InputError(f"{source} has no triangles, which a .glb needs; name an output that ends in .safetensors")
+        if output.name != _DEFAULT.name:
+            raise InputError(f"{source} has no triangles, which a .glb needs; name an output that ends in .safetensors")
+        scene = None
     with tqdm(desc="initialize", unit="step", leave=False, disable=quiet) as bar:
         found = run(first, second, bones, grid, on_step=partial(_show, bar))
     found = remembering(found, known_up(up, scans, camera=depth))

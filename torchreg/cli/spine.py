@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchreg.cli.align_options import NanPolicy, Scale
+from torchreg.cli.align_options import NanPolicy, Scale, cloud_files
 from torchreg.cli.cameras import Calibration, Seen, check_used, load_calibration, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, counted, numbered, tell_origin, with_ending
 from torchreg.cli.reporting import interruption, reporting
@@ -212,7 +212,7 @@ def _read(frames: list[Path], scale: float, nan_policy: str) -> tuple[list[Trian
 
     if any(frame.suffix.lower() == ".npz" for frame in frames):
         raise InputError("FRAMES must be files of meshes, not of arrays; give a folder, or files such as *.ply")
-    names = load_frames(frames[0] if len(frames) == 1 else frames).names
+    names = load_frames(cloud_files(frames)).names
     clouds = ((name, load_points(name, scale=scale, nan_policy=nan_policy)) for name in names)
     return [as_surface(cloud, name)[0] for name, cloud in clouds], names
 

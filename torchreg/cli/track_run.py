@@ -45,19 +45,18 @@ class TrackFiles:
     progress: Path
     movie: Path | None
     gltf: Path | None
-    overlay: Path | None
+    pictures: Path | None
 
     @classmethod
-    def at(cls, result: Path, movie: str, gltf: bool, overlay: Path | None) -> TrackFiles:
+    def at(cls, result: Path, movie: str, gltf: Path | None, pictures: Path | None) -> TrackFiles:
         """Return them for a result, and what else is asked for."""
         named = Path(movie).suffix.lower() in (".gif", ".mp4")
         moving = Path(movie) if named else None if movie == "none" else result.with_suffix(f".{movie}")
-        scene = result.with_suffix(".glb") if gltf else None
-        return cls(result, result.with_suffix(".progress"), moving, scene, overlay)
+        return cls(result, result.with_suffix(".progress"), moving, gltf, pictures)
 
     def frame(self, number: int) -> Path:
         """Return where the picture of a frame goes."""
-        return (self.overlay or Path()) / f"frame_{number:04d}.png"
+        return (self.pictures or Path()) / f"frame_{number:04d}.png"
 
     def check(self, force: bool) -> None:
         """Raise before any work is done if an output cannot be written, or exists and may not be overwritten."""
@@ -68,10 +67,10 @@ class TrackFiles:
             from torchreg.viz.animation import check_animation_path
 
             check_animation_path(self.movie)
-        if self.overlay is not None:
-            if self.overlay.is_dir():
-                check_outputs([next(self.overlay.glob("frame_*.png"), None)], force)
-            self.overlay.mkdir(exist_ok=True)
+        if self.pictures is not None:
+            if self.pictures.is_dir():
+                check_outputs([next(self.pictures.glob("frame_*.png"), None)], force)
+            self.pictures.mkdir(exist_ok=True)
 
 
 class Clouds(Sequence["Tensor"]):
@@ -326,7 +325,7 @@ class TrackRun:
     def _overlays(self) -> list[OnFrame]:
         """Return what draws each frame as soon as it is done."""
         drawn = [begin(self.surface) for begin in (self.seen, self.live) if begin is not None]
-        if self.files.overlay is not None:
+        if self.files.pictures is not None:
             from torchreg.viz.tracking import FrameOverlays
 
             overlays = FrameOverlays(self.tracker.shape, self.surface, up=self.up)

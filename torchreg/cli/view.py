@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchreg.cli.align_options import Scale
+from torchreg.cli.align_options import Scale, cloud_files
 from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
 from torchreg.cli.reporting import reporting
 from torchreg.cli.shape_argument import HANDS, PEOPLE, FreeBase, PackageDir, Parents, Skin, load_shape, near_shape
@@ -47,7 +47,14 @@ def view(
         typer.Option(help="What was measured, once per frame, or a folder: clouds, the target scan, the meshes."),
     ] = None,
     html: Annotated[
-        Path | None, typer.Option(metavar="OUT.html", help="Write one file that needs no network, instead of serving.")
+        Path | None,
+        typer.Option(
+            "--html",
+            "--output",
+            "-o",
+            metavar="OUT.html",
+            help="Write one file that needs no network, instead of serving.",
+        ),
     ] = None,
     port: Port = 8080,
     browser: Browser = True,
@@ -171,8 +178,9 @@ def _read(paths: list[Path], scale: float = 1.0) -> list[Tensor | TriangleMesh]:
 
     if not paths:
         return []
-    frames = load_frames(paths[0] if len(paths) == 1 else paths, scale=scale)
-    if any(path.suffix.lower() == ".npz" for path in paths):
+    files = cloud_files(paths)
+    frames = load_frames(files, scale=scale)
+    if any(path.suffix.lower() == ".npz" for path in files):
         return list(frames)
     clouds = [load_points(name, scale=scale) for name in frames.names]
     return [
