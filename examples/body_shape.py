@@ -3,7 +3,9 @@
 python examples/body_shape.py [SCAN.ply START.json]     # without arguments on a made-up person; needs the extra anny
 """
 
+import json
 import sys
+from pathlib import Path
 
 import torch
 
@@ -27,7 +29,7 @@ def made_up_scan():
 
 
 if len(sys.argv) > 2:
-    scan, truth, start = tr.load_points(sys.argv[1]).points, None, tr.load_pose(sys.argv[2], body)
+    scan, truth, start = tr.load_points(sys.argv[1]).points, None, json.loads(Path(sys.argv[2]).read_text())
 else:
     (scan, truth), start = made_up_scan(), body.rest_pose()
 
