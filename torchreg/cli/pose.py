@@ -42,7 +42,7 @@ def pose(
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
-    """Pose a registered scan: points of it come to lie at targets, joints hold, and the rest moves little.
+    """Pose a registered scan by inverse kinematics: its points go to targets, and joints constrain the rest.
 
     With --handle and --to once and for all; without them on a page in the browser, where points are clicked and
     dragged, pinned, undone, and kept as key poses. The page writes OUT.safetensors, OUT.ply and OUT.glb, numbered where
