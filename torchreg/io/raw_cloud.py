@@ -76,7 +76,7 @@ def parse_numbers(text: bytes, columns: int | None, what: str, *, unit: str = "l
             f"{counts[number]} ({line!r}), {'they must be' if columns else 'the first row'} {width}"
         )
     with warnings.catch_warnings():
-        warnings.simplefilter("error", DeprecationWarning)  # older releases of numpy only warn of text that is no number
+        warnings.simplefilter("error", DeprecationWarning)  # older numpy only warns of text that is no number
         try:
             values = np.fromstring(text, sep=" ") if text.isascii() else np.zeros(0)
         except (ValueError, DeprecationWarning):
