@@ -254,7 +254,8 @@ def align(
     if fit_shape is not False:
         shape = fitted_rig(shape, fit_shape, plain=known is None and model_points is None and seen.keypoints is None)
         found = _align_person(shape, seen, initial_pose, config, on_step)
-        return replace(found, shape=shape.with_coefficients(found.coefficients))
+        person = shape if found.coefficients is None else shape.with_coefficients(found.coefficients)
+        return replace(found, shape=person)
     origin = floating_origin(shape, seen.points)
     if origin is not None:
         found = _align_about(origin, shape, seen, initial_pose, model_points, known, config, on_step)
