@@ -48,7 +48,7 @@ def aligned(pairs: Iterable[Pair]) -> list[Case]:
         moved = moved_points(problem, candidates[0].transforms, pair.source)
         error = (moved - pair.truth).norm(dim=1) / pair.target.diagonal
         right = float((error < NEAR).double().mean()) >= SHARE
-        found.append(Case(right, evidence_against(problem, candidates)))
+        found.append(Case(right, evidence_against(problem, candidates[0])))
     return found
 
 

@@ -3,7 +3,8 @@
 Pairs of kinds that the matcher never saw in training, and with --data those of its folder ``range_pairs``. By group:
 
 - right: share of visible tokens whose best match lies within 5 % of the diagonal of the truth,
-- hidden: recall and precision of tokens called hidden,
+- hidden: recall and precision of tokens called hidden, of all pairs together, where a probability of one half calls;
+  and where as many are called as are, at which both are one number, their break-even,
 - error and registered of the dense alignment (before bones), in which the matcher's posterior is the prior of matches:
   a pair counts as registered when 90 % of its points end within 2.5 % of the diagonal of the truth,
 - the same with the matches of the truth, which tells what the matcher and what the alignment leave to be done.
@@ -62,9 +63,30 @@ def moved_points(problem: ScanAlignProblem, transforms: Tensor, scan: tr.RangeSc
     return problem.unit.denormalize(blend_linear(points, weights, transforms), scan.points)
 
 
+@dataclass(frozen=True)
+class Figures:
+    """Of one pair.
+
+    Args:
+        right: share of visible tokens.
+        hidden: (S,) which tokens are.
+        told: (S,) probabilities of it.
+        errors: of the alignment by the matcher and by the truth, mean, per cent of the diagonal.
+        registered: of both, whether it is.
+        seconds: of all this.
+    """
+
+    right: float
+    hidden: Tensor
+    told: Tensor
+    errors: list[float]
+    registered: list[bool]
+    seconds: float
+
+
 @torch.no_grad()
-def measured(pair: Pair, matcher: ScanMatcher) -> list[float]:
-    """Return the figures of one pair, in the order of the columns; NaN where there is nothing hidden or called so."""
+def measured(pair: Pair, matcher: ScanMatcher) -> Figures:
+    """Return the figures of one pair."""
     begin = time.process_time()
     problem = describe(pair.source, pair.target, ScanAlignConfig())
     scans = (problem.source, problem.target)
@@ -75,14 +97,21 @@ def measured(pair: Pair, matcher: ScanMatcher) -> list[float]:
     places = problem.target.points[: SIZES.num_tokens]
     visible = torch.cdist(truth, problem.target.points).amin(1) < VISIBLE * size
     right = (places[probability.argmax(1)] - truth).norm(dim=1) < RIGHT * size
-    called = hidden > 0.5
-    figures = [share(right[visible]), share(called[~visible]), share(~visible[called])]
+    errors, registered = [], []
     for known in (logits[0].double(), true_logits(truth, places, visible)):
         prior = MatchPrior.of_logits(known, problem.graph.points, problem.target.points)
         transforms = align_problem(replace(problem, prior=prior), lambda _: None)[0].transforms
         error = (moved_points(problem, transforms, pair.source) - pair.truth).norm(dim=1) / pair.target.diagonal
-        figures += [100 * float(error.mean()), float((error < 0.025).double().mean() >= 0.9)]
-    return [*figures, time.process_time() - begin]
+        errors.append(100 * float(error.mean()))
+        registered.append(float((error < 0.025).double().mean()) >= 0.9)
+    return Figures(
+        right=float(right[visible].double().mean()),
+        hidden=~visible,
+        told=hidden,
+        errors=errors,
+        registered=registered,
+        seconds=time.process_time() - begin,
+    )
 
 
 def true_logits(truth: Tensor, places: Tensor, visible: Tensor) -> Tensor:
@@ -93,11 +122,6 @@ def true_logits(truth: Tensor, places: Tensor, visible: Tensor) -> Tensor:
     logits[:-1, -1] = torch.where(visible, -SURE, SURE)
     logits[-1, :-1] = torch.where(apart.amin(0) < RIGHT, -SURE, 0.0)
     return logits
-
-
-def share(flags: Tensor) -> float:
-    """Return the share that is True; NaN of none."""
-    return float(flags.double().mean())
 
 
 def held_out(count: int) -> Iterator[Pair]:
@@ -131,7 +155,8 @@ def main(arguments: list[str] | None = None) -> int:
     if options.weights is not None:
         matcher.load_state_dict(torch.load(options.weights, weights_only=True)["net"])
     print(
-        f"{'':10s} pairs  right  hidden recall, precision   error %  registered   of the truth: error %  registered   s"
+        f"{'':10s} pairs  right  hidden recall, precision, break-even   error %  registered   of the truth: error %  "
+        "registered   s"
     )
     print_rows([(pair.group, measured(pair, matcher)) for pair in held_out(1 if options.smoke else options.pairs)])
     if options.data is None:
@@ -141,16 +166,20 @@ def main(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def print_rows(found: list[tuple[str, list[float]]]) -> None:
-    """Print means by group and of all."""
+def print_rows(found: list[tuple[str, Figures]]) -> None:
+    """Print a row for each group, and one of all."""
     for group in [*dict.fromkeys(name for name, _ in found), "all"]:
-        rows = np.array([figures for name, figures in found if group in (name, "all")])
-        with np.errstate(all="ignore"):
-            mean = [np.nanmean(column) if np.isfinite(column).any() else np.nan for column in rows.T]
-        registered, by_truth = (f"{rows[:, column].sum():3.0f} / {len(rows):3d}" for column in (4, 6))
+        rows = [figures for name, figures in found if group in (name, "all")]
+        hidden, told = (torch.cat([getattr(row, name) for row in rows]) for name in ("hidden", "told"))
+        called = told > 0.5
+        recall, precision = (float((called & hidden).sum() / of.sum().clamp_min(1)) for of in (hidden, called))
+        even = hidden[told.argsort(descending=True)[: int(hidden.sum())]].double().mean()
+        registered, by_truth = (f"{sum(row.registered[end] for row in rows):3d} / {len(rows):3d}" for end in (0, 1))
+        error, by_truth_error = (np.mean([row.errors[end] for row in rows]) for end in (0, 1))
         print(
-            f"{group:10s} {len(rows):5d}  {mean[0]:.3f}  {mean[1]:13.2f}  {mean[2]:9.2f}   {mean[3]:7.2f}  {registered}"
-            f"   {mean[5]:21.2f}  {by_truth}   {mean[7]:.2f}"
+            f"{group:10s} {len(rows):5d}  {np.mean([row.right for row in rows]):.3f}  {recall:13.2f}  "
+            f"{precision:9.2f}  {even:10.2f}   {error:7.2f}  "
+            f"{registered}   {by_truth_error:21.2f}  {by_truth}   {np.mean([row.seconds for row in rows]):.2f}"
         )
 
 

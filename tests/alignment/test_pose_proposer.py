@@ -122,9 +122,23 @@ def test_training_goes_on_where_it_ended_and_files_are_for_their_shape(plain_han
     again = PoseProposer.load(path, plain_hand)
     points, mask = torch.randn(2, 30, 3) / 20, torch.ones(2, 30, dtype=torch.bool)
     torch.testing.assert_close(again.propose(points, mask).poses, trained.propose(points, mask).poses)
+    points = points.to(plain_hand.rest)
+    loaded = PoseInitializer.load(path, plain_hand, PoseInitializerConfig(search="never"))
+    assert not loaded.proposer.training
+    torch.testing.assert_close(loaded.proposer.propose(points, mask).poses, again.propose(points, mask).poses)
     with pytest.raises(FormatError, match="another shape"):
-        PoseProposer.load(path, arm)
+        PoseInitializer.load(path, arm)
     with pytest.raises(FormatError, match="of another shape or network"):
         train_initializer(Hand(), path, TrainInitializerConfig(steps=5, batch=4))
     with pytest.raises(InputError, match="needs a network"):
         PoseInitializer(arm, PoseInitializerConfig(search="never"))
+
+
+def test_an_exported_network_takes_any_number_of_clouds(plain_hand):
+    net = PoseProposer(plain_hand, TINY, shape_size=0.26).eval()
+    points, mask = torch.randn(3, 32, 3) / 20, torch.ones(3, 32, dtype=torch.bool)
+    mask[1, 20:] = False
+    batch = {0: torch.export.Dim("batch", min=2)}
+    program = torch.export.export(net, (points, mask), dynamic_shapes={"points": batch, "mask": batch})
+    many, shown = points.repeat(2, 1, 1).flip(0), mask.repeat(2, 1).flip(0)
+    torch.testing.assert_close(tuple(program.module()(many, shown)), tuple(net(many, shown)))

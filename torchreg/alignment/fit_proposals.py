@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from torchreg.alignment.objectives import GaussianPosePrior, RegistrationObjecti
 from torchreg.alignment.pose_proposer import Proposals
 from torchreg.alignment.pose_search import PoseSearch, fit_candidates, mean_distances, score_candidates
 from torchreg.alignment.problem import AlignProblem, joint_precision
+from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.solvers.e_step import EStep
 
 
@@ -23,7 +24,7 @@ class _Fit:
     surface_std: float = 0.015  # of where the network says that a datum lies on the shape
     sigma: float = 0.02  # of a datum about the model point
     reach: tuple[float, ...] = (0.15, 0.08)  # by which a datum may be off in the rounds after the first
-    joint_std: float = 0.35  # of the network's joints that no datum shows, radians
+    joint_std: float = 0.35  # of the network's joints, radians: its pose is the prior, of fingers that no datum shows
     matched_steps: int = 2  # in each round
     widths: tuple[float, ...] = (0.05, 0.03, 0.02)  # of the kernel, from what a proposal errs by to a searched pose's
     steps: int = 2  # at each width
@@ -34,37 +35,54 @@ class _Fit:
 _FIT = _Fit()
 
 
+@dataclass(frozen=True, eq=False)
+class BestProposal:
+    """The proposal that explains most data.
+
+    Args:
+        pose: (B, num_dofs) after a coarse fit.
+        mean: (B, num_dofs) of the prior: its base, and the joints that the network thinks most probable.
+        lead: (B,) of its score over the best other one's.
+    """
+
+    pose: Tensor
+    mean: Tensor
+    lead: Tensor
+
+
 @torch.no_grad()
-def best_proposal(problem: AlignProblem, proposals: Proposals) -> tuple[Tensor, Tensor]:
-    """Return the pose (B, num_dofs) that explains most data after a coarse fit, and its lead (B,) over other ones.
+def best_proposal(problem: AlignProblem, proposals: Proposals) -> BestProposal:
+    """Return the pose that explains most data after a coarse fit, with the network's pose as the prior of its joints.
 
     Args:
         problem: the batch.
         proposals: for its data.
     """
     search = PoseSearch(problem, torch.Generator().manual_seed(0))
-    coarse = search.coarse_problem
-    poses = coarse.clamp_candidates(proposals.poses[:, : _FIT.kept])
-    poses = torch.cat([matched_pose(problem, proposals, poses[:, 0]).unsqueeze(1), poses], dim=1)
+    poses = search.coarse_problem.clamp_candidates(proposals.poses[:, : _FIT.kept])
+    typical = poses[:, 0]
+    prior = GaussianPosePrior(typical, joint_precision(problem.skin.shape, problem.size, _FIT.joint_std))
+    coarse = replace(search.coarse_problem, prior=prior)
+    poses = torch.cat([matched_pose(replace(problem, prior=prior), proposals).unsqueeze(1), poses], dim=1)
     fitted = fit_candidates(coarse, poses, _FIT.widths, _FIT.steps)
     scores, order = score_candidates(coarse, fitted, _FIT.score_width).sort(dim=1, stable=True)
     fitted = take_rows(fitted, order)
     apart = mean_distances(coarse, fitted)[:, 0] > _FIT.same * problem.size
     share = problem.valid.sum(-1) / coarse.valid.sum(-1).clamp_min(1)
     lead = torch.where(apart, scores, torch.inf).amin(1) - scores[:, 0]
-    return fitted[:, 0], lead * share
+    best = fitted[:, 0]
+    return BestProposal(best, torch.cat([best[:, :BASE_DOFS], typical[:, BASE_DOFS:]], dim=-1), lead * share)
 
 
-def matched_pose(problem: AlignProblem, proposals: Proposals, pose: Tensor) -> Tensor:
+def matched_pose(problem: AlignProblem, proposals: Proposals) -> Tensor:
     """Return poses (B, num_dofs) in which a shape's points lie where a network says that the data are on it.
 
-    An EM from proposed poses (B, num_dofs), which are the prior of joints that no datum shows: to a model point belong
-    the data near to it on the shape at rest, as far as the pose takes it near to them.
+    An EM from the prior's mean: to a model point belong the data near to it on the shape at rest, as far as the pose
+    takes it near to them.
     """
-    skin, sigma = problem.skin, _FIT.sigma * problem.size
+    skin, sigma, pose = problem.skin, _FIT.sigma * problem.size, problem.prior.mean
     near = torch.cdist(proposals.surface, skin.points).square()
     told = (near / (-2 * (_FIT.surface_std * problem.size) ** 2)).softmax(-1) * proposals.inlier.unsqueeze(-1)
-    prior = GaussianPosePrior(pose, joint_precision(skin.shape, problem.size, _FIT.joint_std))
     for width in (None, *_FIT.reach):
         weight = told
         if width is not None:
@@ -73,7 +91,7 @@ def matched_pose(problem: AlignProblem, proposals: Proposals, pose: Tensor) -> T
         total = weight.sum(1)
         targets = weight.mT @ proposals.points / total.clamp_min(1e-9).unsqueeze(-1)
         matches = EStep(total, targets, weight.sum(2), torch.zeros_like(total[:, 0]))
-        objective = RegistrationObjective(skin, matches, torch.full_like(pose[:, 0], sigma), prior)
+        objective = RegistrationObjective(skin, matches, torch.full_like(pose[:, 0], sigma), problem.prior)
         for _ in range(_FIT.matched_steps):
             pose = problem.step(objective(pose), pose).state
     return pose

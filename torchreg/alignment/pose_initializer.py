@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -29,6 +30,7 @@ from torchreg.alignment.reliability import CALIBRATION
 from torchreg.alignment.rough_poses import typical_poses
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface, residual_noise, surface_objective
 from torchreg.errors import InputError
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import BASE_DOFS, shifted
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
@@ -165,6 +167,29 @@ class PoseInitializer(nn.Module):
         count = self.config.num_model_points
         self.skin = check_skin(shape, sample_skin(shape, count) if model_points is None else model_points)
 
+    @classmethod
+    def load(
+        cls,
+        path: str | os.PathLike[str],
+        shape: ArticulatedShape,
+        config: PoseInitializerConfig | None = None,
+        *,
+        limits: FileLimits = DEFAULT_LIMITS,
+    ) -> PoseInitializer:
+        """Return an initializer with the network of a file, as `train_initializer` writes it.
+
+        Args:
+            path: weights, ``.safetensors``.
+            shape: for which it was trained; it may be larger or smaller.
+            config: see `PoseInitializerConfig`.
+            limits: of what is read, see `FileLimits`.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            FormatError: if the file is damaged, holds no network, or one for another shape.
+        """
+        return cls(shape, config, proposer=PoseProposer.load(path, shape, limits=limits))
+
     def forward(self, points: Tensor, mask: Tensor | None = None, start: Tensor | None = None) -> InitialPose:
         """Return the poses of the shape in clouds.
 
@@ -244,18 +269,18 @@ class PoseInitializer(nn.Module):
         """Return poses (B, num_dofs) from scratch, the prior's means, and confidences (B,), zero without points."""
         if self.proposer is None or self.config.search == "always":
             return self._search(data, valid)
-        pose, confidence = self._propose(self.proposer, data, valid)
+        pose, mean, confidence = self._propose(self.proposer, data, valid)
         if self.config.search == "never":
-            return pose, pose, confidence
+            return pose, mean, confidence
         doubtful = valid & (confidence < CALIBRATION.doubtful).unsqueeze(-1)
         searched, typical, sureness = self._search(data, doubtful)
         surer = (sureness > confidence).unsqueeze(-1)
-        poses, means = torch.where(surer, searched, pose), torch.where(surer, typical, pose)
+        poses, means = torch.where(surer, searched, pose), torch.where(surer, typical, mean)
         return poses, means, torch.maximum(confidence, sureness)
 
     @torch.no_grad()
-    def _propose(self, proposer: PoseProposer, data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the best poses (B, num_dofs) among those that a network proposes, and confidences (B,)."""
+    def _propose(self, proposer: PoseProposer, data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what `_find` does of what a network proposes; its prior draws joints to the most probable pose."""
         size = _BATCHING.cpu_proposed if data.device.type == "cpu" else _BATCHING.fitted
         typical = typical_poses(self.shape).mean(0)
         parts = []
@@ -266,11 +291,11 @@ class PoseInitializer(nn.Module):
                 self.skin, cloud, known, shifted(typical.expand(len(rows), -1), origin), origin,
                 prior_std=self.config.find_pose.prior_std, pose_atol=0.0,
             )  # fmt: skip
-            pose, lead = best_proposal(problem, proposer.propose(problem.data, known))
-            confidence = torch.where(known.any(-1), pose_confidence(problem, pose, lead), 0.0)
-            parts.append((shifted(pose, origin), confidence))
-        poses, confidences = zip(*parts, strict=True)
-        return torch.cat(poses), torch.cat(confidences)
+            best = best_proposal(problem, proposer.propose(problem.data, known))
+            confidence = torch.where(known.any(-1), pose_confidence(problem, best.pose, best.lead), 0.0)
+            parts.append((shifted(best.pose, origin), shifted(best.mean, origin), confidence))
+        poses, means, confidences = zip(*parts, strict=True)
+        return torch.cat(poses), torch.cat(means), torch.cat(confidences)
 
     @torch.no_grad()
     def _search(self, data: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -30,6 +30,7 @@ HAND_WEIGHTS = Path(__file__).with_name("hand_poses.safetensors")
 # Keypoints of a shape for which a network was trained are so near to those of the trained one, in their extent, on
 # average: between hands of other proportions, and a hand and its mirror image.
 _SAME_SHAPE = 0.15
+_GOLDEN = (math.sqrt(5) - 1) / 2
 # Joints that turn by more have no limits to speak of; a network's output moves them about the rest pose.
 _OPEN = math.pi
 
@@ -67,8 +68,7 @@ class ProposerSize:
             raise InputError(f"width must be a multiple of twice the heads, got {self.width} and {self.heads}")
 
 
-@dataclass(frozen=True, eq=False)
-class RawPoses:
+class RawPoses(NamedTuple):
     """Poses as a network gives them, the base as a rotation matrix.
 
     Args:
@@ -178,7 +178,7 @@ class PoseProposer(nn.Module):
         for block in self.encoder:
             tokens = block(tokens, tokens, known)
         tokens = self.token_norm(tokens)
-        state = self.queries.expand(len(points), -1, -1)
+        state = self.queries.expand(points.shape[0], -1, -1)
         for cross, among in zip(self.cross, self.among, strict=True):
             state = among(cross(state, tokens, known), None, None)
         out = self.head(self.norm(state)).float()
@@ -312,7 +312,8 @@ def _rows(values: Tensor, index: Tensor) -> Tensor:
 
 def _drawn(values: Tensor, mask: Tensor, count: int) -> Tensor:
     """Return the numbers (B, T) of at most ``count`` rows of values (B, M, C), those that the mask shows first."""
-    rank = torch.rand(values.shape[1], generator=torch.Generator().manual_seed(0)).to(values)
+    # A sequence that fills the unit interval evenly, so that neighbors in the file are drawn as random numbers would.
+    rank = (_GOLDEN * torch.arange(values.shape[1], device=values.device, dtype=torch.float64)).frac().to(values)
     return torch.where(mask, rank, -1.0).topk(min(count, values.shape[1]), dim=1).indices
 
 

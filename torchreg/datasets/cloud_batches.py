@@ -11,7 +11,7 @@ from torch import Tensor
 from torchreg._checks import check_count
 from torchreg.datasets.hand import curled_joints, joint_ranges, placed
 from torchreg.errors import InputError
-from torchreg.geometry.rotation_representations import rotation_vector_from_quaternion
+from torchreg.geometry.rotation_representations import rotation_from_quaternion, rotation_vector_from_quaternion
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.pose_algebra import BASE_DOFS
@@ -28,12 +28,23 @@ class _Variety:
     clumped: float = 0.4  # of the clouds, in which outliers lie about one place
     clump: float = 0.1  # standard deviation about it
     whole: float = 0.15  # of the clouds, seen from all sides
+    stretch: float = 0.06  # standard deviation by which a thing differs from the shape along each axis
+    forearm: float = 0.5  # of the clouds of hands
+    forearm_length: tuple[float, float] = (0.2, 1.5)
+    forearm_radius: tuple[float, float] = (0.09, 0.17)  # at the wrist
+    forearm_growth: float = 0.15  # of the radius, along as much
+    forearm_turn: float = 0.35  # standard deviation of its direction, about that from the hand's middle to the wrist
+    neighbor: float = 0.15  # of the clouds, another thing of the same shape beside the first
+    neighbor_distance: tuple[float, float] = (0.3, 1.0)  # of the two
+    beside: tuple[float, float] = (0.1, 1.0)  # points of a forearm or of another thing for each of the first
+    beside_points: int = 600  # of which those are drawn
     hole: float = 0.4  # of the clouds, with a ball without points
     hole_radius: tuple[float, float] = (0.05, 0.25)
     thinned: float = 0.5  # of the clouds, of which some points lack
     least: float = 0.3  # share of the points that are kept then, at least
     distance: tuple[float, float] = (2.5, 12.0)  # of the camera
-    cells: int = 40  # of the grid of depths, along each side of the picture
+    picture: float = 2.0  # side of the picture, where the shape is
+    cells: int = 80  # of the grid of depths, along each side of the picture
     behind: float = 0.025  # behind the nearest point of its cell a point is hidden
     alone: float = 0.5  # of the hands, whose joints bend independently; in the others fingers curl
     open_std: float = 0.3  # of joints that turn by more than half a turn, radians
@@ -104,6 +115,8 @@ def random_clouds(
 ) -> CloudBatch:
     """Return a cloud of each pose: one-sided or whole, noisy, with outliers and holes, thinned or not.
 
+    The thing is not quite of the shape's proportions; a forearm is at some hands, and another thing beside some.
+
     Args:
         skin: many points of the surface, with normals.
         size: of the shape, metres.
@@ -114,16 +127,27 @@ def random_clouds(
     rows = stacked_rows(skin.shape.part_transforms(poses))
     surface, normals = skin.place(rows), skin.turn_normals(rows)
     draw = _Draw(generator, surface, size)
-    seen, slant = draw.visible(surface, normals)
+    forearm = _VARIETY.forearm if isinstance(skin.shape, Hand) else 0.0
+    scene = draw.scene(surface, normals, poses[:, :3], forearm)
+    seen, slant = draw.visible(scene.points, scene.normals)
     whole = draw.uniform(len(poses), 1) < _VARIETY.whole
-    weight = torch.where(whole, 1.0, torch.where(seen, slant, 0.0))
+    weight = scene.weight * torch.where(whole, 1.0, torch.where(seen, slant, 0.0))
     # Without replacement, by the largest of the logarithms and Gumbel noise.
     ranks = weight.log() - draw.uniform(*weight.shape).clamp_min(1e-12).log().neg().clamp_min(1e-12).log()
     score, index = ranks.topk(min(num_points, ranks.shape[1]), dim=1)
-    points = surface.gather(1, index.unsqueeze(-1).expand(-1, -1, 3))
+    points = scene.points.gather(1, index.unsqueeze(-1).expand(-1, -1, 3))
     points, outlier = draw.disturbed(points)
     mask = score.isfinite() & draw.kept(points)
-    return CloudBatch(points, mask, poses, torch.where(outlier, -1, index))
+    return CloudBatch(points, mask, poses, torch.where(outlier | (index >= surface.shape[1]), -1, index))
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """Oriented points (B, N, 3) of which clouds are drawn, the first of them the skin's, and how often, (B, N)."""
+
+    points: Tensor
+    normals: Tensor
+    weight: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,13 +172,57 @@ class _Draw:
         low, high = map(math.log, limits)
         return (low + (high - low) * self.uniform(*size)).exp()
 
+    def scene(self, surface: Tensor, normals: Tensor, base: Tensor, forearm: float) -> _Scene:
+        """Return a thing that differs a little from the shape, and what is beside it.
+
+        Args:
+            surface: (B, N, 3) of the shape.
+            normals: (B, N, 3).
+            base: (B, 3) its origin.
+            forearm: share of the clouds with one.
+        """
+        batch, count = surface.shape[:2]
+        axes = rotation_from_quaternion(_normal((batch, 4), self.generator, self.like))
+        scale = 1 + _VARIETY.stretch * _normal((batch, 3, 1), self.generator, self.like)
+        # Normals turn by as little as the proportions differ.
+        stretch = axes @ (scale * axes.mT)
+        surface = (surface - base.unsqueeze(1)) @ stretch + base.unsqueeze(1)
+        parts = [(surface, normals, torch.ones_like(surface[..., 0]))]
+        for share, (points, facing) in (
+            (forearm, self.forearm(base, surface.mean(1))),
+            (_VARIETY.neighbor, self.neighbor(surface, normals)),
+        ):
+            there = self.uniform(batch, 1) < share
+            often = self.between(_VARIETY.beside, batch, 1) * count / points.shape[1]
+            parts.append((points, facing, torch.where(there, often, 0.0).expand(-1, points.shape[1])))
+        return _Scene(*(torch.cat(part, dim=1) for part in zip(*parts, strict=True)))
+
+    def forearm(self, base: Tensor, middle: Tensor) -> tuple[Tensor, Tensor]:
+        """Return oriented points (B, P, 3) of cones that begin at the base and lead away from the middle."""
+        batch, count = len(base), _VARIETY.beside_points
+        axis = _unit(_unit(base - middle) + _VARIETY.forearm_turn * _normal((batch, 3), self.generator, self.like))
+        axis = axis.unsqueeze(1)
+        along = self.between(_VARIETY.forearm_length, batch, 1) * self.uniform(batch, count)
+        radius = self.between(_VARIETY.forearm_radius, batch, 1) + _VARIETY.forearm_growth * along
+        around = _normal((batch, count, 3), self.generator, self.like)
+        around = _unit(around - (around * axis).sum(-1, keepdim=True) * axis)
+        offset = along.unsqueeze(-1) * axis + radius.unsqueeze(-1) * around
+        return base.unsqueeze(1) + self.size * offset, around
+
+    def neighbor(self, surface: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
+        """Return oriented points (B, P, 3) of the next thing of the batch, beside each."""
+        distance = self.size * self.between(_VARIETY.neighbor_distance, len(surface), 1, 1)
+        offset = distance * _unit(_normal((len(surface), 1, 3), self.generator, self.like))
+        some = torch.linspace(0, surface.shape[1] - 1, _VARIETY.beside_points, device=surface.device).long()
+        return surface[:, some].roll(1, 0) + offset, normals[:, some].roll(1, 0)
+
     def visible(self, surface: Tensor, normals: Tensor) -> tuple[Tensor, Tensor]:
         """Return which points (B, N) a camera before the shape sees, and the cosine of their slant."""
         away = self.size * self.between(_VARIETY.distance, len(surface), 1)
         ray = torch.cat([surface[..., :2], (surface[..., 2] + away).unsqueeze(-1)], dim=-1)
         slant = -(ray * normals).sum(-1) / ray.norm(dim=-1).clamp_min(1e-9 * self.size)
         cells = _VARIETY.cells
-        place = (ray[..., :2] * (away / ray[..., 2]).unsqueeze(-1) / self.size + 0.5).clamp(0, 1)
+        place = (ray[..., :2] * (away / ray[..., 2]).unsqueeze(-1) / (_VARIETY.picture * self.size) + 0.5).clamp(0, 1)
         column, row = (cells * place).long().clamp_max(cells - 1).unbind(-1)
         cell = row * cells + column
         nearest = torch.full_like(surface[:, :1, 0].expand(-1, cells * cells), torch.inf).clone()
@@ -189,3 +257,7 @@ class _Draw:
 
 def _normal(size: tuple[int, ...], generator: torch.Generator, like: Tensor) -> Tensor:
     return torch.randn(size, generator=generator, device=generator.device).to(like)
+
+
+def _unit(vectors: Tensor) -> Tensor:
+    return torch.nn.functional.normalize(vectors, dim=-1)

@@ -11,7 +11,7 @@ from torchreg.registration.dense.problem import describe
 from torchreg.registration.dense.reliability import SCAN_CALIBRATION, ScanEvidence, confidence_of, scan_evidence
 
 CONFIG = ScanAlignConfig(num_samples=400, num_nodes=30)
-GOOD = ScanEvidence(forward=0.1, backward=0.05, smoothness=0.1, unsupported=0.8, hidden=0.05, rival=0.0)
+GOOD = ScanEvidence(forward=0.1, backward=0.05, smoothness=0.1, unsupported=0.8, hidden=0.05)
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def problem():
     return describe(pair.source, pair.target, CONFIG)
 
 
-@pytest.mark.parametrize("name", ["forward", "backward", "smoothness", "unsupported", "hidden", "rival"])
+@pytest.mark.parametrize("name", ["forward", "backward", "smoothness", "unsupported", "hidden"])
 def test_what_speaks_against_an_alignment_lowers_its_confidence(name):
     assert confidence_of(replace(GOOD, **{name: 0.5 + getattr(GOOD, name)})) < confidence_of(GOOD)
     assert 0.8 < confidence_of(GOOD) < 1
@@ -28,13 +28,13 @@ def test_what_speaks_against_an_alignment_lowers_its_confidence(name):
 
 def test_a_right_alignment_is_trusted_and_none_at_all_is_not(problem):
     found = align_problem(problem, lambda _: None)
-    right = evidence_against(problem, found)
+    right = evidence_against(problem, found[0])
     away = found[0].transforms.clone()
     away[:, 0, 3] += 1
-    wrong = scan_evidence(problem, away, found[0].transforms, 0.0)
+    wrong = scan_evidence(problem, away, 0.0)
     assert confidence_of(right) > SCAN_CALIBRATION.doubtful > confidence_of(wrong)
-    # All that is visible lies on nothing, and the other hypothesis takes all of it elsewhere.
-    assert (wrong.forward, wrong.backward, wrong.rival) == (pytest.approx(1.0), pytest.approx(1.0), 1.0)
+    # All that is visible lies on nothing.
+    assert (wrong.forward, wrong.backward) == (pytest.approx(1.0), pytest.approx(1.0))
     assert wrong.unsupported > right.unsupported
 
 
@@ -42,10 +42,9 @@ def test_what_is_hidden_is_no_evidence(problem):
     rest = problem.graph.rest()
     shown = torch.arange(len(problem.prior.by_source)) % 2 == 0
     half = replace(problem.prior, by_source=problem.prior.by_source * shown.unsqueeze(1))
-    plain, less = (scan_evidence(replace(problem, prior=prior), rest, rest, 0.0) for prior in (problem.prior, half))
+    plain, less = (scan_evidence(replace(problem, prior=prior), rest, 0.0) for prior in (problem.prior, half))
     assert less.hidden == pytest.approx(1 - (1 - plain.hidden) / 2, abs=0.05)
     assert less.backward == pytest.approx(plain.backward)
-    assert plain.rival == less.rival == 0
     away = rest.clone()
     away[:, 0, 3] += 1
-    assert scan_evidence(problem, away, away, 0.0).forward > plain.forward
+    assert scan_evidence(problem, away, 0.0).forward > plain.forward

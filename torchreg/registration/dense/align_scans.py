@@ -110,7 +110,7 @@ def align_scans(
     moved = blend_linear(problem.unit.normalize(source.points), weights, transforms)
     return ScanAlignment(
         points=problem.unit.denormalize(moved, source.points),
-        confidence=confidence_of(evidence_against(problem, found)),
+        confidence=confidence_of(evidence_against(problem, found[0])),
         point_confidence=_point_confidence(problem, transforms, source.points).to(source.points),
         samples=problem.samples,
         nodes=problem.nodes,
@@ -138,10 +138,9 @@ def align_problem(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]
     return found
 
 
-def evidence_against(problem: ScanAlignProblem, found: Sequence[Candidate]) -> ScanEvidence:
-    """Return what speaks against the first of several candidates."""
-    best, rival, *_ = found
-    return scan_evidence(problem, best.transforms, rival.transforms, best.hypothesis.smoothness)
+def evidence_against(problem: ScanAlignProblem, best: Candidate) -> ScanEvidence:
+    """Return what speaks against a candidate."""
+    return scan_evidence(problem, best.transforms, best.hypothesis.smoothness)
 
 
 def _candidates(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]:

@@ -22,7 +22,6 @@ class ScanEvidence:
         smoothness: of the graph, as it was judged.
         unsupported: mean of minus the logarithm of the matcher's support of where visible samples ended.
         hidden: share of samples that the matcher calls hidden.
-        rival: share of samples that the second-best hypothesis takes elsewhere.
     """
 
     forward: float
@@ -30,7 +29,6 @@ class ScanEvidence:
     smoothness: float
     unsupported: float
     hidden: float
-    rival: float
 
     def table(self) -> Tensor:
         """Return the numbers (E,), float64."""
@@ -45,8 +43,8 @@ class ScanCalibration:
     kinds that the matcher is trained on by ``benchmarks/scan_confidence.py --calibrate``.
     """
 
-    bias: float = 6.94
-    weights: tuple[float, ...] = (3.79, 6.29, 5.54, 3.88, 2.42, 0.05)  # in the order of `ScanEvidence`
+    bias: float = 6.48
+    weights: tuple[float, ...] = (5.31, 6.97, 5.71, 2.88, 4.85)  # in the order of `ScanEvidence`
     doubtful: float = 0.5  # confidence below which a result is doubtful
 
 
@@ -60,27 +58,24 @@ def confidence_of(evidence: ScanEvidence) -> float:
     return float(torch.sigmoid(odds))
 
 
-def scan_evidence(problem: ScanAlignProblem, transforms: Tensor, rival: Tensor, smoothness: float) -> ScanEvidence:
+def scan_evidence(problem: ScanAlignProblem, transforms: Tensor, smoothness: float) -> ScanEvidence:
     """Return the evidence against motions (J, 4, 4) of the nodes.
 
     Args:
         problem: the scans.
         transforms: the motions.
-        rival: (J, 4, 4) those of the second-best hypothesis.
         smoothness: of the graph, see `Hypothesis`.
     """
     moved, prior, config = problem.moved(transforms), problem.prior, problem.config
     cost, index = mismatch(problem, moved)
     apart = (NeighborTree(moved.points).nearest(problem.target.points)[1] / config.cap).clamp(max=1).square()
     support = prior.logarithm(index[:, None], config.doubt)[:, 0]
-    elsewhere = (problem.graph(transforms) - problem.graph(rival)).norm(dim=-1) > config.refine.sigma[1]
     return ScanEvidence(
         forward=_mean(cost, prior.visible),
         backward=_mean(apart, prior.target_visible),
         smoothness=smoothness,
         unsupported=-_mean(support, prior.visible),
         hidden=1 - float(prior.visible.mean()),
-        rival=float(elsewhere.double().mean()),
     )
 
 
