@@ -76,7 +76,12 @@ BLOCKS = (
     Block("p2-fig-3", "Overview of the optimization", "the loop of T-step and W-step", why_not=_DRAWING, extra=True),
     Block("p2-fig-4", "Joint constraint on and off", "without it the scan does not register, with it it does", _WALK),
     Block("p2-fig-5", "Labels of cells", "grid cells as sites of a labeling", why_not=_DRAWING, extra=True),
-    Block("p2-fig-6", "Before and after weight refinement", "labels tear the surface, smooth weights do not", _WALK),
+    Block(
+        "p2-fig-6",
+        "Before and after weight refinement",
+        "hard labels make the deformation discontinuous, smooth weights do not",
+        _WALK,
+    ),
     Block("p2-fig-7", "Examples of all sets", "car, robot, walk and hand: source, target, result, weights", _FOUR),
     Block("p2-fig-8", "Registration error in colors", "distance to the closest point, % of the diagonal", _FOUR),
     Block(

@@ -29,7 +29,7 @@ COMMANDS = ("align", "demo", "figure", "formats", "info", "label", "pose", "regi
             ["--help"],
             COMMANDS,
         ),
-        (["track", "--help"], ("--resume", "--overlay")),
+        (["track", "--help"], ("--resume", "--pictures")),
     ],
 )
 def test_help_is_light(arguments, words):

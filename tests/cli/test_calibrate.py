@@ -60,8 +60,8 @@ def test_what_does_not_fit_is_told(error_of, folder, clouds, tmp_path):
     assert "as degrees all would fit" in error_of("calibrate", robot, *clouds, "--joints", table, *output)
     hand = error_of("calibrate", "hand", *clouds, "--joints", table, *output)
     assert "--joints has no meaning without a robot" in hand
-    masks = error_of("calibrate", robot, *clouds, "--joints", table, "--masks", table, *output)
-    assert "--masks has no meaning without --depth" in masks
+    masks = error_of("calibrate", robot, *clouds, "--joints", table, "--mask", table, *output)
+    assert "--mask has no meaning without --depth" in masks
 
 
 def test_a_hand_is_fitted_to_clouds(run, folder, tmp_path):

@@ -57,7 +57,7 @@ def test_an_interrupted_demonstration_writes_what_is_done(run, tmp_path, monkeyp
     starts = PoseStarts(truth, torch.zeros(1), torch.ones(()))
     monkeypatch.setattr(recovery_module, "find_pose", lambda *arguments, **options: starts)
     monkeypatch.setattr(Tracker, "step", interrupted)
-    answer = run("demo", "--frames", "2", "-o", tmp_path, "--no-picture")
+    answer = run("demo", "--frames", "2", "-o", tmp_path, "--no-movie")
     assert answer.exit_code == 130
     assert "torchreg: interrupted; 1 of 2 frames are done" in answer.output
     names = ["hand.glb", "poses.json", "track.json", "track.safetensors"]

@@ -49,4 +49,4 @@ def test_clouds_that_cannot_be_read_are_empty():
 def test_summary_counts_what_became_of_frames():
     statuses = (Status.CONVERGED, Status.LOST, Status.NO_DATA, Status.MAX_STEPS)
     result = SimpleNamespace(statuses=statuses, seconds=torch.tensor([0.1, 0.02, 0.02, 0.02]))
-    assert summary(result) == "4 frames: 2 tracked, 1 lost, 1 no data; 20 ms per frame"
+    assert summary(result) == "4 frames: 2 tracked, 1 lost, 1 no_data; 20 ms per frame"

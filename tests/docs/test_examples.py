@@ -4,6 +4,7 @@ import ast
 import re
 import runpy
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,9 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 def test_the_examples_are_there():
     names = {path.stem for path in EXAMPLES}
-    assert names >= {"own_scan", "own_robot", "register_and_pose", "spine_of_sequence", "train_pose_network"}
+    assert names >= {
+        "own_scan", "own_robot", "body_shape", "register_and_pose", "spine_of_sequence", "train_pose_network",
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
@@ -36,7 +39,14 @@ def test_examples_are_short_public_and_shown(path):
 # Those of two scans and of one are examples of README, which are run, with files around them.
 @pytest.mark.parametrize(
     ("name", "arguments"),
-    [("own_robot", ()), ("spine_of_sequence", ()), ("train_pose_network", ("6",))],
+    [
+        ("own_robot", ()),
+        pytest.param(
+            "body_shape", (), marks=pytest.mark.skipif(find_spec("anny") is None, reason="anny is not installed")
+        ),
+        ("spine_of_sequence", ()),
+        ("train_pose_network", ("6",)),
+    ],
 )
 def test_examples_run_and_print_what_their_pages_say(name, arguments, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

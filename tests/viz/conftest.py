@@ -39,6 +39,9 @@ class _GltfViewer:
 
     def vertices(self, frame):
         local = [np.eye(4) for _ in self.gltf.nodes]
+        for matrix, node in zip(local, self.gltf.nodes, strict=True):
+            matrix[:3, :3] = Rotation.from_quat(node.rotation or (0, 0, 0, 1)).as_matrix()
+            matrix[:3, 3] = node.translation or (0, 0, 0)
         animation = self.gltf.animations[0]
         for channel in animation.channels:
             value = self.read(animation.samplers[channel.sampler].output)[frame].astype(np.float64)

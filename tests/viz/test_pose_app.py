@@ -126,7 +126,7 @@ def test_clouds_are_posed_too(registration, tmp_path):
     from dataclasses import replace
 
     editor = PoseEditor(replace(registration, faces=None))
-    with PoseApp(editor, output=tmp_path / "cloud", port=0, up=(0.0, 1.0, 0.0)) as app:
+    with PoseApp(editor, output=tmp_path / "cloud", port=0) as app:
         assert pick_end(app) == 0
         app.release(0, editor.placed()[0] + torch.tensor([0.0, 0.2, 0.0]))
         points = torch.from_numpy(app.server.scene.get_handle_by_name("/shape").points)

@@ -68,6 +68,17 @@ def test_many_poses_are_played_at_their_times(gltf_viewer, tmp_path):
     np.testing.assert_allclose(own.vertices(3), viewer.vertices(2), atol=1e-5)
 
 
+@pytest.mark.parametrize(("up", "y"), [((0, 0, 1), (2, 1)), ((0, -1, 0), (1, -1)), ((1, 0, 0), (0, 1))])
+def test_what_is_upright_is_y_in_the_file(gltf_viewer, tmp_path, up, y):
+    model, points, faces = scene(bones=3)
+    viewer = gltf_viewer(save_grid_animation(tmp_path / "a.glb", model, points, faces, up=up).path)
+    axis, sign = y
+    for frame, expected in enumerate((points, model(points).detach())):
+        shown = viewer.vertices(frame)
+        np.testing.assert_allclose(shown[:, 1], sign * expected[:, axis].numpy(), atol=1e-5)
+        np.testing.assert_allclose(np.linalg.norm(shown, axis=1), expected.norm(dim=-1).numpy(), atol=1e-5)
+
+
 def test_the_residual_is_what_dropped_weights_cost(gltf_viewer, tmp_path):
     model, points, faces = scene(bones=9, smooth=True)
     truth = model(points).detach().numpy()

@@ -258,7 +258,9 @@ def align(
     known = KnownDofs.of(shape, locked, prior)
     if fit_shape is not False:
         shape = fitted_rig(shape, fit_shape, plain=known is None and model_points is None and seen.keypoints is None)
-        return _align_person(shape, seen, initial_pose, config, on_step)
+        found = _align_person(shape, seen, initial_pose, config, on_step)
+        person = shape if found.coefficients is None else shape.with_coefficients(found.coefficients)
+        return replace(found, shape=person)
     origin = floating_origin(shape, seen.points)
     if origin is not None:
         found = _align_about(origin, shape, seen, initial_pose, model_points, known, config, on_step)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import takewhile
@@ -395,8 +396,9 @@ _REASONS = (
 
 
 def _limb_name(problem: AlignProblem, limb: Limb) -> str:
-    """Return the name of a limb: what its parts' names begin with, or that of its last part."""
+    """Return the name of a limb: what its parts' names begin with, and its side, or that of its last part."""
     names = [problem.skin.shape.part_names[part] for part in limb.parts]
     letters = takewhile(lambda column: len(set(column)) == 1, zip(*names, strict=False))
-    common = "".join(column[0] for column in letters).rstrip("_-. 0123456789")
-    return common if len(names) > 1 and common else names[-1]
+    common = "".join(column[0] for column in letters).rstrip("_-. 0")
+    side = re.search(r"[._](?:l|r|left|right)$", names[-1], re.IGNORECASE)
+    return common + (side[0] if side else "") if len(names) > 1 and common else names[-1]

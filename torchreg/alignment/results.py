@@ -66,7 +66,9 @@ class AlignResult(Result):
         coefficients: (C,) of the shape, where they were fitted too; the distances and all else are those of
             ``shape.with_coefficients(coefficients)``. None where the shape was taken as it was.
         coefficient_covariance: (C, C) of them.
-        shape: that was aligned. A file keeps it without its mesh where that takes more than 4 MB.
+        shape: that was aligned; where coefficients were fitted, the rig of that person. A file keeps it
+            without its mesh where that takes more than 4 MB.
+        up: the upright direction, where it is known, as from a file's format; pictures else guess it from the points.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -94,6 +96,7 @@ class AlignResult(Result):
     coefficients: Tensor | None = None
     coefficient_covariance: Tensor | None = None
     shape: ArticulatedShape | None = field(default=None, metadata=stored_as(record_kept_shape, build_kept_shape))
+    up: tuple[float, float, float] | None = None
 
     @property
     def named_pose(self) -> dict[str, Any]:

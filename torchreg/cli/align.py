@@ -32,6 +32,7 @@ from torchreg.cli.known_options import Joints, JointStd, Known, Locked, observab
 from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
+from torchreg.cli.upright import Up, known_up, remembering
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from torchreg.alignment.align import AlignConfig
     from torchreg.alignment.results import AlignResult
     from torchreg.capture.depth_frames import DepthFrames
+    from torchreg.geometry.upright import Direction
     from torchreg.shapes.articulated import ArticulatedShape
     from torchreg.shapes.skin import LinearBlendSkin
 
@@ -115,6 +117,7 @@ def align(
     gltf: Annotated[
         Path | None, typer.Option(help="Also write the moving shape, all clouds in one file (.glb).")
     ] = None,
+    up: Up = None,
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
@@ -139,6 +142,7 @@ def align(
     """
     check_used(depth, "--depth", {"--intrinsics": intrinsics, "--mask": mask, "--depth-range": depth_range})
     pictures = depth_source(clouds, intrinsics, mask, depth_range) if depth else None
+    upright = known_up(up, clouds, camera=depth)
     clouds = cloud_files(clouds) if pictures is None else [Path(name) for name in pictures.names]
     output = with_ending(output, (".safetensors",), add=True)
     optional = with_ending(pose, (".json", ".csv")), with_ending(ply, (".ply",)), with_ending(picture, PICTURE_ENDINGS)
@@ -161,8 +165,9 @@ def align(
         known = read_known(model, locked, joints, joint_std, len(clouds))
         measured = read_keypoints(keypoints, keypoint_std, clouds, None if side == "either" else model, pictures)
         run = _AlignRun(
-            model, config, points, scale, time, frame, first, known, measured, pictures=pictures, fit_shape=fit_shape
-        )
+            model, config, points, scale, time, frame, first, known, measured, pictures=pictures, fit_shape=fit_shape,
+            up=upright,
+        )  # fmt: skip
         if side == "either":
             side = run.choose_hand(clouds[0])
             if not quiet:
@@ -208,6 +213,7 @@ class _AlignRun:
     measured: MeasuredFrames
     pictures: DepthFrames | None = None
     fit_shape: bool = False
+    up: Direction | None = None
     results: list[AlignResult] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -250,6 +256,7 @@ class _AlignRun:
             prior=self.known.prior(number), fit_shape=self.fit_shape, config=self.config, on_step=on_step,
             **self.measured.of(number),
         )  # fmt: skip
+        result = remembering(result, self.up)
         self._write(result, as_points(data), files)
         self.results.append(result)
         if result.statuses[0].usable and not self.fit_shape:
@@ -290,7 +297,7 @@ class _AlignRun:
             shown = result.local(self.shape.rest)
             near = data if result.origin is None else (data - result.origin).to(self.shape.rest)
             shape, surface = self.fitted(result)
-            ax = draw_alignment(None, shape, shown.pose, near, result.inliers, skin=surface)
+            ax = draw_alignment(None, shape, shown.pose, near, result.inliers, skin=surface, up=self.up)
             save_picture(ax.get_figure(), files.picture)  # type: ignore[arg-type]
         # The result is written last: if it exists, all others do.
         result.save(files.result)
@@ -307,5 +314,5 @@ class _AlignRun:
         poses = torch.stack([shifted_to(origin, result.pose) for result in self.results])
         shape, surface = self.fitted(self.results[-1])
         near = list(shape.keypoints(poses.to(shape.rest)).detach())
-        save_shape_animation(path, shape, poses, skin=surface, up=guess_up(near))
+        save_shape_animation(path, shape, poses, skin=surface, up=self.up or guess_up(near))
         tell_origin(path, origin)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -59,16 +60,16 @@ def read_cloud(
     return load_points(path, scale=scale, nan_policy=nan_policy, time=time, frame=frame).points
 
 
-def cloud_files(paths: list[Path]) -> list[Path]:
+def cloud_files(paths: Sequence[Path]) -> list[Path]:
     """Return the files that are meant: those of a folder, or that match a pattern, in the order of their numbers."""
     import glob
 
-    from torchreg.io.frames import load_frames, natural_sorted
+    from torchreg.io.frames import frames_in, natural_sorted
 
     files: list[Path] = []
     for path in paths:
         if path.is_dir():
-            files += [Path(name) for name in load_frames(path).names]
+            files += natural_sorted(frames_in(path))
         elif not path.exists() and (matching := glob.glob(str(path))):
             files += natural_sorted(Path(name) for name in matching)
         else:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchreg.cli.align_options import NanPolicy, Scale, read_cloud
-from torchreg.cli.cameras import Seen, check_used, seen_folder
+from torchreg.cli.align_options import NanPolicy, Scale, cloud_files, read_cloud
+from torchreg.cli.cameras import Depth, DepthRange, Intrinsics, Mask, Seen, check_used, depth_source, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
 from torchreg.cli.reporting import ExitCode, reporting
 from torchreg.cli.shape_argument import PackageDir, Shape, load_shape
@@ -31,7 +31,8 @@ def calibrate(
         list[Path],
         typer.Argument(
             metavar="FRAMES",
-            help="Clouds in camera coordinates, metres, or depth images; one for each row of --joints.",
+            help="Clouds in camera coordinates, metres, folders or patterns of them, one for each row of --joints. "
+            "With --depth depth pictures.",
         ),
     ],
     joints: Annotated[
@@ -47,16 +48,10 @@ def calibrate(
             "--output", "-o", metavar="RESULT", help="RESULT.safetensors and RESULT.json are written, and more."
         ),
     ] = Path("calibration"),
-    depth: Annotated[
-        bool, typer.Option("--depth", help="FRAMES are depth images (16-bit .png or .tif, .exr, .npy).")
-    ] = False,
-    intrinsics: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="The camera of the depth images, .json.")
-    ] = None,
-    masks: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="FILE", help="Mask of the robot in a depth image, once for each of FRAMES."),
-    ] = None,
+    depth: Depth = False,
+    intrinsics: Intrinsics = None,
+    mask: Mask = None,
+    depth_range: DepthRange = None,
     offsets: Annotated[bool, typer.Option("--offsets", help="Look for constant offsets of the joints, too.")] = False,
     scale: Scale = 1.0,
     nan_policy: NanPolicy = "omit",
@@ -78,9 +73,11 @@ def calibrate(
     transform = None if is_hand else output.with_name(f"{output.stem}_transform.json")
     check_outputs([output, output.with_suffix(".json"), transform], force)
     robot_options = {"--joints": joints, "--depth": depth or None, "--offsets": offsets or None, "--seen": seen}
+    camera_options = {"--intrinsics": intrinsics, "--mask": mask, "--depth-range": depth_range}
     if is_hand:
-        check_used(False, "a robot", {**robot_options, "--intrinsics": intrinsics, "--masks": masks or None})
-    check_used(depth, "--depth", {"--intrinsics": intrinsics, "--masks": masks or None})
+        check_used(False, "a robot", {**robot_options, **camera_options})
+    check_used(depth, "--depth", camera_options)
+    frames, images = _given_frames(frames, depth, intrinsics, mask, depth_range)
     model = load_shape(shape, package_dirs=package_dir)
     if is_hand or transform is None:
         _calibrate_hand(model, [read_cloud(path, scale, nan_policy) for path in frames], output, quiet)
@@ -88,7 +85,7 @@ def calibrate(
     if joints is None:
         raise InputError("a robot takes --joints TABLE.csv with the joints of each frame")
     rows = _read_joints(joints, model, frames)
-    given = _depth_frames(frames, intrinsics, masks) if depth else [read_cloud(f, scale, nan_policy) for f in frames]
+    given: Sequence[Any] = images or [read_cloud(path, scale, nan_policy) for path in frames]
     folder = seen_folder(seen, output, force)
     from torchreg.alignment.calibrate_base import calibrate_base
 
@@ -116,16 +113,14 @@ def _read_joints(path: Path, shape: ArticulatedShape, frames: Sequence[Path]) ->
     return rows
 
 
-def _depth_frames(frames: Sequence[Path], intrinsics: Path | None, masks: Sequence[Path] | None) -> list[DepthFrame]:
-    from torchreg.capture.depth_frame import DepthFrame
-
-    if intrinsics is None:
-        raise InputError("--depth takes --intrinsics FILE with the camera")
-    if masks and len(masks) != len(frames):
-        raise InputError(f"--masks is given once for each of {len(frames)} frames, got {len(masks)}")
-    if not masks:
-        return [DepthFrame.load(path, intrinsics) for path in frames]
-    return [DepthFrame.load(path, intrinsics, mask) for path, mask in zip(frames, masks, strict=True)]
+def _given_frames(
+    frames: list[Path], depth: bool, intrinsics: Path | None, mask: Path | None, depths: tuple[float, float] | None
+) -> tuple[list[Path], list[DepthFrame]]:
+    """Return the files that are meant, and of depth pictures what they show."""
+    if not depth:
+        return cloud_files(frames), []
+    source = depth_source(frames, intrinsics, mask, depths)
+    return [Path(name) for name in source.names], list(source)
 
 
 def _calibrate_hand(shape: ArticulatedShape, clouds: Sequence[Tensor], output: Path, quiet: bool) -> None:
@@ -227,7 +222,7 @@ def _summary(shape: ArticulatedShape, found: BaseCalibration, paths: Sequence[Pa
 
     std = found.covariance.diagonal().sqrt()
     words = [
-        f"{found.status.value.replace('_', ' ')}: base within {1e3 * float(std[:3].max()):.1f} mm and "
+        f"{found.status}: base within {1e3 * float(std[:3].max()):.1f} mm and "
         f"{math.degrees(float(std[3:].max())):.2f} degrees (one standard deviation)",
         f"data {1e3 * float(found.residuals.median()):.1f} mm from the robot",
     ]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchreg.cli.outputs import Force, check_outputs, counted
+from torchreg.cli.outputs import Force, Quiet, check_outputs, counted
 from torchreg.cli.reporting import interruption, reporting
 
 if TYPE_CHECKING:
@@ -23,8 +23,9 @@ def demo(
     ] = Path("torchreg_demo"),
     frames: Annotated[int, typer.Option(min=1, help="Number of frames, 20 per second.")] = 40,
     seed: Annotated[int, typer.Option(help="Seed of motion and measurements.")] = 0,
-    picture: Annotated[bool, typer.Option("--picture/--no-picture", help="Whether to draw the animation.")] = True,
+    no_movie: Annotated[bool, typer.Option("--no-movie", help="Do not draw the animation.")] = False,
     force: Force = False,
+    quiet: Quiet = False,
 ) -> None:
     """Run the main job on built-in data: find a hand and follow it, as a noisy pair of cameras sees it, with outliers.
 
@@ -34,7 +35,7 @@ def demo(
     """
     track, poses = output / "track.safetensors", output / "poses.json"
     scene, movie = output / "hand.glb", output / "tracking.gif"
-    wanted = [poses, track, track.with_suffix(".json"), *([movie] if picture else []), scene]
+    wanted = [poses, track, track.with_suffix(".json"), *([] if no_movie else [movie]), scene]
     check_outputs([path for path in wanted if output.exists()], force)
     output.mkdir(parents=True, exist_ok=True)
 
@@ -46,22 +47,24 @@ def demo(
     from torchreg.tracking.demo import DEMO_FPS, run_demo
     from torchreg.viz.tracking import animate_track, save_track_gltf
 
-    with tqdm(total=frames, unit="frame", desc="tracking", leave=False) as bar:
+    with tqdm(total=frames, unit="frame", desc="tracking", leave=False, disable=quiet) as bar:
         result = run_demo(frames, seed, on_frame=lambda done, planned: bar.update())
     count, hand = len(result.clouds), Hand()
     result.save(track)
     write_poses(poses, result.track)
-    typer.echo(_speed(result))
-    _print_tip_errors("all", result.tip_errors.flatten())
-    _print_tip_errors("seen by the cameras", result.tip_errors[result.tips_seen])
+    if not quiet:
+        typer.echo(_speed(result))
+        _print_tip_errors("all", result.tip_errors.flatten())
+        _print_tip_errors("seen by the cameras", result.tip_errors[result.tips_seen])
     save_track_gltf(scene, hand, result.track, up=guess_up(list(result.track.keypoints)))
-    if picture:
-        with tqdm(total=count, unit="frame", desc="drawing", leave=False) as bar:
+    if not no_movie:
+        with tqdm(total=count, unit="frame", desc="drawing", leave=False, disable=quiet) as bar:
             animate_track(
                 movie, hand, result.track, result.clouds, inliers=result.inliers, fps=DEMO_FPS,
                 on_frame=lambda done, planned: bar.update(),
             )  # fmt: skip
-    typer.echo(f"wrote {', '.join(str(path) for path in wanted)}")
+    if not quiet:
+        typer.echo(f"wrote {', '.join(str(path) for path in wanted)}")
     if count < frames:
         raise interruption(f"{count} of {frames} frames are done")
 

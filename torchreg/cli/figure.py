@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from torchreg.cli.outputs import PICTURE_ENDINGS, Force, check_outputs, with_ending
+from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, with_ending
 from torchreg.cli.reporting import reporting
 
 
@@ -15,9 +15,11 @@ from torchreg.cli.reporting import reporting
 def figure(
     name: Annotated[str, typer.Argument(metavar="bending|readme", help="Which picture to draw.")],
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Where to (.png, .pdf, .svg); by default NAME.png.")
+        Path | None,
+        typer.Option("--output", "-o", metavar="OUT.png", help="Where to (.png, .pdf, .svg); by default NAME.png."),
     ] = None,
     force: Force = False,
+    quiet: Quiet = False,
 ) -> None:
     """Draw a picture: bending (the paper's figure 2, the skin at a = 2 and a = 10) or readme (start and alignment)."""
     from torchreg._checks import check_choice
@@ -27,4 +29,6 @@ def figure(
     check_outputs([path], force)
     from torchreg.viz.figures import bending_picture, readme_picture
 
-    typer.echo(f"wrote {bending_picture(path) if name == 'bending' else readme_picture(path)}")
+    written = bending_picture(path) if name == "bending" else readme_picture(path)
+    if not quiet:
+        typer.echo(f"wrote {written}")

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from torchreg.cli.align_options import NanPolicy, Scale
+from torchreg.cli.align_options import NanPolicy, Scale, cloud_files
 from torchreg.cli.cameras import Depth, DepthRange, Intrinsics, Mask, check_used, depth_source
 from torchreg.cli.outputs import Force, Quiet, check_outputs
 from torchreg.cli.reporting import interruption, reporting
@@ -65,7 +65,7 @@ def label(
     if depth:
         sequence = depth_source(frames, intrinsics, mask, depth_range)
     else:
-        sequence = load_frames(frames[0] if len(frames) == 1 else frames, scale=scale, nan_policy=nan_policy)
+        sequence = load_frames(cloud_files(frames), scale=scale, nan_policy=nan_policy)
     with tqdm(total=len(sequence), unit="frame", desc="reading", leave=False, disable=quiet) as bar:
         from torchreg.alignment.pose_initializer import PoseInitializer
         from torchreg.alignment.pseudo_labels import label_frames

@@ -9,7 +9,8 @@ import typer
 
 from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
 from torchreg.cli.reporting import reporting
-from torchreg.cli.view import Browser, Port, Up, check_up, wait_for_interrupt
+from torchreg.cli.upright import Up, check_up
+from torchreg.cli.view import Browser, Port, wait_for_interrupt
 
 if TYPE_CHECKING:
     from torchreg.registration.results import PoseSolution, ScanRegistration, SequenceRegistration
@@ -41,7 +42,7 @@ def pose(
     force: Force = False,
     quiet: Quiet = False,
 ) -> None:
-    """Pose a registered scan: points of it come to lie at targets, joints hold, and the rest moves little.
+    """Pose a registered scan by inverse kinematics: its points go to targets, and joints constrain the rest.
 
     With --handle and --to once and for all; without them on a page in the browser, where points are clicked and
     dragged, pinned, undone, and kept as key poses. The page writes OUT.safetensors, OUT.ply and OUT.glb, numbered where
@@ -56,13 +57,13 @@ def pose(
     from torchreg.viz.pose_editor import PoseEditor
 
     found, first = _load(result, start)
-    editor = PoseEditor(found, frame=frame, start=None if first is None else first.transforms)
+    editor = PoseEditor(found, frame=frame, start=None if first is None else first.transforms, up=direction)
     if handle or to:
         _pose_once(editor, handle or [], to or [], path, quiet)
         return
     from torchreg.viz.pose_app import PoseApp
 
-    with PoseApp(editor, output=path.with_suffix(""), port=port, up=direction) as app:
+    with PoseApp(editor, output=path.with_suffix(""), port=port) as app:
         wait_for_interrupt(app.url, browser, quiet)
 
 

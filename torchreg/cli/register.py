@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
-from torchreg.cli.align_options import NanPolicy
-from torchreg.cli.cameras import DepthRange, Seen, check_used, seen_folder
+from torchreg.cli.align_options import NanPolicy, cloud_files
+from torchreg.cli.cameras import Depth, DepthRange, Seen, check_used, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, tell_origin, with_ending
 from torchreg.cli.reporting import ExitCode, reporting
 from torchreg.cli.robot import RobotFiles, check_alone, write_scanned_robot
+from torchreg.cli.upright import Up, known_up, remembering
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from torchreg.geometry.range_scan import RangeScan
     from torchreg.registration.results import RegisterRecord, ScanRegistration
 
+_DEFAULT = Path("registered.glb")
 # Pictures of the depth of source and target that was kept.
 _KEPT = ("source.png", "target.png")
 
@@ -35,7 +37,7 @@ def register(
         typer.Argument(
             metavar="SOURCE TARGET",
             help="Scan to be moved (.ply, .obj, .npz, ...), in any unit, and scan to be reached, in the same unit and "
-            "frame. With --urdf, any number of scans of one robot, in metres.",
+            "frame; or a folder or pattern of the two. With --urdf, any number of scans of one robot, in metres.",
         ),
     ],
     output: Annotated[
@@ -45,17 +47,15 @@ def register(
             "-o",
             metavar="OUT.glb",
             help="The moving, skinned source; OUT.safetensors and OUT.json are written beside it. Ending in "
-            ".safetensors: the result alone, which scans without triangles need.",
+            ".safetensors: the result alone, as always of scans without triangles.",
         ),
-    ] = Path("registered.glb"),
+    ] = _DEFAULT,
     bones: Annotated[int, typer.Option(help="Most bones.")] = 20,
     grid: Annotated[int, typer.Option(help="Cells of the grid along the longest side.")] = 50,
-    depth: Annotated[
-        bool, typer.Option("--depth", help="SOURCE and TARGET are depth images (16-bit .png or .tif, .exr, .npy).")
-    ] = False,
+    depth: Depth = False,
     intrinsics: Annotated[
         list[Path] | None,
-        typer.Option(metavar="FILE", help="The camera of the depth images, .json; twice if they have two cameras."),
+        typer.Option(metavar="FILE", help="The camera of the depth pictures, .json; twice if they have two cameras."),
     ] = None,
     depth_range: DepthRange = None,
     smoothing: Annotated[
@@ -78,6 +78,7 @@ def register(
     errors: Annotated[
         Path | None, typer.Option(help="Also write the moved source, colored by its distance from the target (.ply).")
     ] = None,
+    up: Up = None,
     urdf: Annotated[
         bool,
         typer.Option(
@@ -93,16 +94,17 @@ def register(
 
     With --urdf scans of a robot become its description: torchreg register S0 S1 S2 ... -o robot --urdf.
 
-    With --depth A B --intrinsics FILE the scans are depth images in metres, steps cut and flying pixels left out. What
-    was kept of each goes to OUT_seen, red where it was cut, and the moved source over the picture of the target.
+    With --depth A B --intrinsics FILE the scans are depth pictures in metres, steps cut and flying pixels left out.
+    What was kept of each goes to OUT_seen, red where it was cut, and the moved source over the picture of the target.
 
     OMP_NUM_THREADS=2 in the environment makes a second core help to find where the source goes.
 
     Exit codes: 0; 1 if the result is doubtful or too few points match; 2 for an error; 130 for Ctrl-C.
     """
+    scans = cloud_files(scans) if not depth else scans
     if urdf:
         check_alone({"--depth": depth, "--intrinsics": intrinsics, "--depth-range": depth_range, "--seen": seen,
-                     "--smoothing": smoothing, "--weights": weights, "--errors": errors})  # fmt: skip
+                     "--smoothing": smoothing, "--weights": weights, "--errors": errors, "--up": up})  # fmt: skip
         units = _common(scale, "--scale"), _common(time, "--time"), _common(frame, "--frame")
         _write_robot(scans, output, bones, grid, units, nan_policy, force=force, quiet=quiet)
         return
@@ -133,9 +135,12 @@ def register(
             for path, unit, seconds, number in zip((source, target), *pairs, strict=True)
         )
     if scene is not None and first.faces is None:
-        raise InputError(f"{source} has no triangles, which a .glb needs; name an output that ends in .safetensors")
+        if output.name != _DEFAULT.name:
+            raise InputError(f"{source} has no triangles, which a .glb needs; name an output that ends in .safetensors")
+        scene = None
     with tqdm(desc="initialize", unit="step", leave=False, disable=quiet) as bar:
         found = run(first, second, bones, grid, on_step=partial(_show, bar))
+    found = remembering(found, known_up(up, scans, camera=depth))
     _write(found, scene, weights, errors)
     if depth:
         images[1].draw_over(found, folder / "registered.png")
@@ -247,10 +252,11 @@ def _pair(given: list[Given] | None, default: Any, option: str) -> tuple[Any, An
 
 def _write(found: ScanRegistration, scene: Path | None, weights: Path | None, errors: Path | None) -> None:
     if scene is not None and found.faces is not None:
+        from torchreg.geometry.upright import guess_up
         from torchreg.viz.scan_gltf import save_grid_animation
 
         near = found.local()
-        save_grid_animation(scene, near.model, near.points, found.faces)
+        save_grid_animation(scene, near.model, near.points, found.faces, up=found.up or guess_up([found.points]))
         tell_origin(scene, found.origin)
     if weights is not None or errors is not None:
         from torchreg.viz.bone_colors import save_error_ply, save_weight_ply
@@ -262,11 +268,10 @@ def _write(found: ScanRegistration, scene: Path | None, weights: Path | None, er
 
 
 def _summary(found: ScanRegistration) -> str:
-    status = found.status.value.replace("_", " ")
     seconds = ", ".join(
         f"{name} {value:.1f} s"
         for name, value in zip(("setup", "initialization", "align", "refine"), found.seconds.tolist(), strict=True)
     )
     share = float(found.matched.float().mean())
     sure = "" if found.confidence is None else f", confidence {found.confidence:.0%}"
-    return f"{status}{sure}: {found.model.num_bones} bones, {share:.0%} of the points match; {seconds}"
+    return f"{found.status}{sure}: {found.model.num_bones} bones, {share:.0%} of the points match; {seconds}"

@@ -71,7 +71,7 @@ def _summary(found: SequenceRegistration, robot: RobotModel) -> str:
     size = float((found.points.amax(0) - found.points.amin(0)).norm())
     sure = "" if found.confidence is None else f", confidence {float(found.confidence.min()):.0%} in the worst scan"
     return (
-        f"{found.status.value.replace('_', ' ')}{sure}: {len(robot.tree)} links, {kinds.count('revolute')} hinges and "
+        f"{found.status}{sure}: {len(robot.tree)} links, {kinds.count('revolute')} hinges and "
         f"{kinds.count('prismatic')} sliders; the joints leave the scans a median of "
         f"{100 * float(robot.residuals.max()) / size:.2g} % of the size apart in the worst scan"
     )

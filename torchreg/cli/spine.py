@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchreg.cli.align_options import NanPolicy, Scale
+from torchreg.cli.align_options import NanPolicy, Scale, cloud_files
 from torchreg.cli.cameras import Calibration, Seen, check_used, load_calibration, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, counted, numbered, tell_origin, with_ending
 from torchreg.cli.reporting import interruption, reporting
-from torchreg.cli.view import UPS, Up, check_up
+from torchreg.cli.upright import Up, known_up, remembering
 
 if TYPE_CHECKING:
     from torchreg.capture.silhouette_frames import SilhouetteFrames
@@ -111,7 +110,7 @@ def spine(
     check_used(silhouettes, "--silhouettes", hulls)
     if growing:
         _check_free(prior, tips)
-    known, upright = _read_prior(prior), check_up(up) or _up_of(frames)
+    known, upright = _read_prior(prior), known_up(up, [] if silhouettes else frames)
     if silhouettes:
         source = _silhouettes(frames, calibration, bool(screen), resolution, scale)
         count, names = len(source), source.names
@@ -132,7 +131,7 @@ def spine(
         if silhouettes:
             meshes = _hulls(source, seen_folder(seen, glb, force), progress, quiet)
         found = _extracted(meshes, known, config, workers, progress, quiet, growing=growing)
-        found = found if upright is None else replace(found, up=upright)
+        found = remembering(found, upright)
         found.save(result)
         _write(found, meshes, glb, curves, npz, fps)
         if table is not None:
@@ -213,17 +212,9 @@ def _read(frames: list[Path], scale: float, nan_policy: str) -> tuple[list[Trian
 
     if any(frame.suffix.lower() == ".npz" for frame in frames):
         raise InputError("FRAMES must be files of meshes, not of arrays; give a folder, or files such as *.ply")
-    names = load_frames(frames[0] if len(frames) == 1 else frames).names
+    names = load_frames(cloud_files(frames)).names
     clouds = ((name, load_points(name, scale=scale, nan_policy=nan_policy)) for name in names)
     return [as_surface(cloud, name)[0] for name, cloud in clouds], names
-
-
-def _up_of(frames: list[Path]) -> tuple[float, float, float] | None:
-    """Return what is upright in the format of the frames, None where it does not say."""
-    from torchreg.geometry.upright import Y_UP_ENDINGS
-
-    files = [path for frame in frames for path in (sorted(frame.iterdir())[:1] if frame.is_dir() else [frame])]
-    return UPS["y"] if any(path.suffix.lower() in Y_UP_ENDINGS for path in files) else None
 
 
 def _silhouettes(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchreg.cli.align_options import NanPolicy, Scale
+from torchreg.cli.align_options import NanPolicy, Scale, cloud_files
 from torchreg.cli.cameras import (
     Calibration,
     Depth,
@@ -33,13 +33,16 @@ from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, shifted_t
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
 from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary, track_job
+from torchreg.cli.upright import Up, known_up
 from torchreg.cli.view import Browser, Port, tell_url
+from torchreg.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
     from torchreg.capture.depth_frames import DepthFrames
     from torchreg.capture.stereo_frames import StereoFrames
+    from torchreg.geometry.upright import Direction
     from torchreg.shapes.articulated import ArticulatedShape
     from torchreg.shapes.skin import LinearBlendSkin
     from torchreg.tracking.results import FrameResult, TrackResult
@@ -110,7 +113,7 @@ def track(
     package_dir: PackageDir = None,
     free_base: FreeBase = None,
     skin: Skin = None,
-    overlay: Annotated[
+    pictures: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Also draw each frame as soon as it is done (frame_0000.png).")
     ] = None,
     view: Annotated[
@@ -122,8 +125,18 @@ def track(
         Path | None,
         typer.Option(metavar="OUT.csv", help="Also write a table: frame, time, status, and the pose by name."),
     ] = None,
-    movie: Annotated[str, typer.Option(help="The moving picture: gif, mp4 (needs ffmpeg), none, or a path.")] = "gif",
-    gltf: Annotated[bool, typer.Option("--gltf/--no-gltf", help="Whether to write the moving shape.")] = True,
+    movie: Annotated[
+        str | None,
+        typer.Option(
+            metavar="OUT.gif",
+            help="The moving picture, .gif or .mp4 (needs ffmpeg); by default RESULT.gif; none for none.",
+        ),
+    ] = None,
+    gltf: Annotated[
+        Path | None, typer.Option(metavar="OUT.glb", help="The moving shape; by default RESULT.glb.")
+    ] = None,
+    no_gltf: Annotated[bool, typer.Option("--no-gltf", help="Do not write the moving shape.")] = False,
+    up: Up = None,
     save_every: Annotated[int, typer.Option(min=1, help="Frames after which RESULT.progress is written anew.")] = 50,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on where RESULT.progress ends, if it is there; else begin.")
@@ -147,7 +160,7 @@ def track(
     Exit codes: 0; 1 if in any frame the shape was lost or is doubtful, or there were no data; 2 for an error; 130 for
     Ctrl-C.
     """
-    files, resumed = _files(output, movie, gltf, overlay, resume, force)
+    files, resumed = _files(output, movie, gltf, no_gltf, pictures, resume, force)
     poses = with_ending(poses, (".csv",))
     check_outputs([poses], force or resumed)
     _check_rates(fps, scale)
@@ -156,11 +169,11 @@ def track(
     check_used(depth, "--depth", {"--intrinsics": intrinsics, "--mask": mask})
     check_used(stereo or depth, "--stereo or --depth", {"--depth-range": depth_range})
     options = parents, package_dir, free_base, skin
-    pictures = images = folder = None
+    videos = images = folder = None
     if stereo:
         model = load_shape(shape, *options)
-        pictures = stereo_source(frames, calibration, model, depth_range, volume, matcher, reach, scale)
-        clouds, folder = Clouds(pictures, floating=False), seen_folder(seen, files.result, force or resumed)
+        videos = stereo_source(frames, calibration, model, depth_range, volume, matcher, reach, scale)
+        clouds, folder = Clouds(videos, floating=False), seen_folder(seen, files.result, force or resumed)
     elif depth:
         images = depth_source(frames, intrinsics, mask, depth_range)
         clouds, model = Clouds(images), load_shape(shape, *options)
@@ -181,11 +194,11 @@ def track(
         tracker, report = Tracker(model, first, config=config, locked=known.locked), Report(bar, clouds, quiet)
         run = TrackRun(
             tracker=tracker, clouds=clouds, fps=fps, job=job, files=files, report=report, save_every=save_every,
-            known=known, measured=measured,
+            known=known, measured=measured, up=known_up(up, frames, camera=stereo or depth),
         )  # fmt: skip
-        _add_pictures(run, pictures, folder, images)
+        _add_pictures(run, videos, folder, images)
         if view:
-            run.live = _live_page(pages, port, browser, quiet)
+            run.live = _live_page(pages, port, browser, quiet, run.up)
         complete = _run(run, bar, resumed)
     if poses is not None:
         _write_poses(poses, model, run.located)
@@ -224,14 +237,18 @@ def _write_poses(path: Path, shape: ArticulatedShape, result: TrackResult) -> No
 
 
 def _files(
-    output: Path, movie: str, gltf: bool, overlay: Path | None, resume: bool, force: bool
+    output: Path, movie: str | None, gltf: Path | None, no_gltf: bool, pictures: Path | None, resume: bool, force: bool
 ) -> tuple[TrackFiles, bool]:
     """Return the outputs, after a check that they are writable, and whether an earlier run is resumed."""
     from torchreg._checks import check_choice
 
-    if Path(movie).suffix.lower() not in (".gif", ".mp4"):
+    if movie is not None and Path(movie).suffix.lower() not in (".gif", ".mp4"):
         check_choice(movie, "--movie", MOVIES)
-    files = TrackFiles.at(with_ending(output, (".safetensors",), add=True), movie, gltf, overlay)
+    if gltf is not None and no_gltf:
+        raise InputError("--gltf and --no-gltf cannot be used together; leave out either")
+    result = with_ending(output, (".safetensors",), add=True)
+    scene = None if no_gltf else with_ending(gltf, (".glb",)) or result.with_suffix(".glb")
+    files = TrackFiles.at(result, movie or "gif", scene, pictures)
     resumed = resume and files.progress.exists()
     files.check(force or resumed)
     return files, resumed
@@ -240,7 +257,7 @@ def _files(
 def _clouds(frames: list[Path], scale: float, nan_policy: str) -> Clouds:
     from torchreg.io.frames import load_frames
 
-    sequence = load_frames(frames[0] if len(frames) == 1 else frames, scale=scale, nan_policy=nan_policy)
+    sequence = load_frames(cloud_files(frames), scale=scale, nan_policy=nan_policy)
     return Clouds(sequence)
 
 
@@ -257,7 +274,9 @@ def _drawn_pictures(frames: StereoFrames, folder: Path) -> Callable[[LinearBlend
     return lambda skin: StereoPictures(frames, skin, folder)
 
 
-def _live_page(pages: ExitStack, port: int, browser: bool, quiet: bool) -> Callable[[LinearBlendSkin], OnFrame]:
+def _live_page(
+    pages: ExitStack, port: int, browser: bool, quiet: bool, up: Direction | None
+) -> Callable[[LinearBlendSkin], OnFrame]:
     """Return the function that opens a page for a skin, on which each frame is shown; it closes with ``pages``."""
     from torchreg.viz.live_track import LiveTrack
     from torchreg.viz.viser_server import import_viser
@@ -265,7 +284,7 @@ def _live_page(pages: ExitStack, port: int, browser: bool, quiet: bool) -> Calla
     import_viser()  # a missing extra is reported before the first frame
 
     def begin(skin: LinearBlendSkin) -> OnFrame:
-        page = pages.enter_context(LiveTrack(skin, port=port))
+        page = pages.enter_context(LiveTrack(skin, port=port, up=up))
         tell_url(page.url, browser, quiet)
         return page.show
 

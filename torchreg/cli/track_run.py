@@ -17,6 +17,7 @@ from torchreg.cli.keypoint_options import MeasuredFrames
 from torchreg.cli.known_options import Known
 from torchreg.cli.outputs import check_outputs, tell_origin
 from torchreg.cli.reporting import show_warning
+from torchreg.cli.upright import remembering
 from torchreg.errors import FormatError, InputError, UnitsWarning
 
 if TYPE_CHECKING:
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from torchreg.capture.depth_frames import DepthFrames
     from torchreg.capture.stereo_frames import StereoFrames
     from torchreg.cli.track_checkpoint import TrackProgress
+    from torchreg.geometry.upright import Direction
     from torchreg.io.frames import Frames
     from torchreg.shapes.skin import LinearBlendSkin
     from torchreg.tracking.results import FrameResult, TrackResult, TrackState
@@ -43,19 +45,18 @@ class TrackFiles:
     progress: Path
     movie: Path | None
     gltf: Path | None
-    overlay: Path | None
+    pictures: Path | None
 
     @classmethod
-    def at(cls, result: Path, movie: str, gltf: bool, overlay: Path | None) -> TrackFiles:
+    def at(cls, result: Path, movie: str, gltf: Path | None, pictures: Path | None) -> TrackFiles:
         """Return them for a result, and what else is asked for."""
         named = Path(movie).suffix.lower() in (".gif", ".mp4")
         moving = Path(movie) if named else None if movie == "none" else result.with_suffix(f".{movie}")
-        scene = result.with_suffix(".glb") if gltf else None
-        return cls(result, result.with_suffix(".progress"), moving, scene, overlay)
+        return cls(result, result.with_suffix(".progress"), moving, gltf, pictures)
 
     def frame(self, number: int) -> Path:
         """Return where the picture of a frame goes."""
-        return (self.overlay or Path()) / f"frame_{number:04d}.png"
+        return (self.pictures or Path()) / f"frame_{number:04d}.png"
 
     def check(self, force: bool) -> None:
         """Raise before any work is done if an output cannot be written, or exists and may not be overwritten."""
@@ -66,10 +67,10 @@ class TrackFiles:
             from torchreg.viz.animation import check_animation_path
 
             check_animation_path(self.movie)
-        if self.overlay is not None:
-            if self.overlay.is_dir():
-                check_outputs([next(self.overlay.glob("frame_*.png"), None)], force)
-            self.overlay.mkdir(exist_ok=True)
+        if self.pictures is not None:
+            if self.pictures.is_dir():
+                check_outputs([next(self.pictures.glob("frame_*.png"), None)], force)
+            self.pictures.mkdir(exist_ok=True)
 
 
 class Clouds(Sequence["Tensor"]):
@@ -166,7 +167,7 @@ class Report:
             self.bar.update()
             self.bar.set_postfix_str(result.acquired)
             if status.usable != self.usable:
-                what = f"back ({result.acquired})" if status.usable else status.value.replace("_", " ")
+                what = f"back ({result.acquired})" if status.usable else status.value
                 self.bar.write(f"{self.clouds.names[result.frame]}: {what}")
         self.usable = status.usable
 
@@ -209,6 +210,7 @@ class TrackRun:
         live: shows a frame in the browser, or None.
         known: what is known of the poses.
         measured: keypoints of the frames.
+        up: the upright direction, where it is known.
         parts: results of the frames done.
         state: after them.
     """
@@ -224,6 +226,7 @@ class TrackRun:
     live: Callable[[LinearBlendSkin], OnFrame] | None = None
     known: Known = field(default_factory=Known.nothing)
     measured: MeasuredFrames = field(default_factory=MeasuredFrames)
+    up: Direction | None = None
     parts: list[TrackResult] = field(default_factory=list)
     state: TrackState = field(init=False)
 
@@ -290,7 +293,7 @@ class TrackRun:
             contents = [self.clouds.content(number) for number in range(self.state.frame)]
             save_progress(self.files.progress, TrackProgress(self.result, self.state, self.job, contents))
         self.clouds.on_drop = None
-        self.located.save(self.files.result)
+        remembering(self.located, self.up).save(self.files.result)
         return complete
 
     def _part(self, numbers: range, overlays: Sequence[OnFrame]) -> None:
@@ -322,10 +325,10 @@ class TrackRun:
     def _overlays(self) -> list[OnFrame]:
         """Return what draws each frame as soon as it is done."""
         drawn = [begin(self.surface) for begin in (self.seen, self.live) if begin is not None]
-        if self.files.overlay is not None:
+        if self.files.pictures is not None:
             from torchreg.viz.tracking import FrameOverlays
 
-            overlays = FrameOverlays(self.tracker.shape, self.surface)
+            overlays = FrameOverlays(self.tracker.shape, self.surface, up=self.up)
             drawn.append(lambda points, frame: overlays.save(self.files.frame(frame.frame), points, frame))
         return drawn
 
@@ -336,18 +339,20 @@ class TrackRun:
 
         result, shape = self.result, self.tracker.shape
         if self.files.gltf is not None and bool(result.poses.isfinite().all(-1).any()):
-            save_track_gltf(self.files.gltf, shape, result, up=guess_up(list(result.keypoints)))
+            up = self.up or guess_up(list(result.keypoints))
+            save_track_gltf(self.files.gltf, shape, result, up=up)
             tell_origin(self.files.gltf, self.clouds.origin)
         if self.files.movie is not None:
             animate_track(
-                self.files.movie, shape, result, self.clouds, fps=self.fps, skin=self.surface, on_frame=on_frame
-            )
+                self.files.movie, shape, result, self.clouds, fps=self.fps, skin=self.surface, up=self.up,
+                on_frame=on_frame,
+            )  # fmt: skip
 
 
 def summary(result: TrackResult) -> str:
     """Return what became of the frames, and the usual time for one, in one line."""
     usable = sum(status.usable for status in result.statuses)
-    unusable = Counter(status.value.replace("_", " ") for status in result.statuses if not status.usable)
+    unusable = Counter(status.value for status in result.statuses if not status.usable)
     counts = [f"{usable} tracked", *(f"{count} {name}" for name, count in unusable.items())]
     # The mean tells of searches rather than of frames.
     usual = 1e3 * float(result.seconds.median())

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from torchreg.cli.outputs import with_ending
+from torchreg.cli.outputs import Quiet, with_ending
 from torchreg.cli.reporting import reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
 
@@ -32,6 +32,7 @@ def train_initializer(
     package_dir: PackageDir = None,
     free_base: FreeBase = None,
     skin: Skin = None,
+    quiet: Quiet = False,
 ) -> None:
     """Train a network that proposes poses of a shape, on made-up clouds of it; again to go on."""
     from torchreg.alignment.train_initializer import TrainInitializerConfig, train_initializer
@@ -39,8 +40,9 @@ def train_initializer(
     path = with_ending(output, (".safetensors",), add=True)
     model = load_shape(shape, parents, package_dir, free_base, skin).to(device)
     config = TrainInitializerConfig(minutes=minutes, batch=batch, seed=seed)
-    train_initializer(model, path, config, progress=_tell)
-    typer.echo(f"wrote {path}")
+    train_initializer(model, path, config, progress=None if quiet else _tell)
+    if not quiet:
+        typer.echo(f"wrote {path}")
 
 
 def _tell(row: TrainingRow) -> None:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchreg.cli.align_options import Scale
+from torchreg.cli.align_options import Scale, cloud_files
 from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
 from torchreg.cli.reporting import reporting
-from torchreg.cli.shape_argument import HANDS, FreeBase, PackageDir, Parents, Skin, load_shape, near_shape
+from torchreg.cli.shape_argument import HANDS, PEOPLE, FreeBase, PackageDir, Parents, Skin, load_shape, near_shape
+from torchreg.cli.upright import Up, known_up
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,18 +21,8 @@ if TYPE_CHECKING:
     from torchreg.geometry.mesh import TriangleMesh
     from torchreg.viz.scene import Scene
 
-UPS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
-UPS |= {f"-{name}": (-up[0], -up[1], -up[2]) for name, up in UPS.items()}
-
 Port = Annotated[int, typer.Option(min=0, max=65535, help="Where to listen on 127.0.0.1; if taken, a later one.")]
 Browser = Annotated[bool, typer.Option("--browser/--no-browser", help="Whether to open a window of the browser.")]
-Up = Annotated[
-    str | None,
-    typer.Option(
-        help="What is upright: x, y, z, -x, -y or -z; by default -y before a camera, y of .obj, .glb and .gltf, "
-        "else told from what stands and moves."
-    ),
-]
 
 
 @reporting
@@ -40,8 +31,8 @@ def view(
         Path,
         typer.Argument(
             metavar="WHAT",
-            help="A result (.safetensors); or hand, hand-left, a robot (.urdf), a rig or mesh (.glb, .gltf), a scan or "
-            "cloud of any format that `torchreg formats` shows.",
+            help="A result (.safetensors); or hand, hand-left, anny-body, a robot (.urdf), a rig or mesh (.glb, "
+            ".gltf), a scan or cloud of any format that `torchreg formats` shows, or a folder of them.",
         ),
     ],
     shape: Annotated[
@@ -56,7 +47,14 @@ def view(
         typer.Option(help="What was measured, once per frame, or a folder: clouds, the target scan, the meshes."),
     ] = None,
     html: Annotated[
-        Path | None, typer.Option(metavar="OUT.html", help="Write one file that needs no network, instead of serving.")
+        Path | None,
+        typer.Option(
+            "--html",
+            "--output",
+            "-o",
+            metavar="OUT.html",
+            help="Write one file that needs no network, instead of serving.",
+        ),
     ] = None,
     port: Port = 8080,
     browser: Browser = True,
@@ -79,7 +77,7 @@ def view(
         result.stat()  # a missing file is told before all else
     html = with_ending(html, (".html",))
     check_outputs([html], force)
-    up_direction = check_up(up)
+    up_direction = known_up(up, [] if is_result(result) else [result, *(data or [])])
     if shape is None and is_result(result) and (parents or package_dir or skin or free_base is not None):
         raise InputError("--parents, --package-dir, --skin and --free-base are about a --shape, which was not given")
     from torchreg.storage import load
@@ -92,8 +90,7 @@ def view(
     if is_result(result):
         found = load(result if result.suffix else result.with_suffix(".safetensors"))
     else:
-        found, guessed = _shown(result, scale, parents, package_dir, free_base, skin)
-        up_direction = up_direction or guessed
+        found = _shown(result, scale, parents, package_dir, free_base, skin)
     model = None if shape is None else load_shape(shape, parents, package_dir, free_base, skin)
     scene = with_up(result_scene(found, shape=model, data=_read(data or [], scale)), up_direction)
     if html is not None:
@@ -118,32 +115,25 @@ def _shown(
     package_dir: list[Path] | None,
     free_base: bool | None,
     skin: str | None,
-) -> tuple[Any, tuple[float, float, float] | None]:  # fmt: skip
-    """Return a shape, mesh or cloud by name or file, and what is upright in its format."""
+) -> Any:
+    """Return a shape, mesh or cloud by name or file, or the meshes or clouds of a folder."""
     from torchreg.errors import FormatError
-    from torchreg.geometry.upright import Y_UP_ENDINGS
     from torchreg.io.points import load_points
 
     ending = name.suffix.lower()
-    up = UPS["y"] if ending in Y_UP_ENDINGS else None
-    if str(name) in HANDS or ending == ".urdf":
-        return load_shape(str(name), parents, package_dir, free_base, skin), up
+    if name.is_dir() or ending == ".npz":
+        return _read([name], scale)
+    if str(name) in HANDS or str(name) in PEOPLE or ending == ".urdf":
+        return load_shape(str(name), parents, package_dir, free_base, skin)
     if ending in (".glb", ".gltf"):
         try:
-            return load_shape(str(name), parents, package_dir, free_base, skin), up
+            return load_shape(str(name), parents, package_dir, free_base, skin)
         except FormatError:  # no rig, but maybe a mesh
             if parents is not None or skin is not None:
                 raise
     if not name.exists() and not ending:
         raise InputError(f"there is no result {name}.safetensors, and no file {name}; {near_shape(str(name))}")
-    return load_points(name, scale=scale), up
-
-
-def check_up(up: str | None) -> tuple[float, float, float] | None:
-    """Return the direction of a name; InputError if there is none of that name."""
-    if up is not None and up not in UPS:
-        raise InputError(f"--up must be one of {', '.join(sorted(UPS))}, got {up!r}")
-    return None if up is None else UPS[up]
+    return load_points(name, scale=scale)
 
 
 def with_up(scene: Scene, up: tuple[float, float, float] | None) -> Scene:
@@ -188,8 +178,9 @@ def _read(paths: list[Path], scale: float = 1.0) -> list[Tensor | TriangleMesh]:
 
     if not paths:
         return []
-    frames = load_frames(paths[0] if len(paths) == 1 else paths, scale=scale)
-    if any(path.suffix.lower() == ".npz" for path in paths):
+    files = cloud_files(paths)
+    frames = load_frames(files, scale=scale)
+    if any(path.suffix.lower() == ".npz" for path in files):
         return list(frames)
     clouds = [load_points(name, scale=scale) for name in frames.names]
     return [

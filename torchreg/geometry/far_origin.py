@@ -36,7 +36,7 @@ def far_origin(points: Tensor | Sequence[Tensor]) -> Tensor | None:
 
 
 def _middle(points: Tensor) -> tuple[Tensor | None, float]:
-    """Return the median (3,) of points (N, 3) and their spread, neither of which a few strays change much."""
+    """Return the median (3,) of points (N, 3) and their spread, neither of which a few outliers change much."""
     sample = points[:: max(1, len(points) // _FAR.sample)].cpu()
     sample = sample[torch.isfinite(sample).all(-1)]
     if not len(sample):

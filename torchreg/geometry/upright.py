@@ -22,21 +22,28 @@ class _UprightRule:
     tall: float = 1.2  # what stands on y is taller than it is wide and deep by this factor
     steadier: float = 1.5  # factor by which what moves on the ground y = 0 moves less along y than along z
     num_points: int = 2000  # of a frame that are looked at
+    ground: float = 0.05  # what stands on the plane at zero ends there, to this share of its height
+    sole: float = 0.05  # lowest share of the height of what stands, on which it rests
+    more_often: float = 0.15  # share of the frames by which things stand on one axis more often than on another
 
 
 _RULE = _UprightRule()
 
 
 def is_before_camera(lower: Tensor, upper: Tensor) -> bool:
-    """Return whether points with bounds (3,) lie away from the origin, as if measured by a camera there."""
-    return bool(((lower + upper) / 2).norm() > _RULE.far_share * (upper - lower).norm().clamp(min=1e-6))
+    """Return whether points with bounds (3,) lie away from the origin, as if measured by a camera there, along z."""
+    middle = (lower + upper) / 2
+    ahead = middle[2] > middle[:2].abs().amax()
+    return bool(ahead & (middle.norm() > _RULE.far_share * (upper - lower).norm().clamp(min=1e-6)))
 
 
 def guess_up(frames: Sequence[Tensor]) -> Direction:
     """Return the likely upright direction of points over time, one of -y, y and z.
 
-    What lies before a camera at the origin hangs from -y, as cameras look along z with y down. Else y is upright where
-    things are tallest along y, or where they bob less along y than along z: feet stay on the ground. Otherwise z.
+    What lies before a camera at the origin hangs from -y, as cameras look along z with y down. Else that of y and z is
+    upright, if only one is, along which things end at zero, the ground of most files, or along which they would not
+    fall over: their middle is above what they rest on. Else y where things are tallest along y, or bob less along y
+    than along z: feet stay on the ground. Otherwise z.
 
     Args:
         frames: T clouds (N_t, 3), in any unit; those without a finite point are passed over.
@@ -49,7 +56,14 @@ def guess_up(frames: Sequence[Tensor]) -> Direction:
     upper = torch.stack([points.amax(0) for points in found])
     if is_before_camera(lower.amin(0), upper.amax(0)):
         return 0.0, -1.0, 0.0
-    width, height, depth = (upper - lower).median(0).values.tolist()
+    extent = (upper - lower).median(0).values
+    on_ground = (lower.median(0).values.abs() < _RULE.ground * extent)[1:].tolist()
+    if on_ground[0] != on_ground[1]:
+        return (0.0, 1.0, 0.0) if on_ground[0] else (0.0, 0.0, 1.0)
+    on_y, on_z = (sum(_stands(points, axis) for points in found) for axis in (1, 2))
+    if abs(on_y - on_z) > _RULE.more_often * len(found):
+        return (0.0, 1.0, 0.0) if on_y > on_z else (0.0, 0.0, 1.0)
+    width, height, depth = extent.tolist()
     if height > _RULE.tall * max(width, depth) or _is_steadier(found, lower):
         return 0.0, 1.0, 0.0
     return 0.0, 0.0, 1.0
@@ -66,6 +80,15 @@ def to_y_up(up: Direction) -> Tensor:
     else:
         turn[1:3, 1:3] = torch.tensor([[y, z], [-z, y]])
     return turn
+
+
+def _stands(points: Tensor, axis: int) -> bool:
+    """Return whether points (N, 3) would not fall over: their middle is above their lowest ones along an axis."""
+    height = points[:, axis] - points[:, axis].amin()
+    sole = points[height <= _RULE.sole * height.amax()]
+    aside = [other for other in range(3) if other != axis]
+    middle = points.mean(0)[aside]
+    return bool(((middle >= sole[:, aside].amin(0)) & (middle <= sole[:, aside].amax(0))).all())
 
 
 def _is_steadier(frames: Sequence[Tensor], lower: Tensor) -> bool:

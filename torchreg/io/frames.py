@@ -147,7 +147,7 @@ def load_frames(
     check_positive(scale, "scale")
     if isinstance(path, (str, os.PathLike)):
         target = local_path(path)
-        files = _files_of(target) if target.is_dir() else _checked([target])
+        files = frames_in(target) if target.is_dir() else _checked([target])
     else:
         files = _listed(path)
     if sort:
@@ -236,7 +236,8 @@ def natural_key(path: PathLike, *, decimals: bool = True) -> list[tuple[int, Any
     return key
 
 
-def _files_of(folder: Path) -> list[Path]:
+def frames_in(folder: Path) -> list[Path]:
+    """Return the files of a folder that are frames, all of one format, in any order; FormatError if there are none."""
     files = [file for file in folder.iterdir() if ending_of(file) in ENDINGS and not file.name.startswith(".")]
     kinds = Counter(ending_of(file) for file in files)
     if not files:

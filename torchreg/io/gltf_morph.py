@@ -12,6 +12,7 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_shape
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.upright import Direction, to_y_up
 from torchreg.io.gltf_builder import (
     DEFAULT_COLOR,
     Array,
@@ -25,8 +26,9 @@ from torchreg.io.gltf_builder import (
 
 
 def save_vertex_animation(
-    path: str | Path, frames: Tensor, faces: Tensor, times: Tensor, colors: Tensor | None = None
-) -> Path:
+    path: str | Path, frames: Tensor, faces: Tensor, times: Tensor, colors: Tensor | None = None,
+    *, up: Direction | None = None,
+) -> Path:  # fmt: skip
     """Return the path of a .glb file with a mesh whose vertices move freely, in straight lines from frame to frame.
 
     Motions that no skeleton gives, such as blends of dual quaternions, play exactly in any glTF viewer. The first frame
@@ -38,6 +40,7 @@ def save_vertex_animation(
         faces: (F, 3) integers.
         times: (T,) seconds, not negative, strictly increasing.
         colors: (V, 3) or (V, 4) in [0, 1].
+        up: the axis that is upright, turned to glTF's y; left as it is by default.
 
     Returns:
         The path written.
@@ -76,7 +79,7 @@ def save_vertex_animation(
         for frame in range(1, len(points))
     ]
     document.gltf.meshes[mesh].weights = [0.0] * (len(points) - 1)
-    node = document.add_node("surface", None)
+    node = document.add_node("surface", None if up is None else to_y_up(up).numpy())
     document.gltf.nodes[node].mesh = mesh
     # One number per target at every time: all zero for the first frame.
     shares = np.eye(len(points), dtype=np.float32)[:, 1:].reshape(-1)

@@ -76,10 +76,10 @@ def parse_numbers(text: bytes, columns: int | None, what: str, *, unit: str = "l
             f"{counts[number]} ({line!r}), {'they must be' if columns else 'the first row'} {width}"
         )
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # text that is no number ends the reading: see below
+        warnings.simplefilter("error", DeprecationWarning)  # older numpy only warns of text that is no number
         try:
             values = np.fromstring(text, sep=" ") if text.isascii() else np.zeros(0)
-        except ValueError:  # where numpy, or the caller, makes an error of it
+        except (ValueError, DeprecationWarning):
             values = np.zeros(0)
     if len(values) != width * len(rows):
         raise _no_number(text, what, columns, unit, before)

@@ -82,6 +82,7 @@ class ScanRegistration(Result):
             given, and of the paper's way, which do not tell.
         point_confidence: (N,) from 0 to 1, posterior mass of each point's match in the first alignment; low where the
             target shows nothing and points follow what is around them. None as above.
+        up: the upright direction, where it is known, as from a file's format; pictures else guess it from the points.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -104,6 +105,7 @@ class ScanRegistration(Result):
     origin: Tensor | None = None
     confidence: float | None = None
     point_confidence: Tensor | None = None
+    up: tuple[float, float, float] | None = None
 
     def moved(self, origin: Tensor) -> ScanRegistration:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
@@ -180,6 +182,7 @@ class SequenceRegistration(Result):
         confidence: (T,) of each scan, from 0 to 1: the least `ScanRegistration.confidence` of the alignments by which
             the reference, moved from scan to scan, came there; one for the reference. Where any is below one half the
             status is DOUBTFUL. None in files of earlier releases.
+        up: see `ScanRegistration`.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -205,6 +208,7 @@ class SequenceRegistration(Result):
     observed: Tensor | None = None
     observed_normals: Tensor | None = None
     confidence: Tensor | None = None
+    up: tuple[float, float, float] | None = None
 
     def moved(self, origin: Tensor) -> SequenceRegistration:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""

@@ -99,10 +99,10 @@ def solve_pose(
     fixed: Tensor | None = None,
     config: SolvePoseConfig | None = None,
 ) -> PoseSolution:
-    """Return the pose in which handles lie at targets, joints hold, and the rest moves little.
+    """Return the pose by inverse kinematics: handles at targets, joints as constraints, and a prior at the rest pose.
 
-    ``argmin_T mean_h |D(x_h; T) - y_h|^2 + hold sum_joints |T_i c - T_j c|^2 + ...``, a joint being the point c that
-    the model's own motions move alike. Pieces of a scan that hidden joints cut apart hold together as well, see
+    ``argmin_T mean_h |D(x_h; T) - y_h|^2 + hold sum_joints |T_i c - T_j c|^2 + ...``, a joint being the point c on
+    which the model's own motions agree. Pieces of a scan that hidden joints cut apart hold together as well, see
     `GridLBS.joints`.
 
     To solve many poses of one model, as when dragging, use a `PoseSolver`, which finds the joints once.

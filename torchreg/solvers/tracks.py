@@ -46,7 +46,9 @@ class TrackGraph:
         link, start, stop = self._weights()
         gains = torch.cat((zero, link, stop, start, zero, torch.zeros_like(link)))
         costs = (1 + gains.max() - gains).numpy()  # positive: an entry of zero would be none
-        matrix = csr_array((costs, (rows.numpy(), columns.numpy())), shape=(2 * count, 2 * count))
+        # The indices that scipy's matching takes in all its releases.
+        places = rows.int().numpy(), columns.int().numpy()
+        matrix = csr_array((costs, places), shape=(2 * count, 2 * count))
         chosen = torch.from_numpy(min_weight_full_bipartite_matching(matrix)[1]).long()
         used, real = chosen[first] == second, chosen[:count] != numbers
         ends, begins = chosen[:count] == count + numbers, chosen[count:] == numbers

@@ -65,6 +65,7 @@ class TrackResult(Result):
         acquired: what led to each pose, see `FrameResult`.
         origin: see `AlignResult`.
         shape: that was followed, see `AlignResult`.
+        up: see `AlignResult`.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -83,6 +84,7 @@ class TrackResult(Result):
     acquired: tuple[str, ...]
     origin: Tensor | None = None
     shape: ArticulatedShape | None = field(default=None, metadata=stored_as(record_kept_shape, build_kept_shape))
+    up: tuple[float, float, float] | None = None
 
     @property
     def named_poses(self) -> dict[str, Tensor]:

@@ -18,6 +18,7 @@ from torch import Tensor
 from torchreg._checks import check_positive, check_shape
 from torchreg.datasets.hand import surface_skin
 from torchreg.errors import InputError, MissingExtraError
+from torchreg.geometry.upright import Direction
 from torchreg.geometry.visibility import View
 from torchreg.io.atomic import write_atomic
 from torchreg.shapes.articulated import ArticulatedShape
@@ -150,7 +151,7 @@ def common_view(
     skin: LinearBlendSkin,
     poses: Tensor,
     camera: Tensor | None = None,
-    up: Tensor | None = None,
+    up: Tensor | Direction | None = None,
     size: tuple[int, int] = (360, 360),
 ) -> View:
     """Return the view that shows a surface in all poses (T, num_dofs); see `watch`."""

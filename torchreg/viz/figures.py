@@ -18,7 +18,7 @@ from torchreg.errors import InputError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh, interpolate
 from torchreg.geometry.rigid import rigid_matrix
-from torchreg.geometry.upright import is_before_camera
+from torchreg.geometry.upright import Direction, guess_up, is_before_camera
 from torchreg.geometry.visibility import View, aim, rasterize, visible_points
 from torchreg.io.atomic import write_atomic
 from torchreg.shapes.articulated import ArticulatedShape
@@ -141,7 +141,7 @@ def watch(
     points: Tensor,
     *,
     camera: Tensor | None = None,
-    up: Tensor | None = None,
+    up: Tensor | Direction | None = None,
     size: tuple[int, int] = (480, 480),
     margin: float = 0.08,
 ) -> View:
@@ -151,8 +151,8 @@ def watch(
         points: (N, 3), metres.
         camera: (3,) position. By default, points away from the origin are taken for measurements of a camera at the
             origin that looks along +z with -y up, and are viewed from a little right of and above it; other points
-            from before and above, with z up.
-        up: (3,) upright direction; by default as for ``camera``, or -y when a camera is given.
+            from before and above.
+        up: (3,) upright direction; by default as `geometry.upright.guess_up` tells it, or -y when a camera is given.
         size: width and height of the picture, pixels.
         margin: on each side, as a share of the picture.
 
@@ -161,6 +161,7 @@ def watch(
     """
     points = as_float_tensor(points, "points").detach().double()
     check_points(points, "points", batch=False)
+    upright = None if up is None else as_float_tensor(up, "up", like=points)
     if camera is None:
         lower, upper = points.amin(0), points.amax(0)
         middle, length = (lower + upper) / 2, float((upper - lower).norm().clamp(min=1e-6))
@@ -168,10 +169,10 @@ def watch(
             away = float(middle.norm())
             camera = points.new_tensor([0.35 * away, -0.25 * away, 0.0])
         else:
-            up = points.new_tensor([0.0, 0.0, 1.0]) if up is None else as_float_tensor(up, "up", like=points)
-            camera = middle + 3 * length * _from_before(up)
+            upright = points.new_tensor(guess_up([points])) if upright is None else upright
+            camera = middle + 3 * length * _from_before(upright)
     width, height = size
-    return aim(points, camera, up=up, size=(_OVERSAMPLING * width, _OVERSAMPLING * height), margin=margin)
+    return aim(points, camera, up=upright, size=(_OVERSAMPLING * width, _OVERSAMPLING * height), margin=margin)
 
 
 def _from_before(up: Tensor) -> Tensor:
@@ -229,6 +230,7 @@ def draw_alignment(
     *,
     skin: LinearBlendSkin | None = None,
     view: View | None = None,
+    up: Direction | None = None,
     point_size: float = 5.0,
 ) -> Axes:
     """Return axes with a shaded picture of a shape in a pose and of the data.
@@ -243,6 +245,7 @@ def draw_alignment(
         inliers: (M,) bool; unknown by default.
         skin: the surface to draw, with faces; by default `surface_skin`, which is made anew at every call.
         view: camera and pixels, see `watch`; by default of shape and inliers.
+        up: the upright direction of the default view, see `watch`.
         point_size: diameter of a data point, points (1/72 inch).
 
     Raises:
@@ -251,7 +254,7 @@ def draw_alignment(
     mesh = posed_mesh(shape, pose, skin)
     color = DATA_COLOR if inliers is None else INLIER_COLOR
     data, inliers = _checked_data(mesh, data, inliers)
-    view = watch(torch.cat([mesh.vertices, data[inliers]])) if view is None else view
+    view = watch(torch.cat([mesh.vertices, data[inliers]]), up=up) if view is None else view
     if ax is None:
         ax = new_figure(*picture_size(view))[1][0]
     draw_mesh(ax, mesh, view)

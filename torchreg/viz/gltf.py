@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_positive, check_shape
 from torchreg.datasets.hand import faces_of, surface_skin
+from torchreg.geometry.creases import welded
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.upright import Direction
 from torchreg.io.gltf_write import save_animated_skin
@@ -27,6 +28,8 @@ def save_shape_animation(
     up: Direction | None = None,
 ) -> Path:
     """Return the path of a .glb file in which the shape's skinned surface moves through poses.
+
+    Triangles that hardly share vertices are given shared ones, see `geometry.creases.welded`.
 
     Each part becomes a joint; its bending weights become the weights of the file's skin, so that a viewer shows exactly
     the vertices of the skin in each pose.
@@ -53,16 +56,22 @@ def save_shape_animation(
     with torch.no_grad():
         moving = shape.part_transforms(poses)
         rest = shape.part_transforms(skin.reference_pose)
+    vertices, weights = skin.points, skin.weights
+    if len(vertices) > len(faces):  # hardly shared, as in STL files: shared ones are half as many as triangles
+        kept, faces, normals = welded(vertices, faces, weights)
+        vertices, weights = vertices[kept], weights[kept]
+    else:
+        normals = TriangleMesh(vertices, faces).vertex_normals()
     return save_animated_skin(
         path,
-        vertices=skin.points,
+        vertices=vertices,
         faces=faces,
-        weights=skin.weights,
+        weights=weights,
         joint_names=shape.part_names,
         parents=shape.part_parents,
         rest_transforms=rest,
         joint_transforms=moving,
         times=seconds,
-        normals=TriangleMesh(skin.points, faces).vertex_normals(),
+        normals=normals,
         up=up,
     )

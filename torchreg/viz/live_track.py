@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchreg.datasets.hand import faces_of
+from torchreg.geometry.upright import Direction
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.tracking.results import FrameResult
 from torchreg.viz.figures import SKIN_COLOR
@@ -28,10 +29,11 @@ class LiveTrack:
     Args:
         skin: the surface to draw, with faces.
         port: to listen on at 127.0.0.1, or a later one if it is taken.
+        up: the upright direction, see `Scene`.
     """
 
-    def __init__(self, skin: LinearBlendSkin, *, port: int = 8080) -> None:
-        self._skin, self._faces = skin, faces_of(skin).cpu()
+    def __init__(self, skin: LinearBlendSkin, *, port: int = 8080, up: Direction | None = None) -> None:
+        self._skin, self._faces, self._up = skin, faces_of(skin).cpu(), up
         self.server = start_server("torchreg track", port)
         self._label = self.server.gui.add_markdown("waiting for the first frame")
         self._surface: viser.MeshHandle | None = None
@@ -81,7 +83,7 @@ class LiveTrack:
         layers: list[Layer] = [Cloud("data", [data], [paint])]
         if vertices is not None:
             layers.append(MovingMesh("shape", vertices, self._faces))
-        scene = Scene("track", tuple(layers))
+        scene = Scene("track", tuple(layers), up=self._up)
         self._cloud = self.server.scene.add_point_cloud(
             "/data", as_floats(data), as_floats(paint), point_size=0.006 * scene.diagonal, point_shape="circle",
             precision="float32", point_shading="flat",

@@ -55,7 +55,6 @@ class PoseApp:
         editor: of the posed scan.
         output: name of files without their endings .safetensors, .ply and .glb; a number is added if one exists.
         port: to listen on at 127.0.0.1, or a later one if it is taken.
-        up: upright direction, see `Scene`.
     """
 
     def __init__(
@@ -64,7 +63,6 @@ class PoseApp:
         *,
         output: str | Path = "posed",
         port: int = 8080,
-        up: tuple[float, float, float] | None = None,
     ) -> None:
         self.editor = editor
         self._output = Path(output)
@@ -77,7 +75,7 @@ class PoseApp:
         self.worker: LatestWorker[int, Tensor] = LatestWorker(self._solve, self._tell_error, "torchreg pose solver")
         self._update_shape = self._draw_shape()
         self._add_controls()
-        point_camera(self.server, self._scene(up))
+        point_camera(self.server, self._scene())
         self._refresh()
 
     @property
@@ -150,15 +148,15 @@ class PoseApp:
                 if number not in targets:
                     gizmo.position = as_floats(self.editor.state.targets[number])
 
-    def _scene(self, up: tuple[float, float, float] | None) -> Scene:
+    def _scene(self) -> Scene:
         editor = self.editor
         if editor.faces is not None and len(editor.faces):
-            return Scene("pose", (MovingMesh("shape", editor.moved(), editor.faces, editor.colors),), up=up)
-        return Scene("pose", (Cloud("shape", [editor.moved()], [editor.colors]),), up=up)
+            return Scene("pose", (MovingMesh("shape", editor.moved(), editor.faces, editor.colors),), up=self.editor.up)
+        return Scene("pose", (Cloud("shape", [editor.moved()], [editor.colors]),), up=self.editor.up)
 
     def _draw_shape(self) -> Callable[[Tensor], None]:
         """Draw the shape and return the function that moves its points."""
-        (layer,) = self._scene(None).layers
+        (layer,) = self._scene().layers
         if isinstance(layer, MovingMesh):
             patches = draw_patches(self.server.scene, "/shape", layer)
             for node, _ in patches:

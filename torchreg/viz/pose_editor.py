@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_finite, check_shape
 from torchreg.errors import InputError
+from torchreg.geometry.upright import Direction, guess_up
 from torchreg.io.gltf_morph import save_vertex_animation
 from torchreg.io.points import save_points
 from torchreg.registration.bones.grid_lbs import GridLBS
@@ -61,6 +62,7 @@ class PoseEditor:
         frame: of a `SequenceRegistration`, whose pose is the first one.
         start: (B, 4, 4) the first pose instead, such as ``transforms`` of a `PoseSolution`.
         config: of the solver.
+        up: the upright direction; by default that of the registration, or as its points tell it.
 
     Raises:
         InputError: if there is no such frame or ``start`` does not fit.
@@ -73,6 +75,7 @@ class PoseEditor:
         frame: int = 0,
         start: Tensor | None = None,
         config: SolvePoseConfig | None = None,
+        up: Direction | None = None,
     ) -> None:
         poses = registration.transforms.detach()
         if poses.ndim == 4 and not 0 <= frame < len(poses):
@@ -84,6 +87,7 @@ class PoseEditor:
         # A copy in one pose, independent of later changes of the registration.
         self.model: GridLBS = GridLBS.from_record(replace(registration.model.record(), transforms=transforms.cpu()))
         self.points, self.faces = registration.points.detach().cpu(), registration.faces
+        self.up = up or registration.up or guess_up([self.points])
         self._weights = self.model.weights_at(self.points).detach()
         self._solver = PoseSolver(self.model, config=config)
         self._lock = threading.RLock()
@@ -286,8 +290,8 @@ class PoseEditor:
         if self.model.blend != "linear" and len(poses) > 1:
             keys = torch.linspace(0, len(poses) - 1, _PLAYBACK.stored * (len(poses) - 1) + 1)
             frames = self.moved(between_poses(self.model, poses, keys))
-            return save_vertex_animation(path, frames, self.faces, keys * seconds_per_key, self.colors)
-        return save_grid_animation(path, self.model, self.points, self.faces, poses, times).path
+            return save_vertex_animation(path, frames, self.faces, keys * seconds_per_key, self.colors, up=self.up)
+        return save_grid_animation(path, self.model, self.points, self.faces, poses, times, up=self.up).path
 
     def _check(self, number: int) -> None:
         if not 0 <= number < len(self._state.vertices):

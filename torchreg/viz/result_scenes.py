@@ -62,7 +62,7 @@ def result_scene(result: Any, *, shape: ArticulatedShape | None = None, data: Da
     Args:
         result: of any system: an `AlignResult`, `TrackResult`, `DemoResult`, `PoseStarts`, `Calibration`,
             `ScanRegistration`, `SequenceRegistration` or `SpineSequence`; or an `ArticulatedShape`, `TriangleMesh`,
-            `RangeScan`, `PointCloud` or tensor (N, 3).
+            `RangeScan`, `PointCloud` or tensor (N, 3), or a list of meshes or tensors, one per frame.
         shape: that was aligned or tracked, by default the one that the result keeps; where there is none, keypoints and
             registered points alone are shown.
         data: measurements, one cloud or mesh per frame: the clouds of alignments and sequences, the target of a
@@ -100,7 +100,7 @@ def _align_scene(result: AlignResult, shape: ArticulatedShape | None, data: Data
         paints = [inlier_paint(mask, share) for mask, share in zip(masks, posterior, strict=True)]
         layers.append(_cloud("data", clouds, paints))
     title = f"alignment: {', '.join(sorted({status.value for status in result.statuses}))}"
-    return Scene(title, tuple(layers), facts=_align_facts(result))
+    return Scene(title, tuple(layers), up=result.up, facts=_align_facts(result))
 
 
 def _align_facts(result: AlignResult) -> dict[str, str]:
@@ -127,7 +127,7 @@ def _track_scene(result: TrackResult, shape: ArticulatedShape | None, data: Data
         )
     kinds = [status.value for status in result.statuses]
     facts = {kind: counted(kinds.count(kind), "frame") for kind in sorted(set(kinds))}
-    return Scene(counted(len(result.poses), "tracked frame"), tuple(layers), result.times, facts=facts)
+    return Scene(counted(len(result.poses), "tracked frame"), tuple(layers), result.times, result.up, facts)
 
 
 @_scene.register
@@ -184,7 +184,7 @@ def _registration_scene(result: ScanRegistration, shape: None, data: Data) -> Sc
     facts = {"status": result.status.value, "distance, median": f"{float(errors.median()):.3g}"}
     if result.confidence is not None:
         facts["confidence"] = f"{result.confidence:.2f}"
-    return Scene(title, tuple(layers), torch.linspace(0, 2, _STYLE.num_steps), facts=facts)
+    return Scene(title, tuple(layers), torch.linspace(0, 2, _STYLE.num_steps), result.up, facts)
 
 
 @_scene.register
@@ -203,7 +203,7 @@ def _sequence_scene(result: SequenceRegistration, shape: None, data: Data) -> Sc
     facts = {"status": result.status.value}
     if result.confidence is not None:
         facts["confidence, worst scan"] = f"{float(result.confidence.min()):.2f}"
-    return Scene(title, tuple(layers), facts=facts)
+    return Scene(title, tuple(layers), up=result.up, facts=facts)
 
 
 @_scene.register
@@ -251,11 +251,18 @@ def _points_scene(result: Tensor, shape: None, data: Data) -> Scene:
     return Scene(counted(len(result), "point"), (_cloud("points", [result], _STYLE.target),))
 
 
-def _surface_frames(data: Data) -> list[Layer]:
+@_scene.register
+def _frames_scene(result: list, shape: None, data: Data) -> Scene:
+    if not result:
+        raise InputError("result must hold a mesh or cloud at least, got none")
+    return Scene(counted(len(result), "frame"), tuple(_surface_frames(result, opacity=1.0)))
+
+
+def _surface_frames(data: Data, opacity: float = 0.3) -> list[Layer]:
     """Return the layer of meshes, one per frame, or else of their points; none without data."""
     meshes = [item for item in data if isinstance(item, TriangleMesh)]
     if meshes and len(meshes) == len(data):
-        return [Meshes("surface", meshes, _STYLE.body, opacity=0.3)]
+        return [Meshes("surface", meshes, _STYLE.body, opacity=opacity)]
     clouds = [(item.vertices if isinstance(item, TriangleMesh) else item).detach() for item in data]
     return [Cloud("surface", clouds, _STYLE.body, size=0.003)] if clouds else []
 

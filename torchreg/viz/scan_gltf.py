@@ -13,6 +13,7 @@ from torchreg._checks import as_float_tensor, check_choice, check_finite, check_
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import rigid_matrix
+from torchreg.geometry.upright import Direction
 from torchreg.io.gltf_write import save_animated_skin
 from torchreg.registration.blend import blend_linear, check_rigid_motions
 from torchreg.registration.bones.grid_lbs import GridLBS
@@ -50,6 +51,7 @@ def save_grid_animation(
     colors: Tensor | None = None,
     most_weights: int = 4,
     hierarchy: str = "tree",
+    up: Direction | None = None,
 ) -> GridAnimation:
     """Write a .glb file in which the bones of a model move a mesh through poses, and return its description.
 
@@ -69,6 +71,7 @@ def save_grid_animation(
         most_weights: weights kept per vertex, 4, or 8, of which some viewers ignore the second four.
         hierarchy: "tree", or "flat" for nodes without parents: between the poses bones then move on straight lines
             instead of about their joints.
+        up: the axis that is upright, turned to glTF's y; left as it is by default.
 
     Returns:
         Path, error and skeleton of the file.
@@ -109,6 +112,7 @@ def save_grid_animation(
         normals=mesh.vertex_normals() if normals is None else normals,
         colors=weight_colors(model.weights_at(points)).clamp(0, 1) if colors is None else colors,
         most_weights=most_weights,
+        up=up,
     )
     shown = blend_linear(points, weights, moving)
     residual = torch.linalg.vector_norm(shown - model(points, moving), dim=-1).max()

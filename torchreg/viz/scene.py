@@ -289,7 +289,7 @@ class Scene:
         if facing.norm() > _CAMERA.one_sided and side.norm() > 0.2 * facing.norm():
             # A scan from one side is viewed from that side, a little from the right and above.
             direction = -facing / facing.norm() - 0.3 * side / side.norm() - 0.2 * up
-        elif from_camera and self.up is None:
+        elif from_camera and float(up[1]) < 0:
             direction = middle - middle.norm() * middle.new_tensor([0.35, -0.25, 0.0])
         else:
             side = torch.linalg.cross(up, middle.new_tensor([1.0, 0.0, 0.0]) if abs(up[0]) < 0.5 else up.roll(1))

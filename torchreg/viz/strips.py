@@ -87,7 +87,7 @@ def annealing_strip(
     steps: list[tuple[Tensor, str]] = [] if start is None else [(start, "start")]
     steps += [(record.pose[0], _step_label(record)) for record in _spread(result.history, columns - len(steps))]
     meshes = [posed_mesh(shape, pose, surface) for pose, _ in steps]
-    view = watch(torch.cat([mesh.vertices for mesh in meshes]), size=(_STYLE.panel, _STYLE.panel))
+    view = watch(torch.cat([mesh.vertices for mesh in meshes]), up=result.up, size=(_STYLE.panel, _STYLE.panel))
     figure, axes = _row([label for _, label in steps])
     inliers = result.inliers.cpu()
     for ax, mesh in zip(axes, meshes, strict=True):
@@ -136,7 +136,7 @@ def registration_strip(
     ]
     if view is None:
         points = torch.cat([mesh.vertices.detach().cpu() for _, mesh, _ in panels])
-        view = watch(points, size=(_STYLE.panel, _STYLE.panel))
+        view = watch(points, up=result.up, size=(_STYLE.panel, _STYLE.panel))
     figure, axes = _row([label for label, _, _ in panels], margin=_STYLE.bar)
     for ax, (_, mesh, paint) in zip(axes, panels, strict=True):
         draw_mesh(ax, facing_mesh(mesh, view), view, paint)

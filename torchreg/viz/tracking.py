@@ -88,7 +88,7 @@ def draw_track_frame(
 
 def frame_label(frame: int, status: Status, acquired: str) -> str:
     """Return the label of a frame: its number, and the stage that acquired its pose, or its status without one."""
-    return f"{frame}  {acquired if status.usable else status.value.replace('_', ' ')}"
+    return f"{frame}  {acquired if status.usable else status.value}"
 
 
 class FrameOverlays:
@@ -98,12 +98,14 @@ class FrameOverlays:
         shape: the articulated shape.
         skin: the surface to draw, with faces; by default a coarse one, which is made once.
         size: width and height, pixels.
+        up: the upright direction, see `watch`.
     """
 
     def __init__(
-        self, shape: ArticulatedShape, skin: LinearBlendSkin | None = None, size: tuple[int, int] = (480, 480)
-    ) -> None:
-        self._shape, self._size = shape, size
+        self, shape: ArticulatedShape, skin: LinearBlendSkin | None = None, size: tuple[int, int] = (480, 480),
+        up: Direction | None = None,
+    ) -> None:  # fmt: skip
+        self._shape, self._size, self._up = shape, size, up
         self._skin = coarse_skin(shape) if skin is None else skin
         self._view: View | None = None
 
@@ -133,7 +135,7 @@ class FrameOverlays:
         if self._view is not None and _shows(self._view, points):
             return self._view
         # The margin keeps the view while the shape moves a little; an empty frame shows the skin's reference pose.
-        return watch(points if len(points) else self._skin.points, size=self._size, margin=0.2)
+        return watch(points if len(points) else self._skin.points, up=self._up, size=self._size, margin=0.2)
 
 
 def animate_track(
@@ -147,7 +149,7 @@ def animate_track(
     fps: float = 20.0,
     skin: LinearBlendSkin | None = None,
     camera: Tensor | None = None,
-    up: Tensor | None = None,
+    up: Tensor | Direction | None = None,
     size: tuple[int, int] = (360, 360),
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Path:

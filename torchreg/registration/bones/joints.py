@@ -36,7 +36,7 @@ class Joints:
 
     Args:
         pairs: (P, 2) int64 bones, the lower first.
-        centers: (P, 3) the points that both bones of a pair move alike, in the space that the motions start from.
+        centers: (P, 3) joint centers, where the two motions of a pair agree, in the space that the motions start from.
         mass: (P,) of what the bones of a pair share, see `JointMoments`; zero for those that only come near.
         gaps: (..., P) distances between the images of each center under the two motions.
     """

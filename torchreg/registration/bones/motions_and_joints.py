@@ -49,8 +49,8 @@ def fit_bones_and_joints(
 
     ``sum_f E(T_f, c) + F beta lambda sum_p |c_p - m_p|^2``, with E that of the problem, its joints at c, and m the
     centers of its moments. Alternating with `find_joints` instead moves stiff joints by very little in each round:
-    motions adapt to wrong centers, which then look right. Motions are eliminated frame by frame, so that a step solves
-    F systems of 6 B unknowns and one of 3 P.
+    the alternation is biased, as motions adapt to wrong centers. Motions are eliminated frame by frame, so that a step
+    solves F systems of 6 B unknowns and one of 3 P.
 
     Args:
         problem: of F frames, with joints of positive weight.
