@@ -65,9 +65,7 @@ class _Scales:
     max_correlation: float = 0.95  # of neighboring residuals
     limb_data: float = 12.0  # that nothing but one limb explains: so many, and it is misplaced with probability 1 / e
     patches: float = 4.0  # of a part, within which the shape's surface errs alike
-    surface_error: float = (
-        0.008  # standard error of a surface, as a share of the size: where half of the fits are wrong
-    )
+    surface_error: float = 0.008  # standard error of a surface, share of the size: where half of the fits are wrong
     loose_error: float = 0.03  # the same of a part that is told to be hardly seen
     gain: float = 0.1  # of a further step in log-likelihood: less than half a standard deviation of the pose
 

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-# Triangles that meet under less than this are one smooth surface, radians: the default of modelling programs.
-_SMOOTH = math.radians(30)
-# Normals are stored apart if they differ by more, a hundredth: half a degree, which no eye sees.
-_DIGITS = 100
+
+@dataclass(frozen=True)
+class _Creases:
+    """Which triangles are one smooth surface."""
+
+    smooth: float = math.radians(30)  # those that meet under less: the default of modelling programs
+    normal: float = 0.01  # normals whose coordinates differ by less are one: half a degree, which no eye sees
+
+
+_CREASES = _Creases()
 
 
 def welded(vertices: Tensor, faces: Tensor, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -30,7 +37,7 @@ def welded(vertices: Tensor, faces: Tensor, like: Tensor) -> tuple[Tensor, Tenso
     normal = torch.linalg.cross(triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0])
     position = torch.unique(vertices[corners].detach().cpu().float(), dim=0, return_inverse=True)[1]
     smooth = _creased(normal.repeat_interleave(3, dim=0), position)
-    rounded = (smooth * _DIGITS).round()
+    rounded = (smooth / _CREASES.normal).round()
     rows = torch.unique(like[corners].detach().cpu().float(), dim=0, return_inverse=True)[1]
     keys = torch.cat((position.unsqueeze(1), rows.unsqueeze(1), rounded.long()), dim=1)
     unique, index = torch.unique(keys, dim=0, return_inverse=True)
@@ -49,6 +56,6 @@ def _creased(normals: Tensor, position: Tensor) -> Tensor:
     first = torch.arange(len(position)).repeat_interleave(many)
     offset = torch.arange(len(first)) - (torch.cumsum(many, 0) - many).repeat_interleave(many)
     second = order[starts[position[first]] + offset]
-    near = (unit[first] * unit[second]).sum(-1) > math.cos(_SMOOTH)
+    near = (unit[first] * unit[second]).sum(-1) > math.cos(_CREASES.smooth)
     total = torch.zeros_like(normals).index_add_(0, first[near], normals[second[near]])
     return nn.functional.normalize(torch.where(total.norm(dim=-1, keepdim=True) > 0, total, unit), dim=-1)
