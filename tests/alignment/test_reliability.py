@@ -13,9 +13,8 @@ from torchreg.alignment.reliability import (
     confidence_of,
     correlated_count,
     curvature,
-    gather_evidence,
+    judge,
     neighbor_correlation,
-    told_doubts,
 )
 from torchreg.geometry.sampling import farthest_points
 from torchreg.shapes.pose_algebra import difference
@@ -68,16 +67,16 @@ def problem_of(skin, data, pose):
 def test_evidence_is_none_at_the_truth_and_speaks_against_a_wrong_pose(links, links_skin, measured):
     pose, data = measured
     problem = problem_of(links_skin, data, pose)
-    right = gather_evidence(problem, pose[None], None)
+    right = judge(problem, pose[None], None)
     wrong_pose = pose.clone()
     wrong_pose[6] = -0.8
-    wrong = gather_evidence(problem, wrong_pose[None], pose.new_tensor([0.0]))
-    assert float(right.off) < 0.1
-    assert float(wrong.off) > 0.4
-    assert float(wrong.rival) == 1
-    assert float(right.rival) == 0
-    assert float(confidence_of(right.table())) > float(confidence_of(wrong.table()))
-    assert right.table().shape == (1, len(CALIBRATION.weights))
+    wrong = judge(problem, wrong_pose[None], pose.new_tensor([0.0]))
+    assert float(right.evidence.off) < 0.1
+    assert float(wrong.evidence.off) > 0.4
+    assert float(wrong.evidence.rival) == 1
+    assert float(right.evidence.rival) == 0
+    assert float(right.confidence) > float(wrong.confidence)
+    assert right.evidence.table().shape == (1, len(CALIBRATION.weights))
 
 
 def test_a_fit_has_converged_where_another_step_gains_nothing(links, links_skin, measured):
@@ -144,8 +143,7 @@ def test_doubts_name_the_limb_and_the_reason(plain_hand, plain_hand_skin):
     )
     local = pose.clone()
     local[:, :3] -= problem.origin
-    evidence = gather_evidence(problem, local, pose.new_tensor([0.0]))
-    (told,) = told_doubts(problem, local, evidence)
+    (told,) = judge(problem, local, pose.new_tensor([0.0])).doubt
     assert "hardly any data show where ring ends" in told
     assert "another pose explains nearly as much" in told
 

@@ -44,16 +44,7 @@ from torchreg.alignment.problem import (
     masked_mean,
     model_size,
 )
-from torchreg.alignment.reliability import (
-    CALIBRATION,
-    SHAPE_CALIBRATION,
-    SurfaceError,
-    confidence_of,
-    curvature,
-    gather_evidence,
-    told_doubts,
-    without_cut,
-)
+from torchreg.alignment.reliability import CALIBRATION, SurfaceError, judge, without_cut
 from torchreg.alignment.results import AlignRecord, AlignResult
 from torchreg.alignment.shape_fit import fit_coefficients, fitted_rig
 from torchreg.alignment.sigma_schedule import SigmaSchedule
@@ -462,14 +453,10 @@ def _result(
     # What lies off the surface tells nothing of the pose, unless all does.
     told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
     degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=3)
-    around, evidence, calibration = curvature(judged, pose), gather_evidence(judged, pose, lead), CALIBRATION
-    if error is not None:
-        evidence, calibration = replace(evidence, unknown=error.unknown(problem.size)), SHAPE_CALIBRATION
-    table = evidence.table()
-    confidence = torch.where(degenerate, 0.0, confidence_of(table, calibration))
+    judgement = judge(judged, pose, lead, error)
+    confidence = torch.where(degenerate, 0.0, judgement.confidence)
     converged = found.change <= config.pose_atol
-    converged = converged | around.converged if config.surface_steps else converged
-    converged = converged if error is None else error.converged
+    converged = converged | judgement.converged if config.surface_steps or error is not None else converged
     rows = (inliers.sum(-1), problem.valid.sum(-1), converged, degenerate, confidence)
     return AlignResult(
         pose=world,
@@ -482,10 +469,10 @@ def _result(
         cost=cost,
         status=tuple(_status(*row) for row in zip(*(row.tolist() for row in rows), strict=True)),
         history=tuple(batch.history),
-        covariance=around.covariance,
+        covariance=judgement.covariance,
         confidence=confidence,
-        evidence=table,
-        doubt=told_doubts(judged, pose, evidence, error),
+        evidence=judgement.evidence.table(),
+        doubt=judgement.doubt,
     )
 
 

@@ -118,9 +118,10 @@ class SurfaceError:
         """Return the evidence (B,) that the data do not tell where the surface is, from 0 to 1."""
         return (-(_SCALES.surface_error * size / self.whole).square()).exp()
 
-    def loose(self, limb: Limb, size: float) -> Tensor:
-        """Return whether the data leave open where a limb is, (B,)."""
-        return self.parts[:, limb.parts].amax(-1) > _SCALES.loose_error * size
+    def loose(self, limbs: Sequence[Limb], size: float) -> Tensor:
+        """Return of which limbs the data leave open where they are, (B, L)."""
+        largest = [self.parts[:, limb.parts].amax(-1) for limb in limbs]
+        return torch.stack(largest, -1) > _SCALES.loose_error * size if limbs else self.parts[:, :0] > 0
 
 
 def without_cut(problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame]) -> AlignProblem:
@@ -143,7 +144,51 @@ def without_cut(problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame
     return replace(problem, valid=torch.where(valid.any(-1, keepdim=True), valid, problem.valid))
 
 
-def gather_evidence(problem: AlignProblem, pose: Tensor, lead: Tensor | None) -> Evidence:
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """What can be trusted of fitted poses.
+
+    Args:
+        covariance: (B, num_dofs, num_dofs) in tangent coordinates.
+        converged: (B,) whether a further step would hardly matter.
+        evidence: for and against them.
+        confidence: (B,) that they are right.
+        doubt: what is doubtful, a sentence each, empty where nothing is.
+    """
+
+    covariance: Tensor
+    converged: Tensor
+    evidence: Evidence
+    confidence: Tensor
+    doubt: tuple[str, ...]
+
+
+def judge(problem: AlignProblem, pose: Tensor, lead: Tensor | None, error: SurfaceError | None = None) -> Judgement:
+    """Return what can be trusted of poses (B, num_dofs).
+
+    Args:
+        problem: the batch.
+        pose: fitted.
+        lead: see `gather_evidence`.
+        error: of fits of pose and shape together.
+    """
+    around, spreads = curvature(problem, pose), end_spreads(problem, pose)
+    evidence, calibration = gather_evidence(problem, pose, lead, spreads), CALIBRATION
+    converged, loose = around.converged, spreads > EVIDENCE.tolerance * problem.size
+    if error is not None:
+        evidence, calibration = replace(evidence, unknown=error.unknown(problem.size)), SHAPE_CALIBRATION
+        limbs = [limb for limb, _ in limb_points(problem.skin)]
+        converged, loose = error.converged, error.loose(limbs, problem.size)
+    return Judgement(
+        covariance=around.covariance,
+        converged=converged,
+        evidence=evidence,
+        confidence=confidence_of(evidence.table(), calibration),
+        doubt=told_doubts(problem, evidence, loose),
+    )
+
+
+def gather_evidence(problem: AlignProblem, pose: Tensor, lead: Tensor | None, spreads: Tensor) -> Evidence:
     """Return the evidence for poses (B, num_dofs).
 
     Args:
@@ -151,6 +196,7 @@ def gather_evidence(problem: AlignProblem, pose: Tensor, lead: Tensor | None) ->
         pose: fitted.
         lead: (B,) cost by which the second best pose of a search was worse, infinite where there was none; None for
             starts that were given.
+        spreads: (B, L), see `end_spreads`.
     """
     distance = problem.surface.distance(problem.data, pose)
     clustered, on_surface = clustered_data(problem, pose)
@@ -160,7 +206,7 @@ def gather_evidence(problem: AlignProblem, pose: Tensor, lead: Tensor | None) ->
         distance,
         beside=beside_share(problem, pose),
         clustered=clustered.to(pose) / on_surface.clamp_min(1),
-        spread=end_spreads(problem, pose).mean(-1),
+        spread=spreads.mean(-1),
         lead=lead,
     )
 
@@ -360,19 +406,19 @@ def neighbor_correlation(data: Tensor, residual: Tensor, weight: Tensor) -> Tens
     return torch.stack(together).clamp(0, _SCALES.max_correlation)
 
 
-def told_doubts(
-    problem: AlignProblem, pose: Tensor, evidence: Evidence, error: SurfaceError | None = None
-) -> tuple[str, ...]:
-    """Return what is doubtful about poses (B, num_dofs), a sentence each, empty where nothing is."""
+def told_doubts(problem: AlignProblem, evidence: Evidence, loose: Tensor) -> tuple[str, ...]:
+    """Return what is doubtful about poses, a sentence each, empty where nothing is.
+
+    Args:
+        problem: the batch.
+        evidence: for its poses.
+        loose: (B, L) limbs whose ends the data hardly show.
+    """
     limbs = [limb for limb, _ in limb_points(problem.skin)]
-    if error is None:
-        loose = (end_spreads(problem, pose) > EVIDENCE.tolerance * problem.size).tolist()
-    else:
-        loose = [list(row) for row in zip(*(error.loose(limb, problem.size).tolist() for limb in limbs), strict=True)]
     sentences = []
-    for row in range(len(pose)):
+    for row, loose_limbs in enumerate(loose.tolist()):
         reasons = []
-        unseen = [_limb_name(problem, limb) for limb, is_loose in zip(limbs, loose[row], strict=False) if is_loose]
+        unseen = [_limb_name(problem, limb) for limb, is_loose in zip(limbs, loose_limbs, strict=False) if is_loose]
         if unseen:
             reasons.append(f"hardly any data show where {', '.join(unseen)} end{'s' * (len(unseen) == 1)}")
         reasons += [
