@@ -23,10 +23,11 @@ class Frames(list):
 
 
 def test_outputs_lie_beside_the_result(tmp_path):
-    files = TrackFiles.at(tmp_path / "r.safetensors", "gif", True, None)
-    assert (files.movie, files.gltf, files.progress) == tuple(tmp_path / f"r.{e}" for e in ("gif", "glb", "progress"))
+    files = TrackFiles.at(tmp_path / "r.safetensors", "gif", tmp_path / "s.glb", None)
+    assert (files.movie, files.progress) == tuple(tmp_path / f"r.{ending}" for ending in ("gif", "progress"))
+    assert files.gltf == tmp_path / "s.glb"
     assert files.frame(7) == Path("frame_0007.png")
-    bare = TrackFiles.at(tmp_path / "r.safetensors", "none", False, tmp_path / "live")
+    bare = TrackFiles.at(tmp_path / "r.safetensors", "none", None, tmp_path / "live")
     assert (bare.movie, bare.gltf) == (None, None)
     assert bare.frame(7) == tmp_path / "live" / "frame_0007.png"
     bare.check(force=False)
