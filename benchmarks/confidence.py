@@ -142,7 +142,7 @@ def picture(
     cut: float = 0.0,
     sensor: DepthNoise | None = None,
 ) -> tr.DepthFrame:
-    """Return a frame of a posed surface before a wall, by a sensor, in some cases with a side of the mask cut off."""
+    """Return a frame of a posed surface before a wall, by a sensor, in some cases with a side cut off."""
     camera = tr.Camera(WIDTH, HEIGHT, (FOCAL, FOCAL, 0.5 * (WIDTH - 1), 0.5 * (HEIGHT - 1)))
     raster = rasterize(TriangleMesh(surface(pose), surface.faces), camera.view())
     shown = raster.face_index >= 0
@@ -152,8 +152,9 @@ def picture(
     if float(torch.rand((), generator=generator)) < cut:
         _, columns = shown.nonzero().unbind(-1)
         line = int(columns.float().quantile(0.6 + 0.3 * float(torch.rand((), generator=generator))))
-        shown = shown & (torch.arange(WIDTH) < line)
-        depth = torch.where(torch.arange(WIDTH) < line, depth, 0.0)
+        # What is cut off may show the hand: the mask tells nothing there.
+        beyond = torch.arange(WIDTH) >= line
+        shown, depth = shown | beyond, torch.where(beyond, 0.0, depth)
     return tr.DepthFrame(depth, camera, shown)
 
 
