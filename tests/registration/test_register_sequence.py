@@ -15,7 +15,7 @@ from torchreg.registration import register_sequence as module
 from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.align_scans import align_scans
 from torchreg.registration.dense.config import ScanAlignConfig
-from torchreg.registration.register_sequence import ALL_FRAMES, FRAME_TO_FRAME, register_sequence
+from torchreg.registration.register_sequence import ALL_FRAMES, FRAME_TO_FRAME, Motion, register_sequence
 
 QUICK = RegisterConfig(align=ScanAlignConfig(num_samples=300), num_samples=500)
 
@@ -82,12 +82,31 @@ def test_results_are_the_same_on_disk(found, tmp_path):
     assert back.history == found.history
 
 
-def test_points_are_predicted_by_half_their_last_step():
+def test_points_are_predicted_by_half_of_a_single_step():
     first, second = torch.zeros(5, 3), torch.ones(5, 3)
-    assert FRAME_TO_FRAME.predict({2: first}, 3, 1) is None
-    assert torch.equal(FRAME_TO_FRAME.predict({2: first, 3: second}, 4, 1), 1.5 * second)
-    # Towards earlier frames, against the way that later ones were reached.
-    assert torch.equal(FRAME_TO_FRAME.predict({2: first, 3: second}, 1, -1), -0.5 * second)
+    assert Motion().predict([first]) is None
+    found = Motion().predict([first, second])
+    torch.testing.assert_close(found.places, 1.5 * second)
+    # The variance of steps being one, half of each kept leaves three quarters of it.
+    assert found.std == pytest.approx(math.sqrt(0.75))
+
+
+@pytest.mark.parametrize("kept", [0.2, 0.9])
+def test_how_steady_steps_are_is_estimated(kept):
+    generator, steps = torch.Generator().manual_seed(0), [torch.zeros(4000, 3)]
+    for _ in range(40):
+        steps.append(kept * steps[-1] + torch.randn(4000, 3, generator=generator))
+    places = torch.stack(steps).cumsum(0)
+    found = Motion().predict(list(places))
+    torch.testing.assert_close(found.places, places[-1] + kept * steps[-1], rtol=0, atol=0.2)
+    assert found.std == pytest.approx(1, rel=0.05)
+
+
+def test_what_rests_is_expected_to_rest():
+    places = torch.rand(7, 3, generator=torch.Generator().manual_seed(0))
+    found = Motion().predict([places] * 3)
+    assert torch.equal(found.places, places)
+    assert found.std == 0
 
 
 @pytest.mark.parametrize(

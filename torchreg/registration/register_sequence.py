@@ -21,6 +21,7 @@ from torchreg.registration.bones.labels import CellData
 from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.align_scans import align_scans
+from torchreg.registration.dense.problem import ExpectedPlaces
 from torchreg.registration.dense.reliability import SCAN_CALIBRATION
 from torchreg.registration.normalization import Normalization
 from torchreg.registration.register import (
@@ -47,15 +48,12 @@ class FrameToFrame:
         smoothness: lower bound.
         point_to_point: lower bound.
         joint_weight: upper bound.
-        momentum: share of its last step by which a point is predicted to move on; with all of it, hidden limbs would
-            run away.
     """
 
     label_cost: float = 0.002
     smoothness: float = 0.2
     point_to_point: float = 0.1
     joint_weight: float = 1e-4
-    momentum: float = 0.5
 
     def apply(self, config: RegisterConfig) -> RegisterConfig:
         """Return the settings within the bounds."""
@@ -68,10 +66,31 @@ class FrameToFrame:
             joint_weight=(min(first, self.joint_weight), min(last, self.joint_weight)),
         )
 
-    def predict(self, positions: dict[int, Tensor], frame: int, step: int) -> Tensor | None:
-        """Return the points (N, 3) predicted in a frame by their last step, if that is known."""
-        last, before = positions[frame - step], positions.get(frame - 2 * step)
-        return None if before is None else last + self.momentum * (last - before)
+
+@dataclass(frozen=True)
+class Motion:
+    """Steps of points from frame to frame as an autoregression: a share of the last one is kept, the rest is new.
+
+    Share and variance are estimated from the steps so far and, as the first may not be like the next, one more step
+    that keeps what is known beforehand.
+
+    Args:
+        momentum: the share kept beforehand; with all of it, hidden limbs would run away.
+    """
+
+    momentum: float = 0.5
+
+    def predict(self, places: Sequence[Tensor]) -> ExpectedPlaces | None:
+        """Return where points (N, 3) are expected after places so far, the latest last; None before two of them."""
+        if len(places) < 2:
+            return None
+        steps = torch.stack(tuple(places)).diff(dim=0)
+        before, after = steps[:-1], steps[1:]
+        power, tiny = steps[0].square().mean(), torch.finfo(steps.dtype).tiny
+        together = self.momentum * power + (before * after).mean((1, 2)).sum()
+        kept = (together / (power + before.square().mean((1, 2)).sum()).clamp_min(tiny)).clamp(0, 1)
+        new = (1 - self.momentum**2) * power + (after - kept * before).square().mean((1, 2)).sum()
+        return ExpectedPlaces(places[-1] + kept * steps[-1], float(new / len(steps)) ** 0.5)
 
 
 @dataclass(frozen=True)
@@ -111,6 +130,7 @@ class AllFrames:
 
 
 FRAME_TO_FRAME = FrameToFrame()
+MOTION = Motion()
 ALL_FRAMES = AllFrames()
 
 
@@ -128,10 +148,11 @@ def register_sequence(
 ) -> SequenceRegistration:
     """Return one set of bones and weights that takes a reference scan onto all scans, and what all of them show.
 
-    From the reference outward, the reference as moved to one frame is aligned with the next, its points predicted from
-    their last step, and a few bones are fitted to that alignment: every frame is reached by deforming the reference
-    itself, so that errors do not pile up. Then labels, weights and the motions of all frames are solved together, from
-    the alignments; a hinge prior penalizes rotation between bones that share weight about more than one axis.
+    From the reference outward, the reference as moved to one frame is aligned with the next, its points predicted by an
+    autoregression of their steps, which what is hidden follows, and a few bones are fitted to that alignment: every
+    frame is reached by deforming the reference itself, so that errors do not pile up. Then labels, weights and the
+    motions of all frames are solved together, from the alignments; a hinge prior penalizes rotation between bones that
+    share weight about more than one axis.
 
     Args:
         scans: T scans of one thing, two at least, in one unit and frame; motions between neighbors as in `register`.
@@ -223,7 +244,7 @@ def _aligned_frames(
             found = align_scans(
                 current, scans[frame], config.align,
                 generator=generator, on_step=initial_records(on_step),
-                expected=FRAME_TO_FRAME.predict(deformed, frame, step),
+                expected=MOTION.predict([deformed[past] for past in range(reference, frame, step)]),
             )  # fmt: skip
             aligned[frame], confidence[frame] = found.points, found.point_confidence
             # A frame is reached through those before it.

@@ -13,7 +13,7 @@ from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.registration.blend import blend_linear
 from torchreg.registration.dense.align_scans import align_scans
 from torchreg.registration.dense.config import ScanAlignConfig
-from torchreg.registration.dense.problem import describe
+from torchreg.registration.dense.problem import ExpectedPlaces, describe
 from torchreg.registration.dense.stages import judge
 
 SCANNER = DepthScanner(num_points=1000)
@@ -66,7 +66,7 @@ def test_the_result_is_what_its_parts_say(pair, aligned):
     assert bool(torch.isin(aligned.nodes, aligned.samples).all())
     assert aligned.chosen == aligned.hypotheses[0]
     assert [each.energy for each in aligned.hypotheses] == sorted(each.energy for each in aligned.hypotheses)
-    ahead = align_scans(pair.source, pair.target, QUICK, expected=aligned.points).chosen
+    ahead = align_scans(pair.source, pair.target, QUICK, expected=ExpectedPlaces(aligned.points, 0.01)).chosen
     assert aligned.chosen.deviation == 0
     for one in (aligned.chosen, ahead):
         assert one.energy == pytest.approx(one.forward + one.backward + one.smoothness + one.deviation)
@@ -95,7 +95,7 @@ def test_hypotheses_are_fused_unless_two_agree(pair):
     same = align_scans(pair.source, pair.source, QUICK)
     assert {each.name for each in same.hypotheses} == {"rest", "matches"}
     torch.testing.assert_close(same.points, pair.source.points, rtol=0, atol=5e-3 * pair.source.diagonal)
-    known = align_scans(pair.source, pair.source, QUICK, expected=pair.source.points)
+    known = align_scans(pair.source, pair.source, QUICK, expected=ExpectedPlaces(pair.source.points, 0.0))
     assert {each.name for each in known.hypotheses} == {"rest", "expected", "matches"}
     every = align_scans(*scans(walking_animal(7, scanner=SCANNER).pair(0, 6)), QUICK)
     assert {each.name for each in every.hypotheses} == {"rest", "matches", "fused"}
@@ -133,7 +133,7 @@ def test_where_scans_do_not_tell_what_is_expected_does(angle):
     # Both ways, each 20 % of the tube's length from the other: only the expectation can tell which.
     source, target = tube(0), tube(1)
     expected = transform_points(se3_exp(torch.tensor([0.0, 0, 0, 0, 0, angle])), source.points)
-    known = align_scans(source, target, QUICK, expected=expected)
+    known = align_scans(source, target, QUICK, expected=ExpectedPlaces(expected, 0.01 * float(source.diagonal)))
     plain = align_scans(source, target, QUICK)
     assert float((known.points - expected).norm(dim=-1).mean()) < 0.02 * source.diagonal
     assert float((plain.points - expected).norm(dim=-1).mean()) > 0.03 * source.diagonal
@@ -145,15 +145,25 @@ def test_where_scans_do_not_tell_what_is_expected_does(angle):
 def test_expectations_that_are_wrong_do_not_harm(pair):
     generator = torch.Generator().manual_seed(0)
     astray = pair.source.points + 0.1 * pair.source.diagonal * torch.randn(3, generator=generator)
-    assert share_near(pair, align_scans(pair.source, pair.target, QUICK, expected=astray).points) > 0.9
+    assert (
+        share_near(
+            pair,
+            align_scans(
+                pair.source, pair.target, QUICK, expected=ExpectedPlaces(astray, 0.01 * float(pair.source.diagonal))
+            ).points,
+        )
+        > 0.9
+    )
 
 
 def test_expectations_of_another_scan_are_refused(pair):
     points = pair.source.points
-    with pytest.raises(InputError, match=r"expected must have shape"):
-        align_scans(pair.source, pair.target, QUICK, expected=points[1:])
-    with pytest.raises(InputError, match="expected must be finite"):
-        align_scans(pair.source, pair.target, QUICK, expected=points.log())
+    with pytest.raises(InputError, match=r"expected.places must have shape"):
+        align_scans(pair.source, pair.target, QUICK, expected=ExpectedPlaces(points[1:], 0.1))
+    with pytest.raises(InputError, match=r"expected.places must be finite"):
+        align_scans(pair.source, pair.target, QUICK, expected=ExpectedPlaces(points.log(), 0.1))
+    with pytest.raises(InputError, match=r"expected.std"):
+        align_scans(pair.source, pair.target, QUICK, expected=ExpectedPlaces(points, -0.1))
 
 
 def test_the_same_call_gives_the_same_bits(pair, aligned):
@@ -204,7 +214,7 @@ def test_expectations_hold_in_other_frames_and_units():
     for scale in (0.001, 100.0):
         scans = (RangeScan(scale * scan.points, normals=scan.normals).transformed(motion) for scan in (source, target))
         ahead = transform_points(motion, scale * expected)
-        moved = align_scans(*scans, QUICK, expected=ahead)
+        moved = align_scans(*scans, QUICK, expected=ExpectedPlaces(ahead, 0.01 * scale * float(source.diagonal)))
         apart = (moved.points - ahead).norm(dim=-1) / (scale * source.diagonal)
         assert float(apart.mean()) < 0.02
 

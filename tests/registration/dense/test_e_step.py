@@ -81,3 +81,18 @@ def test_exact_matches_are_sure():
 def test_bad_input_is_named():
     with pytest.raises(InputError, match="sigma must be positive"):
         match_softly(samples(4, 0), samples(4, 1), 0.0)
+
+
+def test_hidden_samples_are_matched_by_their_odds():
+    source, target = samples(60, 0), samples(80, 1)
+    plain = match_softly(source, target, 0.05, outliers=0.3)
+    sure = match_softly(source, target, 0.05, outliers=0.3, visible=torch.ones(60, dtype=torch.float64))
+    torch.testing.assert_close(sure.posterior, plain.posterior)
+    visible = torch.linspace(0, 1, 60, dtype=torch.float64)
+    found = match_softly(source, target, 0.05, outliers=0.3, visible=visible)
+    # Bayes' rule on the odds of an outlier, those of a surely visible sample being known.
+    odds = (1 - plain.posterior) / plain.posterior
+    expected = 1 / (1 + odds * ((1 + 0.3) / visible - 1) / 0.3)
+    torch.testing.assert_close(found.posterior[1:], expected[1:])
+    assert float(found.posterior[0]) < 1e-9
+    assert bool(found.targets.isfinite().all())

@@ -7,7 +7,7 @@ from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.geometry.rigid import se3_exp
 from torchreg.registration.dense.config import ScanAlignConfig
-from torchreg.registration.dense.problem import describe
+from torchreg.registration.dense.problem import ExpectedPlaces, describe
 from torchreg.registration.dense.stages import (
     Reporter,
     agree,
@@ -15,6 +15,7 @@ from torchreg.registration.dense.stages import (
     judge,
     mismatch,
     refine,
+    uncovered,
 )
 
 CONFIG = ScanAlignConfig(num_samples=400, num_nodes=30)
@@ -52,12 +53,27 @@ def test_steps_come_nearer_and_report(pair, problem, reporter):
     assert all(record.hypothesis == "some" and record.stage == "refine" for record in reporter[1])
 
 
+def test_what_is_hidden_is_held_where_it_is_expected_the_rest_is_not(problem, reporter):
+    rest, count = problem.graph.rest(), len(problem.samples)
+    half = problem.graph.points[:, 2] > problem.graph.points[:, 2].median()
+    ahead = problem.graph.points + torch.where(half, 0.05, 0.0)[:, None] * torch.tensor([1.0, 0, 0])
+    # A matcher to which the upper half is hidden.
+    prior = replace(problem.prior, source=torch.where(half[:, None], 0.0, problem.prior.source[:count]))
+    scans = replace(problem, prior=prior, expected=ExpectedPlaces(ahead, 0.02))
+    held, free = (problem.graph(refine(scans, rest, reporter[0], hold=hold)) for hold in (True, False))
+    far = [(places - ahead).norm(dim=-1)[half].median() for places in (held, free)]
+    assert far[0] < 0.3 * far[1]
+    known = problem.graph(refine(problem, rest, reporter[0]))
+    low = problem.graph.points[:, 2] < problem.graph.points[:, 2].quantile(0.3)
+    assert float((held - known).norm(dim=-1)[low].median()) < 0.005
+
+
 def test_leaps_cost_their_distance_up_to_a_cap(problem):
     rest = problem.graph.rest()
     places = problem.graph(rest)
     assert float(deviations(problem, places).max()) == 0
     for distance, cost in ((0.0, 0.0), (0.015, 0.25), (0.03, 1.0), (7.0, 1.0)):
-        away = replace(problem, expected=places + distance * torch.tensor([0.6, 0.0, -0.8]))
+        away = replace(problem, expected=ExpectedPlaces(places + distance * torch.tensor([0.6, 0.0, -0.8]), 0.01))
         torch.testing.assert_close(deviations(away, places), torch.full_like(places[:, 0], cost))
         assert judge(away, "", rest).deviation == pytest.approx(cost)
 
@@ -72,16 +88,22 @@ def test_better_hypotheses_are_judged_better(problem, reporter):
     far = rest.clone()
     far[:, :3, 3] += 10
     lost = judge(problem, "lost", far)
-    assert (lost.forward, lost.backward) == (1, 1)
+    # As much as each scan shows the other.
+    prior = problem.prior
+    assert lost.forward == pytest.approx(float(prior.visible[: len(problem.samples)].mean()))
+    assert lost.backward == pytest.approx(float(prior.target_visible.mean()))
 
 
 def test_distances_from_the_target_count_up_to_a_cap(problem):
-    target = problem.target
+    visible = problem.prior.visible
+    target = problem.target.first(len(visible))
     cost, index = mismatch(problem, target)
     assert float(cost.max()) == 0
     assert torch.equal(index, torch.arange(len(target)))
+    assert float(uncovered(problem, problem.target).max()) == 0
     above = target.moved(target.points + torch.tensor([0.0, 0.0, 10.0]), target.normals)
-    torch.testing.assert_close(mismatch(problem, above)[0], torch.ones_like(cost))
+    torch.testing.assert_close(mismatch(problem, above)[0], visible)
+    torch.testing.assert_close(uncovered(problem, above), problem.prior.target_visible)
 
 
 def test_hypotheses_agree_up_to_the_last_sigma(problem):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_finite, check_shape
+from torchreg._checks import as_float_tensor, check_finite, check_positive, check_shape
 from torchreg._threads import one_thread, run_both
 from torchreg.geometry.neighbors import k_nearest
 from torchreg.geometry.range_scan import RangeScan
@@ -26,7 +26,7 @@ from torchreg.registration.dense.config import (
 from torchreg.registration.dense.fusion import fuse_motions
 from torchreg.registration.dense.graph_fit import GraphMatches, fit_graph
 from torchreg.registration.dense.node_graph import spread_weights
-from torchreg.registration.dense.problem import NORMAL_SCALE, ScanAlignProblem, describe
+from torchreg.registration.dense.problem import NORMAL_SCALE, ExpectedPlaces, ScanAlignProblem, describe
 from torchreg.registration.dense.reliability import ScanEvidence, confidence_of, scan_evidence
 from torchreg.registration.dense.stages import (
     Reporter,
@@ -51,16 +51,18 @@ def align_scans(
     *,
     generator: torch.Generator | None = None,
     on_step: OnStep | None = None,
-    expected: Tensor | None = None,
+    expected: ExpectedPlaces | None = None,
 ) -> ScanAlignment:
     """Return the source moved onto the target: a deformation graph of many small nodes, without bones yet.
 
     Both scans are described by even samples and what a learnt `ScanMatcher` says of their matches. Hypotheses start
-    from rest; from where points are expected, if that is known; and from the matcher's matches, to which a stiff graph
-    is fitted by an EM in which they are the prior, see `fit_coarsely`. Each goes on by an EM with an outlier class in
-    which they still are, less and less, while edges of the graph count robustly. Unless the two best agree, each part
-    then moves as in the hypothesis that suits it, and the EM goes on from there as well.
-    The best covers the target, is covered by it, deforms most smoothly, and is nearest to what is expected.
+    from rest; from where points are expected, if that is known, and there samples that the matcher calls hidden are
+    held; and from the matcher's matches, to which a stiff graph is fitted by an EM in which they are the prior, see
+    `fit_coarsely`. Each goes on by an EM with an outlier class, hidden samples by the matcher's probability, in which
+    its matches still are the prior, less and less, while edges of the graph count robustly. Unless the two best agree,
+    each part then moves as in the hypothesis that suits it, and the EM goes on from there as well.
+    The best covers the target, is covered by it, as far as each shows the other, deforms most smoothly, and is nearest
+    to what is expected.
 
     Everything is relative to the source's size and in its own frame: units change nothing, turns and shifts of both
     scans nothing beyond rounding.
@@ -72,13 +74,13 @@ def align_scans(
         generator: source of randomness; None draws the same numbers at every call.
         on_step: called with a `ScanAlignRecord` for each step, by the calling thread; when a hypothesis that another
             thread follows is done, for all of its steps.
-        expected: (N, 3) where the source's points are expected, such as by their velocity.
+        expected: where the source's points (N, 3) are expected, such as by their velocity, and how surely.
 
     Returns:
         a `ScanAlignment`.
 
     Raises:
-        InputError: if ``expected`` is not finite or its shape does not fit.
+        InputError: if ``expected`` is not finite, its std is negative, or its shape does not fit.
 
     Differentiable: no.
 
@@ -154,9 +156,9 @@ def _near(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]:
     rest = problem.graph.rest()
     found = [_compared(problem, rest, Reporter("rest", problem.unit.scale, on_step))]
     if problem.expected is not None:
-        there = GraphMatches.of_places(problem.expected)
+        there = GraphMatches.of_places(problem.expected.places)
         ahead = fit_graph(problem.graph, rest, there, _EXPECTED_STIFFNESS, _EXPECTED_FITS).transforms
-        found.append(_compared(problem, ahead, Reporter("expected", problem.unit.scale, on_step)))
+        found.append(_compared(problem, ahead, Reporter("expected", problem.unit.scale, on_step), hold=True))
     return found
 
 
@@ -177,12 +179,13 @@ def _both_told(
     return found
 
 
-def _checked(expected: Any, source: RangeScan) -> Tensor:
-    """Return where points (N, 3) are expected; raise unless it fits the source."""
-    expected = as_float_tensor(expected, "expected")
-    check_shape(expected, "expected", tuple(source.points.shape))
-    check_finite(expected, "expected")
-    return expected.detach()
+def _checked(expected: ExpectedPlaces, source: RangeScan) -> ExpectedPlaces:
+    """Return where points are expected; raise unless that fits the source."""
+    places = as_float_tensor(expected.places, "expected.places")
+    check_shape(places, "expected.places", tuple(source.points.shape))
+    check_finite(places, "expected.places")
+    check_positive(expected.std, "expected.std", allow_zero=True)
+    return ExpectedPlaces(places.detach(), expected.std)
 
 
 def _fused(problem: ScanAlignProblem, found: Sequence[Candidate], on_step: OnStep) -> Candidate:
@@ -191,9 +194,9 @@ def _fused(problem: ScanAlignProblem, found: Sequence[Candidate], on_step: OnSte
     return _compared(problem, begin, Reporter("fused", problem.unit.scale, on_step))
 
 
-def _compared(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) -> Candidate:
-    """Return the candidate after its EM."""
-    transforms = refine(problem, transforms, reporter)
+def _compared(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter, *, hold: bool = False) -> Candidate:
+    """Return the candidate after its EM, see `refine`."""
+    transforms = refine(problem, transforms, reporter, hold=hold)
     return Candidate(judge(problem, reporter.name, transforms), transforms)
 
 

@@ -48,8 +48,7 @@ class ScanAlignConfig:
             apart: cloth and round limbs have far to go.
         outliers: expected outliers, as a share of what a sample in the middle of its matches gets.
         doubt: support of a match that the matcher calls impossible, beside one of a sure match.
-        cap: distances, from the target and from where samples were expected, if that is known, count up to this in the
-            choice among the hypotheses, length.
+        cap: distances from the target count up to this in the choice among the hypotheses, length.
         smoothness: what it costs there that neighboring nodes disagree by one size in the mean.
 
     Raises:
@@ -119,11 +118,11 @@ class Hypothesis:
     Args:
         name: what it started from.
         energy: ``forward + backward + smoothness + deviation``, by which hypotheses are compared; lower is better.
-        forward: mean squared distance of moved samples to the target, capped at one.
-        backward: mean squared distance of target samples to the moved source, capped at one.
+        forward: mean squared distance of moved samples to the target, capped at one, if visible there.
+        backward: mean squared distance of target samples to the moved source, capped at one, if visible there.
         smoothness: weighted disagreement of neighboring nodes.
-        deviation: weighted mean squared distance of samples from where they were expected, capped at one; 0 if that is
-            not known.
+        deviation: mean squared distance of samples from where they were expected, capped at one; 0 if that is not
+            known.
     """
 
     name: str

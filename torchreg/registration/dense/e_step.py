@@ -40,13 +40,17 @@ def match_softly(
     *,
     normal_weight: float = 5.0,
     outliers: float = 0.3,
+    visible: Tensor | None = None,
     num_candidates: int = 6,
     prior: MatchPrior | None = None,
     doubt: float = 1.0,
 ) -> SoftMatches:
     """Return the expected matches of source samples, by an E-step in which every sample may be an outlier.
 
-    ``a_ij = e_ij / (sum_k e_ik + c)`` with ``e_ij = exp(-|x_i - y_j|^2 / 2 sigma^2 - normal_weight (1 - n_i . n_j))``.
+    ``a_ij = e_ij / (sum_k e_ik + c_i)`` with
+    ``e_ij = exp(-|x_i - y_j|^2 / 2 sigma^2 - normal_weight (1 - n_i . n_j))``. The prior odds of an outlier are those
+    of a hidden sample, or of a visible one that is an outlier after all: ``c_i = (1 + c) / v_i - 1``, which for what is
+    surely visible is c.
 
     Args:
         source: (S) samples where they are now.
@@ -54,6 +58,7 @@ def match_softly(
         sigma: width of the kernel, in the unit of the points.
         normal_weight: exponent lost by normals at right angles.
         outliers: c, as a share of what a sample in the middle of its matches gets.
+        visible: (S,) v, probability that the target shows each sample; one by default.
         num_candidates: targets looked at for each sample: the most compatible.
         prior: what a matcher says of matches, by which ``e_ij`` are multiplied; None if nothing is known.
         doubt: see `MatchPrior.logarithm`.
@@ -79,7 +84,9 @@ def match_softly(
         exponent = exponent + prior.logarithm(index, doubt)
     # In the middle of a surface a sample has about this many others within its reach.
     density = max(1.0, _DENSITY * len(there) * sigma**2)
-    chosen = responsibilities(exponent, outliers * density, dim=1)
+    shown = torch.ones_like(exponent[:, 0]) if visible is None else visible
+    odds = (1 + outliers) / shown.clamp_min(torch.finfo(shown.dtype).eps) - 1
+    chosen = responsibilities(exponent, (odds * density).unsqueeze(1), dim=1)
     posterior = chosen.sum(1)
     ends = torch.cat((target.points, target.normals), dim=1)
     sums = torch.einsum("sk,skd->sd", chosen, ends[index])

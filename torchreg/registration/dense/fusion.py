@@ -70,6 +70,7 @@ class _Energy:
         cover: (T, H K) what a target costs when a sample covers it,
         by: (T, H K) if that sample's node
         under: (H K,) has this label.
+        shown: (T,) probability that the source shows each target.
         smoothness: (E, H, H) what an edge costs under the labels of its ends.
         edges: (E, 2).
     """
@@ -78,6 +79,7 @@ class _Energy:
     cover: Tensor
     by: Tensor
     under: Tensor
+    shown: Tensor
     smoothness: Tensor
     edges: Tensor
 
@@ -98,13 +100,15 @@ class _Energy:
         under = torch.arange(len(options), dtype=torch.uint8, device=owner.device)
         under = under.repeat_interleave(covers[0].shape[1])
         smoothness = problem.config.smoothness * _edge_smoothness(graph, options)
-        return cls(own, torch.cat(covers, dim=1), torch.cat(by, dim=1), under, smoothness, graph.edges)
+        shown = problem.prior.target_visible[: len(targets)]
+        return cls(own, torch.cat(covers, dim=1), torch.cat(by, dim=1), under, shown, smoothness, graph.edges)
 
     def __call__(self, labels: Tensor) -> Tensor:
         """Return energies (C,)."""
         own = self.own.gather(1, labels.mT).sum(0)
         # Labels are few: as bytes they are gathered in half the time.
-        covered = torch.where(labels.to(torch.uint8)[:, self.by] == self.under, self.cover, 1.0).amin(-1).mean(-1)
+        covered = torch.where(labels.to(torch.uint8)[:, self.by] == self.under, self.cover, 1.0).amin(-1)
+        covered = (self.shown * covered).mean(-1)
         one, other = labels[:, self.edges].unbind(-1)
         return own + covered + self.smoothness[torch.arange(len(self.edges)), one, other].sum(-1)
 

@@ -22,6 +22,19 @@ NORMAL_SCALE = 0.03
 
 
 @dataclass(frozen=True, eq=False)
+class ExpectedPlaces:
+    """Where points are expected.
+
+    Args:
+        places: (N, 3).
+        std: how far each coordinate may be off, root mean square, in the unit of the places.
+    """
+
+    places: Tensor
+    std: float
+
+
+@dataclass(frozen=True, eq=False)
 class ScanAlignProblem:
     """What alignment works on: float64 on the CPU, the source's middle at the origin and its size one.
 
@@ -34,7 +47,7 @@ class ScanAlignProblem:
         samples: (S,) source points that are samples of the graph.
         nodes: (J,) source points that are nodes.
         unit: in which coordinates are given.
-        expected: (S, 3) where the samples of the graph are expected; None if that is not known.
+        expected: where the samples of the graph are expected; None if that is not known.
     """
 
     graph: DeformationGraph
@@ -45,7 +58,7 @@ class ScanAlignProblem:
     samples: Tensor
     nodes: Tensor
     unit: Normalization
-    expected: Tensor | None = None
+    expected: ExpectedPlaces | None = None
 
     def moved(self, transforms: Tensor) -> OrientedSamples:
         """Return the samples of the graph where its nodes take them."""
@@ -57,7 +70,7 @@ def describe(
     target: RangeScan,
     config: ScanAlignConfig,
     generator: torch.Generator | None = None,
-    expected: Tensor | None = None,
+    expected: ExpectedPlaces | None = None,
 ) -> ScanAlignProblem:
     """Return the problem of aligning two scans.
 
@@ -66,7 +79,7 @@ def describe(
         target: the scan to be reached.
         config: see `ScanAlignConfig`.
         generator: source of the samples' randomness.
-        expected: (N, 3) where the source's points are expected.
+        expected: where the source's points are expected.
 
     Cost: 0.3 s for scans of 8,000 points.
     """
@@ -85,7 +98,11 @@ def describe(
     ways = sample_graph(unit.normalize(source.points), samples, faces, normals=normals, normal_scale=NORMAL_SCALE)
     nodes = build_node_graph(ways, 0, config.num_nodes)
     graph = DeformationGraph(one.points[: len(samples)], one.normals[: len(samples)], nodes)
-    ahead = None if expected is None else unit.normalize(expected)[samples]
+    ahead = None
+    if expected is not None:
+        # The last sigma is as near as samples can be told apart.
+        std = max(expected.std / unit.scale, config.refine.sigma[1])
+        ahead = ExpectedPlaces(unit.normalize(expected.places)[samples], std)
     return ScanAlignProblem(
         graph=graph, source=one, target=other, config=config,
         prior=MatchPrior.of_samples(one, other, len(samples)),

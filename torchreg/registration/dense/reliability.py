@@ -7,9 +7,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from torchreg.geometry.neighbors import NeighborTree
 from torchreg.registration.dense.problem import ScanAlignProblem
-from torchreg.registration.dense.stages import mismatch
+from torchreg.registration.dense.stages import mismatch, uncovered
 
 
 @dataclass(frozen=True)
@@ -66,19 +65,18 @@ def scan_evidence(problem: ScanAlignProblem, transforms: Tensor, smoothness: flo
         transforms: the motions.
         smoothness: of the graph, see `Hypothesis`.
     """
-    moved, prior, config = problem.moved(transforms), problem.prior, problem.config
+    moved, prior = problem.moved(transforms), problem.prior
     cost, index = mismatch(problem, moved)
-    apart = (NeighborTree(moved.points).nearest(problem.target.points)[1] / config.cap).clamp(max=1).square()
-    support = prior.logarithm(index[:, None], config.doubt)[:, 0]
+    support = prior.logarithm(index[:, None], problem.config.doubt)[:, 0]
     return ScanEvidence(
-        forward=_mean(cost, prior.visible),
-        backward=_mean(apart, prior.target_visible),
+        forward=_share(cost, prior.visible),
+        backward=_share(uncovered(problem, moved), prior.target_visible),
         smoothness=smoothness,
-        unsupported=-_mean(support, prior.visible),
+        unsupported=-_share(prior.visible * support, prior.visible),
         hidden=1 - float(prior.visible.mean()),
     )
 
 
-def _mean(values: Tensor, weights: Tensor) -> float:
-    """Return the weighted mean."""
-    return float((weights * values).sum() / weights.sum().clamp_min(torch.finfo(weights.dtype).tiny))
+def _share(weighted: Tensor, weights: Tensor) -> float:
+    """Return the mean of values that are given times their weights."""
+    return float(weighted.sum() / weights.sum().clamp_min(torch.finfo(weights.dtype).tiny))

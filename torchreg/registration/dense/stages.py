@@ -13,7 +13,11 @@ from torchreg.registration.dense.config import Hypothesis, OnStep, ScanAlignReco
 from torchreg.registration.dense.e_step import SoftMatches, match_softly
 from torchreg.registration.dense.graph_fit import GraphFit, GraphMatches, fit_graph
 from torchreg.registration.dense.oriented_samples import OrientedSamples
-from torchreg.registration.dense.problem import ScanAlignProblem
+from torchreg.registration.dense.problem import ExpectedPlaces, ScanAlignProblem
+from torchreg.solvers.robust import cauchy_weight
+
+# Beyond so many stds from where it is expected, it says nothing any more where a sample is.
+_FAR_OFF = 3.0
 
 
 @dataclass(frozen=True)
@@ -49,13 +53,14 @@ class Reporter:
         )
 
 
-def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) -> Tensor:
+def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter, *, hold: bool = False) -> Tensor:
     """Return motions refined by EM: sigma shrinks, and the graph softens.
 
     Args:
         problem: the scans.
         transforms: (J, 4, 4) to start from.
         reporter: takes a record of each step.
+        hold: whether samples that the matcher calls hidden are held where they are expected.
     """
     config, plan = problem.config, problem.config.refine
     for step in range(plan.num_steps):
@@ -66,6 +71,8 @@ def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) ->
         matches = GraphMatches(
             slice(0, len(moved)), found.targets, found.posterior, found.normals, config.tangential_weight
         )
+        if hold and problem.expected is not None:
+            matches = matches.held_at(problem.expected.places, _held(problem, problem.expected, moved, sigma))
         fit = fit_graph(problem.graph, transforms, matches, stiffness, edge_scale=config.edge_scale)
         transforms = fit.transforms
         matched = float(found.posterior.mean())
@@ -73,42 +80,62 @@ def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) ->
     return transforms
 
 
+def _held(problem: ScanAlignProblem, expected: ExpectedPlaces, moved: OrientedSamples, sigma: float) -> Tensor:
+    """Return by how much samples (S,) are held where they are expected: those that the matcher calls hidden.
+
+    Their places have a Gaussian prior, beside that of matches, whose width is sigma. Parts that turned out of their
+    way are let go.
+    """
+    hidden = 1 - problem.prior.visible[: len(expected.places)]
+    apart = (moved.points - expected.places).square().sum(-1)
+    return hidden * (sigma / expected.std) ** 2 * cauchy_weight(apart / expected.std**2)
+
+
 def soft_matches(problem: ScanAlignProblem, moved: OrientedSamples, sigma: float, share: float = 1.0) -> SoftMatches:
     """Return the matches of an E-step, a share of the way through, of moved samples.
 
-    The matcher is doubted ever more: sigma falls far below what its tokens are apart.
+    The matcher is doubted ever more: sigma falls far below what its tokens are apart. What it calls hidden stays so.
     """
     config = problem.config
     return match_softly(
         moved, problem.target, sigma, normal_weight=config.normal_weight, outliers=config.outliers,
+        visible=problem.prior.visible[: len(moved)],
         prior=problem.prior, doubt=geometric_at((config.doubt, 1.0), share),
     )  # fmt: skip
 
 
 def judge(problem: ScanAlignProblem, name: str, transforms: Tensor) -> Hypothesis:
     """Return how well moved source and target cover each other, and how smooth it is."""
-    moved, config = problem.moved(transforms), problem.config
+    moved = problem.moved(transforms)
     forward = float(mismatch(problem, moved)[0].mean())
-    apart = NeighborTree(moved.points).nearest(problem.target.points)[1]
-    backward = float((apart / config.cap).clamp(max=1).square().mean())
-    smoothness = config.smoothness * float(problem.graph.smoothness(transforms))
+    backward = float(uncovered(problem, moved).mean())
+    smoothness = problem.config.smoothness * float(problem.graph.smoothness(transforms))
     deviation = float(deviations(problem, moved.points).mean())
     costs = (forward, backward, smoothness, deviation)
     return Hypothesis(name, sum(costs), *costs)
 
 
 def deviations(problem: ScanAlignProblem, places: Tensor) -> Tensor:
-    """Return squared distances of samples (S,) from where they are expected, in caps, at most one."""
+    """Return squared distances of samples (S,) from where they are expected, in `_FAR_OFF`, at most one."""
     if problem.expected is None:
         return torch.zeros_like(places[:, 0])
-    apart = (places - problem.expected).norm(dim=-1) / problem.config.cap
+    apart = (places - problem.expected.places).norm(dim=-1) / (_FAR_OFF * problem.expected.std)
     return apart.clamp(max=1).square()
 
 
 def mismatch(problem: ScanAlignProblem, moved: OrientedSamples) -> tuple[Tensor, Tensor]:
-    """Return squared distances (S,) of moved samples from the target, in caps, at most one, and the nearest targets."""
+    """Return what moved samples (S,) are expected to cost, and the target samples nearest to them.
+
+    The squared distance from the target, in caps, at most one, times the probability that the target shows the sample.
+    """
     index, apart = NeighborTree(problem.target.points).nearest(moved.points)
-    return (apart / problem.config.cap).clamp(max=1).square(), index
+    return problem.prior.visible[: len(apart)] * (apart / problem.config.cap).clamp(max=1).square(), index
+
+
+def uncovered(problem: ScanAlignProblem, moved: OrientedSamples) -> Tensor:
+    """Return the same of the target's samples (T,), by their distance from the moved source."""
+    apart = NeighborTree(moved.points).nearest(problem.target.points)[1]
+    return problem.prior.target_visible * (apart / problem.config.cap).clamp(max=1).square()
 
 
 def agree(problem: ScanAlignProblem, one: Tensor, other: Tensor) -> bool:
