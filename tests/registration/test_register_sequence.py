@@ -102,6 +102,14 @@ def test_how_steady_steps_are_is_estimated(kept):
     assert found.std == pytest.approx(1, rel=0.05)
 
 
+def test_hidden_points_do_not_run_away():
+    # Steps that were all alike go on, but those of a hidden point are predictions themselves.
+    places = [step * torch.ones(2, 3) for step in range(20)]
+    found = Motion().predict(places, torch.tensor([1.0, 0.0]))
+    torch.testing.assert_close(found.places[0], torch.full((3,), 20.0), rtol=0, atol=0.05)
+    torch.testing.assert_close(found.places[1], torch.full((3,), 19.5))
+
+
 def test_what_rests_is_expected_to_rest():
     places = torch.rand(7, 3, generator=torch.Generator().manual_seed(0))
     found = Motion().predict([places] * 3)

@@ -80,8 +80,14 @@ class Motion:
 
     momentum: float = 0.5
 
-    def predict(self, places: Sequence[Tensor]) -> ExpectedPlaces | None:
-        """Return where points (N, 3) are expected after places so far, the latest last; None before two of them."""
+    def predict(self, places: Sequence[Tensor], seen: Tensor | None = None) -> ExpectedPlaces | None:
+        """Return where points (N, 3) are expected after places so far, the latest last; None before two of them.
+
+        Args:
+            places: T of (N, 3).
+            seen: (N,) from 0 to 1, how surely a point was in the latest place; ones by default. Of a point that was
+                hidden the last step is itself a prediction, and what is known beforehand holds.
+        """
         if len(places) < 2:
             return None
         steps = torch.stack(tuple(places)).diff(dim=0)
@@ -90,7 +96,8 @@ class Motion:
         together = self.momentum * power + (before * after).mean((1, 2)).sum()
         kept = (together / (power + before.square().mean((1, 2)).sum()).clamp_min(tiny)).clamp(0, 1)
         new = (1 - self.momentum**2) * power + (after - kept * before).square().mean((1, 2)).sum()
-        return ExpectedPlaces(places[-1] + kept * steps[-1], float(new / len(steps)) ** 0.5)
+        share = kept if seen is None else torch.lerp(torch.full_like(seen, self.momentum), kept, seen).unsqueeze(1)
+        return ExpectedPlaces(places[-1] + share * steps[-1], float(new / len(steps)) ** 0.5)
 
 
 @dataclass(frozen=True)
@@ -244,7 +251,9 @@ def _aligned_frames(
             found = align_scans(
                 current, scans[frame], config.align,
                 generator=generator, on_step=initial_records(on_step),
-                expected=MOTION.predict([deformed[past] for past in range(reference, frame, step)]),
+                expected=MOTION.predict(
+                    [deformed[past] for past in range(reference, frame, step)], confidence[frame - step]
+                ),
             )  # fmt: skip
             aligned[frame], confidence[frame] = found.points, found.point_confidence
             # A frame is reached through those before it.
