@@ -47,7 +47,7 @@ SEARCHED, OTHER, PICTURES, CUT, STRETCHED, WHOLE = 0.67, 0.7, 0.5, 0.3, 0.3, 0.4
 SENSORS = (DepthNoise.structured_light(), DepthNoise.time_of_flight(), DepthNoise(quadratic=1e-3, jitter=0.3))
 OTHER_SCALES = (0.05, 0.05, 0.1, 0.1, 0.15)
 FOCAL, WIDTH, HEIGHT = 475.0, 320, 240
-RIDGE, EPOCHS, BINS, MIN_CASES = 0.0015, 200, 10, 15
+RIDGE, EPOCHS, BINS, HANDS = 0.0015, 200, 10, 8
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,8 @@ class Case:
     confidence: float
     covered: bool
     seconds: float
+    seed: int
+    pose: Tensor
 
 
 def subject(name: str, shape: tr.ArticulatedShape, others: Sequence[tr.ArticulatedShape] = ()) -> Subject:
@@ -218,17 +220,29 @@ def measure(thing: Subject, seed: int) -> Case:
     inside = torch.special.gammainc(torch.tensor(0.5 * len(off), dtype=torch.float64), 0.5 * deviation) <= 0.95
     return Case(
         kind=kind, searched=searched, status=found.status, error=float(error) / thing.size, evidence=found.evidence,
-        confidence=float(found.confidence), covered=bool(inside), seconds=seconds,
+        confidence=float(found.confidence), covered=bool(inside), seconds=seconds, seed=seed, pose=found.pose,
     )  # fmt: skip
 
 
-def collect(things: Sequence[Subject], count: int, seed: int) -> list[Case]:
-    """Return cases of all subjects, hands three times as often as each other one."""
-    turns = [thing for thing in things for _ in range(3 if thing.name == "hand" else 1)]
-    return [
-        measure(turns[number % len(turns)], seed + number)
-        for number in tqdm(range(count), desc="alignments", leave=False, disable=None)
-    ]
+def collect(things: Sequence[Subject], seeds: Sequence[int], kept: Path | None = None) -> list[Case]:
+    """Return cases of some seeds of all subjects, hands eight times as often as each other one.
+
+    Args:
+        things: subjects.
+        seeds: of the cases.
+        kept: file of measured cases, which are not measured again; new ones are added.
+    """
+    turns = [thing for thing in things for _ in range(HANDS if thing.name == "hand" else 1)]
+    known = {}
+    if kept is not None and kept.exists():
+        known = {case.seed: case for case in torch.load(kept, weights_only=False)}
+    for number, seed in enumerate(tqdm(seeds, desc="alignments", leave=False, disable=None)):
+        if seed in known:
+            continue
+        known[seed] = measure(turns[seed % len(turns)], seed)
+        if kept is not None and (number % 10 == 9 or seed == seeds[-1]):
+            torch.save(list(known.values()), kept)
+    return [known[seed] for seed in seeds]
 
 
 def is_right(cases: Sequence[Case]) -> Tensor:

@@ -12,7 +12,7 @@ from torchreg._threads import one_thread
 from torchreg.alignment.confidence import explains
 from torchreg.alignment.fit_proposals import best_proposal, best_proposals, with_proposed_prior
 from torchreg.alignment.known_dofs import KnownDofs
-from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer, check_proposer, shipped_proposer
+from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer, check_proposer, shared_proposer
 from torchreg.alignment.problem import AlignProblem, centered_problem
 from torchreg.alignment.reliability import CALIBRATION
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource
@@ -52,7 +52,7 @@ class StartSource:
         """
         if sources is not None and not sources:
             raise InputError("sources must hold at least one source of rough poses, got none")
-        proposer = shipped_proposer(shape) if sources is None and initializer is None else None
+        proposer = shared_proposer(shape) if sources is None and initializer is None else None
         if initializer is not None:
             proposer = check_proposer(shape, initializer)
         return cls(DEFAULT_SOURCES if sources is None else sources, proposer)
