@@ -37,7 +37,10 @@ def surest_crop(
     """
     best: tuple[Answer, DepthFrame] | None = None
     for crops in candidate_crops(frame, size):
-        for crop in _likely_first(crops, shows):
+        for crop, is_likely in _likely_first(crops, shows):
+            # What a glance speaks against is searched where no other crop is believed.
+            if best is not None and not is_likely and _confidence(best[0]) >= CHOICE.enough:
+                break
             found = answer(crop)
             if best is None or _confidence(found) > _confidence(best[0]):
                 best = found, crop
@@ -52,15 +55,17 @@ def surest_crop(
     return answer(everything), everything
 
 
-def _likely_first(crops: Iterable[DepthFrame], shows: Callable[[DepthFrame], bool]) -> Iterator[DepthFrame]:
-    """Yield crops, those that need a search to tell whether they show anything last."""
+def _likely_first(
+    crops: Iterable[DepthFrame], shows: Callable[[DepthFrame], bool]
+) -> Iterator[tuple[DepthFrame, bool]]:
+    """Yield crops and whether they are likely; those that need a search to tell whether they show anything last."""
     others = []
     for crop in crops:
         if shows(crop):
-            yield crop
+            yield crop, True
         else:
             others.append(crop)
-    yield from others
+    yield from ((crop, False) for crop in others)
 
 
 def _confidence(found: Any) -> float:

@@ -15,7 +15,7 @@ from torchreg.alignment.clusters import OFF_SURFACE, clustered_data
 from torchreg.alignment.confidence import EVIDENCE, beside_share, end_spreads, limb_data, limb_points
 from torchreg.alignment.patches import errors_per_patch
 from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem, free_space_loss
-from torchreg.alignment.shape_errors import proportion_covariance
+from torchreg.alignment.shape_errors import shape_covariance
 from torchreg.alignment.surface_fit import SURFACE_FIT, pose_covariance, surface_noise, surface_objective
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import beyond_cut
@@ -277,8 +277,9 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
     """Return the covariance of fitted poses (B, num_dofs), and what another step would gain.
 
     Neighboring data err together: the correlation of their residuals says how many of them count as one. Beside noise,
-    a patch of the surface errs by what the model is not exact, and the proportions of solids may be wrong. What no data
-    tell is as uncertain as the joints' limits leave it, and so is a limb that hardly any data show.
+    a patch of the surface errs by what the model is not exact, and of solids so does the whole surface; their
+    proportions may be wrong, too. What no data tell is as uncertain as the joints' limits leave it, and so is a limb
+    that hardly any data show.
     """
     distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
     noise = surface_noise(distance, problem.valid, problem.size)
@@ -303,12 +304,12 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
         gradient = jacobian.mT @ (near / (noise.square() * shared).unsqueeze(-1)).unsqueeze(-1)
         moved = covariance @ gradient * error[:, None, None]
         covariance = _of_noisier_data(covariance, precision, (error / noise).square()) + moved @ moved.mT
-    proportions = proportion_covariance(
+    inexact_shape = shape_covariance(
         problem, pose, distance=distance, jacobian=jacobian, factor=near.sqrt() / noise.unsqueeze(-1),
         covariance=pose_covariance(jacobian, near, noise, precision), share=correlation,
     )  # fmt: skip
     misplaced = torch.diag_embed(_misplaced_share(problem, pose) / precision)
-    return Curvature((covariance + misplaced + proportions).to(pose), gain)
+    return Curvature((covariance + misplaced + inexact_shape).to(pose), gain)
 
 
 def _of_noisier_data(covariance: Tensor, precision: Tensor, excess: Tensor) -> Tensor:

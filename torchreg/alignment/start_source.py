@@ -14,7 +14,7 @@ from torchreg.alignment.fit_proposals import best_proposal, best_proposals, with
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer, check_proposer, shared_proposer
 from torchreg.alignment.problem import AlignProblem, centered_problem
-from torchreg.alignment.reliability import CALIBRATION
+from torchreg.alignment.reliability import CALIBRATION, without_cut
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.free_space import FreeSpace
@@ -90,7 +90,8 @@ class StartSource:
         )  # fmt: skip
         with one_thread():
             best = best_proposal(problem, self.proposer.propose(data, valid))
-            return bool(explains(problem, best.pose, best.lead) >= CALIBRATION.doubtful)
+            judged = without_cut(problem, best.pose, [near])
+            return bool(explains(judged, best.pose, best.lead) >= CALIBRATION.doubtful)
 
     def _told(self, problem: AlignProblem, poses: Tensor) -> Tensor:
         return problem.clamp_candidates(poses if self.known is None else self.known.informed(problem, poses))
