@@ -25,7 +25,7 @@ def test_the_weights_of_another_shape_are_refused(tmp_path):
     cloud, rig = tmp_path / "cloud.csv", tmp_path / "rod.urdf"
     cloud.write_text("x,y,z\n" + "\n".join(f"{0.01 * k},0,0.1" for k in range(20)))
     rig.write_text(
-        '<robot name="rod"><link name="rod"><visual><geometry><box size="0.1 0.1 0.4"/></geometry></visual></link></robot>'
+        '<robot name="rod"><link name="rod"><visual><geometry><sphere radius="0.1"/></geometry></visual></link></robot>'
     )
     for command, shape, told in (
         (["align", "-o", str(tmp_path / "out")], "hand-left", "another shape"),

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchreg.alignment.clusters import OFF_SURFACE, clustered_data
 from torchreg.alignment.confidence import EVIDENCE, beside_share, end_spreads, limb_data, limb_points
 from torchreg.alignment.patches import errors_per_patch
-from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem, free_space_loss
+from torchreg.alignment.problem import BROAD_PRIOR, INLIER_SHARE, AlignProblem, free_space_loss
 from torchreg.alignment.shape_errors import shape_covariance
 from torchreg.alignment.surface_fit import SURFACE_FIT, pose_covariance, surface_noise, surface_objective
 from torchreg.capture.depth_frame import DepthFrame
@@ -202,41 +202,41 @@ def gather_evidence(problem: AlignProblem, pose: Tensor, lead: Tensor | None, sp
     clustered, on_surface = clustered_data(problem, pose)
     return weigh(
         problem,
-        pose,
         distance,
         beside=beside_share(problem, pose),
         clustered=clustered.to(pose) / on_surface.clamp_min(1),
         spread=spreads.mean(-1),
+        intruding=free_space_loss(problem, pose, INLIER_SHARE),
         lead=lead,
     )
 
 
 def weigh(
     problem: AlignProblem,
-    pose: Tensor,
     distance: Tensor,
     *,
     beside: Tensor,
     clustered: Tensor,
     spread: Tensor,
+    intruding: Tensor | float,
     lead: Tensor | None = None,
 ) -> Evidence:
-    """Return the evidence for poses (B, num_dofs), of which the costly part is known.
+    """Return the evidence for poses, of which the costly part is known.
 
     Args:
         problem: the batch.
-        pose: fitted.
         distance: (B, M) of the data from the surface.
         beside: (B,) share of the data beside the surface, see `beside_share`.
         clustered: (B,) data in clusters, as a share of those on the surface.
         spread: (B,) mean of `end_spreads`, metres.
+        intruding: (B,) the `free_space_loss` of width `INLIER_SHARE`.
         lead: see `gather_evidence`.
     """
     noise = surface_noise(distance, problem.valid, problem.size)
     least = SURFACE_FIT.min_noise(problem.size)
-    count = problem.valid.sum(-1).clamp_min(1).to(pose)
-    near = ((distance.abs() < SURFACE_FIT.max_width * problem.size) & problem.valid).sum(-1).to(pose)
-    intruding = torch.zeros_like(noise) + free_space_loss(problem, pose, SURFACE_FIT.max_width)
+    count = problem.valid.sum(-1).clamp_min(1).to(distance)
+    near = ((distance.abs() < SURFACE_FIT.max_width * problem.size) & problem.valid).sum(-1).to(distance)
+    intruding = torch.zeros_like(noise) + intruding
     lead = torch.full_like(noise, torch.inf) if lead is None else lead.clamp_min(0)
     return Evidence(
         noise=(noise / least).log() / math.log(SURFACE_FIT.max_noise(problem.size) / least),
