@@ -1,7 +1,7 @@
 """How far the confidence and the covariance of an alignment can be trusted, on made-up data.
 
     python benchmarks/confidence.py --data SHARED              # reliability on data not used to calibrate
-    python benchmarks/confidence.py --data SHARED --calibrate  # fits the model anew first, also without each kind
+    python benchmarks/confidence.py --data SHARED --calibrate  # fits the model anew, also to halves and without a kind
     python benchmarks/confidence.py --diagram FILE.png         # draws the reliability beside
     python benchmarks/confidence.py --smoke                    # a few alignments, to see that it runs
 
@@ -341,13 +341,19 @@ def calibrated(cases: Sequence[Case]) -> Calibration:
     return replace(CALIBRATION, bias=round(bias, 2), weights=weights)
 
 
-def left_out(known: Sequence[Case], new: Sequence[Case]) -> str:
+def crossed(cases: Sequence[Case]) -> list[Case]:
+    """Return all cases with the confidence of a model that was calibrated to the other half of them, even or odd."""
+    even, odd = (cases[start::2] for start in (0, 1))
+    return [*as_calibrated(even, calibrated(odd)), *as_calibrated(odd, calibrated(even))]
+
+
+def left_out(cases: Sequence[Case]) -> str:
     """Return the tables of each kind of cases, by the model that was calibrated without that kind."""
     told: list[Case] = []
     lines = []
-    for kind in sorted({case.kind for case in known}):
-        others = calibrated([case for case in known if case.kind != kind])
-        held_out = as_calibrated([case for case in (*known, *new) if case.kind == kind], others)
+    for kind in sorted({case.kind for case in cases}):
+        others = calibrated([case for case in cases if case.kind != kind])
+        held_out = as_calibrated([case for case in cases if case.kind == kind], others)
         area = area_under_curve(confidences(held_out), is_right(held_out))
         mean, share = float(confidences(held_out).mean()), float(is_right(held_out).double().mean())
         lines.append(
@@ -406,24 +412,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with xarm7 and rigs")
     parser.add_argument("--count", type=int, default=200, help="alignments")
-    parser.add_argument("--calibrate", action="store_true", help="fit the model anew to other alignments first")
+    parser.add_argument(
+        "--calibrate", action="store_true", help="fit the model anew: to all, to halves, and without each kind"
+    )
     parser.add_argument("--diagram", type=Path, help="picture of the reliability to be written")
     parser.add_argument("--kept", type=Path, help="file of measured cases, to go on with; of this version only")
     parser.add_argument("--smoke", action="store_true", help="four alignments")
     options = parser.parse_args(arguments)
     things = subjects(None if options.smoke else options.data)
     count = 4 if options.smoke else options.count
-    seeds = range(count)
+    cases = collect(things, range(count), options.kept)
     if options.calibrate:
-        known = collect(things, range(count, 2 * count), options.kept)
-        calibration = calibrated(known)
+        calibration = calibrated(cases)
         names = [item.name for item in fields(Evidence)]
         weights = ", ".join(f"{name} {weight}" for name, weight in zip(names, calibration.weights, strict=True))
-        print(f"{len(known)} cases: bias {calibration.bias:.2f}, {weights}")
-        cases = as_calibrated(collect(things, seeds, options.kept), calibration)
-        print(left_out(known, cases), "not used to calibrate", sep="\n")
-    else:
-        cases = collect(things, seeds, options.kept)
+        print(f"{count} cases: bias {calibration.bias:.2f}, {weights}", left_out(cases), sep="\n")
+        print("each half by a model calibrated to the other")
+        cases = crossed(cases)
     print(render(cases))
     if options.diagram is not None:
         draw(cases, options.diagram)
