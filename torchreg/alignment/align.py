@@ -245,7 +245,7 @@ def align(
                 align, shape, model_points=skin, locked=locked, prior=prior, keypoints=keypoints,
                 keypoint_std=keypoint_std, fit_shape=fit_shape, initializer=initializer, config=config, on_step=on_step,
             ),
-            partial(source.shows, skin),
+            partial(source.glance, skin),
         )  # fmt: skip
         return replace(found, crop=crop.mask)
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)

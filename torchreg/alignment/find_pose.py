@@ -163,7 +163,7 @@ def find_pose(
             find_pose, shape, num_starts=num_starts, sources=sources, initializer=initializer, model_points=skin,
             locked=locked, prior=prior, keypoints=keypoints, keypoint_std=keypoint_std, config=config,
         )  # fmt: skip
-        return surest_crop(data, model_size(skin), search, partial(source.shows, skin))[0]
+        return surest_crop(data, model_size(skin), search, partial(source.glance, skin))[0]
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
     far = floating_origin(shape, seen.points)
     near = seen if far is None else seen.near(far)
