@@ -1,7 +1,7 @@
 """How far the confidence and the covariance of an alignment can be trusted, on made-up data.
 
     python benchmarks/confidence.py --data SHARED              # reliability on data not used to calibrate
-    python benchmarks/confidence.py --data SHARED --calibrate  # fits the model of the confidence anew
+    python benchmarks/confidence.py --data SHARED --calibrate  # fits the model anew, also to halves and without a kind
     python benchmarks/confidence.py --diagram FILE.png         # draws the reliability beside
     python benchmarks/confidence.py --smoke                    # a few alignments, to see that it runs
 
@@ -13,8 +13,9 @@ start; the others start from the truth, turned by up to half a turn.
 
 A pose is right if the ends of its limbs are off by at most 5.8 % of the shape's size on average: 15 mm of a hand.
 
-Bars: in every tenth of the confidence with 15 cases or more, the share that is right is within .1 of the mean
-confidence; the area under its curve is .85 or more; of right poses 90 to 98 % lie in the covariance's 95 % ellipsoid.
+Bars: in every tenth of the confidence the share that is right is within .1 of the mean confidence, or its 95 %
+(Wilson) interval reaches there ("chance"); the area under its curve is .85 or more; of right poses 90 to 98 % lie in
+the covariance's 95 % ellipsoid.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from tqdm import tqdm
 
 import torchreg as tr
 from torchreg.alignment.confidence import limb_ends
-from torchreg.alignment.reliability import CALIBRATION, Evidence
+from torchreg.alignment.reliability import CALIBRATION, Calibration, Evidence, confidence_of
 from torchreg.capture.depth_noise import DepthNoise
 from torchreg.datasets.hand import make_hand_cloud, surface_skin
 from torchreg.datasets.sequences import other_hand
@@ -47,7 +48,7 @@ SEARCHED, OTHER, PICTURES, CUT, STRETCHED, WHOLE = 0.67, 0.7, 0.5, 0.3, 0.3, 0.4
 SENSORS = (DepthNoise.structured_light(), DepthNoise.time_of_flight(), DepthNoise(quadratic=1e-3, jitter=0.3))
 OTHER_SCALES = (0.05, 0.05, 0.1, 0.1, 0.15)
 FOCAL, WIDTH, HEIGHT = 475.0, 320, 240
-RIDGE, EPOCHS, BINS, MIN_CASES = 0.0015, 200, 10, 15
+RIDGE, EPOCHS, BINS, HANDS = 0.0015, 200, 10, 8
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,8 @@ class Case:
     confidence: float
     covered: bool
     seconds: float
+    seed: int
+    pose: Tensor
 
 
 def subject(name: str, shape: tr.ArticulatedShape, others: Sequence[tr.ArticulatedShape] = ()) -> Subject:
@@ -218,17 +221,29 @@ def measure(thing: Subject, seed: int) -> Case:
     inside = torch.special.gammainc(torch.tensor(0.5 * len(off), dtype=torch.float64), 0.5 * deviation) <= 0.95
     return Case(
         kind=kind, searched=searched, status=found.status, error=float(error) / thing.size, evidence=found.evidence,
-        confidence=float(found.confidence), covered=bool(inside), seconds=seconds,
+        confidence=float(found.confidence), covered=bool(inside), seconds=seconds, seed=seed, pose=found.pose,
     )  # fmt: skip
 
 
-def collect(things: Sequence[Subject], count: int, seed: int) -> list[Case]:
-    """Return cases of all subjects, hands three times as often as each other one."""
-    turns = [thing for thing in things for _ in range(3 if thing.name == "hand" else 1)]
-    return [
-        measure(turns[number % len(turns)], seed + number)
-        for number in tqdm(range(count), desc="alignments", leave=False, disable=None)
-    ]
+def collect(things: Sequence[Subject], seeds: Sequence[int], kept: Path | None = None) -> list[Case]:
+    """Return cases of some seeds of all subjects, hands eight times as often as each other one.
+
+    Args:
+        things: subjects.
+        seeds: of the cases.
+        kept: file of measured cases, which are not measured again; new ones are added.
+    """
+    turns = [thing for thing in things for _ in range(HANDS if thing.name == "hand" else 1)]
+    known = {}
+    if kept is not None and kept.exists():
+        known = {case.seed: case for case in torch.load(kept, weights_only=False)}
+    for number, seed in enumerate(tqdm(seeds, desc="alignments", leave=False, disable=None)):
+        if seed in known:
+            continue
+        known[seed] = measure(turns[seed % len(turns)], seed)
+        if kept is not None and (number % 10 == 9 or seed == seeds[-1]):
+            torch.save(list(known.values()), kept)
+    return [known[seed] for seed in seeds]
 
 
 def is_right(cases: Sequence[Case]) -> Tensor:
@@ -271,27 +286,89 @@ def area_under_curve(confidence: Tensor, right: Tensor) -> float:
 
 def render(cases: Sequence[Case]) -> str:
     """Return the tables of reliability, of statuses and of coverage."""
-    right, confidence = is_right(cases), torch.tensor([case.confidence for case in cases])
-    lines = [f"{'confidence':12} {'cases':>6} {'mean':>6} {'right':>6}"]
-    for low in torch.arange(BINS) / BINS:
-        chosen = (confidence >= low) & ((confidence < low + 1 / BINS) | (low + 1 / BINS >= 1))
-        if not bool(chosen.any()):
-            continue
-        mean, share = float(confidence[chosen].mean()), float(right[chosen].double().mean())
-        bar = "" if int(chosen.sum()) < MIN_CASES else "  pass" if abs(mean - share) <= 0.1 else "  FAIL"
-        lines.append(f"{low:4.1f} to {low + 1 / BINS:3.1f}  {int(chosen.sum()):6} {mean:6.2f} {share:6.2f}{bar}")
-    area = area_under_curve(confidence, right)
+    lines = reliability(cases)
+    area = area_under_curve(confidences(cases), is_right(cases))
     lines.append(f"area under the curve {area:.3f}  >= .85: {'pass' if area >= 0.85 else 'FAIL'}")
     for kind in sorted({case.kind for case in cases}):
         lines.append(line_of(kind, [case for case in cases if case.kind == kind]))
     return "\n".join(lines)
 
 
+def confidences(cases: Sequence[Case]) -> Tensor:
+    return torch.tensor([case.confidence for case in cases])
+
+
+def reliability(cases: Sequence[Case]) -> list[str]:
+    """Return for each tenth of the confidence the cases, the mean, the share that is right, and whether they agree.
+
+    They do if the share is within .1 of the mean, but for chance: if its 95 % interval reaches there.
+    """
+    right, confidence = is_right(cases), confidences(cases)
+    lines = [f"{'confidence':12} {'cases':>6} {'mean':>6} {'right':>6}  95 % interval"]
+    for low in torch.arange(BINS) / BINS:
+        chosen = (confidence >= low) & ((confidence < low + 1 / BINS) | (low + 1 / BINS >= 1))
+        count = int(chosen.sum())
+        if count == 0:
+            continue
+        mean, share = float(confidence[chosen].mean()), float(right[chosen].double().mean())
+        least, most = wilson_interval(share, count)
+        near = "pass" if abs(mean - share) <= 0.1 else "chance" if least - 0.1 <= mean <= most + 0.1 else "FAIL"
+        span = f"{least:.2f} to {most:.2f}  {near}"
+        lines.append(f"{low:4.1f} to {low + 1 / BINS:3.1f}  {count:6} {mean:6.2f} {share:6.2f}  {span}")
+    return lines
+
+
+def as_calibrated(cases: Sequence[Case], calibration: Calibration) -> list[Case]:
+    """Return cases with the confidence, and what follows from it, of another calibration."""
+    table = torch.stack([case.evidence for case in cases]).double()
+    sure = confidence_of(table, calibration).tolist()
+    return [
+        replace(case, confidence=value, status=_status_of(case.status, value, calibration))
+        for case, value in zip(cases, sure, strict=True)
+    ]
+
+
+def _status_of(status: tr.Status, confidence: float, calibration: Calibration) -> tr.Status:
+    """Return the status of a case of another confidence; of one that was doubtful it is not known, but mostly this."""
+    if status.usable or status is tr.Status.DOUBTFUL:
+        was_sure = tr.Status.CONVERGED if status is tr.Status.DOUBTFUL else status
+        return tr.Status.DOUBTFUL if confidence < calibration.doubtful else was_sure
+    return status
+
+
+def calibrated(cases: Sequence[Case]) -> Calibration:
+    bias, weights = fitted_model(torch.stack([case.evidence for case in cases]), is_right(cases))
+    return replace(CALIBRATION, bias=round(bias, 2), weights=weights)
+
+
+def crossed(cases: Sequence[Case]) -> list[Case]:
+    """Return all cases with the confidence of a model that was calibrated to the other half of them, even or odd."""
+    even, odd = (cases[start::2] for start in (0, 1))
+    return [*as_calibrated(even, calibrated(odd)), *as_calibrated(odd, calibrated(even))]
+
+
+def left_out(cases: Sequence[Case]) -> str:
+    """Return the tables of each kind of cases, by the model that was calibrated without that kind."""
+    told: list[Case] = []
+    lines = []
+    for kind in sorted({case.kind for case in cases}):
+        others = calibrated([case for case in cases if case.kind != kind])
+        held_out = as_calibrated([case for case in cases if case.kind == kind], others)
+        area = area_under_curve(confidences(held_out), is_right(held_out))
+        mean, share = float(confidences(held_out).mean()), float(is_right(held_out).double().mean())
+        lines.append(
+            f"calibrated without {kind:8}: {len(held_out):4} cases, mean confidence {mean:.2f}, right {share:.2f}, "
+            f"area under the curve {area:.2f}"
+        )
+        told += held_out
+    return "\n".join([*lines, "these together", *reliability(told)])
+
+
 def draw(cases: Sequence[Case], file: Path) -> None:
     """Draw the share that is right over the mean confidence, with 95 % intervals, and how many cases there are."""
     from matplotlib import pyplot
 
-    right, confidence = is_right(cases).double(), torch.tensor([case.confidence for case in cases], dtype=torch.float64)
+    right, confidence = is_right(cases).double(), confidences(cases).double()
     number = (confidence * BINS).long().clamp_max(BINS - 1)
     figure, (axis, below) = pyplot.subplots(2, 1, figsize=(4.5, 5.2), height_ratios=(3, 1), sharex=True)
     axis.fill_between([0, 1], [-0.1, 0.9], [0.1, 1.1], color="0.9", label="within .1")
@@ -335,18 +412,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with xarm7 and rigs")
     parser.add_argument("--count", type=int, default=200, help="alignments")
-    parser.add_argument("--calibrate", action="store_true", help="fit the model anew to other alignments first")
+    parser.add_argument(
+        "--calibrate", action="store_true", help="fit the model anew: to all, to halves, and without each kind"
+    )
     parser.add_argument("--diagram", type=Path, help="picture of the reliability to be written")
+    parser.add_argument("--kept", type=Path, help="file of measured cases, to go on with; of this version only")
     parser.add_argument("--smoke", action="store_true", help="four alignments")
     options = parser.parse_args(arguments)
     things = subjects(None if options.smoke else options.data)
     count = 4 if options.smoke else options.count
+    cases = collect(things, range(count), options.kept)
     if options.calibrate:
-        cases = collect(things, count, seed=count)
-        bias, weights = fitted_model(torch.stack([case.evidence for case in cases]), is_right(cases))
+        calibration = calibrated(cases)
         names = [item.name for item in fields(Evidence)]
-        print(f"bias {bias:.2f}, " + ", ".join(f"{name} {weight}" for name, weight in zip(names, weights, strict=True)))
-    cases = collect(things, count, seed=0)
+        weights = ", ".join(f"{name} {weight}" for name, weight in zip(names, calibration.weights, strict=True))
+        print(f"{count} cases: bias {calibration.bias:.2f}, {weights}", left_out(cases), sep="\n")
+        print("each half by a model calibrated to the other")
+        cases = crossed(cases)
     print(render(cases))
     if options.diagram is not None:
         draw(cases, options.diagram)

@@ -10,7 +10,7 @@ from torchreg.alignment import train_initializer as train_module
 from torchreg.alignment.align import align
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.pose_initializer import PoseInitializer, PoseInitializerConfig
-from torchreg.alignment.pose_proposer import HAND_WEIGHTS, PoseProposer, ProposerSize
+from torchreg.alignment.pose_proposer import HAND_WEIGHTS, PoseProposer, ProposerSize, shared_proposer
 from torchreg.alignment.train_initializer import TrainInitializerConfig, train_initializer
 from torchreg.datasets.cloud_batches import random_clouds, random_poses
 from torchreg.datasets.hand import make_hand_cloud, random_hand_pose
@@ -62,6 +62,13 @@ def test_a_left_hand_is_found_as_the_right_one_in_a_mirror(plain_hand, clouds):
     torch.testing.assert_close(seen.surface, found.surface * flip, atol=1e-4, rtol=0)
     with pytest.raises(FormatError, match="another shape"):
         PoseProposer.load(HAND_WEIGHTS, Hand(side="left"))
+
+
+def test_the_network_of_a_shape_is_read_once_and_anew_for_another(plain_hand):
+    assert shared_proposer(plain_hand) is shared_proposer(Hand())
+    assert shared_proposer(Hand(side="left")).mirrored
+    assert shared_proposer(Hand(scale=2.0)).shape_size == pytest.approx(2 * shared_proposer(plain_hand).shape_size)
+    assert PoseInitializer(plain_hand).proposer is not shared_proposer(plain_hand)
 
 
 def test_a_hand_as_large_as_a_house_is_found_by_the_same_network(plain_hand, clouds):

@@ -34,6 +34,26 @@ def test_the_interval_of_a_share_holds_it_and_shrinks(bench):
 
 
 def test_the_diagram_is_drawn(bench, tmp_path):
-    case = bench.Case("hand", True, bench.tr.Status.CONVERGED, 0.01, torch.zeros(8), 0.95, True, 0.1)
+    case = bench.Case(
+        "hand", True, bench.tr.Status.CONVERGED, 0.01, torch.zeros(8), 0.95, True, 0.1, 0, torch.zeros(27)
+    )
     bench.draw([case, bench.replace(case, confidence=0.2, error=1.0)], tmp_path / "r.png")
     assert (tmp_path / "r.png").stat().st_size > 1000
+
+
+def test_confidence_is_judged_by_cases_of_other_halves_and_kinds(bench):
+    generator = torch.Generator().manual_seed(1)
+    case = bench.Case(
+        "hand", True, bench.tr.Status.CONVERGED, 0.01, torch.zeros(8), 0.95, True, 0.1, 0, torch.zeros(27)
+    )
+    unknown = torch.rand(400, generator=generator)
+    wrong = torch.rand(400, generator=generator) < unknown
+    cases = [
+        bench.replace(case, kind=kind, evidence=value * torch.eye(8)[5], error=float(is_wrong))
+        for kind, value, is_wrong in zip(["hand", "arm"] * 200, unknown, wrong, strict=True)
+    ]
+    for held_out in (bench.reliability(bench.crossed(cases)), bench.left_out(cases).splitlines()):
+        assert "FAIL" not in "\n".join(held_out)
+    assert "calibrated without arm" in held_out[0]
+    # Nothing tells them apart any more: all are as sure.
+    assert "FAIL" in bench.reliability([bench.replace(entry, confidence=0.95) for entry in cases])[1]

@@ -112,6 +112,9 @@ def test_the_gradient_is_that_of_finite_differences(camera):
     points = camera.unproject(pixels, depths) - space.origin
     intrusion, slope = space.intrusion_gradient(points[None])
     torch.testing.assert_close(intrusion, space.intrusion(points[None]))
+    few = space.intruding(points[None], 0.01)
+    assert few[0].tolist() == (intrusion[0] > 0.01).nonzero()[:, 0].tolist()
+    torch.testing.assert_close(few[1:], (intrusion[:, few[0]], slope[:, few[0]]))
     step = 1e-7 * torch.eye(3, dtype=torch.float64)
     ahead, back = (space.intrusion((points.unsqueeze(1) + sign * step).reshape(1, -1, 3)) for sign in (1, -1))
     numeric = ((ahead - back) / 2e-7).reshape(200, 3)

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typer.testing import CliRunner
 
 from torchreg.alignment import train_initializer as train_module
-from torchreg.alignment.pose_proposer import PoseProposer
+from torchreg.alignment.pose_proposer import HAND_WEIGHTS, PoseProposer
 from torchreg.cli.application import app
 from torchreg.shapes.hand import Hand
 
@@ -19,6 +19,25 @@ def test_weights_are_written_and_loaded(tmp_path, monkeypatch):
     assert found.exit_code == 0, found.output
     assert "step 1 " in found.output
     assert PoseProposer.load(path, Hand()).dof_names == tuple(Hand().dof_names)
+
+
+def test_the_weights_of_another_shape_are_refused(tmp_path):
+    cloud, rig = tmp_path / "cloud.csv", tmp_path / "rod.urdf"
+    cloud.write_text("x,y,z\n" + "\n".join(f"{0.01 * k},0,0.1" for k in range(20)))
+    rig.write_text(
+        '<robot name="rod"><link name="rod"><visual><geometry><sphere radius="0.1"/></geometry></visual></link></robot>'
+    )
+    for command, shape, told in (
+        (["align", "-o", str(tmp_path / "out")], "hand-left", "another shape"),
+        (["track", "-o", str(tmp_path / "track")], str(rig), "another shape"),
+        (["align", "--side", "either", "-o", str(tmp_path / "either")], "hand", "--side either"),
+    ):
+        found = CliRunner().invoke(
+            app, [command[0], shape, str(cloud), *command[1:], "--initializer", str(HAND_WEIGHTS)]
+        )
+        assert found.exit_code == 2
+        assert told in found.output
+    assert not list(tmp_path.glob("*.json"))
 
 
 def test_a_base_that_is_bolted_down_is_refused(tmp_path):

@@ -36,6 +36,7 @@ from torchreg.alignment.inputs import (
 )
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmark_fit import align_keypoints, measured_alone
+from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.problem import (
     INLIER_SHARE,
     AlignProblem,
@@ -167,6 +168,7 @@ def align(
     fit_shape: bool | str = False,
     keypoints: Tensor | None = None,
     keypoint_std: Tensor | float | None = None,
+    initializer: PoseProposer | HoldsProposer | None = None,
     config: AlignConfig | None = None,
     on_step: OnStep | None = None,
 ) -> AlignResult:
@@ -203,6 +205,7 @@ def align(
             those not seen. (B, K, 3) or (B, K, 2) for a batch.
         keypoint_std: their standard deviation, () or (K,), in metres or pixels; by default 3 % of the shape's size, or
             5 pixels. Beyond three of them a keypoint is taken for wrong.
+        initializer: a network that proposes poses where there is no start, see `find_pose`; the built-in hand has one.
         config: see `AlignConfig`.
         on_step: called with an `AlignRecord` after each iteration.
 
@@ -224,7 +227,7 @@ def align(
 
     References: Dewaele et al. 2006, section 3.
     """
-    config = config or AlignConfig()
+    config, source = config or AlignConfig(), StartSource.of(shape, initializer=initializer)
     if isinstance(initial_pose, Mapping):
         initial_pose = shape.pose_from_dict(initial_pose)
     if data is None or isinstance(data, Camera):
@@ -240,23 +243,25 @@ def align(
             model_size(skin),
             partial(
                 align, shape, model_points=skin, locked=locked, prior=prior, keypoints=keypoints,
-                keypoint_std=keypoint_std, fit_shape=fit_shape, config=config, on_step=on_step,
+                keypoint_std=keypoint_std, fit_shape=fit_shape, initializer=initializer, config=config, on_step=on_step,
             ),
-            partial(StartSource.of(shape).shows, skin),
+            partial(source.glance, skin),
         )  # fmt: skip
         return replace(found, crop=crop.mask)
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
     known = KnownDofs.of(shape, locked, prior)
     if fit_shape is not False:
+        if initializer is not None:
+            raise InputError("initializer has no meaning with fit_shape; people are sought without one")
         shape = fitted_rig(shape, fit_shape, plain=known is None and model_points is None and seen.keypoints is None)
         found = _align_person(shape, seen, initial_pose, config, on_step)
         person = shape if found.coefficients is None else shape.with_coefficients(found.coefficients)
         return replace(found, shape=person)
     origin = floating_origin(shape, seen.points)
     if origin is not None:
-        found = _align_about(origin, shape, seen, initial_pose, model_points, known, config, on_step)
+        found = _align_about(origin, shape, seen, initial_pose, model_points, known, source, config, on_step)
     else:
-        found = _align(shape, seen, initial_pose, model_points, known, config, on_step)
+        found = _align(shape, seen, initial_pose, model_points, known, source, config, on_step)
     return replace(found, shape=shape)
 
 
@@ -266,6 +271,7 @@ def _align(
     initial_pose: Tensor | None,
     model_points: Tensor | LinearBlendSkin | None,
     known: KnownDofs | None,
+    source: StartSource,
     config: AlignConfig,
     on_step: OnStep | None,
 ) -> AlignResult:
@@ -274,7 +280,7 @@ def _align(
     if initial_pose is None and known is not None and known.places_base:
         initial_pose = known.start(shape)
     if initial_pose is None:
-        search = _found_pose(shape, seen, model_points, known, config)
+        search = _found_pose(shape, seen, model_points, known, source, config)
         initial_pose, lead = search.starts.best, search.lead
     # A sixth faster than without gradients alone, as most of the time goes to small operations.
     with torch.inference_mode():
@@ -351,6 +357,7 @@ def _align_about(
     initial_pose: Tensor | None,
     model_points: Tensor | LinearBlendSkin | None,
     known: KnownDofs | None,
+    source: StartSource,
     config: AlignConfig,
     on_step: OnStep | None,
 ) -> AlignResult:
@@ -359,7 +366,7 @@ def _align_about(
     start = None if initial_pose is None else shifted(torch.as_tensor(initial_pose).double(), -origin)
     points = model_points - origin if isinstance(model_points, Tensor) else model_points
     known = None if known is None else known.near(origin)
-    return _align(shape, seen.near(origin), start, points, known, config, told).moved(origin)
+    return _align(shape, seen.near(origin), start, points, known, source, config, told).moved(origin)
 
 
 def _tell_moved(on_step: OnStep, origin: Tensor, step: AlignRecord) -> None:
@@ -372,6 +379,7 @@ def _found_pose(
     seen: Observation,
     model_points: Tensor | LinearBlendSkin | None,
     known: KnownDofs | None,
+    source: StartSource,
     config: AlignConfig,
 ) -> FoundStarts:
     """Return the best pose that a search without a start finds, and its lead over others."""
@@ -380,7 +388,7 @@ def _found_pose(
     search = FindPoseConfig(num_model_points=config.num_model_points, nan_policy=config.nan_policy, seed=config.seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UnitsWarning)  # the alignment tells it
-        return search_everywhere(shape, seen, 1, StartSource.of(shape), model_points, search, known)
+        return search_everywhere(shape, seen, 1, source, model_points, search, known)
 
 
 def _check_start(shape: ArticulatedShape, initial_pose: Tensor | None, clouds: Tensor) -> tuple[Tensor, bool]:

@@ -34,7 +34,7 @@ from torchreg.alignment.problem import (
     masked_mean,
     model_size,
 )
-from torchreg.alignment.reliability import CALIBRATION
+from torchreg.alignment.reliability import CALIBRATION, without_cut
 from torchreg.alignment.results import PoseStarts
 from torchreg.alignment.rough_poses import PoseSource, bent_pose, register_rigidly
 from torchreg.alignment.start_source import StartSource
@@ -163,7 +163,7 @@ def find_pose(
             find_pose, shape, num_starts=num_starts, sources=sources, initializer=initializer, model_points=skin,
             locked=locked, prior=prior, keypoints=keypoints, keypoint_std=keypoint_std, config=config,
         )  # fmt: skip
-        return surest_crop(data, model_size(skin), search, partial(source.shows, skin))[0]
+        return surest_crop(data, model_size(skin), search, partial(source.glance, skin))[0]
     seen = Observation.of(data, mask).with_keypoints(shape, keypoints, keypoint_std)
     far = floating_origin(shape, seen.points)
     near = seen if far is None else seen.near(far)
@@ -201,7 +201,7 @@ def search_everywhere(
         warn_about_units(problem.data, problem.valid, problem.size, stacklevel=3)
         degenerate = warn_about_degenerate(problem.data, problem.valid, problem.size, stacklevel=3)
         with one_thread():
-            poses, costs = _find(problem, source.informed(known), config)
+            poses, costs = _find(problem, seen.frames, source.informed(known), config)
         lead = _lead(problem, poses, costs)
         starts = _ranked(problem, poses, costs, lead, num_starts)
         confidence = torch.where(degenerate, 0.0, starts.confidence)
@@ -222,7 +222,9 @@ class FoundStarts:
     lead: Tensor
 
 
-def _find(problem: AlignProblem, source: StartSource, config: FindPoseConfig) -> tuple[Tensor, Tensor]:
+def _find(
+    problem: AlignProblem, frames: Sequence[DepthFrame], source: StartSource, config: FindPoseConfig
+) -> tuple[Tensor, Tensor]:
     """Return candidates (B, H, num_dofs), best first, and their costs: a network's, and those of a search if doubtful.
 
     The search is of no use where all that is doubtful is where limbs end that no data show.
@@ -231,7 +233,8 @@ def _find(problem: AlignProblem, source: StartSource, config: FindPoseConfig) ->
     if proposed.shape[1] == 0:
         return _search_with_retries(problem, source, config, proposed)
     poses, costs = _fitted(problem, proposed)
-    sure = explains(problem, poses[:, 0], _lead(problem, poses, costs)) >= CALIBRATION.doubtful
+    judged = without_cut(problem, poses[:, 0], frames)
+    sure = explains(judged, poses[:, 0], _lead(problem, poses, costs)) >= CALIBRATION.doubtful
     rows = (~sure).nonzero()[:, 0]
     # The best one again is a duplicate that takes no place.
     first = torch.zeros(len(poses), min(config.num_searched, config.num_placed), dtype=torch.int64, device=poses.device)

@@ -85,11 +85,12 @@ class FreeSpaceTerm:
         """Return cost, gradient and Gauss-Newton Hessian at poses (B, num_dofs)."""
         rows, derivative = skin.shape.transform_jacobian(pose, chart="tangent")
         points = skin.place(rows)
-        intrusion, slope = self.free_space.intrusion_gradient(points)
+        # Where points do not intrude, and few do, cost and derivatives are zero.
+        index, intrusion, slope = self.free_space.intruding(points, self.tolerance)
         residual = (intrusion - self.tolerance).clamp_min(0)
         beta = welsch_weight((residual / sigma.unsqueeze(-1)).square())
         weight = (self.weight() / noise.square()).unsqueeze(-1)
-        along = (skin.basis.unsqueeze(-1) * slope.unsqueeze(-2)).flatten(-2)
+        along = (skin.basis[index].unsqueeze(-1) * slope.unsqueeze(-2)).flatten(-2)
         jacobian = (along @ derivative.flatten(-3, -2)) * (residual > 0).unsqueeze(-1)
         weighted = jacobian * (weight * beta).unsqueeze(-1)
         cost = 0.5 * weight[:, 0] * sigma.square() * (1 - beta).sum(-1)

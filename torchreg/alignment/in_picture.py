@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -25,7 +25,7 @@ Answer = TypeVar("Answer", AlignResult, PoseStarts)
 
 
 def surest_crop(
-    frame: DepthFrame, size: float, answer: Callable[[DepthFrame], Answer], shows: Callable[[DepthFrame], bool]
+    frame: DepthFrame, size: float, answer: Callable[[DepthFrame], Answer], glance: Callable[[DepthFrame], float]
 ) -> tuple[Answer, DepthFrame]:
     """Return the answer of highest confidence for the crops of a frame, and that crop; nearer ones are tried first.
 
@@ -33,11 +33,14 @@ def surest_crop(
         frame: the picture.
         size: of the shape, metres.
         answer: what is found in a crop.
-        shows: whether a glance says that a crop shows the shape: of a surface, such crops are tried first.
+        glance: how well a crop is explained at first sight, from 0 to 1: of a surface, the best are tried first.
     """
     best: tuple[Answer, DepthFrame] | None = None
     for crops in candidate_crops(frame, size):
-        for crop in _likely_first(crops, shows):
+        for crop, is_likely in _likely_first(crops, glance):
+            # What needs a search is tried where no other crop is believed.
+            if best is not None and not is_likely and _confidence(best[0]) >= CHOICE.enough:
+                break
             found = answer(crop)
             if best is None or _confidence(found) > _confidence(best[0]):
                 best = found, crop
@@ -52,15 +55,10 @@ def surest_crop(
     return answer(everything), everything
 
 
-def _likely_first(crops: Iterable[DepthFrame], shows: Callable[[DepthFrame], bool]) -> Iterator[DepthFrame]:
-    """Yield crops, those that need a search to tell whether they show anything last."""
-    others = []
-    for crop in crops:
-        if shows(crop):
-            yield crop
-        else:
-            others.append(crop)
-    yield from others
+def _likely_first(crops: Iterable[DepthFrame], glance: Callable[[DepthFrame], float]) -> list[tuple[DepthFrame, bool]]:
+    """Return crops, the likeliest first, and whether they are likely to show anything without a search."""
+    seen = sorted(((glance(crop), crop) for crop in crops), key=lambda pair: -pair[0])
+    return [(crop, likely >= CHOICE.enough) for likely, crop in seen]
 
 
 def _confidence(found: Any) -> float:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections import OrderedDict
+from collections.abc import Hashable, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -384,3 +385,33 @@ def shipped_proposer(shape: Articulation) -> PoseProposer | None:
     right = PoseProposer.load(HAND_WEIGHTS, Hand(scale=shape.scale).to(shape.rest.device))
     right.mirrored = True
     return right
+
+
+# The networks of the last shapes that were searched, by what they depend on: most calls are for one shape.
+_SHARED: OrderedDict[Hashable, PoseProposer] = OrderedDict()
+_MOST_SHARED = 4
+
+
+def shared_proposer(shape: Articulation) -> PoseProposer | None:
+    """Return the same network, read once: all who ask for it share it, so it must not be changed."""
+    if not isinstance(shape, Hand):
+        return None
+    key = (HAND_WEIGHTS, HAND_WEIGHTS.stat().st_mtime_ns, shape.side, shape.scale, shape.rest.device, *_values(shape))
+    if key not in _SHARED:
+        # What is made in inference mode could not be used outside of it.
+        with torch.inference_mode(False):
+            found = shipped_proposer(shape)
+        if found is None:
+            return None
+        _SHARED[key] = found
+    _SHARED.move_to_end(key)
+    while len(_SHARED) > _MOST_SHARED:
+        _SHARED.popitem(last=False)
+    return _SHARED[key]
+
+
+@torch.no_grad()
+def _values(shape: Articulation) -> tuple[tuple[float, ...], ...]:
+    """Return the numbers of a shape that its network depends on: limits, rest pose and proportions."""
+    tensors = shape.lower, shape.upper, shape.rest, shape.keypoints(shape.rest_pose())
+    return tuple(tuple(tensor.flatten().tolist()) for tensor in tensors)

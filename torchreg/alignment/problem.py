@@ -269,15 +269,24 @@ def soft_inliers(problem: AlignProblem, distances: Tensor) -> Tensor:
     return welsch_weight((distances / (INLIER_SHARE * problem.size)).square()) * problem.valid
 
 
-def alignment_cost(problem: AlignProblem, pose: Tensor, distances: Tensor | None = None) -> Tensor:
+def alignment_cost(
+    problem: AlignProblem, pose: Tensor, distances: Tensor | None = None, intruding: Tensor | float | None = None
+) -> Tensor:
     """Return the cost (B,) by which alignments of the same data are ranked.
 
     Outliers, softly counted, those that would be if the shape's points in free space were seen, and the prior.
+
+    Args:
+        problem: the batch.
+        pose: (B, num_dofs).
+        distances: (B, M) of the data from the surface, where they are known.
+        intruding: (B,) the `free_space_loss` of width `INLIER_SHARE`, where it is known.
     """
+    intruding = free_space_loss(problem, pose, INLIER_SHARE) if intruding is None else intruding
     distances = problem.surface.distance(problem.data, pose) if distances is None else distances
     outliers = welsch_loss((distances / (INLIER_SHARE * problem.size)).square())
     cost = (outliers * problem.valid).sum(-1) + PRIOR_SHARE * problem.prior.cost(pose)
-    return cost + free_space_loss(problem, pose, INLIER_SHARE) + landmark_loss(problem, pose, INLIER_SHARE)
+    return cost + intruding + landmark_loss(problem, pose, INLIER_SHARE)
 
 
 def landmark_loss(problem: AlignProblem, pose: Tensor, width: float) -> Tensor | float:

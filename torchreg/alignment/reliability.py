@@ -14,8 +14,8 @@ from torch import Tensor
 from torchreg.alignment.clusters import OFF_SURFACE, clustered_data
 from torchreg.alignment.confidence import EVIDENCE, beside_share, end_spreads, limb_data, limb_points
 from torchreg.alignment.patches import errors_per_patch
-from torchreg.alignment.problem import BROAD_PRIOR, AlignProblem, free_space_loss
-from torchreg.alignment.shape_errors import proportion_covariance
+from torchreg.alignment.problem import BROAD_PRIOR, INLIER_SHARE, AlignProblem, free_space_loss
+from torchreg.alignment.shape_errors import shape_covariance
 from torchreg.alignment.surface_fit import SURFACE_FIT, pose_covariance, surface_noise, surface_objective
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.depth_segments import beyond_cut
@@ -78,7 +78,8 @@ class Calibration:
     """The logistic model of the confidence: log-odds of a right pose, ``bias - sum_k weight_k evidence_k``.
 
     A pose is right if the ends of the shape's limbs are off by at most `right` of its size on average. Fitted by
-    ``benchmarks/confidence.py --calibrate`` to 143 made-up alignments of hands, a robot arm and a fox.
+    ``benchmarks/confidence.py --calibrate`` to 143 made-up alignments of hands, a robot arm and a fox, and tested on
+    310 others (``docs/measured/confidence.txt``), of which halves give no better one.
     """
 
     bias: float = 5.35
@@ -202,41 +203,41 @@ def gather_evidence(problem: AlignProblem, pose: Tensor, lead: Tensor | None, sp
     clustered, on_surface = clustered_data(problem, pose)
     return weigh(
         problem,
-        pose,
         distance,
         beside=beside_share(problem, pose),
         clustered=clustered.to(pose) / on_surface.clamp_min(1),
         spread=spreads.mean(-1),
+        intruding=free_space_loss(problem, pose, INLIER_SHARE),
         lead=lead,
     )
 
 
 def weigh(
     problem: AlignProblem,
-    pose: Tensor,
     distance: Tensor,
     *,
     beside: Tensor,
     clustered: Tensor,
     spread: Tensor,
+    intruding: Tensor | float,
     lead: Tensor | None = None,
 ) -> Evidence:
-    """Return the evidence for poses (B, num_dofs), of which the costly part is known.
+    """Return the evidence for poses, of which the costly part is known.
 
     Args:
         problem: the batch.
-        pose: fitted.
         distance: (B, M) of the data from the surface.
         beside: (B,) share of the data beside the surface, see `beside_share`.
         clustered: (B,) data in clusters, as a share of those on the surface.
         spread: (B,) mean of `end_spreads`, metres.
+        intruding: (B,) the `free_space_loss` of width `INLIER_SHARE`.
         lead: see `gather_evidence`.
     """
     noise = surface_noise(distance, problem.valid, problem.size)
     least = SURFACE_FIT.min_noise(problem.size)
-    count = problem.valid.sum(-1).clamp_min(1).to(pose)
-    near = ((distance.abs() < SURFACE_FIT.max_width * problem.size) & problem.valid).sum(-1).to(pose)
-    intruding = torch.zeros_like(noise) + free_space_loss(problem, pose, SURFACE_FIT.max_width)
+    count = problem.valid.sum(-1).clamp_min(1).to(distance)
+    near = ((distance.abs() < SURFACE_FIT.max_width * problem.size) & problem.valid).sum(-1).to(distance)
+    intruding = torch.zeros_like(noise) + intruding
     lead = torch.full_like(noise, torch.inf) if lead is None else lead.clamp_min(0)
     return Evidence(
         noise=(noise / least).log() / math.log(SURFACE_FIT.max_noise(problem.size) / least),
@@ -277,8 +278,9 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
     """Return the covariance of fitted poses (B, num_dofs), and what another step would gain.
 
     Neighboring data err together: the correlation of their residuals says how many of them count as one. Beside noise,
-    a patch of the surface errs by what the model is not exact, and the proportions of solids may be wrong. What no data
-    tell is as uncertain as the joints' limits leave it, and so is a limb that hardly any data show.
+    a patch of the surface errs by what the model is not exact, and of solids so does the whole surface; their
+    proportions may be wrong, too. What no data tell is as uncertain as the joints' limits leave it, and so is a limb
+    that hardly any data show.
     """
     distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
     noise = surface_noise(distance, problem.valid, problem.size)
@@ -303,12 +305,12 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
         gradient = jacobian.mT @ (near / (noise.square() * shared).unsqueeze(-1)).unsqueeze(-1)
         moved = covariance @ gradient * error[:, None, None]
         covariance = _of_noisier_data(covariance, precision, (error / noise).square()) + moved @ moved.mT
-    proportions = proportion_covariance(
+    inexact_shape = shape_covariance(
         problem, pose, distance=distance, jacobian=jacobian, factor=near.sqrt() / noise.unsqueeze(-1),
         covariance=pose_covariance(jacobian, near, noise, precision), share=correlation,
     )  # fmt: skip
     misplaced = torch.diag_embed(_misplaced_share(problem, pose) / precision)
-    return Curvature((covariance + misplaced + proportions).to(pose), gain)
+    return Curvature((covariance + misplaced + inexact_shape).to(pose), gain)
 
 
 def _of_noisier_data(covariance: Tensor, precision: Tensor, excess: Tensor) -> Tensor:

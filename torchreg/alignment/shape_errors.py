@@ -1,4 +1,4 @@
-"""What a shape of other proportions than the measured one does to a pose: a covariance beside that of the noise."""
+"""What a shape that is not quite the measured one does to a pose: a covariance beside that of the noise."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from torch import Tensor
 
 from torchreg.alignment.problem import AlignProblem
 from torchreg.alignment.scale_fit import SCALE_FIT, scale_jacobian
+from torchreg.alignment.surface_fit import SURFACE_FIT
 from torchreg.shapes.surface import FusedSurface
 
 
-def proportion_covariance(
+def shape_covariance(
     problem: AlignProblem,
     pose: Tensor,
     *,
@@ -20,13 +21,18 @@ def proportion_covariance(
     covariance: Tensor,
     share: Tensor,
 ) -> Tensor | float:
-    """Return by how much wrong proportions of a shape of solids may have moved its pose; zero for exact surfaces.
+    """Return by how much what is wrong with a shape of solids may have moved its pose; zero for exact surfaces.
 
     The logarithms of the parts' lengths and radii are parameters that the fit left out: those of the measured thing
     differ by ``s``. With weighted Jacobians ``J`` by the pose and ``S`` by the scales, and the fit's covariance ``C``,
     that moves the pose by ``-G s``, ``G = C J^T S``, and leaves the residuals ``(S - J G) s``. If the scales differ
     independently by a standard deviation ``tau``, the pose's covariance is ``tau^2 G G^T``; ``tau`` is that of which
     such residuals are as large as what neighboring ones share, which noise does not.
+
+    And the surface as a whole may lie too far in or out, as solids fuse more or less and skin is thick or thin. Seen
+    from one side such an offset moves the pose and leaves no residual, so its standard deviation is what a model is not
+    exact, `SURFACE_FIT.min_noise`, 0.3 mm of a hand. (Of the hands of ``benchmarks/confidence.py --calibrate``
+    the likelihood of the true poses is largest at 0.25 to 0.3 mm.)
 
     Args:
         problem: the batch.
@@ -53,4 +59,5 @@ def proportion_covariance(
     left = (scaled - rows @ moved).square().sum((-2, -1))
     shared = share.double() * (distance.double() * weight.squeeze(-1)).square().sum(-1)
     variance = (shared / left.clamp_min(torch.finfo(left.dtype).tiny)).clamp_max(SCALE_FIT.max_log_scale**2)
-    return variance[:, None, None] * (moved @ moved.mT)
+    offset = covariance.double() @ (rows.mT @ weight) * SURFACE_FIT.min_noise(problem.size)
+    return variance[:, None, None] * (moved @ moved.mT) + offset @ offset.mT

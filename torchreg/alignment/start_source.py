@@ -12,9 +12,9 @@ from torchreg._threads import one_thread
 from torchreg.alignment.confidence import explains
 from torchreg.alignment.fit_proposals import best_proposal, best_proposals, with_proposed_prior
 from torchreg.alignment.known_dofs import KnownDofs
-from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer, check_proposer, shipped_proposer
+from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer, check_proposer, shared_proposer
 from torchreg.alignment.problem import AlignProblem, centered_problem
-from torchreg.alignment.reliability import CALIBRATION
+from torchreg.alignment.reliability import without_cut
 from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.free_space import FreeSpace
@@ -52,7 +52,7 @@ class StartSource:
         """
         if sources is not None and not sources:
             raise InputError("sources must hold at least one source of rough poses, got none")
-        proposer = shipped_proposer(shape) if sources is None and initializer is None else None
+        proposer = shared_proposer(shape) if sources is None and initializer is None else None
         if initializer is not None:
             proposer = check_proposer(shape, initializer)
         return cls(DEFAULT_SOURCES if sources is None else sources, proposer)
@@ -77,10 +77,10 @@ class StartSource:
         return problem, self._told(problem, best_proposals(problem, proposals, count))
 
     @torch.no_grad()
-    def shows(self, skin: LinearBlendSkin, frame: DepthFrame) -> bool:
-        """Return whether a frame shows the shape of a skin, as the network sees it; True without one, as none tells."""
+    def glance(self, skin: LinearBlendSkin, frame: DepthFrame) -> float:
+        """Return how well a frame is explained by the network's pose of the shape of a skin; 1 without a network."""
         if self.proposer is None:
-            return True
+            return 1.0
         near = frame.near(frame.points.double().mean(0))
         data = near.points[None].to(skin.shape.rest)
         valid, origin = torch.ones_like(data[..., 0], dtype=torch.bool), torch.zeros_like(data[:, 0])
@@ -90,7 +90,8 @@ class StartSource:
         )  # fmt: skip
         with one_thread():
             best = best_proposal(problem, self.proposer.propose(data, valid))
-            return bool(explains(problem, best.pose, best.lead) >= CALIBRATION.doubtful)
+            judged = without_cut(problem, best.pose, [near])
+            return float(explains(judged, best.pose, best.lead))
 
     def _told(self, problem: AlignProblem, poses: Tensor) -> Tensor:
         return problem.clamp_candidates(poses if self.known is None else self.known.informed(problem, poses))

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from torchreg.capture.mask_distance import signed_mask_distance
+from torchreg.capture.mask_distance import beside_mask
 from torchreg.geometry.camera import Camera, distort, lens_jacobian
 
 
@@ -46,7 +47,7 @@ class FreeSpace:
     @classmethod
     def of_picture(cls, depth: Tensor, camera: Camera, mask: Tensor | None, stride: int) -> FreeSpace:
         """Return the free space of one picture (H, W), metres, whose data are every ``stride``-th pixel each way."""
-        beside = torch.zeros_like(depth) if mask is None else signed_mask_distance(mask).to(depth).clamp_min(0)
+        beside = torch.zeros_like(depth) if mask is None else beside_mask(mask).to(depth)
         fx, fy = camera.intrinsics[:2].tolist()
         return cls(
             depth=depth[None],
@@ -100,17 +101,32 @@ class FreeSpace:
 
     def intrusion(self, points: Tensor) -> Tensor:
         """Return how far points (B, ..., 3) of the problems lie in free space, (B, ...), metres."""
-        seen = self._look(points.reshape(len(points), -1, 3))
-        return torch.where(seen.counts, torch.minimum(seen.ahead, seen.sideways), 0.0).reshape(points.shape[:-1])
+        return self._look(points.reshape(len(points), -1, 3)).intrusion.reshape(points.shape[:-1])
 
     def intrusion_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the same for points (B, N, 3), and its gradient (B, N, 3) by their coordinates."""
         seen = self._look(points)
-        intrusion = torch.where(seen.counts, torch.minimum(seen.ahead, seen.sideways), 0.0)
+        return seen.intrusion, self._gradient(seen)
+
+    def intruding(self, points: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Return which points of (B, N, 3) intrude by more than is tolerated in any problem, most often few.
+
+        Returns:
+            Their numbers (K,), by how much they intrude (B, K), and the gradients of that (B, K, 3).
+        """
+        seen = self._look(points)
+        index = (seen.intrusion > tolerance).any(0).nonzero()[:, 0]
+        seen = seen.part(index)
+        return index, seen.intrusion, self._gradient(seen)
+
+    def _gradient(self, seen: _Look) -> Tensor:
+        """Return the gradients (B, N, 3) of the intrusion by the coordinates of points."""
         intrinsics = self.intrinsics[self.picture].unsqueeze(1)
         scale = intrinsics[..., :2].prod(-1).rsqrt()
-        lens = self.lens[self.picture].mT.unsqueeze(-1)
-        by_plane = ((seen.slope * intrinsics[..., :2]).unsqueeze(-2) @ lens_jacobian(seen.plane, lens)).squeeze(-2)
+        by_plane = seen.slope * intrinsics[..., :2]
+        if self._is_distorted:
+            lens = self.lens[self.picture].mT.unsqueeze(-1)
+            by_plane = (by_plane.unsqueeze(-2) @ lens_jacobian(seen.plane, lens)).squeeze(-2)
         across = by_plane * scale.unsqueeze(-1)
         along = seen.distance * scale - (across * seen.plane).sum(-1)
         sideways = torch.cat((across, along.unsqueeze(-1)), dim=-1)
@@ -118,7 +134,11 @@ class FreeSpace:
         ahead[..., 2] = -1
         local = torch.where((seen.ahead <= seen.sideways).unsqueeze(-1), ahead, sideways)
         local = torch.where(seen.counts.unsqueeze(-1), local, 0.0)
-        return intrusion, local @ self.world_to_camera[self.picture, :3, :3].to(points)
+        return local @ self.world_to_camera[self.picture, :3, :3].to(local)
+
+    @cached_property
+    def _is_distorted(self) -> bool:
+        return bool(self.lens.any())
 
     def depths(self, points: Tensor) -> Tensor:
         """Return the depths (B, N) of points (B, N, 3) before the cameras, metres."""
@@ -136,8 +156,8 @@ class FreeSpace:
         depth = local[..., 2]
         plane = local[..., :2] / torch.where(depth > 0, depth, 1.0).unsqueeze(-1)
         focal, center = self.intrinsics[self.picture].unsqueeze(1).split(2, dim=-1)
-        lens = self.lens[self.picture].mT.unsqueeze(-1)
-        pixels = distort(plane, lens) * focal + center
+        bent = distort(plane, self.lens[self.picture].mT.unsqueeze(-1)) if self._is_distorted else plane
+        pixels = bent * focal + center
         extent = self.extent[self.picture].unsqueeze(1)
         framed = (depth > 0) & ((pixels >= -0.5) & (pixels < extent - 0.5)).all(-1)
         pixels = torch.where(framed.unsqueeze(-1), pixels, 0.0)
@@ -191,3 +211,12 @@ class _Look:
     ahead: Tensor
     sideways: Tensor
     counts: Tensor
+
+    @property
+    def intrusion(self) -> Tensor:
+        """How far points lie in free space, (B, N), metres."""
+        return torch.where(self.counts, torch.minimum(self.ahead, self.sideways), 0.0)
+
+    def part(self, index: Tensor) -> _Look:
+        """Return the same for some of the points (K,)."""
+        return _Look(**{item.name: getattr(self, item.name)[:, index] for item in fields(self)})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchreg.geometry.distance_transform import signed_distance
+from torchreg.geometry.distance_transform import distance_beside, signed_distance
 
 
 def signed_mask_distance(mask: Tensor) -> Tensor:
@@ -23,5 +23,14 @@ def signed_mask_distance(mask: Tensor) -> Tensor:
 
     Cost: 0.1 s for a megapixel.
     """
-    far = 0.5 * float(mask.shape[0] ** 2 + mask.shape[1] ** 2) ** 0.5
+    far = _far(mask)
     return signed_distance(mask.cpu(), torch.float32).nan_to_num(posinf=far, neginf=-far)
+
+
+def beside_mask(mask: Tensor) -> Tensor:
+    """Return the same (H, W) beside the mask, and zero inside, in half the time."""
+    return distance_beside(mask.cpu(), torch.float32).nan_to_num(posinf=_far(mask))
+
+
+def _far(mask: Tensor) -> float:
+    return 0.5 * float(mask.shape[0] ** 2 + mask.shape[1] ** 2) ** 0.5

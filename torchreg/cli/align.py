@@ -27,6 +27,7 @@ from torchreg.cli.align_options import (
 )
 from torchreg.cli.cameras import Depth, DepthRange, Intrinsics, Mask, check_used, depth_source
 from torchreg.cli.hand_side import Side, better_hand, shape_of_side
+from torchreg.cli.initializer_option import Initializer, read_initializer
 from torchreg.cli.keypoint_options import Keypoints, KeypointStd, MeasuredFrames, read_keypoints
 from torchreg.cli.known_options import Joints, JointStd, Known, Locked, observability, read_known
 from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from torchreg.alignment.align import AlignConfig
+    from torchreg.alignment.pose_proposer import PoseProposer
     from torchreg.alignment.results import AlignResult
     from torchreg.capture.depth_frames import DepthFrames
     from torchreg.geometry.upright import Direction
@@ -80,6 +82,7 @@ def align(
             "without one the shape is searched for."
         ),
     ] = None,
+    initializer: Initializer = None,
     fit_shape: Annotated[
         bool,
         typer.Option(
@@ -162,11 +165,12 @@ def align(
         config = AlignConfig(schedule=read_schedule(sigma), outlier=outlier, search=search, nan_policy=nan_policy)
         first = None if start is None else load_pose(start, model)
         points = sample_skin(model, config.num_model_points, sharpness=config.sharpness)
+        network = read_initializer(initializer, model, side)
         known = read_known(model, locked, joints, joint_std, len(clouds))
         measured = read_keypoints(keypoints, keypoint_std, clouds, None if side == "either" else model, pictures)
         run = _AlignRun(
-            model, config, points, scale, time, frame, first, known, measured, pictures=pictures, fit_shape=fit_shape,
-            up=upright,
+            model, config, points, scale, time, frame, first, known, measured, network, pictures=pictures,
+            fit_shape=fit_shape, up=upright,
         )  # fmt: skip
         if side == "either":
             side = run.choose_hand(clouds[0])
@@ -211,6 +215,7 @@ class _AlignRun:
     start: Tensor | None
     known: Known
     measured: MeasuredFrames
+    initializer: PoseProposer | None = None
     pictures: DepthFrames | None = None
     fit_shape: bool = False
     up: Direction | None = None
@@ -253,8 +258,8 @@ class _AlignRun:
         data = self._data(number, path)
         result = align(
             self.shape, data, self.start, model_points=None if self.fit_shape else self.skin, locked=self.known.locked,
-            prior=self.known.prior(number), fit_shape=self.fit_shape, config=self.config, on_step=on_step,
-            **self.measured.of(number),
+            prior=self.known.prior(number), fit_shape=self.fit_shape, initializer=self.initializer, config=self.config,
+            on_step=on_step, **self.measured.of(number),
         )  # fmt: skip
         result = remembering(result, self.up)
         self._write(result, as_points(data), files)

@@ -9,6 +9,7 @@ import typer
 
 from torchreg.cli.align_options import NanPolicy, Scale, cloud_files
 from torchreg.cli.cameras import Depth, DepthRange, Intrinsics, Mask, check_used, depth_source
+from torchreg.cli.initializer_option import Initializer, read_initializer
 from torchreg.cli.outputs import Force, Quiet, check_outputs
 from torchreg.cli.reporting import interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
@@ -32,6 +33,7 @@ def label(
     start: Annotated[
         Path | None, typer.Option(help="Pose of the first frame, as for align; searched by default.")
     ] = None,
+    initializer: Initializer = None,
     trusted: Annotated[
         float, typer.Option(help="Poses less sure than this are not started from: the next frame is searched.")
     ] = 0.5,
@@ -77,9 +79,10 @@ def label(
         check_outputs([path.with_suffix(ending) for path in paths for ending in (".safetensors", ".json")], force)
         model = load_shape(shape, parents, package_dir, free_base, skin)
         first = None if start is None else load_pose(start, model)
+        network = PoseInitializer(model, proposer=read_initializer(initializer, model))
         done = 0
         try:
-            for found in label_frames(PoseInitializer(model), sequence, trusted=trusted, start=first):
+            for found in label_frames(network, sequence, trusted=trusted, start=first):
                 written = found.save(output, done)
                 if not quiet:
                     bar.write(f"{sequence.names[done]}: confidence {float(found.confidence):.2f} -> {written}")

@@ -27,6 +27,7 @@ from torchreg.cli.cameras import (
     stereo_job,
     stereo_source,
 )
+from torchreg.cli.initializer_option import Initializer, read_initializer
 from torchreg.cli.keypoint_options import Keypoints, KeypointStd, read_keypoints
 from torchreg.cli.known_options import Joints, JointStd, Locked, read_known
 from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, shifted_to, with_ending
@@ -80,6 +81,7 @@ def track(
             "without one the shape is searched for."
         ),
     ] = None,
+    initializer: Initializer = None,
     stereo: Annotated[
         bool, typer.Option("--stereo", help="FRAMES are the pictures of a calibrated pair of cameras.")
     ] = False,
@@ -187,14 +189,16 @@ def track(
         model_points=model_points, num_model_points=points, prediction=prediction, recovery=recovery, seed=seed
     )
     first = None if start is None else shifted_to(clouds.origin, load_pose(start, model))
+    network = read_initializer(initializer, model)
     known = read_known(model, locked, joints, joint_std, len(clouds))
     measured = read_keypoints(keypoints, keypoint_std, clouds, model, images)
     job = track_job(shape, options, first, config, fps, scale, nan_policy, clouds) | known.job() | measured.job()
+    job |= {} if initializer is None else {"--initializer": str(initializer)}
     with claimed(files.result), ExitStack() as pages, _progress_bar(len(clouds), quiet) as bar:
-        tracker, report = Tracker(model, first, config=config, locked=known.locked), Report(bar, clouds, quiet)
+        tracker = Tracker(model, first, config=config, locked=known.locked, initializer=network)
         run = TrackRun(
-            tracker=tracker, clouds=clouds, fps=fps, job=job, files=files, report=report, save_every=save_every,
-            known=known, measured=measured, up=known_up(up, frames, camera=stereo or depth),
+            tracker=tracker, clouds=clouds, fps=fps, job=job, files=files, report=Report(bar, clouds, quiet),
+            save_every=save_every, known=known, measured=measured, up=known_up(up, frames, camera=stereo or depth),
         )  # fmt: skip
         _add_pictures(run, videos, folder, images)
         if view:

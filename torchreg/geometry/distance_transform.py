@@ -35,6 +35,15 @@ def signed_distance(mask: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
     return torch.where(mask, -distance, distance)
 
 
+def distance_beside(mask: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
+    """Return the same where that is positive and zero inside, in half the time."""
+    inside = mask.cpu().numpy()
+    if not inside.any():
+        return torch.full(mask.shape, torch.inf, dtype=dtype, device=mask.device)
+    beside = torch.from_numpy(distance_transform_edt(~inside)).to(dtype) - 0.5
+    return beside.clamp_min(0).to(mask.device)
+
+
 def nearest_inside(mask: Tensor) -> Tensor:
     """Return the flat index (...) int64 of the cell inside a mask that is nearest to each cell of its grid.
 

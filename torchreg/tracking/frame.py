@@ -114,6 +114,7 @@ class FrameFit:
         residual: () robust standard deviation of the distances near the surface, metres.
         change: largest change of the pose in the last step.
         cost: soft count of outliers and the prior, by which fits to a frame are ranked.
+        intruding: data that points in free space stand for, see `free_space_loss`.
         num_inliers: number of data near the surface.
         unexplained: (K, 3) clusters of data off the surface, as dense as the data on it.
         num_new_unexplained: number of them that a limb can reach and that are no cluster of the frame before.
@@ -130,6 +131,7 @@ class FrameFit:
     residual: Tensor
     change: float
     cost: float
+    intruding: Tensor | float
     num_inliers: int
     unexplained: Tensor
     num_new_unexplained: int

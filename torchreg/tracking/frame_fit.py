@@ -16,7 +16,7 @@ from torchreg.alignment.confidence import end_motions, end_variances, limb_ends,
 from torchreg.alignment.free_space_term import INTRUSION, FreeSpaceTerm
 from torchreg.alignment.landmarks import keypoint_skin
 from torchreg.alignment.objectives import GaussianPosePrior
-from torchreg.alignment.problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem
+from torchreg.alignment.problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem, free_space_loss
 from torchreg.alignment.reliability import Evidence, hardly_gains, weigh
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, SurfaceResult, pose_covariance, refine_surface, surface_noise
@@ -181,9 +181,10 @@ class FrameFitter:
         problem, pose = fit.view.problem, fit.pose
         moves = end_motions(self.skin, pose, self._ends)
         evidence = weigh(
-            problem, pose, fit.distance, beside=share_beside(problem, fit.distance),
+            problem, fit.distance, beside=share_beside(problem, fit.distance),
             clustered=pose.new_tensor([len(fit.unexplained) / max(1, fit.num_inliers)]),
             spread=end_variances(moves, covariance[None]).clamp_min(torch.finfo(pose.dtype).tiny).sqrt().mean(-1),
+            intruding=fit.intruding,
         )  # fmt: skip
         converged = fit.change <= problem.pose_atol or hardly_gains(
             problem, pose, fit.distance, fit.jacobian, fit.residual[None], covariance[None]
@@ -198,12 +199,13 @@ class FrameFitter:
         transforms = self.shape.part_transforms(pose[0])
         unexplained = self.clusters.find(problem.data[0], distance[0], residual)
         moved = (problem.skin.place(stacked_rows(transforms)) - problem.skin.place(view.rows)).norm(dim=-1)
+        intruding = free_space_loss(problem, pose, INLIER_SHARE)
         wide_prior = GaussianPosePrior(problem.prior.mean, self._joint_precision(FILTER.max_joint_std))
         return FrameFit(
             view=view, pose=pose, distance=distance, jacobian=fitted.jacobian, transforms=transforms,
             residual=residual, change=float(fitted.change),
-            cost=float(alignment_cost(replace(problem, prior=wide_prior), pose, distance)),
-            num_inliers=int((distance.abs() < self.inlier_distance).sum()),
+            cost=float(alignment_cost(replace(problem, prior=wide_prior), pose, distance, intruding)),
+            intruding=intruding, num_inliers=int((distance.abs() < self.inlier_distance).sum()),
             unexplained=unexplained, num_new_unexplained=self.clusters.count_new(state, unexplained, transforms[0]),
             limit_share=share_at_limits(problem, pose),
             deviation=float(moved.quantile(_SETTINGS.deviation_quantile)), acquired=acquired,
