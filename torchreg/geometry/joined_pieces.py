@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from scipy.ndimage import label
 from torch import Tensor
 
-from torchreg.geometry.distance_transform import signed_distance
+from torchreg.geometry.distance_transform import numbered_pieces, signed_distance
 from torchreg.geometry.graphs import component_links
 
 
@@ -35,16 +34,16 @@ def join_pieces(inside: Tensor) -> tuple[Tensor, int]:
 
     Differentiable: no.
     """
-    numbers, count = label(inside.cpu().numpy())
+    numbers = numbered_pieces(inside)
     bars = torch.zeros(inside.shape, dtype=torch.bool)
-    if count < 2:
+    if int(numbers.max()) < 2:
         return bars, 0
     rim = (inside & (signed_distance(inside) > -1)).nonzero()
-    sizes = torch.bincount(torch.from_numpy(numbers).long()[inside])
+    sizes = torch.bincount(numbers[inside])
     shares = sizes / sizes.max()
     kept = (shares >= JOINING.dust) & (shares < JOINING.body)
     kept[sizes.argmax()] = True
-    piece = torch.from_numpy(numbers).long()[tuple(rim.T)]
+    piece = numbers[tuple(rim.T)]
     rim, piece = rim[kept[piece]], piece[kept[piece]].unique(return_inverse=True)[1]
     links, lengths = component_links(rim.double(), piece, 1)
     lows, highs = torch.full((2, int(piece.max()) + 1, 3), 0)
