@@ -10,13 +10,17 @@
   frame, of all tips' vertices (bar: 99 %). "inside": curve points inside the surface (bar: 99.5 %).
 - identity: the same sequences, every frame and every second, fourth, eighth and sixteenth. A tip is right in a frame if
   it is within 6 % of the diagonal of its own vertex, the one nearest to it in the frame that speaks best for it (bar
-  for all frames and for every fourth: 97 % of tips and frames, one tree). Beside it the mean confidence in names.
+  for all frames and for every fourth: 97 % of tips and frames, one tree). Beside it the mean confidence in names; in
+  the end how well confidence tells right names from wrong ones, here and of frames left out.
 - creatures: starfish and octopuses of known tips, with noise and with two arms that touch side by side or end to end.
   Bars: all arms and one junction in every frame, every name right. Where tips of arms touch end to end names are
   judged by the whole arm.
 - left out: made-up people and animals that step, gallop and tuck limbs in, left and right in the mirror, and creatures
   whose arms touch, meshed anew; all of 48 frames and every second, fourth, eighth and sixteenth. Identity as above (bar
   for all frames: 98 %). A cycle of steps is 24 frames long: every eighth is a third of it.
+- clouds: the same sequences, every frame, as 12,000 points with noise of 0.2 % of the diagonal (standard deviation),
+  and with 30 % of the points missing in round holes. Identity as above (bar without holes: 95 %). "off": how far tips
+  are from those of the meshes, in diagonals: the median and the share within 2 % (bar: the median).
 - time: CPU seconds of all processes for the captured sequences, and what two cores need at best (bar for 44 frames of
   about 14,000 vertices: 60 s).
 - borne: noise, holes, thin limbs, fragments, wrong winding, one frame, a missing limb: the result, or the error.
@@ -31,8 +35,9 @@ import argparse
 import resource
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -54,8 +59,10 @@ from torchreg.spines.clearance import Inside
 
 BAR_OWN, BAR_NAMED, BAR_INSIDE, BAR_SECONDS, BAR_HANDS = 0.7, 0.99, 0.995, 60.0, 0.9
 BARS_IDENTITY, BARS_LEFT_OUT = {1: 0.97, 4: 0.97}, {1: 0.98}
+BINS = (0.0, 0.5, 0.8, 0.95, 0.99, 1.0)
 WITHIN, STEPS, CYCLE, TOUCHING = 0.06, (1, 2, 4, 8, 16), 24, "flanks touch"
-PARTS = ("captured", "identity", "creatures", "left-out", "borne", "hands")
+CLOUD_POINTS, CLOUD_NOISE, HOLES, HOLE_RADIUS, BAR_CLOUDS, BAR_OFF = 12_000, 0.002, 0.3, 0.03, 0.95, 0.02
+PARTS = ("captured", "identity", "clouds", "creatures", "left-out", "borne", "hands")
 TIPS, RIGHT, NUM_POINTS, BEND = [4, 8, 12, 16, 20], 0.01, 500, 0.5
 CREATURES: dict[str, tuple[CreatureForm, str, float]] = {
     "starfish": (STARFISH, "none", 0.0),
@@ -135,29 +142,94 @@ def from_file(path: Path, every: int) -> tuple[Tensor, Tensor]:
         return torch.from_numpy(archive["vertices"][::every]), torch.from_numpy(archive["faces"].astype(np.int64))
 
 
-def tip_identity(tips: Tensor, vertices: Tensor) -> float:
-    """Return the share of tips (T, K, 3) and frames that are near their own vertices, of all vertices (T, V, 3)."""
+def right_names(tips: Tensor, vertices: Tensor) -> Tensor:
+    """Return in which frames tips (T, K, 3) are near their own vertices, of all vertices (T, V, 3): (T, K) bool."""
     diagonal = (vertices.amax(1) - vertices.amin(1)).norm(dim=-1).median()
     own = torch.stack([torch.cdist(*frame).argmin(-1) for frame in zip(tips, vertices, strict=True)])
     near = torch.stack([(tips - vertices[:, row]).norm(dim=-1) <= WITHIN * diagonal for row in own])
-    return float(near.double().mean(1).amax(0).mean())
+    best = near.double().mean(1).argmax(0)
+    return near[best, :, torch.arange(tips.shape[1])].mT
+
+
+def tip_identity(tips: Tensor, vertices: Tensor) -> float:
+    """Return the share of tips (T, K, 3) and frames that are near their own vertices, of all vertices (T, V, 3)."""
+    return float(right_names(tips, vertices).double().mean())
+
+
+@dataclass
+class Confidences:
+    """Confidences of names (N,), and which names are right."""
+
+    values: Tensor = field(default_factory=lambda: torch.zeros(0))
+    right: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.bool))
+
+    def add(self, values: Tensor, right: Tensor) -> None:
+        """Add those of a sequence, (T, K)."""
+        self.values = torch.cat((self.values, values.reshape(-1)))
+        self.right = torch.cat((self.right, right.reshape(-1)))
+
+    def render(self) -> str:
+        """Return the probability that a right name is surer than a wrong one, and what is right in bins."""
+        apart = self.values[self.right][:, None] - self.values[~self.right]
+        area = float(((apart > 0).double() + 0.5 * (apart == 0)).mean())
+        lines = [f"confidence: area under the curve {area:.3f}, {len(self.right)} names"]
+        for low, high in pairwise(BINS):
+            which = (self.values >= low) & ((self.values < high) | (high == 1))
+            share = f"{float(self.right[which].double().mean()):.3f}" if bool(which.any()) else "-"
+            lines.append(f"  {low:4.2f} to {high:4.2f}: {int(which.sum()):5} names, right {share}")
+        return "\n".join(lines)
 
 
 def identities(
-    name: str, meshes: Sequence[tr.TriangleMesh], places: Tensor, bars: Mapping[int, float]
+    name: str, meshes: Sequence[tr.TriangleMesh], places: Tensor, bars: Mapping[int, float], told: Confidences
 ) -> Iterator[str]:
     """Yield a line per share of the frames of a sequence, on whose surfaces places (T, V, 3) are known.
 
-    Some shares, every first or fourth frame, have bars.
+    Some shares, every first or fourth frame, have bars. Confidences are added to those that were told.
     """
     for step in STEPS:
         if len(meshes[::step]) < 3:
             return
         spine = tr.extract_spine(meshes[::step])
-        share, trees = tip_identity(spine.tips.double(), places[::step].double()), len(set(spine.topologies))
+        right, trees = right_names(spine.tips.double(), places[::step].double()), len(set(spine.topologies))
+        told.add(spine.confidence, right)
+        share = float(right.double().mean())
         line = f"{name:24} every {step:2}: {len(spine.tips):3} frames, {spine.num_tips} tips, {trees} tree(s), "
         line += f"identity {share:.3f}, confidence {float(spine.confidence.mean()):.3f}"
         yield f"{line}  {verdict(share >= bars[step] and trees == 1)}" if step in bars else line
+
+
+def cloud(mesh: tr.TriangleMesh, holes: float, seed: int) -> Tensor:
+    """Return noisy points (N, 3) of a surface, a share of which is missing in balls around random ones."""
+    generator = torch.Generator().manual_seed(seed)
+    points = sample_surface(mesh, CLOUD_POINTS, generator)[0]
+    diagonal = (points.amax(0) - points.amin(0)).norm()
+    kept = torch.ones(len(points), dtype=torch.bool)
+    while float((~kept).double().mean()) < holes:
+        center = points[torch.randint(len(points), (1,), generator=generator)]
+        kept &= (points - center).norm(dim=-1) > HOLE_RADIUS * diagonal
+    return (points + CLOUD_NOISE * diagonal * torch.randn(points.shape, generator=generator))[kept]
+
+
+def cloud_lines(name: str, meshes: Sequence[tr.TriangleMesh], places: Tensor) -> Iterator[str]:
+    """Yield a line per kind of cloud of a sequence, on whose surfaces places (T, V, 3) are known."""
+    diagonal = float((places.amax(1) - places.amin(1)).norm(dim=-1).median())
+    of_meshes = tr.extract_spine(meshes).tips.double()
+    share = tip_identity(of_meshes, places.double())
+    yield f"{name:24} meshes: {len(of_meshes):3} frames, {of_meshes.shape[1]} tips, identity {share:.3f}"
+    for holes in (0.0, HOLES):
+        spine = tr.extract_spine([cloud(mesh, holes, seed) for seed, mesh in enumerate(meshes)])
+        tips, trees = spine.tips.double(), len(set(spine.topologies))
+        apart = (of_meshes.unsqueeze(2) - tips.unsqueeze(1)).norm(dim=-1) / diagonal
+        off = apart.transpose(0, 1)[torch.arange(apart.shape[1]), :, assign(apart.median(0).values)]
+        share = tip_identity(tips, places.double())
+        line = (
+            f"{name:24} {holes:4.0%} missing: {len(tips):3} frames, {spine.num_tips} tips, {trees} tree(s), identity "
+        )
+        near = float((off < BAR_OFF).double().mean())
+        line += f"identity {share:.3f}, off {float(off.median()):.2%}, within {BAR_OFF:.0%}: {near:.3f}"
+        passed = share >= BAR_CLOUDS and float(off.median()) < BAR_OFF and trees == 1
+        yield line if holes else f"{line}  {verdict(passed)}"
 
 
 def made_figure(name: str, num_frames: int, resolution: int) -> tuple[list[tr.TriangleMesh], Tensor]:
@@ -317,6 +389,8 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
         rows += run_captured(options)
     if "identity" in parts:
         run_identity(options)
+    if "clouds" in parts:
+        run_clouds(options)
     if "creatures" in parts:
         names = ["starfish"] if options.smoke else list(CREATURES)
         made = [creature(name, 3 if options.smoke else options.frames, 32 if options.smoke else 96) for name in names]
@@ -348,29 +422,45 @@ def run_captured(options: argparse.Namespace) -> list[Row]:
     return rows
 
 
-def run_identity(options: argparse.Namespace) -> None:
+def meshed_anew(options: argparse.Namespace, part: str) -> Iterator[tuple[str, list[tr.TriangleMesh], Tensor]]:
+    """Yield the sequences: their names, meshes from voxels, and the vertices (T, V, 3) that they came from."""
     paths = sorted(options.data.glob("*.npz")) if options.data else []
-    print("identity" if paths else "identity: left out, as there is no --data FOLDER with NPZ files")
+    print(part if paths else f"{part}: left out, as there is no --data FOLDER with NPZ files")
     resolution, every = (40, 6) if options.smoke else (options.resolution, 1)
     for path in paths:
         places, faces = from_file(path, every)
         meshes = [voxelize(tr.TriangleMesh(frame.float(), faces), resolution).mesh() for frame in places]
-        for line in identities(path.stem, meshes, places, BARS_IDENTITY):
+        yield path.stem, meshes, places
+
+
+def run_identity(options: argparse.Namespace) -> None:
+    told = Confidences()
+    for name, meshes, places in meshed_anew(options, "identity"):
+        for line in identities(name, meshes, places, BARS_IDENTITY, told):
+            print(line, flush=True)
+    if len(told.right):
+        print(told.render())
+
+
+def run_clouds(options: argparse.Namespace) -> None:
+    for name, meshes, places in meshed_anew(options, "clouds"):
+        for line in cloud_lines(name, meshes, places):
             print(line, flush=True)
 
 
 def run_left_out(options: argparse.Namespace) -> None:
     print("frames left out")
     num_frames, resolution = (3, 32) if options.smoke else (2 * options.frames, options.resolution // 2)
-    bars = {} if options.smoke else BARS_LEFT_OUT
+    bars, told = {} if options.smoke else BARS_LEFT_OUT, Confidences()
     for name in list(FIGURES)[:1] if options.smoke else FIGURES:
-        for line in identities(name, *made_figure(name, num_frames, resolution), bars):
+        for line in identities(name, *made_figure(name, num_frames, resolution), bars, told):
             print(line, flush=True)
     for name in [] if options.smoke else [name for name in CREATURES if name.endswith(TOUCHING)]:
         form, touching, noise = CREATURES[name]
         made = creature_sequence(form, num_frames, touching=touching, noise=noise, resolution=resolution)
-        for line in identities(name, made.meshes, made.tips, bars):
+        for line in identities(name, made.meshes, made.tips, bars, told):
             print(line, flush=True)
+    print(told.render())
 
 
 if __name__ == "__main__":

@@ -63,6 +63,20 @@ def test_one_side_of_a_body_is_told_as_that(clouds):
     assert not skeletonize(points).notes
 
 
+def test_a_plane_of_points_is_told_as_one_side():
+    plane = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 1.0, 0.0])
+    assert any("do not enclose a body" in note for note in skeletonize(plane).notes)
+
+
+def test_a_limb_that_a_hole_cuts_is_joined_and_told(starfish, clouds):
+    tips, curves = starfish.tips[0], starfish.curves[0]
+    cut = curves[1, curves.shape[1] // 2]
+    holed = clouds[0][(clouds[0] - cut).norm(dim=-1) > 0.2]
+    found = skeletonize(holed)
+    assert any("joined across gaps" in note for note in found.notes)
+    assert len(found.tips) == len(tips)
+
+
 def test_few_points_are_refused(clouds):
     with pytest.raises(InputError, match=r"meshes\[1\] must hold 100 different points or more, got 20"):
         extract_spine([clouds[0], clouds[1][:20].repeat(10, 1)])

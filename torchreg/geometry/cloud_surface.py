@@ -64,15 +64,25 @@ def cloud_surface(points: Tensor, name: str = "points") -> CloudSurface:
 
     References: Serra 1982, closing.
     """
-    places = distinct_positions(points.detach().cpu().double())[0]
-    if len(places) < CLOSING.min_points:
-        raise InputError(f"{name} must hold {CLOSING.min_points} different points or more, got {len(places)}")
+    places = enough_places(points, name)
     gap = float(k_nearest_others(places, CLOSING.neighbors)[1][:, -1].quantile(CLOSING.quantile))
     for radius in CLOSING.radii:
         grid, encloses = _closed(places, radius * gap)
         if encloses:
             break
     return CloudSurface(mesh=replace(grid, origin=grid.origin.to(points)).mesh(), encloses=encloses)
+
+
+def enough_places(points: Tensor, name: str) -> Tensor:
+    """Return the different ones of points (N, 3), float64 on the CPU.
+
+    Raises:
+        InputError: if there are fewer than 100.
+    """
+    places = distinct_positions(points.detach().cpu().double())[0]
+    if len(places) < CLOSING.min_points:
+        raise InputError(f"{name} must hold {CLOSING.min_points} different points or more, got {len(places)}")
+    return places
 
 
 def _closed(places: Tensor, radius: float) -> tuple[VoxelGrid, bool]:

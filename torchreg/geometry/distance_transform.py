@@ -1,10 +1,10 @@
-"""Masks on a grid: each cell's signed distance to the border, its nearest cell inside, and masks without holes."""
+"""Masks on a grid: each cell's signed distance to the border, its nearest cell inside, pieces, masks without holes."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.ndimage import binary_fill_holes, distance_transform_edt
+from scipy.ndimage import binary_fill_holes, distance_transform_edt, label
 from torch import Tensor
 
 
@@ -63,3 +63,12 @@ def fill_holes(mask: Tensor) -> Tensor:
         mask: bool of any shape.
     """
     return torch.from_numpy(binary_fill_holes(mask.cpu().numpy())).to(mask.device)
+
+
+def numbered_pieces(mask: Tensor) -> Tensor:
+    """Return the piece (...) int64 that each cell of a mask belongs to, from 1 on, joined along the axes; 0 outside.
+
+    Args:
+        mask: bool of any shape.
+    """
+    return torch.from_numpy(label(mask.cpu().numpy())[0]).long().to(mask.device)
