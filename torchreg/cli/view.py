@@ -117,7 +117,7 @@ def _shown(
     skin: str | None,
 ) -> Any:
     """Return a shape, mesh or cloud by name or file, or the meshes or clouds of a folder."""
-    from torchreg.errors import FormatError
+    from torchreg.errors import FormatError, ModelError
     from torchreg.io.points import load_points
 
     ending = name.suffix.lower()
@@ -128,7 +128,7 @@ def _shown(
     if ending in (".glb", ".gltf"):
         try:
             return load_shape(str(name), parents, package_dir, free_base, skin)
-        except FormatError:  # no rig, but maybe a mesh
+        except (FormatError, ModelError):  # no rig, but maybe a mesh
             if parents is not None or skin is not None:
                 raise
     if not name.exists() and not ending:

@@ -287,7 +287,9 @@ def _shape_layers(shape: ArticulatedShape | None, poses: Tensor) -> list[Layer]:
     with torch.no_grad():
         vertices = torch.where(found[:, None, None], skin(safe), torch.nan)
         origins = torch.where(found[:, None, None], shape.part_transforms(safe)[..., :3, 3], torch.nan)
-    layers: list[Layer] = [MovingMesh("shape", vertices, faces, SKIN_COLOR)]
+    colors = None if shape.surface is None else shape.surface.colors
+    paint = SKIN_COLOR if colors is None else colors[skin.weights.argmax(-1).cpu()].float()
+    layers: list[Layer] = [MovingMesh("shape", vertices, faces, paint)]
     pairs = [(parent, part) for part, parent in enumerate(shape.part_parents) if parent >= 0]
     if pairs:
         layers.append(Curves("bones", origins[:, torch.tensor(pairs)], bone_palette(len(pairs)), visible=False))
