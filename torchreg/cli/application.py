@@ -79,7 +79,7 @@ _COMMANDS: tuple[tuple[Callable[..., None], str, tuple[str, str]], ...] = (
     (register, "Register two range scans of something that moves.",
      ("register a.ply b.ply -o moved.glb", "register --depth a.png b.png --intrinsics camera.json")),
     (track, "Follow a shape through a sequence of clouds.",
-     ("track hand frames/ -o moving --poses poses.csv", "track hand depth/ --depth --intrinsics camera.json")),
+     ("track hand frames/ -o moving --poses poses.csv --bvh moving.bvh", "track hand depth/ --depth --intrinsics camera.json")),
     (train_initializer, "Train a network that proposes poses of a shape.",
      ("train-initializer rig.glb -o rig.safetensors", "train-initializer hand --device cuda --batch 512 --minutes 5")),
     (view, "Show a result, a shape or a scan in the browser, or write one HTML file.",
