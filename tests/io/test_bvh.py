@@ -130,7 +130,7 @@ def test_what_the_format_cannot_hold_is_refused(tmp_path):
     (tmp_path / "r.urdf").write_text(sides("prismatic"), encoding="utf-8")
     shape = tr.ArticulatedShape.from_urdf(tmp_path / "r.urdf")
     poses = torch.stack((shape.rest_pose(), shape.pose_from_dict({"left": 0.5})))
-    with pytest.raises(InputError, match="'left_arm' slides by 0.5 in its parent; write .glb"):
+    with pytest.raises(InputError, match=r"'left_arm' slides by 0.5 in its parent; write \.glb"):
         save_track_bvh(tmp_path / "a.bvh", shape, track(shape, poses))
     still = torch.eye(4).repeat(2, 1, 1)
     with pytest.raises(InputError, match=r"path must end in \.bvh"):

@@ -29,7 +29,7 @@ from torchreg.cli.cameras import (
 )
 from torchreg.cli.keypoint_options import Keypoints, KeypointStd, read_keypoints
 from torchreg.cli.known_options import Joints, JointStd, Locked, read_known
-from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, shifted_to, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, shifted_to, tell_origin, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
 from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary, track_job
