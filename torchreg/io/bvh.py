@@ -15,7 +15,7 @@ from torchreg.io.atomic import write_atomic
 from torchreg.io.gltf_builder import Array, checked_numbers
 from torchreg.io.gltf_document import parents_first
 
-# Share of the size of a skeleton by which a joint may wander in its parent: rounding of float32.
+# Share of all lengths of a skeleton by which a joint may wander in its parent: rounding of float32.
 _FIXED = 1e-4
 
 
@@ -81,7 +81,7 @@ def _check_fixed(names: Sequence[str], offsets: Array, turned: Array, found: Arr
     """Raise InputError where joints are not at their offsets (J, 3) in their parents, turned by (T, J, 3, 3)."""
     away = np.linalg.norm((turned @ offsets[..., None])[..., 0] - found, axis=-1).max(0)
     worst = int(away.argmax())
-    if away[worst] > _FIXED * max(1.0, float(np.abs(offsets).sum())):
+    if away[worst] > _FIXED * float(np.abs(offsets).sum()):
         raise InputError(
             f"BVH holds joints that turn, but {names[worst]!r} slides by {away[worst]:.3g} in its parent; write .glb"
         )
