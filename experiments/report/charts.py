@@ -215,7 +215,8 @@ def curves(
     figure.update_yaxes(title=named(name), rangemode="tozero", type="log" if report.curve_log else "linear")
     figure.update_layout(legend_title_text=short(axis), showlegend=True)
     kind = "mean, lowest and highest" if report.curve_spread else "median"
-    heading = f"{named(name)} along the steps: {kind} over all trials of a {short(axis) or 'sweep'}"
+    each = f", by {short(axis)}" if axis else ""
+    heading = f"{named(name)} along the steps: {kind} over all trials{each}"
     return _html(figure, heading, _HEIGHT)
 
 

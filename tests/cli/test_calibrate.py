@@ -55,7 +55,7 @@ def test_what_does_not_fit_is_told(error_of, folder, clouds, tmp_path):
     named = error_of("calibrate", robot, *clouds, "--joints", table, *output)
     assert "has no column rail; the robot's joints are shoulder, rail" in named
     table.write_text("shoulder,rail\n0.1,0.2\n")
-    assert "a row for each of 2 frames, got 1" in error_of("calibrate", robot, *clouds, "--joints", table, *output)
+    assert "a row for every frame, 2, got 1" in error_of("calibrate", robot, *clouds, "--joints", table, *output)
     table.write_text("shoulder,rail\n34.0,0.2\n-50.0,0.2\n")
     assert "as degrees all would fit" in error_of("calibrate", robot, *clouds, "--joints", table, *output)
     hand = error_of("calibrate", "hand", *clouds, "--joints", table, *output)

@@ -99,7 +99,7 @@ DARK = ("--depth", "--intrinsics", "camera.json", "--mask", "depth/0.png", "--de
         (
             "align",
             (*DARK[:3], "--keypoints", "keypoints.json"),
-            "keypoints.json must hold the keypoints of each of 1 frames; got those of 2",
+            "keypoints.json must hold the keypoints of every frame, 1; got those of 2",
         ),
         ("track", (*DARK[:3], "--keypoint-std", "4"), "--keypoint-std has no meaning without --keypoints"),
     ],

@@ -95,15 +95,16 @@ def stop_at(monkeypatch, frame, error=KeyboardInterrupt):
 
 
 def test_a_sequence_is_tracked_and_everything_asked_for_is_written(run, command, whole, tmp_path):
-    answer = run(*command("--pictures", tmp_path / "live"))
+    answer = run(*command("--pictures", tmp_path / "live", "--bvh", tmp_path / "r.bvh"))
     assert answer.exit_code == 0, answer.output
     assert f"{FRAMES} frames: {FRAMES} tracked; " in answer.output
-    names = ["live", "r.gif", "r.glb", "r.json", "r.progress", "r.safetensors"]
+    names = ["live", "r.bvh", "r.gif", "r.glb", "r.json", "r.progress", "r.safetensors"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
     result = load(tmp_path / "r.safetensors")
     assert same(result, whole)
     assert result.times.tolist() == [k / 20 for k in range(FRAMES)]
     assert sorted(path.name for path in (tmp_path / "live").iterdir()) == [f"frame_000{k}.png" for k in range(FRAMES)]
+    assert f"Frames: {FRAMES}\nFrame Time: 0.05\n" in (tmp_path / "r.bvh").read_text(encoding="utf-8")
     with Image.open(tmp_path / "r.gif") as file:
         assert (file.n_frames, file.info["duration"]) == (FRAMES, 50)
     assert ArticulatedShape.from_gltf(tmp_path / "r.glb").part_names[0] == "palm"
@@ -287,7 +288,7 @@ def test_what_is_never_found_has_a_picture_and_no_gltf(run, sequence, tmp_path):
     )  # fmt: skip
     assert answer.exit_code == 1, answer.output
     assert "1 frame: 0 tracked, 1 lost" in answer.output
-    names = ["live", "r.gif", "r.json", "r.progress", "r.safetensors"]
+    names = ["live", "r.bvh", "r.gif", "r.json", "r.progress", "r.safetensors"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
     assert not load(tmp_path / "r.safetensors").poses.isfinite().any()
     assert (tmp_path / "live" / "frame_0000.png").exists()

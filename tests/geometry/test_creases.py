@@ -20,7 +20,7 @@ def cube():
 def test_a_round_surface_is_smooth_again():
     mesh = unit_sphere(3)
     vertices, faces = soup(mesh)
-    kept, indexed, normals = welded(vertices, faces, torch.zeros(len(vertices), 1))
+    kept, indexed, normals = welded(vertices, faces)
     assert len(kept) == mesh.num_vertices
     torch.testing.assert_close(vertices[kept][indexed], vertices[faces])
     assert float((normals.float() * vertices[kept]).sum(-1).min()) > 0.995
@@ -28,16 +28,7 @@ def test_a_round_surface_is_smooth_again():
 
 def test_edges_of_a_cube_stay_sharp():
     vertices, faces = soup(cube())
-    kept, indexed, normals = welded(vertices, faces, torch.zeros(len(vertices), 1))
+    kept, indexed, normals = welded(vertices, faces)
     assert len(kept) == 24  # each corner with the normals of its three sides
     torch.testing.assert_close(vertices[kept][indexed], vertices[faces])
     assert bool((normals.abs().amax(-1) == 1).all())
-
-
-def test_vertices_of_different_parts_stay_apart():
-    mesh = unit_sphere(1)
-    vertices, faces = soup(mesh)
-    part = (torch.arange(len(vertices)) // 3 % 2).float()[:, None]
-    kept, indexed, _ = welded(vertices, faces, torch.cat((part, 1 - part), dim=1))
-    assert len(kept) > mesh.num_vertices
-    torch.testing.assert_close(part[kept][indexed], part[faces])

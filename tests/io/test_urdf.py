@@ -298,3 +298,20 @@ def test_other_encodings_are_read(tmp_path: Path) -> None:
     path = tmp_path / "robot.urdf"
     path.write_bytes(text.encode("utf-16"))
     assert load_urdf(path).link_names == ("Gelenk-ü",)
+
+
+def test_colors_of_links_are_those_of_their_first_visual_with_one(tmp_path: Path) -> None:
+    def link(name: str, *materials: str) -> str:
+        box = "<geometry><box size='1 1 1'/></geometry>"
+        return f"<link name='{name}'>{''.join(f'<visual>{box}{inner}</visual>' for inner in materials)}</link>"
+
+    red = "<material name='m'><color rgba='1 0 0 1'/></material>"
+    text = robot(
+        "<material name='green'><color rgba='0 1 0 0.5'/></material>",
+        link("a", "<material name='none'/>", "<material name='green'/>"),
+        link("b", red),
+        link("c", "<material name='x'><color rgba='9 0 0 1'/></material>"),
+        link("d", "<material><color rgba='red'/></material>"),
+        *(joint(f"j{child}", "a", child, "fixed") for child in "bcd"),
+    )
+    assert load_urdf(write(tmp_path, text)).link_colors == ((0, 1, 0), (1, 0, 0), None, None)

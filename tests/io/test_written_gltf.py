@@ -244,6 +244,23 @@ def test_parts_move_as_nodes(tmp_path: Path) -> None:
     assert [node.name for node in Player(unnamed).gltf.nodes] == ["part_0", "part_1", "part_2"]
 
 
+def test_parts_move_with_their_parents(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    transforms = random_rigid(rng, 3, 3)
+    ball = unit_sphere(1)
+    path = save_animated_parts(
+        tmp_path / "p.glb", [ball] * 3, torch.from_numpy(transforms), torch.arange(3), list("abc"), None,
+        part_normals=[ball.vertices, None, None], parents=[2, 0, -1], up=(0.0, 0.0, 1.0),
+    )  # fmt: skip
+    player = Player(path)
+    turn = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    for frame in range(3):
+        np.testing.assert_allclose(np.stack(player.world(frame))[:3], turn @ transforms[frame], atol=1e-6)
+    attributes = [mesh.primitives[0].attributes for mesh in player.gltf.meshes]
+    np.testing.assert_allclose(player.accessor(attributes[0].NORMAL), ball.vertices, atol=1e-6)
+    assert attributes[1].NORMAL is None
+
+
 def test_nothing_half_written_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = tmp_path / "a.glb"
     target.write_bytes(b"before")
@@ -324,6 +341,10 @@ def test_khronos_validator_finds_no_errors(tmp_path: Path) -> None:
     files = [save(tmp_path / "a.glb", arguments), save(tmp_path / "b.glb", scene(spread=2))]
     part = torch.eye(4).expand(2, 1, 4, 4)
     files.append(save_animated_parts(tmp_path / "c.glb", [unit_sphere(1)], part, torch.arange(2)))
+    both = part.expand(2, 2, 4, 4)
+    balls, chain = [unit_sphere(1), None], {"parents": [-1, 0], "up": (0.0, 0.0, 1.0)}
+    normals = [unit_sphere(1).vertices, None]
+    files.append(save_animated_parts(tmp_path / "d.glb", balls, both, torch.arange(2), part_normals=normals, **chain))
     script = (
         "const v=require(process.argv[1]),fs=require('fs');"
         "for(const f of process.argv.slice(2))v.validateBytes(new Uint8Array(fs.readFileSync(f)))"

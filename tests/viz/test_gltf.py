@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from torchreg.datasets.hand import hand_motion, surface_skin
 from torchreg.errors import InputError
@@ -48,6 +49,30 @@ def test_the_surface_is_made_when_no_skin_is_given(tmp_path):
     shape = ArticulatedShape.from_skinned_mesh(box, faces, weights, box[[0, 1]], [-1, 0])
     poses = shape.rest_pose().expand(2, -1)
     assert save_shape_animation(tmp_path / "a.glb", shape, poses).stat().st_size > 500
+
+
+ARM = """<robot name="arm"><material name="red"><color rgba="1 0 0 1"/></material>
+<link name="upper"><visual><origin xyz="0 0 .2"/><geometry><box size=".05 .08 .4"/></geometry>
+<material name="red"/></visual></link>
+<link name="fore"><visual><origin xyz="0 0 .15"/><geometry><cylinder radius=".03" length=".3"/>
+</geometry></visual></link>
+<joint name="elbow" type="revolute"><parent link="upper"/><child link="fore"/><origin xyz="0 0 .4"/>
+<axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint></robot>"""
+
+
+def test_links_of_a_robot_are_nodes_in_their_colors(tmp_path):
+    (tmp_path / "arm.urdf").write_text(ARM, encoding="utf-8")
+    arm = ArticulatedShape.from_urdf(tmp_path / "arm.urdf", free_base=False)
+    poses = torch.stack([arm.pose_from_dict({"elbow": angle}) for angle in (0.7, -0.4)])
+    path = save_shape_animation(tmp_path / "arm.glb", arm, poses, up=(0.0, 0.0, 1.0))
+    scene = trimesh.load_scene(path)  # an independent reader, which shows the first frame
+    assert set(scene.graph.nodes_geometry) == {"upper", "fore"}
+    expected = arm.file_skin()(poses[0]).detach()[:, [0, 2, 1]] * torch.tensor([1.0, 1.0, -1.0])
+    np.testing.assert_allclose(scene.bounds, torch.stack((expected.amin(0), expected.amax(0))), atol=1e-5)
+    colors = {name: mesh.visual.material.baseColorFactor for name, mesh in scene.geometry.items()}
+    assert colors["upper"].tolist() == [255, 0, 0, 255]
+    assert colors["fore"][0] != 255
+    assert len(scene.geometry["upper"].vertices) == 24  # a box, with the normals of its sides
 
 
 def test_save_shape_animation_refuses(hand, skin, tmp_path):

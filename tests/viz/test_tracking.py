@@ -106,9 +106,9 @@ def test_points_that_are_not_finite_are_left_out(drawing, tracked):
 
 
 def test_labels_say_what_led_to_a_pose_or_why_there_is_none(drawing):
-    assert frame_label(3, Status.CONVERGED, "tracked") == "3  tracked"
-    assert frame_label(0, Status.MAX_STEPS, "found") == "0  found"
-    assert frame_label(12, Status.NO_DATA, "held") == "12  no_data"
+    assert frame_label(3, Status.CONVERGED, "tracked") == "frame 3: tracked"
+    assert frame_label(0, Status.MAX_STEPS, "found") == "frame 0: found"
+    assert frame_label(12, Status.NO_DATA, "held") == "frame 12: no_data"
     corner = np.s_[-16:, :60]
     assert np.abs(drawing(label="12  lost")[corner] - drawing()[corner]).max() > 100
 

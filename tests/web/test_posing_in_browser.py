@@ -30,9 +30,9 @@ class Screen:
         camera = client.camera
         self._rotation = transforms.SO3(np.asarray(camera.wxyz)).as_matrix()
         self._position = np.asarray(camera.position)
-        size = page.viewport_size
-        self._middle = np.array([size["width"], size["height"]]) / 2
-        self._focal = self._middle[1] / np.tan(camera.fov / 2)
+        box = page.locator("canvas").first.bounding_box()  # beside the controls
+        self._middle = np.array([box["x"] + box["width"] / 2, box["y"] + box["height"] / 2])
+        self._focal = box["height"] / 2 / np.tan(camera.fov / 2)
 
     def project(self, points):
         local = (np.asarray(points) - self._position) @ self._rotation

@@ -109,7 +109,7 @@ def _read_joints(path: Path, shape: ArticulatedShape, frames: Sequence[Path]) ->
     if lacking:
         raise InputError(f"{path} has no column {', '.join(lacking[:4])}; the robot's joints are {', '.join(names)}")
     if len(rows) != len(frames):
-        raise InputError(f"{path} must hold a row for each of {len(frames)} frames, got {len(rows)}")
+        raise InputError(f"{path} must hold a row for every frame, {len(frames)}, got {len(rows)}")
     return rows
 
 

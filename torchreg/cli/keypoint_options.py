@@ -89,5 +89,5 @@ def read_keypoints(
     size = None if camera is None else (camera.width, camera.height)
     table = load_keypoints(path, side=getattr(shape, "side", None), picture=size)
     if len(table) != len(frames):
-        raise InputError(f"{path} must hold the keypoints of each of {len(frames)} frames; got those of {len(table)}")
+        raise InputError(f"{path} must hold the keypoints of every frame, {len(frames)}; got those of {len(table)}")
     return MeasuredFrames(table, std)

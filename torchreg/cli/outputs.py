@@ -28,8 +28,8 @@ _LEAST_SPACE = 256 * 1024
 # Endings of the files that lie beside a result, and of those that options name.
 _BESIDE = (".safetensors", ".json", ".glb", ".progress")
 _OTHER_KINDS = (
-    ".swc", ".npz", ".npy", ".csv", ".ply", ".obj", ".stl", ".off", ".pcd", ".xyz", ".gltf", ".gif", ".mp4", ".png",
-    ".pdf", ".svg", ".html", ".urdf",
+    ".swc", ".bvh", ".npz", ".npy", ".csv", ".ply", ".obj", ".stl", ".off", ".pcd", ".xyz", ".gltf", ".gif", ".mp4",
+    ".png", ".pdf", ".svg", ".html", ".rrd", ".urdf",
 )  # fmt: skip
 PICTURE_ENDINGS = (".png", ".pdf", ".svg")
 

@@ -180,7 +180,7 @@ def _write_robot(
 
 def _show(bar: tqdm, record: RegisterRecord) -> None:
     """Show a step on a progress bar."""
-    bar.set_description(record.stage)
+    bar.set_description_str(record.stage)  # tqdm adds the colon where there is no total
     bar.update()
 
 

@@ -30,7 +30,7 @@ from torchreg.cli.cameras import (
 from torchreg.cli.initializer_option import Initializer, read_initializer
 from torchreg.cli.keypoint_options import Keypoints, KeypointStd, read_keypoints
 from torchreg.cli.known_options import Joints, JointStd, Locked, read_known
-from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, shifted_to, with_ending
+from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, shifted_to, tell_origin, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
 from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary, track_job
@@ -127,6 +127,9 @@ def track(
         Path | None,
         typer.Option(metavar="OUT.csv", help="Also write a table: frame, time, status, and the pose by name."),
     ] = None,
+    bvh: Annotated[
+        Path | None, typer.Option(metavar="OUT.bvh", help="Also write the motion for animation programs (BVH).")
+    ] = None,
     movie: Annotated[
         str | None,
         typer.Option(
@@ -163,8 +166,8 @@ def track(
     Ctrl-C.
     """
     files, resumed = _files(output, movie, gltf, no_gltf, pictures, resume, force)
-    poses = with_ending(poses, (".csv",))
-    check_outputs([poses], force or resumed)
+    poses, bvh = with_ending(poses, (".csv",)), with_ending(bvh, (".bvh",))
+    check_outputs([poses, bvh], force or resumed)
     _check_rates(fps, scale)
     views = {"--volume": volume, "--matcher": matcher, "--reach": reach, "--seen": seen}
     check_used(stereo, "--stereo", {"--calibration": calibration, **views})
@@ -206,6 +209,8 @@ def track(
         complete = _run(run, bar, resumed)
     if poses is not None:
         _write_poses(poses, model, run.located)
+    if bvh is not None:
+        _write_motion(bvh, run)
     _report_end(run, complete, quiet)
 
 
@@ -238,6 +243,16 @@ def _write_poses(path: Path, shape: ArticulatedShape, result: TrackResult) -> No
         )
     ]
     save_pose_table(path, ["frame", "time", "status", *shape.dof_names], rows)
+
+
+def _write_motion(path: Path, run: TrackRun) -> None:
+    """Write the motion of the shape, unless it was never found."""
+    from torchreg.geometry.upright import guess_up
+    from torchreg.viz.track_bvh import save_track_bvh
+
+    if bool(run.result.poses.isfinite().all(-1).any()):
+        save_track_bvh(path, run.tracker.shape, run.result, up=run.up or guess_up(list(run.result.keypoints)))
+        tell_origin(path, run.clouds.origin)
 
 
 def _files(

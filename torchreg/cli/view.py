@@ -56,6 +56,10 @@ def view(
             help="Write one file that needs no network, instead of serving.",
         ),
     ] = None,
+    rerun: Annotated[
+        Path | None,
+        typer.Option(metavar="OUT.rrd", help="Write a recording for the viewer rerun instead (extra rerun)."),
+    ] = None,
     port: Port = 8080,
     browser: Browser = True,
     up: Up = None,
@@ -75,17 +79,21 @@ def view(
     """
     if result.suffix:
         result.stat()  # a missing file is told before all else
-    html = with_ending(html, (".html",))
-    check_outputs([html], force)
+    html, rerun = with_ending(html, (".html",)), with_ending(rerun, (".rrd",))
+    check_outputs([html, rerun], force)
     up_direction = known_up(up, [] if is_result(result) else [result, *(data or [])])
     if shape is None and is_result(result) and (parents or package_dir or skin or free_base is not None):
         raise InputError("--parents, --package-dir, --skin and --free-base are about a --shape, which was not given")
     from torchreg.storage import load
+    from torchreg.viz.rerun_log import import_rerun, scene_rrd
     from torchreg.viz.result_scenes import result_scene
     from torchreg.viz.viewer import scene_html
     from torchreg.viz.viser_server import import_viser
 
-    import_viser()
+    if rerun is not None:
+        import_rerun()
+    if rerun is None or html is not None:
+        import_viser()
     found: Any
     if is_result(result):
         found = load(result if result.suffix else result.with_suffix(".safetensors"))
@@ -93,12 +101,15 @@ def view(
         found = _shown(result, scale, parents, package_dir, free_base, skin)
     model = None if shape is None else load_shape(shape, parents, package_dir, free_base, skin)
     scene = with_up(result_scene(found, shape=model, data=_read(data or [], scale)), up_direction)
+    if rerun is not None:
+        scene_rrd(rerun, scene)
     if html is not None:
         scene_html(html, scene)
-        if not quiet:
-            typer.echo(f"{scene.title} -> {html}")
-        return
-    _serve(scene, port, browser, quiet)
+    written = [str(path) for path in (html, rerun) if path is not None]
+    if not written:
+        _serve(scene, port, browser, quiet)
+    elif not quiet:
+        typer.echo(f"{scene.title} -> {', '.join(written)}")
 
 
 def is_result(name: Path) -> bool:
@@ -117,7 +128,7 @@ def _shown(
     skin: str | None,
 ) -> Any:
     """Return a shape, mesh or cloud by name or file, or the meshes or clouds of a folder."""
-    from torchreg.errors import FormatError
+    from torchreg.errors import FormatError, ModelError
     from torchreg.io.points import load_points
 
     ending = name.suffix.lower()
@@ -128,7 +139,7 @@ def _shown(
     if ending in (".glb", ".gltf"):
         try:
             return load_shape(str(name), parents, package_dir, free_base, skin)
-        except FormatError:  # no rig, but maybe a mesh
+        except (FormatError, ModelError):  # no rig, but maybe a mesh
             if parents is not None or skin is not None:
                 raise
     if not name.exists() and not ending:

@@ -131,8 +131,15 @@ def save_animated_parts(
     times: Tensor,
     part_names: Sequence[str] | None = None,
     colors: Tensor | None = None,
+    *,
+    part_normals: Sequence[Tensor | None] | None = None,
+    parents: Sequence[int] | None = None,
+    up: Direction | None = None,
 ) -> Path:
     """Return the path of a .glb file in which each rigid part is a moving node.
+
+    Between frames, parts move relative to their parents: translations are interpolated linearly, rotations along the
+    shorter arc.
 
     Args:
         path: where to write; the suffix must be .glb. An existing file is replaced once the new one is complete.
@@ -141,6 +148,9 @@ def save_animated_parts(
         times: (T,) seconds, not negative, strictly increasing.
         part_names: P different names; part_0, part_1, ... by default.
         colors: (P, 3) or (P, 4) in [0, 1].
+        part_normals: P normals (V, 3) at the vertices, None where a part has none.
+        parents: P indices of parent parts, -1 for roots, in any order; by default all are roots.
+        up: the axis that is upright, turned to glTF's y by a root node; left as it is by default.
 
     Returns:
         The path written.
@@ -158,18 +168,28 @@ def save_animated_parts(
     moving = _rigid(part_transforms, "part_transforms", (len(seconds), count, 4, 4))
     paint = np.tile(DEFAULT_COLOR, (count, 1)) if colors is None else checked_rgba(colors, "colors", count)
 
+    above = [-1] * count if parents is None else list(parents)
+    order, normals = _checked_parents(above, count, names), part_normals or [None] * count
+    local = _local(moving, above)
+
     document = GltfBuilder()
-    nodes = []
-    for index, (name, mesh) in enumerate(zip(names, part_meshes, strict=True)):
-        node = document.add_node(name, moving[0, index])
-        nodes.append(node)
+    nodes = [document.add_node(name, local[0, index]) for index, name in enumerate(names)]
+    for index, mesh in enumerate(part_meshes):
         if mesh is not None:
             points = checked_numbers(mesh.vertices, f"part_meshes[{index}].vertices", ("V", 3))
             triangles = checked_triangles(mesh.faces, f"part_meshes[{index}].faces", len(points))
-            attributes = document.mesh_attributes(points, None, None)
-            document.gltf.nodes[node].mesh = document.add_mesh(name, attributes, triangles, tuple(paint[index]))
-    document.animate("motion", seconds, nodes, moving)
-    return document.write(target, nodes)
+            attributes = document.mesh_attributes(points, normals[index], None)
+            color = tuple(paint[index])
+            document.gltf.nodes[nodes[index]].mesh = document.add_mesh(names[index], attributes, triangles, color)
+    for index in order:
+        if above[index] >= 0:
+            document.gltf.nodes[nodes[above[index]]].children.append(nodes[index])
+    roots = [nodes[index] for index in order if above[index] < 0]
+    if up is not None:
+        root = document.add_node("upright", to_y_up(up).numpy())
+        document.gltf.nodes[root].children, roots = roots, [root]
+    document.animate("motion", seconds, nodes, local)
+    return document.write(target, roots)
 
 
 def _checked_names(names: Sequence[str], argument: str) -> int:

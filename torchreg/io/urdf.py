@@ -72,6 +72,7 @@ class UrdfRecord:
         link_names: names of the links, in the order of ``tree.joints``.
         link_meshes: mesh in link coordinates, float64, or None; visual geometry, else collision geometry.
         link_primitives: boxes, cylinders, capsules and spheres of the same geometry.
+        link_colors: red, green and blue from 0 to 1 of a link's first visual with a color; None where there is none.
     """
 
     name: str
@@ -79,6 +80,7 @@ class UrdfRecord:
     link_names: tuple[str, ...]
     link_meshes: tuple[TriangleMesh | None, ...]
     link_primitives: tuple[tuple[UrdfPrimitive, ...], ...]
+    link_colors: tuple[tuple[float, ...] | None, ...] = ()
 
 
 def load_urdf(
@@ -129,13 +131,35 @@ def _read_robot(source: Path, package_dirs: Sequence[Path], meshes: str, limits:
     files = MeshFiles(source, package_dirs, meshes == "require", limits, warn=meshes == "warn")
     geometry = _Geometry(source, files, limits)
     shapes = [geometry.of_link(name, links[name]) for name, _ in order]
+    named = {material.get("name"): _color(material) for material in robot.findall("material")}
     return UrdfRecord(
         name=robot.get("name") or source.stem,
         tree=_build_tree(source, order, joints),
         link_names=tuple(name for name, _ in order),
         link_meshes=tuple(mesh for mesh, _ in shapes),
         link_primitives=tuple(primitives for _, primitives in shapes),
+        link_colors=tuple(_link_color(links[name], named) for name, _ in order),
     )
+
+
+def _link_color(link: ET.Element, named: Mapping[str | None, tuple[float, ...] | None]) -> tuple[float, ...] | None:
+    """Return the color of the first visual of a link that has one, by itself or by the name of its material."""
+    for material in link.findall("visual/material"):
+        color = _color(material) or named.get(material.get("name"))
+        if color is not None:
+            return color
+    return None
+
+
+def _color(material: ET.Element) -> tuple[float, ...] | None:
+    """Return red, green and blue of a material from 0 to 1; None where there are none that can be read."""
+    color = material.find("color")
+    try:
+        numbers = [float(word) for word in ("" if color is None else color.get("rgba", "")).split()]
+    except ValueError:
+        return None
+    is_color = len(numbers) in (3, 4) and all(0 <= number <= 1 for number in numbers)
+    return tuple(numbers[:3]) if is_color else None
 
 
 def _parse(path: Path, limits: FileLimits) -> ET.Element:

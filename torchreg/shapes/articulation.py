@@ -299,14 +299,21 @@ class Articulation(PosedTree):
         check_finite(pose, "pose")
         if spacing is not None:
             check_positive(spacing, "spacing")
-        with torch.no_grad():
-            transforms = self.part_transforms(pose)
-            positions = self._solid_frames(transforms)[..., 3]
-            reach = self.primitives.reaches(self._scaled_sizes()).unsqueeze(-1) + 3 * self.nu
-            lower, upper = (positions - reach).amin(0), (positions + reach).amax(0)
-        if spacing is None:
-            spacing = max(self.nu, float((upper - lower).prod() / BUDGET.surface_samples) ** (1 / 3))
+        lower, upper = self._surface_box(pose)
+        spacing = max(self.nu, _least_spacing(lower, upper)) if spacing is None else spacing
         return isosurface(lambda points: self.distance(points, pose), lower, upper, spacing)
+
+    def coarse_surface_mesh(self) -> TriangleMesh:
+        """Return a mesh of the fused surface at rest as `surface_mesh`, on a grid of 1.5 fusion lengths or wider."""
+        pose = self.rest_pose()
+        return self.surface_mesh(pose, max(1.5 * self.nu, _least_spacing(*self._surface_box(pose))))
+
+    @torch.no_grad()
+    def _surface_box(self, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the lower and the upper corner (3,) of a box around the fused surface."""
+        positions = self._solid_frames(self.part_transforms(pose))[..., 3]
+        reach = self.primitives.reaches(self._scaled_sizes()).unsqueeze(-1) + 3 * self.nu
+        return (positions - reach).amin(0), (positions + reach).amax(0)
 
     def _held(self) -> _HeldSizes | None:
         """Return the sizes that the running thread holds of this shape."""
@@ -357,6 +364,11 @@ class Articulation(PosedTree):
         local = (rotations.movedim(-1, -3).flatten(-3, -2) @ points.mT).sub_(offsets)
         x, y, z = local.unflatten(-2, (3, -1)).unbind(-3)
         return x, y, z
+
+
+def _least_spacing(lower: Tensor, upper: Tensor) -> float:
+    """Return the edge length of the finest grid in a box that is evaluated without being asked for."""
+    return float((upper - lower).prod() / BUDGET.surface_samples) ** (1 / 3)
 
 
 def _minor(a: Tensor, d: Tensor, b: Tensor, c: Tensor) -> Tensor:

@@ -39,6 +39,8 @@ class _RobotFit:
     segments: int = 24
     # Radius of the capsules that stand for links without geometry, in median distances between frames: a finger's.
     radius_per_bone: float = 0.1
+    # Of links whose color the file does not tell: bare metal.
+    color: tuple[float, float, float] = (0.7, 0.7, 0.72)
 
 
 _FIT = _RobotFit()
@@ -116,7 +118,7 @@ def _spec_of(record: UrdfRecord, primitive: str, empty: str) -> ShapeSpec:
         primitives=tuple(solids),
         nu=fusion_length(solids, _FIT.nu_per_thickness),
         part_names=tuple(part_names),
-        surface=_robot_surface(record.tree, surfaces, links),
+        surface=_robot_surface(record, surfaces, links),
     )
 
 
@@ -218,9 +220,9 @@ def solid_mesh(solid: UrdfPrimitive) -> TriangleMesh:
     return TriangleMesh(transform_points(solid.origin, mesh.vertices), mesh.faces)
 
 
-def _robot_surface(tree: KinematicTree, surfaces: Sequence[TriangleMesh | None], links: Sequence[int]) -> RigSurface:
+def _robot_surface(record: UrdfRecord, surfaces: Sequence[TriangleMesh | None], links: Sequence[int]) -> RigSurface:
     """Return the links' surfaces with every joint at zero, each vertex on the first part of its link."""
-    kinematics = ForwardKinematics(tree)
+    kinematics = ForwardKinematics(record.tree)
     transforms = kinematics(torch.zeros(kinematics.num_dofs, dtype=torch.float64))
     part_of = {link: links.index(link) for link in dict.fromkeys(links)}
     found = [(part, transforms[link], mesh) for link, part in part_of.items() if (mesh := surfaces[link]) is not None]
@@ -231,7 +233,13 @@ def _robot_surface(tree: KinematicTree, surfaces: Sequence[TriangleMesh | None],
     # Robots' meshes are large and these weights zeros and ones, so that half the memory holds them exactly.
     weights = torch.zeros(len(owners), len(links), dtype=torch.float32)
     weights.scatter_(1, owners.unsqueeze(-1), 1.0)
-    return RigSurface(surface.vertices, surface.faces, weights, is_rigid=True)
+    return RigSurface(surface.vertices, surface.faces, weights, is_rigid=True, colors=_part_colors(record, links))
+
+
+def _part_colors(record: UrdfRecord, links: Sequence[int]) -> Tensor:
+    """Return the colors (P, 3) of parts on links."""
+    known = record.link_colors or [None] * len(record.link_names)
+    return torch.tensor([known[link] or _FIT.color for link in links])
 
 
 def _new_name(name: str, joints: Sequence[Joint]) -> str:

@@ -26,12 +26,14 @@ class RigSurface:
         faces: (F, 3) int64.
         weights: (V, P) over the parts, rows sum to one.
         is_rigid: whether it is made of rigid links, whose vertices are few or many wherever their makers liked.
+        colors: (P, 3) of the parts, red, green, blue from 0 to 1, where the file tells any.
     """
 
     vertices: Tensor
     faces: Tensor
     weights: Tensor
     is_rigid: bool = False
+    colors: Tensor | None = None
 
 
 @dataclass(frozen=True)

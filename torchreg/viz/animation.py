@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchreg._checks import check_positive, check_shape
-from torchreg.datasets.hand import surface_skin
 from torchreg.errors import InputError, MissingExtraError
 from torchreg.geometry.upright import Direction
 from torchreg.geometry.visibility import View
 from torchreg.io.atomic import write_atomic
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.shapes.skin import BendingSkin, LinearBlendSkin
 from torchreg.viz.figures import draw_alignment, new_figure, watch
 
 if TYPE_CHECKING:
@@ -162,8 +161,11 @@ def common_view(
 
 
 def coarse_skin(shape: ArticulatedShape) -> LinearBlendSkin:
-    """Return the surface of a shape on a grid of 1.5 fusion lengths, fine enough for small pictures."""
-    return surface_skin(shape, spacing=None if shape.surface is not None else 1.5 * shape.nu)
+    """Return the surface of a shape: the mesh of its file, else a coarse one, fine enough for small pictures."""
+    if shape.surface is not None:
+        return shape.file_skin()
+    mesh = shape.coarse_surface_mesh()
+    return BendingSkin(shape, mesh.vertices, shape.rest_pose(), faces=mesh.faces)
 
 
 def _picture(frame: Frame, size: tuple[int, int], index: int) -> NDArray[np.uint8]:

@@ -170,17 +170,23 @@ def watch(
             camera = points.new_tensor([0.35 * away, -0.25 * away, 0.0])
         else:
             upright = points.new_tensor(guess_up([points])) if upright is None else upright
-            camera = middle + 3 * length * _from_before(upright)
+            camera = middle + 3 * length * _from_before(upright, points)
     width, height = size
     return aim(points, camera, up=upright, size=(_OVERSAMPLING * width, _OVERSAMPLING * height), margin=margin)
 
 
-def _from_before(up: Tensor) -> Tensor:
-    """Return the direction (3,) from which an upright thing is seen: from before, a little to the right and above."""
+def _from_before(up: Tensor, points: Tensor) -> Tensor:
+    """Return the direction (3,) from which upright points (N, 3) are seen: from before, a little right and above.
+
+    The less they spread along up, beside their width, the further above.
+    """
     along_z = -1.0 if float(up[1]) < 0 else 1.0  # a camera's y points down, and it looks along z
     front = up.new_tensor([0.0, -1.0, 0.0] if abs(float(up[2])) > 0.5 else [0.0, 0.0, along_z])
     right = torch.linalg.cross(up, front)
-    return nn.functional.normalize(0.6 * right + front + 0.5 * up, dim=0)
+    level = nn.functional.normalize(0.6 * right + front, dim=0)
+    height, width = (float((points @ axis).std()) for axis in (up, torch.linalg.cross(up, level)))
+    sine = min(max(0.4, 0.9 - height / max(width, 1e-9)), 0.8)  # of the elevation: 24 to 53 degrees
+    return math.sqrt(1 - sine**2) * level + sine * up
 
 
 def new_figure(width: int, height: int, columns: int = 1) -> tuple[Figure, list[Axes]]:

@@ -125,9 +125,14 @@ def _track_scene(result: TrackResult, shape: ArticulatedShape | None, data: Data
         layers.append(
             _cloud("data", clouds, [_nearness(shape, *pair) for pair in zip(clouds, result.poses, strict=True)])
         )
+    title = counted(len(result.poses), "tracked frame")
+    return Scene(title, tuple(layers), result.times, result.up, _status_facts(result))
+
+
+def _status_facts(result: TrackResult) -> dict[str, str]:
+    """Return the number of frames of each status in words."""
     kinds = [status.value for status in result.statuses]
-    facts = {kind: counted(kinds.count(kind), "frame") for kind in sorted(set(kinds))}
-    return Scene(counted(len(result.poses), "tracked frame"), tuple(layers), result.times, result.up, facts)
+    return {kind: counted(kinds.count(kind), "frame") for kind in sorted(set(kinds))}
 
 
 @_scene.register
@@ -135,7 +140,10 @@ def _demo_scene(result: DemoResult, shape: ArticulatedShape | None, data: Data) 
     hand = Hand() if shape is None else shape
     paints = [inlier_paint(mask, torch.ones(len(mask))) for mask in result.inliers]
     layers = [*_shape_layers(hand, result.track.poses), _cloud("data", result.clouds, paints)]
-    return Scene(f"demo, seed {result.seed}", tuple(layers), result.track.times)
+    facts = _status_facts(result.track)
+    if result.tips_seen.any():
+        facts["error of seen fingertips"] = f"{1e3 * float(result.tip_errors[result.tips_seen].mean()):.1f} mm"
+    return Scene(f"demo, seed {result.seed}", tuple(layers), result.track.times, facts=facts)
 
 
 @_scene.register
@@ -216,12 +224,11 @@ def _spine_scene(result: SpineSequence, shape: None, data: Data) -> Scene:
     if data and len(data) != len(result.curves):
         raise InputError(f"data must hold one surface per frame ({len(result.curves)}), got {len(data)}")
     layers += _surface_frames(data)
-    return Scene(
-        f"{counted(result.num_tips, 'tip')}, {counted(len(result.graph), 'limb')}",
-        tuple(layers),
-        result.times,
-        result.up,
-    )
+    title = f"{counted(result.num_tips, 'tip')}, {counted(len(result.graph), 'limb')}"
+    facts = {"status": result.status.value}
+    if result.confidence is not None:
+        facts["confidence of names"] = f"{float(result.confidence.nan_to_num(1.0).min()):.2f} and more"
+    return Scene(title, tuple(layers), result.times, result.up, facts)
 
 
 @_scene.register
@@ -280,7 +287,9 @@ def _shape_layers(shape: ArticulatedShape | None, poses: Tensor) -> list[Layer]:
     with torch.no_grad():
         vertices = torch.where(found[:, None, None], skin(safe), torch.nan)
         origins = torch.where(found[:, None, None], shape.part_transforms(safe)[..., :3, 3], torch.nan)
-    layers: list[Layer] = [MovingMesh("shape", vertices, faces, SKIN_COLOR)]
+    colors = None if shape.surface is None else shape.surface.colors
+    paint = SKIN_COLOR if colors is None else colors[skin.weights.argmax(-1).cpu()].float()
+    layers: list[Layer] = [MovingMesh("shape", vertices, faces, paint)]
     pairs = [(parent, part) for part, parent in enumerate(shape.part_parents) if parent >= 0]
     if pairs:
         layers.append(Curves("bones", origins[:, torch.tensor(pairs)], bone_palette(len(pairs)), visible=False))

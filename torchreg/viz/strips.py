@@ -187,7 +187,7 @@ def convergence_figure(
         path: the picture to write.
         curves: numbers per step by name, such as ``[float(record.cost) for record in result.history]``.
         ylabel: name of the numbers.
-        logarithmic: whether their scale is; numbers that are not positive are then omitted.
+        logarithmic: whether their scale is; numbers that are not positive are then omitted, and lines without others.
 
     Raises:
         InputError: if there is no line.
@@ -196,6 +196,7 @@ def convergence_figure(
         raise InputError("curves must hold one line at least, and each a number")
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogFormatter, MaxNLocator
 
     figure = Figure(figsize=(5.2, 3.2), dpi=100, facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
@@ -203,11 +204,18 @@ def convergence_figure(
     for name, values in curves.items():
         line = np.asarray(values, dtype=float)
         line = np.where(line > 0, line, np.nan) if logarithmic else line
-        ax.plot(np.arange(1, len(line) + 1), line, marker="o", markersize=3, linewidth=1.4, label=name)
+        if np.isfinite(line).any():
+            ax.plot(np.arange(1, len(line) + 1), line, marker="o", markersize=3, linewidth=1.4, label=name)
     ax.set(xlabel="step", ylabel=ylabel, yscale="log" if logarithmic else "linear")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    if logarithmic:
+        plain = LogFormatter(labelOnlyBase=False, minor_thresholds=(2.0, 0.5))
+        ax.yaxis.set_major_formatter(plain)
+        ax.yaxis.set_minor_formatter(plain)
     ax.grid(True, which="both", alpha=0.25)
     ax.spines[["top", "right"]].set_visible(False)
-    ax.legend(frameon=False)
+    if ax.lines:
+        ax.legend(frameon=False)
     return save_picture(figure, path)
 
 

@@ -88,7 +88,7 @@ def draw_track_frame(
 
 def frame_label(frame: int, status: Status, acquired: str) -> str:
     """Return the label of a frame: its number, and the stage that acquired its pose, or its status without one."""
-    return f"{frame}  {acquired if status.usable else status.value}"
+    return f"frame {frame}: {acquired if status.usable else status.value}"
 
 
 class FrameOverlays:

@@ -50,6 +50,7 @@ def start_server(title: str, port: int) -> viser.ViserServer:
     # Sharing would open a tunnel through a foreign server.
     setattr(server, "request_share_url", lambda verbose=True: None)  # noqa: B010
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+    server.gui.main_panel.dock_right()  # beside the scene, whose middle it would cover in small windows
     server.scene.configure_environment_map(None)
     return server
 
