@@ -36,7 +36,20 @@ def masks(tmp_path_factory):
 
 
 def test_everything_is_written(run, frames, tmp_path):
-    options = ("--swc", "a.swc", "--npz", "a.npz", "--table", "a.csv", "--movie", "a.gif", "--pictures", "pictures")
+    options = (
+        "--swc",
+        "a.swc",
+        "--npz",
+        "a.npz",
+        "--table",
+        "a.csv",
+        "--plot",
+        "a.png",
+        "--movie",
+        "a.gif",
+        "--pictures",
+        "pictures",
+    )
     options = [tmp_path / option if not option.startswith("--") else option for option in options]
     answer = run("spine", frames, "-o", tmp_path / "a.glb", *options)
     assert answer.exit_code == 0, answer.output
@@ -54,7 +67,7 @@ def test_everything_is_written(run, frames, tmp_path):
     assert [float(line.split(",")[1]) for line in lines[1:]] == pytest.approx(
         found.measurements().lengths[:, 0].tolist()
     )
-    for name in ("a.glb", "a.json", "a.gif"):
+    for name in ("a.glb", "a.json", "a.gif", "a.png"):
         assert (tmp_path / name).stat().st_size > 0
 
 

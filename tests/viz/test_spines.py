@@ -10,9 +10,11 @@ from PIL import Image
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.geometry.skeleton import Skeleton
+from torchreg.spines.measurements import measure_limbs
 from torchreg.viz.bone_colors import bone_palette
 from torchreg.viz.figures import new_figure
 from torchreg.viz.spines import (
+    draw_measurements,
     draw_spine_frame,
     draw_tip_distance,
     save_skeleton_picture,
@@ -31,6 +33,23 @@ def spine():
     turned = curves.roll(1, -1)
     own = torch.tensor([[True, True, True], [True, False, True]])
     return SimpleNamespace(curves=torch.stack((curves, turned)), num_tips=3, own=own, up=None)
+
+
+@pytest.mark.parametrize("frames", [1, 3])
+def test_measurements_are_drawn_over_time_in_the_colors_of_limbs(spine, frames):
+    curves = spine.curves[:1] * torch.linspace(1, 2, frames)[:, None, None, None]
+    graph, times = torch.tensor([[0, 3], [1, 3], [2, 3]]), torch.linspace(0, 1, frames)
+    found = measure_limbs(curves, torch.ones(frames, 3, 5), graph, times)
+    figure = draw_measurements(found)
+    lengths, _, angles = figure.axes
+    colors = bone_palette(3).tolist()
+    assert [line.get_color() for line in lengths.lines] == colors
+    for limb, line in enumerate(lengths.lines):
+        np.testing.assert_allclose(line.get_xydata(), torch.stack((times, found.lengths[:, limb]), dim=1))
+    # Both limbs of each of three pairs at right angles.
+    assert len(angles.lines) == 6
+    np.testing.assert_allclose(angles.lines[0].get_ydata(), 90, atol=1e-4)
+    assert [text.get_text() for text in lengths.get_legend().get_texts()] == ["0", "1", "2"]
 
 
 def test_limbs_keep_their_colors_and_transferred_ones_are_dashed(spine):

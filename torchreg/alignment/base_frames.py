@@ -136,7 +136,7 @@ def read_joints(shape: Articulation, poses: Any, count: int) -> Tensor:
             f"({count}, {shape.num_dofs}) with the base before them; got {tuple(rows.shape)}"
         )
     if len(rows) != count:
-        raise InputError(f"poses must hold one row for each of {count} frames, got {len(rows)}")
+        raise InputError(f"poses must hold one row per frame, {count}, got {len(rows)}")
     joints = rows[:, -len(names) :] if names else rows[:, :0]
     if not bool(joints.isfinite().all()):
         number, dof = (~joints.isfinite()).nonzero()[0].tolist()

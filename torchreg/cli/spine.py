@@ -11,7 +11,17 @@ import typer
 
 from torchreg.cli.align_options import NanPolicy, Scale, cloud_files
 from torchreg.cli.cameras import Calibration, Seen, check_used, load_calibration, seen_folder
-from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, counted, numbered, tell_origin, with_ending
+from torchreg.cli.outputs import (
+    PICTURE_ENDINGS,
+    Force,
+    Quiet,
+    check_outputs,
+    claimed,
+    counted,
+    numbered,
+    tell_origin,
+    with_ending,
+)
 from torchreg.cli.reporting import interruption, reporting
 from torchreg.cli.upright import Up, known_up, remembering
 
@@ -60,6 +70,10 @@ def spine(
         Path | None,
         typer.Option(metavar="OUT.csv", help="Also write lengths, radii and angles of limbs, one line per frame."),
     ] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(metavar="OUT.png", help="Also draw lengths, radii and angles of limbs over time."),
+    ] = None,
     movie: Annotated[
         Path | None, typer.Option(metavar="OUT.gif", help="Also draw all frames as a moving picture, .gif or .mp4.")
     ] = None,
@@ -106,6 +120,7 @@ def spine(
     glb = with_ending(output, (".glb",), add=True)
     result = glb.with_suffix(".safetensors")
     swc, npz, table = with_ending(swc, (".swc",)), with_ending(npz, (".npz",)), with_ending(table, (".csv",))
+    plot = with_ending(plot, PICTURE_ENDINGS)
     hulls = {"--calibration": calibration, "--screen": screen, "--resolution": resolution, "--seen": seen}
     check_used(silhouettes, "--silhouettes", hulls)
     if growing:
@@ -118,7 +133,7 @@ def spine(
         meshes, names = _read(frames, scale, nan_policy)
         count = len(meshes)
     curves = [numbered(swc, frame, count) for frame in range(count)] if swc is not None else []
-    check_outputs([glb, result, result.with_suffix(".json"), npz, table, movie, *curves], force)
+    check_outputs([glb, result, result.with_suffix(".json"), npz, table, plot, movie, *curves], force)
     if movie is not None:
         from torchreg.viz.animation import check_animation_path
 
@@ -136,6 +151,11 @@ def spine(
         _write(found, meshes, glb, curves, npz, fps)
         if table is not None:
             found.measurements().save_csv(table)
+        if plot is not None:
+            from torchreg.viz.figures import save_picture
+            from torchreg.viz.spines import draw_measurements
+
+            save_picture(draw_measurements(found.measurements()), plot)
         _draw(found, meshes, movie, pictures, fps)
     if not quiet:
         for warning in found.warnings:

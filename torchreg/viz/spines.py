@@ -15,6 +15,7 @@ from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.geometry.visibility import View
+from torchreg.spines.measurements import SpineMeasurements
 from torchreg.spines.results import SpineSequence
 from torchreg.viz.animation import save_animation
 from torchreg.viz.bone_colors import bone_palette, scale_colors
@@ -22,6 +23,7 @@ from torchreg.viz.figures import draw_mesh, draw_rendered, new_figure, picture_s
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,39 @@ def save_skeleton_picture(
     figure, (ax,) = new_figure(*picture_size(shown))
     draw_spine_frame(ax, mesh, skeleton.resample(_STYLE.num_samples)[0], len(skeleton.tips), view=shown)
     return save_picture(figure, Path(path))
+
+
+def draw_measurements(measurements: SpineMeasurements) -> Figure:
+    """Return a figure of lengths, radii and angles over time, limbs in the colors that they have in pictures.
+
+    An angle is drawn in the color of the first of its limbs, dashed in that of the second. What grows has lines from
+    its birth to its end. A single frame is drawn as dots.
+    """
+    figure, axes = new_figure(720, 720, 3)
+    times = measurements.times.detach().cpu()
+    colors = bone_palette(measurements.lengths.shape[1]).tolist()
+    marker = "o" if len(times) == 1 else None
+    panels = (
+        ("length of limbs", measurements.lengths),
+        ("mean radius of limbs", measurements.radii),
+        ("angle between limbs, degrees", measurements.angles.rad2deg()),
+    )
+    for row, (ax, (title, values)) in enumerate(zip(axes, panels, strict=True)):
+        ax.set_position((0.1, 0.71 - 0.32 * row, 0.75, 0.25))
+        ax.set_axis_on()
+        ax.set_title(title, fontsize=9, loc="left")
+        drawn = values.detach().cpu()
+        for column, line in enumerate(drawn.unbind(1)):
+            if row < len(panels) - 1:
+                ax.plot(times, line, color=colors[column], marker=marker, label=str(column))
+            else:
+                first, second = measurements.pairs[column].tolist()
+                ax.plot(times, line, color=colors[first], marker=marker)
+                ax.plot(times, line, color=colors[second], dashes=(3, 3), marker=marker)
+        ax.margins(x=0.01)
+    axes[-1].set_xlabel("time")
+    axes[0].legend(title="limb", loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=8, frameon=False)
+    return figure
 
 
 def save_spine_pictures(
