@@ -157,7 +157,7 @@ def test_joints_come_in_many_forms(arm):
         ([[17.0, 51.0, -23.0]], r"poses\[0\] has joint 'turn' at 17, .*as degrees all would fit"),
         ([[0.1, 2.6, 0.0]], r"joint 'elbow' at 2.6, beyond its limits -2.2 to 2.2; check units and order"),
         ([[0.1, 0.2]], r"must have shape \(1, 3\), the joints turn, elbow, wrist, .* got \(1, 2\)"),
-        ([[0.1, 0.2, 0.3]] * 2, "one row for each of 1 frames, got 2"),
+        ([[0.1, 0.2, 0.3]] * 2, "one row per frame, 1, got 2"),
         ([[0.1, math.nan, 0.3]], r"poses\[0\] holds no finite number for joint 'elbow'"),
     ],
 )
