@@ -64,13 +64,14 @@ OWNERS = {
 MODULES_INSIDE = {"torchreg", "scipy", "scipy.sparse"}
 # What stands in backticks in the docstring of a system's package may be used outside it.
 DOORS = re.compile(r"`(\w+)`")
-LAZY = {"matplotlib", "viser", "websockets", "plotly", "cv2", "PIL", "OpenEXR"}
+LAZY = {"matplotlib", "viser", "websockets", "plotly", "cv2", "PIL", "OpenEXR", "rerun"}
 LOWEST_THIRD_PARTY = {"errors": set(), "metrics": {"torch"}, "_checks": {"torch"}, "_threads": {"torch"}}
 IMPORT_NAMES = {
     "pytorch-kinematics": "pytorch_kinematics",
     "scikit-image": "skimage",
     "pillow": "PIL",
     "opencv-python-headless": "cv2",
+    "rerun-sdk": "rerun",
 }
 
 

@@ -249,7 +249,7 @@ def test_millimeters_taken_for_meters_are_warned_of_once(run, command, sequence,
 def test_options_reach_the_tracker(run, command, monkeypatch):
     seen = []
 
-    def noted(shape, initial_pose=None, *, config=None, locked=()):
+    def noted(shape, initial_pose=None, *, config=None, locked=(), initializer=None):
         seen.append((initial_pose, config, locked))
         raise KeyboardInterrupt
 
@@ -288,7 +288,7 @@ def test_what_is_never_found_has_a_picture_and_no_gltf(run, sequence, tmp_path):
     )  # fmt: skip
     assert answer.exit_code == 1, answer.output
     assert "1 frame: 0 tracked, 1 lost" in answer.output
-    names = ["live", "r.bvh", "r.gif", "r.json", "r.progress", "r.safetensors"]
+    names = ["live", "r.gif", "r.json", "r.progress", "r.safetensors"]
     assert sorted(path.name for path in tmp_path.iterdir()) == names
     assert not load(tmp_path / "r.safetensors").poses.isfinite().any()
     assert (tmp_path / "live" / "frame_0000.png").exists()

@@ -138,7 +138,7 @@ class ScanTokens:
 def _drawn_around(distances: Tensor, tokens: Tensor, radius: float, generator: torch.Generator) -> Tensor:
     """Return K points (T, K) drawn within a radius of each token, at distances (T, P); the token for want of more."""
     count = min(SIZES.num_neighbors, distances.shape[1])
-    draw = torch.rand(distances.shape, generator=generator).masked_fill_(distances > radius, 2.0)
+    draw = torch.rand(distances.shape, generator=generator, dtype=torch.float32).masked_fill_(distances > radius, 2.0)
     found, index = draw.topk(count, dim=1, largest=False)
     index = torch.where(found > 1, tokens.unsqueeze(1), index)
     missing = tokens.unsqueeze(1).expand(-1, SIZES.num_neighbors - count)
