@@ -29,6 +29,7 @@ class PoissonFit:
     border: int = 6  # empty voxels around the points: the equation is solved on a torus
     num_rays: int = 500  # through the body, which tell whether the far side is shown
     near: float = 3.0  # along a ray, within which points are those that it starts from
+    least_shown: float = 0.5  # share of points with a far side: about one of a whole body, zero of what one view shows
 
 
 FIT = PoissonFit()
@@ -48,6 +49,11 @@ class PoissonBody:
     mesh: TriangleMesh
     joined: int
     shown: float
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether points show most of the body from both sides."""
+        return self.shown > FIT.least_shown
 
 
 def poisson_body(points: Tensor) -> PoissonBody:

@@ -88,8 +88,8 @@ def skeletonize(mesh: TriangleMesh | Tensor, config: SkeletonizeConfig | None = 
 
     Args:
         mesh: any triangles that make a surface: open, with duplicate vertices, wrong winding, edges of more than two
-            triangles; or points of a surface (N, 3), a cloud or a scan without faces, on which one is laid, see
-            `poisson_body`, and for what is seen from one side `cloud_surface`.
+            triangles; or points of a surface (N, 3), a cloud or a scan without faces, to which a surface is
+            fitted, see `poisson_body`, and for what is seen from one side `cloud_surface`.
         config: defaults do for bodies with limbs.
 
     Returns:

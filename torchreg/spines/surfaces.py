@@ -13,7 +13,6 @@ from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.poisson_body import poisson_body
 from torchreg.geometry.spread import SPREADS, spread_dimensions
 
-LEAST_SHOWN = 0.5  # of a body's points, those opposite to others: all of a whole body, none of what one view shows
 ONE_SIDED = "the points do not enclose a body, as those of a single view: limbs follow the side that they show"
 
 
@@ -36,7 +35,7 @@ def as_surface(value: Any, name: str) -> tuple[TriangleMesh, tuple[str, ...]]:
     places = enough_places(points, name)
     size = (places.amax(0) - places.amin(0)).norm()
     body = poisson_body(places) if int(spread_dimensions(places, size)) == len(SPREADS) else None
-    if body is not None and body.shown > LEAST_SHOWN:
+    if body is not None and body.is_whole:
         notes = (f"{body.joined} piece(s) joined across gaps between points",) if body.joined else ()
         return TriangleMesh(body.mesh.vertices.to(points), body.mesh.faces.to(points.device)), notes
     found = cloud_surface(points.detach(), name)

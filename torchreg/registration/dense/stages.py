@@ -16,7 +16,7 @@ from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.registration.dense.problem import ExpectedPlaces, ScanAlignProblem
 from torchreg.solvers.robust import cauchy_weight
 
-# Beyond so many stds from where it is expected, it says nothing any more where a sample is.
+# Stds beyond which the expectation no longer tells where a sample is: of a Gaussian one in a hundred lies there.
 _FAR_OFF = 3.0
 
 
@@ -133,7 +133,7 @@ def mismatch(problem: ScanAlignProblem, moved: OrientedSamples) -> tuple[Tensor,
 
 
 def uncovered(problem: ScanAlignProblem, moved: OrientedSamples) -> Tensor:
-    """Return the same of the target's samples (T,), by their distance from the moved source."""
+    """Return what the target's samples (T,) are expected to cost, by their distance from the moved source alike."""
     apart = NeighborTree(moved.points).nearest(problem.target.points)[1]
     return problem.prior.target_visible * (apart / problem.config.cap).clamp(max=1).square()
 
