@@ -16,7 +16,7 @@ from torchreg.registration.dense.oriented_samples import OrientedSamples
 from torchreg.registration.dense.problem import ExpectedPlaces, ScanAlignProblem
 from torchreg.solvers.robust import cauchy_weight
 
-# Stds beyond which the expectation no longer tells where a sample is: of a Gaussian one in a hundred lies there.
+# Stds beyond which the expectation no longer tells where a sample is: of a Gaussian three in a hundred lie there.
 _FAR_OFF = 3.0
 
 
