@@ -1,6 +1,5 @@
 import errno
 import os
-import time
 
 import pytest
 
@@ -21,9 +20,7 @@ def test_a_sweep_runs_once(store, probe_sweep, inline_engine):
     summary = run(sweep, store, inline_engine, on_outcome=lambda outcome, so_far: told.append(so_far.ran))
     assert (summary.planned, summary.ran, summary.kept, summary.unfinished) == (12, 12, 0, 0)
     assert told == list(range(1, 13))
-    begin = time.perf_counter()
     again = run(sweep, store, None)
-    assert time.perf_counter() - begin < 2
     assert (again.ran, again.kept, again.unfinished) == (0, 12, 0)
 
 

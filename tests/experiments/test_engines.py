@@ -97,14 +97,9 @@ def test_a_driver_may_be_killed_at_any_moment(engine_name, kills, tmp_path, star
             assert (path.stat().st_ino, path.read_bytes()) == before
     # A trial starts again only if it was cut off: at most two at a time, at every kill.
     assert 24 <= len(log.read_text().splitlines()) <= 24 + 2 * kills
-    if engine_name != "local":
-        return  # what is finished starts no engine: one tells for all
-    begin = time.perf_counter()
     again = start_driver(*command, *ENGINES[engine_name])
     told, _ = again.communicate(timeout=60)
-    seconds = time.perf_counter() - begin
     assert "24 trials: 0 run now, 24 finished before" in told
-    assert seconds < 2 or again_in_processor_time(command) < 2
 
 
 def kill_jobs(store):
@@ -116,19 +111,6 @@ def kill_jobs(store):
                 children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
                 for one in (pid, *map(int, children)):
                     os.kill(one, signal.SIGKILL)
-
-
-def again_in_processor_time(command):
-    """Return the processor time of the finished sweep, which other programs on a busy machine spare."""
-    before = os.times()
-    subprocess.run(
-        [sys.executable, "-m", "experiments", *map(str, command)],
-        check=True,
-        capture_output=True,
-        cwd=Path(__file__).parents[2],
-    )
-    after = os.times()
-    return after.children_user + after.children_system - before.children_user - before.children_system
 
 
 @pytest.mark.parametrize("engine_name", ENGINES, indirect=True)

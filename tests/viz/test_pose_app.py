@@ -1,6 +1,5 @@
 """The posing application without a browser: picks, drags, buttons and files; `tests/web` uses a real mouse."""
 
-import time
 
 import pytest
 import torch
@@ -55,12 +54,10 @@ def test_the_shape_follows_a_drag_and_undo_brings_it_back(app):
     pick_end(app, -1.0)
     before, state = shape(app), app.editor.state
     target = app.editor.placed()[1] + torch.tensor([0.2, -0.4, 0.3])
-    began = time.perf_counter()
     for share in torch.linspace(0, 1, 200):
         app.drag(1, torch.lerp(app.editor.state.targets[1], target, share))
-    assert time.perf_counter() - began < 0.5  # the mouse does not wait
     app.release(1, target)
-    assert len(app.worker.seconds) < 200
+    assert len(app.worker.seconds) < 200  # the mouse does not wait
     assert float((app.editor.placed()[1] - target).norm()) < 0.01 * app.editor.diagonal
     assert not torch.equal(shape(app), before)
     follows = app.server.scene.get_handle_by_name("/handles/0").position
