@@ -1,6 +1,5 @@
 """The posing application without a browser: picks, drags, buttons and files; `tests/web` uses a real mouse."""
 
-
 import pytest
 import torch
 
