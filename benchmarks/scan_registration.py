@@ -13,10 +13,11 @@ Turned and made larger, both scans of a pair must end where they did: beside eac
 A sequence of the figure and one of the toy are registered together, and beside that chained: adjacent pairs, one after
 the other. The last frame is compared with the first pair, whose motion is the least, and with the mean of the adjacent
 pairs; parts and joints are judged by what moved apart in any frame. Several sequences, of figures, toys of random forms
-and animals, tell how often the last frame is reached: registered like a pair.
+and animals, tell how often the last frame is reached: registered like a pair. Captured motion, from files of meshes
+that share vertices, is scanned by the same camera, from as many sides as there are sequences; its parts are not known.
 
     python benchmarks/scan_registration.py --data FOLDER --pairs 189 --ablations --moved --growth
-    python benchmarks/scan_registration.py --pairs 0 --frames 10 --sequences 6
+    python benchmarks/scan_registration.py --pairs 0 --frames 10 --sequences 6 --captured samba.npz horse_gallop.npz
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ import argparse
 import resource
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -34,6 +35,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from captured_scans import CapturedSequence, captured_sequences
 from torch import Tensor
 
 import torchreg as tr
@@ -47,6 +49,7 @@ from torchreg.registration.dense.config import ScanAlignConfig
 
 NEAR, REGISTERED, JOINT, APART = 0.025, 0.9, 0.05, 0.005
 SCALE = 100
+KINDS = ("figure", "toy", "animal")  # of sequences
 SMOKE_POINTS = 300  # of each scan
 STAGES = ("setup", "initialization", "align", "refine")
 
@@ -247,7 +250,7 @@ def chained(scans: list[tr.RangeScan], pairs: list[Tensor]) -> list[Tensor]:
     return places
 
 
-def misses(sequence: ScanSequence, places: Tensor, source: int, target: int, size: float) -> Tensor:
+def misses(sequence: ScanSequence | CapturedSequence, places: Tensor, source: int, target: int, size: float) -> Tensor:
     """Return how far moved points (N, 3) of a frame are from the truth in another, shares of a size."""
     return (places - sequence.truth(source, target)).norm(dim=-1) / size
 
@@ -276,8 +279,13 @@ def print_sequence(kind: str, sequence: ScanSequence, recipe: Recipe) -> None:
     print(f"parts: adjusted Rand index {rand:.2f}; joints within {JOINT:.0%}: {right:.0%} of {len(joints)}", flush=True)
 
 
-def sequences_of(kind: str, count: int, frames: int, scanner: DepthScanner | None = None) -> Iterator[ScanSequence]:
-    """Yield sequences of one kind with seeds from 0 on; toys are of random forms."""
+def sequences_of(
+    kind: str | Path, count: int, frames: int, scanner: DepthScanner | None = None
+) -> Iterator[ScanSequence | CapturedSequence]:
+    """Yield sequences of one kind with seeds from 0 on; toys are of random forms, captured motion comes from a file."""
+    if isinstance(kind, Path):
+        yield from captured_sequences(kind, count, frames, scanner)
+        return
     for seed in range(count):
         if kind == "toy":
             yield jointed_toy(frames, seed, toy=random_toy(torch.Generator().manual_seed(seed)), scanner=scanner)
@@ -285,14 +293,16 @@ def sequences_of(kind: str, count: int, frames: int, scanner: DepthScanner | Non
             yield {"figure": walking_figure, "animal": walking_animal}[kind](frames, seed, scanner=scanner)
 
 
-def print_many_sequences(count: int, frames: int, recipe: Recipe, scanner: DepthScanner | None = None) -> None:
+def print_many_sequences(
+    kinds: Sequence[str | Path], count: int, frames: int, recipe: Recipe, scanner: DepthScanner | None = None
+) -> None:
     """Print mean errors of the first frame's points in all frames and in the last, and how often they are there.
 
-    Beside that errors of adjacent pairs, and parts and joints.
+    Beside that errors of adjacent pairs, and parts and joints where they are known.
     """
     print(f"\n{count} sequences of {frames} frames, registered together")
-    print(f"{'':8s} mean %  last %  pair %  last/pair  frames  last registered   rand joints")
-    for kind in ("figure", "toy", "animal"):
+    print(f"{'':12s} mean %  last %  pair %  last/pair  frames  last registered   rand joints")
+    for kind in kinds:
         rows, rands, joints = [], [], []
         for sequence in sequences_of(kind, count, frames, scanner):
             scans = list(sequence)
@@ -306,15 +316,17 @@ def print_many_sequences(count: int, frames: int, recipe: Recipe, scanner: Depth
                 for frame, moved in enumerate(adjacent(scans, recipe))
             ]
             rows.append((errors.mean(1), (errors < NEAR).double().mean(1) >= REGISTERED, torch.tensor(alone).mean()))
-            rand, near = parts_and_joints(found, PartTruth.of_sequence(sequence))
-            rands.append(rand)
-            joints.extend(near)
+            if isinstance(sequence, ScanSequence):
+                rand, near = parts_and_joints(found, PartTruth.of_sequence(sequence))
+                rands.append(rand)
+                joints.extend(near)
         error, there, pair = (torch.stack(each) for each in zip(*rows, strict=True))
         last = error[:, -1].mean()
         print(
-            f"{kind:8s} {100 * error.mean():6.2f} {100 * last:7.2f} {100 * pair.mean():7.2f} {last / pair.mean():10.2f}"
+            f"{Path(kind).stem:12s} {100 * error.mean():6.2f} {100 * last:7.2f} {100 * pair.mean():7.2f}"
+            f" {last / pair.mean():10.2f}"
             f" {there.double().mean():7.0%} {int(there[:, -1].sum()):9d} /{count:4d}"
-            f" {np.mean(rands):6.2f} {np.mean(np.array(joints) < JOINT):6.0%}",
+            + (f" {np.mean(rands):6.2f} {np.mean(np.array(joints) < JOINT):6.0%}" if rands else ""),
             flush=True,
         )
 
@@ -356,6 +368,9 @@ def main(arguments: list[str] | None = None) -> int:
         "--frames", type=int, default=0, help="length of a sequence to be registered together, 2 or more"
     )
     parser.add_argument("--sequences", type=int, default=0, help="of --frames frames, of each kind")
+    parser.add_argument(
+        "--captured", type=Path, nargs="+", default=(), help="NPZ files of captured motion for --sequences"
+    )
     parser.add_argument("--verbose", action="store_true", help="a line per pair")
     parser.add_argument("--smoke", action="store_true", help="one small pair, for a quick look")
     options = parser.parse_args(arguments)
@@ -369,7 +384,7 @@ def main(arguments: list[str] | None = None) -> int:
         print_set("toy, moved", [moved(toy) for toy in toys], small, options.verbose)
         scanner = DepthScanner(num_points=SMOKE_POINTS)
         print_sequence("figure", walking_figure(2, scanner=scanner), small[0])
-        print_many_sequences(1, 2, small[0], scanner)
+        print_many_sequences(KINDS, 1, 2, small[0], scanner)
         return 0
     sets: dict[str, list[Problem]] = {}
     if options.data is None or not options.data.is_dir():
@@ -390,7 +405,8 @@ def main(arguments: list[str] | None = None) -> int:
         print_sequence("figure", walking_figure(options.frames), Recipe("default"))
         print_sequence("toy", jointed_toy(options.frames), Recipe("default"))
         if options.sequences:
-            print_many_sequences(options.sequences, options.frames, Recipe("default"))
+            kinds = (*KINDS, *options.captured)
+            print_many_sequences(kinds, options.sequences, options.frames, Recipe("default"))
     if options.growth:
         print_growth((2000, 10_000, 50_000, 200_000))
     return 0

@@ -155,11 +155,11 @@ def register_sequence(
 ) -> SequenceRegistration:
     """Return one set of bones and weights that takes a reference scan onto all scans, and what all of them show.
 
-    From the reference outward, the reference as moved to one frame is aligned with the next, its points predicted by an
-    autoregression of their steps, which what is hidden follows, and a few bones are fitted to that alignment: every
-    frame is reached by deforming the reference itself, so that errors do not pile up. Then labels, weights and the
-    motions of all frames are solved together, from the alignments; a hinge prior penalizes rotation between bones that
-    share weight about more than one axis.
+    From the reference outward, the reference as moved to one frame is aligned with the next, its points expected where
+    an autoregression of their steps predicts them, and a few bones are fitted to that alignment: every frame is reached
+    by deforming the reference itself, so that errors do not pile up. Then labels, weights and the motions of all frames
+    are solved together, from the alignments; a hinge prior penalizes rotation between bones that share weight about
+    more than one axis.
 
     Args:
         scans: T scans of one thing, two at least, in one unit and frame; motions between neighbors as in `register`.

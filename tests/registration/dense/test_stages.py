@@ -53,21 +53,6 @@ def test_steps_come_nearer_and_report(pair, problem, reporter):
     assert all(record.hypothesis == "some" and record.stage == "refine" for record in reporter[1])
 
 
-def test_what_is_hidden_is_held_where_it_is_expected_the_rest_is_not(problem, reporter):
-    rest, count = problem.graph.rest(), len(problem.samples)
-    half = problem.graph.points[:, 2] > problem.graph.points[:, 2].median()
-    ahead = problem.graph.points + torch.where(half, 0.05, 0.0)[:, None] * torch.tensor([1.0, 0, 0])
-    # A matcher to which the upper half is hidden.
-    prior = replace(problem.prior, source=torch.where(half[:, None], 0.0, problem.prior.source[:count]))
-    scans = replace(problem, prior=prior, expected=ExpectedPlaces(ahead, 0.02))
-    held, free = (problem.graph(refine(scans, rest, reporter[0], hold=hold)) for hold in (True, False))
-    far = [(places - ahead).norm(dim=-1)[half].median() for places in (held, free)]
-    assert far[0] < 0.3 * far[1]
-    known = problem.graph(refine(problem, rest, reporter[0]))
-    low = problem.graph.points[:, 2] < problem.graph.points[:, 2].quantile(0.3)
-    assert float((held - known).norm(dim=-1)[low].median()) < 0.005
-
-
 def test_leaps_cost_their_distance_up_to_a_cap(problem):
     rest = problem.graph.rest()
     places = problem.graph(rest)

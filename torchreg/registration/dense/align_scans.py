@@ -158,7 +158,7 @@ def _near(problem: ScanAlignProblem, on_step: OnStep) -> list[Candidate]:
     if problem.expected is not None:
         there = GraphMatches.of_places(problem.expected.places)
         ahead = fit_graph(problem.graph, rest, there, _EXPECTED_STIFFNESS, _EXPECTED_FITS).transforms
-        found.append(_compared(problem, ahead, Reporter("expected", problem.unit.scale, on_step), hold=True))
+        found.append(_compared(problem, ahead, Reporter("expected", problem.unit.scale, on_step)))
     return found
 
 
@@ -194,9 +194,9 @@ def _fused(problem: ScanAlignProblem, found: Sequence[Candidate], on_step: OnSte
     return _compared(problem, begin, Reporter("fused", problem.unit.scale, on_step))
 
 
-def _compared(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter, *, hold: bool = False) -> Candidate:
+def _compared(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) -> Candidate:
     """Return the candidate after its EM, see `refine`."""
-    transforms = refine(problem, transforms, reporter, hold=hold)
+    transforms = refine(problem, transforms, reporter)
     return Candidate(judge(problem, reporter.name, transforms), transforms)
 
 

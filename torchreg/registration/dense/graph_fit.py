@@ -43,22 +43,6 @@ class GraphMatches:
         """Return matches of the first samples with places (n, 3), that all count alike."""
         return cls(slice(0, len(places)), places, torch.ones_like(places[:, 0]))
 
-    def held_at(self, places: Tensor, weights: Tensor) -> GraphMatches:
-        """Return these matches, one of each of the first samples, all of which are also held at places (n, 3).
-
-        The weights (n,) of both are means over the samples as those of these matches alone.
-        """
-        each = torch.arange(len(places), device=places.device)
-        normals = torch.zeros_like(places) if self.normals is None else self.normals
-        tangential = torch.as_tensor(self.tangential_weight).to(weights).expand_as(weights)
-        return GraphMatches(
-            which=each.repeat(2),
-            targets=torch.cat((self.targets, places)),
-            weights=2 * torch.cat((self.weights, weights)),
-            normals=torch.cat((normals, torch.zeros_like(places))),
-            tangential_weight=torch.cat((tangential, torch.ones_like(weights))),
-        )
-
 
 @dataclass(frozen=True)
 class GraphFit:

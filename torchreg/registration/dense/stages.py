@@ -13,8 +13,7 @@ from torchreg.registration.dense.config import Hypothesis, OnStep, ScanAlignReco
 from torchreg.registration.dense.e_step import SoftMatches, match_softly
 from torchreg.registration.dense.graph_fit import GraphFit, GraphMatches, fit_graph
 from torchreg.registration.dense.oriented_samples import OrientedSamples
-from torchreg.registration.dense.problem import ExpectedPlaces, ScanAlignProblem
-from torchreg.solvers.robust import cauchy_weight
+from torchreg.registration.dense.problem import ScanAlignProblem
 
 # Stds beyond which the expectation no longer tells where a sample is: of a Gaussian three in a hundred lie there.
 _FAR_OFF = 3.0
@@ -53,14 +52,13 @@ class Reporter:
         )
 
 
-def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter, *, hold: bool = False) -> Tensor:
+def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter) -> Tensor:
     """Return motions refined by EM: sigma shrinks, and the graph softens.
 
     Args:
         problem: the scans.
         transforms: (J, 4, 4) to start from.
         reporter: takes a record of each step.
-        hold: whether samples that the matcher calls hidden are held where they are expected.
     """
     config, plan = problem.config, problem.config.refine
     for step in range(plan.num_steps):
@@ -71,24 +69,11 @@ def refine(problem: ScanAlignProblem, transforms: Tensor, reporter: Reporter, *,
         matches = GraphMatches(
             slice(0, len(moved)), found.targets, found.posterior, found.normals, config.tangential_weight
         )
-        if hold and problem.expected is not None:
-            matches = matches.held_at(problem.expected.places, _held(problem, problem.expected, moved, sigma))
         fit = fit_graph(problem.graph, transforms, matches, stiffness, edge_scale=config.edge_scale)
         transforms = fit.transforms
         matched = float(found.posterior.mean())
         reporter.report("refine", step, plan.num_steps, sigma, fit, stiffness, matched)
     return transforms
-
-
-def _held(problem: ScanAlignProblem, expected: ExpectedPlaces, moved: OrientedSamples, sigma: float) -> Tensor:
-    """Return by how much samples (S,) are held where they are expected: those that the matcher calls hidden.
-
-    Their places have a Gaussian prior, beside that of matches, whose width is sigma. Parts that turned out of their
-    way are let go.
-    """
-    hidden = 1 - problem.prior.visible[: len(expected.places)]
-    apart = (moved.points - expected.places).square().sum(-1)
-    return hidden * (sigma / expected.std) ** 2 * cauchy_weight(apart / expected.std**2)
 
 
 def soft_matches(problem: ScanAlignProblem, moved: OrientedSamples, sigma: float, share: float = 1.0) -> SoftMatches:
