@@ -50,6 +50,7 @@ from torchreg.registration.dense.config import ScanAlignConfig
 NEAR, REGISTERED, JOINT, APART = 0.025, 0.9, 0.05, 0.005
 SCALE = 100
 KINDS = ("figure", "toy", "animal")  # of sequences
+CONFIDENCES = (0.0, 0.2, 0.4, 0.6, 0.8, 0.9, 1.0)
 SMOKE_POINTS = 300  # of each scan
 STAGES = ("setup", "initialization", "align", "refine")
 
@@ -302,6 +303,7 @@ def print_many_sequences(
     """
     print(f"\n{count} sequences of {frames} frames, registered together")
     print(f"{'':12s} mean %  last %  pair %  last/pair  frames  last registered   rand joints")
+    sure, right = [], []
     for kind in kinds:
         rows, rands, joints = [], [], []
         for sequence in sequences_of(kind, count, frames, scanner):
@@ -316,6 +318,8 @@ def print_many_sequences(
                 for frame, moved in enumerate(adjacent(scans, recipe))
             ]
             rows.append((errors.mean(1), (errors < NEAR).double().mean(1) >= REGISTERED, torch.tensor(alone).mean()))
+            sure.append(found.confidence[1:])
+            right.append(rows[-1][1])
             if isinstance(sequence, ScanSequence):
                 rand, near = parts_and_joints(found, PartTruth.of_sequence(sequence))
                 rands.append(rand)
@@ -329,6 +333,17 @@ def print_many_sequences(
             + (f" {np.mean(rands):6.2f} {np.mean(np.array(joints) < JOINT):6.0%}" if rands else ""),
             flush=True,
         )
+    print_reliability(torch.cat(sure), torch.cat(right))
+
+
+def print_reliability(confidence: Tensor, right: Tensor) -> None:
+    """Print of how many frames (N,) with a confidence, from 0 to 1, 90 % of the points are near their true place."""
+    print("confidence    frames  mean  registered")
+    for low, high in pairwise(CONFIDENCES):
+        within = (confidence >= low) & ((confidence < high) | (high == 1))
+        if within.any():
+            mean, share = confidence[within].mean(), right[within].double().mean()
+            print(f"{low:.1f} to {high:.1f} {int(within.sum()):9d} {mean:5.2f} {share:11.0%}", flush=True)
 
 
 def grown(num_points: int) -> tuple[int, float, float, float, float]:

@@ -69,7 +69,8 @@ def test_frames_beyond_a_doubtful_one_are_doubtful(toy, monkeypatch):
     monkeypatch.setattr(module, "align_scans", judged)
     scans = [toy[0].subset(torch.arange(0, len(toy[0]), 2))] * 4
     found = register_sequence(scans, 2, 10, replace(QUICK, label_steps=1, refine_steps=0))
-    assert found.confidence.tolist() == pytest.approx([1.0, 0.9, 0.2, 0.2])
+    # What is wrong stays so but for few frames.
+    assert found.confidence.tolist() == pytest.approx([1.0, 0.9, 0.9 * 0.2, 0.9 * 0.2 * 0.7], abs=0.06)
     assert found.status is tr.Status.DOUBTFUL
     assert not found.status.usable
 

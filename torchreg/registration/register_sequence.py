@@ -22,7 +22,7 @@ from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.registration.config import RegisterConfig
 from torchreg.registration.dense.align_scans import align_scans
 from torchreg.registration.dense.problem import ExpectedPlaces
-from torchreg.registration.dense.reliability import SCAN_CALIBRATION
+from torchreg.registration.dense.reliability import SCAN_CALIBRATION, confidence_onward
 from torchreg.registration.normalization import Normalization
 from torchreg.registration.register import (
     check_inputs,
@@ -256,8 +256,7 @@ def _aligned_frames(
                 ),
             )  # fmt: skip
             aligned[frame], confidence[frame] = found.points, found.point_confidence
-            # A frame is reached through those before it.
-            sure[frame] = min(found.confidence, float(sure[frame - step]))
+            sure[frame] = confidence_onward(float(sure[frame - step]), found.confidence)
             if frame + step == end:
                 break
             bent = register(

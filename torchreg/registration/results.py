@@ -179,9 +179,9 @@ class SequenceRegistration(Result):
         origin: see `ScanRegistration`.
         observed: (K, 3) the points of all scans where they were seen; None in files of earlier releases.
         observed_normals: (K, 3) their unit normals there.
-        confidence: (T,) of each scan, from 0 to 1: the least `ScanRegistration.confidence` of the alignments by which
-            the reference, moved from scan to scan, came there; one for the reference. Where any is below one half the
-            status is DOUBTFUL. None in files of earlier releases.
+        confidence: (T,) probability that each scan is registered, see `ScanRegistration.confidence`, which falls away
+            from the reference, as what has gone wrong seldom recovers; one for the reference. Where any is below one
+            half the status is DOUBTFUL. None in files of earlier releases.
         up: see `ScanRegistration`.
     """
 

@@ -8,7 +8,13 @@ from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.registration.dense.align_scans import align_problem, evidence_against
 from torchreg.registration.dense.config import ScanAlignConfig
 from torchreg.registration.dense.problem import describe
-from torchreg.registration.dense.reliability import SCAN_CALIBRATION, ScanEvidence, confidence_of, scan_evidence
+from torchreg.registration.dense.reliability import (
+    SCAN_CALIBRATION,
+    ScanEvidence,
+    confidence_of,
+    confidence_onward,
+    scan_evidence,
+)
 
 CONFIG = ScanAlignConfig(num_samples=400, num_nodes=30)
 GOOD = ScanEvidence(forward=0.1, backward=0.05, smoothness=0.1, unsupported=0.8, hidden=0.05)
@@ -24,6 +30,18 @@ def problem():
 def test_what_speaks_against_an_alignment_lowers_its_confidence(name):
     assert confidence_of(replace(GOOD, **{name: 0.5 + getattr(GOOD, name)})) < confidence_of(GOOD)
     assert 0.8 < confidence_of(GOOD) < 1
+
+
+def test_a_frame_is_as_sure_as_its_way_there():
+    """As often as frames of a simulated chain are right, where alignments of right frames are right in 80 %."""
+    generator = torch.Generator().manual_seed(0)
+    right, sure = torch.ones(20_000, dtype=torch.bool), 1.0
+    for _ in range(5):
+        chance = torch.where(right, 0.8, SCAN_CALIBRATION.recovery)
+        right = torch.rand(len(right), generator=generator) < chance
+        sure = confidence_onward(sure, 0.8)
+        assert sure == pytest.approx(float(right.double().mean()), abs=0.02)
+    assert 0.3 < sure < 0.5
 
 
 def test_a_right_alignment_is_trusted_and_none_at_all_is_not(problem):
