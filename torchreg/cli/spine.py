@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from torchreg.geometry.skeleton import Skeleton
     from torchreg.spines.extract_spine import SpineConfig
     from torchreg.spines.results import SpineSequence
+    from torchreg.spines.surfaces import FrameSurfaces
 
 
 @reporting
@@ -130,8 +132,8 @@ def spine(
         source = _silhouettes(frames, calibration, bool(screen), resolution, scale)
         count, names = len(source), source.names
     else:
-        meshes, names = _read(frames, scale, nan_policy)
-        count = len(meshes)
+        surfaces = _read(frames, scale, nan_policy)
+        count, names = len(surfaces), surfaces.names
     curves = [numbered(swc, frame, count) for frame in range(count)] if swc is not None else []
     check_outputs([glb, result, result.with_suffix(".json"), npz, table, plot, movie, *curves], force)
     if movie is not None:
@@ -143,8 +145,7 @@ def spine(
 
     config = SpineConfig.growing(num_samples=samples) if growing else SpineConfig(num_tips=tips, num_samples=samples)
     with claimed(glb), _kept(progress):
-        if silhouettes:
-            meshes = _hulls(source, seen_folder(seen, glb, force), progress, quiet)
+        meshes = _hulls(source, seen_folder(seen, glb, force), progress, quiet) if silhouettes else surfaces
         found = _extracted(meshes, known, config, workers, progress, quiet, growing=growing)
         found = remembering(found, upright)
         found.save(result)
@@ -186,7 +187,7 @@ def _kept(progress: Path | None) -> Iterator[None]:
 
 
 def _extracted(
-    meshes: list[TriangleMesh],
+    meshes: Sequence[TriangleMesh],
     known: Skeleton | SpineSequence | None,
     config: SpineConfig,
     workers: int | None,
@@ -223,18 +224,33 @@ def _read_prior(path: Path | None) -> Skeleton | SpineSequence | None:
     return spine
 
 
-def _read(frames: list[Path], scale: float, nan_policy: str) -> tuple[list[TriangleMesh], tuple[str, ...]]:
-    """Return the meshes, and the surfaces of clouds, in the order of time, and their names."""
+@dataclass(frozen=True)
+class _Files(Sequence[Any]):
+    """What files hold, read when it is asked for and not kept."""
+
+    names: tuple[str, ...]
+    scale: float
+    nan_policy: NanPolicy
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __getitem__(self, index: Any) -> Any:
+        from torchreg.io.points import load_points
+
+        return load_points(self.names[index], scale=self.scale, nan_policy=self.nan_policy)
+
+
+def _read(frames: list[Path], scale: float, nan_policy: NanPolicy) -> FrameSurfaces:
+    """Return the meshes, and the surfaces of clouds, in the order of time."""
     from torchreg.errors import InputError
     from torchreg.io.frames import load_frames
-    from torchreg.io.points import load_points
-    from torchreg.spines.surfaces import as_surface
+    from torchreg.spines.surfaces import FrameSurfaces
 
     if any(frame.suffix.lower() == ".npz" for frame in frames):
         raise InputError("FRAMES must be files of meshes, not of arrays; give a folder, or files such as *.ply")
     names = load_frames(cloud_files(frames)).names
-    clouds = ((name, load_points(name, scale=scale, nan_policy=nan_policy)) for name in names)
-    return [as_surface(cloud, name)[0] for name, cloud in clouds], names
+    return FrameSurfaces.of_frames(_Files(names, scale, nan_policy), names)
 
 
 def _silhouettes(
@@ -261,7 +277,7 @@ def _hulls(source: SilhouetteFrames, folder: Path, progress: Path | None, quiet:
 
 
 def _write(
-    found: SpineSequence, meshes: list[TriangleMesh], glb: Path, swc: Sequence[Path | None], npz: Path | None,
+    found: SpineSequence, meshes: Sequence[TriangleMesh], glb: Path, swc: Sequence[Path | None], npz: Path | None,
     fps: float,
 ) -> None:  # fmt: skip
     from torchreg.geometry.mesh import TriangleMesh
@@ -284,7 +300,7 @@ def _write(
 
 
 def _draw(
-    found: SpineSequence, meshes: list[TriangleMesh], movie: Path | None, pictures: Path | None, fps: float
+    found: SpineSequence, meshes: Sequence[TriangleMesh], movie: Path | None, pictures: Path | None, fps: float
 ) -> None:
     from torchreg.viz.spines import save_spine_movie, save_spine_pictures
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_count, warn_about_rounding
-from torchreg.errors import InputError, InputTypeError
+from torchreg.errors import InputError
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
@@ -37,7 +37,7 @@ from torchreg.spines.prior import PriorSkeleton
 from torchreg.spines.results import SpineRecord, SpineSequence
 from torchreg.spines.skeletonize import SkeletonizeConfig
 from torchreg.spines.spine import Spine
-from torchreg.spines.surfaces import as_surface
+from torchreg.spines.surfaces import FrameSurfaces
 from torchreg.spines.tip_relations import TipRelations
 from torchreg.spines.tip_tracking import has_loops, track_tips
 
@@ -123,7 +123,8 @@ def extract_spine(
 
     Args:
         meshes: T surfaces, of any numbers of vertices, in one unit; or points (N, 3) of them, clouds or scans without
-            faces, see `skeletonize`.
+            faces, see `skeletonize`. A sequence that reads meshes on request, one at a time, is never held as a whole;
+            the surfaces of clouds are.
         prior: a skeleton with all limbs, or another spine, whose names (numbers of tips) and graph are kept.
         growing: whether tips may appear and end.
         times: (T,) of the frames, strictly increasing; 0, 1, 2, ... by default.
@@ -152,14 +153,14 @@ def extract_spine(
     References: Brostow, Essa, Steedly and Kwatra 2004; a prior skeleton is its section 6's.
     """
     config = config or (SpineConfig.growing() if growing else SpineConfig())
-    surfaces, told = _check_surfaces(meshes)
+    surfaces = meshes if isinstance(meshes, FrameSurfaces) else FrameSurfaces.of_frames(meshes)
     _check_settings(config, prior, workers, growing=growing)
-    origin = far_origin([mesh.vertices for mesh in surfaces])
+    origin = far_origin(surfaces.samples)
     if origin is not None:
-        surfaces = [TriangleMesh(mesh.vertices - origin.to(mesh.vertices), mesh.faces) for mesh in surfaces]
-    check_sizes(surfaces, growing=growing)
+        surfaces = surfaces.shifted(-origin)
+    check_sizes(surfaces.samples, growing=growing)
     known = None if prior is None else PriorSkeleton.from_given(prior, config.num_tips)
-    first = surfaces[0].vertices
+    first = surfaces.samples[0]
     warn_about_rounding(first, "meshes", float((first.amax(0) - first.amin(0)).norm()), stacklevel=2)
     with torch.no_grad():
         # Section 4.1: the second factor of eq. 3, frame by frame.
@@ -168,12 +169,12 @@ def extract_spine(
     kept = [number for number in range(len(found)) if number not in passed]
     when = torch.arange(len(found)).to(first) if times is None else times
     if passed:
-        surfaces, told, times = [surfaces[number] for number in kept], [told[number] for number in kept], when[kept]
+        surfaces, times = surfaces.chosen(kept), when[kept]
     shown = [found[number] for number in kept]
     if growing:
-        spine = growing_spine(surfaces, shown, told, times, config.num_samples)
+        spine = growing_spine(surfaces, shown, times, config.num_samples)
     else:
-        spine = _joined_spine(surfaces, shown, told, known, times, config)
+        spine = _joined_spine(surfaces, shown, known, times, config)
     if passed:
         spine = with_frames_between(spine, kept, when, {number: found[number][0] for number in passed})
     return spine if origin is None else spine.moved(origin)
@@ -181,10 +182,10 @@ def extract_spine(
 
 @torch.no_grad()
 def _joined_spine(
-    surfaces: Sequence[TriangleMesh], found: Sequence[FrameSkeleton], told: Sequence[tuple[str, ...]],
-    known: PriorSkeleton | None, times: Tensor | None, config: SpineConfig,
+    surfaces: FrameSurfaces, found: Sequence[FrameSkeleton], known: PriorSkeleton | None, times: Tensor | None,
+    config: SpineConfig,
 ) -> SpineSequence:  # fmt: skip
-    """Return the spine of surfaces whose skeletons were found, and of which some notes were told."""
+    """Return the spine of surfaces whose skeletons were found."""
     skeletons, relations = [smooth_rough_limbs(skeleton) for skeleton, _ in found], [row for _, row in found]
     known = known and known.fitted(skeletons, config.num_tips)
     names = _named_tips(skeletons, relations, config, known)
@@ -194,7 +195,7 @@ def _joined_spine(
     limbs = _all_limbs(observed, graph, surfaces, known, names.reference)
     curves, radii = (torch.stack([getattr(frame, name) for frame in limbs]) for name in ("curves", "radii"))
     frames, topologies = transported_frames(curves, names.reference), [curve_topology(graph, rows) for rows in curves]
-    curves, radii, frames = (rows.to(surfaces[0].vertices) for rows in (curves, radii, frames))
+    curves, radii, frames = (rows.to(surfaces.samples[0]) for rows in (curves, radii, frames))
     model = Spine(curves, graph.edges, radii=radii, frames=frames, times=times)  # eq. 1
     shown, own = names.labels >= 0, torch.stack([frame.observed for frame in observed])
     return SpineSequence(
@@ -210,9 +211,12 @@ def _joined_spine(
         reference=names.reference,
         topologies=tuple(topologies),
         own_topologies=tuple(skeleton.topology for skeleton in skeletons),
-        up=guess_up([surface.vertices for surface in surfaces]),
+        up=guess_up(surfaces.samples),
         **told_statuses(
-            [frame_notes(*rows) for rows in zip(skeletons, told, shown.sum(1).tolist(), ~shown, ~own, strict=True)]
+            [
+                frame_notes(*rows)
+                for rows in zip(skeletons, surfaces.notes, shown.sum(1).tolist(), ~shown, ~own, strict=True)
+            ]
         ),
     )
 
@@ -229,19 +233,6 @@ def _check_settings(
     if growing and (prior is not None or config.num_tips is not None or config.printed):
         what = "prior" if prior is not None else "SpineConfig.paper()" if config.printed else "num_tips"
         raise InputError(f"growing=True cannot be used with {what}, which fixes the number of limbs; leave out either")
-
-
-def _check_surfaces(meshes: Sequence[TriangleMesh | Tensor]) -> tuple[list[TriangleMesh], list[tuple[str, ...]]]:
-    """Return the surfaces of the frames and notes; raise InputError or InputTypeError unless each has one."""
-    if isinstance(meshes, TriangleMesh):
-        raise InputTypeError("meshes must be a sequence of TriangleMesh, got one mesh; put it into a list")
-    rows = [as_surface(mesh, f"meshes[{frame}]") for frame, mesh in enumerate(meshes)]
-    if not rows:
-        raise InputError("meshes must hold at least one frame, got none")
-    for frame, (mesh, _) in enumerate(rows):
-        if not mesh.num_faces:
-            raise InputError(f"meshes[{frame}] must have faces, got none; leave out frames without a surface")
-    return [mesh for mesh, _ in rows], [notes for _, notes in rows]
 
 
 def _named_tips(

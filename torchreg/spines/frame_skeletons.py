@@ -50,7 +50,7 @@ def skeletonize_frames(
     """Return the skeleton of every frame, and the relations of its tips along the surface.
 
     Args:
-        meshes: T surfaces.
+        meshes: T surfaces, each of which is taken when its turn comes.
         config: see `skeletonize`.
         workers: processes; by default one per core that may be used. Where processes cannot be forked, or for few
             frames, all is done in this one.
@@ -101,7 +101,7 @@ def _computed(
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = min(cores if workers is None else workers, len(frames))
     can_fork = "fork" in multiprocessing.get_all_start_methods() and not multiprocessing.current_process().daemon
-    if count < 2 or not can_fork or len(frames) < _MIN_PARALLEL or any(m.vertices.is_cuda for m in meshes):
+    if count < 2 or not can_fork or len(frames) < _MIN_PARALLEL or meshes[0].vertices.is_cuda:
         yield from ((frame, _compute(meshes[frame], frame, config)) for frame in frames)
         return
     try:
@@ -147,7 +147,7 @@ def _forked(
 
 
 def _packed(mesh: TriangleMesh) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    return mesh.vertices.detach().numpy(), mesh.faces.numpy()
+    return mesh.vertices.detach().cpu().numpy(), mesh.faces.cpu().numpy()
 
 
 def _compute_packed(

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchreg.errors import InputError
-from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.geometry.upright import guess_up
 from torchreg.spines.frame_notes import frame_notes, told_statuses
@@ -21,6 +20,7 @@ from torchreg.spines.organ_graph import common_graph, restricted, shown_tree
 from torchreg.spines.organ_tracks import OrganTracks, track_organs
 from torchreg.spines.results import SpineSequence
 from torchreg.spines.spine import Spine
+from torchreg.spines.surfaces import FrameSurfaces
 from torchreg.spines.tip_features import observe_tips
 
 _NO_TIP = -50.0  # log-odds that no place on tracks makes up for
@@ -28,10 +28,9 @@ _NO_TIP = -50.0  # log-odds that no place on tracks makes up for
 
 @torch.no_grad()
 def growing_spine(
-    surfaces: Sequence[TriangleMesh], found: Sequence[FrameSkeleton], told: Sequence[tuple[str, ...]],
-    times: Tensor | None, num_samples: int,
+    surfaces: FrameSurfaces, found: Sequence[FrameSkeleton], times: Tensor | None, num_samples: int,
 ) -> SpineSequence:  # fmt: skip
-    """Return the spine of surfaces that grow, whose skeletons were found, and of which some notes were told.
+    """Return the spine of surfaces that grow, whose skeletons were found.
 
     Raises:
         InputError: if fewer than two organs are found.
@@ -45,7 +44,7 @@ def growing_spine(
     graph = common_graph([shown_tree(*row) for row in zip(skeletons, tracks.labels.tolist(), strict=True)], num_organs)
     limbs = growing_limbs(skeletons, tracks, graph, num_samples)
     reference = int((tracks.labels >= 0).sum(1).argmax())
-    like = surfaces[0].vertices
+    like = surfaces.samples[0]
     frames = transported_frames(limbs.curves, reference).to(like)
     curves, radii = limbs.curves.to(like), limbs.radii.to(like)
     model = Spine(curves, graph.edges, radii=radii, frames=frames, times=times)
@@ -63,10 +62,10 @@ def growing_spine(
         reference=reference,
         topologies=tuple(_topology(graph, row) for row in tracks.alive),
         own_topologies=tuple(skeleton.topology for skeleton in skeletons),
-        up=guess_up([surface.vertices for surface in surfaces]),
+        up=guess_up(surfaces.samples),
         births=tracks.births,
         ends=tracks.ends,
-        **told_statuses(_notes(skeletons, told, tracks, limbs)),
+        **told_statuses(_notes(skeletons, surfaces.notes, tracks, limbs)),
     )
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import pairwise
 
 import torch
@@ -19,6 +20,9 @@ from torchreg.spines.labeled_tree import LimbGraph, gather_nodes, number_nodes, 
 from torchreg.spines.local_icp import LOCAL_FITS, SurfacePoints, transfer_nodes
 from torchreg.spines.observed_limbs import FrameLimbs
 
+# Depths that are kept: each takes ten megabytes at most, and a tenth of a second to make again.
+_KEPT = 32
+
 
 @dataclass(frozen=True, eq=False)
 class _Sequence:
@@ -28,13 +32,24 @@ class _Sequence:
         frames: T frames with the limbs that they show.
         graph: of the limbs.
         meshes: the surfaces of the frames.
-        fields: the depth in each frame that lacks a limb.
+        missing: the frames that lack a limb.
+        depth: gives the depth in a frame, of which few are kept.
     """
 
     frames: Sequence[FrameLimbs]
     graph: LimbGraph
     meshes: Sequence[TriangleMesh]
-    fields: dict[int, DepthField]
+    missing: frozenset[int]
+    depth: Callable[[int], DepthField]
+
+    @classmethod
+    def of_frames(
+        cls, frames: Sequence[FrameLimbs], graph: LimbGraph, meshes: Sequence[TriangleMesh], missing: Iterable[int]
+    ) -> _Sequence:
+        """Return the sequence of frames, some of which lack limbs."""
+        return cls(
+            frames, graph, meshes, frozenset(missing), lru_cache(_KEPT)(lambda number: DepthField(meshes[number]))
+        )
 
 
 def transfer_missing_limbs(
@@ -51,11 +66,11 @@ def transfer_missing_limbs(
         meshes: the surfaces of the frames.
     """
     missing = [number for number, frame in enumerate(frames) if not bool(frame.observed.all())]
-    sequence = _Sequence(frames, graph, meshes, {number: DepthField(meshes[number]) for number in missing})
+    sequence = _Sequence.of_frames(frames, graph, meshes, missing)
     forward = _propagate(sequence, range(len(frames)))
     backward = _propagate(sequence, range(len(frames) - 1, -1, -1))
     return [
-        _interpolated_limbs(sequence, number, forward, backward) if number in sequence.fields else frame
+        _interpolated_limbs(sequence, number, forward, backward) if number in sequence.missing else frame
         for number, frame in enumerate(frames)
     ]
 
@@ -88,7 +103,7 @@ def complete_from_prior(
     motion = fit_rigid(prior.curves[shown].flatten(0, 1), frame.curves[shown].flatten(0, 1))
     curves = torch.where(shown[:, None, None], frame.curves, transform_points(motion, prior.curves))
     radii = torch.where(shown[:, None], frame.radii, prior.radii)
-    sequence = _Sequence(frames, graph, meshes, {number: DepthField(meshes[number])})
+    sequence = _Sequence.of_frames(frames, graph, meshes, [number])
     completed = _joined_limbs(replace(frame, curves=curves, radii=radii), sequence, number)
     return [*frames[:number], replace(completed, observed=torch.ones_like(shown)), *frames[number + 1 :]]
 
@@ -97,8 +112,8 @@ def _propagate(sequence: _Sequence, order: Sequence[int]) -> dict[int, FrameLimb
     """Return the frames that lack limbs with those of the frame before them in an order of time."""
     transferred: dict[int, FrameLimbs] = {}
     for before, number in pairwise(order):
-        complete = before not in sequence.fields
-        if number in sequence.fields and (complete or before in transferred):
+        complete = before not in sequence.missing
+        if number in sequence.missing and (complete or before in transferred):
             source = sequence.frames[before] if complete else transferred[before]
             transferred[number] = _transfer(sequence, source, before, number)
     return transferred
@@ -158,7 +173,7 @@ def _interpolated_limbs(
     before, after = forward.get(number), backward.get(number)
     if before is None or after is None:
         return before or after or sequence.frames[number]
-    complete = [k for k in range(len(sequence.frames)) if k not in sequence.fields]
+    complete = [k for k in range(len(sequence.frames)) if k not in sequence.missing]
     previous, following = max(k for k in complete if k < number), min(k for k in complete if k > number)
     share = (number - previous) / (following - previous)
     curves = before.curves + share * (after.curves - before.curves)
@@ -168,7 +183,7 @@ def _interpolated_limbs(
 
 def _joined_limbs(limbs: FrameLimbs, sequence: _Sequence, number: int) -> FrameLimbs:
     """Return transferred limbs of a frame that meet in their nodes again, and lie inside."""
-    frame, field, ends = sequence.frames[number], sequence.fields[number], sequence.graph.edges
+    frame, field, ends = sequence.frames[number], sequence.depth(number), sequence.graph.edges
     reliable = _reliable_nodes(frame, sequence.graph)
     total, count = torch.zeros_like(limbs.nodes), torch.zeros(len(limbs.nodes), dtype=limbs.nodes.dtype)
     for side in (0, -1):

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from torchreg.errors import InputError
-from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.geometry.surface_graph import ANOTHER_BODY
 from torchreg.result import Status
@@ -25,15 +24,19 @@ class SizeLimits:
     most: float = (
         8.0  # times as large: a body that bends or a part of it changes less, centimeters and millimeters more
     )
-    num_points: int = 2000  # of a frame that tell its size
 
 
 _LIMITS = SizeLimits()
 
 
-def check_sizes(meshes: Sequence[TriangleMesh], *, growing: bool) -> None:
-    """Raise InputError if a frame is far larger or smaller than most, or of what grows, than the one before it."""
-    sizes = torch.stack([_size(mesh) for mesh in meshes])
+def check_sizes(samples: Sequence[Tensor], *, growing: bool) -> None:
+    """Raise InputError if a frame is far larger or smaller than most, or of what grows, than the one before it.
+
+    Args:
+        samples: some vertices of every frame.
+        growing: whether the frames show what grows.
+    """
+    sizes = torch.stack([_size(points) for points in samples])
     usual = torch.cat((sizes[:1], sizes[:-1])) if growing else sizes.median().expand_as(sizes)
     ratios = torch.where((sizes > 0) & (usual > 0), (sizes / usual).log().abs().exp(), 1.0)  # points: told elsewhere
     frame = int(ratios.argmax())
@@ -45,9 +48,9 @@ def check_sizes(meshes: Sequence[TriangleMesh], *, growing: bool) -> None:
         )
 
 
-def _size(mesh: TriangleMesh) -> Tensor:
-    """Return the median distance of a surface's vertices from their middle, which no far fragment changes much."""
-    points = mesh.vertices[:: max(1, mesh.num_vertices // _LIMITS.num_points)].detach().cpu().double()
+def _size(points: Tensor) -> Tensor:
+    """Return the median distance of points from their middle, which no far fragment changes much."""
+    points = points.detach().cpu().double()
     return (points - points.median(0).values).norm(dim=-1).median()
 
 
