@@ -138,7 +138,8 @@ class _Spectrum:
         """Return the spectrum of the function whose gradient is nearest to vectors (N, 3) at the points."""
         rows = zip(self._waves, vectors.unbind(1), strict=True)
         divergence = torch.stack([wave * self._transformed(values) for wave, values in rows]).sum(0)
-        return -1j * divergence * torch.where(self._squares > 0, 1 / self._squares, 0.0)  # torch 2.5 cannot divide by inf
+        # Of complex numbers over infinity torch 2.5 makes NaN.
+        return -1j * divergence * torch.where(self._squares > 0, 1 / self._squares, 0.0)
 
     def _blur(self, width: float) -> Tensor:
         return (-0.5 * width**2 * self._squares).exp()
