@@ -2,6 +2,7 @@
 
     python benchmarks/confidence.py --data SHARED              # reliability on data not used to calibrate
     python benchmarks/confidence.py --data SHARED --calibrate  # fits the model anew, also to halves and without a kind
+    python benchmarks/confidence.py --data SHARED --only arm --count 30
     python benchmarks/confidence.py --diagram FILE.png         # draws the reliability beside
     python benchmarks/confidence.py --smoke                    # a few alignments, to see that it runs
 
@@ -412,6 +413,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with xarm7 and rigs")
     parser.add_argument("--count", type=int, default=200, help="alignments")
+    parser.add_argument("--only", choices=("hand", "arm", "fox"), help="alignments of one shape alone")
     parser.add_argument(
         "--calibrate", action="store_true", help="fit the model anew: to all, to halves, and without each kind"
     )
@@ -420,6 +422,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--smoke", action="store_true", help="four alignments")
     options = parser.parse_args(arguments)
     things = subjects(None if options.smoke else options.data)
+    things = [thing for thing in things if options.only in (None, thing.name)]
+    if not things:
+        parser.error(f"--only {options.only} needs --data")
     count = 4 if options.smoke else options.count
     cases = collect(things, range(count), options.kept)
     if options.calibrate:

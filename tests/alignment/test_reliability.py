@@ -16,8 +16,11 @@ from torchreg.alignment.reliability import (
     judge,
     neighbor_correlation,
 )
+from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.sampling import farthest_points
+from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import difference
+from torchreg.shapes.primitives import Primitive
 
 
 def lattice(count=30):
@@ -111,6 +114,32 @@ def test_the_covariance_is_that_of_repeated_measurements(links, links_skin, meas
     told = found.covariance.diagonal(dim1=-2, dim2=-1).mean(0).sqrt()[6:]
     assert bool((told > 0.6 * spread).all())
     assert bool((told < 4 * spread).all())
+
+
+def test_one_datum_on_a_handle_tells_no_turn_surely():
+    """Of a round knob it alone would tell how far it is turned, and may be there by chance; ten tell."""
+    eye = torch.eye(4, dtype=torch.float64)
+    turn = Joint("knob", 0, eye, "revolute", (0.0, 0.0, 1.0), -3.0, 3.0)
+    joints = Joint("base", -1, eye), turn, Joint("handle", 1, eye)
+    knob, handle = eye.clone(), eye.clone()
+    knob[2, 3], handle[:3, 3] = 0.1, torch.tensor([0.1, 0.0, 0.1])
+    solids = [
+        Primitive("ellipsoid", (0.05, 0.08, 0.06), eye), Primitive("ellipsoid", (0.07, 0.07, 0.04), knob),
+        Primitive("ellipsoid", (0.04, 0.01, 0.01), handle),
+    ]  # fmt: skip
+    shape = ArticulatedShape(KinematicTree(joints), ["base", "knob", "handle"], solids, nu=0.003, dtype=torch.float64)
+    skin = tr.sample_skin(shape.requires_grad_(False), 600)
+    pose = shape.rest_pose()
+    noise = 0.001 * torch.randn(len(skin), 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    data = skin(pose) + noise
+    on_handle = data[:, 0] > 0.1
+
+    def std(count):
+        seen = torch.cat((data[~on_handle & (data[:, 0] < 0.06)], data[on_handle][:count]))
+        return float(curvature(problem_of(skin, seen, pose), pose[None]).covariance[0, 6, 6].sqrt())
+
+    assert std(1) > 0.5 * std(0)
+    assert std(10) < 0.2 * std(0)
 
 
 def test_the_covariance_is_that_of_shapes_of_other_proportions(links, links_skin, measured):

@@ -57,3 +57,9 @@ def test_confidence_is_judged_by_cases_of_other_halves_and_kinds(bench):
     assert "calibrated without arm" in held_out[0]
     # Nothing tells them apart any more: all are as sure.
     assert "FAIL" in bench.reliability([bench.replace(entry, confidence=0.95) for entry in cases])[1]
+
+
+def test_other_shapes_alone_need_data(bench, capsys):
+    with pytest.raises(SystemExit):
+        bench.main(["--only", "arm"])
+    assert "--only arm needs --data" in capsys.readouterr().err
