@@ -251,7 +251,9 @@ def chained(scans: list[tr.RangeScan], pairs: list[Tensor]) -> list[Tensor]:
     return places
 
 
-def misses(sequence: ScanSequence | CapturedSequence, places: Tensor, source: int, target: int, size: float) -> Tensor:
+def place_errors(
+    sequence: ScanSequence | CapturedSequence, places: Tensor, source: int, target: int, size: float
+) -> Tensor:
     """Return how far moved points (N, 3) of a frame are from the truth in another, shares of a size."""
     return (places - sequence.truth(source, target)).norm(dim=-1) / size
 
@@ -264,7 +266,7 @@ def print_sequence(kind: str, sequence: ScanSequence, recipe: Recipe) -> None:
     ways, size = (found.deformed, chained(scans, pairs)), scans[0].diagonal
 
     def error(places: Tensor, source: int, target: int) -> float:
-        return 100 * float(misses(sequence, places, source, target, size).mean())
+        return 100 * float(place_errors(sequence, places, source, target, size).mean())
 
     print(f"\n{kind}, sequence of {len(scans)} frames, mean % from the first, and of the pair that ends there")
     print(f"{'frame':>6s} together chained   pair")
@@ -311,10 +313,10 @@ def print_many_sequences(
             size = scans[0].diagonal
             found = tr.register_sequence(scans, recipe.bones, recipe.grid, recipe.config)
             errors = torch.stack(
-                [misses(sequence, found.deformed[frame], 0, frame, size) for frame in range(1, frames)]
+                [place_errors(sequence, found.deformed[frame], 0, frame, size) for frame in range(1, frames)]
             )
             alone = [
-                float(misses(sequence, moved, frame, frame + 1, size).mean())
+                float(place_errors(sequence, moved, frame, frame + 1, size).mean())
                 for frame, moved in enumerate(adjacent(scans, recipe))
             ]
             rows.append((errors.mean(1), (errors < NEAR).double().mean(1) >= REGISTERED, torch.tensor(alone).mean()))

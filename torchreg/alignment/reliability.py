@@ -294,11 +294,11 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
         # As the fit weighed the data against what was told.
         shared = torch.maximum(shared, errors_per_patch(problem.data, problem.valid, problem.size))
     precision = plausible_precision(problem, pose)
-    covariance = pose_covariance(jacobian, near, noise * shared.sqrt(), precision)
+    fitted = pose_covariance(jacobian, near, noise * shared.sqrt(), precision)
+    covariance = _sure_covariance(jacobian, near, noise * shared.sqrt(), precision)
     if problem.landmarks is not None:
-        covariance = problem.landmarks.informed(covariance, pose)
-    gain = _gain(problem, pose, distance, jacobian, noise, covariance) / shared.square()
-    covariance = _surely_told(covariance, jacobian, near, noise * shared.sqrt(), precision)
+        fitted, covariance = (problem.landmarks.informed(each, pose) for each in (fitted, covariance))
+    gain = _gain(problem, pose, distance, jacobian, noise, fitted) / shared.square()
     if problem.told_precision is not None:
         # A fit takes noise for no larger than a share of the size, so that it keeps its hold; what is known must not.
         error = surface_noise(distance, problem.valid, problem.size, clamped=False)
@@ -314,27 +314,22 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
     return Curvature((covariance + misplaced + inexact_shape).to(pose), gain)
 
 
-def _surely_told(covariance: Tensor, jacobian: Tensor, near: Tensor, error: Tensor, precision: Tensor) -> Tensor:
-    """Return the covariance by the information that is surely in the data, not in one of them or two by chance.
+def _sure_covariance(jacobian: Tensor, weights: Tensor, noise: Tensor, precision: Tensor) -> Tensor:
+    """Return the covariance of `pose_covariance` by what the data surely tell, not one of them or two by chance.
 
-    What data tell of a direction is a sum over them, whose standard deviation, if others of their kind had been
-    measured, is the root of the sum of squares: of that the lower end is taken. A few outliers on the surface seem to
-    tell of turns that a round part does not show; of what hundreds tell it takes a tenth.
-
-    Args:
-        covariance: (B, D, D) of the fit.
-        jacobian: (B, M, D) of the distances.
-        near: (B, M) weights of the data.
-        error: (B,) standard deviation of a datum.
-        precision: (B, D) of what is known without data.
+    What they tell of a direction, in units of what is known without them, is a sum over the data, whose standard
+    deviation, if others of their kind had been measured, is the root of the sum of squares: the lower end is taken. A
+    few outliers on the surface seem to tell of turns that a round part does not show; of what hundreds tell it takes a
+    tenth.
 
     References: Efron 1979, the variance of a sum over resampled data.
     """
-    variance, directions = torch.linalg.eigh(covariance.double())
-    told = (jacobian.double() @ directions).square() * (near.double() / error.double().square()[:, None]).unsqueeze(-1)
-    least = (directions.square() * precision.double().unsqueeze(-1)).sum(-2)
-    sure = torch.maximum(1 / variance - told.square().sum(-2).sqrt(), least)
-    return ((directions / sure.unsqueeze(-2)) @ directions.mT).to(covariance)
+    known = precision.double().rsqrt()
+    rows = (jacobian * (weights.sqrt() / noise.unsqueeze(-1)).unsqueeze(-1)).double() * known.unsqueeze(-2)
+    told, directions = torch.linalg.eigh(rows.mT @ rows)
+    sure = (told - (rows @ directions).pow(4).sum(-2).sqrt()).clamp_min(0)
+    scaled = directions * known.unsqueeze(-1)
+    return ((scaled / (1 + sure).unsqueeze(-2)) @ scaled.mT).to(jacobian)
 
 
 def _of_noisier_data(covariance: Tensor, precision: Tensor, excess: Tensor) -> Tensor:

@@ -20,8 +20,15 @@ from torchreg.spines.labeled_tree import LimbGraph, gather_nodes, number_nodes, 
 from torchreg.spines.local_icp import LOCAL_FITS, SurfacePoints, transfer_nodes
 from torchreg.spines.observed_limbs import FrameLimbs
 
-# Depths that are kept: each takes ten megabytes at most, and a tenth of a second to make again.
-_KEPT = 32
+
+@dataclass(frozen=True)
+class _Memory:
+    """What is kept of long sequences."""
+
+    depths: int = 32  # of frames: each takes ten megabytes at most, and a tenth of a second to make again
+
+
+_MEMORY = _Memory()
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +55,11 @@ class _Sequence:
     ) -> _Sequence:
         """Return the sequence of frames, some of which lack limbs."""
         return cls(
-            frames, graph, meshes, frozenset(missing), lru_cache(_KEPT)(lambda number: DepthField(meshes[number]))
+            frames,
+            graph,
+            meshes,
+            frozenset(missing),
+            lru_cache(_MEMORY.depths)(lambda number: DepthField(meshes[number])),
         )
 
 

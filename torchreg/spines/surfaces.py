@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, overload
+from typing import Any
 
 from torch import Tensor
 
@@ -16,8 +16,17 @@ from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.poisson_body import poisson_body
 from torchreg.geometry.spread import SPREADS, spread_dimensions
 
-NUM_SAMPLES = 2000  # vertices of a frame that tell its size, its place and what is upright
 ONE_SIDED = "the points do not enclose a body, as those of a single view: limbs follow the side that they show"
+
+
+@dataclass(frozen=True)
+class _SurfaceSampling:
+    """What is kept of the surface of every frame."""
+
+    num_vertices: int = 2000  # tell its size, its place and what is upright, as all of them would
+
+
+_SAMPLING = _SurfaceSampling()
 
 
 def as_surface(value: Any, name: str) -> tuple[TriangleMesh, tuple[str, ...]]:
@@ -64,7 +73,7 @@ class FrameSurfaces(Sequence[TriangleMesh]):
         names: of the frames.
         made: the surfaces of clouds by the number of the frame.
         notes: on each frame.
-        samples: some vertices of each frame, about `NUM_SAMPLES`.
+        samples: some vertices of each frame, as many as tell its size and place.
         shift: (3,) added to vertices; None for nothing.
     """
 
@@ -95,7 +104,7 @@ class FrameSurfaces(Sequence[TriangleMesh]):
             if _cloud(frame) is not None:
                 made[number] = mesh
             notes.append(told)
-            samples.append(mesh.vertices[:: max(1, mesh.num_vertices // NUM_SAMPLES)].detach().clone())
+            samples.append(mesh.vertices[:: max(1, mesh.num_vertices // _SAMPLING.num_vertices)].detach().clone())
         if not samples:
             raise InputError("meshes must hold at least one frame, got none")
         return cls(frames, names, made, tuple(notes), tuple(samples))
@@ -103,15 +112,7 @@ class FrameSurfaces(Sequence[TriangleMesh]):
     def __len__(self) -> int:
         return len(self.names)
 
-    @overload
-    def __getitem__(self, index: int) -> TriangleMesh: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> FrameSurfaces: ...
-
-    def __getitem__(self, index: int | slice) -> TriangleMesh | FrameSurfaces:
-        if isinstance(index, slice):
-            return self.chosen(range(len(self))[index])
+    def __getitem__(self, index: int) -> TriangleMesh:  # type: ignore[override]
         index = range(len(self))[index]
         mesh = self.made[index] if index in self.made else as_mesh(self.frames[index], self.names[index])
         return mesh if self.shift is None else TriangleMesh(mesh.vertices + self.shift.to(mesh.vertices), mesh.faces)
