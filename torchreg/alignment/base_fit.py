@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
+from torch.nn.utils.rnn import pad_sequence
 
 from torchreg.alignment.base_frames import BaseFrame
 from torchreg.alignment.patches import independent_share
 from torchreg.alignment.surface_fit import SURFACE_FIT, surface_noise
+from torchreg.capture.free_space import FreeSpace
 from torchreg.geometry.neighbors import sampling_distance
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp, so3_log
@@ -28,8 +30,8 @@ class BaseFitNumbers:
     """Numbers of the fit of a base; lengths are shares of the model's size."""
 
     widths: tuple[float, ...] = (0.09, 0.05, 0.03)  # of the kernel before the last one, which follows from the noise
-    steps: int = 3  # at each of them
-    last_steps: int = 20  # at the last one, at most
+    steps: int = 3  # at each of them, and of each round at the last one
+    rounds: int = 8  # at the last one, at most
     atol: float = 1e-4  # change that ends it, metres and radians
     depth_std: float = 0.02  # by which all measured surfaces may lie off the true ones, along their normals
     offset_std: float = 0.05  # of a joint's offset about zero, radians: three degrees
@@ -41,8 +43,6 @@ class BaseFitNumbers:
 BASE_FIT = BaseFitNumbers()
 # The base, then one number for the depth, then the joints' offsets.
 _DEPTH, _OFFSETS = BASE_DOFS, BASE_DOFS + 1
-# Residual of data that count as outliers, whatever the kernel, metres.
-_FAR = 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,54 +87,80 @@ class BaseProblem:
         head = torch.tensor([0.0] * BASE_DOFS + [(BASE_FIT.depth_std * self.size) ** -2], dtype=torch.float64)
         return torch.cat([head, std**-2])
 
-    def poses(self, state: Tensor) -> list[Tensor]:
-        """Return the pose (num_dofs,) of each frame, in the shape's dtype."""
-        like, offsets = self.skin.shape.rest, state[0, _OFFSETS:]
-        return [torch.cat([state[0, :BASE_DOFS], frame.joints + offsets]).to(like) for frame in self.frames]
+    def poses(self, state: Tensor) -> Tensor:
+        """Return the pose (T, num_dofs) of each frame, in the shape's dtype."""
+        joints = torch.stack([frame.joints for frame in self.frames]) + state[0, _OFFSETS:]
+        base = state[0, :BASE_DOFS].expand(len(joints), BASE_DOFS)
+        return torch.cat([base, joints], dim=-1).to(self.skin.shape.rest)
+
+    @cached_property
+    def data(self) -> tuple[Tensor, Tensor]:
+        """The data of all frames (T, M, 3), in the shape's dtype, and which of them are (T, M): the rest pads."""
+        rows = [frame.points.to(self.skin.shape.rest) for frame in self.frames]
+        valid = [torch.ones(len(row), dtype=torch.bool) for row in rows]
+        return pad_sequence(rows, batch_first=True), pad_sequence(valid, batch_first=True)
+
+    @cached_property
+    def skin_area(self) -> float:
+        """The area that a point of the skin stands for, square metres."""
+        return sampling_distance(self.skin.points) ** 2
 
     def residuals(self, state: Tensor) -> list[Tensor]:
         """Return the distance (M,) of each frame's data from the surface as it was measured, float64."""
-        poses = self.poses(state)
-        rows = [
-            self.surface.distance(frame.points.to(pose), pose) for frame, pose in zip(self.frames, poses, strict=True)
-        ]
-        return [row.cpu().double() - state[0, _DEPTH] for row in rows]
+        points, valid = self.data
+        distance = self.surface.distance(points, self.poses(state)).cpu().double() - state[0, _DEPTH]
+        return [row[kept] for row, kept in zip(distance, valid, strict=True)]
 
-    def linearize(self, state: Tensor, sigma: float, noise: float) -> Linearization:
-        """Return cost, gradient and Gauss-Newton Hessian with a Welsch kernel of a width and a noise, metres."""
+    def facing(self, state: Tensor) -> Tensor:
+        """Return which data (T, M) lie on surfaces that face the camera.
+
+        Along an outline the nearest surface may be one that is turned away, which the camera cannot have measured.
+        """
+        points, valid = self.data
+        jacobian = self.surface.distance_jacobian(points, self.poses(state))[1]
+        return ((jacobian[..., :3] * points).sum(-1) > 0) & valid
+
+    def linearize(self, state: Tensor, seen: Tensor, sigma: float, noise: float) -> Linearization:
+        """Return cost, gradient and Gauss-Newton Hessian of the data that are ``seen`` (T, M).
+
+        Args:
+            state: (1, 7 + J).
+            seen: of `facing`.
+            sigma: width of the Welsch kernel, metres.
+            noise: standard deviation of the data, metres.
+        """
         prior = self.precision()
         cost, gradient, hessian = 0.5 * (prior * state[0].square()).sum(), prior * state[0], torch.diag(prior)
-        for number, pose in enumerate(self.poses(state)):
-            for residual, jacobian, weight in self._terms(number, pose, float(state[0, _DEPTH])):
-                beta = welsch_weight((residual / sigma).square())
-                weighted = jacobian * (weight * beta / noise**2).unsqueeze(-1)
-                cost = cost + 0.5 * weight * (1 - beta).sum() * (sigma / noise) ** 2
-                gradient, hessian = gradient + weighted.mT @ residual, hessian + weighted.mT @ jacobian
+        for residual, jacobian, weight in self._terms(state, seen):
+            beta = welsch_weight((residual / sigma).square())
+            weighted = jacobian * (weight * beta / noise**2).unsqueeze(-1)
+            cost = cost + 0.5 * (weight * (1 - beta)).sum() * (sigma / noise) ** 2
+            gradient, hessian = gradient + weighted.mT @ residual, hessian + weighted.mT @ jacobian
         held = torch.cat([torch.zeros(_OFFSETS, dtype=torch.bool), ~self.free])
         gradient = gradient.masked_fill(held, 0.0)
         return Linearization(cost[None], gradient[None], hessian.masked_fill(held | held.unsqueeze(-1), 0.0)[None])
 
-    def _terms(self, number: int, pose: Tensor, depth: float) -> Iterator[tuple[Tensor, Tensor, float]]:
-        """Yield residuals (N,), their Jacobian (N, 7 + J) and weight: of a frame's data, and of what is not there."""
-        frame, share = self.frames[number], self.shares[number]
-        distance, jacobian = self.surface.distance_jacobian(frame.points.to(pose), pose)
-        # Along an outline the nearest surface may be one that is turned away, which the camera cannot have measured.
-        facing = (jacobian[:, :3] * frame.points.to(pose)).sum(-1) > 0
-        distance = torch.where(facing, distance.cpu().double() - depth, _FAR)
-        yield distance, _with_depth(jacobian, -1.0), share
-        if frame.free_space is None:
-            return
-        space = frame.free_space
-        rows, derivative = self.skin.shape.transform_jacobian(pose, chart="tangent")
-        points = self.skin.place(rows).to(space.depth)
-        intrusion, slope = (value[0].to(pose) for value in space.intrusion_gradient(points[None]))
-        along = (self.skin.basis.unsqueeze(-1) * slope.unsqueeze(-2)).flatten(-2)
-        shown = BASE_FIT.space_share * self.skin_area() / float(space.datum_area) / points[:, 2].mean().square()
-        yield intrusion.cpu().double(), _with_depth(along @ derivative.flatten(-3, -2), 0.0), share * float(shown)
+    def _terms(self, state: Tensor, seen: Tensor) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Yield residuals (N,), their Jacobian (N, 7 + J) and weights (N,): of the data, and of what is not there."""
+        poses = self.poses(state)
+        distance, jacobian = self.surface.distance_jacobian(self.data[0], poses)
+        weight = torch.tensor(self.shares, dtype=torch.float64).unsqueeze(-1).expand(seen.shape)
+        yield distance[seen].cpu().double() - state[0, _DEPTH], _with_depth(jacobian[seen], -1.0), weight[seen]
+        rows, derivatives = self.skin.shape.transform_jacobian(poses, chart="tangent")
+        placed = self.skin.place(rows)
+        for frame, share, points, derivative in zip(self.frames, self.shares, placed, derivatives, strict=True):
+            if frame.free_space is not None:
+                yield self._beside(frame.free_space, share, points, derivative)
 
-    def skin_area(self) -> float:
-        """Return the area that a point of the skin stands for, square metres."""
-        return sampling_distance(self.skin.points) ** 2
+    def _beside(
+        self, space: FreeSpace, share: float, points: Tensor, derivative: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Return residuals, Jacobian and weights of the skin's points (N, 3) where a frame saw nothing."""
+        intrusion, slope = (value[0].to(points) for value in space.intrusion_gradient(points[None].to(space.depth)))
+        along = (self.skin.basis.unsqueeze(-1) * slope.unsqueeze(-2)).flatten(-2)
+        shown = BASE_FIT.space_share * self.skin_area / float(space.datum_area) / points[:, 2].double().mean().square()
+        weight = (share * shown).expand(len(points))
+        return intrusion.cpu().double(), _with_depth(along @ derivative.flatten(-3, -2), 0.0), weight
 
 
 def _with_depth(jacobian: Tensor, by_depth: float) -> Tensor:
@@ -164,16 +190,20 @@ class BaseFit:
     @property
     def base(self) -> Tensor:
         """``T_camera_base`` (4, 4)."""
-        return rigid_matrix(so3_exp(self.state[:, 3:BASE_DOFS])[0], self.state[0, :3])
+        return base_of(self.state)
 
     @property
     def offsets(self) -> Tensor:
         """Offsets (J,) of the joints."""
         return self.state[0, _OFFSETS:]
 
+    def linearization(self) -> Linearization:
+        """Return the problem about the state."""
+        return self.problem.linearize(self.state, self.problem.facing(self.state), self.sigma, self.noise)
+
     def covariance(self) -> tuple[Tensor, Tensor]:
         """Return the covariance (6, 6) of the base and the standard deviations (J,) of the offsets."""
-        found = _inverse(self.problem.linearize(self.state, self.sigma, self.noise).hessian[0])
+        found = _inverse(self.linearization().hessian[0])
         return found[:BASE_DOFS, :BASE_DOFS], found.diagonal()[_OFFSETS:].clamp_min(0).sqrt()
 
     @property
@@ -182,26 +212,38 @@ class BaseFit:
         return float(self.state[0, _DEPTH])
 
 
+def base_of(state: Tensor) -> Tensor:
+    """Return the base (4, 4) of a state (1, 7 + J)."""
+    return rigid_matrix(so3_exp(state[:, 3:BASE_DOFS])[0], state[0, :3])
+
+
 def fit_base(problem: BaseProblem, state: Tensor, widths: Sequence[float] = BASE_FIT.widths) -> BaseFit:
     """Return the state after a fit with kernels of some widths, shares of the size, and one that follows the noise."""
-    noise = SURFACE_FIT.max_noise(problem.size)
-    for width in widths:
-        state = _solve(problem, state, width * problem.size, noise, BASE_FIT.steps)[0]
+    state = approach_base(problem, state, widths)
     residual = torch.cat(problem.residuals(state))
     noise = float(surface_noise(residual, torch.ones_like(residual, dtype=torch.bool), problem.size))
     sigma = SURFACE_FIT.width_per_noise * noise
-    state, converged = _solve(problem, state, sigma, noise, BASE_FIT.last_steps)
+    state, converged = _solve(problem, state, sigma, noise, BASE_FIT.rounds)
     return BaseFit(problem=problem, state=state, sigma=sigma, noise=noise, converged=converged)
 
 
-def _solve(
-    problem: BaseProblem, state: Tensor, sigma: float, noise: float, steps: int
-) -> tuple[Tensor, bool]:  # fmt: skip
-    solved = levenberg_marquardt(
-        partial(problem.linearize, sigma=sigma, noise=noise), state, retract=retract, max_steps=steps,
-        atol=BASE_FIT.atol,
-    )  # fmt: skip
-    return solved.state, float(solved.last_step.abs().max()) <= BASE_FIT.atol or solved.num_steps < steps
+def approach_base(problem: BaseProblem, state: Tensor, widths: Sequence[float] = BASE_FIT.widths) -> Tensor:
+    """Return the state after a few steps with a kernel of each of some widths, shares of the size."""
+    noise = SURFACE_FIT.max_noise(problem.size)
+    for width in widths:
+        state = _solve(problem, state, width * problem.size, noise, 1)[0]
+    return state
+
+
+def _solve(problem: BaseProblem, state: Tensor, sigma: float, noise: float, rounds: int) -> tuple[Tensor, bool]:
+    """Return the state after rounds of a few steps each: which data are seen, then a fit to those."""
+    for _ in range(rounds):
+        before, seen = state, problem.facing(state)
+        linearize = partial(problem.linearize, seen=seen, sigma=sigma, noise=noise)
+        state = levenberg_marquardt(linearize, state, retract=retract, max_steps=BASE_FIT.steps).state
+        if float((state - before).abs().max()) <= BASE_FIT.atol:
+            return state, True
+    return state, False
 
 
 def _inverse(hessian: Tensor) -> Tensor:
@@ -221,9 +263,7 @@ def fit_offsets(fit: BaseFit) -> BaseFit:
     """
     problem = replace(fit.problem, free=torch.ones_like(fit.problem.free))
     found = fit_base(problem, fit.state, widths=())
-    prior, hessian = problem.precision()[_OFFSETS:].rsqrt(), problem.linearize(
-        found.state, found.sigma, found.noise
-    ).hessian[0]  # fmt: skip
+    prior, hessian = problem.precision()[_OFFSETS:].rsqrt(), found.linearization().hessian[0]
     free = problem.free.clone()
     while bool(free.any()):
         kept = torch.cat([torch.ones(_OFFSETS, dtype=torch.bool), free])

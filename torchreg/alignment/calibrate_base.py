@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchreg._threads import one_thread
-from torchreg.alignment.base_fit import BASE_FIT, BaseFit, BaseProblem, fit_base, fit_offsets
+from torchreg.alignment.base_fit import BASE_FIT, BaseFit, BaseProblem, approach_base, base_of, fit_base, fit_offsets
 from torchreg.alignment.base_frames import BaseFrame, read_frames
 from torchreg.alignment.base_search import PosedModel, rank_bases, search_base, seen_shares
 from torchreg.alignment.problem import fitted_surface, model_size
@@ -94,8 +94,8 @@ def _best_base(problem: BaseProblem, models: Sequence[PosedModel]) -> tuple[Tens
     """Return the best base (4, 4) of a search, and its relative lead over the next."""
     frames, size = problem.frames, problem.size
     candidates, _ = search_base(frames, models, size)
-    fits = [fit_base(problem, problem.state(base)) for base in candidates[: _NUMBERS.num_fitted]]
-    bases, costs = rank_bases(torch.stack([fit.base for fit in fits]), frames, models, size)
+    fitted = [base_of(approach_base(problem, problem.state(base))) for base in candidates[: _NUMBERS.num_fitted]]
+    bases, costs = rank_bases(torch.stack(fitted), frames, models, size)
     lead = float(costs[1] / costs[0]) - 1 if len(costs) > 1 else float("inf")
     return bases[0], lead
 

@@ -144,6 +144,14 @@ class LimbSearch:
         found = [_Search(self, problem.rows(row), subset.rows(row), effort).run(poses[row]) for row in rows]
         return torch.cat(found)
 
+    def knows(self, problem: AlignProblem, limb: Limb) -> bool:
+        """Return whether the joints of a limb are known beforehand as well as samples would tell them."""
+        if problem.told_precision is None:
+            return False
+        slides = (self.shape.upper - self.shape.lower) / _SAMPLING.slide_count
+        spacing = torch.where(self.shape.is_sliding, slides, _SAMPLING.angle)[limb.dofs]
+        return bool((problem.told_precision[:, limb.dofs].rsqrt() <= spacing).all())
+
     def _leader(self, follower: Limb) -> Limb:
         """Return the limb whose degrees of freedom move the first body of one that has none."""
         kinematics, first = self.shape.kinematics, follower.bodies[0]
@@ -204,6 +212,7 @@ class _Search:
         self.problem = problem if effort.refine_widths else subset
         self.width = effort.width * problem.size
         self.score_width = effort.score_width * problem.size
+        self.known = [limb for limb in limbs.limbs if limbs.knows(problem, limb)]
 
     def run(self, poses: Tensor) -> Tensor:
         """Return the best poses (B, C, num_dofs) with the trunk where ``poses`` have it."""
@@ -211,10 +220,15 @@ class _Search:
         score_losses = self._part_losses(self.problem, transforms, self.limbs.trunk, self.score_width)[:, 0]
         losses = self._part_losses(self.subset, transforms, self.limbs.trunk, self.width)
         found = poses.unsqueeze(1)
-        for level in sorted({limb.level for limb in self.limbs.limbs}):
+        for limb in self.known:
+            losses = torch.minimum(losses, self._limb_losses(self.subset, found, limb, self.width))
+            known = self._limb_losses(self.problem, found, limb, self.score_width)[:, 0]
+            score_losses = torch.minimum(score_losses, known)
+        sought = [limb for limb in self.limbs.limbs if limb not in self.known]
+        for level in sorted({limb.level for limb in sought}):
             # Limbs that hang on limbs are placed on the best combination of those.
             pose = found[:, 0]
-            members = [limb for limb in self.limbs.limbs if limb.level == level]
+            members = [limb for limb in sought if limb.level == level]
             placed = [self._place(pose, losses, score_losses, limb) for limb in members]
             index = self._combine(pose, score_losses, placed)
             found = pose.unsqueeze(1).repeat(1, index.shape[1], 1)

@@ -44,7 +44,6 @@ class _Around:
     placed_share: float = 0.35  # of the candidates, the best, whose limbs are placed
     num_refined: int = 3  # candidates that are refined thoroughly, at most
     data_per_candidate: int = 500  # on which it is measured, with its limbs in several positions
-    held_share: float = 0.35  # of the candidates, that suffice where the base is held
     entries: int = 4_000_000  # of a table in memory
 
 
@@ -97,8 +96,6 @@ def explore(
     Returns:
         (B, num_dofs).
     """
-    if bool((problem.lower[..., :BASE_DOFS] == problem.upper[..., :BASE_DOFS]).all()):
-        candidates = max(1, round(_AROUND.held_share * candidates))
     per_problem = candidates * _AROUND.data_per_candidate * problem.skin.shape.num_parts
     rows = torch.arange(len(start), device=start.device).split(max(1, _AROUND.entries // per_problem))
     state, found = generator.get_state(), []
@@ -152,13 +149,16 @@ def _scatter(search: PoseSearch, center: Tensor, count: int, generator: torch.Ge
     shape = problem.skin.shape
     scale = (_SCATTER.joints * (shape.upper - shape.lower)).clamp_max(_SCATTER.max_joints)
     scale[:3], scale[3:BASE_DOFS] = _SCATTER.shift * problem.size, _SCATTER.turn
-    noise = torch.randn(count, shape.num_dofs, generator=generator, dtype=torch.float32).to(center) * scale
+    scale = problem.at_most_told(scale).unsqueeze(1)
+    noise = torch.randn(count, shape.num_dofs, generator=generator, dtype=torch.float32).to(center)
     noise[0] = 0
-    wide = center.unsqueeze(1).expand(-1, count, -1)
-    around = shape.retract(wide, noise.expand_as(wide))
-    span = (shape.upper - shape.lower).clamp_max(2 * _SCATTER.redrawn_reach)
-    low = torch.maximum(center - _SCATTER.redrawn_reach, shape.lower).clamp_max(shape.upper - span)
-    redrawn = low.unsqueeze(1) + span * torch.rand(noise.shape, generator=generator, dtype=torch.float32).to(center)
+    around = shape.retract(center.unsqueeze(1).expand(-1, count, -1), noise * scale)
+    lower, upper = problem.plausible_limits()
+    span = (upper - lower).clamp_max(2 * _SCATTER.redrawn_reach)
+    low = torch.minimum(torch.maximum(center - _SCATTER.redrawn_reach, lower), upper - span)
+    redrawn = low.unsqueeze(1) + span.unsqueeze(1) * torch.rand(
+        noise.shape, generator=generator, dtype=torch.float32
+    ).to(center)
     for limb in search.limbs.limbs:
         is_redrawn = torch.rand(count, 1, generator=generator, dtype=torch.float32).to(center) < _SCATTER.redrawn_limbs
         is_redrawn[0] = False

@@ -216,9 +216,16 @@ class DepthFrame:
 
 def _pooled(picture: Tensor, radius: int) -> Tensor:
     """Return the largest number of a picture (H, W) within some pixels of each."""
-    # Rows after columns: a square at once costs its whole area for each pixel.
-    tall = torch.nn.functional.max_pool2d(picture[None], (2 * radius + 1, 1), 1, (radius, 0))
-    return torch.nn.functional.max_pool2d(tall, (1, 2 * radius + 1), 1, (0, radius))[0]
+    found = torch.nn.functional.pad(picture, (radius,) * 4, value=-torch.inf)
+    # Rows after columns, and the window doubled in each step: a square at once costs its whole area for each pixel.
+    for axis in (0, 1):
+        width = 1
+        while width < 2 * radius + 1:
+            step = min(width, 2 * radius + 1 - width)
+            size = found.shape[axis] - step
+            found = torch.maximum(found.narrow(axis, 0, size), found.narrow(axis, step, size))
+            width += step
+    return found
 
 
 def _grown(mask: Tensor, radius: int) -> Tensor:
