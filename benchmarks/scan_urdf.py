@@ -9,6 +9,7 @@ reference, moved by the file's own joints, lie from where they truly are, as med
 
     python benchmarks/scan_urdf.py
     python benchmarks/scan_urdf.py --fused
+    python benchmarks/scan_urdf.py --fused --robot ROBOT.urdf     # a robot of a file, in random steps
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from torch import Tensor
 import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
+from torchreg.geometry.rigid import invert_rigid
 from torchreg.io.urdf import UrdfPrimitive
 from torchreg.registration.robots.model import RobotModel
 from torchreg.shapes.posed_tree import PosedTree
@@ -40,7 +42,7 @@ STEP, SPLITS = 0.25, 3
 class Arm:
     """A made-up arm: vertices (V, 3) in their links' frames, faces, links (V,), and poses (T, 6 + J)."""
 
-    tree: PosedTree
+    tree: PosedTree | tr.ArticulatedShape
     vertices: Tensor
     faces: Tensor
     link: Tensor
@@ -75,6 +77,21 @@ class Arm:
         poses = torch.nn.functional.pad(steps.cumsum(0), (6, 0))
         return cls(tree, torch.cat(pieces), torch.cat(faces), torch.cat(link), poses)
 
+    @classmethod
+    def of_file(cls, path: Path, frames: int, seed: int) -> Arm:
+        """Return the robot of a URDF file in a number of frames; steps beyond a joint's limits come back."""
+        shape = tr.ArticulatedShape.from_urdf(path, dtype=torch.float64)
+        skin, to_part = shape.file_skin(), invert_rigid(shape.part_transforms(torch.zeros_like(shape.rest)))
+        link = skin.weights.argmax(-1)
+        draw = torch.Generator().manual_seed(seed)
+        steps = STEP * torch.randn(frames, shape.num_dofs - 6, generator=draw, dtype=torch.float64)
+        steps[0] *= 2
+        poses = shape.rest + torch.nn.functional.pad(steps.cumsum(0), (6, 0))
+        poses = torch.where(poses > shape.upper, 2 * shape.upper - poses, poses)
+        poses = torch.where(poses < shape.lower, 2 * shape.lower - poses, poses)
+        vertices = (to_part[link, :3, :3] @ skin.points.unsqueeze(-1)).squeeze(-1) + to_part[link, :3, 3]
+        return cls(shape, vertices, skin.faces, link, poses)
+
     def placed(self) -> Tensor:
         """Return the vertices (T, V, 3) in all frames."""
         frames = self.tree.part_transforms(self.poses)[:, self.link]
@@ -82,9 +99,10 @@ class Arm:
 
     def axes(self) -> tuple[Tensor, Tensor]:
         """Return the directions and points (J, 3) of the joints' axes in the first frame."""
-        joints = self.tree.kinematics.tree.joints[1:]
-        frames = self.tree.part_transforms(self.poses[0])[1:]
-        axes = torch.tensor([joint.axis for joint in joints], dtype=torch.float64)
+        joints = self.tree.kinematics.tree.joints
+        moving = [number for number, joint in enumerate(joints) if joint.kind != "fixed"]
+        frames = self.tree.frame_transforms(self.poses[0])[moving]
+        axes = torch.tensor([joints[number].axis for number in moving], dtype=torch.float64)
         return (frames[:, :3, :3] @ axes.unsqueeze(-1)).squeeze(-1), frames[:, :3, 3]
 
 
@@ -188,7 +206,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--frames", type=int, default=10, help="per arm")
     parser.add_argument("--joints", type=int, nargs="+", default=[3, 5, 7], help="of the arms")
     parser.add_argument("--fused", action="store_true", help="clouds of four depth cameras instead of whole surfaces")
+    parser.add_argument("--robot", type=Path, help="URDF file of a robot to scan instead of made-up arms")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of a robot's steps")
     options = parser.parse_args(arguments)
+    if options.robot:
+        for seed in options.seeds:
+            arm = Arm.of_file(options.robot, options.frames, seed)
+            show(arm, f"{options.robot.stem}, seed {seed}, {options.frames} frames", options.fused)
+        return 0
     for joints in options.joints:
         show(Arm.drawn(joints, options.frames, seed=joints), f"{joints} joints, {options.frames} frames", options.fused)
     return 0

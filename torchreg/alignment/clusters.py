@@ -47,9 +47,15 @@ def leaves_clusters(problem: AlignProblem, pose: Tensor) -> Tensor:
 
 def clustered_data(problem: AlignProblem, pose: Tensor) -> tuple[Tensor, Tensor]:
     """Return the numbers of data (B,) in unexplained clusters, and on the surface."""
-    if problem.data.shape[-2] > CLUSTERS.max_data:
-        problem = _thinned(problem, CLUSTERS.max_data)
-    distance = problem.surface.distance(problem.data, pose).abs()
+    return clusters_beside(problem, problem.surface.distance(problem.data, pose))
+
+
+def clusters_beside(problem: AlignProblem, distance: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the same for data at distances (B, M) from the surface."""
+    stride = -(-problem.data.shape[-2] // CLUSTERS.max_data)
+    if stride > 1:
+        problem = problem.with_data(problem.data[:, ::stride], problem.valid[:, ::stride])
+    distance = distance[:, ::stride].abs()
     limit = OFF_SURFACE.distance(surface_noise(distance, problem.valid, problem.size), problem.size)
     far = (distance > limit.unsqueeze(-1)) & problem.valid
     near = ~far & problem.valid
@@ -65,9 +71,3 @@ def clustered_data(problem: AlignProblem, pose: Tensor) -> tuple[Tensor, Tensor]
 def _squared_distances(data: Tensor) -> Tensor:
     norms = data.square().sum(-1)
     return (norms.unsqueeze(-1) + norms.unsqueeze(-2) - 2 * data @ data.mT).clamp_min_(0)
-
-
-def _thinned(problem: AlignProblem, count: int) -> AlignProblem:
-    """Return the problem with every k-th datum, so that about ``count`` remain at most."""
-    stride = -(-problem.data.shape[-2] // count)
-    return problem.with_data(problem.data[:, ::stride], problem.valid[:, ::stride])

@@ -154,11 +154,9 @@ def _covariance(problem: AlignProblem, pose: Tensor, precision: Tensor) -> Tenso
 
 def limb_data(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return the number of data (B, L) that only one limb explains, for each limb; infinity without limbs."""
-    shape = problem.skin.shape
-    explained = soft_inliers(problem, shape.distance(problem.data, pose))
-    counts = []
-    for limb, _ in limb_points(problem.skin):
-        rest = [number for number in range(shape.num_parts) if number not in limb.parts]
-        by_rest = soft_inliers(problem, shape.distance(problem.data, pose, parts=rest)) if rest else 0.0
-        counts.append((explained - by_rest).clamp_min(0).sum(-1))
+    limbs = [limb.parts for limb, _ in limb_points(problem.skin)]
+    explained, *by_rest = soft_inliers(
+        problem, problem.skin.shape.distances_without(problem.data, pose, [(), *limbs])
+    ).unbind(0)
+    counts = [(explained - rest).clamp_min(0).sum(-1) for rest in by_rest]
     return torch.stack(counts, dim=-1) if counts else torch.full_like(explained[:, :1], torch.inf)

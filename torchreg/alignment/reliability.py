@@ -11,8 +11,8 @@ from itertools import takewhile
 import torch
 from torch import Tensor
 
-from torchreg.alignment.clusters import OFF_SURFACE, clustered_data
-from torchreg.alignment.confidence import EVIDENCE, beside_share, end_spreads, limb_data, limb_points
+from torchreg.alignment.clusters import OFF_SURFACE, clusters_beside
+from torchreg.alignment.confidence import EVIDENCE, end_spreads, limb_data, limb_points, share_beside
 from torchreg.alignment.patches import errors_per_patch
 from torchreg.alignment.problem import BROAD_PRIOR, INLIER_SHARE, AlignProblem, free_space_loss
 from torchreg.alignment.shape_errors import shape_covariance
@@ -174,7 +174,7 @@ def judge(problem: AlignProblem, pose: Tensor, lead: Tensor | None, error: Surfa
         error: of fits of pose and shape together.
     """
     around, spreads = curvature(problem, pose), end_spreads(problem, pose)
-    evidence, calibration = gather_evidence(problem, pose, lead, spreads), CALIBRATION
+    evidence, calibration = gather_evidence(problem, pose, around.distance, lead, spreads), CALIBRATION
     converged, loose = around.converged, spreads > EVIDENCE.tolerance * problem.size
     if error is not None:
         evidence, calibration = replace(evidence, unknown=error.unknown(problem.size)), SHAPE_CALIBRATION
@@ -189,22 +189,24 @@ def judge(problem: AlignProblem, pose: Tensor, lead: Tensor | None, error: Surfa
     )
 
 
-def gather_evidence(problem: AlignProblem, pose: Tensor, lead: Tensor | None, spreads: Tensor) -> Evidence:
+def gather_evidence(
+    problem: AlignProblem, pose: Tensor, distance: Tensor, lead: Tensor | None, spreads: Tensor
+) -> Evidence:
     """Return the evidence for poses (B, num_dofs).
 
     Args:
         problem: the batch.
         pose: fitted.
+        distance: (B, M) of the data from the surface.
         lead: (B,) cost by which the second best pose of a search was worse, infinite where there was none; None for
             starts that were given.
         spreads: (B, L), see `end_spreads`.
     """
-    distance = problem.surface.distance(problem.data, pose)
-    clustered, on_surface = clustered_data(problem, pose)
+    clustered, on_surface = clusters_beside(problem, distance)
     return weigh(
         problem,
         distance,
-        beside=beside_share(problem, pose),
+        beside=share_beside(problem, distance),
         clustered=clustered.to(pose) / on_surface.clamp_min(1),
         spread=spreads.mean(-1),
         intruding=free_space_loss(problem, pose, INLIER_SHARE),
@@ -263,10 +265,12 @@ class Curvature:
     Args:
         covariance: (B, num_dofs, num_dofs) in tangent coordinates.
         gain: (B,) log-likelihood that a further step would gain.
+        distance: (B, M) of the data from the surface, metres.
     """
 
     covariance: Tensor
     gain: Tensor
+    distance: Tensor
 
     @property
     def converged(self) -> Tensor:
@@ -311,7 +315,7 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
         covariance=pose_covariance(jacobian, near, noise, precision), share=correlation,
     )  # fmt: skip
     misplaced = torch.diag_embed(_misplaced_share(problem, pose) / precision)
-    return Curvature((covariance + misplaced + inexact_shape).to(pose), gain)
+    return Curvature((covariance + misplaced + inexact_shape).to(pose), gain, distance)
 
 
 def _sure_covariance(jacobian: Tensor, weights: Tensor, noise: Tensor, precision: Tensor) -> Tensor:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import torch
@@ -215,31 +213,17 @@ def scale_jacobian(shape: Articulation, points: Tensor, poses: Tensor) -> Tensor
     return torch.cat([by_length - force @ moves.flatten(1, 2), by_radius], dim=-1).detach()
 
 
-@contextmanager
-def _learning(parameter: Tensor) -> Iterator[None]:
-    """Let a parameter take gradients in a ``with`` block, whether or not it does otherwise."""
-    before = parameter.requires_grad
-    parameter.requires_grad_(True)
-    try:
-        yield
-    finally:
-        parameter.requires_grad_(before)
-
-
 def _solid_motions(shape: Articulation, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return centers (T, P, 3) and rotations (T, P, 3, 3) of the solids, and motions of the centers (T, P, 3, P).
 
     The motions, by the logarithms of all lengths, are in each solid's own frame.
     """
-    lengths = shape.log_length_scales
-    with torch.enable_grad(), _learning(lengths):
-        transforms = shape.part_transforms(poses)
-        scaled = shape.primitives.centers.detach() * lengths.exp().unsqueeze(-1)
-        centers = transforms[..., :3, 3] + (transforms[..., :3, :3] @ scaled.unsqueeze(-1)).squeeze(-1)
-        # The product J^T u is linear in u; its derivative by u is J, in as many backward passes as there are lengths.
-        probe = torch.zeros_like(centers, requires_grad=True)
-        (product,) = torch.autograd.grad(centers, lengths, probe, create_graph=True)
-        identity = torch.eye(len(lengths)).to(lengths)
-        (moves,) = torch.autograd.grad(product, probe, identity, is_grads_batched=True)
-    rotations = transforms[..., :3, :3].detach() @ shape.primitives.rotations
-    return centers.detach(), rotations, rotations.mT @ moves.movedim(0, -1)
+    frames = shape.frame_transforms(poses)
+    turns, origins = frames[:, shape.part_index, :3, :3], frames[:, shape.part_index, :3, 3]
+    centers = shape.primitives.centers * shape.log_length_scales.exp().unsqueeze(-1)
+    within = (turns @ centers.unsqueeze(-1)).squeeze(-1)
+    # A solid's center within its part moves with that part's own length, too.
+    own = within.unsqueeze(-1) * torch.eye(shape.num_parts).to(poses).unsqueeze(-2)
+    moves = shape.length_motions(frames)[:, shape.part_index] + own
+    rotations = turns @ shape.primitives.rotations
+    return (origins + within).detach(), rotations.detach(), (rotations.mT @ moves).detach()

@@ -241,6 +241,27 @@ class Articulation(PosedTree):
             0
         ]
 
+    def distances_without(self, points: Tensor, pose: Tensor, left_out: Sequence[Sequence[int]]) -> Tensor:
+        """Return the distance of points to the surface fused without some parts, for each of some sets of parts.
+
+        Args:
+            points: (..., N, 3), metres.
+            pose: (..., num_dofs).
+            left_out: L sets of indices of parts.
+
+        Returns:
+            Distances (L, ..., N), metres, negative inside; infinite where all parts are left out.
+
+        Differentiable: as `distance`.
+        """
+        each = self.part_distances(points, pose)
+        gone = torch.zeros(len(left_out), each.shape[-1], dtype=torch.bool, device=each.device)
+        for row, parts in zip(gone, left_out, strict=True):
+            row[list(parts)] = True
+        gone = gone.reshape(len(gone), *[1] * (each.ndim - 1), -1)
+        fused = fuse(each.masked_fill(gone, torch.inf), self.adjacency, self.fusion_length())[0]
+        return fused.masked_fill(gone.all(-1), torch.inf)
+
     def distance_jacobian(
         self, points: Tensor, pose: Tensor, *, chart: str = "pose", parts: Sequence[int] | None = None
     ) -> tuple[Tensor, Tensor]:

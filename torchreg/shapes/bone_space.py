@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.shape_space import CoefficientPrior, LinearSpace
@@ -38,7 +37,7 @@ def bone_space(shape: Articulation, surface: RigSurface) -> LinearSpace:
     frames = shape.frame_transforms(torch.zeros_like(shape.rest)).detach().double()
     index = shape.part_index
     positions, joints = frames[:, :3, 3], frames[index, :3, 3]
-    by_length = _joint_motions(shape, positions)
+    by_length = shape.length_motions(frames)
     along = frames[index, :3, :3] @ shape.primitives.rotations[:, :, 2:].double()
     across = torch.eye(3, dtype=torch.float64) - along @ along.mT
     vertices, weights = surface.vertices.double(), surface.weights.double()
@@ -51,14 +50,6 @@ def bone_space(shape: Articulation, surface: RigSurface) -> LinearSpace:
     root = (positions - positions[0]).unsqueeze(-1)
     frame_dirs = torch.cat([root, still, by_length, still.expand(-1, -1, shape.num_parts)], dim=-1)
     return LinearSpace(vertices, vertex_dirs, positions, frame_dirs, _prior(shape.part_names))
-
-
-def _joint_motions(shape: Articulation, positions: Tensor) -> Tensor:
-    """Return how far frames (F, 3) move per relative change of each part's length, (F, 3, P)."""
-    parents = torch.tensor([joint.parent for joint in shape.kinematics.tree.joints])
-    offsets = torch.where((parents < 0).unsqueeze(-1), 0.0, positions - positions[parents.clamp_min(0)])
-    owned = torch.nn.functional.one_hot(shape.offset_owners(), shape.num_parts + 1)[:, 1:].to(positions)
-    return torch.einsum("fa,ac,ap->fcp", shape.kinematics.ancestors().to(positions), offsets, owned)
 
 
 def _prior(parts: tuple[str, ...]) -> CoefficientPrior:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 from torch import Tensor
 
@@ -54,7 +55,18 @@ def find_limbs(shape: Articulation) -> tuple[list[Limb], list[int]]:
 
     Args:
         shape: the articulated shape.
+
+    Cost: nothing after the first time for a shape.
     """
+    if shape not in _FOUND:
+        _FOUND[shape] = _find_limbs(shape)
+    return _FOUND[shape]
+
+
+_FOUND: WeakKeyDictionary[Articulation, tuple[list[Limb], list[int]]] = WeakKeyDictionary()
+
+
+def _find_limbs(shape: Articulation) -> tuple[list[Limb], list[int]]:
     bodies = _find_bodies(shape)
     owner = {part: number for number, body in enumerate(bodies) for part in body.parts}
     above = [owner[body.parent] if body.parent >= 0 else -1 for body in bodies]

@@ -319,6 +319,23 @@ class PosedTree(nn.Module):
         """Return, per frame (F,), 1 + the part whose length scales its offset from its parent, or 0."""
         return self._owners
 
+    def length_motions(self, frames: Tensor) -> Tensor:
+        """Return how far frames move as the logarithm of each part's length grows.
+
+        Args:
+            frames: (..., F, 4, 4) of a pose, see `frame_transforms`.
+
+        Returns:
+            (..., F, 3, P), metres.
+        """
+        above = frames[..., [max(joint.parent, 0) for joint in self.kinematics.tree.joints], :3, :3]
+        offsets = self.kinematics.lengths.unflatten(-1, (4, 4))[:, :3, 3] * self._offset_scales().unsqueeze(-1)
+        offsets = above @ offsets.to(frames).unsqueeze(-1)
+        owners = nn.functional.one_hot(self._owners, self.num_parts + 1)[:, 1:].to(frames)
+        # What hangs on a bone moves along it.
+        along = (offsets * owners.unsqueeze(-2)).flatten(-2)
+        return (self.kinematics.ancestors().to(frames) @ along).unflatten(-1, (3, -1))
+
     def couplings(self) -> Tensor:
         """Return the matrix (6 + J, num_dofs) from degrees of freedom to base and moving joints."""
         return self._couplings
