@@ -129,10 +129,10 @@ def extract_spine(
         growing: whether tips may appear and end.
         times: (T,) of the frames, strictly increasing; 0, 1, 2, ... by default.
         config: see `SpineConfig`; by default `SpineConfig.growing()` of what grows.
-        workers: processes for skeletons and for limbs that are transferred; by default one per core.
+        workers: processes for surfaces of clouds, skeletons and limbs that are transferred; by default one per core.
         on_step: called with every frame that is skeletonized.
-        progress: folder in which skeletons and transferred limbs are kept, so that a call that was interrupted goes on
-            where it ended.
+        progress: folder in which each of these is kept as soon as it is done, so that a call that was interrupted goes
+            on where it ended.
 
     Returns:
         A `SpineSequence`; `warnings` tell the irregularities frame by frame. Frames without a body, or with another
@@ -154,8 +154,10 @@ def extract_spine(
     References: Brostow, Essa, Steedly and Kwatra 2004; a prior skeleton is its section 6's.
     """
     config = config or (SpineConfig.growing() if growing else SpineConfig())
-    surfaces = meshes if isinstance(meshes, FrameSurfaces) else FrameSurfaces.of_frames(meshes)
     _check_settings(config, prior, workers, growing=growing)
+    surfaces = meshes
+    if not isinstance(surfaces, FrameSurfaces):
+        surfaces = FrameSurfaces.of_frames(meshes, workers=workers, progress=progress)
     origin = far_origin(surfaces.samples)
     if origin is not None:
         surfaces = surfaces.shifted(-origin)
