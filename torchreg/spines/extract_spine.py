@@ -148,8 +148,8 @@ def extract_spine(
 
     Differentiable: no; `SpineSequence.model` is.
 
-    Cost: about 1 s per frame of 15,000 vertices and CPU core; half a second more where limbs are transferred; 0.1 s for
-    names.
+    Cost: about 1 s per frame of 15,000 vertices and CPU core; half a second more where limbs are transferred, 1 s more
+    for a cloud of 12,000 points; 0.1 s for names.
 
     References: Brostow, Essa, Steedly and Kwatra 2004; a prior skeleton is its section 6's.
     """
