@@ -223,9 +223,7 @@ def cloud_lines(name: str, meshes: Sequence[tr.TriangleMesh], places: Tensor) ->
         apart = (of_meshes.unsqueeze(2) - tips.unsqueeze(1)).norm(dim=-1) / diagonal
         off = apart.transpose(0, 1)[torch.arange(apart.shape[1]), :, assign(apart.median(0).values)]
         share = tip_identity(tips, places.double())
-        line = (
-            f"{name:24} {holes:4.0%} missing: {len(tips):3} frames, {spine.num_tips} tips, {trees} tree(s), identity "
-        )
+        line = f"{name:24} {holes:4.0%} missing: {len(tips):3} frames, {spine.num_tips} tips, {trees} tree(s), "
         near = float((off < BAR_OFF).double().mean())
         line += f"identity {share:.3f}, off {float(off.median()):.2%}, within {BAR_OFF:.0%}: {near:.3f}"
         passed = share >= BAR_CLOUDS and float(off.median()) < BAR_OFF and trees == 1

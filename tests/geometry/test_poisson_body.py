@@ -5,9 +5,12 @@ import math
 import pytest
 import torch
 
+from torchreg.datasets.bodies import person
 from torchreg.geometry.joined_pieces import join_pieces
 from torchreg.geometry.mesh import sample_surface, unit_sphere
+from torchreg.geometry.neighbors import NeighborTree
 from torchreg.geometry.poisson_body import poisson_body
+from torchreg.geometry.voxels import voxelize
 
 
 def noisy_ball(count):
@@ -59,3 +62,16 @@ def test_two_thin_bodies_near_each_other_stay_apart():
     body = poisson_body(torch.cat((slender, slender + torch.tensor([0.0, 0.45, 0.0]))))
     above = (body.mesh.vertices[:, 1] > 0.225)[body.mesh.faces]
     assert bool((above.all(1) | ~above.any(1)).all())
+
+
+def test_thin_hands_and_feet_are_not_inside_out():
+    body = voxelize(person().mesh, 80).mesh()
+    generator = torch.Generator().manual_seed(0)
+    points = sample_surface(body, 4000, generator)[0].double()
+    diagonal = float((points.amax(0) - points.amin(0)).norm())
+    points = points + 0.002 * diagonal * torch.randn(points.shape, generator=generator, dtype=points.dtype)
+    found = poisson_body(points).mesh
+    # Where normals point inwards the surface is a bubble around the limb, far from the points.
+    far = NeighborTree(points).nearest(found.vertices)[1] > 0.03 * diagonal
+    assert float(far.double().mean()) < 0.003
+    assert volume(found) == pytest.approx(float(volume(body)), rel=0.05)

@@ -8,8 +8,10 @@ from torchreg.errors import InputError
 from torchreg.geometry.cloud_surface import cloud_surface
 from torchreg.geometry.mesh import sample_surface, unit_sphere
 from torchreg.geometry.range_scan import RangeScan
+from torchreg.spines import surfaces
 from torchreg.spines.extract_spine import extract_spine
 from torchreg.spines.skeletonize import skeletonize
+from torchreg.spines.surfaces import FrameSurfaces
 
 
 def noisy_points(mesh, count, seed=0):
@@ -46,6 +48,33 @@ def test_a_spine_of_clouds_has_the_tips_of_the_body(starfish, clouds):
     assert bool((arm == arm[0]).all())
     assert float(distance.max()) < 0.02 * float((clouds[0].amax(0) - clouds[0].amin(0)).norm())
     assert bool((spine.confidence > 0.9).all())
+
+
+def test_processes_give_the_surfaces_that_one_gives(clouds):
+    many = [*clouds, clouds[0][::2], creature_sequence(STARFISH, 1, resolution=32).meshes[0]]
+    alone, shared = (FrameSurfaces.of_frames(many, workers=workers) for workers in (1, 2))
+    for number in range(len(many)):
+        assert torch.equal(shared[number].vertices, alone[number].vertices)
+        assert torch.equal(shared[number].faces, alone[number].faces)
+    assert all(torch.equal(*pair) for pair in zip(shared.samples, alone.samples, strict=True))
+    assert shared.notes == alone.notes
+    assert sorted(shared.made) == [0, 1, 2, 3]
+
+
+def test_surfaces_that_were_kept_are_not_made_again(clouds, tmp_path, monkeypatch):
+    flat = clouds[0] * torch.tensor([1.0, 1.0, 0.0])
+    first = FrameSurfaces.of_frames([*clouds, flat], workers=2, progress=tmp_path)
+
+    def fails(*_):
+        raise AssertionError("made again")
+
+    monkeypatch.setattr(surfaces, "as_surface", fails)
+    again = FrameSurfaces.of_frames([*clouds, flat], workers=1, progress=tmp_path)
+    assert all(torch.equal(first[number].vertices, again[number].vertices) for number in range(4))
+    assert again.notes == first.notes
+    assert again.notes[3]
+    with pytest.raises(AssertionError, match="made again"):
+        FrameSurfaces.of_frames([clouds[0] + 1], workers=1, progress=tmp_path)
 
 
 def test_order_and_repetition_of_points_change_nothing(clouds):

@@ -93,6 +93,20 @@ def test_the_gradient_of_depth_points_to_the_middle(sphere):
     assert sphere.gradient(points).dtype == torch.float32
 
 
+def test_a_sheet_without_a_voxel_inside_has_depths():
+    flat = unit_sphere(3, dtype=torch.float64)
+    field = DepthField(TriangleMesh(flat.vertices * torch.tensor([1.0, 1.0, 1e-6]), flat.faces), 48)
+    depth, gradient = field.with_gradient(torch.tensor([[0.1, 0.2, 0.0], [0.1, 0.2, 0.3], [0.0, 0.0, 0.5]]).double())
+    assert bool(depth.isfinite().all() & gradient.isfinite().all())
+    assert depth[0] > depth[1] > depth[2]
+
+
+def test_the_depth_does_not_depend_on_what_was_asked_before(sphere):
+    points = torch.randn(40, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    fresh = DepthField(unit_sphere(4, dtype=torch.float64), 48)
+    assert torch.equal(torch.stack([fresh(point) for point in points.flip(0)]).flip(0), sphere(points))
+
+
 def test_batches_equal_loops(sphere):
     points = torch.randn(2, 3, 5, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
     torch.testing.assert_close(sphere(points)[1, 2], sphere(points[1, 2]))

@@ -1,6 +1,8 @@
 """One graph on every frame: limbs that a frame shows, limbs that touch each other, and those transferred to it."""
 
 import math
+import weakref
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -10,6 +12,7 @@ from torchreg.datasets.creatures import STARFISH, creature_sequence
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.skeleton import build_skeleton
+from torchreg.spines import limb_transfer
 from torchreg.spines.labeled_tree import LimbGraph
 from torchreg.spines.limb_transfer import transfer_missing_limbs, transported_frames
 from torchreg.spines.local_icp import LocalFits, SurfacePoints, transfer_nodes
@@ -104,6 +107,75 @@ def test_missing_limbs_are_transferred_and_lie_on_the_true_axes(creature, missin
         assert torch.equal(done[frame].curves[:3], frames[frame].curves[:3])
         tip = (done[frame].curves[3, 0] - creature.curves[frame, 3, -1]).norm()
         assert float(tip) < 0.15
+
+
+class Meshes(Sequence):
+    """Meshes that are made when they are asked for; some frames cannot be read."""
+
+    def __init__(self, meshes, unreadable=()):
+        self.rows, self.unreadable = [(mesh.vertices, mesh.faces) for mesh in meshes], unreadable
+        self.alive, self.most = weakref.WeakSet(), 0
+
+    def __len__(self):
+        return len(self.rows)
+
+    def __getitem__(self, index):
+        if index in self.unreadable:
+            raise KeyboardInterrupt
+        mesh = TriangleMesh(*(part.clone() for part in self.rows[index]))
+        self.alive.add(mesh)
+        self.most = max(self.most, len(self.alive))
+        return mesh
+
+
+@pytest.fixture(scope="module")
+def long_gap():
+    """A sequence of which the frames 1 to 4, and 6 to the end, lack an arm."""
+    sequence = creature_sequence(STARFISH, 8, resolution=40, dtype=torch.float64, seed=2)
+    frames = [observed(sequence, frame) for frame in range(8)]
+    for frame in (1, 2, 3, 4, 6, 7):
+        skeleton = star(sequence.curves[frame], sequence.radii, arms=(0, 1, 2, 4))
+        frames[frame] = observe_limbs(skeleton, [0, 1, 2, -1, 3], STAR, SAMPLES)
+    return frames, sequence.meshes
+
+
+@pytest.fixture(scope="module")
+def carried(long_gap):
+    frames, meshes = long_gap
+    return transfer_missing_limbs(frames, STAR, meshes, workers=1)
+
+
+def same(first, second):
+    pairs = zip(first, second, strict=True)
+    return all(torch.equal(a.curves, b.curves) and torch.equal(a.nodes, b.nodes) for a, b in pairs)
+
+
+def test_processes_give_what_one_gives_from_few_surfaces(long_gap, carried):
+    frames, meshes = long_gap
+    on_request = Meshes(meshes)
+    assert same(transfer_missing_limbs(frames, STAR, on_request, workers=1), carried)
+    assert on_request.most <= 4  # two of this step, two of the last
+    assert same(transfer_missing_limbs(frames, STAR, meshes, workers=2), carried)
+
+
+def test_a_transfer_that_was_interrupted_goes_on_where_it_ended(long_gap, carried, tmp_path, monkeypatch):
+    frames, meshes = long_gap
+    with pytest.raises(KeyboardInterrupt):
+        transfer_missing_limbs(frames, STAR, Meshes(meshes, unreadable=[3]), workers=1, progress=tmp_path)
+    before = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.safetensors")}
+    assert before
+    assert same(transfer_missing_limbs(frames, STAR, meshes, workers=2, progress=tmp_path), carried)
+    after = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.safetensors")}
+    assert before.items() < after.items()
+
+    def fails(**_):
+        raise AssertionError("computed again")
+
+    monkeypatch.setattr(limb_transfer, "transfer_nodes", fails)
+    assert same(transfer_missing_limbs(frames, STAR, meshes, workers=1, progress=tmp_path), carried)
+    other = TriangleMesh(1.01 * meshes[7].vertices, meshes[7].faces)
+    with pytest.raises(AssertionError, match="computed again"):
+        transfer_missing_limbs(frames, STAR, [*meshes[:7], other], workers=1, progress=tmp_path)
 
 
 def test_complete_frames_stay_as_they_are(creature):

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from torchreg.geometry.skeleton import Skeleton
     from torchreg.spines.extract_spine import SpineConfig
     from torchreg.spines.results import SpineSequence
-    from torchreg.spines.surfaces import FrameSurfaces
 
 
 @reporting
@@ -132,8 +131,8 @@ def spine(
         source = _silhouettes(frames, calibration, bool(screen), resolution, scale)
         count, names = len(source), source.names
     else:
-        surfaces = _read(frames, scale, nan_policy)
-        count, names = len(surfaces), surfaces.names
+        files = _files(frames, scale, nan_policy)
+        count, names = len(files), files.names
     curves = [numbered(swc, frame, count) for frame in range(count)] if swc is not None else []
     check_outputs([glb, result, result.with_suffix(".json"), npz, table, plot, movie, *curves], force)
     if movie is not None:
@@ -142,10 +141,14 @@ def spine(
         check_animation_path(movie)
 
     from torchreg.spines.extract_spine import SpineConfig
+    from torchreg.spines.surfaces import FrameSurfaces
 
     config = SpineConfig.growing(num_samples=samples) if growing else SpineConfig(num_tips=tips, num_samples=samples)
     with claimed(glb), _kept(progress):
-        meshes = _hulls(source, seen_folder(seen, glb, force), progress, quiet) if silhouettes else surfaces
+        if silhouettes:
+            meshes: Sequence[TriangleMesh] = _hulls(source, seen_folder(seen, glb, force), progress, quiet)
+        else:
+            meshes = FrameSurfaces.of_frames(files, names, workers=workers, progress=progress)
         found = _extracted(meshes, known, config, workers, progress, quiet, growing=growing)
         found = remembering(found, upright)
         found.save(result)
@@ -241,16 +244,14 @@ class _Files(Sequence[Any]):
         return load_points(self.names[index], scale=self.scale, nan_policy=self.nan_policy)
 
 
-def _read(frames: list[Path], scale: float, nan_policy: NanPolicy) -> FrameSurfaces:
-    """Return the meshes, and the surfaces of clouds, in the order of time."""
+def _files(frames: list[Path], scale: float, nan_policy: NanPolicy) -> _Files:
+    """Return the files of meshes and clouds in the order of time."""
     from torchreg.errors import InputError
     from torchreg.io.frames import load_frames
-    from torchreg.spines.surfaces import FrameSurfaces
 
     if any(frame.suffix.lower() == ".npz" for frame in frames):
         raise InputError("FRAMES must be files of meshes, not of arrays; give a folder, or files such as *.ply")
-    names = load_frames(cloud_files(frames)).names
-    return FrameSurfaces.of_frames(_Files(names, scale, nan_policy), names)
+    return _Files(load_frames(cloud_files(frames)).names, scale, nan_policy)
 
 
 def _silhouettes(

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchreg.geometry.graphs import Graph
+from torchreg.geometry.graphs import Graph, sorting_order
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.neighbors import k_nearest_others
 
@@ -61,7 +61,8 @@ def _edges_and_chords(vertices: np.ndarray, faces: np.ndarray) -> list[_Segments
     start, end, opposite = (np.roll(faces, -shift, axis=1).reshape(-1) for shift in range(3))
     low, high = np.minimum(start, end), np.maximum(start, end)
     key = low * len(vertices) + high
-    order = np.argsort(key, kind="stable")
+    order = sorting_order(high, len(vertices))[0]
+    order = order[sorting_order(low[order], len(vertices))[0]]
     shared = np.flatnonzero(key[order[1:]] == key[order[:-1]])
     first, second = order[shared], order[shared + 1]
     once = np.delete(order, shared + 1)
@@ -75,11 +76,15 @@ def _edges_and_chords(vertices: np.ndarray, faces: np.ndarray) -> list[_Segments
 
 def _unfolded(start: np.ndarray, end: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the coordinates (n,) of points along and off the lines from start to end, and the lengths of these."""
-    line = end - start
-    length = np.linalg.norm(line, axis=1)
+    line, offset = end - start, points - start
+    length = _norms(line)
     line = line / np.where(length > 0, length, 1.0)[:, None]
-    along = np.einsum("nk,nk->n", points - start, line)
-    return along, np.linalg.norm(points - start - along[:, None] * line, axis=1), length
+    along = np.einsum("nk,nk->n", offset, line)
+    return along, _norms(offset - along[:, None] * line), length
+
+
+def _norms(vectors: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.einsum("nk,nk->n", vectors, vectors))
 
 
 def _short_chords(

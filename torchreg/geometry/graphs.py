@@ -215,10 +215,19 @@ def component_links(points: Tensor, component: Tensor, count: int = 3) -> tuple[
     return torch.cat(links), torch.cat(lengths)
 
 
+def sorting_order(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the stable order (N,) that sorts integers (N,) from 0 to count - 1, and where each begins, (count + 1,).
+
+    By counting, which takes a fifth of the time of `numpy.argsort`: the transpose of a sparse matrix.
+    """
+    numbers = np.arange(len(values) + 1, dtype=np.int32)
+    entries = csr_array((numbers[:-1], values.astype(np.int32), numbers), shape=(len(values), count)).tocsc()
+    return entries.data, entries.indptr
+
+
 def _adjacency(rows: np.ndarray, columns: np.ndarray, values: np.ndarray, count: int) -> csr_array:
     """Return the matrix of entries, each row's in their given order; repeated ones are not summed."""
-    order = np.argsort(rows.astype(np.int32), kind="stable")
-    starts = np.concatenate(([0], np.cumsum(np.bincount(rows, minlength=count)))).astype(np.int32)
+    order, starts = sorting_order(rows, count)
     return csr_array((values[order], columns[order].astype(np.int32), starts), shape=(count, count))
 
 

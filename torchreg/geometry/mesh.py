@@ -102,8 +102,8 @@ class TriangleMesh:
         return torch.stack((self.vertices.amin(dim=0), self.vertices.amax(dim=0)))
 
     def _edges(self) -> tuple[Tensor, Tensor]:
-        corners = self.vertices[self.faces]
-        return corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        first, second, third = (self.vertices.index_select(0, corner) for corner in self.faces.unbind(1))
+        return second - first, third - first
 
 
 def _check_faces(faces: Any, vertices: Tensor) -> Tensor:

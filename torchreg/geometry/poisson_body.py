@@ -21,6 +21,9 @@ class PoissonFit:
     neighbors: int = 6  # around a point, which tell its share of the surface
     widths: tuple[float, ...] = (1.5, 1.0)  # of the blur under which normals agree; wider ones mix sides of thin limbs
     num_rounds: int = 8  # of new normals for each width
+    turned_after: int = (
+        2  # rounds, the normals of inverted parts are turned over: some parts then still turn themselves
+    )
     blur: float = 0.75  # of the indicator function
     level_width: float = 1.5  # of the blur of its values at the points, of which the surface has the mean
     far: float = 0.01  # of the density at the points, below which points are far
@@ -63,8 +66,9 @@ def poisson_body(points: Tensor) -> PoissonBody:
     that of a closed surface if it is the gradient of an indicator function. The normals are those with the largest
     ``|P V|^2``, of the part ``P V`` of the blurred field that is a gradient, from normals that point away from where
     the points are dense. As this is a convex function of the normals, ``n_i <- (P V)(p_i) / |(P V)(p_i)|`` never
-    makes it less. The surface is where the indicator function, ``laplace chi = div V``, has its mean value at the
-    points.
+    makes it less. The maximum may be a local one, where thin parts, as hands and feet, are inside out: the indicator
+    function, ``laplace chi = div V``, is less at their points than outside of the body, and their normals are turned
+    over on the way. The surface is where the function has its mean value at the points.
 
     Args:
         points: (N, 3) different ones, float64 on the CPU.
@@ -121,13 +125,22 @@ class _Spectrum:
         """Return the gradients (N, 3) at the points of their blurred density, with weights (N,)."""
         return self._gradients(self._transformed(weights), width)
 
-    def potential_part(self, vectors: Tensor, width: float) -> Tensor:
-        """Return the blurred field of vectors (N, 3) at the points, as far as it is a gradient, at the points."""
-        return self._gradients(self._potential(vectors), width)
+    def improved_normals(self, vectors: Tensor, width: float) -> tuple[Tensor, Tensor]:
+        """Return better normals (N, 3) of the points, and which points (N,) are inside out, from vectors (N, 3) there.
+
+        The normals are the directions of the blurred field of the vectors, as far as it is a gradient. Points are
+        inside out where the indicator function of the vectors is less than outside.
+        """
+        potential = self._potential(vectors)
+        indicator = self._indicator(potential, width)
+        return _normalized(self._gradients(potential, width)), self.at_points(indicator) < _outside(indicator)
 
     def indicator(self, vectors: Tensor, width: float) -> Tensor:
         """Return the function (X, Y, Z) that falls by one along each blurred vector (N, 3), times its area."""
-        return -torch.fft.irfftn(self._potential(vectors) * self._blur(width), s=self.sizes)
+        return self._indicator(self._potential(vectors), width)
+
+    def _indicator(self, potential: Tensor, width: float) -> Tensor:
+        return -torch.fft.irfftn(potential * self._blur(width), s=self.sizes)
 
     def _transformed(self, weights: Tensor) -> Tensor:
         field = weights.new_zeros(math.prod(self.sizes))
@@ -147,6 +160,12 @@ class _Spectrum:
     def _gradients(self, spectrum: Tensor, width: float) -> Tensor:
         blurred = 1j * spectrum * self._blur(width)
         return torch.stack([self.at_points(torch.fft.irfftn(wave * blurred, s=self.sizes)) for wave in self._waves], -1)
+
+
+def _outside(field: Tensor) -> Tensor:
+    """Return the mean () of a field (X, Y, Z) on the border of its grid."""
+    sides = [field.select(axis, end).mean() for axis in range(field.dim()) for end in (0, -1)]
+    return torch.stack(sides).mean()
 
 
 def _level(grid: _Spectrum, areas: Tensor, values: Tensor, width: float) -> Tensor:
@@ -170,9 +189,12 @@ def _outward_normals(grid: _Spectrum, areas: Tensor, gap: float) -> Tensor:
     """Return the normals (N, 3) of points with areas (N,), see `poisson_body`."""
     normals = -_normalized(grid.density_gradients(areas, FIT.widths[0] * gap))
     for width in FIT.widths:
-        for _ in range(FIT.num_rounds):
-            normals = _normalized(grid.potential_part(areas[:, None] * normals, width * gap))
-    return normals
+        for number in range(FIT.num_rounds):
+            following, inverted = grid.improved_normals(areas[:, None] * normals, width * gap)
+            turned = inverted & (number % FIT.turned_after == FIT.turned_after - 1)
+            normals = torch.where(turned[:, None], -following, following)
+    inverted = grid.improved_normals(areas[:, None] * normals, FIT.blur * gap)[1]
+    return torch.where(inverted[:, None], -normals, normals)
 
 
 def _normalized(vectors: Tensor) -> Tensor:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchreg.geometry.graphs import sorting_order
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.neighbors import NeighborTree
 
@@ -69,10 +70,9 @@ class _RayGrid:
         span = last - first + 1
         face, item = _expand_counts(span.prod(1))
         position = first[face] + torch.stack((item // span[face, 1], item % span[face, 1]), dim=1)
-        cell, order = (position[:, 0] * self.shape[1] + position[:, 1]).sort(stable=True)
-        self.faces = face[order]
-        self.counts = torch.bincount(cell, minlength=int(self.shape.prod()))
-        self.begins = self.counts.cumsum(0) - self.counts
+        cell = position[:, 0] * self.shape[1] + position[:, 1]
+        order, begins = (torch.from_numpy(part) for part in sorting_order(cell.numpy(), int(self.shape.prod())))
+        self.faces, self.begins, self.counts = face[order], begins[:-1].long(), begins.diff().long()
 
     def _project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return the coordinates (..., 2) of points (..., 3) across the ray, and those (...,) along it."""

@@ -120,8 +120,8 @@ def curve_frames(curves: Tensor) -> Tensor:
     directions = tangents(curves)
     eye = torch.eye(3, dtype=curves.dtype, device=curves.device).expand(*curves.shape[:-2], 3, 3)
     frames = [align_frames(eye, directions[..., 0, :])]
-    for index in range(1, curves.shape[-2]):
-        frames.append(align_frames(frames[-1], directions[..., index, :]))
+    for turn in rotation_between(directions[..., :-1, :], directions[..., 1:, :]).unbind(-3):
+        frames.append(turn @ frames[-1])
     return torch.stack(frames, dim=-3)
 
 

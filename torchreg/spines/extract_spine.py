@@ -129,9 +129,10 @@ def extract_spine(
         growing: whether tips may appear and end.
         times: (T,) of the frames, strictly increasing; 0, 1, 2, ... by default.
         config: see `SpineConfig`; by default `SpineConfig.growing()` of what grows.
-        workers: processes for the skeletons; by default one per core.
+        workers: processes for surfaces of clouds, skeletons and limbs that are transferred; by default one per core.
         on_step: called with every frame that is skeletonized.
-        progress: folder in which skeletons are kept, so that a call that was interrupted goes on where it ended.
+        progress: folder in which each of these is kept as soon as it is done, so that a call that was interrupted goes
+            on where it ended.
 
     Returns:
         A `SpineSequence`; `warnings` tell the irregularities frame by frame. Frames without a body, or with another
@@ -147,14 +148,16 @@ def extract_spine(
 
     Differentiable: no; `SpineSequence.model` is.
 
-    Cost: about 1 s per frame of 15,000 vertices and CPU core; half a second more where limbs are transferred; 0.1 s for
-    names.
+    Cost: about 1 s per frame of 15,000 vertices and CPU core; half a second more where limbs are transferred, 1 s more
+    for a cloud of 12,000 points; 0.1 s for names.
 
     References: Brostow, Essa, Steedly and Kwatra 2004; a prior skeleton is its section 6's.
     """
     config = config or (SpineConfig.growing() if growing else SpineConfig())
-    surfaces = meshes if isinstance(meshes, FrameSurfaces) else FrameSurfaces.of_frames(meshes)
     _check_settings(config, prior, workers, growing=growing)
+    surfaces = meshes
+    if not isinstance(surfaces, FrameSurfaces):
+        surfaces = FrameSurfaces.of_frames(meshes, workers=workers, progress=progress)
     origin = far_origin(surfaces.samples)
     if origin is not None:
         surfaces = surfaces.shifted(-origin)
@@ -174,7 +177,7 @@ def extract_spine(
     if growing:
         spine = growing_spine(surfaces, shown, times, config.num_samples)
     else:
-        spine = _joined_spine(surfaces, shown, known, times, config)
+        spine = _joined_spine(surfaces, shown, known, times, config, workers=workers, progress=progress)
     if passed:
         spine = with_frames_between(spine, kept, when, {number: found[number][0] for number in passed})
     return spine if origin is None else spine.moved(origin)
@@ -183,7 +186,7 @@ def extract_spine(
 @torch.no_grad()
 def _joined_spine(
     surfaces: FrameSurfaces, found: Sequence[FrameSkeleton], known: PriorSkeleton | None, times: Tensor | None,
-    config: SpineConfig,
+    config: SpineConfig, *, workers: int | None, progress: str | os.PathLike[str] | None,
 ) -> SpineSequence:  # fmt: skip
     """Return the spine of surfaces whose skeletons were found."""
     skeletons, relations = [smooth_rough_limbs(skeleton) for skeleton, _ in found], [row for _, row in found]
@@ -192,7 +195,10 @@ def _joined_spine(
     # Section 4.3: the first factor of eq. 3, then G imposed.
     graph = _most_frequent_graph(skeletons, names.labels) if known is None else known.graph
     observed = _observed_limbs(skeletons, names.labels, graph, config.num_samples, known)
-    limbs = _all_limbs(observed, graph, surfaces, known, names.reference)
+    usable = observed
+    if known is not None:
+        usable = complete_from_prior(observed, graph, surfaces, known.limbs(config.num_samples), names.reference)
+    limbs = transfer_missing_limbs(usable, graph, surfaces, workers=workers, progress=progress)
     curves, radii = (torch.stack([getattr(frame, name) for frame in limbs]) for name in ("curves", "radii"))
     frames, topologies = transported_frames(curves, names.reference), [curve_topology(graph, rows) for rows in curves]
     curves, radii, frames = (rows.to(surfaces.samples[0]) for rows in (curves, radii, frames))
@@ -276,14 +282,3 @@ def _observed_limbs(
     observed = trusted if any(bool(frame.observed.all()) for frame in trusted) else frames
     # The tree of a prior need not be that of any frame.
     return observed if prior is None else accept_shared_paths(observed)
-
-
-def _all_limbs(
-    frames: Sequence[FrameLimbs], graph: LimbGraph, meshes: Sequence[TriangleMesh], prior: PriorSkeleton | None,
-    reference: int,
-) -> list[FrameLimbs]:  # fmt: skip
-    """Return the frames with the limbs that they lack transferred from the frames around, if need be from the prior."""
-    if prior is not None:
-        limbs = prior.limbs(frames[0].curves.shape[1])
-        frames = complete_from_prior(frames, graph, meshes, limbs, reference)
-    return transfer_missing_limbs(frames, graph, meshes)

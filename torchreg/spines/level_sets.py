@@ -160,8 +160,9 @@ class _Crossings:
             points[cut, filled[cut]] = vertices[start] + share[:, None] * (vertices[end] - vertices[start])
             crossing[cut, filled[cut]] = first[edge] + level - self.low[edge] - 1
             filled[cut] += 1
-        labels = connected_components(torch.from_numpy(crossing), int(count.sum())).numpy()
-        return points, np.unique(labels[crossing[:, 0]], return_inverse=True)[1]
+        labels = connected_components(torch.from_numpy(crossing), int(count.sum())).numpy()[crossing[:, 0]]
+        used = np.bincount(labels) > 0
+        return points, (np.cumsum(used) - 1)[labels]
 
 
 def _ranges(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.geometry.neighbors import nearest_neighbor
+from torchreg.geometry.neighbors import NeighborTree
 from torchreg.geometry.rigid import rigid_matrix, transform_points
 from torchreg.geometry.skeleton import nearest_rotation
 
@@ -76,12 +76,12 @@ def transfer_nodes(
     base_weights = torch.cat((nodes.new_ones(len(holder)), nodes.new_full((len(fixed),), fits.known_weight)))
     start = torch.cat((source.points, nodes[fixed]))
     motions = torch.eye(4).to(nodes).expand(len(nodes), 4, 4)
-    extent = float(path_lengths.max())
+    extent, tree = float(path_lengths.max()), NeighborTree(target.points)
     for width in fits.widths:
         kernel = torch.exp(-0.5 * (path_lengths[:, owner] / (width * extent)).square())
         weights = (kernel + fits.background_weight) * base_weights
         for _ in range(fits.num_rounds):
-            closest, compatible = _correspondences(source, target, motions[holder], math.cos(fits.max_angle))
+            closest, compatible = _correspondences(source, target, tree, motions[holder], math.cos(fits.max_angle))
             valid = torch.cat((compatible.to(nodes), torch.ones_like(base_weights[len(holder) :])))
             goal = torch.cat((closest, known[fixed]))
             motions = _rigid_fits(start, goal, weights * valid)
@@ -89,12 +89,15 @@ def transfer_nodes(
 
 
 def _correspondences(
-    source: SurfacePoints, target: SurfacePoints, motions: Tensor, min_cosine: float
+    source: SurfacePoints, target: SurfacePoints, tree: NeighborTree, motions: Tensor, min_cosine: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the target points (V, 3) nearest to source points under motions (V, 4, 4), and whether normals agree."""
+    """Return the target points (V, 3) nearest to source points under motions (V, 4, 4), and whether normals agree.
+
+    The tree is that of the target's points.
+    """
     moved = transform_points(motions, source.points.unsqueeze(1)).squeeze(1)
     normals = (motions[:, :3, :3] @ source.normals.unsqueeze(-1)).squeeze(-1)
-    index, _ = nearest_neighbor(moved, target.points)
+    index, _ = tree.nearest(moved)
     return target.points[index], (normals * target.normals[index]).sum(-1) > min_cosine
 
 

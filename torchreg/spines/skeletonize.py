@@ -308,11 +308,12 @@ def _centered_limbs(limbs: Sequence[_Limb], mesh: TriangleMesh, interior: Interi
     num_tips = len(tips.vertices)
     free = [(limb.ends[0] < num_tips, limb.ends[1] < num_tips) for limb in limbs]
     curves = centered_curves([limb.points for limb in limbs], mesh, tips.spacing, free)
-    centered = []
-    for limb, curve in zip(limbs, curves, strict=True):
-        points = interior.keep_inside(limb.points, curve, tips.spacing)
-        centered.append(replace(limb, points=points, frames=align_frames(limb.frames, tangents(points))))
-    return centered
+    points = interior.keep_inside(torch.cat([limb.points for limb in limbs]), torch.cat(curves), tips.spacing)
+    parts = points.split([len(curve) for curve in curves])
+    return [
+        replace(limb, points=part, frames=align_frames(limb.frames, tangents(part)))
+        for limb, part in zip(limbs, parts, strict=True)
+    ]
 
 
 def _assembled(

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_points
@@ -15,6 +18,7 @@ from torchreg.geometry.loaded import as_mesh
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.poisson_body import poisson_body
 from torchreg.geometry.spread import SPREADS, spread_dimensions
+from torchreg.spines.frame_workers import Job, KeptResults, do_jobs
 
 ONE_SIDED = "the points do not enclose a body, as those of a single view: limbs follow the side that they show"
 
@@ -61,6 +65,60 @@ def _cloud(value: Any) -> Tensor | None:
     return points if isinstance(points, Tensor) else None
 
 
+# A surface and the notes on it.
+_Surface = tuple[TriangleMesh, tuple[str, ...]]
+
+
+class _Making:
+    """The surfaces of frames in the making."""
+
+    def __init__(self, frames: Sequence[Any], names: tuple[str, ...], kept: KeptResults) -> None:
+        self._frames, self._names, self._kept = frames, names, kept
+        self.made: dict[int, TriangleMesh] = {}
+        self.samples: dict[int, Tensor] = {}
+        self.notes: list[tuple[str, ...]] = [()] * len(names)
+
+    def jobs(self) -> Iterator[Job[_Surface]]:
+        """Yield the making of each cloud's surface that was not kept; meshes are looked at on the way."""
+        for number, name in enumerate(self._names):
+            frame = self._frames[number]
+            points = _cloud(frame)
+            if points is None:
+                self._sample(number, as_mesh(frame, name))
+                continue
+            source = self._kept.digest(str(points.dtype), points)
+            found = self._kept.load(_kept_name(number), source, _from_tensors)
+            if found is None:
+                yield Job(
+                    number, partial(as_surface, points, name), partial(self._finish, number, source, points.device)
+                )
+            else:
+                self._add(number, points.device, found)
+
+    def _finish(self, number: int, source: str, device: torch.device, found: _Surface) -> None:
+        mesh, notes = found
+        self._kept.save(_kept_name(number), source, {"vertices": mesh.vertices, "faces": mesh.faces}, notes)
+        self._add(number, device, found)
+
+    def _add(self, number: int, device: torch.device, found: _Surface) -> None:
+        self.made[number], self.notes[number] = found[0].to(device), found[1]
+        self._sample(number, self.made[number])
+
+    def _sample(self, number: int, mesh: TriangleMesh) -> None:
+        if not mesh.num_faces:
+            raise InputError(f"{self._names[number]} must have faces, got none; leave out frames without a surface")
+        step = max(1, mesh.num_vertices // _SAMPLING.num_vertices)
+        self.samples[number] = mesh.vertices[::step].detach().clone()
+
+
+def _kept_name(number: int) -> str:
+    return f"surface_{number:05d}"
+
+
+def _from_tensors(tensors: Mapping[str, Tensor], notes: Sequence[str]) -> _Surface:
+    return TriangleMesh(tensors["vertices"], tensors["faces"]), tuple(notes)
+
+
 @dataclass(frozen=True, eq=False)
 class FrameSurfaces(Sequence[TriangleMesh]):
     """The surfaces of frames.
@@ -85,8 +143,21 @@ class FrameSurfaces(Sequence[TriangleMesh]):
     shift: Tensor | None = None
 
     @classmethod
-    def of_frames(cls, frames: Sequence[Any], names: Sequence[str] | None = None) -> FrameSurfaces:
-        """Return the surfaces of frames, each of which is looked at once.
+    def of_frames(
+        cls,
+        frames: Sequence[Any],
+        names: Sequence[str] | None = None,
+        *,
+        workers: int | None = None,
+        progress: str | os.PathLike[str] | None = None,
+    ) -> FrameSurfaces:
+        """Return the surfaces of frames, each of which is taken when its turn comes.
+
+        Args:
+            frames: meshes, or points without faces.
+            names: of the frames, for errors.
+            workers: processes for the surfaces of clouds, see `do_jobs`.
+            progress: a folder in which each of these is kept as soon as it is done, see `KeptResults`.
 
         Raises:
             InputTypeError: if a frame is neither a mesh nor points; names it.
@@ -95,19 +166,13 @@ class FrameSurfaces(Sequence[TriangleMesh]):
         if isinstance(frames, TriangleMesh):
             raise InputTypeError("meshes must be a sequence of TriangleMesh, got one mesh; put it into a list")
         names = tuple(names or (f"meshes[{frame}]" for frame in range(len(frames))))
-        made, notes, samples = {}, [], []
-        for number, name in enumerate(names):
-            frame = frames[number]
-            mesh, told = as_surface(frame, name)
-            if not mesh.num_faces:
-                raise InputError(f"{name} must have faces, got none; leave out frames without a surface")
-            if _cloud(frame) is not None:
-                made[number] = mesh
-            notes.append(told)
-            samples.append(mesh.vertices[:: max(1, mesh.num_vertices // _SAMPLING.num_vertices)].detach().clone())
-        if not samples:
+        if not names:
             raise InputError("meshes must hold at least one frame, got none")
-        return cls(frames, names, made, tuple(notes), tuple(samples))
+        making = _Making(frames, names, KeptResults.in_folder(progress))
+        first, jobs = _cloud(frames[0]), making.jobs()
+        do_jobs(lambda: next(jobs, None), len(names), 1 if first is not None and first.is_cuda else workers)
+        samples = tuple(making.samples[number] for number in range(len(names)))
+        return cls(frames, names, making.made, tuple(making.notes), samples)
 
     def __len__(self) -> int:
         return len(self.names)
