@@ -11,51 +11,21 @@ from torchreg.alignment.reliability import SurfaceError
 from torchreg.alignment.shape_fit import different_people
 from torchreg.errors import InputError
 from torchreg.geometry.facing_normals import facing_normals
-from torchreg.geometry.mesh import TriangleMesh, concatenate, sample_surface, unit_sphere
+from torchreg.geometry.mesh import TriangleMesh, sample_surface
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.rotation import so3_exp
 from torchreg.result import Status
-from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.limbs import Body, Limb
 from torchreg.solvers.e_step import expectation
 from torchreg.solvers.oriented_e_step import oriented_expectation
 from torchreg.storage import load
 
-# Center and half axes of each part, metres, and its joint; the trunk first.
-PARTS = {
-    "trunk": ((0.0, 0.0, 0.0), (0.16, 0.1, 0.3), (0.0, 0.0, 0.0)),
-    "head": ((0.0, 0.0, 0.42), (0.08, 0.09, 0.13), (0.0, 0.0, 0.3)),
-    "left": ((0.4, 0.0, 0.2), (0.26, 0.045, 0.045), (0.16, 0.0, 0.2)),
-    "right": ((-0.4, 0.0, 0.2), (0.26, 0.045, 0.045), (-0.16, 0.0, 0.2)),
-}
-
 QUICK = AlignConfig(num_model_points=150, search="never")
 
 
-def person():
-    """A figure of ellipsoids whose coefficients are its stature, the girth of its trunk and its arms' length."""
-    ball = unit_sphere(2, dtype=torch.float64)
-    meshes, weights, joints, dirs = [], [], [], []
-    for number, (center, axes, joint) in enumerate(PARTS.values()):
-        center, axes, joint = (torch.tensor(value, dtype=torch.float64) for value in (center, axes, joint))
-        vertices = ball.vertices * axes + center
-        meshes.append(TriangleMesh(vertices, ball.faces))
-        weights.append(torch.eye(len(PARTS), dtype=torch.float64)[number].expand(len(vertices), -1))
-        joints.append(joint)
-        girth = vertices * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64) if number == 0 else 0 * vertices
-        reach = (vertices - joint) * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64) if number > 1 else 0 * vertices
-        dirs.append(torch.stack([0.15 * vertices, 0.25 * girth, 0.2 * reach], dim=-1))
-    mesh, places = concatenate(meshes), torch.stack(joints)
-    joint_dirs = torch.stack([0.15 * places, torch.zeros_like(places), torch.zeros_like(places)], dim=-1)
-    return ArticulatedShape.from_skinned_mesh(
-        mesh.vertices, mesh.faces, torch.cat(weights), places, [-1, 0, 0, 0], joint_names=list(PARTS),
-        shape_dirs=torch.cat(dirs), joint_dirs=joint_dirs, coefficient_names=["stature", "girth", "reach"],
-    )  # fmt: skip
-
-
 @pytest.fixture(scope="module")
-def shape():
-    return person()
+def shape(person):
+    return person
 
 
 def scan(shape, coefficients, seed, *, one_sided=True, count=700):

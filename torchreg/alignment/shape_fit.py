@@ -33,6 +33,7 @@ from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.sampling import farthest_points
 from torchreg.result import normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.shape_space import ShapeSpace
 from torchreg.shapes.shaped import ShapedSkin, ShapedTree
 from torchreg.shapes.shaped_surface import ShapedSurface
@@ -334,14 +335,50 @@ def _surface_error(problem: ShapeProblem, before: Tensor, state: Tensor, covaria
 
 def _covariance(problem: ShapeProblem, state: Tensor) -> Tensor:
     """Return the covariance (T, D + K, D + K) of each scan's pose and the coefficients, as if it were alone."""
-    distance, jacobian = problem.surface.distance_jacobian(problem.data, state)
-    noise = surface_noise(distance, problem.valid, problem.size)
-    near = welsch_weight((distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square()) * problem.valid
-    shared = correlated_count(neighbor_correlation(problem.data, distance, near))
-    rig = problem.skin.shape.rig
-    broad = pad(BROAD_PRIOR.precision(rig, problem.size), (0, state.shape[-1] - rig.num_dofs))
-    precision = torch.maximum(problem.prior.precision, broad).expand_as(state)
-    return pose_covariance(jacobian, near, noise * shared.clamp_min(1).sqrt(), precision)
+    rows = robust_rows(problem.surface, problem.data, problem.valid, state, problem.size)
+    precision = plausible_precision(problem.skin.shape.rig, problem.size, problem.prior.precision)
+    return pose_covariance(rows.jacobian, rows.weights, rows.noise, precision.expand_as(state))
+
+
+@dataclass(frozen=True)
+class RobustRows:
+    """Data as rows of a least-squares problem in states.
+
+    Args:
+        distance: (B, M) of the data from the surface, metres.
+        jacobian: (B, M, D + K) of the distances.
+        weights: (B, M) from 0 to 1, of the Welsch kernel at the noise.
+        noise: (B,) standard deviation of each datum as if all were independent, metres: larger where neighbors err
+            together.
+    """
+
+    distance: Tensor
+    jacobian: Tensor
+    weights: Tensor
+    noise: Tensor
+
+
+def robust_rows(surface: ShapedSurface, data: Tensor, valid: Tensor, state: Tensor, size: float) -> RobustRows:
+    """Return data (B, M, 3) as rows of a least-squares problem in states (B, D + K).
+
+    Args:
+        surface: of the rig.
+        data: metres.
+        valid: (B, M) False where padded.
+        state: poses and coefficients.
+        size: of the rig, metres.
+    """
+    distance, jacobian = surface.distance_jacobian(data, state)
+    noise = surface_noise(distance, valid, size)
+    near = welsch_weight((distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square()) * valid
+    shared = correlated_count(neighbor_correlation(data, distance, near))
+    return RobustRows(distance, jacobian=jacobian, weights=near, noise=noise * shared.clamp_min(1).sqrt())
+
+
+def plausible_precision(rig: Articulation, size: float, precision: Tensor) -> Tensor:
+    """Return the precision (D + K,) of a prior, of the pose at least that of any plausible one."""
+    broad = BROAD_PRIOR.precision(rig, size)
+    return torch.maximum(precision, pad(broad, (0, precision.shape[-1] - rig.num_dofs)))
 
 
 def different_people(space: ShapeSpace, generator: torch.Generator) -> Tensor:
@@ -380,10 +417,10 @@ def _problem(
     people = different_people(space, generator)
     tree = ShapedTree(shape, space)
     normals = torch.stack([
-        _scan_normals(points, told, None if viewpoints is None else viewpoints[number])
+        scan_normals(points, told, None if viewpoints is None else viewpoints[number])
         for number, (points, told) in enumerate(zip(data, valid, strict=True))
     ])  # fmt: skip
-    model, dense = _skins(tree, surface, config.num_model_points, generator)
+    model, dense = surface_skins(tree, surface, config.num_model_points, generator)
     size, count, scans = model_size(model), len(people), len(data)
     origin = masked_mean(data, valid)
     middle = space.rest(torch.cat([space.mean[None], people]))[0].mean(-2)
@@ -424,14 +461,14 @@ def _start(poses: Tensor, people: Tensor, offsets: Tensor) -> Tensor:
     return torch.cat([placed, shared], dim=-1).flatten(0, 1)
 
 
-def _scan_normals(points: Tensor, valid: Tensor, viewpoint: Tensor | None) -> Tensor:
+def scan_normals(points: Tensor, valid: Tensor, viewpoint: Tensor | None) -> Tensor:
     """Return the normals (M, 3) of a scan, zero where a point is padding."""
     normals = torch.zeros_like(points)
     normals[valid] = facing_normals(points[valid], viewpoint).to(points)
     return normals
 
 
-def _skins(
+def surface_skins(
     tree: ShapedTree, surface: RigSurface, count: int, generator: torch.Generator
 ) -> tuple[ShapedSkin, ShapedSkin]:
     """Return model points that cover the surface evenly, and denser ones to measure distances from."""
