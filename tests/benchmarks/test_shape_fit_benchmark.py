@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+import torchreg as tr
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
 
 
@@ -31,3 +32,18 @@ def test_a_scan_shows_one_side_with_noise_and_outliers(benchmark):
     # From 1.7 diagonals away nothing is seen below the horizon at 1 / distance.
     distance = benchmark.DISTANCE * 12**0.5
     assert float((seen @ side).quantile(0.01)) > 1 / distance - 0.1
+
+
+def test_a_split_rig_has_the_same_surface_and_coefficients(benchmark):
+    ball = unit_sphere(1, dtype=torch.float64)
+    shape = tr.ArticulatedShape.from_skinned_mesh(
+        ball.vertices, ball.faces, torch.ones(len(ball.vertices), 1), torch.zeros(1, 3), [-1],
+        shape_dirs=ball.vertices.unsqueeze(-1), joint_dirs=torch.zeros(1, 3, 1), dtype=torch.float64,
+    )  # fmt: skip
+    finer, grown = benchmark.split(shape), torch.ones(1, dtype=torch.float64)
+    edges = len(ball.faces) * 3 // 2
+    assert len(finer.surface.vertices) == len(ball.vertices) + edges
+    assert len(finer.surface.faces) == 4 * len(ball.faces)
+    meshes = [TriangleMesh(one.vertices(one.rest_pose(), grown), one.surface.faces) for one in (shape, finer)]
+    assert float(meshes[0].face_areas().sum()) == pytest.approx(float(meshes[1].face_areas().sum()))
+    assert float((meshes[0].vertices.norm(dim=-1) - 2).abs().max()) < 1e-9
