@@ -85,6 +85,8 @@ class FittedShape:
         sigma: (1,) last width of the annealed EM, metres.
         change: (1,) of the last step.
         error: standard errors of the surface in each scan.
+        problem: that was solved, about the scans' means.
+        state: (T, D + K) its solution.
         lead: (1,) cost by which the best of different people is worse, of a search without a start; else None.
     """
 
@@ -95,6 +97,8 @@ class FittedShape:
     sigma: Tensor
     change: Tensor
     error: SurfaceError
+    problem: ShapeProblem
+    state: Tensor
     lead: Tensor | None = None
 
 
@@ -320,6 +324,8 @@ def _fitted(problem: ShapeProblem, before: Tensor, found: StageResult, num_dofs:
         sigma=found.sigma,
         change=found.change.amax(0, keepdim=True),
         error=_surface_error(problem, before, found.pose, covariance),
+        problem=problem,
+        state=found.pose,
     )
 
 
