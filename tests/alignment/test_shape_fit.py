@@ -101,6 +101,27 @@ def test_bones_of_a_rig_take_the_lengths_of_another(shape):
     assert float((lengths[0] / lengths[1] - 1).abs().max()) < 0.06
 
 
+def test_by_how_much_parts_differ_from_the_whole_is_learned(shape):
+    rig = shape.with_coefficients(torch.zeros(3)).with_bone_coefficients()
+    pose = scan(shape, torch.zeros(3), seed=4)[0]
+    whole = torch.zeros(len(rig.coefficient_names))
+    whole[:2] = torch.tensor([0.15, 0.1])
+    uneven = whole.clone()
+    uneven[2 : 2 + rig.num_parts] = torch.tensor([0.1, -0.1, 0.1, -0.1])
+    deviations, lengths = [], []
+    for truth in (whole, uneven):
+        mesh = TriangleMesh(rig.vertices(pose, truth), rig.surface.faces)
+        data = sample_surface(mesh, 1200, generator=torch.Generator().manual_seed(1))[0]
+        found = align(rig, data, start_near(shape, pose), fit_shape=True, config=QUICK)
+        parts = slice(2, 2 + rig.num_parts)
+        lengths.append((found.coefficients - truth)[parts].abs().mean())
+        deviations.append(found.coefficient_covariance.diagonal()[parts].sqrt().mean())
+    assert float(lengths[0]) < 0.02
+    assert float(lengths[1]) < 0.04
+    # The less parts differ, the surer those are that the data hardly tell.
+    assert float(deviations[0]) < 0.6 * float(deviations[1])
+
+
 def test_growing_bones_scale_a_rig(shape):
     rig = shape.with_coefficients(torch.zeros(3)).with_bone_coefficients()
     size = torch.zeros(len(rig.coefficient_names))
