@@ -9,6 +9,7 @@ import torch
 from torchreg.alignment.results import AlignResult
 from torchreg.datasets.hand import surface_skin
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
+from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
 from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
@@ -16,6 +17,14 @@ from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.skin import sample_skin
 
 torch.set_num_threads(1)
+
+# Center and half axes of each part, metres, and its joint; the trunk first.
+PARTS = {
+    "trunk": ((0.0, 0.0, 0.0), (0.16, 0.1, 0.3), (0.0, 0.0, 0.0)),
+    "head": ((0.0, 0.0, 0.42), (0.08, 0.09, 0.13), (0.0, 0.0, 0.3)),
+    "left": ((0.4, 0.0, 0.2), (0.26, 0.045, 0.045), (0.16, 0.0, 0.2)),
+    "right": ((-0.4, 0.0, 0.2), (0.26, 0.045, 0.045), (-0.16, 0.0, 0.2)),
+}
 
 # Long runs of everything together. Tracing slows them most, and their parts have tests of their own, which are traced.
 UNTRACED = {
@@ -84,3 +93,25 @@ def result() -> AlignResult:
         cost=torch.tensor(1.5),
         status=Status.CONVERGED,
     )
+
+
+@pytest.fixture(scope="session")
+def person():
+    """A figure of ellipsoids whose coefficients are its stature, the girth of its trunk and its arms' length."""
+    ball = unit_sphere(2, dtype=torch.float64)
+    meshes, weights, joints, dirs = [], [], [], []
+    for number, (center, axes, joint) in enumerate(PARTS.values()):
+        center, axes, joint = (torch.tensor(value, dtype=torch.float64) for value in (center, axes, joint))
+        vertices = ball.vertices * axes + center
+        meshes.append(TriangleMesh(vertices, ball.faces))
+        weights.append(torch.eye(len(PARTS), dtype=torch.float64)[number].expand(len(vertices), -1))
+        joints.append(joint)
+        girth = vertices * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64) if number == 0 else 0 * vertices
+        reach = (vertices - joint) * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64) if number > 1 else 0 * vertices
+        dirs.append(torch.stack([0.15 * vertices, 0.25 * girth, 0.2 * reach], dim=-1))
+    mesh, places = concatenate(meshes), torch.stack(joints)
+    joint_dirs = torch.stack([0.15 * places, torch.zeros_like(places), torch.zeros_like(places)], dim=-1)
+    return ArticulatedShape.from_skinned_mesh(
+        mesh.vertices, mesh.faces, torch.cat(weights), places, [-1, 0, 0, 0], joint_names=list(PARTS),
+        shape_dirs=torch.cat(dirs), joint_dirs=joint_dirs, coefficient_names=["stature", "girth", "reach"],
+    )  # fmt: skip

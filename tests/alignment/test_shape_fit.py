@@ -11,51 +11,21 @@ from torchreg.alignment.reliability import SurfaceError
 from torchreg.alignment.shape_fit import different_people
 from torchreg.errors import InputError
 from torchreg.geometry.facing_normals import facing_normals
-from torchreg.geometry.mesh import TriangleMesh, concatenate, sample_surface, unit_sphere
+from torchreg.geometry.mesh import TriangleMesh, sample_surface
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.rotation import so3_exp
 from torchreg.result import Status
-from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.limbs import Body, Limb
 from torchreg.solvers.e_step import expectation
 from torchreg.solvers.oriented_e_step import oriented_expectation
 from torchreg.storage import load
 
-# Center and half axes of each part, metres, and its joint; the trunk first.
-PARTS = {
-    "trunk": ((0.0, 0.0, 0.0), (0.16, 0.1, 0.3), (0.0, 0.0, 0.0)),
-    "head": ((0.0, 0.0, 0.42), (0.08, 0.09, 0.13), (0.0, 0.0, 0.3)),
-    "left": ((0.4, 0.0, 0.2), (0.26, 0.045, 0.045), (0.16, 0.0, 0.2)),
-    "right": ((-0.4, 0.0, 0.2), (0.26, 0.045, 0.045), (-0.16, 0.0, 0.2)),
-}
-
 QUICK = AlignConfig(num_model_points=150, search="never")
 
 
-def person():
-    """A figure of ellipsoids whose coefficients are its stature, the girth of its trunk and its arms' length."""
-    ball = unit_sphere(2, dtype=torch.float64)
-    meshes, weights, joints, dirs = [], [], [], []
-    for number, (center, axes, joint) in enumerate(PARTS.values()):
-        center, axes, joint = (torch.tensor(value, dtype=torch.float64) for value in (center, axes, joint))
-        vertices = ball.vertices * axes + center
-        meshes.append(TriangleMesh(vertices, ball.faces))
-        weights.append(torch.eye(len(PARTS), dtype=torch.float64)[number].expand(len(vertices), -1))
-        joints.append(joint)
-        girth = vertices * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64) if number == 0 else 0 * vertices
-        reach = (vertices - joint) * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64) if number > 1 else 0 * vertices
-        dirs.append(torch.stack([0.15 * vertices, 0.25 * girth, 0.2 * reach], dim=-1))
-    mesh, places = concatenate(meshes), torch.stack(joints)
-    joint_dirs = torch.stack([0.15 * places, torch.zeros_like(places), torch.zeros_like(places)], dim=-1)
-    return ArticulatedShape.from_skinned_mesh(
-        mesh.vertices, mesh.faces, torch.cat(weights), places, [-1, 0, 0, 0], joint_names=list(PARTS),
-        shape_dirs=torch.cat(dirs), joint_dirs=joint_dirs, coefficient_names=["stature", "girth", "reach"],
-    )  # fmt: skip
-
-
 @pytest.fixture(scope="module")
-def shape():
-    return person()
+def shape(person):
+    return person
 
 
 def scan(shape, coefficients, seed, *, one_sided=True, count=700):
@@ -129,6 +99,27 @@ def test_bones_of_a_rig_take_the_lengths_of_another(shape):
     ))  # fmt: skip
     lengths = [(keypoints[1:] - keypoints[0]).norm(dim=-1) for keypoints in (fitted, true)]
     assert float((lengths[0] / lengths[1] - 1).abs().max()) < 0.06
+
+
+def test_by_how_much_parts_differ_from_the_whole_is_learned(shape):
+    rig = shape.with_coefficients(torch.zeros(3)).with_bone_coefficients()
+    pose = scan(shape, torch.zeros(3), seed=4)[0]
+    whole = torch.zeros(len(rig.coefficient_names))
+    whole[:2] = torch.tensor([0.15, 0.1])
+    uneven = whole.clone()
+    uneven[2 : 2 + rig.num_parts] = torch.tensor([0.1, -0.1, 0.1, -0.1])
+    deviations, lengths = [], []
+    for truth in (whole, uneven):
+        mesh = TriangleMesh(rig.vertices(pose, truth), rig.surface.faces)
+        data = sample_surface(mesh, 1200, generator=torch.Generator().manual_seed(1))[0]
+        found = align(rig, data, start_near(shape, pose), fit_shape=True, config=QUICK)
+        parts = slice(2, 2 + rig.num_parts)
+        lengths.append((found.coefficients - truth)[parts].abs().mean())
+        deviations.append(found.coefficient_covariance.diagonal()[parts].sqrt().mean())
+    assert float(lengths[0]) < 0.02
+    assert float(lengths[1]) < 0.04
+    # The less parts differ, the surer those are that the data hardly tell.
+    assert float(deviations[0]) < 0.6 * float(deviations[1])
 
 
 def test_growing_bones_scale_a_rig(shape):

@@ -1,9 +1,12 @@
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
+import torchreg as tr
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
+from torchreg.io.gltf_write import save_animated_skin
 
 
 @pytest.fixture(scope="module")
@@ -31,3 +34,50 @@ def test_a_scan_shows_one_side_with_noise_and_outliers(benchmark):
     # From 1.7 diagonals away nothing is seen below the horizon at 1 / distance.
     distance = benchmark.DISTANCE * 12**0.5
     assert float((seen @ side).quantile(0.01)) > 1 / distance - 0.1
+
+
+def test_a_split_rig_has_the_same_surface_and_coefficients(benchmark):
+    ball = unit_sphere(1, dtype=torch.float64)
+    shape = tr.ArticulatedShape.from_skinned_mesh(
+        ball.vertices, ball.faces, torch.ones(len(ball.vertices), 1), torch.zeros(1, 3), [-1],
+        shape_dirs=ball.vertices.unsqueeze(-1), joint_dirs=torch.zeros(1, 3, 1), dtype=torch.float64,
+    )  # fmt: skip
+    finer, grown = benchmark.split(shape), torch.ones(1, dtype=torch.float64)
+    edges = len(ball.faces) * 3 // 2
+    assert len(finer.surface.vertices) == len(ball.vertices) + edges
+    assert len(finer.surface.faces) == 4 * len(ball.faces)
+    meshes = [TriangleMesh(one.vertices(one.rest_pose(), grown), one.surface.faces) for one in (shape, finer)]
+    assert float(meshes[0].face_areas().sum()) == pytest.approx(float(meshes[1].face_areas().sum()))
+    assert float((meshes[0].vertices.norm(dim=-1) - 2).abs().max()) < 1e-9
+
+
+def test_files_of_rigs_are_told(benchmark, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["shape_fit.py", "--part", "bones", "--data", str(tmp_path)])
+    assert benchmark.main() == 0
+    assert "skipped: --data must be a folder with rigs/*.glb" in capsys.readouterr().out
+    ball = unit_sphere(2, dtype=torch.float64)
+    vertices, frames = ball.vertices * torch.tensor([0.3, 0.05, 0.05]), torch.eye(4, dtype=torch.float64)
+    second = torch.sigmoid(40 * vertices[:, 0])
+    rest = frames.repeat(2, 1, 1)
+    rest[0, 0, 3] = -0.3
+    moving = rest.repeat(2, 1, 1, 1)
+    moving[1, :, 1, 3] = 0.1
+    weights = torch.stack([1 - second, second], dim=-1)
+    times = torch.tensor([0.0, 1.0])
+    save_animated_skin(tmp_path / "bar.glb", vertices, ball.faces, weights, ["a", "b"], [-1, 0], rest, moving, times)
+    ((lengths, moved),) = benchmark.clip_lengths(tmp_path / "bar.glb")
+    torch.testing.assert_close(lengths, torch.full((10, 1), 0.3, dtype=torch.float64))
+    assert moved == pytest.approx(0.09, abs=1e-6)
+    rig = tr.ArticulatedShape.from_gltf(tmp_path / "bar.glb")
+    person = rig.with_bone_coefficients()
+    truth, _, points = benchmark.grown_scan(person, 0.0, 0)
+    assert points.shape == (benchmark.NUM_POINTS, 3)
+    assert benchmark.bone_lengths(person, truth).tolist() == pytest.approx([0.3 * 1.12])
+    placed = rig.rest_pose()
+    placed[0] = 0.1
+    result = SimpleNamespace(
+        to_gltf=person.with_coefficients(truth).to_gltf, pose=placed, shape=person.with_coefficients(truth)
+    )
+    told = benchmark.file_report(tmp_path / "bar.glb", result)
+    assert "joints move in 1 of 1 clips (before 1)" in told
+    assert "vertices read back within 0.000 mm" in told

@@ -12,6 +12,8 @@ import torchreg
 import torchreg.alignment.align as align_module
 from torchreg.alignment.align import AlignConfig
 from torchreg.cli.hand_side import better_hand
+from torchreg.cli.shape_argument import load_shape
+from torchreg.io.gltf import load_rig
 from torchreg.io.points import load_points, save_points
 from torchreg.result import Status
 from torchreg.shapes.hand import Hand
@@ -151,6 +153,28 @@ def rig_aligned(run, error_of, folder, tmp_path_factory):
         "align", folder / "flat.glb", folder / "flat.glb", "--parents", folder / "parents.json", "-o", out, *QUICK
     )
     return answer, load(out.with_suffix(".safetensors"))
+
+
+def test_the_file_of_a_rig_is_written_with_the_bones_found(folder, run, error_of, tmp_path):
+    rig, parents = folder / "flat.glb", folder / "parents.json"
+    cloud = load_rig(rig).vertices * 1.1
+    save_points(tmp_path / "cloud.ply", cloud)
+    common = "align", rig, tmp_path / "cloud.ply", "--parents", parents, "-o", tmp_path / "r"
+    answer = run(*common, "--fit-shape", "--start", zeros(tmp_path, rig, parents), "--rig", tmp_path / "new.glb")
+    assert answer.exit_code in (0, 1), answer.output
+    found = load(tmp_path / "r.safetensors")
+    written = load_shape(str(tmp_path / "new.glb"), parents)
+    torch.testing.assert_close(written(found.pose).points, found.shape(found.pose).points, atol=1e-5, rtol=0)
+    assert "--rig has no meaning without --fit-shape" in error_of(*common, "--rig", tmp_path / "n.glb")
+    hand = "align", "hand", tmp_path / "cloud.ply", "--fit-shape", "--rig", tmp_path / "n.glb"
+    assert "--rig has no meaning for hand" in error_of(*hand)
+
+
+def zeros(place, rig, parents):
+    """Return the file of a pose at rest."""
+    names = load_shape(str(rig), parents).dof_names
+    (place / "rest.json").write_text(json.dumps(dict.fromkeys(names, 0.0)), encoding="utf-8")
+    return place / "rest.json"
 
 
 def test_a_rig_with_a_flat_hierarchy_is_aligned(rig_aligned):

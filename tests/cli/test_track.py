@@ -249,15 +249,16 @@ def test_millimeters_taken_for_meters_are_warned_of_once(run, command, sequence,
 def test_options_reach_the_tracker(run, command, monkeypatch):
     seen = []
 
-    def noted(shape, initial_pose=None, *, config=None, locked=(), initializer=None):
-        seen.append((initial_pose, config, locked))
+    def noted(shape, initial_pose=None, *, config=None, locked=(), initializer=None, fit_shape=False):
+        seen.append((initial_pose, config, locked, fit_shape))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(track_module, "Tracker", noted)
     options = ("--prediction", "none", "--points", 300, "--model-points", "data", "--recovery", "starts", "--seed", 4,
                "--locked", "base")  # fmt: skip
     run(*command(*options))
-    ((pose, config, locked),) = seen
+    ((pose, config, locked, fit_shape),) = seen
+    assert not fit_shape
     assert locked == ("base",)
     assert config == TrackConfig(
         prediction="none", num_model_points=300, model_points="data", recovery="starts", seed=4
@@ -349,3 +350,21 @@ def test_shapes_with_as_many_joints_are_told_apart(run, error_of, command, seque
     other = ["hand-left" if argument == "hand" else argument for argument in command("--resume", *FAST)]
     assert "was written by another command: shape differ" in error_of(*other)
     assert Hand("left").num_dofs == Hand().num_dofs
+
+
+def test_the_bones_of_a_rig_are_fitted_over_the_frames(folder, run, error_of, tmp_path):
+    vertices = load_points(folder / "flat.glb").points
+    for number in range(2):
+        save_points(tmp_path / f"frame{number}.ply", 1.1 * vertices + torch.tensor([0.01 * number, 0.0, 0.0]))
+    (tmp_path / "start.json").write_text("{}", encoding="utf-8")
+    common = (
+        "track", folder / "flat.glb", tmp_path / "frame0.ply", tmp_path / "frame1.ply", "--parents",
+        folder / "parents.json", "--start", tmp_path / "start.json", "-o", tmp_path / "r", *FAST, "--fit-shape",
+    )  # fmt: skip
+    answer = run(*common)
+    assert answer.exit_code in (0, 1), answer.output
+    assert "; size 0." in answer.output
+    found = load(tmp_path / "r.safetensors")
+    assert found.coefficients.shape == (2 + 2 * 3,)
+    assert float(found.residuals[-1]) < 0.003
+    assert "fit_shape goes without" in error_of(*common, "--force", "--locked", "base")

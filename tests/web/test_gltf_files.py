@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from torchreg.datasets.hand import hand_motion
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.gltf_morph import save_vertex_animation
+from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.spines.spine import Spine
 from torchreg.viz.animation import coarse_skin
@@ -191,3 +192,16 @@ def test_the_validator_finds_nothing(files, node):
     for kind, line in zip(files, lines, strict=True):
         issues = json.loads(line)
         assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), (kind, issues["messages"])
+
+
+def test_a_refitted_rig_passes_and_plays(files, node, tmp_path):
+    source, times, _ = files["track"]
+    rig = ArticulatedShape.from_gltf(source).with_bone_coefficients()
+    changes = 0.05 * torch.randn(len(rig.coefficient_names), generator=torch.Generator().manual_seed(0))
+    path = rig.with_coefficients(changes).to_gltf(tmp_path / "grown.glb", source)
+    issues = json.loads(node("validate_gltf.cjs", path))
+    assert (issues["numErrors"], issues["numWarnings"]) == (0, 0), issues["messages"]
+    player = Player(path)
+    expected = torch.from_numpy(np.stack([player.vertices(float(time)) for time in times]))
+    assert float((expected[0] - expected[-1]).abs().max()) > 0.02
+    check(json.loads(node("play_gltf.mjs", path, *times.tolist())), expected)

@@ -36,6 +36,7 @@ from torchreg.alignment.inputs import (
 )
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmark_fit import align_keypoints, measured_alone
+from torchreg.alignment.person_gradient import person_with_gradients
 from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.problem import (
     INLIER_SHARE,
@@ -221,7 +222,8 @@ def align(
         DegenerateDataWarning: if the inliers lie at one place, on a line or on a plane; the status is DEGENERATE.
         UnitsWarning: if the data are more than thirty times larger or smaller than the shape.
 
-    Differentiable: no; use `EMLoss` for gradients.
+    Differentiable: with ``fit_shape``, ``pose`` and ``coefficients`` once in ``data``, by the implicit function; which
+    points of the surface data belong to is held fixed. Nothing else; use `EMLoss`, or `PoseInitializer` for a layer.
 
     Cost: O(N M) per EM iteration, in bounded memory; that of `find_pose` beside, without a start.
 
@@ -341,13 +343,17 @@ def _align_person(
         found = StageResult(pose=batch.start, sigma=fitted.sigma, change=fitted.change)
         result = _unbatched(_result(batch, found, config, fitted.lead, batch.problem, fitted.error))
         dofs = shape.num_dofs
-        return normal_copy(replace(
+        result = normal_copy(replace(
             result,
             history=tuple(history),
             coefficients=fitted.coefficients,
             covariance=fitted.covariance[0, :dofs, :dofs],
             coefficient_covariance=fitted.covariance[0, dofs:, dofs:],
         ))  # fmt: skip
+    if not (torch.is_grad_enabled() and isinstance(seen.points, Tensor) and seen.points.requires_grad):
+        return result
+    found_pose, coefficients = person_with_gradients(shape, fitted, seen.points, valid)
+    return replace(result, pose=found_pose, coefficients=coefficients)
 
 
 def _align_about(

@@ -17,7 +17,7 @@ from torchreg.alignment.inputs import check_clouds
 from torchreg.alignment.problem import model_size
 from torchreg.alignment.results import Calibration
 from torchreg.alignment.scale_fit import SCALE_FIT, ScalePrior, ScaleProblem
-from torchreg.alignment.shape_fit import fit_coefficients
+from torchreg.alignment.shape_fit import fit_coefficients, shared_covariance
 from torchreg.alignment.surface_fit import SURFACE_FIT
 from torchreg.errors import InputError
 from torchreg.result import Status, normal_copy
@@ -175,9 +175,7 @@ def _calibrate_person(
         poses = _check_poses(shape, initial_poses, len(data))
     fitted = fit_coefficients(shape, data, valid, poses, config=config.align)
     person = shape.with_coefficients(fitted.coefficients)
-    # Each frame tells of the coefficients what it would alone, with its share of the prior; information adds up.
-    alone = fitted.covariance[:, shape.num_dofs :, shape.num_dofs :].double()
-    shared = torch.linalg.inv(torch.linalg.inv(alone).sum(0))
+    shared = shared_covariance(fitted.covariance, shape.num_dofs)
     status = Status.CONVERGED if bool(fitted.error.converged.all()) else Status.MAX_STEPS
     return normal_copy(Calibration(
         shape=person,

@@ -12,6 +12,7 @@ from torch.autograd.function import once_differentiable
 from torchreg.geometry.rotation import left_jacobian, so3_exp
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import BASE_DOFS, difference, retract
+from torchreg.shapes.shaped import ShapedTree
 from torchreg.shapes.surface import ShapeSurface
 from torchreg.solvers.levenberg_marquardt import held_at_limits
 from torchreg.solvers.robust import welsch_loss
@@ -28,7 +29,7 @@ class FixedPoint:
     base's rotation differs from the start's by composition. Its stationary point inside the joint limits is the pose.
 
     Args:
-        shape: the articulated shape.
+        shape: the articulated shape; or the tree of one whose variables end with shape coefficients.
         surface: of the shape, twice differentiable in points, pose and, where wanted, the shape's parameters.
         valid: (B, M) False where data are padding.
         sigma: (B,) s, metres.
@@ -40,7 +41,7 @@ class FixedPoint:
     References: Dewaele et al. 2006, eqs. 21 and 22.
     """
 
-    shape: ArticulatedShape
+    shape: ArticulatedShape | ShapedTree
     surface: ShapeSurface
     valid: Tensor
     sigma: Tensor

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
+from torchreg.errors import InputError
 from torchreg.result import Result, Status, stored_as
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
@@ -123,6 +125,29 @@ class AlignResult(Result):
         return replace(
             found, pose=found.pose.to(like), registered=found.registered.to(like), keypoints=found.keypoints.to(like)
         )
+
+    def to_gltf(self, path: str | Path, source: str | Path, *, skin: str | int | None = None) -> Path:
+        """Write the rig that was fitted, with the bones found and its clips, and return the path.
+
+        See `ArticulatedShape.to_gltf`. At the result's pose its vertices are those of ``shape``; where a file of
+        results left that mesh out, it is made again from the rig's own and the coefficients.
+
+        Args:
+            path: of the .glb file to write.
+            source: the rigged .glb or .gltf file that the shape was read from.
+            skin: as given to `ArticulatedShape.from_gltf`.
+
+        Raises:
+            InputError: if the result has no shape with a mesh, or it is not one of that file.
+            FormatError: if the file cannot be read.
+        """
+        shape = self.shape
+        if self.coefficients is not None and (shape is None or shape.surface is None):
+            rig = ArticulatedShape.from_gltf(source, skin=skin).with_bone_coefficients()
+            shape = rig.with_coefficients(self.coefficients)
+        if shape is None:
+            raise InputError("this result has no shape, and no coefficients to make it from")
+        return shape.to_gltf(path, source, skin=skin)
 
     @property
     def statuses(self) -> tuple[Status, ...]:

@@ -12,18 +12,17 @@ from torch.nn.functional import pad
 
 from torchreg.alignment.annealed_em import ANNEALING, OnStep, StageResult, anneal
 from torchreg.alignment.confidence import end_variances
-from torchreg.alignment.objectives import GaussianPosePrior, Objective
+from torchreg.alignment.objectives import GaussianPosePrior
 from torchreg.alignment.person_search import find_people, lead_over_rivals
 from torchreg.alignment.problem import (
     BROAD_PRIOR,
-    AlignProblem,
-    alignment_cost,
     joint_precision,
     masked_mean,
     model_size,
 )
 from torchreg.alignment.reliability import SurfaceError, correlated_count, neighbor_correlation
 from torchreg.alignment.results import AlignRecord
+from torchreg.alignment.shape_problem import ShapeProblem
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface, pose_covariance, surface_noise
 from torchreg.errors import InputError
@@ -33,17 +32,11 @@ from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.sampling import farthest_points
 from torchreg.result import normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.shape_space import ShapeSpace
 from torchreg.shapes.shaped import ShapedSkin, ShapedTree
 from torchreg.shapes.shaped_surface import ShapedSurface
 from torchreg.shapes.spec import RigSurface
-from torchreg.solvers.levenberg_marquardt import (
-    Linearization,
-    LMResult,
-    damped_step,
-    held_at_limits,
-    levenberg_marquardt,
-)
 from torchreg.solvers.robust import welsch_weight
 
 if TYPE_CHECKING:
@@ -66,6 +59,7 @@ class ShapeFit:
     coarse_steps: int = 3  # at each width of the surface fit
     fine_steps: int = 4
     em_steps: int = 6  # values of sigma
+    spread_steps: int = 4  # after which a learned deviation of coefficients hardly changes
     again: float = 0.06  # first sigma of the second annealing, as a share of the size
 
 
@@ -84,6 +78,8 @@ class FittedShape:
         sigma: (1,) last width of the annealed EM, metres.
         change: (1,) of the last step.
         error: standard errors of the surface in each scan.
+        problem: that was solved, about the scans' means.
+        state: (T, D + K) its solution.
         lead: (1,) cost by which the best of different people is worse, of a search without a start; else None.
     """
 
@@ -94,124 +90,9 @@ class FittedShape:
     sigma: Tensor
     change: Tensor
     error: SurfaceError
+    problem: ShapeProblem
+    state: Tensor
     lead: Tensor | None = None
-
-
-@dataclass(frozen=True)
-class ShapeProblem(AlignProblem):
-    """Alignments whose degrees of freedom end with shape coefficients, which successive rows may share.
-
-    Args:
-        skin: model points, of a `ShapedTree`.
-        surface: the surface that the surface fit fits.
-        scans: rows, one after another, of one person.
-    """
-
-    skin: ShapedSkin  # type: ignore[assignment]
-    surface: ShapedSurface
-    scans: int = 1
-
-    def rows(self, index: Tensor) -> ShapeProblem:
-        """Return the problems of some rows of the batch."""
-        chosen: ShapeProblem = super().rows(index)  # type: ignore[assignment]
-        return replace(chosen, surface=self.surface.with_normals(chosen.data_normals()))
-
-    def people(self, index: Tensor) -> Tensor:
-        """Return the rows (S T,) of some people (S,)."""
-        return (index.unsqueeze(-1) * self.scans + torch.arange(self.scans)).flatten()
-
-    def data_normals(self) -> Tensor:
-        """Return the normals (B, M, 3) of the data."""
-        return torch.zeros_like(self.data) if self.normals is None else self.normals
-
-    def sample(self, count: int, generator: torch.Generator) -> ShapeProblem:
-        """Return the problem with at most so many data of every scan, the same for all people."""
-        draw = torch.rand(self.scans, self.valid.shape[1], generator=generator).to(self.data)
-        draw = draw.repeat(len(self.data) // self.scans, 1)
-        keep = torch.where(self.valid, draw, -1.0).topk(min(count, draw.shape[-1]), dim=-1).indices
-        index = keep.unsqueeze(-1).expand(*keep.shape, 3)
-        normals = self.data_normals().gather(1, index)
-        return replace(
-            self, data=self.data.gather(1, index), valid=self.valid.gather(1, keep), normals=normals,
-            surface=self.surface.with_normals(normals),
-        )  # fmt: skip
-
-    def cost_of_people(self, state: Tensor) -> Tensor:
-        """Return the cost (S,) by which people are ranked."""
-        return alignment_cost(self, state).unflatten(0, (-1, self.scans)).sum(-1)
-
-    def solve(
-        self,
-        objective: Objective,
-        pose: Tensor,
-        max_steps: int,
-        around: Linearization,
-        damping: Tensor | None = None,
-    ) -> LMResult:
-        """Return the result of Levenberg-Marquardt, see `AlignProblem.solve`, with coefficients shared."""
-        if self.scans == 1:
-            return super().solve(objective, pose, max_steps, around, damping)
-        low, high = self._joined_limits()
-        found = levenberg_marquardt(
-            lambda state: self._joined(objective(self._split(state))), self._together(pose), retract=self._retract,
-            lower=low, upper=high, damping=damping, max_steps=max_steps, atol=self.pose_atol * min(1.0, self.size),
-            start=self._joined(around),
-        )  # fmt: skip
-        return self._spread(found)
-
-    def step(self, around: Linearization, pose: Tensor, damping: float = 1e-3) -> LMResult:
-        """Return the result of one damped step, see `AlignProblem.step`, with coefficients shared."""
-        if self.scans == 1:
-            return super().step(around, pose, damping)
-        joined, state = self._joined(around), self._together(pose)
-        low, high = self._joined_limits()
-        shares = torch.full_like(state[:, 0], damping)
-        step, _ = damped_step(joined, shares, frozen=held_at_limits(joined.gradient, state, low, high))
-        moved = torch.minimum(torch.maximum(self._retract(state, step), low), high)
-        return self._spread(LMResult(moved, joined.cost, shares, step, 1))
-
-    @property
-    def _dofs(self) -> int:
-        return self.skin.shape.rig.num_dofs
-
-    def _together(self, rows: Tensor) -> Tensor:
-        """Return rows (S T, D + K) as one state a person, (S, T D + K)."""
-        grouped = rows.unflatten(0, (-1, self.scans))
-        return torch.cat([grouped[..., : self._dofs].flatten(1), grouped[:, 0, self._dofs :]], dim=-1)
-
-    def _split(self, state: Tensor) -> Tensor:
-        """Return states (S, T D + K) as rows (S T, D + K)."""
-        poses, coefficients = state.tensor_split([self.scans * self._dofs], dim=-1)
-        shared = coefficients.unsqueeze(1).expand(-1, self.scans, -1)
-        return torch.cat([poses.unflatten(1, (self.scans, -1)), shared], dim=-1).flatten(0, 1)
-
-    def _retract(self, state: Tensor, step: Tensor) -> Tensor:
-        return self._together(self.skin.shape.retract(self._split(state), self._split(step)))
-
-    def _joined_limits(self) -> tuple[Tensor, Tensor]:
-        low, high = (limit.expand(self.scans, -1) for limit in (self.lower, self.upper))
-        return self._together(low)[0], self._together(high)[0]
-
-    def _joined(self, rows: Linearization) -> Linearization:
-        """Return the least-squares problem (S, T D + K) of people from that of their scans (S T, D + K)."""
-        dofs, scans = self._dofs, self.scans
-        gradient, hessian = (value.unflatten(0, (-1, scans)) for value in (rows.gradient, rows.hessian))
-        poses = hessian.new_zeros(len(hessian), scans, dofs, scans, dofs)
-        index = torch.arange(scans)
-        poses[:, index, :, index] = hessian[..., :dofs, :dofs].transpose(0, 1)
-        across = hessian[..., :dofs, dofs:].flatten(1, 2)
-        corner = hessian[..., dofs:, dofs:].sum(1)
-        top = torch.cat([poses.flatten(3, 4).flatten(1, 2), across], dim=-1)
-        return Linearization(
-            cost=rows.cost.unflatten(0, (-1, scans)).sum(-1),
-            gradient=torch.cat([gradient[..., :dofs].flatten(1), gradient[..., dofs:].sum(1)], dim=-1),
-            hessian=torch.cat([top, torch.cat([across.mT, corner], dim=-1)], dim=1),
-        )
-
-    def _spread(self, found: LMResult) -> LMResult:
-        """Return a result over people as one over their scans."""
-        cost, damping = (value.repeat_interleave(self.scans) for value in (found.cost, found.damping))
-        return LMResult(self._split(found.state), cost, damping, self._split(found.last_step), found.num_steps)
 
 
 def fitted_rig(shape: ArticulatedShape, fit_shape: bool | str, *, plain: bool = True) -> ArticulatedShape:
@@ -282,6 +163,10 @@ def fit_coefficients(
     problem, state = problem.rows(kept[best]), state[best]
     fine = problem.sample(SHAPE_FIT.fine_data, generator)
     state = fit_surface(fine, state, steps=SHAPE_FIT.fine_steps, on_step=on_step).pose
+    alike = shape.coefficient_space().alike
+    if alike is not None:
+        fine, state = _with_learned_spread(fine, state, alike, on_step)
+        problem = replace(problem, prior=replace(problem.prior, precision=fine.prior.precision))
     finish = partial(fit_surface, problem, widths=SURFACE_FIT.widths[-1:], on_step=on_step)
     before = finish(state, steps=SHAPE_FIT.fine_steps).pose
     last = replace(finish(before, steps=1), sigma=sigma)
@@ -298,6 +183,45 @@ def _placed_again(problem: ShapeProblem, state: Tensor, config: AlignConfig, on_
     found = fit_surface(problem, found, steps=SHAPE_FIT.coarse_steps, on_step=on_step).pose
     better = problem.cost_of_people(found) < problem.cost_of_people(state)
     return torch.where(better.repeat_interleave(problem.scans).unsqueeze(-1), found, state)
+
+
+def _with_learned_spread(
+    problem: ShapeProblem, state: Tensor, alike: Tensor, on_step: OnStep | None
+) -> tuple[ShapeProblem, Tensor]:
+    """Return the problem of one person with the deviations of alike coefficients learned, and states (T, D + K) fitted.
+
+    The deviation of the greatest evidence has ``s^2 = sum_k (c_k - m_k)^2 / sum_k g_k`` over coefficients k, where
+    ``g_k = 1 - C_kk / s^2`` is the share of each that the data tell and C the covariance. The guess of the prior counts
+    as one more coefficient.
+
+    References: MacKay 1992, Bayesian interpolation, eq. 4.9.
+    """
+    space, dofs = problem.skin.shape.space, problem.skin.shape.rig.num_dofs
+    member = alike.unsqueeze(-1) == alike.clamp_min(0).unique()
+    group = member.to(state)
+    for _ in range(SHAPE_FIT.spread_steps):
+        precision = problem.prior.precision[dofs:] * problem.scans
+        covariance = shared_covariance(_covariance(problem, state), dofs)
+        told = (1 - covariance.diagonal() * precision).clamp(0, 1)
+        squares = (state[0, dofs:] - space.mean).square() @ group + (space.std.square() @ group) / group.sum(0)
+        variance = squares / (told @ group + 1)
+        learned = torch.where(member.any(-1), (group @ variance.reciprocal()), precision) / problem.scans
+        joined = torch.cat([problem.prior.precision[:dofs], learned])
+        problem = replace(problem, prior=replace(problem.prior, precision=joined))
+        widths = SURFACE_FIT.widths[-1:]
+        state = fit_surface(problem, state, steps=SHAPE_FIT.fine_steps, widths=widths, on_step=on_step).pose
+    return problem, state
+
+
+def shared_covariance(covariance: Tensor, num_dofs: int) -> Tensor:
+    """Return the covariance (K, K) of coefficients from those of scans, each alone with its share of the prior.
+
+    Args:
+        covariance: (T, D + K, D + K).
+        num_dofs: D.
+    """
+    alone = covariance[:, num_dofs:, num_dofs:].double()
+    return torch.linalg.inv(torch.linalg.inv(alone).sum(0)).to(covariance)
 
 
 def _tell(on_step: OnStep, problem: ShapeProblem, num_dofs: int, record: AlignRecord) -> None:
@@ -319,6 +243,8 @@ def _fitted(problem: ShapeProblem, before: Tensor, found: StageResult, num_dofs:
         sigma=found.sigma,
         change=found.change.amax(0, keepdim=True),
         error=_surface_error(problem, before, found.pose, covariance),
+        problem=problem,
+        state=found.pose,
     )
 
 
@@ -334,14 +260,50 @@ def _surface_error(problem: ShapeProblem, before: Tensor, state: Tensor, covaria
 
 def _covariance(problem: ShapeProblem, state: Tensor) -> Tensor:
     """Return the covariance (T, D + K, D + K) of each scan's pose and the coefficients, as if it were alone."""
-    distance, jacobian = problem.surface.distance_jacobian(problem.data, state)
-    noise = surface_noise(distance, problem.valid, problem.size)
-    near = welsch_weight((distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square()) * problem.valid
-    shared = correlated_count(neighbor_correlation(problem.data, distance, near))
-    rig = problem.skin.shape.rig
-    broad = pad(BROAD_PRIOR.precision(rig, problem.size), (0, state.shape[-1] - rig.num_dofs))
-    precision = torch.maximum(problem.prior.precision, broad).expand_as(state)
-    return pose_covariance(jacobian, near, noise * shared.clamp_min(1).sqrt(), precision)
+    rows = robust_rows(problem.surface, problem.data, problem.valid, state, problem.size)
+    precision = plausible_precision(problem.skin.shape.rig, problem.size, problem.prior.precision)
+    return pose_covariance(rows.jacobian, rows.weights, rows.noise, precision.expand_as(state))
+
+
+@dataclass(frozen=True)
+class RobustRows:
+    """Data as rows of a least-squares problem in states.
+
+    Args:
+        distance: (B, M) of the data from the surface, metres.
+        jacobian: (B, M, D + K) of the distances.
+        weights: (B, M) from 0 to 1, of the Welsch kernel at the noise.
+        noise: (B,) standard deviation of each datum as if all were independent, metres: larger where neighbors err
+            together.
+    """
+
+    distance: Tensor
+    jacobian: Tensor
+    weights: Tensor
+    noise: Tensor
+
+
+def robust_rows(surface: ShapedSurface, data: Tensor, valid: Tensor, state: Tensor, size: float) -> RobustRows:
+    """Return data (B, M, 3) as rows of a least-squares problem in states (B, D + K).
+
+    Args:
+        surface: of the rig.
+        data: metres.
+        valid: (B, M) False where padded.
+        state: poses and coefficients.
+        size: of the rig, metres.
+    """
+    distance, jacobian = surface.distance_jacobian(data, state)
+    noise = surface_noise(distance, valid, size)
+    near = welsch_weight((distance / (SURFACE_FIT.width_per_noise * noise).unsqueeze(-1)).square()) * valid
+    shared = correlated_count(neighbor_correlation(data, distance, near))
+    return RobustRows(distance, jacobian=jacobian, weights=near, noise=noise * shared.clamp_min(1).sqrt())
+
+
+def plausible_precision(rig: Articulation, size: float, precision: Tensor) -> Tensor:
+    """Return the precision (D + K,) of a prior, of the pose at least that of any plausible one."""
+    broad = BROAD_PRIOR.precision(rig, size)
+    return torch.maximum(precision, pad(broad, (0, precision.shape[-1] - rig.num_dofs)))
 
 
 def different_people(space: ShapeSpace, generator: torch.Generator) -> Tensor:
@@ -380,10 +342,10 @@ def _problem(
     people = different_people(space, generator)
     tree = ShapedTree(shape, space)
     normals = torch.stack([
-        _scan_normals(points, told, None if viewpoints is None else viewpoints[number])
+        scan_normals(points, told, None if viewpoints is None else viewpoints[number])
         for number, (points, told) in enumerate(zip(data, valid, strict=True))
     ])  # fmt: skip
-    model, dense = _skins(tree, surface, config.num_model_points, generator)
+    model, dense = surface_skins(tree, surface, config.num_model_points, generator)
     size, count, scans = model_size(model), len(people), len(data)
     origin = masked_mean(data, valid)
     middle = space.rest(torch.cat([space.mean[None], people]))[0].mean(-2)
@@ -424,14 +386,14 @@ def _start(poses: Tensor, people: Tensor, offsets: Tensor) -> Tensor:
     return torch.cat([placed, shared], dim=-1).flatten(0, 1)
 
 
-def _scan_normals(points: Tensor, valid: Tensor, viewpoint: Tensor | None) -> Tensor:
+def scan_normals(points: Tensor, valid: Tensor, viewpoint: Tensor | None) -> Tensor:
     """Return the normals (M, 3) of a scan, zero where a point is padding."""
     normals = torch.zeros_like(points)
     normals[valid] = facing_normals(points[valid], viewpoint).to(points)
     return normals
 
 
-def _skins(
+def surface_skins(
     tree: ShapedTree, surface: RigSurface, count: int, generator: torch.Generator
 ) -> tuple[ShapedSkin, ShapedSkin]:
     """Return model points that cover the surface evenly, and denser ones to measure distances from."""

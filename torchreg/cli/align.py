@@ -32,8 +32,9 @@ from torchreg.cli.keypoint_options import Keypoints, KeypointStd, MeasuredFrames
 from torchreg.cli.known_options import Joints, JointStd, Known, Locked, observability, read_known
 from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
-from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
+from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, chosen_skin, load_shape
 from torchreg.cli.upright import Up, known_up, remembering
+from torchreg.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -55,10 +56,11 @@ class _Files:
     pose: Path | None
     ply: Path | None
     picture: Path | None
+    rig: Path | None
 
     def all(self) -> Iterable[Path | None]:
         """Yield the paths of all outputs."""
-        yield from (self.result, self.result.with_suffix(".json"), self.pose, self.ply, self.picture)
+        yield from (self.result, self.result.with_suffix(".json"), self.pose, self.ply, self.picture, self.rig)
 
 
 @reporting
@@ -120,6 +122,13 @@ def align(
     gltf: Annotated[
         Path | None, typer.Option(help="Also write the moving shape, all clouds in one file (.glb).")
     ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            help="Also write the file of SHAPE with the bones found and its clips (.glb); of a rigged character with "
+            "--fit-shape."
+        ),
+    ] = None,
     up: Up = None,
     force: Force = False,
     quiet: Quiet = False,
@@ -144,11 +153,17 @@ def align(
     Ctrl-C.
     """
     check_used(depth, "--depth", {"--intrinsics": intrinsics, "--mask": mask, "--depth-range": depth_range})
+    check_used(fit_shape, "--fit-shape", {"--rig": rig})
+    if rig is not None and Path(shape).suffix.lower() not in (".glb", ".gltf"):
+        raise InputError(f"--rig has no meaning for {shape}, which is no rigged character; leave it out")
     pictures = depth_source(clouds, intrinsics, mask, depth_range) if depth else None
     upright = known_up(up, clouds, camera=depth)
     clouds = cloud_files(clouds) if pictures is None else [Path(name) for name in pictures.names]
     output = with_ending(output, (".safetensors",), add=True)
-    optional = with_ending(pose, (".json", ".csv")), with_ending(ply, (".ply",)), with_ending(picture, PICTURE_ENDINGS)
+    optional = (
+        with_ending(pose, (".json", ".csv")), with_ending(ply, (".ply",)), with_ending(picture, PICTURE_ENDINGS),
+        with_ending(rig, (".glb",)),
+    )  # fmt: skip
     files = _output_files(output, optional, len(clouds))
     check_outputs([*(path for entry in files for path in entry.all()), with_ending(gltf, (".glb",))], force)
     for path in clouds:
@@ -170,7 +185,7 @@ def align(
         measured = read_keypoints(keypoints, keypoint_std, clouds, None if side == "either" else model, pictures)
         run = _AlignRun(
             model, config, points, scale, time, frame, first, known, measured, network, pictures=pictures,
-            fit_shape=fit_shape, up=upright,
+            fit_shape=fit_shape, source=(shape, chosen_skin(skin)), up=upright,
         )  # fmt: skip
         if side == "either":
             side = run.choose_hand(clouds[0])
@@ -218,6 +233,7 @@ class _AlignRun:
     initializer: PoseProposer | None = None
     pictures: DepthFrames | None = None
     fit_shape: bool = False
+    source: tuple[str, str | int | None] = ("", None)
     up: Direction | None = None
     results: list[AlignResult] = field(default_factory=list)
 
@@ -304,6 +320,8 @@ class _AlignRun:
             shape, surface = self.fitted(result)
             ax = draw_alignment(None, shape, shown.pose, near, result.inliers, skin=surface, up=self.up)
             save_picture(ax.get_figure(), files.picture)  # type: ignore[arg-type]
+        if files.rig is not None:
+            result.to_gltf(files.rig, self.source[0], skin=self.source[1])
         # The result is written last: if it exists, all others do.
         result.save(files.result)
 

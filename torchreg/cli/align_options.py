@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from torchreg.alignment.results import AlignResult
     from torchreg.alignment.sigma_schedule import SigmaSchedule
     from torchreg.shapes.articulated import ArticulatedShape
+    from torchreg.tracking.results import TrackResult
 
 Sigma = Annotated[
     str | None, typer.Option(metavar="START:STOP:STEPS", help="Widths of the EM, metres, as in 0.02:0.005:5.")
@@ -108,7 +109,7 @@ def alignment_summary(result: AlignResult) -> str:
 _TOLD = 6
 
 
-def person_summary(shape: ArticulatedShape, result: AlignResult) -> str:
+def person_summary(shape: ArticulatedShape, result: AlignResult | TrackResult) -> str:
     """Return the coefficients that were fitted, with their standard deviations; nothing where none were."""
     if result.coefficients is None or result.coefficient_covariance is None:
         return ""

@@ -68,8 +68,13 @@ def load_shape(
         return ArticulatedShape.from_anny(PEOPLE[name])
     if ending == ".urdf":
         return ArticulatedShape.from_urdf(name, package_dirs=package_dirs or (), free_base=free_base is not False)
-    chosen = int(skin) if skin is not None and skin.isdecimal() else skin
-    return ArticulatedShape.from_gltf(name, parents=None if parents is None else _read_parents(parents), skin=chosen)
+    joined = None if parents is None else _read_parents(parents)
+    return ArticulatedShape.from_gltf(name, parents=joined, skin=chosen_skin(skin))
+
+
+def chosen_skin(skin: str | None) -> str | int | None:
+    """Return the name or number that --skin gives."""
+    return int(skin) if skin is not None and skin.isdecimal() else skin
 
 
 def near_shape(name: str) -> str:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from torchreg.cli.align_options import NanPolicy, Scale, cloud_files
+from torchreg.cli.align_options import NanPolicy, Scale, cloud_files, person_summary
 from torchreg.cli.cameras import (
     Calibration,
     Depth,
@@ -82,6 +82,14 @@ def track(
         ),
     ] = None,
     initializer: Initializer = None,
+    fit_shape: Annotated[
+        bool,
+        typer.Option(
+            "--fit-shape",
+            help="Also fit the shape's coefficients, as of a body to a person, or of a rig without any the lengths and "
+            "radii of its parts: the first frame tells them, and every other one more.",
+        ),
+    ] = False,
     stereo: Annotated[
         bool, typer.Option("--stereo", help="FRAMES are the pictures of a calibrated pair of cameras.")
     ] = False,
@@ -197,8 +205,13 @@ def track(
     measured = read_keypoints(keypoints, keypoint_std, clouds, model, images)
     job = track_job(shape, options, first, config, fps, scale, nan_policy, clouds) | known.job() | measured.job()
     job |= {} if initializer is None else {"--initializer": str(initializer)}
+    job |= {"--fit-shape": True} if fit_shape else {}
+    if fit_shape and not model.coefficient_names:
+        model = model.with_bone_coefficients()
     with claimed(files.result), ExitStack() as pages, _progress_bar(len(clouds), quiet) as bar:
-        tracker = Tracker(model, first, config=config, locked=known.locked, initializer=network)
+        tracker = Tracker(
+            model, first, config=config, locked=known.locked, initializer=network, fit_shape=fit_shape
+        )  # fmt: skip
         run = TrackRun(
             tracker=tracker, clouds=clouds, fps=fps, job=job, files=files, report=Report(bar, clouds, quiet),
             save_every=save_every, known=known, measured=measured, up=known_up(up, frames, camera=stereo or depth),
@@ -211,7 +224,7 @@ def track(
         _write_poses(poses, model, run.located)
     if bvh is not None:
         _write_motion(bvh, run)
-    _report_end(run, complete, quiet)
+    _report_end(run, model, complete, quiet)
 
 
 def _check_rates(fps: float, scale: float) -> None:
@@ -310,11 +323,12 @@ def _live_page(
     return begin
 
 
-def _report_end(run: TrackRun, complete: bool, quiet: bool) -> None:
+def _report_end(run: TrackRun, model: ArticulatedShape, complete: bool, quiet: bool) -> None:
     """Print the summary of a run; raise its exit unless it is complete and usable."""
     statuses = run.result.statuses
     if not quiet:
-        typer.echo(f"{summary(run.result)} -> {run.files.result}")
+        told = "; ".join(filter(None, (summary(run.result), person_summary(model, run.result))))
+        typer.echo(f"{told} -> {run.files.result}")
     if not complete:
         raise interruption(f"{len(statuses)} of {len(run.clouds)} frames are done; --resume goes on from there")
     if not all(status.usable for status in statuses):

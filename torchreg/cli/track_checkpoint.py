@@ -26,7 +26,7 @@ _RESULT, _STATE, _JOB = "result.safetensors", "state.safetensors", "job.json"
 _CONTENTS = "contents of frames"
 _MEMBERS = (_RESULT, "result.json", _STATE, "state.json", _JOB)
 # Fields of a `TrackResult` that belong to all frames.
-_NOT_BY_FRAME = {"origin", "shape", "up"}
+_NOT_BY_FRAME = {"origin", "shape", "up", "coefficients", "coefficient_covariance"}
 
 
 @dataclass(frozen=True)

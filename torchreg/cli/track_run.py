@@ -282,13 +282,12 @@ class TrackRun:
         """Track what is left, and return whether all is done; what is done is on disk."""
         from torchreg.cli.track_checkpoint import TrackProgress, save_progress
 
-        overlays = self._overlays()
         self.clouds.on_drop = self.report.dropped
         complete = True
         while complete and self.state.frame < len(self.clouds):
             end = min(self.state.frame + self.save_every, len(self.clouds))
             with self.report.warnings():
-                self._part(range(self.state.frame, end), overlays)
+                self._part(range(self.state.frame, end))
             complete = self.state.frame == end
             contents = [self.clouds.content(number) for number in range(self.state.frame)]
             save_progress(self.files.progress, TrackProgress(self.result, self.state, self.job, contents))
@@ -296,12 +295,12 @@ class TrackRun:
         remembering(self.located, self.up).save(self.files.result)
         return complete
 
-    def _part(self, numbers: range, overlays: Sequence[OnFrame]) -> None:
+    def _part(self, numbers: range) -> None:
         """Track some frames; fewer are done if the keyboard interrupts."""
         from torchreg.cli.track_checkpoint import first_frames
 
         def note(points: Tensor, frame: FrameResult) -> None:
-            for overlay in overlays:
+            for overlay in self._overlays:
                 overlay(points, frame)
             self.report.frame(frame)
             # A frame counts as done when all of it is.
@@ -322,8 +321,9 @@ class TrackRun:
             raise KeyboardInterrupt
         self.parts.append(first_frames(result, done))
 
+    @cached_property
     def _overlays(self) -> list[OnFrame]:
-        """Return what draws each frame as soon as it is done."""
+        """What draws each frame as soon as it is done; made after the first, which tells who is fitted."""
         drawn = [begin(self.surface) for begin in (self.seen, self.live) if begin is not None]
         if self.files.pictures is not None:
             from torchreg.viz.tracking import FrameOverlays

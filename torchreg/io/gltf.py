@@ -63,6 +63,28 @@ class RigRecord:
     scale: float = 1.0
 
 
+@dataclass(frozen=True)
+class RigPrimitive:
+    """A primitive of a skinned mesh.
+
+    Args:
+        entry: of the document.
+        attributes: of the entry.
+        mode: see `Mode`.
+        what: it is, for messages.
+    """
+
+    entry: dict[str, Any]
+    attributes: dict[str, Any]
+    mode: int
+    what: str
+
+    @property
+    def key(self) -> str:
+        """The same for primitives that share their vertices and differ in indices and material only, as many do."""
+        return repr(sorted(self.attributes.items(), key=str))
+
+
 def load_rig(
     path: str | Path,
     *,
@@ -112,7 +134,7 @@ def _read_rig(
     limits: FileLimits,
 ) -> RigRecord:
     nodes = document.items("nodes")
-    skin_index, meshes = _choose(document, mesh, skin)
+    skin_index, meshes = choose_skin(document, mesh, skin)
     chosen = document.item("skins", skin_index)
     listed = document.entry(chosen, "joints", list)
     joints = [document.index("nodes", joint, f"a joint of skin {skin_index}") for joint in listed]
@@ -129,7 +151,7 @@ def _read_rig(
     all_parents = _joint_parents(joints, node_parents, names, parents)
     inverse_bind = chosen.get("inverseBindMatrices")
     bind = (
-        world if inverse_bind is None else _bind_transforms(document, inverse_bind, names, weights, world, all_parents)
+        world if inverse_bind is None else bind_transforms(document, inverse_bind, names, weights, world, all_parents)
     )
     joint_transforms = _strip_scale(bind, names, "bind")
     rest_transforms = _strip_scale(world, names, "rest")
@@ -161,7 +183,7 @@ def _numbers(document: GltfDocument, index: Any, what: str, shape: str) -> Array
     return values.astype(np.float64)
 
 
-def _choose(document: GltfDocument, mesh: str | int | None, skin: str | int | None) -> tuple[int, list[int]]:
+def choose_skin(document: GltfDocument, mesh: str | int | None, skin: str | int | None) -> tuple[int, list[int]]:
     """Return the index of the requested skin, and those of the requested meshes that it moves."""
     wanted_mesh = None if mesh is None else _find(document.items("meshes"), mesh, "mesh")
     wanted_skin = None if skin is None else _find(document.items("skins"), skin, "skin")
@@ -198,7 +220,7 @@ def _unique_names(names: Sequence[Any]) -> list[str]:
     return unique
 
 
-def _bind_transforms(
+def bind_transforms(
     document: GltfDocument,
     inverse_bind: Any,
     names: Sequence[str],
@@ -300,29 +322,15 @@ def _read_meshes(
     blocks: list[tuple[Array, Array | None, Array]] = []
     faces: list[Array] = []
     begins: dict[str, tuple[int, int]] = {}
-    total, left_out = 0, list[str]()
-    for index in meshes:
-        mesh = document.item("meshes", index)
-        for number, primitive in enumerate(document.entry(mesh, "primitives", list)):
-            what = f"primitive {number} of mesh {mesh.get('name') or index!r}"
-            if not isinstance(primitive, dict):
-                raise FormatError(f"{what} must be an object")
-            mode = document.entry(primitive, "mode", int, Mode.TRIANGLES)
-            if mode not in set(Mode):
-                continue
-            attributes = document.entry(primitive, "attributes", dict)
-            missing = _missing(document, primitive, attributes)
-            if missing:
-                left_out.append(f"{what} has no {missing}")
-                continue
-            # Primitives often share their vertices and differ in indices and material only.
-            key = repr(sorted(attributes.items(), key=str))
-            if key not in begins:
-                blocks.append(_read_vertices(document, attributes, what, num_joints, total, limits))
-                size = len(blocks[-1][0])
-                begins[key], total = (total, size), total + size
-            begin, size = begins[key]
-            faces.append(_read_faces(document, primitive, mode, what, size) + begin)
+    primitives, left_out = rig_primitives(document, meshes)
+    total = 0
+    for primitive in primitives:
+        if primitive.key not in begins:
+            blocks.append(_read_vertices(document, primitive.attributes, primitive.what, num_joints, total, limits))
+            size = len(blocks[-1][0])
+            begins[primitive.key], total = (total, size), total + size
+        begin, size = begins[primitive.key]
+        faces.append(_read_faces(document, primitive.entry, primitive.mode, primitive.what, size) + begin)
     if not faces:
         reason = f": {left_out[0]}" if left_out else ""
         raise ModelError(f"the skinned mesh has no triangles that a skin moves{reason}")
@@ -332,6 +340,27 @@ def _read_meshes(
     known = [block for block in normals if block is not None]
     all_normals = np.concatenate(known) if len(known) == len(blocks) else None
     return np.concatenate(vertices), np.concatenate(faces), all_normals, np.concatenate(weights)
+
+
+def rig_primitives(document: GltfDocument, meshes: Sequence[int]) -> tuple[list[RigPrimitive], list[str]]:
+    """Return the triangle primitives of meshes that a skin moves, and what others lack."""
+    primitives, left_out = list[RigPrimitive](), list[str]()
+    for index in meshes:
+        mesh = document.item("meshes", index)
+        for number, entry in enumerate(document.entry(mesh, "primitives", list)):
+            what = f"primitive {number} of mesh {mesh.get('name') or index!r}"
+            if not isinstance(entry, dict):
+                raise FormatError(f"{what} must be an object")
+            mode = document.entry(entry, "mode", int, Mode.TRIANGLES)
+            if mode not in set(Mode):
+                continue
+            attributes = document.entry(entry, "attributes", dict)
+            missing = _missing(document, entry, attributes)
+            if missing:
+                left_out.append(f"{what} has no {missing}")
+            else:
+                primitives.append(RigPrimitive(entry, attributes=attributes, mode=mode, what=what))
+    return primitives, left_out
 
 
 def _missing(document: GltfDocument, primitive: dict[str, Any], attributes: dict[str, Any]) -> str:

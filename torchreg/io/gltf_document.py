@@ -155,7 +155,7 @@ class GltfDocument:
     def _buffer_of(self, owner: dict[str, Any], what: str) -> bytes:
         """Return the buffer that the buffer view of an entry is part of."""
         view = self.item("bufferViews", owner.get("bufferView"), f"the bufferView of {what}")
-        return self._buffer(self.index("buffers", view.get("buffer"), f"the buffer of {what}"))
+        return self.buffer(self.index("buffers", view.get("buffer"), f"the buffer of {what}"))
 
     def check_use(self, size: int, what: str) -> None:
         """Raise FormatError if all accessors that were read ask for far more bytes than the document holds."""
@@ -215,11 +215,12 @@ class GltfDocument:
             raise FormatError(f"the {key} of {what} is {value}: it reaches beyond its buffer")
         return value
 
-    def _buffer(self, index: int) -> bytes:
+    def buffer(self, index: int) -> bytes:
+        """Return the bytes of a buffer, from the file or beside it."""
         if index not in self._buffers:
             item = self.item("buffers", index)
             uri = item.get("uri")
-            data = self._binary if uri is None else self._external(index, self.entry(item, "uri", str))
+            data = self._binary if uri is None else self.external(f"buffer {index}", self.entry(item, "uri", str))
             if data is None:
                 raise FormatError(f"buffer {index} has neither an address nor a binary chunk")
             length = self._size(item, "byteLength", f"buffer {index}")
@@ -230,15 +231,16 @@ class GltfDocument:
             self._buffers[index] = data
         return self._buffers[index]
 
-    def _external(self, index: int, uri: str) -> bytes:
+    def external(self, what: str, uri: str) -> bytes:
+        """Return the bytes at an address, of what messages call ``what``."""
         if uri.startswith("data:"):
             head, _, packed = uri.partition(",")
             if not head.endswith(";base64"):
-                raise FormatError(f"buffer {index} is not base64, as data inside a file must be base64: {head[:60]!r}")
+                raise FormatError(f"{what} is not base64, as data inside a file must be base64: {head[:60]!r}")
             try:
                 return base64.b64decode(packed, validate=True)
             except ValueError as error:
-                raise FormatError(f"buffer {index} is damaged base64, not valid base64 ({error})") from error
+                raise FormatError(f"{what} is damaged base64, not valid base64 ({error})") from error
         name, folder = unquote(uri), self._path.parent.resolve()
         # A lone surrogate, which JSON may hold, is in no file's name.
         plain = not {":", "\0", "\\"} & set(name) and name.isprintable()

@@ -20,7 +20,7 @@ from torchreg.shapes.rigs import spec_from_arrays, spec_from_gltf
 from torchreg.shapes.robots import spec_from_chain, spec_from_urdf
 from torchreg.shapes.shape_space import ShapeSpace
 from torchreg.shapes.shaped import ShapedTree, blended
-from torchreg.shapes.shaped_rig import Coefficients, ShapeDirs, person_spec
+from torchreg.shapes.shaped_rig import Coefficients, ShapeDirs, person_spec, save_rig
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.shapes.spec import RigSurface, ShapeSpec
 
@@ -380,6 +380,27 @@ class ArticulatedShape(Articulation):
         other = copy.deepcopy(self)
         other.space = bone_space(self, self.file_surface()).to(self.rest)
         return other
+
+    def to_gltf(self, path: str | Path, source: str | Path, *, skin: str | int | None = None) -> Path:
+        """Write a rigged glTF file with this shape's vertices and bones, and return its path.
+
+        The bind pose is that of the shape; skin weights, materials and pictures stay. Its clips play on: joints turn as
+        before, and translations grow as the bones they move do, those of the root as the whole skeleton, so that feet
+        stay on the ground.
+
+        Args:
+            path: of the .glb file to write.
+            source: the rigged .glb or .gltf file that `from_gltf` read; the shape itself, or that of a fit of its bones
+                (``align(..., fit_shape="bones").shape``, `with_coefficients`).
+            skin: as given to `from_gltf`.
+
+        Raises:
+            InputError: if the shape has no mesh or is not one of that file, or ``path`` does not end in .glb.
+            FormatError: if the file cannot be read.
+
+        Differentiable: no.
+        """
+        return save_rig(path, source, self, self.file_surface(), skin)
 
     def coefficient_space(self) -> ShapeSpace:
         """Return the space of rest states; InputError where the shape has no coefficients."""

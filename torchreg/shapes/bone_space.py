@@ -17,7 +17,7 @@ class BonePrior:
 
     size: float = 0.2  # of the whole: adults differ by 0.05, a made-up rig and a person by more
     girth: float = 0.15  # of all radii beyond the size
-    part: float = 0.07  # of each part's length and radius beyond those
+    part: float = 0.07  # of each part's length and radius beyond those, a guess that fits correct
     most: float = 0.6  # of any of them: nothing shrinks to nothing
 
 
@@ -28,7 +28,8 @@ def bone_space(shape: Articulation, surface: RigSurface) -> LinearSpace:
     """Return the space in which a rig grows as a whole, in girth, and part by part in length and radius.
 
     Coefficients are relative changes: size, girth, then the length and the radius of each part. Lengths move the joints
-    that a part carries along, and stretch its vertices along its bone; radii stretch them across it.
+    that a part carries along, and stretch its vertices along its bone; radii stretch them across it. By how much parts
+    differ from the whole is not known beforehand: a scaled figure's do not, another person's do.
 
     Args:
         shape: the rig.
@@ -57,4 +58,5 @@ def _prior(parts: tuple[str, ...]) -> CoefficientPrior:
     std = torch.full((len(names),), BONE_PRIOR.part, dtype=torch.float64)
     std[0], std[1] = BONE_PRIOR.size, BONE_PRIOR.girth
     zero, most = torch.zeros_like(std), torch.full_like(std, BONE_PRIOR.most)
-    return CoefficientPrior(names=names, mean=zero, std=std, lower=-most, upper=most)
+    alike = torch.tensor([-1, -1, *[0] * len(parts), *[1] * len(parts)])
+    return CoefficientPrior(names=names, mean=zero, std=std, lower=-most, upper=most, alike=alike)

@@ -21,6 +21,8 @@ class CoefficientPrior:
         std: (K,) standard deviations.
         lower: (K,) limits.
         upper: (K,) limits.
+        alike: (K,) numbers of groups of coefficients whose common deviation is not known, of which ``std`` is a guess;
+            -1 for others. None where there are no such groups.
     """
 
     names: tuple[str, ...]
@@ -28,6 +30,7 @@ class CoefficientPrior:
     std: Tensor
     lower: Tensor
     upper: Tensor
+    alike: Tensor | None = None
 
     @classmethod
     def normal(cls, names: Sequence[str], std: Tensor | float = 1.0, limit: float = 5.0) -> CoefficientPrior:
@@ -50,12 +53,14 @@ class ShapeSpace(nn.Module):
     std: Tensor
     lower: Tensor
     upper: Tensor
+    alike: Tensor | None
 
     def __init__(self, prior: CoefficientPrior) -> None:
         super().__init__()
         self.names = prior.names
-        for name in ("mean", "std", "lower", "upper"):
-            self.register_buffer(name, getattr(prior, name).detach().clone(), persistent=False)
+        for name in ("mean", "std", "lower", "upper", "alike"):
+            value = getattr(prior, name)
+            self.register_buffer(name, None if value is None else value.detach().clone(), persistent=False)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -63,7 +68,9 @@ class ShapeSpace(nn.Module):
     @property
     def prior(self) -> CoefficientPrior:
         """What is known of the coefficients before any data."""
-        return CoefficientPrior(self.names, mean=self.mean, std=self.std, lower=self.lower, upper=self.upper)
+        return CoefficientPrior(
+            self.names, mean=self.mean, std=self.std, lower=self.lower, upper=self.upper, alike=self.alike
+        )  # fmt: skip
 
     def rest(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Return the rest state for coefficients.

@@ -144,6 +144,7 @@ class ShapedSkin(nn.Module):
     shares: Tensor
     weights: Tensor
     subtree: Tensor
+    _used: Tensor
 
     def __init__(self, tree: ShapedTree, corners: Tensor, shares: Tensor, weights: Tensor) -> None:
         super().__init__()
@@ -152,7 +153,7 @@ class ShapedSkin(nn.Module):
         self.space = tree.space.restricted(used)
         weights = weights / weights.sum(-1, keepdim=True)
         subtree = weights @ tree.part_moves
-        buffers = {"corners": inverse, "shares": shares, "weights": weights, "subtree": subtree}
+        buffers = {"corners": inverse, "shares": shares, "weights": weights, "subtree": subtree, "_used": used}
         for name, value in buffers.items():
             self.register_buffer(name, value, persistent=False)
         with torch.no_grad():
@@ -165,6 +166,10 @@ class ShapedSkin(nn.Module):
     def basis(self) -> Tensor:
         """The matrix (N, N) that takes points, as rows, to points."""
         return torch.eye(len(self), dtype=self.weights.dtype, device=self.weights.device)
+
+    def vertex_index(self, index: Tensor) -> Tensor:
+        """Return the vertices (M, C) of the rig between which some points (M,) lie."""
+        return self._used[self.corners[index]]
 
     def forward(self, state: Tensor) -> Tensor:
         """Return the points (..., N, 3) in states (..., D + K), metres.

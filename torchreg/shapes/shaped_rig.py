@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from torchreg.errors import InputError
 from torchreg.geometry.kinematic_tree import KinematicTree
 from torchreg.geometry.primitives import PRIMITIVE_KINDS
 from torchreg.geometry.rigid import invert_rigid
+from torchreg.io.gltf_refit import save_refitted_rig
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.shape_space import CoefficientPrior, FunctionSpace, LinearSpace, RestFunction, ShapeSpace
@@ -189,3 +191,14 @@ def _grown_solids(
         placed[:3, 3] = pose[:3, :3] @ center
         result.append(Primitive(solid.kind, sizes, placed))
     return result
+
+
+def save_rig(
+    path: str | Path, source: str | Path, shape: Articulation, surface: RigSurface, skin: str | int | None
+) -> Path:
+    """Write the rig of a file with the vertices and bones of a shape; see `ArticulatedShape.to_gltf`."""
+    tree = shape.kinematics.tree
+    frames = shape.frame_transforms(torch.zeros_like(shape.rest)).detach().double()
+    # A joint of the file is the first of the frames that its axes are stacked on.
+    positions = {joint.name: frames[index, :3, 3] for index, joint in enumerate(tree.joints) if joint.kind == "fixed"}
+    return save_refitted_rig(path, source, surface.vertices, positions, skin=skin)

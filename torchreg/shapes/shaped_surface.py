@@ -35,6 +35,10 @@ class ShapedSurface(SkinSurface):
         """Return the signed distances (B, M) of the data (B, M, 3) in states (B, D + K), metres."""
         return self._oriented_distance(points, *self.shaped.oriented(pose))[0]
 
+    def nearest(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the distances (B, M) of the data in states, and the samples (B, M) that they are from."""
+        return self._oriented_distance(points, *self.shaped.oriented(pose))
+
     def distance_jacobian(self, points: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
         """Return distances (B, M) and their Jacobian (B, M, D + K) in tangent coordinates."""
         posed, normals, jacobian = self.shaped.normal_jacobian(pose)

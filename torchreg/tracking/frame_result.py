@@ -93,4 +93,6 @@ def track_result(results: Sequence[FrameResult], seconds: Sequence[float]) -> Tr
         acquired=tuple(result.acquired for result in results),
         origin=results[-1].origin,
         shape=results[-1].shape,
+        coefficients=results[-1].coefficients,
+        coefficient_covariance=results[-1].coefficient_covariance,
     )

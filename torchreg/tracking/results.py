@@ -21,7 +21,9 @@ class FrameResult(AlignResult):
     """One frame of a tracked sequence.
 
     Distances of points out of the shape's reach are infinite; ``sigma``, ``cost``, covariance and residual of a frame
-    that was not fitted are NaN, as is everything before the shape was first found.
+    that was not fitted are NaN, as is everything before the shape was first found. Where a tracker fits coefficients
+    too, they are what is known after the frame, and ``shape`` the rig that was followed in it: of these coefficients,
+    or of earlier ones that the surface hardly differs from.
 
     Args:
         covariance: (num_dofs, num_dofs) of the pose in tangent coordinates (base: translation, then a rotation composed
@@ -64,13 +66,15 @@ class TrackResult(Result):
         statuses: how each frame ended.
         acquired: what led to each pose, see `FrameResult`.
         origin: see `AlignResult`.
-        shape: that was followed, see `AlignResult`.
+        shape: that was followed, see `AlignResult`; where coefficients were fitted, that of the last frame.
         up: see `AlignResult`.
+        coefficients: (C,) of the person tracked, where they were fitted, as known after the last frame.
+        coefficient_covariance: (C, C) of them.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
         "poses": "T D", "std": "T D", "keypoints": "T K 3", "inlier_ratios": "T", "residuals": "T", "times": "T",
-        "seconds": "T", "statuses": "T", "acquired": "T",
+        "seconds": "T", "statuses": "T", "acquired": "T", "coefficients": "C", "coefficient_covariance": "C C",
     }  # fmt: skip
 
     poses: Tensor
@@ -85,6 +89,8 @@ class TrackResult(Result):
     origin: Tensor | None = None
     shape: ArticulatedShape | None = field(default=None, metadata=stored_as(record_kept_shape, build_kept_shape))
     up: tuple[float, float, float] | None = None
+    coefficients: Tensor | None = None
+    coefficient_covariance: Tensor | None = None
 
     @property
     def named_poses(self) -> dict[str, Tensor]:
@@ -126,11 +132,14 @@ class TrackState(Result):
         pending_checks: how often a pose found by a search everywhere is still to be compared with another search.
         seed: of all random draws.
         origin: (3,) float64 about which all this is, where clouds lie far from that of coordinates; None elsewhere.
+        coefficients: (C,) of the person tracked, where they are fitted and a frame showed any.
+        coefficient_covariance: (C, C) of them.
+        person: (C,) coefficients of the rig that is followed; another one is made when its surface is off.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
         "pose": "D", "velocity": "D", "points": "N 3", "weights": "N P", "reference_pose": "D", "keyframes": "K D",
-        "unexplained": "S 3", "innovation": "3",
+        "unexplained": "S 3", "innovation": "3", "coefficients": "C", "coefficient_covariance": "C C", "person": "C",
     }  # fmt: skip
 
     frame: int
@@ -156,6 +165,9 @@ class TrackState(Result):
     pending_checks: int = field(metadata=formerly("unsure"))
     seed: int
     origin: Tensor | None = None
+    coefficients: Tensor | None = None
+    coefficient_covariance: Tensor | None = None
+    person: Tensor | None = None
 
     @property
     def found(self) -> bool:

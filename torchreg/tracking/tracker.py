@@ -17,6 +17,7 @@ from torchreg.alignment.align import AlignConfig, align
 from torchreg.alignment.inputs import check_skin, floating_origin, warn_about_degenerate, warn_about_units
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmarks import MeasuredKeypoints
+from torchreg.alignment.person_filter import KnownPerson, PersonFilter
 from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.start_source import StartSource
 from torchreg.capture.depth_frame import DepthFrame
@@ -66,10 +67,17 @@ class Tracker:
         model_points: a skin of the shape, whose points represent its surface; sampled by default (see `sample_skin`).
         locked: degrees of freedom that are held at the initial pose, or at rest without one; see `align`.
         initializer: a network that proposes poses where the shape is lost, see `find_pose`.
+        fit_shape: True to fit the shape's coefficients too, "bones" the lengths and radii of any rig's parts, see
+            `align`. The first frame that shows the shape tells the person, as `align` does; that rig is followed then,
+            and every frame that is not doubtful narrows what is known of its coefficients. The initial pose is one of
+            the mean person.
+
+    Attributes:
+        shape: that is followed; with ``fit_shape`` that of the person, once a frame showed any.
 
     Raises:
-        InputError: if the pose does not fit the shape or is not finite, a locked name is unknown, or the skin is of
-            another shape.
+        InputError: if the pose does not fit the shape or is not finite, a locked name is unknown, the skin is of
+            another shape, or what is given does not go with ``fit_shape``.
 
     References: Dewaele et al. 2006, sections 3 and 5.
     """
@@ -83,8 +91,13 @@ class Tracker:
         model_points: LinearBlendSkin | None = None,
         locked: Sequence[str] | Tensor = (),
         initializer: PoseProposer | HoldsProposer | None = None,
+        fit_shape: bool | str = False,
     ) -> None:
         self.shape, self.config = shape, config or TrackConfig()
+        if fit_shape is not False and not (model_points is None and initializer is None and len(locked) == 0):
+            raise InputError("fit_shape goes without model_points, locked and initializer; leave them out")
+        self._person = None if fit_shape is False else PersonFilter(shape, fit_shape, self.config.seed)
+        self._followed: Tensor | None = None
         if model_points is not None:
             model_points = check_skin(shape, model_points)
         with torch.no_grad():
@@ -117,7 +130,14 @@ class Tracker:
                 f"state must be that of a shape with {dofs} degrees of freedom and {parts} parts, got poses of shape "
                 f"{tuple(state.pose.shape)} and weights of shape {tuple(state.weights.shape)}"
             )
+        count = 0 if self._person is None else len(self._person.space)
+        if state.person is not None and state.person.shape != (count,):
+            raise InputError(
+                f"state must be that of a tracker with {count} coefficients, got {tuple(state.person.shape)} of them; "
+                f"fit_shape must be the same"
+            )
         self._state = state
+        self._follow(state.person)
 
     def step(
         self,
@@ -163,13 +183,13 @@ class Tracker:
             measured = None if measured is None else measured.near(self._state.origin)
         known = self._known(prior)
         state, elapsed = advance_clock(self._state, time)
+        finite = torch.isfinite(cloud).all(-1)
+        frame = Frame(cloud=cloud, finite=finite, elapsed=elapsed, picture=picture, known=known, keypoints=measured)
+        rejection = self._rejection(frame.data)
+        if self._person is not None and state.person is None and rejection is None:
+            state = self._met(self._person, state, frame)
         # A tenth faster than without gradients alone, as most of the time goes to small operations.
         with torch.inference_mode(), one_thread(), self.shape.held_sizes():
-            finite = torch.isfinite(cloud).all(-1)
-            frame = Frame(
-                cloud=cloud, finite=finite, elapsed=elapsed, picture=picture, known=known, keypoints=measured
-            )  # fmt: skip
-            rejection = self._rejection(frame.data)
             if rejection is not None:
                 result, state = self._hold(state, frame, rejection)
             else:
@@ -182,8 +202,13 @@ class Tracker:
                     fit, state = self._recover(state, frame, view, fit)
                 fit, state = self._recover.cross_check(state, frame, fit)
                 result, state = self._accept(state, frame, fit)
+                if self._person is not None and fit is not None and result.statuses[0].usable:
+                    state = _learned(self._person, state, frame, fit)
             self._state = normal_copy(state)
-            found = normal_copy(result)
+            found = normal_copy(replace(
+                result, coefficients=state.coefficients, coefficient_covariance=state.coefficient_covariance
+            ))  # fmt: skip
+        self._follow_closer()
         return found if state.origin is None else found.moved(state.origin)
 
     def run(
@@ -235,6 +260,43 @@ class Tracker:
         if not results:
             raise InputError("frames must hold at least one cloud, got none")
         return track_result(results, seconds)
+
+    def _met(self, person: PersonFilter, state: TrackState, frame: Frame) -> TrackState:
+        """Return the state with the person whom a frame shows, who is followed from now on; itself without one."""
+        start = state.pose if state.found else None
+        met = person.met(frame.data if frame.picture is None else frame.picture, start)
+        if met is None:
+            return state
+        pose, known = met
+        self._follow(known.coefficients)
+        return replace(
+            state, pose=pose, person=known.coefficients, coefficients=known.coefficients,
+            coefficient_covariance=known.covariance,
+        )  # fmt: skip
+
+    def _follow(self, coefficients: Tensor | None) -> None:
+        """Go on with the rig of a person with coefficients (K,), where there is one and it is another."""
+        if self._person is None or coefficients is None:
+            return
+        if self._followed is not None and torch.equal(self._followed, coefficients):
+            return
+        self.shape, self._followed = self._person.rig.with_coefficients(coefficients), coefficients
+        with torch.no_grad():
+            self._fitter = FrameFitter(self.shape, self.config, None)
+            self._recover = Recovery(self._fitter, StartSource.of(self.shape))
+
+    def _follow_closer(self) -> None:
+        """Go on with the rig of the coefficients known by now, where that of the one followed is off."""
+        state = self._state
+        if self._person is None or state.person is None or state.coefficients is None:
+            return
+        if self._person.differs(state.person, state.coefficients):
+            self._follow(state.coefficients)
+            skin = self._fitter.skin
+            self._state = replace(
+                state, person=state.coefficients, points=skin.points, weights=skin.weights,
+                reference_pose=skin.reference_pose,
+            )  # fmt: skip
 
     def _checked_pose(self, pose: Tensor | None) -> Tensor:
         """Return the initial pose (num_dofs,) within the limits, NaN if it is to be found."""
@@ -362,3 +424,13 @@ class Tracker:
         pose = self._fitter.predict(state, frame.elapsed)
         after = replace(state, pose=pose, velocity=decayed_velocity(state, frame.elapsed), lost=state.lost + 1)
         return predicted_result(self._fitter, state, frame, pose, status), after
+
+
+def _learned(person: PersonFilter, state: TrackState, frame: Frame, fit: FrameFit) -> TrackState:
+    """Return the state with what a fit to a frame tells of the coefficients."""
+    if state.coefficients is None or state.coefficient_covariance is None:
+        return state
+    known = KnownPerson(state.coefficients, state.coefficient_covariance)
+    viewpoint = None if frame.picture is None else frame.picture.camera.position - fit.view.origin
+    known = person.learned(known, fit.view.problem.data[0], fit.pose[0], viewpoint)
+    return replace(state, coefficients=known.coefficients, coefficient_covariance=known.covariance)
