@@ -21,9 +21,7 @@ class PoissonFit:
     neighbors: int = 6  # around a point, which tell its share of the surface
     widths: tuple[float, ...] = (1.5, 1.0)  # of the blur under which normals agree; wider ones mix sides of thin limbs
     num_rounds: int = 8  # of new normals for each width
-    turned_after: int = (
-        2  # rounds, the normals of inverted parts are turned over: some parts then still turn themselves
-    )
+    turned_after: int = 2  # rounds, normals of inverted parts are turned over; in between parts turn by themselves
     blur: float = 0.75  # of the indicator function
     level_width: float = 1.5  # of the blur of its values at the points, of which the surface has the mean
     far: float = 0.01  # of the density at the points, below which points are far
