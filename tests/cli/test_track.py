@@ -1,6 +1,7 @@
 """Tracking from the command line: what is printed and written, resumed runs, frames of no use, errors."""
 
 import json
+import re
 from dataclasses import fields
 
 import numpy as np
@@ -363,7 +364,8 @@ def test_the_bones_of_a_rig_are_fitted_over_the_frames(folder, run, error_of, tm
     )  # fmt: skip
     answer = run(*common)
     assert answer.exit_code in (0, 1), answer.output
-    assert "; size 0." in answer.output
+    # An open cone slides along itself as it grows: what its size is, it does not tell.
+    assert re.search(r"; size -?0\.\d\d \+- 0\.\d\d, girth ", answer.output)
     found = load(tmp_path / "r.safetensors")
     assert found.coefficients.shape == (2 + 2 * 3,)
     assert float(found.residuals[-1]) < 0.003

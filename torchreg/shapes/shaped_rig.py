@@ -14,7 +14,6 @@ from torchreg.errors import InputError
 from torchreg.geometry.kinematic_tree import KinematicTree
 from torchreg.geometry.primitives import PRIMITIVE_KINDS
 from torchreg.geometry.rigid import invert_rigid
-from torchreg.io.gltf_refit import save_refitted_rig
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.shape_space import CoefficientPrior, FunctionSpace, LinearSpace, RestFunction, ShapeSpace
@@ -201,4 +200,6 @@ def save_rig(
     frames = shape.frame_transforms(torch.zeros_like(shape.rest)).detach().double()
     # A joint of the file is the first of the frames that its axes are stacked on.
     positions = {joint.name: frames[index, :3, 3] for index, joint in enumerate(tree.joints) if joint.kind == "fixed"}
+    from torchreg.io.gltf_refit import save_refitted_rig
+
     return save_refitted_rig(path, source, surface.vertices, positions, skin=skin)
