@@ -224,6 +224,21 @@ def test_some_parts_alone_equal_a_shape_whose_other_parts_are_far_away(parts):
     torch.testing.assert_close(jacobian, expected_jacobian)
 
 
+def test_distances_without_some_parts_equal_those_of_a_shape_where_they_are_far_away():
+    shape, poses = crane(), torch.stack([pose_with(), pose_with() * 0.5])
+    points = torch.randn(2, 40, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    left_out = [(), (0,), (4, 1), (1, 2, 3)]
+    with torch.no_grad():
+        found = shape.distances_without(points, poses, [*left_out, range(5)])
+        for parts, distances in zip(left_out, found, strict=False):
+            apart = crane()
+            for part in parts:
+                apart.primitives.centers[part] += 1e4
+            torch.testing.assert_close(distances, apart.distance(points, poses))
+    assert found.shape == (5, 2, 40)
+    assert bool(torch.isposinf(found[-1]).all())
+
+
 def test_placed_parts_keep_their_distances_wherever_their_joints_are():
     shape, pose, parts = crane(), pose_with(), [3, 1]
     points = torch.randn(7, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(4))

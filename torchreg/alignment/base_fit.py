@@ -30,7 +30,8 @@ class BaseFitNumbers:
     """Numbers of the fit of a base; lengths are shares of the model's size."""
 
     widths: tuple[float, ...] = (0.09, 0.05, 0.03)  # of the kernel before the last one, which follows from the noise
-    steps: int = 3  # at each of them, and of each round at the last one
+    steps: int = 3  # at each of them
+    last_steps: int = 20  # of each round at the last one, at most
     rounds: int = 8  # at the last one, at most
     atol: float = 1e-4  # change that ends it, metres and radians
     depth_std: float = 0.02  # by which all measured surfaces may lie off the true ones, along their normals
@@ -223,7 +224,11 @@ def fit_base(problem: BaseProblem, state: Tensor, widths: Sequence[float] = BASE
     residual = torch.cat(problem.residuals(state))
     noise = float(surface_noise(residual, torch.ones_like(residual, dtype=torch.bool), problem.size))
     sigma = SURFACE_FIT.width_per_noise * noise
-    state, converged = _solve(problem, state, sigma, noise, BASE_FIT.rounds)
+    for _ in range(BASE_FIT.rounds):
+        before, state = state, _solve(problem, state, sigma, noise, BASE_FIT.last_steps)
+        converged = float((state - before).abs().max()) <= BASE_FIT.atol
+        if converged:
+            break
     return BaseFit(problem=problem, state=state, sigma=sigma, noise=noise, converged=converged)
 
 
@@ -231,19 +236,15 @@ def approach_base(problem: BaseProblem, state: Tensor, widths: Sequence[float] =
     """Return the state after a few steps with a kernel of each of some widths, shares of the size."""
     noise = SURFACE_FIT.max_noise(problem.size)
     for width in widths:
-        state = _solve(problem, state, width * problem.size, noise, 1)[0]
+        state = _solve(problem, state, width * problem.size, noise, BASE_FIT.steps)
     return state
 
 
-def _solve(problem: BaseProblem, state: Tensor, sigma: float, noise: float, rounds: int) -> tuple[Tensor, bool]:
-    """Return the state after rounds of a few steps each: which data are seen, then a fit to those."""
-    for _ in range(rounds):
-        before, seen = state, problem.facing(state)
-        linearize = partial(problem.linearize, seen=seen, sigma=sigma, noise=noise)
-        state = levenberg_marquardt(linearize, state, retract=retract, max_steps=BASE_FIT.steps).state
-        if float((state - before).abs().max()) <= BASE_FIT.atol:
-            return state, True
-    return state, False
+def _solve(problem: BaseProblem, state: Tensor, sigma: float, noise: float, steps: int) -> Tensor:
+    """Return the state after steps on the data that are seen in the given one."""
+    linearize = partial(problem.linearize, seen=problem.facing(state), sigma=sigma, noise=noise)
+    found = levenberg_marquardt(linearize, state, retract=retract, max_steps=steps, atol=BASE_FIT.atol)
+    return found.state
 
 
 def _inverse(hessian: Tensor) -> Tensor:

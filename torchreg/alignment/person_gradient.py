@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -11,8 +13,15 @@ from torchreg.alignment.surface_fit import SURFACE_FIT, surface_noise
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.shaped import ShapedSkin, ShapedTree
 
-# From a fit, whose last steps were as small as its tolerance.
-_NEWTON_STEPS = 2
+
+@dataclass(frozen=True)
+class _Exactness:
+    """How near to where the energy is stationary gradients are taken."""
+
+    steps: int = 2  # of Newton's method, from a fit whose last step was as small as its tolerance
+
+
+_EXACTNESS = _Exactness()
 
 
 class PairedPlanes:
@@ -79,7 +88,7 @@ def person_with_gradients(
     origin = problem.origin.clone()
     centered = torch.where(valid.clone().unsqueeze(-1), points.to(data) - origin, 0.0).unsqueeze(0)
     start = problem.prior.mean.clone()
-    exact = fixed.newton_steps(state.clone(), centered, start, _NEWTON_STEPS)
+    exact = fixed.newton_steps(state.clone(), centered, start, _EXACTNESS.steps)
     found = (state.clone() + (attach_gradients(fixed, exact, centered, start) - exact))[0]
     pose, coefficients = found.tensor_split([shape.num_dofs])
     return torch.cat([pose[:3] + origin[0], pose[3:]]), coefficients

@@ -31,8 +31,6 @@ from torchreg.solvers.robust import welsch_loss, welsch_weight
 INLIER_SHARE = 0.02
 # Weight of the prior in a score, in outliers per half squared standard deviation.
 PRIOR_SHARE = 0.3
-# Standard deviations of what is known beforehand within which poses are sought: beyond lies 1 in 400.
-PRIOR_REACH = 3.0
 # Revolute joints with one center make a ball joint from this number on.
 BALL_AXES = 3
 # So many model points follow the surface as closely as a sampling made for that.
@@ -136,13 +134,17 @@ class AlignProblem:
         space = None if self.free_space is None else self.free_space.for_skin(skin)
         return replace(self, skin=skin, free_space=space)
 
-    def plausible_limits(self) -> tuple[Tensor, Tensor]:
-        """Return the limits (B, num_dofs) of the pose, narrowed to where what is known beforehand has it."""
+    def plausible_limits(self, reach: float) -> tuple[Tensor, Tensor]:
+        """Return the limits (B, num_dofs) of the pose, narrowed to where what is known beforehand has it.
+
+        Args:
+            reach: about its mean, standard deviations.
+        """
         lower, upper = (limit.expand_as(self.prior.mean) for limit in (self.lower, self.upper))
         if self.told_precision is None:
             return lower, upper
-        reach = PRIOR_REACH * self.told_precision.rsqrt()
-        low, high = self.prior.mean - reach, self.prior.mean + reach
+        width = reach * self.told_precision.rsqrt()
+        low, high = self.prior.mean - width, self.prior.mean + width
         return torch.minimum(torch.maximum(low, lower), upper), torch.maximum(torch.minimum(high, upper), lower)
 
     def at_most_told(self, std: Tensor) -> Tensor:

@@ -60,7 +60,8 @@ def find_limbs(shape: Articulation) -> tuple[list[Limb], list[int]]:
     """
     if shape not in _FOUND:
         _FOUND[shape] = _find_limbs(shape)
-    return _FOUND[shape]
+    limbs, trunk = _FOUND[shape]
+    return list(limbs), list(trunk)
 
 
 _FOUND: WeakKeyDictionary[Articulation, tuple[list[Limb], list[int]]] = WeakKeyDictionary()
