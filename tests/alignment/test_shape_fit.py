@@ -13,7 +13,7 @@ from torchreg.errors import InputError
 from torchreg.geometry.facing_normals import facing_normals
 from torchreg.geometry.mesh import TriangleMesh, sample_surface
 from torchreg.geometry.neighbors import nearest_neighbor
-from torchreg.geometry.rotation import so3_exp
+from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
 from torchreg.result import Status
 from torchreg.shapes.limbs import Body, Limb
 from torchreg.solvers.e_step import expectation
@@ -196,6 +196,24 @@ def test_a_person_is_found_without_a_start(shape):
     _, off = nearest_neighbor(shape.vertices(result.pose, result.coefficients), shape.vertices(pose, coefficients))
     assert float(off.mean()) < 0.02
     assert float(result.evidence[-1]) < 1, "no rival was compared"
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_a_person_found_leaning_is_set_upright(shape, seed, monkeypatch):
+    coefficients = torch.tensor([0.9, -0.8, 0.4])
+    pose, data = scan(shape, coefficients, seed, count=600)
+
+    def leaning(problem, rig, people, count, generator):
+        """The mean person at rest who leans by 50 degrees to the side, as the camera sees it."""
+        state = torch.cat([shape.rest_pose(), torch.zeros(3)]).unsqueeze(0)
+        state[0, 3:6] = compose_rotation_vectors(torch.tensor([0.0, math.radians(50), 0.0]), pose[3:6])
+        state[:, :3] += problem.data[0].mean(0) - problem.skin(state)[0].mean(0)
+        return state
+
+    monkeypatch.setattr("torchreg.alignment.shape_fit.find_people", leaning)
+    result = align(shape, data, fit_shape=True, config=QUICK)
+    off = (shape.vertices(result.pose, result.coefficients) - shape.vertices(pose, coefficients)).norm(dim=-1)
+    assert float(off.mean()) < 0.02
 
 
 def test_a_person_in_what_is_none_is_doubtful(shape):

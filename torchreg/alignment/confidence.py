@@ -55,9 +55,14 @@ def pose_confidence(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor
 
 def explains(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor:
     """Return the same (B,) but for what no data determine, which no search would find either."""
+    left = left_over(problem, pose)
+    return (1 - (-lead.clamp_min(0) / EVIDENCE.lead).exp()) * (-left / EVIDENCE.left_over).exp()
+
+
+def left_over(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return how many data (B,) lie beside the surface or in dense clusters, as a share of those on it."""
     clustered, near = clustered_data(problem, pose)
-    left_over = clustered.to(pose) / near.clamp_min(1) + beside_share(problem, pose)
-    return (1 - (-lead.clamp_min(0) / EVIDENCE.lead).exp()) * (-left_over / EVIDENCE.left_over).exp()
+    return clustered.to(pose) / near.clamp_min(1) + beside_share(problem, pose)
 
 
 def is_misfit(problem: AlignProblem, pose: Tensor) -> Tensor:

@@ -12,8 +12,9 @@ from torchreg.alignment.limb_search import distinct_first, take_rows
 from torchreg.alignment.pose_search import mean_distances
 from torchreg.alignment.problem import AlignProblem
 from torchreg.alignment.rough_poses import register_rigidly, spread_rotations, typical_poses
-from torchreg.geometry.rotation import so3_log
+from torchreg.geometry.rotation import compose_rotation_vectors, so3_log
 from torchreg.shapes.articulation import Articulation
+from torchreg.shapes.pose_algebra import BASE_DOFS, shifted
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,7 @@ class _PersonSearch:
     num_compared: int = 400  # best candidates, among which different ones are sought
     same: float = 0.06  # as a share of the size: candidates whose points differ by less are duplicates
     other: float = 0.05  # the same, of fitted people: what differs by more is a rival
+    turn: float = math.pi / 6  # by which people are turned anew: as far as the rotations of the search are apart
 
 
 _SEARCH = _PersonSearch()
@@ -59,6 +61,24 @@ def find_people(
     best = take_rows(registered, costs.argsort(1)[:, : _SEARCH.num_compared])
     order = distinct_first(mean_distances(problem, best) < _SEARCH.same * problem.size)
     return take_rows(best, order[:, :count])[0]
+
+
+def turned_people(problem: AlignProblem, state: Tensor, num_dofs: int) -> Tensor:
+    """Return a person (D + K,) turned to both sides about each axis of space, joints as the prior has them, (6, D + K).
+
+    A person that leans explains one leg by the other, whose own data are left; no step leads upright from there.
+
+    Args:
+        problem: of one scan.
+        state: fitted; its size is kept.
+        num_dofs: D, of the pose.
+    """
+    axes = torch.eye(3).to(state)
+    turned = state.repeat(6, 1)
+    turned[:, BASE_DOFS:num_dofs] = problem.prior.mean[:1, BASE_DOFS:num_dofs]
+    middle = problem.skin(state.unsqueeze(0)).mean(-2)
+    turned[:, 3:BASE_DOFS] = compose_rotation_vectors(_SEARCH.turn * torch.cat([axes, -axes]), turned[:, 3:BASE_DOFS])
+    return shifted(turned, middle - problem.skin(turned).mean(-2))
 
 
 def lead_over_rivals(problem: AlignProblem, states: Tensor, costs: Tensor) -> Tensor:

@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchreg.alignment.annealed_em import ANNEALING, OnStep, StageResult, anneal
-from torchreg.alignment.confidence import end_variances
+from torchreg.alignment.confidence import EVIDENCE, end_variances, left_over
 from torchreg.alignment.objectives import GaussianPosePrior
-from torchreg.alignment.person_search import find_people, lead_over_rivals
+from torchreg.alignment.person_search import find_people, lead_over_rivals, turned_people
 from torchreg.alignment.problem import (
     BROAD_PRIOR,
     joint_precision,
@@ -157,6 +157,8 @@ def fit_coefficients(
     coarse, state = coarse.rows(kept), found.pose[kept]
     state = fit_surface(coarse, state, steps=SHAPE_FIT.coarse_steps, on_step=on_step).pose
     state = _placed_again(coarse, state, config, on_step)
+    if poses is None:
+        state = _turned_anew(coarse, state, shape.num_dofs, config, on_step)
     costs = coarse.cost_of_people(state)
     lead = lead_over_rivals(coarse, state, costs) if poses is None else None
     best = problem.people(costs.argmin().unsqueeze(0))
@@ -183,6 +185,22 @@ def _placed_again(problem: ShapeProblem, state: Tensor, config: AlignConfig, on_
     found = fit_surface(problem, found, steps=SHAPE_FIT.coarse_steps, on_step=on_step).pose
     better = problem.cost_of_people(found) < problem.cost_of_people(state)
     return torch.where(better.repeat_interleave(problem.scans).unsqueeze(-1), found, state)
+
+
+def _turned_anew(
+    problem: ShapeProblem, state: Tensor, num_dofs: int, config: AlignConfig, on_step: OnStep | None
+) -> Tensor:
+    """Return people (B, D + K) found in one scan, the best of them turned and annealed again if data are left over."""
+    costs = problem.cost_of_people(state)
+    best = costs.argmin().unsqueeze(0)
+    if float(left_over(problem.rows(best), state[best])) <= EVIDENCE.left_over:
+        return state
+    turned = turned_people(problem.rows(best), state[best[0]], num_dofs)
+    wide, widths = problem.rows(best.expand(len(turned))), ANNEALING.schedule(problem.size, SHAPE_FIT.em_steps)
+    found = anneal(wide, turned, widths, em_steps=config.em_steps, m_steps=config.m_steps, on_step=on_step).pose
+    found = fit_surface(wide, found, steps=SHAPE_FIT.coarse_steps, on_step=on_step).pose
+    again, choice = wide.cost_of_people(found).min(0)
+    return state.index_copy(0, best, found[choice].unsqueeze(0)) if float(again) < float(costs[best]) else state
 
 
 def _with_learned_spread(
