@@ -392,7 +392,7 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
             show(f"pictures, search {search}", real_pictures(hand(), options.data / "hand_depth", search))
     if options.only_proposed:
         return tell_bars(figures)
-    figures["gradient"] = gradient_error(generator(0), 150 if options.smoke else NUM_POINTS)
+    figures["gradient"] = gradient_error(generator(0), 60 if options.smoke else NUM_POINTS)
     show("gradient", figures["gradient"])
     figures["start"] = from_starts(hand(), batches, generator(1), device)
     show("start", figures["start"])
