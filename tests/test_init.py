@@ -23,8 +23,8 @@ def run(code, cwd):
 def test_import_is_light_and_a_used_name_brings_torch(tmp_path):
     heavy = "{'torch', 'numpy', 'scipy', 'matplotlib', 'trimesh', 'kornia', 'typer', 'pytorch_kinematics'}"
     code = (
-        f"import sys, torchreg; dir(torchreg); torchreg.errors.InputError; print(*({heavy} & set(sys.modules)), 'then');"
-        "torchreg.metrics.chamfer; print('torch' in sys.modules)"
+        "import sys, torchreg; dir(torchreg); torchreg.errors.InputError;"
+        f"print(*({heavy} & set(sys.modules)), 'then'); torchreg.metrics.chamfer; print('torch' in sys.modules)"
     )
     assert run(code, tmp_path) == ["then", "True"]
 
