@@ -421,10 +421,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--kept", type=Path, help="file of measured cases, to go on with; of this version only")
     parser.add_argument("--smoke", action="store_true", help="four alignments")
     options = parser.parse_args(arguments)
-    things = subjects(None if options.smoke else options.data)
-    things = [thing for thing in things if options.only in (None, thing.name)]
-    if not things:
+    data = None if options.smoke else options.data
+    if data is None and options.only not in (None, "hand"):
         parser.error(f"--only {options.only} needs --data")
+    things = [thing for thing in subjects(data) if options.only in (None, thing.name)]
     count = 4 if options.smoke else options.count
     cases = collect(things, range(count), options.kept)
     if options.calibrate:

@@ -332,16 +332,16 @@ def gradient_error(generator: torch.Generator, num_points: int = NUM_POINTS) -> 
     weights = torch.randn(1, 21, 3, generator=generator, dtype=torch.float64)
     direction = torch.randn(points.shape, generator=generator, dtype=torch.float64)
 
-    def function(cloud: Tensor) -> Tensor:
-        return (weights * layer(cloud.requires_grad_(), start=start).keypoints).sum()
-
-    leaf = points.clone()
-    value = function(leaf)
+    leaf = points.clone().requires_grad_()
+    value = (weights * layer(leaf, start=start).keypoints).sum()
     begin = time.perf_counter()
     (gradient,) = torch.autograd.grad(value, leaf)
     seconds = time.perf_counter() - begin
     size = 1e-6
-    values = [float(function(points + shift * size * direction).detach()) for shift in (-2, -1, 1, 2)]
+    # Side by side, as a batch takes hardly longer than one.
+    shifts = torch.tensor([-2.0, -1.0, 1.0, 2.0], dtype=torch.float64).view(-1, 1, 1)
+    moved = layer((points + size * shifts * direction).requires_grad_(), start=start.expand(4, -1))
+    values = (weights * moved.keypoints).sum((-2, -1)).tolist()
     slope = (8 * (values[2] - values[1]) - (values[3] - values[0])) / (12 * size)
     return {"relative_error": abs(float((gradient * direction).sum()) / slope - 1), "backward_seconds": seconds}
 

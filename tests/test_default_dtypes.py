@@ -89,7 +89,9 @@ def scans(dtype):
 def align(dtype):
     cloud, pose = hand_cloud()
     hand = tr.Hand(dtype=dtype)
-    found = tr.align(hand, cloud.to(dtype), initial_pose=pose.to(dtype) + 0.02)
+    # Searches are those of `find_pose` below.
+    config = tr.AlignConfig(search="never")
+    found = tr.align(hand, cloud.to(dtype), initial_pose=pose.to(dtype) + 0.02, config=config)
     return [found.pose, found.keypoints, found.distances, found.posterior, found.cost, found.sigma]
 
 
@@ -99,8 +101,8 @@ def find_pose(dtype):
 
 
 def track(dtype):
-    cloud = finger_cloud().to(dtype)
-    found = tr.Tracker(finger(dtype)).run([cloud, cloud + 0.002])
+    shape, cloud = finger(dtype), finger_cloud().to(dtype)
+    found = tr.Tracker(shape, shape.rest_pose()).run([cloud, cloud + 0.002])
     return [found.poses, found.keypoints]
 
 

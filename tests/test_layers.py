@@ -6,6 +6,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -84,8 +85,9 @@ class Import:
     lazy: bool
 
 
-def imports_of(source: str, path: str) -> Iterator[Import]:
-    """Yield every import in the source of torchreg/``path``, relative ones resolved."""
+@cache
+def imports_of(source: str, path: str) -> tuple[Import, ...]:
+    """Return every import in the source of torchreg/``path``, relative ones resolved."""
     package = ["torchreg", *Path(path).parts[:-1]]
 
     def walk(node: ast.AST, lazy: bool) -> Iterator[Import]:
@@ -101,7 +103,7 @@ def imports_of(source: str, path: str) -> Iterator[Import]:
         for child in ast.iter_child_nodes(node):
             yield from walk(child, lazy or in_function or for_types)
 
-    yield from walk(ast.parse(source), lazy=False)
+    return tuple(walk(ast.parse(source), lazy=False))
 
 
 def unit_of(path: str) -> str:
@@ -215,14 +217,21 @@ def test_the_door_check_tells_right_from_wrong(path, source, count):
     assert len(door_problems(source, path)) == count
 
 
+@cache
+def names_taken() -> list[tuple[str, str, str]]:
+    """Return what modules take from others: the package of the one, the other's name, and what is taken."""
+    return [
+        (unit_of(path), f"{node.module}.", name.name)
+        for path in sources()
+        for node in ast.walk(ast.parse((PACKAGE / path).read_text(encoding="utf-8")))
+        if isinstance(node, ast.ImportFrom)
+        for name in node.names
+    ]
+
+
 @pytest.mark.parametrize("system", sorted(SYSTEMS))
 def test_every_door_is_used(system):
-    used = set()
-    for path in sources():
-        if unit_of(path) != system:
-            tree = ast.parse((PACKAGE / path).read_text(encoding="utf-8"))
-            imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-            used |= {a.name for node in imports if f".{system}." in f"{node.module}." for a in node.names}
+    used = {name for unit, module, name in names_taken() if unit != system and f".{system}." in module}
     assert doors_of(system) - {*tr.__all__} <= used
 
 

@@ -92,9 +92,9 @@ def test_every_mode_of_differentiation(reduction):
     loss = EMLoss(0.3, reduction=reduction)
     inputs = (posed.clone().requires_grad_(), data.clone().requires_grad_())
     assert torch.autograd.gradcheck(
-        lambda x, y: loss(x, y, mask), inputs, check_forward_ad=True, check_batched_grad=True
+        lambda x, y: loss(x, y, mask), inputs, check_forward_ad=True, check_batched_grad=True, fast_mode=True
     )
-    assert torch.autograd.gradgradcheck(lambda x, y: loss(x, y, mask), inputs)
+    assert torch.autograd.gradgradcheck(lambda x, y: loss(x, y, mask), inputs, fast_mode=True)
     for argument in (0, 1):
         forward, reverse = (mode(loss, argnums=argument)(posed, data, mask) for mode in (jacfwd, jacrev))
         torch.testing.assert_close(forward, reverse)
@@ -220,7 +220,7 @@ def test_backpropagation_holds_no_matrix_of_all_pairs():
     code = """
 import resource, torch
 from torchreg.alignment.em_loss import EMLoss
-posed, data = torch.rand(8000, 3, requires_grad=True), torch.rand(8000, 3)
+posed, data = torch.rand(6000, 3, requires_grad=True), torch.rand(6000, 3)
 loss = EMLoss(0.05)
 loss(posed[:10], data[:10]).backward()
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -230,7 +230,7 @@ print(before, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
     before, after = (int(kilobytes) / 1024 for kilobytes in run.stdout.split())
-    # The dense matrix alone would add 256 MB, and autograd would keep several.
+    # The dense matrix alone would add 144 MB, and autograd would keep several.
     assert after - before < 100
 
 

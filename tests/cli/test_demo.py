@@ -1,8 +1,6 @@
 """The demonstration: what it prints and writes, also when it is interrupted."""
 
 import json
-import subprocess
-import sys
 
 import torch
 
@@ -17,9 +15,8 @@ from torchreg.tracking.tracker import Tracker
 
 def test_the_demonstration_runs(run, tmp_path):
     out = tmp_path / "made" / "demo"
-    command = [sys.executable, "-m", "torchreg", "demo", "--frames", "3", "-o", str(out)]
-    answer = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=tmp_path)
-    assert answer.returncode == 0, answer.stderr
+    answer = run("demo", "--frames", "3", "-o", out)
+    assert answer.exit_code == 0, answer.output
     names = ["hand.glb", "poses.json", "track.json", "track.safetensors", "tracking.gif"]
     assert sorted(path.name for path in out.iterdir()) == names
     result = load(out / "track.safetensors")

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,13 @@ def probe_sweep():
         return SweepConfig(name, "probe", "does it work?", trial or ProbeTrial(), **settings)
 
     return make
+
+
+@pytest.fixture(scope="session")
+def loaded_sweep():
+    """Return the function that loads a configuration of the repository, which is not to be changed, once."""
+    compose = pytest.importorskip("experiments.compose", reason="experiments take the extra experiments")
+    return cache(compose.load_sweep)
 
 
 @pytest.fixture

@@ -174,8 +174,8 @@ def test_no_task_has_a_field_that_a_sweep_has_too():
 
 
 @pytest.mark.parametrize("name", known_configs())
-def test_every_configuration_of_the_repository_fits_its_schema(name):
-    sweep = load_sweep(name)
+def test_every_configuration_of_the_repository_fits_its_schema(name, loaded_sweep):
+    sweep = loaded_sweep(name)
     trials = planned_trials(sweep)
     assert trials
     assert name.startswith(sweep.task)
@@ -185,8 +185,8 @@ def test_every_configuration_of_the_repository_fits_its_schema(name):
 
 
 @pytest.mark.parametrize("name", [name for name in known_configs() if "smoke" not in name])
-def test_every_configuration_has_a_smoke_twin(name):
-    small, full = load_sweep(f"{name}_smoke"), load_sweep(name)
+def test_every_configuration_has_a_smoke_twin(name, loaded_sweep):
+    small, full = loaded_sweep(f"{name}_smoke"), loaded_sweep(name)
     assert (CONFIGS / f"{name}_smoke.yaml").read_text().startswith("defaults:")
     assert len(planned_trials(small)) <= max(4, len(planned_trials(full)) // 4)
     assert small.seeds == 1

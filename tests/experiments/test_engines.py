@@ -67,7 +67,7 @@ def wait_for_records(store, count, driver, timeout=60):
         time.sleep(0.01)
 
 
-@pytest.mark.parametrize(("engine_name", "kills"), [("local", 3), ("ray", 1), ("slurm", 2)], indirect=["engine_name"])
+@pytest.mark.parametrize(("engine_name", "kills"), [("local", 2), ("ray", 1), ("slurm", 2)], indirect=["engine_name"])
 def test_a_driver_may_be_killed_at_any_moment(engine_name, kills, tmp_path, start_driver):
     """Then every trial has one result, and no finished one ran again."""
     sweep, log = tmp_path / "many.yaml", tmp_path / "log"
@@ -97,7 +97,8 @@ def test_a_driver_may_be_killed_at_any_moment(engine_name, kills, tmp_path, star
             assert (path.stat().st_ino, path.read_bytes()) == before
     # A trial starts again only if it was cut off: at most two at a time, at every kill.
     assert 24 <= len(log.read_text().splitlines()) <= 24 + 2 * kills
-    again = start_driver(*command, *ENGINES[engine_name])
+    # Whatever ran them, another engine, which starts soonest, finds them finished.
+    again = start_driver("sweep", sweep, "--results", tmp_path / "results")
     told, _ = again.communicate(timeout=60)
     assert "24 trials: 0 run now, 24 finished before" in told
 
@@ -143,7 +144,9 @@ def test_all_engines_find_the_same_bit_for_bit(tmp_path, ray_cluster, monkeypatc
     found = {}
     for name in (*ENGINES, "none"):
         store = Store(tmp_path / name)
-        start = (lambda: inline_engine) if name == "none" else (lambda name=name: make_engine(name, config(name)))
+        start = (
+            (lambda: inline_engine) if name == "none" else (lambda name=name: make_engine(name, config(name, jobs=1)))
+        )
         run_sweep(sweep, store, start, engine_name=name)
         found[name] = result = only_record(store, sweep)
         assert (result.status, result.engine) == ("done", name), result.traceback

@@ -190,7 +190,7 @@ def test_a_linear_problem_is_solved_in_a_few_steps():
     torch.testing.assert_close(result.state[0], torch.linalg.lstsq(a, b).solution, atol=1e-9, rtol=0)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.integers(0, 100_000))
 def test_bounded_linear_problems_meet_the_optimality_conditions(seed):
     generator = torch.Generator().manual_seed(seed)
@@ -210,7 +210,7 @@ def test_bounded_linear_problems_meet_the_optimality_conditions(seed):
     assert float(torch.where(x == high, gradient, 0).max()) < 1e-5
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.integers(0, 100_000))
 def test_an_increase_is_never_accepted(seed):
     generator = torch.Generator().manual_seed(seed)

@@ -41,6 +41,10 @@ class _HeldSizes:
 # Belongs to the running thread, not to the shape, which other threads may use at the same time.
 _HELD: ContextVar[_HeldSizes | None] = ContextVar("torchreg held sizes", default=None)
 
+# The latest meshes of fused surfaces: every call of `align` or `find_pose` without model points asks for the same one.
+_MESHES: dict[tuple[object, ...], TriangleMesh] = {}
+_NUM_MESHES = 8
+
 
 class Articulation(PosedTree):
     """Parts on a kinematic tree and their fused surface, in any pose: the basis of skins and of shapes from files.
@@ -322,12 +326,26 @@ class Articulation(PosedTree):
             check_positive(spacing, "spacing")
         lower, upper = self._surface_box(pose)
         spacing = max(self.nu, _least_spacing(lower, upper)) if spacing is None else spacing
-        return isosurface(lambda points: self.distance(points, pose), lower, upper, spacing)
+        key = self._surface_key(pose, spacing)
+        mesh = _MESHES.get(key)
+        if mesh is None:
+            mesh = _MESHES[key] = isosurface(lambda points: self.distance(points, pose), lower, upper, spacing)
+            for old in list(_MESHES)[:-_NUM_MESHES]:
+                _MESHES.pop(old, None)
+        return TriangleMesh(mesh.vertices.clone(), mesh.faces.clone())
 
     def coarse_surface_mesh(self) -> TriangleMesh:
         """Return a mesh of the fused surface at rest as `surface_mesh`, on a grid of 1.5 fusion lengths or wider."""
         pose = self.rest_pose()
         return self.surface_mesh(pose, max(1.5 * self.nu, _least_spacing(*self._surface_box(pose))))
+
+    @torch.no_grad()
+    def _surface_key(self, pose: Tensor, spacing: float) -> tuple[object, ...]:
+        """Return everything that the mesh of the fused surface depends on."""
+        frames = self._solid_frames(self.part_transforms(pose))
+        values = [frames, *self._scaled_sizes(), self.adjacency, self.fusion_length()]
+        numbers = tuple(value.double().cpu().numpy().tobytes() for value in values)
+        return self.primitives.part_kinds, spacing, self.rest.dtype, self.rest.device, numbers
 
     @torch.no_grad()
     def _surface_box(self, pose: Tensor) -> tuple[Tensor, Tensor]:

@@ -303,7 +303,7 @@ def sample_skin(
     Raises:
         InputError: if ``count`` is not positive.
 
-    Cost: meshing the fused surface takes about half a second; keep the skin when aligning many clouds.
+    Cost: meshing the fused surface takes about half a second; the meshes of the latest shapes are kept.
     """
     check_count(count, "count", 1)
     mesh = shape.surface_mesh() if shape.surface is None else TriangleMesh(

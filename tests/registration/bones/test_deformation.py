@@ -115,7 +115,9 @@ def test_gradients(blend):
         return own + torch.func.functional_call(model, values, (points, transforms))
 
     inputs = (points, model.transforms, *(getattr(model, name) for name in names))
-    assert torch.autograd.gradcheck(posed, tuple(value.detach().clone().requires_grad_() for value in inputs))
+    assert torch.autograd.gradcheck(
+        posed, tuple(value.detach().clone().requires_grad_() for value in inputs), fast_mode=True
+    )
 
 
 def test_twists_turn_bones_about_their_middles():
@@ -216,16 +218,6 @@ def test_moments_are_those_of_the_normalized_weights():
     mass = model.joint_moments().mass
     torch.testing.assert_close(mass, random_model().joint_moments().mass)
     torch.testing.assert_close(model.joint_moments(pairs=torch.tensor([[1, 2]])).mass, mass[2:])
-
-
-@pytest.mark.parametrize("blend", ["linear", "dual_quaternion"])
-def test_compiles_whole_and_exports(blend):
-    model, points = random_model(blend), bar(20, 1)
-    expected = model(points)
-    torch.testing.assert_close(torch.compile(model, fullgraph=True, backend="eager")(points), expected)
-    count = torch.export.Dim("count", min=2, max=100)
-    program = torch.export.export(model, (points,), dynamic_shapes=({0: count},))
-    torch.testing.assert_close(program.module()(bar(30, 2)), model(bar(30, 2)))
 
 
 def test_moves_between_dtypes_and_into_records():
