@@ -340,6 +340,21 @@ def test_the_mesh_lies_on_the_surface_in_any_pose():
     assert 100 < len(coarse.vertices) < len(mesh.vertices)
 
 
+def test_a_mesh_that_is_asked_for_again_is_that_of_the_shape_as_it_is_now():
+    shape = crane(torch.float32)
+    mesh = shape.surface_mesh(spacing=0.08)
+    kept = mesh.vertices.clone()
+    mesh.vertices.zero_()
+    assert torch.equal(shape.surface_mesh(spacing=0.08).vertices, kept), "what a caller does to a mesh is the caller's"
+    with torch.no_grad():
+        for name, value in shape.state_dict().items():
+            if name.startswith("primitives.sizes"):
+                value.mul_(1.3)
+    changed = shape.surface_mesh(spacing=0.08)
+    assert float(shape.distance(changed.vertices, shape.rest_pose()).abs().quantile(0.9)) < 0.3 * shape.nu
+    assert not torch.equal(changed.vertices, kept)
+
+
 def ball():
     return Primitive("ellipsoid", (1.0, 1.0, 1.0), torch.eye(4))
 
