@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_count, warn_about_rounding
+from torchreg._threads import one_thread
 from torchreg.errors import InputError
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import TriangleMesh
@@ -184,6 +185,7 @@ def extract_spine(
 
 
 @torch.no_grad()
+@one_thread()
 def _joined_spine(
     surfaces: FrameSurfaces, found: Sequence[FrameSkeleton], known: PriorSkeleton | None, times: Tensor | None,
     config: SpineConfig, *, workers: int | None, progress: str | os.PathLike[str] | None,
@@ -191,7 +193,7 @@ def _joined_spine(
     """Return the spine of surfaces whose skeletons were found."""
     skeletons, relations = [smooth_rough_limbs(skeleton) for skeleton, _ in found], [row for _, row in found]
     known = known and known.fitted(skeletons, config.num_tips)
-    names = _named_tips(skeletons, relations, config, known)
+    names = _named_tips(skeletons, relations, config, known, workers)
     # Section 4.3: the first factor of eq. 3, then G imposed.
     graph = _most_frequent_graph(skeletons, names.labels) if known is None else known.graph
     observed = _observed_limbs(skeletons, names.labels, graph, config.num_samples, known)
@@ -242,13 +244,14 @@ def _check_settings(
 
 
 def _named_tips(
-    skeletons: Sequence[Skeleton], relations: Sequence[TipRelations], config: SpineConfig, prior: PriorSkeleton | None
-) -> TipNames:
+    skeletons: Sequence[Skeleton], relations: Sequence[TipRelations], config: SpineConfig, prior: PriorSkeleton | None,
+    workers: int | None,
+) -> TipNames:  # fmt: skip
     """Return the names of the tips in all frames."""
     if config.printed:
         labels, reference = track_tips_rigidly(skeletons, config.num_tips)  # section 4.2, eqs. 6-8
         return TipNames(labels=labels, confidence=(labels >= 0).double(), reference=reference)
-    return track_tips(skeletons, config.num_tips, None if prior is None else prior.skeleton, relations)
+    return track_tips(skeletons, config.num_tips, None if prior is None else prior.skeleton, relations, workers)
 
 
 def _most_frequent_graph(skeletons: Sequence[Skeleton], labels: Tensor) -> LimbGraph:

@@ -137,11 +137,15 @@ class NameModel:
 
     def first_scores(self, features: Tensor) -> Tensor:
         """Return the log-probability ratios (P,) of features (P, n) of a frame by itself to the background."""
+        if self.weight == 0:
+            return features.new_zeros(len(features))
         scores = self.density(features - self.mean) - self._background_scores(features)
         return self.weight * scores.sum(-1)
 
     def next_scores(self, before: Tensor, after: Tensor) -> Tensor:
         """Return those (A, B) of features (B, n) after a frame with features (A, n)."""
+        if self.weight == 0:
+            return after.new_zeros(len(before), len(after))
         correlation = torch.zeros_like(self.mean)
         for group, value in zip(self.features.groups, self.correlation, strict=True):
             correlation[group.index] = value

@@ -40,6 +40,7 @@ def track_tips(
     num_tips: int | None = None,
     prior: Skeleton | None = None,
     relations: Sequence[TipRelations] | None = None,
+    workers: int | None = 1,
 ) -> TipNames:
     """Return the names of the tips in all frames.
 
@@ -54,6 +55,7 @@ def track_tips(
         num_tips: K; the most frequent number by default.
         prior: float64 and of the size of the frames; names are the numbers of its tips.
         relations: of the tips along the surface of each frame; by default those along the skeleton.
+        workers: processes, see `name_over_time`.
 
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.2.
     """
@@ -69,7 +71,7 @@ def track_tips(
     else:
         reference, names = _fit_prior(prior, skeletons, _evenly([k for k, flag in enumerate(clean) if flag]))
     relations = [_along_skeleton(skeleton) for skeleton in skeletons] if relations is None else relations
-    return name_over_time(observe_tips(skeletons, relations), reference, names)
+    return name_over_time(observe_tips(skeletons, relations), reference, names, workers)
 
 
 def most_frequent_count(counts: Sequence[int]) -> int:
