@@ -9,6 +9,7 @@ hidden ones too, from its true place. Needs `pip install "torchreg-articulated[a
     python benchmarks/shape_fit.py                             # bodies, 10 seeds
     python benchmarks/shape_fit.py --kind hand.R
     python benchmarks/shape_fit.py --rivals 2                  # also the rivals, on the first two seeds
+    python benchmarks/shape_fit.py --part search --seeds 20    # people who are found without a start
     python benchmarks/shape_fit.py --part shared               # several scans of one person
     python benchmarks/shape_fit.py --part growth               # seconds by numbers of vertices and points
     python benchmarks/shape_fit.py --part bones --data DIR     # lengths of the bones of DIR/rigs/*.glb, and their files
@@ -48,6 +49,8 @@ SPREAD, NUM_POINTS, OUTLIER_SHARE, MARGIN = math.radians(12), 4000, 0.05, 0.1
 PIXELS, DISTANCE, HEIGHT = 700, 1.7, 0.1
 # Of a body and of a hand: noise and uncertainty of the place in metres, bar of the mean error in millimeters.
 KINDS = {"body": (0.003, 0.1, 15.0), "hand.R": (0.001, 0.01, 3.0), "hand.L": (0.001, 0.01, 3.0)}
+# Of people found without a start, a share of the size: 25 mm of 1.7 m; and how many of them, at least.
+FOUND, FOUND_BAR = 0.015, 0.8
 # Of the shared fit: height of a person in metres.
 HEIGHT_BAR = 0.02
 # Of bones: growth of the whole, of radii, standard deviation of joints in radians, noise as a share of the diagonal.
@@ -202,6 +205,23 @@ def compare(kind: str, seeds: int, rivals: int) -> bool:
     return sum(ours) / len(ours) <= bar
 
 
+def search(kind: str, seeds: int) -> bool:
+    """Print the errors of people found without a start; return whether enough are found."""
+    model, shape = load_model(kind), tr.ArticulatedShape.from_anny(kind)
+    found, sure = [], []
+    for seed in range(seeds):
+        person = make_person(model, kind, shape.part_names[0], seed)
+        vertices, result, seconds = fit(shape, person, None)
+        extent = float((person.vertices.amax(0) - person.vertices.amin(0)).norm())
+        found.append(error_mm(vertices, person) <= 1e3 * FOUND * extent)
+        sure.append(result.status is tr.Status.CONVERGED)
+        print(f"{kind} seed {seed}: {error_mm(vertices, person):.1f} mm; confidence {float(result.confidence):.2f}, "
+              f"{result.status.value}; {seconds:.1f} CPU s", flush=True)  # fmt: skip
+    wrong = sum(told and not right for told, right in zip(sure, found, strict=True))
+    print(f"within {FOUND:.1%} of the size: {sum(found)} of {seeds}; {wrong} converged and not within")
+    return sum(found) >= FOUND_BAR * seeds
+
+
 def shared(scans: int, seeds: int) -> bool:
     """Print the errors of single fits and of one fit of all scans of a person; return whether the latter is better."""
     model, shape = load_model("body"), tr.ArticulatedShape.from_anny("body")
@@ -354,7 +374,7 @@ def file_report(source: Path, result: tr.AlignResult) -> str:
 def main() -> int:
     """Run what is asked for; 0 if every bar is met."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--part", choices=("single", "shared", "growth", "bones"), default="single")
+    parser.add_argument("--part", choices=("single", "search", "shared", "growth", "bones"), default="single")
     parser.add_argument("--kind", choices=tuple(KINDS), default="body")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--scans", type=int, default=5, help="of one person, with --part shared")
@@ -371,6 +391,8 @@ def main() -> int:
         return 0
     if options.part == "growth":
         return 0 if growth() else 1
+    if options.part == "search":
+        return 0 if search(options.kind, options.seeds) else 1
     if options.part == "shared":
         return 0 if shared(options.scans, options.seeds) else 1
     return 0 if compare(options.kind, options.seeds, options.rivals) else 1

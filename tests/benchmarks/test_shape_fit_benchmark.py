@@ -36,6 +36,23 @@ def test_a_scan_shows_one_side_with_noise_and_outliers(benchmark):
     assert float((seen @ side).quantile(0.01)) > 1 / distance - 0.1
 
 
+def test_people_who_are_found_are_counted(benchmark, capsys, monkeypatch):
+    vertices = torch.rand(50, 3, generator=torch.Generator().manual_seed(0)).double()
+    person = SimpleNamespace(vertices=vertices)
+    fits = iter([(0.001, tr.Status.CONVERGED), (0.4, tr.Status.CONVERGED), (0.4, tr.Status.DOUBTFUL)])
+
+    def fit(shape, person, start):
+        assert start is None
+        off, status = next(fits)
+        return vertices + off, SimpleNamespace(status=status, confidence=0.5), 1.0
+
+    for name, value in {"load_model": None, "make_person": person, "fit": fit}.items():
+        monkeypatch.setattr(benchmark, name, value if name == "fit" else lambda *_, value=value: value)
+    monkeypatch.setattr(tr.ArticulatedShape, "from_anny", lambda kind: SimpleNamespace(part_names=["root"]))
+    assert not benchmark.search("body", 3)
+    assert "within 1.5% of the size: 1 of 3; 1 converged and not within" in capsys.readouterr().out
+
+
 def test_a_split_rig_has_the_same_surface_and_coefficients(benchmark):
     ball = unit_sphere(1, dtype=torch.float64)
     shape = tr.ArticulatedShape.from_skinned_mesh(
