@@ -71,6 +71,19 @@ def test_the_rig_that_is_followed_is_that_of_the_person(tracked, person):
     assert float((person(rest).points - wanted).norm(dim=-1).mean()) > 0.03
 
 
+def test_the_pose_of_a_person_just_found_is_not_sought_again(person, monkeypatch):
+    def no_search(*arguments, **options):
+        raise AssertionError("the pose was found together with the person")
+
+    monkeypatch.setattr("torchreg.tracking.tracker.align", no_search)
+    monkeypatch.setattr("torchreg.tracking.recovery.find_pose", no_search)
+    poses = motion(person, 1)
+    result = Tracker(person, start_near(poses), fit_shape=True).step(scans(person, poses, TRUTH)[0])
+    assert result.status is Status.CONVERGED
+    found = person.vertices(result.pose, result.coefficients)
+    assert float((found - person.vertices(poses[0], TRUTH)).norm(dim=-1).mean()) < 0.02
+
+
 def test_a_state_goes_on_in_another_tracker(tracked, person, tmp_path):
     poses = motion(person, 3)
     clouds = scans(person, poses, TRUTH)
