@@ -91,9 +91,9 @@ class Calibration:
 CALIBRATION = Calibration()
 # Of fits of pose and shape together, which are right if all of the surface, hidden parts too, is off by at most that
 # share of the size on average: 25 mm of a body of 1.7 m. What is unknown is then the standard error of the surface,
-# which no shape's limbs or number of parts enter. Fitted by `benchmarks/shape_confidence.py --calibrate` to 59 made-up
-# people and hands from given starts; on 72 others, a third of which were searched, its area under the curve is .96.
-# Pictures and rivals are new to it: their weights are those of poses.
+# which no shape's limbs or number of parts enter. Fitted to 59 made-up people and hands, all from starts, as
+# `benchmarks/shape_confidence.py --calibrate` fits one to what it draws; its area under the curve on 72 others, a third
+# of them searched, is .96. Pictures and rivals were not among the 59: their weights are those of poses.
 SHAPE_CALIBRATION = Calibration(bias=5.37, weights=(0.0, 2.45, 3.1, 2.83, 8.53, 10.78, 1.03, 3.93), right=0.015)
 
 

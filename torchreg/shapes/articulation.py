@@ -41,9 +41,17 @@ class _HeldSizes:
 # Belongs to the running thread, not to the shape, which other threads may use at the same time.
 _HELD: ContextVar[_HeldSizes | None] = ContextVar("torchreg held sizes", default=None)
 
-# The latest meshes of fused surfaces: every call of `align` or `find_pose` without model points asks for the same one.
+
+@dataclass(frozen=True)
+class _KeptMeshes:
+    """How many meshes of fused surfaces are kept."""
+
+    count: int = 8  # shapes in use at a time, two meshes each at most, of a megabyte or less
+
+
+_KEPT_MESHES = _KeptMeshes()
+# The latest ones: every call of `align` or `find_pose` without model points asks for the same one.
 _MESHES: dict[tuple[object, ...], TriangleMesh] = {}
-_NUM_MESHES = 8
 
 
 class Articulation(PosedTree):
@@ -330,7 +338,7 @@ class Articulation(PosedTree):
         mesh = _MESHES.get(key)
         if mesh is None:
             mesh = _MESHES[key] = isosurface(lambda points: self.distance(points, pose), lower, upper, spacing)
-            for old in list(_MESHES)[:-_NUM_MESHES]:
+            for old in list(_MESHES)[: -_KEPT_MESHES.count]:
                 _MESHES.pop(old, None)
         return TriangleMesh(mesh.vertices.clone(), mesh.faces.clone())
 

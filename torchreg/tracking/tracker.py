@@ -377,8 +377,8 @@ class Tracker:
             return self._fitter.descend(view, state, frame.elapsed)
         if state.tracked or not state.found:
             return None
-        if state.person is not None:
-            # The pose is that in which the person was just found.
+        if state.person is not None and self._state.person is None:
+            # In this frame the person was found, together with its pose.
             return self._fitter.fit_at(state, frame, state.pose, "tracked")
         data = subsample(frame.data, self.config.max_points, frame_generator(state))
         config = AlignConfig(sharpness=self.config.sharpness)
