@@ -23,6 +23,8 @@
   are from those of the meshes, in diagonals: the median and the share within 2 % (bar: the median).
 - time: CPU seconds of all processes for the captured sequences, and what two cores need at best (bar for 44 frames of
   about 14,000 vertices: 60 s).
+- speed: the same sequences, every second frame up to twelve, of about 100,000 vertices: seconds a frame from meshes to
+  named limbs, with two workers and their start (bar: .25 s), and CPU seconds of all processes.
 - borne: noise, holes, thin limbs, fragments, wrong winding, one frame, a missing limb: the result, or the error.
 - hands: surfaces of hands, each joint bent by up to half its range, turned in any way. `find_pose` with candidates from
   the skeleton alone, and as it comes. Right: fingertips within 10 mm on average (bar: 90 %). The time of the skeleton
@@ -57,12 +59,14 @@ from torchreg.geometry.voxels import VoxelGrid, voxelize
 from torchreg.solvers.assignment import assign
 from torchreg.spines.clearance import Inside
 
-BAR_OWN, BAR_NAMED, BAR_INSIDE, BAR_SECONDS, BAR_HANDS = 0.7, 0.99, 0.995, 60.0, 0.9
+# Voxels along the longest side for some 100,000 vertices, and frames that are timed.
+FINE_RESOLUTION, SPEED_FRAMES = 340, 12
+BAR_OWN, BAR_NAMED, BAR_INSIDE, BAR_SECONDS, BAR_HANDS, BAR_FRAME = 0.7, 0.99, 0.995, 60.0, 0.9, 0.25
 BARS_IDENTITY, BARS_LEFT_OUT = {1: 0.97, 4: 0.97}, {1: 0.98}
 BINS = (0.0, 0.5, 0.8, 0.95, 0.99, 1.0)
 WITHIN, STEPS, CYCLE, TOUCHING = 0.06, (1, 2, 4, 8, 16), 24, "flanks touch"
 CLOUD_POINTS, CLOUD_NOISE, HOLES, HOLE_RADIUS, BAR_CLOUDS, BAR_OFF = 12_000, 0.002, 0.3, 0.03, 0.95, 0.02
-PARTS = ("captured", "identity", "clouds", "creatures", "left-out", "borne", "hands")
+PARTS = ("captured", "identity", "clouds", "creatures", "left-out", "borne", "hands", "speed")
 TIPS, RIGHT, NUM_POINTS, BEND = [4, 8, 12, 16, 20], 0.01, 500, 0.5
 CREATURES: dict[str, tuple[CreatureForm, str, float]] = {
     "starfish": (STARFISH, "none", 0.0),
@@ -336,6 +340,16 @@ def hands(count: int, seed: int) -> Tensor:
     return torch.tensor(rows)
 
 
+def speed(name: str, meshes: Sequence[tr.TriangleMesh]) -> str:
+    """Return what a sequence of meshes takes with two workers."""
+    wall, cpu = time.perf_counter(), cpu_seconds()
+    tr.extract_spine(meshes, workers=2)
+    wall, cpu = ((now - before) / len(meshes) for now, before in ((time.perf_counter(), wall), (cpu_seconds(), cpu)))
+    vertices = sum(len(mesh.vertices) for mesh in meshes) // len(meshes)
+    told = f"{len(meshes)} frames of {vertices} vertices: {wall:.2f} s a frame ({cpu:.2f} CPU s)"
+    return f"{name:24} {told}: {verdict(wall <= BAR_FRAME)}"
+
+
 def verdict(passed: bool) -> str:
     return "pass" if passed else "FAIL"
 
@@ -389,6 +403,8 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
         run_identity(options)
     if "clouds" in parts:
         run_clouds(options)
+    if "speed" in parts:
+        run_speed(options)
     if "creatures" in parts:
         names = ["starfish"] if options.smoke else list(CREATURES)
         made = [creature(name, 3 if options.smoke else options.frames, 32 if options.smoke else 96) for name in names]
@@ -420,15 +436,24 @@ def run_captured(options: argparse.Namespace) -> list[Row]:
     return rows
 
 
-def meshed_anew(options: argparse.Namespace, part: str) -> Iterator[tuple[str, list[tr.TriangleMesh], Tensor]]:
+def meshed_anew(
+    options: argparse.Namespace, part: str, every: int = 1, most: int | None = None
+) -> Iterator[tuple[str, list[tr.TriangleMesh], Tensor]]:
     """Yield the sequences: their names, meshes from voxels, and the vertices (T, V, 3) that they came from."""
     paths = sorted(options.data.glob("*.npz")) if options.data else []
     print(part if paths else f"{part}: left out, as there is no --data FOLDER with NPZ files")
-    resolution, every = (40, 6) if options.smoke else (options.resolution, 1)
+    resolution, every = (40, 6) if options.smoke else (options.resolution, every)
     for path in paths:
         places, faces = from_file(path, every)
+        places = places[:most]
         meshes = [voxelize(tr.TriangleMesh(frame.float(), faces), resolution).mesh() for frame in places]
         yield path.stem, meshes, places
+
+
+def run_speed(options: argparse.Namespace) -> None:
+    options = argparse.Namespace(**vars(options) | {"resolution": FINE_RESOLUTION})
+    for name, meshes, _ in meshed_anew(options, "speed", every=2, most=SPEED_FRAMES):
+        print(speed(name, meshes), flush=True)
 
 
 def run_identity(options: argparse.Namespace) -> None:

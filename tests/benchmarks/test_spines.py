@@ -28,3 +28,13 @@ def test_sequences_of_a_folder_are_judged_by_their_vertices(benchmark, tmp_path,
     (row,) = benchmark.main(["--smoke", "--part", "captured", "--data", str(tmp_path)])
     assert (row.frames, row.tips, row.own, row.named, row.trees) == (2, 5, 1.0, 1.0, (1, 1))
     assert "s on two cores: pass" in capsys.readouterr().out
+
+
+def test_frames_are_timed(benchmark, tmp_path, capsys, monkeypatch):
+    still = creature_sequence(STARFISH, 1, resolution=40).meshes[0]
+    np.savez(tmp_path / "star.npz", vertices=still.vertices.expand(14, -1, 3).numpy(), faces=still.faces.numpy())
+    given = []
+    monkeypatch.setattr(benchmark.tr, "extract_spine", lambda meshes, workers: given.append((len(meshes), workers)))
+    benchmark.main(["--smoke", "--part", "speed", "--data", str(tmp_path)])
+    assert given == [(3, 2)]
+    assert "3 frames of" in capsys.readouterr().out
