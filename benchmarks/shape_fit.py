@@ -9,7 +9,7 @@ hidden ones too, from its true place. Needs `pip install "torchreg-articulated[a
     python benchmarks/shape_fit.py                             # bodies, 10 seeds
     python benchmarks/shape_fit.py --kind hand.R
     python benchmarks/shape_fit.py --rivals 2                  # also the rivals, on the first two seeds
-    python benchmarks/shape_fit.py --part search --seeds 20    # people who are found without a start
+    python benchmarks/shape_fit.py --part search --seeds 20    # people who are found without a start; also --upright
     python benchmarks/shape_fit.py --part shared               # several scans of one person
     python benchmarks/shape_fit.py --part growth               # seconds by numbers of vertices and points
     python benchmarks/shape_fit.py --part bones --data DIR     # lengths of the bones of DIR/rigs/*.glb, and their files
@@ -21,7 +21,7 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from itertools import product
@@ -168,10 +168,12 @@ def error_mm(vertices: Tensor, person: Person) -> float:
     return 1e3 * float((vertices.double() - person.vertices).norm(dim=-1).mean())
 
 
-def fit(shape: tr.ArticulatedShape, person: Person, start: Tensor | None) -> tuple[Tensor, tr.AlignResult, float]:
+def fit(
+    shape: tr.ArticulatedShape, person: Person, start: Tensor | None, config: tr.AlignConfig | None = None
+) -> tuple[Tensor, tr.AlignResult, float]:
     """Return the vertices of a fit of pose and shape, its result, and its CPU seconds."""
     before = time.process_time()
-    result = tr.align(shape, person.data.to(shape.rest), start, fit_shape=True)
+    result = tr.align(shape, person.data.to(shape.rest), start, fit_shape=True, config=config)
     seconds = time.process_time() - before
     return shape.vertices(result.pose, result.coefficients), result, seconds
 
@@ -205,21 +207,22 @@ def compare(kind: str, seeds: int, rivals: int) -> bool:
     return sum(ours) / len(ours) <= bar
 
 
-def search(kind: str, seeds: int) -> bool:
+def search(kind: str, seeds: Sequence[int], upright: bool) -> bool:
     """Print the errors of people found without a start; return whether enough are found."""
     model, shape = load_model(kind), tr.ArticulatedShape.from_anny(kind)
+    config = tr.AlignConfig(upright=shape.up if upright else None)
     found, sure = [], []
-    for seed in range(seeds):
+    for seed in seeds:
         person = make_person(model, kind, shape.part_names[0], seed)
-        vertices, result, seconds = fit(shape, person, None)
+        vertices, result, seconds = fit(shape, person, None, config)
         extent = float((person.vertices.amax(0) - person.vertices.amin(0)).norm())
         found.append(error_mm(vertices, person) <= 1e3 * FOUND * extent)
         sure.append(result.status is tr.Status.CONVERGED)
         print(f"{kind} seed {seed}: {error_mm(vertices, person):.1f} mm; confidence {float(result.confidence):.2f}, "
               f"{result.status.value}; {seconds:.1f} CPU s", flush=True)  # fmt: skip
     wrong = sum(told and not right for told, right in zip(sure, found, strict=True))
-    print(f"within {FOUND:.1%} of the size: {sum(found)} of {seeds}; {wrong} converged and not within")
-    return sum(found) >= FOUND_BAR * seeds
+    print(f"within {FOUND:.1%} of the size: {sum(found)} of {len(seeds)}; {wrong} converged and not within")
+    return sum(found) >= FOUND_BAR * len(seeds)
 
 
 def shared(scans: int, seeds: int) -> bool:
@@ -377,6 +380,8 @@ def main() -> int:
     parser.add_argument("--part", choices=("single", "search", "shared", "growth", "bones"), default="single")
     parser.add_argument("--kind", choices=tuple(KINDS), default="body")
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--first", type=int, default=0, help="seed, of --part search")
+    parser.add_argument("--upright", action="store_true", help="people stand, of --part search")
     parser.add_argument("--scans", type=int, default=5, help="of one person, with --part shared")
     parser.add_argument("--rivals", type=int, default=0, help="seeds that the rivals get too")
     parser.add_argument("--data", type=Path, help="folder with rigs/*.glb, of --part bones")
@@ -392,7 +397,8 @@ def main() -> int:
     if options.part == "growth":
         return 0 if growth() else 1
     if options.part == "search":
-        return 0 if search(options.kind, options.seeds) else 1
+        seeds = range(options.first, options.first + options.seeds)
+        return 0 if search(options.kind, seeds, options.upright) else 1
     if options.part == "shared":
         return 0 if shared(options.scans, options.seeds) else 1
     return 0 if compare(options.kind, options.seeds, options.rivals) else 1

@@ -114,4 +114,5 @@ def person():
     return ArticulatedShape.from_skinned_mesh(
         mesh.vertices, mesh.faces, torch.cat(weights), places, [-1, 0, 0, 0], joint_names=list(PARTS),
         shape_dirs=torch.cat(dirs), joint_dirs=joint_dirs, coefficient_names=["stature", "girth", "reach"],
+        up=(0.0, 0.0, 1.0),
     )  # fmt: skip

@@ -12,7 +12,8 @@ import safetensors.torch
 import torch
 
 from torchreg import storage
-from torchreg.alignment.align import AlignConfig, align
+from torchreg.alignment.align import align
+from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.results import AlignRecord, AlignResult, Calibration
 from torchreg.errors import FormatError, InputError, InputTypeError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree

@@ -13,9 +13,10 @@ __version__ = "0.1.0"
 # Every public name stands here, beside the module that defines it, and nowhere else: `__init__.pyi`, which tells type
 # checkers the same, is written from this table by tests/test_init.py.
 _NAMES = {
-    "alignment.align": "AlignConfig align",
+    "alignment.align": "align",
     "alignment.calibrate": "CalibrateConfig calibrate",
     "alignment.calibrate_base": "calibrate_base",
+    "alignment.config": "AlignConfig",
     "alignment.em_loss": "EMLoss",
     "alignment.find_pose": "FindPoseConfig find_pose",
     "alignment.pose_initializer": "InitialPose PoseInitializer PoseInitializerConfig",

@@ -1,11 +1,11 @@
 # Written from the table in __init__.py by `python tests/test_init.py`.
 from torchreg import errors as errors
 from torchreg import metrics as metrics
-from torchreg.alignment.align import AlignConfig as AlignConfig
 from torchreg.alignment.align import align as align
 from torchreg.alignment.calibrate import CalibrateConfig as CalibrateConfig
 from torchreg.alignment.calibrate import calibrate as calibrate
 from torchreg.alignment.calibrate_base import calibrate_base as calibrate_base
+from torchreg.alignment.config import AlignConfig as AlignConfig
 from torchreg.alignment.em_loss import EMLoss as EMLoss
 from torchreg.alignment.find_pose import FindPoseConfig as FindPoseConfig
 from torchreg.alignment.find_pose import find_pose as find_pose

@@ -102,6 +102,17 @@ def check_count(value: int, name: str, least: int) -> None:
         raise InputError(f"{name} must be at least {least}, got {value}")
 
 
+def check_direction(value: Sequence[float] | Tensor, name: str) -> tuple[float, float, float]:
+    """Return three numbers, finite and not all zero, of a direction in space."""
+    direction = as_float_tensor(value, name)
+    check_shape(direction, name, (3,))
+    check_finite(direction, name)
+    if not bool(direction.any()):
+        raise InputError(f"{name} must be a direction, got zeros")
+    x, y, z = direction.tolist()
+    return x, y, z
+
+
 def check_choice(value: str, name: str, choices: Sequence[str]) -> None:
     """Raise InputError unless ``value`` is one of ``choices``."""
     if value not in choices:

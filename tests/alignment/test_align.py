@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchreg.alignment.align import AlignConfig, align
+from torchreg.alignment.align import align
+from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.datasets.hand import make_hand_cloud
 from torchreg.errors import DegenerateDataWarning

@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from torchreg.alignment.align import AlignConfig, align
+from torchreg.alignment.align import align
 from torchreg.alignment.calibrate import CalibrateConfig, calibrate
+from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.results import Calibration
 from torchreg.alignment.scale_fit import scale_jacobian
 from torchreg.datasets.hand import hand_motion, make_hand_cloud

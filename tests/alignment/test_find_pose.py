@@ -10,7 +10,13 @@ import torchreg.alignment.find_pose as find_pose_module
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.problem import alignment_cost, centered_problem, masked_mean
 from torchreg.alignment.results import PoseStarts
-from torchreg.alignment.rough_poses import PrincipalAxes, UniformRotations, spread_rotations, typical_poses
+from torchreg.alignment.rough_poses import (
+    PrincipalAxes,
+    UniformRotations,
+    UprightRotations,
+    spread_rotations,
+    typical_poses,
+)
 from torchreg.datasets.hand import make_hand_cloud
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rotation import so3_exp, so3_log
@@ -229,6 +235,30 @@ def test_uniform_rotations_are_typical_poses_amid_the_data(plain_hand, plain_han
     middle = plain_hand_skin(poses).mean(-2)
     assert float(middle.std(1).max()) < 1e-5
     assert float(middle.norm(dim=-1).max()) < 0.05
+
+
+def test_upright_rotations_turn_about_the_vertical_alone(plain_hand, plain_hand_skin, clouds):
+    up = torch.tensor([1.0, -2.0, 0.5])
+    problem = problem_at(plain_hand_skin, clouds)
+    poses = UprightRotations(tuple(up.tolist()), 8)(problem, generator())
+    kinds = len(typical_poses(plain_hand))
+    assert poses.shape == (2, 8 * kinds, 27)
+    turns = so3_exp(poses[0, :8, 3:6])
+    own = torch.tensor(plain_hand.up)
+    torch.testing.assert_close(turns @ own, (up / up.norm()).expand(8, 3), atol=1e-5, rtol=0)
+    steps = so3_log(turns[1:] @ turns[:-1].mT)
+    torch.testing.assert_close(steps, (up / up.norm() * math.tau / 8).expand(7, 3), atol=1e-5, rtol=0)
+    middle = plain_hand_skin(poses).mean(-2)
+    assert float(middle.std(1).max()) < 1e-5
+
+
+def test_what_stands_is_sought_standing(plain_hand, plain_hand_skin, truths):
+    truth = truths[0].clone()
+    truth[3:6] = torch.tensor([0.0, 0.0, 2.0])
+    data = plain_hand_skin(truth)
+    upright = replace(QUICK, upright=plain_hand.up)
+    found = find_pose(plain_hand, data, model_points=plain_hand_skin, config=upright)
+    assert float(offsets(plain_hand, found.best, truth)[TIPS].mean()) < 0.005
 
 
 def test_principal_axes_find_an_unbent_shape_at_once(plain_hand, plain_hand_skin):

@@ -6,7 +6,8 @@ import math
 import pytest
 import torch
 
-from torchreg.alignment.align import AlignConfig, align
+from torchreg.alignment.align import align
+from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.implicit_gradient import FixedPoint, attach_gradients
 from torchreg.alignment.person_gradient import PairedPlanes
 from torchreg.geometry.mesh import TriangleMesh, sample_surface

@@ -1,19 +1,22 @@
 """Fitting pose and shape together: made-up people with a head, arms and legs whose coefficients are known."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from torchreg.alignment.align import AlignConfig, align
+from torchreg.alignment.align import align
 from torchreg.alignment.calibrate import CalibrateConfig, calibrate
+from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.person_search import swung_people
 from torchreg.alignment.reliability import SurfaceError
-from torchreg.alignment.shape_fit import different_people
+from torchreg.alignment.shape_fit import _problem, different_people
 from torchreg.errors import InputError
 from torchreg.geometry.facing_normals import facing_normals
 from torchreg.geometry.mesh import TriangleMesh, sample_surface
 from torchreg.geometry.neighbors import nearest_neighbor
-from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp
+from torchreg.geometry.rotation import compose_rotation_vectors, so3_exp, so3_log
 from torchreg.result import Status
 from torchreg.shapes.limbs import Body, Limb
 from torchreg.solvers.e_step import expectation
@@ -203,7 +206,7 @@ def test_a_person_found_leaning_is_set_upright(shape, seed, monkeypatch):
     coefficients = torch.tensor([0.9, -0.8, 0.4])
     pose, data = scan(shape, coefficients, seed, count=600)
 
-    def leaning(problem, rig, people, count, generator):
+    def leaning(problem, rig, people, count, generator, upright):
         """The mean person at rest who leans by 50 degrees to the side, as the camera sees it."""
         state = torch.cat([shape.rest_pose(), torch.zeros(3)]).unsqueeze(0)
         state[0, 3:6] = compose_rotation_vectors(torch.tensor([0.0, math.radians(50), 0.0]), pose[3:6])
@@ -214,6 +217,43 @@ def test_a_person_found_leaning_is_set_upright(shape, seed, monkeypatch):
     result = align(shape, data, fit_shape=True, config=QUICK)
     off = (shape.vertices(result.pose, result.coefficients) - shape.vertices(pose, coefficients)).norm(dim=-1)
     assert float(off.mean()) < 0.02
+
+
+def test_a_person_who_stands_is_sought_standing(shape):
+    coefficients = torch.tensor([0.9, -0.8, 0.4])
+    pose, data = scan(shape, coefficients, seed=3, count=600)
+    # Upright in the data is x, and the person is turned about it.
+    turn = so3_exp(torch.tensor([2.2, 0.0, 0.0])) @ so3_exp(torch.tensor([0.0, math.pi / 2, 0.0]))
+    pose[3:6], pose[:3] = so3_log((turn @ so3_exp(pose[3:6])).unsqueeze(0))[0], turn @ pose[:3]
+    data = data @ turn.mT
+    result = align(shape, data, fit_shape=True, config=replace(QUICK, upright=(2, 0, 0)))
+    _, off = nearest_neighbor(shape.vertices(result.pose, result.coefficients), shape.vertices(pose, coefficients))
+    assert float(off.mean()) < 0.02
+    upside_down = align(shape, data, fit_shape=True, config=replace(QUICK, upright=(-1, 0, 0)))
+    assert float(upside_down.confidence) < float(result.confidence)
+
+
+def test_a_limb_on_the_data_of_another_is_swung_onto_its_own(shape):
+    coefficients = torch.zeros(3)
+    pose, data = scan(shape, coefficients, seed=3, one_sided=False, count=800)
+    names = list(shape.dof_names)
+    arm = [names.index(f"{shape.part_names[2]}_{axis}") for axis in "xyz"]
+    problem, state = _problem(
+        shape, data[None], torch.ones(1, len(data), dtype=torch.bool), pose[None], None, config=QUICK,
+        generator=torch.Generator().manual_seed(0),
+    )  # fmt: skip
+    problem, right = problem.rows(torch.zeros(1, dtype=torch.int64)), state[0].clone()
+    right[shape.num_dofs :] = 0
+    right[:3] = pose[:3] - problem.origin[0]
+    wrong = right.clone()
+    wrong[arm] += torch.tensor([0.3, 1.2, 0.0])
+    swung = swung_people(problem, wrong, 3, torch.Generator().manual_seed(0))
+    assert len(swung) == 3
+    points = problem.skin(torch.stack([right, wrong, swung[0]]))
+    apart = (points - points[0]).square().sum(-1).mean(-1).sqrt()
+    assert float(apart[2]) < 0.5 * float(apart[1])
+    kept = [dof for dof in range(len(wrong)) if dof not in arm]
+    torch.testing.assert_close(swung[0, kept], wrong[kept])
 
 
 def test_a_person_in_what_is_none_is_doubtful(shape):

@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from torchreg.alignment.align import AlignConfig
+from torchreg.alignment.config import AlignConfig
 from torchreg.shapes.articulated import ArticulatedShape
 
 # A box on a hinge whose limits exclude zero, a box that slides, and a round cap that turns about its own axis.

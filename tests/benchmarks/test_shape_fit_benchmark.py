@@ -41,15 +41,18 @@ def test_people_who_are_found_are_counted(benchmark, capsys, monkeypatch):
     person = SimpleNamespace(vertices=vertices)
     fits = iter([(0.001, tr.Status.CONVERGED), (0.4, tr.Status.CONVERGED), (0.4, tr.Status.DOUBTFUL)])
 
-    def fit(shape, person, start):
+    def fit(shape, person, start, config):
         assert start is None
+        assert config.upright == (0, 0, 1)
         off, status = next(fits)
         return vertices + off, SimpleNamespace(status=status, confidence=0.5), 1.0
 
     for name, value in {"load_model": None, "make_person": person, "fit": fit}.items():
         monkeypatch.setattr(benchmark, name, value if name == "fit" else lambda *_, value=value: value)
-    monkeypatch.setattr(tr.ArticulatedShape, "from_anny", lambda kind: SimpleNamespace(part_names=["root"]))
-    assert not benchmark.search("body", 3)
+    monkeypatch.setattr(
+        tr.ArticulatedShape, "from_anny", lambda kind: SimpleNamespace(part_names=["root"], up=(0, 0, 1))
+    )
+    assert not benchmark.search("body", range(3), upright=True)
     assert "within 1.5% of the size: 1 of 3; 1 converged and not within" in capsys.readouterr().out
 
 

@@ -10,9 +10,10 @@ import torch
 
 import torchreg
 import torchreg.alignment.align as align_module
-from torchreg.alignment.align import AlignConfig
+from torchreg.alignment.config import AlignConfig
 from torchreg.cli.hand_side import better_hand
 from torchreg.cli.shape_argument import load_shape
+from torchreg.geometry.upright import guess_up
 from torchreg.io.gltf import load_rig
 from torchreg.io.points import load_points, save_points
 from torchreg.result import Status
@@ -168,6 +169,21 @@ def test_the_file_of_a_rig_is_written_with_the_bones_found(folder, run, error_of
     assert "--rig has no meaning without --fit-shape" in error_of(*common, "--rig", tmp_path / "n.glb")
     hand = "align", "hand", tmp_path / "cloud.ply", "--fit-shape", "--rig", tmp_path / "n.glb"
     assert "--rig has no meaning for hand" in error_of(*hand)
+
+
+def test_an_upright_shape_is_sought_about_the_vertical(run, error_of, folder, tmp_path, monkeypatch):
+    asked = []
+
+    def noted(shape, data, initial_pose, *, config, **options):
+        asked.append(config.upright)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torchreg.alignment.align.align", noted)
+    common = "align", "hand", folder / "cloud0.ply", "-o", tmp_path / "r", "--upright"
+    run(*common, "--up", "x")
+    run(*common)
+    assert asked == [(1, 0, 0), guess_up([load_points(folder / "cloud0.ply").points])]
+    assert "--upright is of a search" in error_of(*common, "--start", folder / "truth0.json")
 
 
 def zeros(place, rig, parents):

@@ -256,13 +256,18 @@ def test_options_reach_the_tracker(run, command, monkeypatch):
 
     monkeypatch.setattr(track_module, "Tracker", noted)
     options = ("--prediction", "none", "--points", 300, "--model-points", "data", "--recovery", "starts", "--seed", 4,
-               "--locked", "base")  # fmt: skip
+               "--locked", "base", "--upright", "--up", "-z")  # fmt: skip
     run(*command(*options))
     ((pose, config, locked, fit_shape),) = seen
     assert not fit_shape
     assert locked == ("base",)
     assert config == TrackConfig(
-        prediction="none", num_model_points=300, model_points="data", recovery="starts", seed=4
+        prediction="none",
+        num_model_points=300,
+        model_points="data",
+        recovery="starts",
+        seed=4,
+        upright=(0, 0, -1),
     )
     assert pose.shape == (27,)
 

@@ -84,7 +84,9 @@ def test_the_mean_person_is_the_rig_itself():
 def test_one_person_is_a_rig_of_its_own():
     shape = made()
     pose, coefficients = (value[0] for value in drawn(shape, 1))
+    shape.up = (0.0, 0.0, -1.0)
     person = shape.with_coefficients(coefficients)
+    assert person.up == shape.with_bone_coefficients().up == shape.up
     assert person.coefficient_names == ()
     assert person.dof_names == shape.dof_names
     torch.testing.assert_close(person(pose).points, shape.vertices(pose, coefficients), atol=1e-12, rtol=0)

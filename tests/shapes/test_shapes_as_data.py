@@ -80,6 +80,11 @@ def test_the_built_shape_is_the_recorded_one(make, dtype):
     assert torch.equal(built.distance(points, pose), shape.distance(points, pose))
 
 
+def test_what_is_upright_is_recorded():
+    assert make_machine().up == (0, 0, 1)
+    assert build_shape(record_shape(make_machine(up=(0.0, -1.0, 0.0)))).up == (0, -1, 0)
+
+
 def test_a_record_shares_nothing_with_its_shape():
     shape = make_machine()
     record = record_shape(shape)

@@ -65,6 +65,7 @@ def test_joints_may_come_in_any_order_and_with_the_root_marked_as_in_smpl():
         vertices.numpy(), faces.numpy(), weights[:, order].numpy(), joints[order].numpy(),
         np.array([3, 2**32 - 1, 0, 1], dtype=np.uint32), joint_names=[NAMES[index] for index in order],
     )  # fmt: skip
+    assert shape.up == (0, 1, 0)
     assert shape.part_names == ("shoulder", "elbow", "wrist")
 
 

@@ -16,6 +16,7 @@ from torchreg.tracking.tracker import TrackConfig, Tracker
         ({"prediction": "kalman"}, "prediction must be one of velocity, none"),
         ({"recovery": "some"}, "recovery must be one of full, starts, none"),
         ({"nan_policy": "drop"}, "nan_policy must be one of omit, raise"),
+        ({"upright": (0, 0, 0)}, "upright must be a direction, got zeros"),
         ({"num_model_points": 0}, "num_model_points must be at least 1"),
         ({"em_steps": 0}, "em_steps must be at least 1"),
         ({"surface_steps": 0}, "surface_steps must be at least 1"),

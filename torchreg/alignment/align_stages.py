@@ -18,7 +18,7 @@ from torchreg.result import normal_copy
 from torchreg.shapes.pose_algebra import shifted
 
 if TYPE_CHECKING:
-    from torchreg.alignment.align import AlignConfig
+    from torchreg.alignment.config import AlignConfig
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from torchreg._checks import as_float_tensor, check_count, check_finite, check_positive, check_shape
-from torchreg.alignment.align import AlignConfig, align
+from torchreg.alignment.align import align
+from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.inputs import check_clouds
 from torchreg.alignment.problem import model_size
 from torchreg.alignment.results import Calibration

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_choice, check_count, check_positive, warn_about_rounding
+from torchreg._checks import check_choice, check_count, check_direction, check_positive, warn_about_rounding
 from torchreg._threads import one_thread
 from torchreg.alignment.confidence import explains, is_misfit, pose_confidence
 from torchreg.alignment.in_picture import surest_crop
@@ -41,6 +41,7 @@ from torchreg.alignment.start_source import StartSource
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.geometry.camera import Camera
+from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
 from torchreg.shapes.skin import LinearBlendSkin, sample_skin
@@ -74,6 +75,7 @@ class FindPoseConfig:
         prior_std: standard deviation of a weak prior that draws joints to a typical pose, radians; None for none.
         num_model_points: points sampled on the shape.
         nan_policy: "raise", or "omit" to leave out non-finite data.
+        upright: of the sources by default, see `AlignConfig`.
         seed: of everything that is drawn.
     """
 
@@ -85,6 +87,7 @@ class FindPoseConfig:
     prior_std: float | None = 0.4
     num_model_points: int = 500
     nan_policy: str = "raise"
+    upright: Direction | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -94,6 +97,8 @@ class FindPoseConfig:
         if self.prior_std is not None:
             check_positive(self.prior_std, "prior_std")
         check_choice(self.nan_policy, "nan_policy", ("raise", "omit"))
+        if self.upright is not None:
+            check_direction(self.upright, "upright")
 
 
 def find_pose(
@@ -152,13 +157,14 @@ def find_pose(
     Cost: .3 s for a hand on one CPU core, whatever the number of data; 1 to 2 s where it is searched for.
     """
     check_count(num_starts, "num_starts", 1)
-    source = StartSource.of(shape, sources, initializer)
+    config = config or FindPoseConfig()
+    source = StartSource.of(shape, sources, initializer, config.upright)
     if data is None or isinstance(data, Camera):
-        points = model_points or sample_skin(shape, (config or FindPoseConfig()).num_model_points)
+        points = model_points or sample_skin(shape, config.num_model_points)
         measured = measured_alone(shape, data, keypoints, keypoint_std)
         return find_keypoints(shape, points, measured, num_starts, KnownDofs.of(shape, locked, prior))
     if isinstance(data, DepthFrame) and data.mask is None:
-        skin = model_points or sample_skin(shape, (config or FindPoseConfig()).num_model_points)
+        skin = model_points or sample_skin(shape, config.num_model_points)
         search = partial(
             find_pose, shape, num_starts=num_starts, sources=sources, initializer=initializer, model_points=skin,
             locked=locked, prior=prior, keypoints=keypoints, keypoint_std=keypoint_std, config=config,
@@ -169,7 +175,7 @@ def find_pose(
     near = seen if far is None else seen.near(far)
     known = KnownDofs.of(shape, locked, prior)
     known = known if known is None or far is None else known.near(far)
-    starts = search_everywhere(shape, near, num_starts, source, model_points, config or FindPoseConfig(), known).starts
+    starts = search_everywhere(shape, near, num_starts, source, model_points, config, known).starts
     poses = starts.poses if far is None else shifted(starts.poses.double(), far.to(starts.poses.device))
     return replace(starts, poses=poses, shape=shape)
 

@@ -99,6 +99,31 @@ def take_rows(table: Tensor, index: Tensor) -> Tensor:
     return table.gather(1, index.reshape(*index.shape, *[1] * (table.ndim - 2)).expand(*index.shape, *table.shape[2:]))
 
 
+def joint_samples(shape: Articulation, body: Body) -> Tensor:
+    """Return samples (G, dofs) of the joints between a body and its parent; none if those only follow others."""
+    dofs = list(body.dofs)
+    if not dofs:
+        return shape.rest.new_zeros(0, 0)
+    free = _SAMPLING.free_range if len(dofs) < BALL_AXES else _SAMPLING.ball_range
+    lower, upper = shape.lower[dofs], shape.upper[dofs]
+    lower = torch.where(lower.isfinite(), lower, torch.where(upper.isfinite(), upper - free, -free / 2))
+    upper = torch.where(upper.isfinite(), upper, lower + free)
+    counts = [
+        _SAMPLING.slide_count if shape.is_sliding[dof] else max(2, math.ceil(width / _SAMPLING.angle))
+        for dof, width in zip(dofs, (upper - lower).tolist(), strict=True)
+    ]
+    if math.prod(counts) > _SAMPLING.max_count:
+        shares = torch.quasirandom.SobolEngine(len(dofs), scramble=True, seed=0).draw(
+            _SAMPLING.max_count, dtype=torch.float32
+        )
+    else:
+        grids = torch.meshgrid(
+            *[(torch.arange(count, dtype=torch.float32) + 0.5) / count for count in counts], indexing="ij"
+        )
+        shares = torch.stack(grids, dim=-1).reshape(-1, len(dofs))
+    return lower + (upper - lower) * shares.to(lower)
+
+
 class LimbSearch:
     """The samples of a shape's joints, and the search over them.
 
@@ -117,7 +142,7 @@ class LimbSearch:
                 leader = self._leader(follower)
                 self.parts[leader] = self.parts[leader] + follower.parts
         bodies = [body for limb in self.limbs for body in limb.bodies]
-        self.samples = {body: self._sample(body) for body in bodies}
+        self.samples = {body: joint_samples(shape, body) for body in bodies}
         # Mimic joints of a body follow joints elsewhere, so its samples do not determine its transforms.
         self.relative = {} if shape.kinematics.has_mimics else {body: self._sampled_transforms(body) for body in bodies}
 
@@ -159,30 +184,6 @@ class LimbSearch:
         joints = moves[first.parts[0]] - moves[first.parent] if first.parent >= 0 else moves[first.parts[0]]
         driven = joints.to(kinematics.couplings) @ kinematics.couplings.abs() > 0
         return max(self.limbs, key=lambda limb: int(driven[[dof - BASE_DOFS for dof in limb.dofs]].sum()))
-
-    def _sample(self, body: Body) -> Tensor:
-        """Return samples (G, dofs) of the joints between a body and its parent; none if those only follow others."""
-        shape, dofs = self.shape, list(body.dofs)
-        if not dofs:
-            return shape.rest.new_zeros(0, 0)
-        free = _SAMPLING.free_range if len(dofs) < BALL_AXES else _SAMPLING.ball_range
-        lower, upper = shape.lower[dofs], shape.upper[dofs]
-        lower = torch.where(lower.isfinite(), lower, torch.where(upper.isfinite(), upper - free, -free / 2))
-        upper = torch.where(upper.isfinite(), upper, lower + free)
-        counts = [
-            _SAMPLING.slide_count if shape.is_sliding[dof] else max(2, math.ceil(width / _SAMPLING.angle))
-            for dof, width in zip(dofs, (upper - lower).tolist(), strict=True)
-        ]
-        if math.prod(counts) > _SAMPLING.max_count:
-            shares = torch.quasirandom.SobolEngine(len(dofs), scramble=True, seed=0).draw(
-                _SAMPLING.max_count, dtype=torch.float32
-            )
-        else:
-            grids = torch.meshgrid(
-                *[(torch.arange(count, dtype=torch.float32) + 0.5) / count for count in counts], indexing="ij"
-            )
-            shares = torch.stack(grids, dim=-1).reshape(-1, len(dofs))
-        return lower + (upper - lower) * shares.to(lower)
 
     def _sampled_transforms(self, body: Body) -> Tensor:
         poses = self.shape.rest.repeat(len(self.samples[body]), 1)

@@ -7,11 +7,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg.alignment.align import AlignConfig, align
+from torchreg.alignment.align import align
+from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.problem import joint_precision, model_size
 from torchreg.alignment.shape_fit import fitted_rig, plausible_precision, robust_rows, scan_normals, surface_skins
 from torchreg.alignment.surface_fit import SURFACE_FIT
 from torchreg.capture.depth_frame import DepthFrame
+from torchreg.geometry.upright import Direction
 from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.shaped import ShapedTree
@@ -48,12 +50,15 @@ class PersonFilter:
         shape: a rig with coefficients, or any with a mesh.
         fit_shape: True, or "bones", see `align`.
         seed: of all random draws.
+        upright: see `AlignConfig`.
     """
 
-    def __init__(self, shape: ArticulatedShape, fit_shape: bool | str, seed: int = 0) -> None:
+    def __init__(
+        self, shape: ArticulatedShape, fit_shape: bool | str, seed: int = 0, upright: Direction | None = None
+    ) -> None:
         self.rig = fitted_rig(shape, fit_shape)
         self.space = self.rig.coefficient_space()
-        self._config = AlignConfig(nan_policy="omit", seed=seed)
+        self._config = AlignConfig(nan_policy="omit", upright=upright, seed=seed)
         tree, generator = ShapedTree(self.rig, self.space), torch.Generator().manual_seed(seed)
         model, self._skin = surface_skins(
             tree, self.rig.file_surface(), self._config.num_model_points, generator

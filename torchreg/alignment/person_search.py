@@ -3,17 +3,30 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchreg.alignment.limb_search import distinct_first, take_rows
+from torchreg.alignment.clusters import CLUSTERS
+from torchreg.alignment.limb_search import distinct_first, joint_samples, take_rows
 from torchreg.alignment.pose_search import mean_distances
 from torchreg.alignment.problem import AlignProblem
-from torchreg.alignment.rough_poses import register_rigidly, spread_rotations, typical_poses
+from torchreg.alignment.rough_poses import (
+    UprightRotations,
+    closeness,
+    register_rigidly,
+    spread_rotations,
+    two_sided_cost,
+    typical_poses,
+)
+from torchreg.alignment.shape_problem import ShapeProblem
 from torchreg.geometry.rotation import compose_rotation_vectors, so3_log
+from torchreg.geometry.sampling import farthest_points
+from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulation import Articulation
+from torchreg.shapes.limbs import Body, bodies_below, find_bodies, find_limbs
 from torchreg.shapes.pose_algebra import BASE_DOFS, shifted
 
 
@@ -24,20 +37,29 @@ class _PersonSearch:
     num_rotations: int = 200  # of each size: 30 degrees apart, which the rigid EM bridges
     num_compared: int = 400  # best candidates, among which different ones are sought
     same: float = 0.06  # as a share of the size: candidates whose points differ by less are duplicates
+    same_swung: float = 0.03  # the same, of people of whom only one part differs
     other: float = 0.05  # the same, of fitted people: what differs by more is a rival
     turn: float = math.pi / 6  # by which people are turned anew: as far as the rotations of the search are apart
+    most_swung: float = 0.5  # of the surface: a limb that is more is not swung, as the rest would be
+    num_points: int = 250  # model points, and data, by which swung parts are ranked
+    num_data: int = 500
 
 
 _SEARCH = _PersonSearch()
 
 
 def find_people(
-    problem: AlignProblem, rig: Articulation, people: Tensor, count: int, generator: torch.Generator
+    problem: AlignProblem,
+    rig: Articulation,
+    people: Tensor,
+    count: int,
+    generator: torch.Generator,
+    upright: Direction | None = None,
 ) -> Tensor:
     """Return states (count, D + K) of people that may be what a scan shows, the likeliest first.
 
-    People of all sizes, in evenly spread rotations, are registered rigidly to the scan, and ranked by the data far from
-    them and by how much of them is far from the data.
+    People of all sizes, in evenly spread rotations or turned about the vertical, are registered rigidly to the scan,
+    and ranked by the data far from them and by how much of them is far from the data.
 
     Args:
         problem: of one scan.
@@ -45,8 +67,10 @@ def find_people(
         people: (S, K) coefficients.
         count: of states, at most.
         generator: of what is drawn.
+        upright: see `AlignConfig`.
     """
-    rotations = so3_log(spread_rotations(_SEARCH.num_rotations)).to(people)
+    turns = spread_rotations(_SEARCH.num_rotations) if upright is None else UprightRotations(upright).rotations(rig.up)
+    rotations = so3_log(turns).to(people)
     joints = typical_poses(rig)
     grid = (len(people), len(joints), len(rotations))
     states = people.new_zeros(*grid, rig.num_dofs + people.shape[-1])
@@ -63,7 +87,59 @@ def find_people(
     return take_rows(best, order[:, :count])[0]
 
 
-def turned_people(problem: AlignProblem, state: Tensor, num_dofs: int) -> Tensor:
+def swung_people(problem: ShapeProblem, state: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Return a person (D + K,) with one limb swung to where more of a scan is explained, (count, D + K), best first.
+
+    A limb that begins on the data of another does not leave them, and its own are left over. Each limb, with all that
+    hangs on it, is tried over the range of each of its joints, the others as the prior has them, those above it also as
+    they are; what explains data and is explained by them is ranked first, as in `find_people`.
+
+    Args:
+        problem: of one scan.
+        state: fitted; its size and the rest of its pose are kept.
+        count: of states, at most.
+        generator: of the data that are looked at.
+    """
+    rig, mean, size = problem.skin.shape.rig, problem.prior.mean[0], problem.size
+    bodies, drawn = find_bodies(rig), problem.draw(_SEARCH.num_data, generator)
+    skin = problem.skin.subset(farthest_points(problem.skin.points, min(_SEARCH.num_points, len(problem.skin))))
+    owner, points = skin.weights.argmax(-1), skin(state)[None, None]
+    swung, costs = [], []
+    for limb in find_limbs(rig)[0]:
+        below = bodies_below(rig, bodies, limb.bodies[0])
+        moves = torch.isin(owner, owner.new_tensor([part for body in below for part in body.parts]))
+        if not limb.dofs or not CLUSTERS.share < float(moves.double().mean()) < _SEARCH.most_swung:
+            continue
+        reset = _with_joints(state, below, mean)
+        states = [reset.unsqueeze(0)]
+        for body in limb.bodies:
+            samples = joint_samples(rig, body)
+            for rest in (reset, _with_joints(state, bodies_below(rig, below, body), mean)):
+                states.append(rest.repeat(len(samples), 1))
+                states[-1][:, list(body.dofs)] = samples
+        swung.append(problem.clamp_candidates(torch.cat(states).unsqueeze(0)))
+        # The rest is where it was.
+        rest_data, rest_points = closeness(points[..., ~moves, :], drawn, size)
+        data, moved = closeness(skin.subset(moves.nonzero()[:, 0])(swung[-1]), drawn, size)
+        near = torch.cat([rest_points.expand(1, moved.shape[1], -1), moved], dim=-1)
+        costs.append(two_sided_cost(torch.maximum(data, rest_data), near, drawn))
+    if not swung:
+        return state[None][:0]
+    best = take_rows(torch.cat(swung, dim=1), torch.cat(costs, dim=1).argsort(1)[:, : _SEARCH.num_compared])
+    # Those who hardly differ from the given one are duplicates of it.
+    best = torch.cat([state[None, None], best], dim=1)
+    order = distinct_first(mean_distances(problem, best) < _SEARCH.same_swung * size)
+    return take_rows(best, order[:, 1 : 1 + count])[0]
+
+
+def _with_joints(state: Tensor, bodies: Sequence[Body], values: Tensor) -> Tensor:
+    """Return a state (D + K,) with the joints of some bodies at other values (D + K,)."""
+    dofs, moved = [dof for body in bodies for dof in body.dofs], state.clone()
+    moved[dofs] = values[dofs]
+    return moved
+
+
+def turned_people(problem: ShapeProblem, state: Tensor) -> Tensor:
     """Return a person (D + K,) turned to both sides about each axis of space, joints as the prior has them, (6, D + K).
 
     A person that leans explains one leg by the other, whose own data are left; no step leads upright from there.
@@ -71,8 +147,8 @@ def turned_people(problem: AlignProblem, state: Tensor, num_dofs: int) -> Tensor
     Args:
         problem: of one scan.
         state: fitted; its size is kept.
-        num_dofs: D, of the pose.
     """
+    num_dofs = problem.skin.shape.rig.num_dofs
     axes = torch.eye(3).to(state)
     turned = state.repeat(6, 1)
     turned[:, BASE_DOFS:num_dofs] = problem.prior.mean[:1, BASE_DOFS:num_dofs]

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from torchreg._checks import check_choice, check_count, check_positive, check_shape
-from torchreg.alignment.align import AlignConfig
 from torchreg.alignment.annealed_em import ANNEALING, anneal
 from torchreg.alignment.clusters import clustered_data
 from torchreg.alignment.confidence import EVIDENCE, pose_confidence
+from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.find_pose import FindPoseConfig, find_pose
 from torchreg.alignment.fit_proposals import best_proposal
 from torchreg.alignment.implicit_gradient import FixedPoint, attach_gradients

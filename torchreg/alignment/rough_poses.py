@@ -8,11 +8,14 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
+from torchreg._checks import check_count, check_direction
 from torchreg.alignment.problem import AlignProblem
 from torchreg.geometry.rigid import fit_rigid, rigid_matrix, transform_points
-from torchreg.geometry.rotation import so3_exp, so3_log
+from torchreg.geometry.rotation import rotation_between, so3_exp, so3_log
 from torchreg.geometry.sampling import farthest_points
+from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulation import Articulation
 from torchreg.shapes.pose_algebra import BASE_DOFS, shifted
 from torchreg.solvers.e_step import OUTLIER_CONSTANT, expectation
@@ -82,6 +85,39 @@ class PrincipalAxes:
         return _at_data_median(problem, poses.flatten(1, 2))
 
 
+@dataclass(frozen=True)
+class UprightRotations:
+    """A `PoseSource`: typical poses of a shape that stands upright, turned about the vertical.
+
+    They are put at the median of the data. A fit may lean afterwards.
+
+    Args:
+        up: (3,) what is upright in the data; in the shape it is `ArticulatedShape.up`.
+        count: of rotations, per typical pose; 30 degrees apart, as those of `UniformRotations`.
+    """
+
+    up: Direction
+    count: int = 12
+
+    def __post_init__(self) -> None:
+        check_direction(self.up, "up")
+        check_count(self.count, "count", 1)
+
+    def __call__(self, problem: AlignProblem, generator: torch.Generator) -> Tensor:
+        """Return (B, K, num_dofs) poses, see `PoseSource`."""
+        joints = typical_poses(problem.skin.shape)
+        poses = joints.repeat_interleave(self.count, 0)
+        rotations = so3_log(self.rotations(problem.skin.shape.up)).to(poses)
+        poses[:, 3:BASE_DOFS] = rotations.repeat(len(joints), 1)
+        return _at_data_median(problem, poses)
+
+    def rotations(self, own_up: Direction) -> Tensor:
+        """Return rotations (count, 3, 3), float64, that take what is upright in a shape (3,) to what is in the data."""
+        up, own = (normalize(torch.tensor(axis, dtype=torch.float64), dim=0) for axis in (self.up, own_up))
+        angles = torch.arange(self.count, dtype=torch.float64) * (math.tau / self.count)
+        return so3_exp(angles.unsqueeze(-1) * up) @ rotation_between(own, up)
+
+
 DEFAULT_SOURCES: tuple[PoseSource, ...] = (UniformRotations(), PrincipalAxes())
 
 
@@ -147,19 +183,24 @@ def register_rigidly(problem: AlignProblem, poses: Tensor, generator: torch.Gene
     base = motion @ rigid_matrix(so3_exp(poses[..., 3:BASE_DOFS]), poses[..., :3])
     rotation = so3_log(base[..., :3, :3].flatten(0, 1)).reshape(*poses.shape[:2], 3)
     registered = torch.cat([base[..., :3, 3], rotation, poses[..., BASE_DOFS:]], dim=-1)
-    return registered, _two_sided_cost(moved, drawn, size)
+    return registered, two_sided_cost(*closeness(moved, drawn, size), drawn)
 
 
 def _has_fixed_base(problem: AlignProblem) -> bool:
     return bool((problem.lower[..., :BASE_DOFS] == problem.upper[..., :BASE_DOFS]).all())
 
 
-def _two_sided_cost(points: Tensor, problem: AlignProblem, size: float) -> Tensor:
-    """Return the cost (B, K) of posed model points (B, K, N, 3): data far from them, and points far from the data."""
+def closeness(points: Tensor, problem: AlignProblem, size: float) -> tuple[Tensor, Tensor]:
+    """Return how near data are to points (B, K, N, 3), and points to data, (B, K, M) and (B, K, N), from 0 to 1."""
     data, valid = problem.data.unsqueeze(1), problem.valid.to(points)[:, None, None]
     kernel = _kernel(points, data, _RIGID_EM.score_width * size / math.sqrt(2)) * valid
+    return kernel.amax(-2), kernel.amax(-1)
+
+
+def two_sided_cost(data: Tensor, points: Tensor, problem: AlignProblem) -> Tensor:
+    """Return the cost (B, K) of data far from points, and points far from data, by their `closeness`."""
     count = problem.valid.sum(-1, keepdim=True).clamp_min(1)
-    return -kernel.amax(-2).sum(-1) / count - _RIGID_EM.model_weight * kernel.amax(-1).mean(-1)
+    return -data.sum(-1) / count - _RIGID_EM.model_weight * points.mean(-1)
 
 
 def _kernel(points: Tensor, data: Tensor, sigma: float) -> Tensor:

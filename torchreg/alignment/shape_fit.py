@@ -11,9 +11,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchreg.alignment.annealed_em import ANNEALING, OnStep, StageResult, anneal
-from torchreg.alignment.confidence import EVIDENCE, end_variances, left_over
+from torchreg.alignment.clusters import leaves_clusters
+from torchreg.alignment.confidence import EVIDENCE, end_variances
 from torchreg.alignment.objectives import GaussianPosePrior
-from torchreg.alignment.person_search import find_people, lead_over_rivals, turned_people
+from torchreg.alignment.person_search import find_people, lead_over_rivals, swung_people, turned_people
 from torchreg.alignment.problem import (
     BROAD_PRIOR,
     joint_precision,
@@ -30,6 +31,7 @@ from torchreg.geometry.facing_normals import facing_normals
 from torchreg.geometry.mesh import TriangleMesh, interpolate, sample_surface
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.sampling import farthest_points
+from torchreg.geometry.upright import Direction
 from torchreg.result import normal_copy
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.articulation import Articulation
@@ -40,7 +42,7 @@ from torchreg.shapes.spec import RigSurface
 from torchreg.solvers.robust import welsch_weight
 
 if TYPE_CHECKING:
-    from torchreg.alignment.align import AlignConfig
+    from torchreg.alignment.config import AlignConfig
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ class ShapeFit:
     fine_steps: int = 4
     em_steps: int = 6  # values of sigma
     spread_steps: int = 4  # after which a learned deviation of coefficients hardly changes
+    num_swung: int = 2  # people with a limb swung who are fitted: the first was right in all that were looked at
     again: float = 0.06  # first sigma of the second annealing, as a share of the size
 
 
@@ -156,9 +159,10 @@ def fit_coefficients(
     kept = problem.people(coarse.cost_of_people(found.pose).argsort()[:num_kept])
     coarse, state = coarse.rows(kept), found.pose[kept]
     state = fit_surface(coarse, state, steps=SHAPE_FIT.coarse_steps, on_step=on_step).pose
-    state = _placed_again(coarse, state, config, on_step)
-    if poses is None:
-        state = _turned_anew(coarse, state, shape.num_dofs, config, on_step)
+    descend = _Descent(config, on_step)
+    state = _placed_again(coarse, state, descend)
+    if problem.scans == 1:
+        state = _explained_anew(coarse, state, descend, generator, searched=poses is None)
     costs = coarse.cost_of_people(state)
     lead = lead_over_rivals(coarse, state, costs) if poses is None else None
     best = problem.people(costs.argmin().unsqueeze(0))
@@ -175,32 +179,60 @@ def fit_coefficients(
     return replace(_fitted(problem, before, last, shape.num_dofs), lead=lead)
 
 
-def _placed_again(problem: ShapeProblem, state: Tensor, config: AlignConfig, on_step: OnStep | None) -> Tensor:
+def _placed_again(problem: ShapeProblem, state: Tensor, descend: _Descent) -> Tensor:
     """Return states (B, D + K) after another, narrower annealing, where that explains more of the data.
 
     Once size and trunk are right, limbs that the first annealing put on the wrong data find theirs.
     """
-    again = SigmaSchedule.geometric(SHAPE_FIT.again * problem.size, ANNEALING.stop * problem.size, SHAPE_FIT.em_steps)
-    found = anneal(problem, state, again, em_steps=config.em_steps, m_steps=config.m_steps, on_step=on_step).pose
-    found = fit_surface(problem, found, steps=SHAPE_FIT.coarse_steps, on_step=on_step).pose
+    found = descend(problem, state, _narrow(problem))
     better = problem.cost_of_people(found) < problem.cost_of_people(state)
     return torch.where(better.repeat_interleave(problem.scans).unsqueeze(-1), found, state)
 
 
-def _turned_anew(
-    problem: ShapeProblem, state: Tensor, num_dofs: int, config: AlignConfig, on_step: OnStep | None
+def _explained_anew(
+    problem: ShapeProblem, state: Tensor, descend: _Descent, generator: torch.Generator, *, searched: bool
 ) -> Tensor:
-    """Return people (B, D + K) found in one scan, the best of them turned and annealed again if data are left over."""
+    """Return people (B, D + K) in one scan, the best of them with a part swung, where clusters of data are left over.
+
+    One that was searched is turned as a whole, too.
+    """
     costs = problem.cost_of_people(state)
     best = costs.argmin().unsqueeze(0)
-    if float(left_over(problem.rows(best), state[best])) <= EVIDENCE.left_over:
+    one = problem.rows(best)
+    if not bool(leaves_clusters(one, state[best])):
         return state
-    turned = turned_people(problem.rows(best), state[best[0]], num_dofs)
-    wide, widths = problem.rows(best.expand(len(turned))), ANNEALING.schedule(problem.size, SHAPE_FIT.em_steps)
-    found = anneal(wide, turned, widths, em_steps=config.em_steps, m_steps=config.m_steps, on_step=on_step).pose
-    found = fit_surface(wide, found, steps=SHAPE_FIT.coarse_steps, on_step=on_step).pose
-    again, choice = wide.cost_of_people(found).min(0)
-    return state.index_copy(0, best, found[choice].unsqueeze(0)) if float(again) < float(costs[best]) else state
+    others = [(swung_people(one, state[best[0]], SHAPE_FIT.num_swung, generator), _narrow(problem))]
+    if searched:
+        others.append((turned_people(one, state[best[0]]), ANNEALING.schedule(problem.size, SHAPE_FIT.em_steps)))
+    found = torch.cat([descend(problem.rows(best.expand(len(start))), start, widths) for start, widths in others])
+    again, choice = problem.rows(best.expand(len(found))).cost_of_people(found).min(0)
+    # A smaller lead is no evidence.
+    better = float(again) < float(costs[best]) - EVIDENCE.lead
+    return state.index_copy(0, best, found[choice].unsqueeze(0)) if better else state
+
+
+def _narrow(problem: ShapeProblem) -> SigmaSchedule:
+    """Return the schedule of people whose size and trunk are right."""
+    return SigmaSchedule.geometric(SHAPE_FIT.again * problem.size, ANNEALING.stop * problem.size, SHAPE_FIT.em_steps)
+
+
+@dataclass(frozen=True)
+class _Descent:
+    """Annealed EM, then a coarse fit to the surface.
+
+    Args:
+        config: of the alignment.
+        on_step: called after each iteration.
+    """
+
+    config: AlignConfig
+    on_step: OnStep | None
+
+    def __call__(self, problem: ShapeProblem, state: Tensor, widths: SigmaSchedule) -> Tensor:
+        """Return states (B, D + K) at the end of a descent from others."""
+        steps = {"em_steps": self.config.em_steps, "m_steps": self.config.m_steps}
+        found = anneal(problem, state, widths, **steps, on_step=self.on_step).pose
+        return fit_surface(problem, found, steps=SHAPE_FIT.coarse_steps, on_step=self.on_step).pose
 
 
 def _with_learned_spread(
@@ -355,7 +387,7 @@ def _problem(
     if poses is None:
         rest = shape.rest_pose().unsqueeze(0)
         problem, start = _problem(shape, data, valid, rest, viewpoints, config=config, generator=generator)
-        return _found(problem, shape, start[:, shape.num_dofs :], generator)
+        return _found(problem, shape, start[:, shape.num_dofs :], generator, config.upright)
     space, surface = shape.coefficient_space(), shape.file_surface()
     people = different_people(space, generator)
     tree = ShapedTree(shape, space)
@@ -382,11 +414,15 @@ def _problem(
 
 
 def _found(
-    problem: ShapeProblem, rig: ArticulatedShape, people: Tensor, generator: torch.Generator
+    problem: ShapeProblem,
+    rig: ArticulatedShape,
+    people: Tensor,
+    generator: torch.Generator,
+    upright: Direction | None,
 ) -> tuple[ShapeProblem, Tensor]:
     """Return the problem of one scan in rows for those of people (S, K) who are found in it, and their states."""
     one = problem.rows(torch.zeros(1, dtype=torch.int64)).sample(SHAPE_FIT.coarse_data, generator)
-    states = find_people(one, rig, people, SHAPE_FIT.num_found, generator)
+    states = find_people(one, rig, people, SHAPE_FIT.num_found, generator, upright)
     return problem.rows(torch.zeros(len(states), dtype=torch.int64)), states
 
 

@@ -15,10 +15,11 @@ from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer, check_proposer, shared_proposer
 from torchreg.alignment.problem import AlignProblem, centered_problem
 from torchreg.alignment.reliability import without_cut
-from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource
+from torchreg.alignment.rough_poses import DEFAULT_SOURCES, PoseSource, UprightRotations
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.free_space import FreeSpace
 from torchreg.errors import InputError
+from torchreg.geometry.upright import Direction
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
 
@@ -43,13 +44,16 @@ class StartSource:
         shape: ArticulatedShape,
         sources: Sequence[PoseSource] | None = None,
         initializer: PoseProposer | HoldsProposer | None = None,
+        upright: Direction | None = None,
     ) -> StartSource:
-        """Return what is given, or else the default for a shape.
+        """Return what is given, or else the default for a shape: upright poses alone where it is known to stand.
 
         Raises:
             InputError: if the sources are an empty list, or the network is for another shape.
             InputTypeError: if the network is none.
         """
+        if sources is None and upright is not None:
+            sources = (UprightRotations(upright),)
         if sources is not None and not sources:
             raise InputError("sources must hold at least one source of rough poses, got none")
         proposer = shared_proposer(shape) if sources is None and initializer is None else None

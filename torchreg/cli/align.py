@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,13 +33,13 @@ from torchreg.cli.known_options import Joints, JointStd, Known, Locked, observab
 from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, chosen_skin, load_shape
-from torchreg.cli.upright import Up, known_up, remembering
+from torchreg.cli.upright import Up, Upright, known_up, remembering
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from torchreg.alignment.align import AlignConfig
+    from torchreg.alignment.config import AlignConfig
     from torchreg.alignment.pose_proposer import PoseProposer
     from torchreg.alignment.results import AlignResult
     from torchreg.capture.depth_frames import DepthFrames
@@ -129,6 +129,7 @@ def align(
             "--fit-shape."
         ),
     ] = None,
+    upright: Upright = False,
     up: Up = None,
     force: Force = False,
     quiet: Quiet = False,
@@ -156,8 +157,10 @@ def align(
     check_used(fit_shape, "--fit-shape", {"--rig": rig})
     if rig is not None and Path(shape).suffix.lower() not in (".glb", ".gltf"):
         raise InputError(f"--rig has no meaning for {shape}, which is no rigged character; leave it out")
+    if upright and start is not None:
+        raise InputError("--upright is of a search, which --start leaves out; give one of them")
     pictures = depth_source(clouds, intrinsics, mask, depth_range) if depth else None
-    upright = known_up(up, clouds, camera=depth)
+    known_direction = known_up(up, clouds, camera=depth)
     clouds = cloud_files(clouds) if pictures is None else [Path(name) for name in pictures.names]
     output = with_ending(output, (".safetensors",), add=True)
     optional = (
@@ -173,7 +176,7 @@ def align(
 
     with tqdm(total=len(clouds), unit="cloud", desc="reading", leave=False, disable=quiet) as bar:
         model = load_shape(shape_of_side(shape, side), parents, package_dir, free_base, skin)
-        from torchreg.alignment.align import AlignConfig
+        from torchreg.alignment.config import AlignConfig
         from torchreg.shapes.skin import sample_skin
         from torchreg.storage import load_pose
 
@@ -185,8 +188,10 @@ def align(
         measured = read_keypoints(keypoints, keypoint_std, clouds, None if side == "either" else model, pictures)
         run = _AlignRun(
             model, config, points, scale, time, frame, first, known, measured, network, pictures=pictures,
-            fit_shape=fit_shape, source=(shape, chosen_skin(skin)), up=upright,
+            fit_shape=fit_shape, source=(shape, chosen_skin(skin)), up=known_direction,
         )  # fmt: skip
+        if upright:
+            run.search_upright(clouds[0])
         if side == "either":
             side = run.choose_hand(clouds[0])
             if not quiet:
@@ -288,6 +293,13 @@ class _AlignRun:
         if self.pictures is not None:
             return self.pictures[number]
         return read_cloud(path, self.scale, self.config.nan_policy, self.time, self.frame)
+
+    def search_upright(self, path: Path) -> None:
+        """Search upright shapes alone; where neither --up nor the file say what that is, the first cloud does."""
+        from torchreg.geometry.loaded import as_points
+        from torchreg.geometry.upright import guess_up
+
+        self.config = replace(self.config, upright=self.up or guess_up([as_points(self._data(0, path))]))
 
     def choose_hand(self, path: Path) -> str:
         """Go on with the hand that the first cloud or picture shows, and return its side."""

@@ -14,7 +14,7 @@ _ELSEWHERE = {
     "--unit": "--scale", "--camera": "--intrinsics", "--cameras": "--calibration", "--initial-pose": "--start",
     "--init": "--start", "--gif": "--movie", "--mp4": "--movie", "--video": "--movie", "--glb": "--gltf",
     "--overwrite": "--force", "--threads": "--workers", "--jobs": "--workers", "--image": "--picture",
-    "--upright": "--up", "--masks": "--mask", "--overlay": "--pictures", "--resume": "--progress",
+    "--standing": "--upright", "--masks": "--mask", "--overlay": "--pictures", "--resume": "--progress",
     "--progress": "--resume",
 }  # fmt: skip
 # What a command may well not have, and why.

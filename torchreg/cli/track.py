@@ -34,7 +34,7 @@ from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, shifted_t
 from torchreg.cli.reporting import ExitCode, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
 from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary, track_job
-from torchreg.cli.upright import Up, known_up
+from torchreg.cli.upright import Up, Upright, known_up
 from torchreg.cli.view import Browser, Port, tell_url
 from torchreg.errors import InputError
 
@@ -149,6 +149,7 @@ def track(
         Path | None, typer.Option(metavar="OUT.glb", help="The moving shape; by default RESULT.glb.")
     ] = None,
     no_gltf: Annotated[bool, typer.Option("--no-gltf", help="Do not write the moving shape.")] = False,
+    upright: Upright = False,
     up: Up = None,
     save_every: Annotated[int, typer.Option(min=1, help="Frames after which RESULT.progress is written anew.")] = 50,
     resume: Annotated[
@@ -193,11 +194,18 @@ def track(
     else:
         clouds, model = _clouds(frames, scale, nan_policy), load_shape(shape, *options)
 
+    from torchreg.geometry.upright import guess_up
     from torchreg.storage import load_pose
     from torchreg.tracking.tracker import TrackConfig, Tracker
 
+    known_direction = known_up(up, frames, camera=stereo or depth)
     config = TrackConfig(
-        model_points=model_points, num_model_points=points, prediction=prediction, recovery=recovery, seed=seed
+        model_points=model_points,
+        num_model_points=points,
+        prediction=prediction,
+        recovery=recovery,
+        seed=seed,
+        upright=(known_direction or guess_up([clouds[0]])) if upright else None,
     )
     first = None if start is None else shifted_to(clouds.origin, load_pose(start, model))
     network = read_initializer(initializer, model)
@@ -214,7 +222,7 @@ def track(
         )  # fmt: skip
         run = TrackRun(
             tracker=tracker, clouds=clouds, fps=fps, job=job, files=files, report=Report(bar, clouds, quiet),
-            save_every=save_every, known=known, measured=measured, up=known_up(up, frames, camera=stereo or depth),
+            save_every=save_every, known=known, measured=measured, up=known_direction,
         )  # fmt: skip
         _add_pictures(run, videos, folder, images)
         if view:

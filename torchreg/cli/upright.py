@@ -28,6 +28,15 @@ Up = Annotated[
     ),
 ]
 
+Upright = Annotated[
+    bool,
+    typer.Option(
+        "--upright",
+        help="The shape stands upright, as in its own file: without --start only turns about the vertical (see --up) "
+        "are searched.",
+    ),
+]
+
 
 def check_up(up: str | None) -> Direction | None:
     """Return the direction of --up."""

@@ -10,6 +10,9 @@ from torch import Tensor
 
 Direction = tuple[float, float, float]
 
+Y_UP: Direction = (0.0, 1.0, 0.0)
+Z_UP: Direction = (0.0, 0.0, 1.0)
+
 # Endings of formats whose y axis points up, by their specification or by use.
 Y_UP_ENDINGS = (".glb", ".gltf", ".obj")
 

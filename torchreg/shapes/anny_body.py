@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchreg._checks import check_choice
 from torchreg.errors import FormatError, MissingExtraError
+from torchreg.geometry.upright import Z_UP
 from torchreg.io.tensors import load_tensors, save_tensors
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.rigs import spec_from_arrays
@@ -168,7 +169,7 @@ def _rig(arrays: Mapping[str, Tensor], names: Mapping[str, Any]) -> tuple[ShapeS
         solids = [Primitive("ellipsoid", tuple(sizes), pose) for sizes, pose in pairs]
     spec = spec_from_arrays(
         at_mean, arrays["faces"], arrays["weights"], heads, arrays["parents"].tolist(), joint_names=joints,
-        solids=solids,
+        solids=solids, up=Z_UP,
     )  # fmt: skip
     prior = CoefficientPrior(
         names=tuple(labels), mean=half, std=torch.full_like(half, _UNIFORM_STD), lower=torch.zeros_like(half),

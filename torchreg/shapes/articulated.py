@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_count, check_finite, check_shape
+from torchreg._checks import as_float_tensor, check_count, check_direction, check_finite, check_shape
 from torchreg.errors import InputError
+from torchreg.geometry.upright import Y_UP
 from torchreg.io.file_format import naming
 from torchreg.io.npz import load_arrays
 from torchreg.shapes.articulation import Articulation
@@ -52,6 +53,7 @@ class ArticulatedShape(Articulation):
         free_base: False pins the base at the origin (its six limits are zero).
         surface: mesh and skin weights of the file the shape came from, if any.
         space: rest states of the rig by shape coefficients, if it has any.
+        up: what is upright in the coordinates of the tree, see `UprightRotations`.
         dtype: of all parameters and buffers; the default dtype if None.
 
     Raises:
@@ -66,8 +68,9 @@ class ArticulatedShape(Articulation):
         given = {key: value for key, value in options.items() if value is not None}
         options = {"nu": spec.nu, "sharpness": spec.sharpness, **given}
         return cls(
-            spec.tree, spec.part_frames, spec.primitives, part_names=spec.part_names, surface=spec.surface, **options
-        )
+            spec.tree, spec.part_frames, spec.primitives, part_names=spec.part_names, surface=spec.surface,
+            up=spec.up, **options,
+        )  # fmt: skip
 
     @classmethod
     def from_urdf(
@@ -200,6 +203,7 @@ class ArticulatedShape(Articulation):
         coefficient_names: Sequence[str] | None = None,
         coefficient_std: Tensor | float = 1.0,
         primitive: str = "ellipsoid",
+        up: Sequence[float] = Y_UP,
         nu: float | None = None,
         dtype: torch.dtype | None = None,
     ) -> ArticulatedShape:
@@ -226,6 +230,7 @@ class ArticulatedShape(Articulation):
             coefficient_std: standard deviation of the coefficients' prior about zero, one number or (K,); a fit keeps
                 them within five of it.
             primitive: kind of the fitted solids.
+            up: (3,) what is upright in the coordinates of the arrays, y as in SMPL and glTF by default.
             nu: fusion length, metres; from the parts' thickness by default.
             dtype: of the module; the default dtype if None.
 
@@ -240,7 +245,7 @@ class ArticulatedShape(Articulation):
         """
         spec = spec_from_arrays(
             vertices, faces, weights, joints, parents,
-            joint_names=joint_names, axes=axes, limits=limits, primitive=primitive,
+            joint_names=joint_names, axes=axes, limits=limits, primitive=primitive, up=check_direction(up, "up"),
         )  # fmt: skip
         coefficients = Coefficients(
             shape_dirs=shape_dirs, joint_dirs=joint_dirs, joint_regressor=joint_regressor, names=coefficient_names,

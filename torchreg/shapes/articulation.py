@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchreg._checks import check_finite, check_positive, check_shape
+from torchreg._checks import check_direction, check_finite, check_positive, check_shape
 from torchreg.errors import InputError, ModelError
 from torchreg.geometry.budget import BUDGET
 from torchreg.geometry.isosurface import isosurface
@@ -20,6 +20,7 @@ from torchreg.geometry.kinematic_tree import KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.primitives import Planes
 from torchreg.geometry.rigid import invert_rigid, rigid_matrix
+from torchreg.geometry.upright import Z_UP, Direction
 from torchreg.shapes.material_points import MaterialPoints, ShapeOutput, fused_points, mesh_points, onto_fused
 from torchreg.shapes.posed_tree import PosedTree, frozen
 from torchreg.shapes.primitives import Primitive, PrimitiveSet, fuse
@@ -74,6 +75,7 @@ class Articulation(PosedTree):
         free_base: bool = True,
         surface: RigSurface | None = None,
         space: ShapeSpace | None = None,
+        up: Direction = Z_UP,
         dtype: torch.dtype | None = None,
     ) -> None:
         check_positive(nu, "nu")
@@ -86,6 +88,7 @@ class Articulation(PosedTree):
         self.primitives = PrimitiveSet(primitives)
         self.surface = surface
         self.space = space
+        self.up = check_direction(up, "up")
         self.log_radius_scales = frozen(torch.zeros(len(primitives), dtype=torch.float64))
         self.log_nu = frozen(torch.tensor(math.log(nu), dtype=torch.float64))
         self.log_sharpness = frozen(torch.tensor(math.log(sharpness), dtype=torch.float64))

@@ -68,7 +68,7 @@ _FOUND: WeakKeyDictionary[Articulation, tuple[list[Limb], list[int]]] = WeakKeyD
 
 
 def _find_limbs(shape: Articulation) -> tuple[list[Limb], list[int]]:
-    bodies = _find_bodies(shape)
+    bodies = find_bodies(shape)
     owner = {part: number for number, body in enumerate(bodies) for part in body.parts}
     above = [owner[body.parent] if body.parent >= 0 else -1 for body in bodies]
     moved = shape.kinematics.moves[shape.part_index].any(-1).tolist()
@@ -91,7 +91,7 @@ def _find_limbs(shape: Articulation) -> tuple[list[Limb], list[int]]:
     return found, trunk
 
 
-def _find_bodies(shape: Articulation) -> list[Body]:
+def find_bodies(shape: Articulation) -> list[Body]:
     """Return the bodies of a shape, parents before children: parts below the same joints."""
     joints: Tensor = shape.kinematics.moves[shape.part_index] > 0
     drives = shape.kinematics.couplings != 0
@@ -107,6 +107,11 @@ def _find_bodies(shape: Articulation) -> list[Body]:
         bodies.append(Body(tuple(parts), parent, tuple(6 + dof for dof in driven if dof not in taken)))
         taken.update(driven)
     return bodies
+
+
+def bodies_below(shape: Articulation, bodies: list[Body], top: Body) -> list[Body]:
+    """Return those of the bodies that hang on one of them, itself included."""
+    return [body for body in bodies if top.parts[0] in (body.parts[0], *_ancestors(shape, body.parts[0]))]
 
 
 def _ancestors(shape: Articulation, part: int) -> list[int]:

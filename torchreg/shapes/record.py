@@ -74,6 +74,7 @@ def record_shape(shape: ArticulatedShape) -> ShapeRecord:
             part_names=shape.part_names,
             surface=shape.surface,
             sharpness=shape.start_sharpness,
+            up=shape.up,
         )
     else:
         raise InputTypeError(

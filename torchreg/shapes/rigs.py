@@ -15,6 +15,7 @@ from torchreg.errors import FileWarning, InputError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import RIGID_TOLERANCE, invert_rigid, rigid_matrix, transform_points
+from torchreg.geometry.upright import Y_UP, Direction
 from torchreg.io.file_format import naming
 from torchreg.io.gltf import load_rig
 from torchreg.io.gltf_document import parents_first
@@ -101,6 +102,7 @@ def spec_from_arrays(
     limits: Limits | None = None,
     primitive: str = "ellipsoid",
     solids: Sequence[Primitive] | None = None,
+    up: Direction = Y_UP,
 ) -> ShapeSpec:
     """Return the `ShapeSpec` of a skinned mesh; see `ArticulatedShape.from_skinned_mesh`.
 
@@ -134,6 +136,7 @@ def spec_from_arrays(
         nu=nu,
         part_names=tuple(names[index] for index in parts),
         surface=RigSurface(vertices, mesh.faces, weights[:, parts]),
+        up=up,
     )
 
 

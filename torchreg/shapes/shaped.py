@@ -171,6 +171,10 @@ class ShapedSkin(nn.Module):
         """Return the vertices (M, C) of the rig between which some points (M,) lie."""
         return self._used[self.corners[index]]
 
+    def subset(self, index: Tensor) -> ShapedSkin:
+        """Return the skin of some of the points (M,)."""
+        return ShapedSkin(self.shape, self.vertex_index(index), self.shares[index], self.weights[index])
+
     def forward(self, state: Tensor) -> Tensor:
         """Return the points (..., N, 3) in states (..., D + K), metres.
 

@@ -159,6 +159,7 @@ def person_spec(shape: Articulation, surface: RigSurface, vertices: Tensor, posi
         part_names=shape.part_names,
         surface=grown,
         sharpness=shape.start_sharpness,
+        up=shape.up,
     )
 
 

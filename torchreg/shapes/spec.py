@@ -11,6 +11,7 @@ from torch import Tensor
 from torchreg.geometry.kinematic_tree import KinematicTree
 from torchreg.geometry.primitive_fit import fit_primitive
 from torchreg.geometry.primitives import PRIMITIVE_KINDS
+from torchreg.geometry.upright import Z_UP, Direction
 from torchreg.shapes.primitives import Primitive
 
 # Kinds of solids by name, or the one nearest to the points.
@@ -48,6 +49,7 @@ class ShapeSpec:
         part_names: names of the parts.
         surface: mesh and weights of the file, in the pose of all zeros.
         sharpness: of the bending skin.
+        up: (3,) what is upright in the shape's own coordinates.
     """
 
     tree: KinematicTree
@@ -57,6 +59,7 @@ class ShapeSpec:
     part_names: tuple[str, ...]
     surface: RigSurface | None = None
     sharpness: float = 2.0
+    up: Direction = Z_UP
 
 
 def fitted_solid(points: Tensor, kind: str) -> Primitive:

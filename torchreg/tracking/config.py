@@ -6,7 +6,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
-from torchreg._checks import check_choice, check_count, check_positive
+from torchreg._checks import check_choice, check_count, check_direction, check_positive
+from torchreg.geometry.upright import Direction
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class TrackConfig:
         sharpness: of the bending skin; the shape's own by default.
         debias: see `AlignConfig`.
         nan_policy: "omit" leaves out data that are not finite; "raise" refuses them.
+        upright: of searches without a start, see `AlignConfig`.
         seed: of all random draws.
     """
 
@@ -44,6 +46,7 @@ class TrackConfig:
     sharpness: float | None = None
     debias: float = 0.8
     nan_policy: str = "omit"
+    upright: Direction | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -59,6 +62,8 @@ class TrackConfig:
         if self.sharpness is not None:
             check_positive(self.sharpness, "sharpness")
         check_positive(self.debias, "debias", allow_zero=True)
+        if self.upright is not None:
+            check_direction(self.upright, "upright")
 
     @classmethod
     def paper(cls, **changes: Any) -> TrackConfig:

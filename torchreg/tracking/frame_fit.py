@@ -10,9 +10,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from torchreg.alignment.align import AlignConfig
 from torchreg.alignment.annealed_em import anneal
 from torchreg.alignment.confidence import end_motions, end_variances, limb_ends, share_beside
+from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.free_space_term import INTRUSION, FreeSpaceTerm
 from torchreg.alignment.landmarks import keypoint_skin
 from torchreg.alignment.objectives import GaussianPosePrior

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_finite, check_shape, warn_about_rounding
 from torchreg._threads import one_thread
-from torchreg.alignment.align import AlignConfig, align
+from torchreg.alignment.align import align
+from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.inputs import check_skin, floating_origin, warn_about_degenerate, warn_about_units
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmarks import MeasuredKeypoints
@@ -96,13 +97,17 @@ class Tracker:
         self.shape, self.config = shape, config or TrackConfig()
         if fit_shape is not False and not (model_points is None and initializer is None and len(locked) == 0):
             raise InputError("fit_shape goes without model_points, locked and initializer; leave them out")
-        self._person = None if fit_shape is False else PersonFilter(shape, fit_shape, self.config.seed)
+        self._person = None if fit_shape is False else PersonFilter(
+            shape, fit_shape, self.config.seed, self.config.upright
+        )  # fmt: skip
         self._followed: Tensor | None = None
         if model_points is not None:
             model_points = check_skin(shape, model_points)
         with torch.no_grad():
             self._fitter = FrameFitter(shape, self.config, model_points)
-            self._recover = Recovery(self._fitter, StartSource.of(shape, initializer=initializer))
+            self._recover = Recovery(
+                self._fitter, StartSource.of(shape, initializer=initializer, upright=self.config.upright)
+            )  # fmt: skip
             pose = self._checked_pose(initial_pose)
             # In full precision, for clouds far from the origin.
             self._start = pose if initial_pose is None else torch.as_tensor(initial_pose, dtype=torch.float64)
@@ -283,7 +288,7 @@ class Tracker:
         self.shape, self._followed = self._person.rig.with_coefficients(coefficients), coefficients
         with torch.no_grad():
             self._fitter = FrameFitter(self.shape, self.config, None)
-            self._recover = Recovery(self._fitter, StartSource.of(self.shape))
+            self._recover = Recovery(self._fitter, StartSource.of(self.shape, upright=self.config.upright))
 
     def _follow_closer(self) -> None:
         """Go on with the rig of the coefficients known by now, where that of the one followed is off."""
