@@ -4,8 +4,7 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.alignment import align
-from torchreg.alignment import annealed_em as align_stages
+from torchreg.alignment import annealed_em, config
 
 METHODS = [
     "EM", "EM c / 10", "EM own sigma", "SoftAssign", "ICP", "EM debiased", "SoftAssign debiased", "EM + surface fit",
@@ -17,8 +16,8 @@ METHODS = [
 def bench(loaded_benchmark):
     with pytest.MonkeyPatch.context() as patch:
         # The benchmark adds an E-step of its own, which other tests must not see.
-        registry = dict(align_stages.CORRESPONDENCES)
-        for user in (align, align_stages):
+        registry = dict(annealed_em.CORRESPONDENCES)
+        for user in (config, annealed_em):
             patch.setattr(user, "CORRESPONDENCES", registry)
         with loaded_benchmark("rivals") as module:
             yield module

@@ -97,7 +97,7 @@ def swung_people(problem: ShapeProblem, state: Tensor, count: int, generator: to
     Args:
         problem: of one scan.
         state: fitted; its size and the rest of its pose are kept.
-        count: of states, at most.
+        count: of states, at most; none without limbs of less than half of the surface.
         generator: of the data that are looked at.
     """
     rig, mean, size = problem.skin.shape.rig, problem.prior.mean[0], problem.size

@@ -204,6 +204,10 @@ def _explained_anew(
     others = [(swung_people(one, state[best[0]], SHAPE_FIT.num_swung, generator), _narrow(problem))]
     if searched:
         others.append((turned_people(one, state[best[0]]), ANNEALING.schedule(problem.size, SHAPE_FIT.em_steps)))
+    # A chain without branches has no limb to swing.
+    others = [(start, widths) for start, widths in others if len(start)]
+    if not others:
+        return state
     found = torch.cat([descend(problem.rows(best.expand(len(start))), start, widths) for start, widths in others])
     again, choice = problem.rows(best.expand(len(found))).cost_of_people(found).min(0)
     # A smaller lead is no evidence.
