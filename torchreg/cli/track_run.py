@@ -136,10 +136,11 @@ def track_job(
     shape: str, options: tuple[Any, ...], start: Tensor | None, config: TrackConfig, fps: float, scale: float,
     nan_policy: str, clouds: Clouds,
 ) -> dict[str, Any]:  # fmt: skip
-    """Return all that decides about the poses, as plain data."""
+    """Return all that decides about the poses, as plain data: what JSON gives back is equal to it."""
+    configuration = asdict(config) | {"upright": None if config.upright is None else list(config.upright)}
     return {
         "shape": shape, "shape options": [None if value is None else str(value) for value in options],
-        "--start": None if start is None else start.tolist(), "configuration": asdict(config), "--fps": fps,
+        "--start": None if start is None else start.tolist(), "configuration": configuration, "--fps": fps,
         "--scale": scale, "--nan-policy": nan_policy, "frames": list(clouds.names),
     }  # fmt: skip
 
