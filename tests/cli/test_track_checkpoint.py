@@ -1,7 +1,9 @@
 """Progress of a tracker: files that come back to the last bit, damaged ones, parts of sequences."""
 
+import json
 import zipfile
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -14,7 +16,9 @@ from torchreg.cli.track_checkpoint import (
     load_progress,
     save_progress,
 )
+from torchreg.cli.track_run import track_job
 from torchreg.errors import FormatError, InputError
+from torchreg.tracking.config import TrackConfig
 from torchreg.tracking.tracker import Tracker
 
 JOB = {"shape": "hand", "--start": [0.1, 1e-17], "--fps": 20.0, "options": [None, True], "inner": {"seed": 3}}
@@ -116,3 +120,9 @@ def test_parts_make_the_whole(progress):
             first_frames(whole, count)
     with pytest.raises(InputError, match="with 27 degrees of freedom and 21 keypoints, got 26 and 21"):
         join_frames(whole, replace(whole, poses=whole.poses[:, 1:]))
+
+
+def test_what_decides_about_the_poses_comes_back_from_json(tmp_path):
+    clouds = SimpleNamespace(names=["a", "b"])
+    job = track_job("hand", (None,), torch.zeros(27), TrackConfig(upright=(0, 0, 1)), 20.0, 1.0, "omit", clouds)
+    assert json.loads(json.dumps(job)) == job
