@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchreg.alignment.problem import AlignProblem
 from torchreg.alignment.surface_fit import surface_noise
+from torchreg.geometry.budget import BUDGET
 
 
 @dataclass(frozen=True)
@@ -59,15 +60,27 @@ def clusters_beside(problem: AlignProblem, distance: Tensor) -> tuple[Tensor, Te
     limit = OFF_SURFACE.distance(surface_noise(distance, problem.valid, problem.size), problem.size)
     far = (distance > limit.unsqueeze(-1)) & problem.valid
     near = ~far & problem.valid
-    squares = _squared_distances(problem.data)
-    squares.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
-    spacing = torch.where(near, squares.amin(-1), torch.nan).nanmedian(-1).values.sqrt()
-    radius = torch.nan_to_num(CLUSTERS.radius * spacing, nan=0.0).clamp_max(CLUSTERS.max_radius * problem.size)
-    close = (squares < radius.square()[:, None, None]) & far.unsqueeze(-2)
-    clustered = far & (close.sum(-1) >= CLUSTERS.neighbors)
+    clustered = far & (_far_neighbors(problem, near, far) >= CLUSTERS.neighbors)
     return clustered.sum(-1), near.sum(-1)
 
 
-def _squared_distances(data: Tensor) -> Tensor:
-    norms = data.square().sum(-1)
-    return (norms.unsqueeze(-1) + norms.unsqueeze(-2) - 2 * data @ data.mT).clamp_min_(0)
+def _far_neighbors(problem: AlignProblem, near: Tensor, far: Tensor) -> Tensor:
+    """Return the number of data (B, M) off the surface within the radius of clusters about each datum."""
+    data, counts = problem.data, torch.zeros_like(problem.data[..., 0])
+    rows = max(1, BUDGET.table_entries // data.shape[1] ** 2)
+    for start in range(0, len(data), rows):
+        part = slice(start, start + rows)
+        squares = _squared_distances(data[part], problem.valid[part])
+        squares.diagonal(dim1=-2, dim2=-1).fill_(torch.inf)
+        spacing = torch.where(near[part], squares.amin(-1), torch.nan).nanmedian(-1).values.clamp_min(0).sqrt()
+        radius = torch.nan_to_num(CLUSTERS.radius * spacing, nan=0.0).clamp_max(CLUSTERS.max_radius * problem.size)
+        within = squares.lt_(radius.square()[:, None, None])
+        torch.matmul(within, far[part].to(data).unsqueeze(-1), out=counts[part].unsqueeze(-1))
+    return counts
+
+
+def _squared_distances(data: Tensor, valid: Tensor) -> Tensor:
+    """Return the squared distances (B, M, M) of data by one product, infinite from padding."""
+    norms = data.square().sum(-1).masked_fill(~valid, torch.inf).unsqueeze(-1)
+    ones = torch.ones_like(norms)
+    return torch.cat([data, norms, ones], dim=-1) @ torch.cat([-2 * data, ones, norms], dim=-1).mT

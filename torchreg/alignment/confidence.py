@@ -39,6 +39,26 @@ EVIDENCE = Evidence()
 _MISFIT = _Misfit()
 
 
+@dataclass(frozen=True, eq=False)
+class DataOnSurface:
+    """How the data lie on the surface in some poses.
+
+    Args:
+        distance: (B, M) of the data from it, metres.
+        jacobian: (B, M, num_dofs) of the distances.
+        limb_data: (B, L) number of data that only one limb explains, see `limb_data`.
+    """
+
+    distance: Tensor
+    jacobian: Tensor
+    limb_data: Tensor
+
+    @classmethod
+    def of(cls, problem: AlignProblem, pose: Tensor) -> DataOnSurface:
+        """Return how the data of a batch lie in poses (B, num_dofs)."""
+        return cls(*problem.surface.distance_jacobian(problem.data, pose), limb_data(problem, pose))
+
+
 def pose_confidence(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor:
     """Return the confidence (B,) in poses, from 0 to 1.
 
@@ -96,23 +116,29 @@ def known_ends(problem: AlignProblem, pose: Tensor) -> Tensor:
     return 1 - (-(EVIDENCE.tolerance * problem.size / spread).square()).exp()
 
 
-def end_spreads(problem: AlignProblem, pose: Tensor) -> Tensor:
+def end_spreads(problem: AlignProblem, pose: Tensor, lying: DataOnSurface | None = None) -> Tensor:
     """Return by how much the ends (B, L) of the limbs may be off in poses (B, num_dofs), metres.
 
     The position of an end spreads by the covariance of the pose, given the data near the surface and the prior; that of
     a limb which explains no data alone spreads by the prior.
+
+    Args:
+        problem: the batch.
+        pose: (B, num_dofs), fitted.
+        lying: how its data lie in these poses, where that is known.
     """
     if problem.data.shape[-2] > EVIDENCE.num_data:
-        problem = problem.draw(EVIDENCE.num_data, torch.Generator().manual_seed(0))
+        problem, lying = problem.draw(EVIDENCE.num_data, torch.Generator().manual_seed(0)), None
+    lying = lying or DataOnSurface.of(problem, pose)
     moves = end_motions(problem.skin, pose, limb_ends(problem.skin))
     # What the prior leaves free is plausible, at least.
     prior = torch.maximum(problem.prior.precision, BROAD_PRIOR.precision(problem.skin.shape, problem.size))
     variances = prior.reciprocal()
     variances[..., :BASE_DOFS] = 0
     loose = (moves.square() * variances[..., None, None, :]).sum((-2, -1))
-    covariance = _covariance(problem, pose, prior)
+    covariance = _covariance(problem, pose, lying, prior)
     fitted = end_variances(moves, covariance)
-    alone = (-limb_data(problem, pose) / EVIDENCE.limb_data).exp()
+    alone = (-lying.limb_data / EVIDENCE.limb_data).exp()
     return (fitted + alone * (loose - fitted).clamp_min(0)).clamp_min(torch.finfo(pose.dtype).tiny).sqrt()
 
 
@@ -147,13 +173,12 @@ def limb_points(skin: LinearBlendSkin) -> list[tuple[Limb, Tensor]]:
     return [(limb, index) for limb, index in points if len(index)]
 
 
-def _covariance(problem: AlignProblem, pose: Tensor, precision: Tensor) -> Tensor:
+def _covariance(problem: AlignProblem, pose: Tensor, lying: DataOnSurface, precision: Tensor) -> Tensor:
     """Return the covariance (B, num_dofs, num_dofs) of poses, given near data and a prior's precision."""
-    distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
-    noise = surface_noise(distance, problem.valid, problem.size)
+    noise = surface_noise(lying.distance, problem.valid, problem.size)
     width = SURFACE_FIT.width_per_noise * noise
-    near = welsch_weight((distance / width.unsqueeze(-1)).square()) * problem.valid
-    covariance = pose_covariance(jacobian, near, noise, precision)
+    near = welsch_weight((lying.distance / width.unsqueeze(-1)).square()) * problem.valid
+    covariance = pose_covariance(lying.jacobian, near, noise, precision)
     return covariance if problem.landmarks is None else problem.landmarks.informed(covariance, pose)
 
 

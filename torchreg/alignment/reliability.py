@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.clusters import OFF_SURFACE, clusters_beside
-from torchreg.alignment.confidence import EVIDENCE, end_spreads, limb_data, limb_points, share_beside
+from torchreg.alignment.confidence import EVIDENCE, DataOnSurface, end_spreads, limb_points, share_beside
 from torchreg.alignment.patches import errors_per_patch
 from torchreg.alignment.problem import BROAD_PRIOR, INLIER_SHARE, AlignProblem, free_space_loss
 from torchreg.alignment.shape_errors import shape_covariance
@@ -174,8 +174,9 @@ def judge(problem: AlignProblem, pose: Tensor, lead: Tensor | None, error: Surfa
         lead: see `gather_evidence`.
         error: of fits of pose and shape together.
     """
-    around, spreads = curvature(problem, pose), end_spreads(problem, pose)
-    evidence, calibration = gather_evidence(problem, pose, around.distance, lead, spreads), CALIBRATION
+    lying = DataOnSurface.of(problem, pose)
+    around, spreads = curvature(problem, pose, lying), end_spreads(problem, pose, lying)
+    evidence, calibration = gather_evidence(problem, pose, lying.distance, lead, spreads), CALIBRATION
     converged, loose = around.converged, spreads > EVIDENCE.tolerance * problem.size
     if error is not None:
         evidence, calibration = replace(evidence, unknown=error.unknown(problem.size)), SHAPE_CALIBRATION
@@ -266,12 +267,10 @@ class Curvature:
     Args:
         covariance: (B, num_dofs, num_dofs) in tangent coordinates.
         gain: (B,) log-likelihood that a further step would gain.
-        distance: (B, M) of the data from the surface, metres.
     """
 
     covariance: Tensor
     gain: Tensor
-    distance: Tensor
 
     @property
     def converged(self) -> Tensor:
@@ -279,15 +278,21 @@ class Curvature:
         return self.gain <= _SCALES.gain
 
 
-def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
+def curvature(problem: AlignProblem, pose: Tensor, lying: DataOnSurface | None = None) -> Curvature:
     """Return the covariance of fitted poses (B, num_dofs), and what another step would gain.
 
     Neighboring data err together: the correlation of their residuals says how many of them count as one. Beside noise,
     a patch of the surface errs by what the model is not exact, and of solids so does the whole surface; their
     proportions may be wrong, too. One datum or two tell nothing surely. What no data tell is as uncertain as the
     joints' limits leave it, and so is a limb that hardly any data show.
+
+    Args:
+        problem: the batch.
+        pose: fitted.
+        lying: how its data lie in these poses, where that is known.
     """
-    distance, jacobian = problem.surface.distance_jacobian(problem.data, pose)
+    lying = lying or DataOnSurface.of(problem, pose)
+    distance, jacobian = lying.distance, lying.jacobian
     noise = surface_noise(distance, problem.valid, problem.size)
     sigma = SURFACE_FIT.width_per_noise * noise
     near = welsch_weight((distance / sigma.unsqueeze(-1)).square()) * problem.valid
@@ -315,8 +320,8 @@ def curvature(problem: AlignProblem, pose: Tensor) -> Curvature:
         problem, pose, distance=distance, jacobian=jacobian, factor=near.sqrt() / noise.unsqueeze(-1),
         covariance=pose_covariance(jacobian, near, noise, precision), share=correlation,
     )  # fmt: skip
-    misplaced = torch.diag_embed(_misplaced_share(problem, pose) / precision)
-    return Curvature((covariance + misplaced + inexact_shape).to(pose), gain, distance)
+    misplaced = torch.diag_embed(_misplaced_share(problem, lying.limb_data) / precision)
+    return Curvature((covariance + misplaced + inexact_shape).to(pose), gain)
 
 
 def _sure_covariance(jacobian: Tensor, weights: Tensor, noise: Tensor, precision: Tensor) -> Tensor:
@@ -382,10 +387,10 @@ def hardly_gains(
     return _gain(problem, pose, distance, jacobian, noise, covariance) / shared <= _SCALES.gain
 
 
-def _misplaced_share(problem: AlignProblem, pose: Tensor) -> Tensor:
+def _misplaced_share(problem: AlignProblem, limb_data: Tensor) -> Tensor:
     """Return the probability (B, num_dofs) that a joint is anywhere: that of a limb which hardly any data show."""
-    share = torch.zeros_like(pose)
-    missing = (-limb_data(problem, pose) / _SCALES.limb_data).exp()
+    share = torch.zeros_like(problem.prior.mean)
+    missing = (-limb_data / _SCALES.limb_data).exp()
     for column, (limb, _) in enumerate(limb_points(problem.skin)):
         share[:, limb.dofs] = missing[:, column : column + 1]
     return share
