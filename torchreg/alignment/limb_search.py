@@ -94,6 +94,12 @@ class _Beam:
         return _Beam(take_rows(self.poses, index), take_rows(self.losses, index), take_rows(self.frames, index))
 
 
+def rows_in_memory(count: int, entries: int, device: torch.device) -> tuple[Tensor, ...]:
+    """Return the indices of ``count`` problems in groups whose tables, of so many entries each, fit into memory."""
+    most = _PLACEMENT.cpu_entries if device.type == "cpu" else _PLACEMENT.device_entries
+    return torch.arange(count, device=device).split(max(1, most // max(1, entries)))
+
+
 def take_rows(table: Tensor, index: Tensor) -> Tensor:
     """Return rows ``index`` (B, C) of a table (B, K, ...)."""
     return table.gather(1, index.reshape(*index.shape, *[1] * (table.ndim - 2)).expand(*index.shape, *table.shape[2:]))
@@ -162,9 +168,7 @@ class LimbSearch:
         """
         if not self.limbs:
             return poses.unsqueeze(1)
-        per_row = effort.num_data * _PLACEMENT.max_tried
-        entries = _PLACEMENT.cpu_entries if poses.device.type == "cpu" else _PLACEMENT.device_entries
-        rows = torch.arange(len(poses), device=poses.device).split(max(1, entries // per_row))
+        rows = rows_in_memory(len(poses), effort.num_data * _PLACEMENT.max_tried, poses.device)
         subset = problem.draw(effort.num_data, generator)
         found = [_Search(self, problem.rows(row), subset.rows(row), effort).run(poses[row]) for row in rows]
         return torch.cat(found)
