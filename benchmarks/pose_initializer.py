@@ -10,7 +10,9 @@ average.
 
 - start: from starts that are off by 0.1 rad in every joint and 5 mm in place; clouds per second by size of the batch.
 - proposed: without starts, by the network that comes with torchreg: 600 points, 15 % of them outliers, fingers that
-  curl (`random_hand_pose`), right within 15 mm; clouds per CPU second. Bars: 92 % right, 20 a second.
+  curl (`random_hand_pose`), right within 15 mm; clouds per CPU second. Bars: 92 % right, 20 a second. Beside it by
+  what the camera sees most of (palm, back, an edge, or along the fingers), and by how many last phalanges have fewer
+  than 4 points.
 - pictures: the same on SHARED/hand_depth, real depth pictures cut to what is within 19 cm of the marked middle
   fingertip, as in `depth_frames.py`; beside it by the search. ``--data SHARED``; skipped without.
 - scratch: without starts, by a search alone. Bars: 85 % right, and confidence that ranks the failures, AUROC of 0.9.
@@ -39,9 +41,11 @@ from depth_frames import REACH, marked_tips
 from torch import Tensor
 
 import torchreg as tr
-from torchreg.datasets.hand import make_hand_cloud, random_hand_pose, surface_skin
+from torchreg.datasets.hand import HandCloud, make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.geometry.rotation import so3_log
 from torchreg.geometry.rotation_representations import rotation_from_quaternion
+
+Figures = dict[str, float]
 
 NUM_POINTS, NOISE, OUTLIERS, DISTANCE = 512, 0.001, 0.1, 0.5
 HALF, FULL = 0.5, 1.0
@@ -55,8 +59,10 @@ QUICK = tr.FindPoseConfig(num_candidates=8, num_placed=2, num_searched=1, search
 PROFILED = {"cpu": 8, "cuda": 512}
 BAR_RIGHT, BAR_AUROC, BAR_GRADIENT = 0.85, 0.9, 1e-5
 PICTURE_POINTS = 2000
-PROPOSED_POINTS, PROPOSED_OUTLIERS, PROPOSED_RIGHT = 510, 90, 0.015
+PROPOSED_POINTS, PROPOSED_OUTLIERS, PROPOSED_RIGHT, SURE = 510, 90, 0.015, 0.5
 BAR_PROPOSED, BAR_RATE = 0.92, 20.0
+# What a camera sees most of, along the positive and the negative axis of the palm's frame; points that show a tip.
+VIEWS, MIN_SEEN = (("edge", "edge"), ("back", "palm"), ("along the fingers", "along the fingers")), 4
 
 
 def draw(
@@ -175,15 +181,46 @@ def from_scratch(
     return figures, found.confidence.cpu(), right.cpu()
 
 
+def view_of(hand: tr.Hand, pose: Tensor) -> str:
+    """Return what a camera at the origin sees most of in a pose."""
+    palm = hand.part_transforms(pose)[0]
+    towards = -palm[:3, :3].mT @ palm[:3, 3]
+    axis = int(towards.abs().argmax())
+    return VIEWS[axis][int(towards[axis] < 0)]
+
+
+def hidden_tips(hand: tr.Hand, cloud: HandCloud) -> str:
+    """Return how many fingertips hardly any points of a cloud show."""
+    counts = [int((cloud.inliers & (cloud.part_labels == part)).sum()) for part in hand.fingertip_parts]
+    hidden = sum(count < MIN_SEEN for count in counts)
+    return f"{hidden} hidden" if hidden < 2 else "2 or more hidden"
+
+
+def by_case(names: Sequence[str], error: Tensor, sure: Tensor) -> str:
+    """Return how many clouds of each case are right, a line per case."""
+    lines = []
+    for name in sorted(set(names)):
+        of_case = torch.tensor([each == name for each in names])
+        right = (error <= PROPOSED_RIGHT)[of_case].double().mean()
+        median = 1e3 * float(error[of_case].median())
+        lines.append(
+            f"  {name:18} {int(of_case.sum()):5} clouds, right {right:6.1%}, median {median:4.1f} mm, "
+            f"sure {sure[of_case].double().mean():6.1%}"
+        )
+    return "\n".join(lines)
+
+
 @torch.no_grad()
-def proposed(hand: tr.Hand, count: int, generator: torch.Generator, device: torch.device) -> dict[str, float]:
-    """Return how good and how fast poses are that a network proposes."""
+def proposed(hand: tr.Hand, count: int, generator: torch.Generator, device: torch.device) -> tuple[Figures, str]:
+    """Return how good and how fast poses are that a network proposes, and how good by view and by hidden tips."""
     surface, share = surface_skin(hand), PROPOSED_OUTLIERS / (PROPOSED_POINTS + PROPOSED_OUTLIERS)
     poses = torch.stack([random_hand_pose(hand, generator) for _ in range(count)])
-    clouds = torch.stack([
+    seen = [
         make_hand_cloud(hand, pose, num_points=PROPOSED_POINTS, outlier_ratio=share, camera=torch.zeros(3).to(pose),
-                        skin=surface, generator=generator).points for pose in poses
-    ])  # fmt: skip
+                        skin=surface, generator=generator) for pose in poses
+    ]  # fmt: skip
+    views, hidden = [view_of(hand, pose) for pose in poses], [hidden_tips(hand, cloud) for cloud in seen]
+    clouds = torch.stack([cloud.points for cloud in seen])
     hand, clouds, poses = hand.to(device), clouds.to(device), poses.to(device)
     layer = tr.PoseInitializer(hand, tr.PoseInitializerConfig(search="never"))
     layer(clouds[:2])
@@ -191,17 +228,18 @@ def proposed(hand: tr.Hand, count: int, generator: torch.Generator, device: torc
     found = layer(clouds)
     wall, cpu = now(device) - wall, time.process_time() - cpu
     error = tip_errors(hand, found.pose, poses)
-    right = error <= PROPOSED_RIGHT
-    return {
+    right, sure = error <= PROPOSED_RIGHT, found.confidence >= SURE
+    figures = {
         "clouds": float(count),
         "per_cpu_second": count / cpu,
         "per_second": count / wall,
         "median_mm": 1e3 * float(error.median()),
         "right": float(right.double().mean()),
         "auroc": auroc(found.confidence, right),
-        "sure": float((found.confidence >= 0.5).double().mean()),
-        "right_if_sure": float(right[found.confidence >= 0.5].double().mean()),
+        "sure": float(sure.double().mean()),
+        "right_if_sure": float(right[sure].double().mean()),
     }
+    return figures, "\n".join(by_case(names, error.cpu(), sure.cpu()) for names in (views, hidden))
 
 
 @torch.no_grad()
@@ -382,9 +420,11 @@ def main(arguments: Sequence[str] | None = None) -> dict[str, dict[str, float]]:
     def hand() -> tr.Hand:
         return tr.Hand().requires_grad_(False)
 
-    figures: dict[str, dict[str, float]] = {}
-    figures["proposed"] = proposed(hand(), 4 if options.smoke else options.proposed_clouds, generator(5), device)
+    figures: dict[str, Figures] = {}
+    count = 4 if options.smoke else options.proposed_clouds
+    figures["proposed"], table = proposed(hand(), count, generator(5), device)
     show("proposed", figures["proposed"])
+    print(table)
     if options.data is None:
         print("pictures: skipped; pass the folder that holds hand_depth as --data")
     else:

@@ -2,11 +2,13 @@ import math
 
 import pytest
 import torch
+import trimesh
 
 import torchreg as tr
 from torchreg.alignment.pose_proposer import PoseProposer, ProposerSize
 from torchreg.datasets.hand import surface_skin
 from torchreg.geometry.rotation import so3_exp
+from torchreg.viz.gltf import save_shape_animation
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +34,19 @@ def test_a_rig_is_found_by_the_search_and_by_a_network(bench, arm):
     assert [row.way for row in rows] == ["search", "network"]
     assert all(row.errors.shape == (1,) and bool(torch.isfinite(row.errors).all()) for row in rows)
     assert rows[0].render().startswith("search   1 clouds, within 5%: ")
+
+
+def test_a_rig_is_found_in_clouds_of_its_clip(bench, person, tmp_path):
+    save_shape_animation(tmp_path / "still.glb", person, person.rest_pose().expand(3, -1), fps=2)
+    row = bench.measure_clip(tr.ArticulatedShape.from_gltf(tmp_path / "still.glb"), tmp_path / "still.glb", 1, 0)
+    assert row.way == "clip"
+    assert float(row.errors) < 0.05
+
+
+def test_a_file_without_a_clip_gives_no_clouds(bench, person, tmp_path):
+    posed = tr.TriangleMesh(person.vertices(person.rest_pose()), person.surface.faces)
+    trimesh.Trimesh(posed.vertices.numpy(), posed.faces.numpy()).export(tmp_path / "still.glb")
+    assert bench.measure_clip(person, tmp_path / "still.glb", 1, 0) is None
 
 
 def test_poses_have_any_rotation_and_joints_bent_to_half_their_range(bench):

@@ -43,6 +43,25 @@ def test_confidence_is_told_beside_the_share_that_is_right(benchmark):
     ]
 
 
+def test_views_are_told_by_what_faces_the_camera(benchmark, plain_hand):
+    pose = plain_hand.rest_pose()
+    pose[2] = 0.5
+    # The back of the hand looks along y, the fingers along z.
+    for turn, view in (((0.0, 0, 0), "along the fingers"), ((-1.5708, 0, 0), "back"), ((1.5708, 0, 0), "palm")):
+        pose[3:6] = torch.tensor(turn)
+        assert benchmark.view_of(plain_hand, pose) == view
+    pose[3:6] = torch.tensor([0, 1.5708, 0])
+    assert benchmark.view_of(plain_hand, pose) == "edge"
+
+
+def test_cases_are_counted_apart(benchmark):
+    told = benchmark.by_case(["b", "a", "b"], torch.tensor([0.01, 0.2, 0.02]), torch.tensor([True, False, True]))
+    assert [line.split()[:5] for line in told.splitlines()] == [
+        ["a", "1", "clouds,", "right", "0.0%,"],
+        ["b", "2", "clouds,", "right", "50.0%,"],
+    ]
+
+
 def test_evaluations_are_counted(benchmark, plain_hand):
     with benchmark.counted(plain_hand) as total:
         plain_hand.distance(torch.zeros(2, 7, 3), plain_hand.rest_pose().expand(2, -1))
