@@ -64,6 +64,7 @@ def clusters_beside(problem: AlignProblem, distance: Tensor) -> tuple[Tensor, Te
     return clustered.sum(-1), near.sum(-1)
 
 
+@torch.no_grad()
 def _far_neighbors(problem: AlignProblem, near: Tensor, far: Tensor) -> Tensor:
     """Return the number of data (B, M) off the surface within the radius of clusters about each datum."""
     data, counts = problem.data, torch.zeros_like(problem.data[..., 0])
