@@ -38,6 +38,7 @@ from pathlib import Path
 
 import torch
 from depth_frames import REACH, marked_tips
+from find_pose import seen_tips
 from torch import Tensor
 
 import torchreg as tr
@@ -61,8 +62,8 @@ BAR_RIGHT, BAR_AUROC, BAR_GRADIENT = 0.85, 0.9, 1e-5
 PICTURE_POINTS = 2000
 PROPOSED_POINTS, PROPOSED_OUTLIERS, PROPOSED_RIGHT, SURE = 510, 90, 0.015, 0.5
 BAR_PROPOSED, BAR_RATE = 0.92, 20.0
-# What a camera sees most of, along the positive and the negative axis of the palm's frame; points that show a tip.
-VIEWS, MIN_SEEN = (("edge", "edge"), ("back", "palm"), ("along the fingers", "along the fingers")), 4
+# What a camera sees most of, along the positive and the negative axis of the palm's frame.
+VIEWS = (("edge", "edge"), ("back", "palm"), ("along the fingers", "along the fingers"))
 
 
 def draw(
@@ -191,8 +192,7 @@ def view_of(hand: tr.Hand, pose: Tensor) -> str:
 
 def hidden_tips(hand: tr.Hand, cloud: HandCloud) -> str:
     """Return how many fingertips hardly any points of a cloud show."""
-    counts = [int((cloud.inliers & (cloud.part_labels == part)).sum()) for part in hand.fingertip_parts]
-    hidden = sum(count < MIN_SEEN for count in counts)
+    hidden = int((~seen_tips(hand, cloud)).sum())
     return f"{hidden} hidden" if hidden < 2 else "2 or more hidden"
 
 

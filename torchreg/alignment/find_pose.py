@@ -72,7 +72,7 @@ class FindPoseConfig:
     Args:
         num_candidates: rough poses, after rigid registration, that are fitted to the surface.
         num_placed: of those, the best, whose limbs are placed coarsely; of a skinned rig, those that are aligned.
-        num_searched: of those, the best, whose limbs are placed thoroughly.
+        num_searched: of those, the best, whose limbs are placed thoroughly; of a skinned rig, those fitted to all data.
         search_rounds: of the thorough search, at most.
         num_retries: searches with other draws, at most, where the best pose leaves many data beside the surface.
         prior_std: standard deviation of a weak prior that draws joints to a typical pose, radians; None for none.

@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -87,8 +88,12 @@ class PoseSearch:
         reduced = replace(problem.with_skin(_coarse_skin(problem.skin)), surface=FusedSurface(shape))
         self.problem = reduced.draw(SEARCH_BUDGET.num_data, generator)
         self.coarse_problem = self.problem.draw(SEARCH_BUDGET.num_coarse_data, generator)
-        self.limbs = LimbSearch(shape)
         self.seed = int(torch.randint(2**31, (), generator=generator))
+
+    @cached_property
+    def limbs(self) -> LimbSearch:
+        """The search over the limbs, whose samples of the joints are placed when first needed."""
+        return LimbSearch(self.problem.skin.shape)
 
     def rows(self, index: Tensor) -> PoseSearch:
         """Return the search for some rows of the batch."""
