@@ -120,7 +120,7 @@ def scene():
     return tr.DepthFrame(depth, CAMERA)
 
 
-def test_crops_are_the_ends_of_the_nearest_surface_first():
+def test_crops_are_the_ends_of_the_nearest_surface_first_but_no_large_planes():
     crops = [crop for surface in candidate_crops(scene(), 0.2) for crop in surface]
     first, second = crops[:2]
     assert float(first.points[:, 2].max()) == 1.0
@@ -128,7 +128,12 @@ def test_crops_are_the_ends_of_the_nearest_surface_first():
     assert int(column.min()) == 43
     assert 0.15 <= (int(column.max()) - 43) / 110 <= 0.25
     assert int(second.pixels[:, 0].max()) == 95
-    assert float(crops[-1].points[:, 2].min()) == 2.0
+    assert all(float(crop.points[:, 2].max()) == 1.0 for crop in crops)  # a wall is larger than the shape
+
+
+def test_of_a_picture_that_shows_planes_alone_there_is_no_crop():
+    wall = tr.DepthFrame(torch.full((72, 96), 2.0, dtype=torch.float64), CAMERA)
+    assert not list(candidate_crops(wall, 0.2))
 
 
 def test_what_a_crop_cuts_off_is_told_from_what_stands_alone():

@@ -220,7 +220,9 @@ def _align(
             judged = without_cut(batch.problem, found.pose, seen.frames)
             found = refit_without_cut(batch, judged, found, config)
             found = fit_to_the_end(batch, judged, found, config)
-        result = _result(batch, found, config, lead, judged)  # inliers by eq. 2, the posterior by eq. 17
+        result = _result(
+            batch, found, config, lead, judged, frames=seen.frames
+        )  # inliers by eq. 2, the posterior by eq. 17
         return normal_copy(_unbatched(result) if clouds.ndim == 2 else result)
 
 
@@ -258,7 +260,7 @@ def _align_person(
         skin = _model_skin(person, None, fitted.poses, config)
         batch = _centered_batch(skin, clouds, valid, fitted.poses, config, on_step, seen)
         found = StageResult(pose=batch.start, sigma=fitted.sigma, change=fitted.change)
-        result = _unbatched(_result(batch, found, config, fitted.lead, batch.problem, fitted.error))
+        result = _unbatched(_result(batch, found, config, fitted.lead, batch.problem, fitted.error, seen.frames))
         dofs = shape.num_dofs
         result = normal_copy(replace(
             result,
@@ -371,6 +373,7 @@ def _result(
     lead: Tensor | None,
     judged: AlignProblem,
     error: SurfaceError | None = None,
+    frames: Sequence[DepthFrame] = (),
 ) -> AlignResult:
     problem, pose = batch.problem, found.pose
     distances = problem.surface.distance(problem.data, pose)
@@ -384,7 +387,7 @@ def _result(
     # What lies off the surface tells nothing of the pose, unless all does.
     told = torch.where(inliers.any(-1, keepdim=True), inliers, problem.valid)
     degenerate = warn_about_degenerate(problem.data, told, problem.size, stacklevel=3)
-    judgement = judge(judged, pose, lead, error)
+    judgement = judge(judged, pose, lead, error, frames)
     confidence = torch.where(degenerate, 0.0, judgement.confidence)
     converged = found.change <= config.pose_atol
     converged = converged | judgement.converged if config.surface_steps or error is not None else converged

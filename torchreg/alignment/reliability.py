@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchreg.alignment.clusters import OFF_SURFACE, clusters_beside
 from torchreg.alignment.confidence import EVIDENCE, DataOnSurface, end_spreads, limb_points, share_beside
+from torchreg.alignment.other_explanations import open_rims, planes_instead
 from torchreg.alignment.patches import errors_per_patch
 from torchreg.alignment.problem import BROAD_PRIOR, INLIER_SHARE, AlignProblem, free_space_loss
 from torchreg.alignment.shape_errors import shape_covariance
@@ -38,6 +39,8 @@ class Evidence:
         unknown: probability that the data do not tell where the limbs end.
         rival: how near the second-best pose of a search comes, 0 for a start that was given.
         rival_share: the same, relative to the number of data.
+        open_rim: square of `open_rims`, as a little of it is usual; zero for clouds.
+        planes: square of `planes_instead`, as for the rim.
     """
 
     noise: Tensor
@@ -48,6 +51,8 @@ class Evidence:
     unknown: Tensor
     rival: Tensor
     rival_share: Tensor
+    open_rim: Tensor
+    planes: Tensor
 
     def table(self) -> Tensor:
         """Return the numbers as (B, E)."""
@@ -79,11 +84,23 @@ class Calibration:
 
     A pose is right if the ends of the shape's limbs are off by at most `right` of its size on average. Fitted by
     ``benchmarks/confidence.py --calibrate`` to 143 made-up alignments of hands, a robot arm and a fox, and tested on
-    310 others (``docs/measured/confidence.txt``), of which halves give no better one.
+    310 others (``docs/measured/confidence.txt``), of which halves give no better one. The last two weights, of what else
+    may explain a picture, are fitted by ``benchmarks/scenes.py --calibrate`` to 68 made-up rooms, the others held.
     """
 
     bias: float = 5.35
-    weights: tuple[float, ...] = (1.36, 4.4, 8.69, 3.46, 8.53, 5.48, 1.03, 3.93)  # in the order of `Evidence`
+    weights: tuple[float, ...] = (
+        1.36,
+        4.4,
+        8.69,
+        3.46,
+        8.53,
+        5.48,
+        1.03,
+        3.93,
+        20.0,
+        4.05,
+    )  # in the order of `Evidence`
     right: float = 0.058  # of the size: 15 mm of a hand
     doubtful: float = 0.5  # confidence below which a result is doubtful
 
@@ -94,7 +111,9 @@ CALIBRATION = Calibration()
 # which no shape's limbs or number of parts enter. Fitted to 59 made-up people and hands, all from starts, as
 # `benchmarks/shape_confidence.py --calibrate` fits one to what it draws; its area under the curve on 72 others, a third
 # of them searched, is .96. Pictures and rivals were not among the 59: their weights are those of poses.
-SHAPE_CALIBRATION = Calibration(bias=5.37, weights=(0.0, 2.45, 3.1, 2.83, 8.53, 10.78, 1.03, 3.93), right=0.015)
+SHAPE_CALIBRATION = Calibration(
+    bias=5.37, weights=(0.0, 2.45, 3.1, 2.83, 8.53, 10.78, 1.03, 3.93, 20.0, 4.05), right=0.015
+)
 
 
 @dataclass(frozen=True)
@@ -165,7 +184,13 @@ class Judgement:
     doubt: tuple[str, ...]
 
 
-def judge(problem: AlignProblem, pose: Tensor, lead: Tensor | None, error: SurfaceError | None = None) -> Judgement:
+def judge(
+    problem: AlignProblem,
+    pose: Tensor,
+    lead: Tensor | None,
+    error: SurfaceError | None = None,
+    frames: Sequence[DepthFrame] = (),
+) -> Judgement:
     """Return what can be trusted of poses (B, num_dofs).
 
     Args:
@@ -173,10 +198,14 @@ def judge(problem: AlignProblem, pose: Tensor, lead: Tensor | None, error: Surfa
         pose: fitted.
         lead: see `gather_evidence`.
         error: of fits of pose and shape together.
+        frames: whose points the data are.
     """
     lying = DataOnSurface.of(problem, pose)
     around, spreads = curvature(problem, pose, lying), end_spreads(problem, pose, lying)
     evidence, calibration = gather_evidence(problem, pose, lying.distance, lead, spreads), CALIBRATION
+    if frames:
+        rims, planes = open_rims(problem, pose, frames), planes_instead(problem, lying.distance)
+        evidence = replace(evidence, open_rim=rims.square(), planes=planes.square())
     converged, loose = around.converged, spreads > EVIDENCE.tolerance * problem.size
     if error is not None:
         evidence, calibration = replace(evidence, unknown=error.unknown(problem.size)), SHAPE_CALIBRATION
@@ -252,6 +281,8 @@ def weigh(
         unknown=(-(EVIDENCE.tolerance * problem.size / spread).square()).exp(),
         rival=(-lead / EVIDENCE.lead).exp(),
         rival_share=(-lead / (_SCALES.rival_share * count)).exp(),
+        open_rim=torch.zeros_like(noise),
+        planes=torch.zeros_like(noise),
     )
 
 
@@ -467,6 +498,8 @@ _REASONS = (
     ("clusters", 0.2, "data in clusters off the shape are {:.0%} of those on it"),
     ("beside", 0.3, "{:.0%} of the data lie beside the shape's surface"),
     ("free_space", 0.2, "parts of the shape lie where the picture shows nothing"),
+    ("open_rim", 0.25, "the surface goes on where the shape ends, as a wall or a table does"),
+    ("planes", 0.2, "flat faces explain the data better than the shape"),
 )
 
 

@@ -175,15 +175,23 @@ class DepthFrame:
         column, row = self.pixels.unbind(-1)
         number[row, column] = torch.arange(len(row), device=row.device)
         number, depth = number[::stride, ::stride], self.depth[::stride, ::stride]
-        step = _PICTURE.steepest * stride * depth / float(self.camera.intrinsics[:2].min())
         pairs = []
         for axis in (0, 1):
             size = number.shape[axis] - 1
             first, second = number.narrow(axis, 0, size), number.narrow(axis, 1, size)
-            joined = depth.diff(dim=axis).abs() <= step.narrow(axis, 0, size)
-            joined &= (first >= 0) & (second >= 0)
+            joined = self.is_continuous(depth, axis) & (first >= 0) & (second >= 0)
             pairs.append(torch.stack((first[joined], second[joined]), dim=-1))
         return torch.cat(pairs)
+
+    def is_continuous(self, depth: Tensor, axis: int) -> Tensor:
+        """Return where the depths (H', W') of every stride-th pixel go on along an axis as those of one surface do."""
+        step = _PICTURE.steepest * self.stride * depth / float(self.camera.intrinsics[:2].min())
+        return depth.diff(dim=axis).abs() <= step.narrow(axis, 0, depth.shape[axis] - 1)
+
+    @cached_property
+    def without_mask(self) -> DepthFrame:
+        """The frame in which all pixels count."""
+        return DepthFrame(self.depth, self.camera, max_points=self.max_points)
 
     @cached_property
     def cut(self) -> Tensor:
@@ -191,13 +199,13 @@ class DepthFrame:
         radius = max(_PICTURE.least_rim, self.stride)
         outside = torch.zeros_like(self.measured) if self.mask is None else ~self.mask & self._clean
         # What is thinner than the radius is the rim of a mask that is not exact.
-        outside = _grown(~_grown(~outside, radius), radius)
+        outside = grown(~grown(~outside, radius), radius)
         low = -_pooled(torch.where(outside, -self.depth, -torch.inf), radius + 1)
         high = _pooled(torch.where(outside, self.depth, -torch.inf), radius + 1)
         step = _PICTURE.steepest * radius * self.depth / float(self.camera.intrinsics[:2].min())
         goes_on = (self.depth >= low - step) & (self.depth <= high + step)
         goes_on[[0, -1]], goes_on[:, [0, -1]] = True, True
-        near = _grown(goes_on & self.measured, self.stride)
+        near = grown(goes_on & self.measured, self.stride)
         column, row = self.pixels.unbind(-1)
         return near[row, column]
 
@@ -228,7 +236,7 @@ def _pooled(picture: Tensor, radius: int) -> Tensor:
     return found
 
 
-def _grown(mask: Tensor, radius: int) -> Tensor:
+def grown(mask: Tensor, radius: int) -> Tensor:
     """Return a mask (H, W) grown by some pixels."""
     return _pooled(mask.float(), radius) > 0
 

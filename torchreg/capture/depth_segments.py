@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from torchreg.capture.depth_frame import DepthFrame
+from torchreg.capture.depth_frame import DepthFrame, grown
 from torchreg.geometry.graphs import Graph, connected_components
+from torchreg.geometry.planes import distance_to_plane
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,9 @@ class Segmentation:
     beyond: float = 0.2  # from an end: nothing so near is farther from the other ends
     max_ends: int = 4  # of a surface
     max_surfaces: int = 3  # of a picture
+    plane_band: float = 0.02  # within which points lie on one plane
+    plane_width: float = 0.7  # from which on no part of the shape is so wide: a floor, a table, a wall
+    max_planes: int = 4  # of a picture that are looked for
 
 
 SEGMENTATION = Segmentation()
@@ -63,6 +68,21 @@ class _Grid:
         lengths = (points[pairs[:, 0]] - points[pairs[:, 1]]).norm(dim=-1)
         return cls(frame, stride, pixels, points, Graph.from_edges(pairs, lengths, len(pixels)))
 
+    def without_planes(self, size: float) -> _Grid:
+        """Return the grid without planes that are larger than a shape of some size: floors, tables, walls."""
+        kept, generator = torch.ones(len(self.points), dtype=torch.bool), torch.Generator().manual_seed(0)
+        edges, lengths = self.graph.edges()
+        for _ in range(SEGMENTATION.max_planes):
+            away = distance_to_plane(self.points[None], kept[None], SEGMENTATION.plane_band * size, generator)[0]
+            patch = _largest_patch(kept & (away < SEGMENTATION.plane_band * size), edges)
+            if not len(patch) or _width(self.points[patch]) < SEGMENTATION.plane_width * size:
+                break
+            kept[patch] = False
+        number = kept.cumsum(0) - 1
+        both = kept[edges].all(-1)
+        graph = Graph.from_edges(number[edges[both]], lengths[both], int(kept.sum()))
+        return replace(self, pixels=self.pixels[kept], points=self.points[kept], graph=graph)
+
     def mask(self, kept: Tensor) -> Tensor:
         """Return the mask (H, W) of what some nodes (V,) stand for."""
         coarse = torch.zeros(self.frame.depth[:: self.stride, :: self.stride].shape, dtype=torch.bool)
@@ -76,9 +96,11 @@ def candidate_crops(frame: DepthFrame, size: float) -> Iterator[Iterator[DepthFr
     """Yield the crops of a frame that may show a shape of some size, metres, surface by surface, nearer ones first.
 
     A surface of about that size is one crop. Of a larger one, as an arm or a body, its ends are: what lies within reach
-    of an end, along the surface.
+    of an end, along the surface. Planes that are larger than the shape show something else.
     """
-    grid = _Grid.of(frame, size)
+    grid = _Grid.of(frame, size).without_planes(size)
+    if not len(grid.points):
+        return
     component = grid.graph.components().to(grid.points.device)
     depth = frame.camera.project(grid.points)[1]
     counts = torch.bincount(component)
@@ -86,13 +108,30 @@ def candidate_crops(frame: DepthFrame, size: float) -> Iterator[Iterator[DepthFr
     num_surfaces = 0
     for number in nearness.argsort().tolist():
         index = (component == number).nonzero()[:, 0]
-        extent = (grid.points[index].amax(0) - grid.points[index].amin(0)).norm()
-        if float(extent) < SEGMENTATION.least * size:
+        if float(_extent(grid.points[index])) < SEGMENTATION.least * size:
             continue
         yield (frame.cropped(grid.mask(kept)) for kept in _parts(grid, index, size))
         num_surfaces += 1
         if num_surfaces == SEGMENTATION.max_surfaces:
             return
+
+
+def _largest_patch(on_plane: Tensor, edges: Tensor) -> Tensor:
+    """Return the nodes (K,) of the largest piece of those on a plane (V,)."""
+    index = on_plane.nonzero()[:, 0]
+    part = connected_components(edges[on_plane[edges].all(-1)], len(on_plane))[index]
+    return index[part == part.mode().values] if len(index) else index
+
+
+def _extent(points: Tensor) -> Tensor:
+    """Return the diagonal () of the box around points (N, 3)."""
+    return (points.amax(0) - points.amin(0)).norm()
+
+
+def _width(points: Tensor) -> float:
+    """Return the shorter side of a rectangle that spreads as points (N, 3) do, which lie on a plane."""
+    local = points - points.mean(0)
+    return math.sqrt(12 * max(0.0, float(torch.linalg.eigvalsh(local.mT @ local / len(points))[1])))
 
 
 def _parts(grid: _Grid, index: Tensor, size: float) -> Iterator[Tensor]:
@@ -148,3 +187,28 @@ def beyond_cut(frame: DepthFrame, off: Tensor) -> Tensor:
     is_cut = torch.zeros(int(part.max()) + 1, dtype=torch.bool, device=off.device)
     is_cut[part[frame.cut & off]] = True
     return off & is_cut[part]
+
+
+def open_rim(frame: DepthFrame, lies_on: Callable[[Tensor], Tensor]) -> float:
+    """Return the share of the rim of what lies on a shape along which the measured surface goes on, from 0 to 1.
+
+    Args:
+        frame: the picture; what its mask leaves out is looked at, too.
+        lies_on: which of points (M, 3), in world coordinates, lie on the shape, (M,) bool.
+    """
+    stride, surface = frame.stride, frame.without_mask.measured
+    depth = (frame.depth * surface)[::stride, ::stride]
+    pixels = depth.nonzero()
+    points = frame.camera.unproject(stride * pixels.flip(-1).double(), depth[tuple(pixels.T)].double())
+    on = torch.zeros_like(depth, dtype=torch.bool)
+    on[tuple(pixels.T)] = lies_on(points)
+    off = (depth > 0) & ~on
+    filled = ~grown(~grown(on, 1), 1) & ~off  # pixels that measured nothing are no rim
+    rim = goes_on = 0
+    for axis in (0, 1):
+        size = on.shape[axis] - 1
+        first, second = filled.narrow(axis, 0, size), filled.narrow(axis, 1, size)
+        onto = (first & off.narrow(axis, 1, size)) | (off.narrow(axis, 0, size) & second)
+        rim += int((first ^ second).sum())
+        goes_on += int((onto & frame.is_continuous(depth, axis)).sum())
+    return goes_on / rim if rim else 0.0
