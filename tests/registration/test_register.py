@@ -9,7 +9,8 @@ import trimesh
 import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
-from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError
+from torchreg.errors import DegenerateDataWarning, FileWarning, InputError, InputTypeError
+from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.metrics import adjusted_rand
@@ -54,6 +55,36 @@ def test_bones_filter_the_noise_of_the_start(pair, known):
     assert float(pair.error(found.deformed).mean()) < 0.7 * float(pair.error(start).mean())
     assert float(adjusted_rand(found.parts(), pair.moving_labels())) > 0.8
     assert found.matched.float().mean() > 0.5
+
+
+def test_the_table_below_is_left_out_of_both_scans(pair):
+    noise = torch.randn(pair.truth.shape, generator=torch.Generator().manual_seed(0))
+    start = pair.truth + 0.004 * pair.source.diagonal * noise
+    parts = pair.moving_labels().clamp_max(7)
+    plain = register(pair.source, pair.target, 8, 30, start=start, parts=parts)
+    low = float(min(pair.source.points[:, 1].min(), pair.target.points[:, 1].min()))
+    steps = 1.5 * pair.source.diagonal * torch.linspace(-1, 1, 25)
+    table = torch.cartesian_prod(steps, torch.tensor([low]), steps)
+
+    def on_table(scan):
+        middle = scan.points.mean(0) * torch.tensor([1.0, 0.0, 1.0])
+        return RangeScan(
+            torch.cat((table + middle, scan.points)), normals=torch.cat((up.expand(len(table), 3), scan.normals))
+        )
+
+    up = torch.tensor([0.0, 1.0, 0.0])
+    scans = on_table(pair.source), on_table(pair.target)
+    known = torch.cat((table, start)), torch.cat((torch.zeros(len(table), dtype=torch.int64), parts))
+    with pytest.warns(FileWarning, match="points of (source|target) lie on the plane") as told:
+        found = register(*scans, 8, 30, start=known[0], parts=known[1])
+    assert len(told) == 2
+    assert len(found.points) >= 0.98 * len(pair.source)
+    error = (found.deformed[-500:] - pair.truth[-500:]).norm(dim=1)
+    assert float(error.mean()) < 1.2 * float((plain.deformed[-500:] - pair.truth[-500:]).norm(dim=1).mean())
+    kept = register(*scans, 8, 30, FEW, start=known[0], support="keep")
+    assert len(kept.points) == len(scans[0])
+    with pytest.raises(InputError, match="support must be"):
+        register(pair.source, pair.target, support="cut")
 
 
 def test_what_is_returned_fits_together(pair, known):

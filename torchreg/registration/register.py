@@ -12,7 +12,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, as_tensor, check_count, check_finite, check_shape, warn_about_rounding
+from torchreg._checks import (
+    as_float_tensor,
+    as_tensor,
+    check_choice,
+    check_count,
+    check_finite,
+    check_shape,
+    warn_about_rounding,
+)
 from torchreg._threads import one_thread
 from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.far_origin import far_origin
@@ -20,6 +28,7 @@ from torchreg.geometry.loaded import as_scan
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.spread import SPREADS, spread_dimensions
+from torchreg.geometry.support import SUPPORTS, split_support, warn_about_support
 from torchreg.registration.bones.alternation import ReducedFit, Samples
 from torchreg.registration.bones.config import BoneConfig, OnRegisterStep
 from torchreg.registration.bones.labels import CellData, labels_of_parts
@@ -47,6 +56,7 @@ def register(
     start: Tensor | None = None,
     confidence: Tensor | None = None,
     parts: Tensor | None = None,
+    support: str = "auto",
 ) -> ScanRegistration:
     """Return the bones, weights and deformation that take one range scan onto another, without a template.
 
@@ -70,6 +80,8 @@ def register(
         confidence: (N,) from 0 to 1, of ``start``; ones by default.
         parts: (N,) integers from zero, less than ``num_bones``, the parts from which bones start, such as the limbs of
             a spine, ``skeletonize(mesh).limb_of(source.points)``; by default patches that move as one.
+        support: "auto" leaves out a table or a floor that a scanned thing stands on, see `split_support`, so that N is
+            the number of the other points; "keep" keeps it.
 
     Returns:
         a `ScanRegistration`.
@@ -82,6 +94,7 @@ def register(
     Warns:
         DegenerateDataWarning: if a scan lies on a line or on a plane; the status is DEGENERATE.
         UnitsWarning: if one scan is more than thirty times larger than the other.
+        FileWarning: if a support is left out.
 
     Differentiable: no; `GridLBS` is, for refining what was found.
 
@@ -90,16 +103,23 @@ def register(
     References: Chang and Zwicker 2009, algorithm 1; Le and Deng 2012, for motions and weights in turn.
     """
     config = RegisterConfig() if config is None else config
+    check_choice(support, "support", SUPPORTS)
     source, target = _checked_scans(source, target, num_bones, grid_resolution)
+    _check_start(source, start, confidence, config)
+    parts = _checked_parts(source, parts, num_bones, config)
+    if support == "auto":
+        (source, kept), (target, _) = _without_support(source, "source"), _without_support(target, "target")
+        start, confidence, parts = (
+            rows if rows is None or kept is None else rows[kept.to(rows.device)] for rows in (start, confidence, parts)
+        )
     origin = far_origin((source.points, target.points))
     if origin is not None:
         return register(
             source.shifted(-origin), target.shifted(-origin), num_bones, grid_resolution, config, generator, on_step,
             start=None if start is None else start - origin, confidence=confidence, parts=parts,
+            support="keep",
         ).moved(origin)  # fmt: skip
     degenerate = warn_about_flat_scans((source, target), stacklevel=4)
-    _check_start(source, start, confidence, config)
-    parts = _checked_parts(source, parts, num_bones, config)
     return _registered(
         source, target, num_bones, grid_resolution, config, generator, on_step,
         start=start, confidence=confidence, parts=parts, degenerate=degenerate,
@@ -171,6 +191,16 @@ def _checked_scans(source: Any, target: Any, num_bones: int, grid_resolution: in
     warn_about_rounding(source.points, "points of source", source.diagonal, stacklevel=5)
     _warn_about_units(source, target)
     return source, target
+
+
+def _without_support(scan: RangeScan, name: str) -> tuple[RangeScan, Tensor | None]:
+    """Return a scan without what the scanned thing stands on, and a mask (N,) of its points; None for all of them."""
+    split = split_support(scan)
+    if split.plane is None:
+        return scan, None
+    # From the caller of `register` and its two decorators.
+    warn_about_support(f"{int(split.mask.sum())} of {len(scan)} points of {name}", stacklevel=5)
+    return scan.subset(~split.mask, mark_cut=True), ~split.mask
 
 
 def _aligned_samples(source: RangeScan, index: Tensor, start: Tensor, confidence: Tensor | None) -> Samples:
