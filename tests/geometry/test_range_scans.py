@@ -439,7 +439,7 @@ def test_the_first_point_beside_a_cut_is_on_the_boundary_too(first):
     order = torch.arange(7).roll(-first)
     place = order.argsort()
     faces = place[torch.tensor([[0, 1 + k, 1 + (k + 1) % 6] for k in range(6)])]
-    scan = RangeScan(points[order], faces)._with(boundary=torch.zeros(7, dtype=torch.bool))
+    scan = RangeScan(points[order], faces).replaced(boundary=torch.zeros(7, dtype=torch.bool))
     left = torch.ones(7, dtype=torch.bool)
     left[place[4]] = False
     cut = scan.subset(left, mark_cut=True)

@@ -27,9 +27,10 @@ from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.loaded import as_scan
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
+from torchreg.geometry.scan_clusters import clustered_scan
 from torchreg.geometry.spread import SPREADS, spread_dimensions
 from torchreg.geometry.support import SUPPORTS, split_support, warn_about_support
-from torchreg.registration.bones.alternation import ReducedFit, Samples
+from torchreg.registration.bones.alternation import ReducedFit, Samples, turned_normals
 from torchreg.registration.bones.config import BoneConfig, OnRegisterStep
 from torchreg.registration.bones.labels import CellData, labels_of_parts
 from torchreg.registration.bones.sparse_grid import MAX_RESOLUTION, SparseGrid
@@ -40,6 +41,16 @@ from torchreg.registration.normalization import Normalization
 from torchreg.registration.paper.algorithm import PaperFit
 from torchreg.registration.results import RegisterRecord, ScanRegistration
 from torchreg.result import Status
+
+
+@dataclass(frozen=True)
+class _Most:
+    """How much of large scans is fitted to."""
+
+    points: int = 16_000  # several for each sample, so that matches lie on the surface; all are moved in the end
+
+
+_MOST = _Most()
 
 
 @torch.no_grad()
@@ -142,6 +153,11 @@ def _registered(
 ) -> ScanRegistration:
     """Run algorithm 1 on checked scans; arguments as of `register`."""
     clock = _Clock()
+    fine_source, fine_target = source, target
+    (source, chosen, nearest), (target, _, _) = (clustered_scan(scan, _MOST.points) for scan in (source, target))
+    start, confidence, parts = (
+        rows if rows is None else rows[chosen.to(rows.device)] for rows in (start, confidence, parts)
+    )
     index = source_samples(source, config, generator)
     normalization = Normalization.from_points(source.points[index])
     normalized_source, normalized_target = (normalization.normalize_scan(scan) for scan in (source, target))
@@ -172,11 +188,11 @@ def _registered(
     # Line 9: continuous weights.
     converged = fit.refine() and converged
     clock.lap()
-    result = _scan_registration(source, normalized_source, normalization, fit, converged, degenerate, clock.seconds)
-    return result if sure is None else _trusted(result, sure, confidence)
+    result = _scan_registration(fine_source, fine_target, normalization, fit, converged, degenerate, clock.seconds)
+    return result if sure is None or confidence is None else _trusted(result, sure, confidence[nearest])
 
 
-def _trusted(result: ScanRegistration, sure: float, confidence: Tensor | None) -> ScanRegistration:
+def _trusted(result: ScanRegistration, sure: float, confidence: Tensor) -> ScanRegistration:
     """Return a result with how far it can be trusted: doubtful where its alignment is."""
     doubtful = sure < SCAN_CALIBRATION.doubtful and result.status.usable
     status = Status.DOUBTFUL if doubtful else result.status
@@ -211,17 +227,19 @@ def _aligned_samples(source: RangeScan, index: Tensor, start: Tensor, confidence
 
 def _scan_registration(
     source: RangeScan,
-    normalized_source: RangeScan,
+    target: RangeScan,
     normalization: Normalization,
     fit: ReducedFit | PaperFit,
     converged: bool,
     degenerate: bool,
     seconds: Tensor,
 ) -> ScanRegistration:
-    """Return the registration in the unit and frame of the source, from that of the normalized scans."""
+    """Return the registration of all points in the unit and frame of the source, from that of normalized scans."""
     config, like = fit.config, source.points
-    weights = fit.model.weights_at(normalized_source.points)
-    (moved,), (normals,) = fit.moved(normalized_source.points, normalized_source.normals)
+    points = normalization.normalize(source.points)
+    weights, transforms = fit.model.weights_at(points), fit.model.transforms
+    moved = fit.model.move(points, weights)[0]
+    normals = turned_normals(source.normals.detach().cpu().double(), weights, transforms)[0]
     (matcher,) = fit.matchers
     matches = matcher.match(moved, normals, max_distance=config.max_distance[1], max_angle=config.max_angle[1])
     fit.model.set_transforms_(fit.model.transforms.detach()[0])
@@ -234,7 +252,7 @@ def _scan_registration(
         labels=weights.argmax(-1).to(like.device),
         transforms=model.transforms.detach(),
         weights=weights.to(like),
-        distances=(normalization.scale * nearest_neighbor(moved, matcher.target.points)[1]).to(like),
+        distances=(normalization.scale * nearest_neighbor(moved, normalization.normalize(target.points))[1]).to(like),
         matched=matches.kept.to(like.device),
         status=fit_status(int(matches.kept.sum()) / len(moved), converged, config, degenerate=degenerate),
         seconds=seconds,

@@ -43,7 +43,7 @@ class SkeletonizeConfig:
         num_levels: levels of the largest geodesic distance from a tip; nodes are as far apart as levels.
         num_base: base points that stand for the whole surface in average distances.
         overlap: junctions closer to each other than this times the sum of their widths are one.
-        max_vertices: larger surfaces are coarsened first.
+        max_vertices: surfaces of more than twice as many vertices are coarsened to that many first.
         pieces: for loose parts: keep the "largest", "bridge" the gaps, or raise an "error".
         printed: as in the paper: bins of vertices instead of curves on the surface, trees merged from the tips inward
             instead of by majority, nodes left at the centers of their bins.
@@ -56,7 +56,7 @@ class SkeletonizeConfig:
     num_levels: int = 100
     num_base: int = 20
     overlap: float = 2 / 3
-    max_vertices: int = 16_000
+    max_vertices: int = 8000
     pieces: str = "largest"
     printed: bool = False
 
@@ -170,15 +170,15 @@ def _prepared(mesh: TriangleMesh, config: SkeletonizeConfig) -> _Body:
     """Return the surface as one piece of not too many vertices, with its holes closed and its long loops cut."""
     piece = one_piece(mesh, config.pieces)
     notes, bridged = piece.notes, bool(len(piece.bridges))
-    if not bool(piece.mesh.face_areas().sum().isfinite()):
+    area = piece.mesh.face_areas().sum()
+    if not bool(area.isfinite()):
         raise InputError("mesh must have a finite area, got coordinates whose products overflow; use a larger unit")
     extent = float((piece.mesh.vertices.amax(0) - piece.mesh.vertices.amin(0)).norm())
     if int(spread_dimensions(piece.mesh.vertices, extent)) < len(SPREADS):
         notes += (f"{FLAT}: it encloses no body",)
-    coarse = coarsened(piece.mesh, config.max_vertices)
-    if coarse is not piece.mesh:
+    if piece.mesh.num_vertices > 2 * config.max_vertices:
         # Coarsening leaves pinholes where patches meet.
-        piece = one_piece(coarse, "bridge" if bridged else "largest")
+        piece = one_piece(coarsened(piece.mesh, config.max_vertices, area), "bridge" if bridged else "largest")
     if bridged:
         # Cuts would renumber the vertices that bridges join.
         return _Body(OpenedLoops.from_uncut(piece.mesh), piece.bridges, notes)
