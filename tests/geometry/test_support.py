@@ -144,6 +144,8 @@ ALONE = {
     "ball": lambda: unit_sphere(4),
     "animal": lambda: solid(*ANIMAL),
     "three points": lambda: torch.eye(3),
+    "line": lambda: torch.linspace(0, 1, 500)[:, None].expand(500, 3),
+    "one place": lambda: torch.ones(500, 3),
 }  # fmt: skip
 
 

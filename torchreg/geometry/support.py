@@ -194,7 +194,7 @@ def _planes(samples: Tensor) -> Iterator[_Plane]:
     planes = torch.cat((planes, -planes))
     count = torch.cat((count * (below <= _SEARCH.outliers), count * (above <= _SEARCH.outliers)))
     for _ in range(_SEARCH.num_tried):
-        if not float(count.amax()) > 0:
+        if not bool((count > 0).any()):
             return
         best = planes[count.argmax()]
         alike = (planes[:, :3] @ best[:3] > _SEARCH.alike) & ((planes[:, 3] - best[3]).abs() < _SEARCH.band * size)
