@@ -161,8 +161,8 @@ def _registered(
     index = source_samples(source, config, generator)
     normalization = Normalization.from_points(source.points[index])
     normalized_source, normalized_target = (normalization.normalize_scan(scan) for scan in (source, target))
-    # Line 1 of the algorithm: the grid.
-    grid = SparseGrid.from_points(normalized_source.points, grid_resolution)
+    # Line 1 of the algorithm: the grid, around all points.
+    grid = SparseGrid.from_points(normalization.normalize(fine_source.points), grid_resolution)
     data = CellData(grid, normalized_source.points[index], CellData.PER_BONE * num_bones)
     clock.lap()
     # Line 2: first matches; by default a first alignment of all points, which alone tells how sure it is.
