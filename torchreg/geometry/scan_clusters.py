@@ -44,8 +44,12 @@ def clustered_scan(scan: RangeScan, count: int) -> tuple[RangeScan, Tensor, Tens
         if len(distinct) <= 2 * count:
             break
         size *= math.sqrt(len(distinct) / count)
-    # The last point of each cluster, those on the boundary after all others.
-    index = torch.zeros_like(distinct).scatter_reduce(0, cluster, every + total * scan.boundary, "amax") % total
+    # The point of each cluster that is nearest to its middle, those on the boundary before all others.
+    middle = points.new_zeros(len(distinct), 3).index_add(0, cluster, points) / torch.bincount(cluster)[:, None]
+    apart = (points - middle[cluster]).norm(dim=1) + torch.where(scan.boundary, 0.0, 2 * size)
+    least = torch.full_like(middle[:, 0], torch.inf).scatter_reduce(0, cluster, apart, "amin")
+    first = torch.where(apart <= least[cluster], every, total)
+    index = torch.full_like(distinct, total).scatter_reduce(0, cluster, first, "amin")
     faces = None if scan.faces is None else distinct_faces(cluster[scan.faces])
     coarse = scan.replaced(
         points=scan.points[index],

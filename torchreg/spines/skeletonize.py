@@ -110,7 +110,7 @@ def skeletonize(
 
     Differentiable: no.
 
-    Cost: 0.5 s for 10,000 vertices, 0.75 s for 100,000, 1.8 s for 400,000, of one CPU core.
+    Cost: 0.4 s for 10,000 vertices, 0.5 s for 100,000, 1 s for 400,000, of one CPU core.
 
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1, eq. 4 and 5.
     """
