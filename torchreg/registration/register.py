@@ -109,8 +109,8 @@ def register(
 
     Differentiable: no; `GridLBS` is, for refining what was found.
 
-    Cost: 1.3 to 3.5 s for scans of 8,000 points on one core, the alignment three quarters of it; 1.2 s more for 400,000,
-    of which as many as 16,000 to 32,000 stand for all until the end, see `clustered_scan`.
+    Cost: 1.3 to 3.5 s for scans of 8,000 points on one core, the alignment three quarters of it; a second
+    more for 400,000, of which 16,000 to 32,000 stand for all until the end, see `clustered_scan`.
 
     References: Chang and Zwicker 2009, algorithm 1; Le and Deng 2012, for motions and weights in turn.
     """
