@@ -36,6 +36,7 @@ _NAMES = {
     "geometry.mesh": "TriangleMesh",
     "geometry.range_scan": "RangeScan",
     "geometry.skeleton": "Skeleton",
+    "geometry.support": "SupportSplit split_support",
     "io.calibration": "load_cameras",
     "io.frames": "load_frames",
     "io.points": "PointCloud load_mesh load_points",

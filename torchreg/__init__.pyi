@@ -38,6 +38,8 @@ from torchreg.geometry.camera_rig import StereoPair as StereoPair
 from torchreg.geometry.mesh import TriangleMesh as TriangleMesh
 from torchreg.geometry.range_scan import RangeScan as RangeScan
 from torchreg.geometry.skeleton import Skeleton as Skeleton
+from torchreg.geometry.support import SupportSplit as SupportSplit
+from torchreg.geometry.support import split_support as split_support
 from torchreg.io.calibration import load_cameras as load_cameras
 from torchreg.io.frames import load_frames as load_frames
 from torchreg.io.points import PointCloud as PointCloud
@@ -135,6 +137,7 @@ __all__ = [
     "StereoConfig",
     "StereoFrames",
     "StereoPair",
+    "SupportSplit",
     "TrackConfig",
     "TrackResult",
     "TrackState",
@@ -165,6 +168,7 @@ __all__ = [
     "sample_skin",
     "skeletonize",
     "solve_pose",
+    "split_support",
     "stereo_points",
     "to_open3d",
     "to_pyvista",

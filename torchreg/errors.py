@@ -46,4 +46,4 @@ class UnitsWarning(TorchregWarning):
 
 
 class FileWarning(TorchregWarning):
-    """Part of a file was left out, or read otherwise than it says; the message names the file and counts."""
+    """Part of a file or of its data was left out, or read otherwise than it says; the message names it and counts."""

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import sys
 
 import pytest
 import torch
@@ -48,6 +49,16 @@ def test_a_pair_becomes_a_scene_a_result_and_pictures(run, scans, tmp_path, monk
         torch.testing.assert_close(load_points(tmp_path / name).points, found.deformed, atol=1e-5, rtol=0)
 
 
+def test_what_scans_stand_on_is_left_out(run, error_of, scans, tmp_path, monkeypatch):
+    folder, _ = scans
+    asked = []
+    monkeypatch.setattr(pipeline, "register", lambda *_, **given: asked.append(given["support"]) or sys.exit(3))
+    for option in ([], ["--support", "keep"]):
+        run("register", folder / "source.ply", folder / "target.ply", "-o", tmp_path / "out.glb", *option)
+    assert asked == ["auto", "keep"]
+    assert "no meaning with --urdf" in error_of("register", folder, "--urdf", "--support", "keep")
+
+
 def test_what_cannot_be_written_is_told_first(run, error_of, scans, tmp_path, monkeypatch):
     folder, known = scans
     monkeypatch.setattr(pipeline, "register", known)
@@ -90,8 +101,8 @@ def depth_images(tmp_path_factory):
 def test_depth_images_are_registered_and_what_was_seen_is_drawn(run, error_of, depth_images, tmp_path, monkeypatch):
     folder = depth_images
 
-    def still(source, target, bones, grid, on_step):
-        return register(source, target, bones, grid, start=source.points, on_step=on_step)
+    def still(source, target, bones, grid, **given):
+        return register(source, target, bones, grid, start=source.points, **given)
 
     register = pipeline.register
     monkeypatch.setattr(pipeline, "register", still)

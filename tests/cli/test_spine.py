@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 
 from torchreg.datasets.creatures import STARFISH, creature_sequence
 from torchreg.datasets.pictures import camera_ring
 from torchreg.io.calibration import save_cameras
 from torchreg.io.images import save_image
-from torchreg.io.points import save_points
+from torchreg.io.points import load_mesh, save_points
 from torchreg.io.swc import load_swc
 from torchreg.storage import load
 from torchreg.viz.seen import model_mask
@@ -69,6 +70,27 @@ def test_everything_is_written(run, frames, tmp_path):
     )
     for name in ("a.glb", "a.json", "a.gif", "a.png"):
         assert (tmp_path / name).stat().st_size > 0
+
+
+def test_the_table_below_is_left_out_with_one_sentence(run, error_of, frames, tmp_path):
+    (tmp_path / "on_table").mkdir()
+    table = torch.tensor([[-3.0, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]])
+    for path in sorted(frames.iterdir()):
+        mesh = load_mesh(path)
+        table[:, 2] = mesh.vertices[:, 2].min() - 0.02
+        faces = torch.cat((mesh.faces, mesh.num_vertices + torch.tensor([[0, 1, 2], [0, 2, 3]])))
+        save_points(tmp_path / "on_table" / path.name, torch.cat((mesh.vertices, table.to(mesh.vertices))), faces=faces)
+    told = run("spine", tmp_path / "on_table", "-o", tmp_path / "o.glb", "--workers", 1, "--quiet").output
+    assert told.count("12 points in 3 of 3 frames lie on the plane") == 1
+    assert "--support keep" in told
+    plain = run("spine", frames, "-o", tmp_path / "plain.glb", "--workers", 1, "--quiet")
+    assert plain.output == ""
+    found, truth = (load(tmp_path / f"{name}.safetensors") for name in ("o", "plain"))
+    torch.testing.assert_close(found.tips, truth.tips, atol=1e-4, rtol=0)
+    kept = run("spine", tmp_path / "on_table", "-o", tmp_path / "kept.glb", "--workers", 1, "--support", "keep")
+    assert "lie on the plane" not in kept.output
+    assert load(tmp_path / "kept.safetensors").num_tips != 5  # it is the table
+    assert "auto, keep" in error_of("spine", frames, "-o", tmp_path / "no.glb", "--support", "cut")
 
 
 def test_files_are_put_in_order_and_work_goes_on(run, frames, tmp_path):

@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from torchreg.errors import InputError, InputTypeError
+from torchreg.geometry.graphs import connected_components
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
+from torchreg.geometry.scan_clusters import clustered_scan
 from torchreg.geometry.visibility import aim, rasterize
 
 
@@ -439,10 +441,38 @@ def test_the_first_point_beside_a_cut_is_on_the_boundary_too(first):
     order = torch.arange(7).roll(-first)
     place = order.argsort()
     faces = place[torch.tensor([[0, 1 + k, 1 + (k + 1) % 6] for k in range(6)])]
-    scan = RangeScan(points[order], faces)._with(boundary=torch.zeros(7, dtype=torch.bool))
+    scan = RangeScan(points[order], faces).replaced(boundary=torch.zeros(7, dtype=torch.bool))
     left = torch.ones(7, dtype=torch.bool)
     left[place[4]] = False
     cut = scan.subset(left, mark_cut=True)
     kept = order[left]
     assert {int(number) for number in kept[cut.boundary]} >= {0, 3, 5}
     assert not bool(cut.boundary[(kept == 1).nonzero()[0, 0]])
+
+
+@pytest.mark.parametrize("with_faces", [True, False])
+@pytest.mark.parametrize("cut", [True, False])
+def test_few_points_stand_for_many_near_them_that_face_the_same_way(with_faces, cut):
+    ball = unit_sphere(5, dtype=torch.float64)
+    thin = TriangleMesh(ball.vertices * torch.tensor([1.0, 1.0, 0.02], dtype=torch.float64), ball.faces)
+    scan = RangeScan(thin.vertices, thin.faces, ball.vertices)
+    scan = scan.subset(thin.vertices[:, 0] < 0.5) if cut else scan
+    scan = scan if with_faces else RangeScan(scan.points, None, scan.normals)
+    few, index, cluster = clustered_scan(scan, 500)
+    assert 250 <= len(few) <= 1000
+    for name in ("points", "normals", "boundary"):
+        assert torch.equal(getattr(few, name), getattr(scan, name)[index])
+    assert torch.equal(cluster[index], torch.arange(len(few)))
+    apart = (few.points[cluster] - scan.points).norm(dim=1)
+    assert float(apart.max()) < 5 * few.spacing
+    assert float((few.normals[cluster] * scan.normals).sum(1).amin()) > -0.5
+    assert few.spacing > 1.5 * scan.spacing
+    assert bool(few.boundary.any()) == bool(scan.boundary.any())
+    if with_faces:
+        assert few.faces is not None
+        assert not bool((few.normals[few.faces[:, 0]] * few.normals[few.faces[:, 1]]).sum(1).lt(-0.9).any())
+        piece = connected_components(torch.cat((few.faces[:, :2], few.faces[:, 1:])), len(few))
+        assert float((piece == piece.mode().values).double().mean()) > 0.99
+    same, every, _ = clustered_scan(scan, len(scan) // 2 + 1)
+    assert same is scan
+    assert torch.equal(every, torch.arange(len(scan)))

@@ -9,8 +9,10 @@ import trimesh
 import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
-from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError
-from torchreg.geometry.rigid import rigid_matrix, transform_points
+from torchreg.errors import DegenerateDataWarning, FileWarning, InputError, InputTypeError
+from torchreg.geometry.mesh import unit_sphere
+from torchreg.geometry.range_scan import RangeScan
+from torchreg.geometry.rigid import rigid_matrix, se3_exp, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.metrics import adjusted_rand
 from torchreg.registration.config import RegisterConfig
@@ -54,6 +56,55 @@ def test_bones_filter_the_noise_of_the_start(pair, known):
     assert float(pair.error(found.deformed).mean()) < 0.7 * float(pair.error(start).mean())
     assert float(adjusted_rand(found.parts(), pair.moving_labels())) > 0.8
     assert found.matched.float().mean() > 0.5
+
+
+def test_the_table_below_is_left_out_of_both_scans(pair):
+    noise = torch.randn(pair.truth.shape, generator=torch.Generator().manual_seed(0))
+    start = pair.truth + 0.004 * pair.source.diagonal * noise
+    parts = pair.moving_labels().clamp_max(7)
+    plain = register(pair.source, pair.target, 8, 30, start=start, parts=parts)
+    low = float(min(pair.source.points[:, 1].min(), pair.target.points[:, 1].min()))
+    steps = 1.5 * pair.source.diagonal * torch.linspace(-1, 1, 25)
+    table = torch.cartesian_prod(steps, torch.tensor([low]), steps)
+
+    def on_table(scan):
+        middle = scan.points.mean(0) * torch.tensor([1.0, 0.0, 1.0])
+        return RangeScan(
+            torch.cat((table + middle, scan.points)), normals=torch.cat((up.expand(len(table), 3), scan.normals))
+        )
+
+    up = torch.tensor([0.0, 1.0, 0.0])
+    scans = on_table(pair.source), on_table(pair.target)
+    known = torch.cat((table, start)), torch.cat((torch.zeros(len(table), dtype=torch.int64), parts))
+    with pytest.warns(FileWarning, match="points of (source|target) lie on the plane") as told:
+        found = register(*scans, 8, 30, start=known[0], parts=known[1])
+    assert len(told) == 2
+    assert len(found.points) >= 0.98 * len(pair.source)
+    error = (found.deformed[-500:] - pair.truth[-500:]).norm(dim=1)
+    assert float(error.mean()) < 1.2 * float((plain.deformed[-500:] - pair.truth[-500:]).norm(dim=1).mean())
+    kept = register(*scans, 8, 30, FEW, start=known[0], support="keep")
+    assert len(kept.points) == len(scans[0])
+    with pytest.raises(InputError, match="support must be"):
+        register(pair.source, pair.target, support="cut")
+
+
+def test_all_points_of_large_scans_are_moved_by_what_fits_a_few_of_them():
+    ball = unit_sphere(6, dtype=torch.float64)
+    arm = ball.vertices * (1 + 1.5 * (20 * (ball.vertices[:, :1] - 1)).exp()) * torch.tensor([1.0, 0.6, 0.4])
+    source = RangeScan(arm.float(), ball.faces)
+    motion = se3_exp(torch.tensor([0.02, -0.05, 0.03, 0.0, 0.05, 0.08]))
+    truth = transform_points(motion, source.points)
+    target = RangeScan(truth, ball.faces)
+    found = register(source, target, 4, 20)
+    assert len(source) > 2 * 16_000
+    assert found.deformed.shape == truth.shape
+    assert float((found.deformed - truth).norm(dim=1).max()) < 0.02 * source.diagonal
+    nearest = torch.cdist(found.deformed[::500].double(), target.points.double()).amin(1).float()
+    torch.testing.assert_close(found.distances[::500], nearest, atol=1e-4, rtol=0)
+    for name in ("labels", "matched", "point_confidence", "weights"):
+        assert len(getattr(found, name)) == len(source)
+    with_start = register(source, target, 4, 20, start=truth, parts=(source.points[:, 0] > 1).long())
+    assert float((with_start.deformed - truth).norm(dim=1).max()) < 0.01 * source.diagonal
 
 
 def test_what_is_returned_fits_together(pair, known):

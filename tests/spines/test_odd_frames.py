@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchreg.datasets.creatures import STARFISH, creature_sequence
-from torchreg.errors import InputError
+from torchreg.errors import FileWarning, InputError
 from torchreg.geometry.mesh import TriangleMesh, concatenate
 from torchreg.spines.extract_spine import extract_spine
 
@@ -26,6 +26,29 @@ def with_frame(meshes, number, mesh):
 def two_bodies(mesh):
     away = mesh.vertices.new_tensor([4.0, 0.0, 0.0])
     return concatenate([TriangleMesh(mesh.vertices + away, mesh.faces), mesh])
+
+
+@pytest.mark.parametrize("cloud", [False, True])
+def test_what_the_creature_stands_on_is_left_out(meshes, whole, cloud):
+    steps = torch.linspace(-2.5, 2.5, 60)
+    table = torch.cartesian_prod(steps, steps, torch.zeros(1))
+    corner = torch.arange(3600).reshape(60, 60)[:-1, :-1].reshape(-1, 1)
+    top = TriangleMesh(table, torch.cat((corner + torch.tensor([0, 60, 1]), corner + torch.tensor([1, 60, 61]))))
+
+    def standing(mesh):
+        below = mesh.vertices.new_tensor([0.0, 0.0, float(mesh.vertices[:, 2].min()) - 0.01])
+        both = concatenate([mesh, TriangleMesh(top.vertices + below, top.faces)])
+        return both.vertices if cloud else both
+
+    frames = [standing(mesh) for mesh in meshes]
+    with pytest.warns(FileWarning, match=r"14\d\d\d points in 4 of 4 frames lie on the plane") as told:
+        spine = extract_spine(frames, workers=1)
+    assert len(told) == 1
+    apart = torch.cdist(spine.tips, whole.tips)
+    assert spine.num_tips == 5
+    assert float(apart.amin(2).max()) < 0.2
+    with pytest.raises(InputError, match="support must be"):
+        extract_spine(meshes, support="cut")
 
 
 @pytest.mark.parametrize("growing", [False, True])

@@ -7,7 +7,7 @@ import torch
 
 import torchreg as tr
 from torchreg.datasets.creatures import STARFISH, creature_sequence
-from torchreg.errors import InputError, InputTypeError
+from torchreg.errors import FileWarning, InputError, InputTypeError
 from torchreg.geometry.isosurface import isosurface
 from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
 from torchreg.geometry.rigid import rigid_matrix, se3_exp
@@ -119,6 +119,19 @@ def test_holes_are_closed_and_told(star):
     assert skeleton.topology == STAR
     assert any("hole" in note for note in skeleton.notes)
     assert Inside(mesh)(skeleton.nodes).float().mean() > 0.995
+
+
+def test_what_the_body_stands_on_is_left_out_or_kept(star):
+    mesh = star.meshes[0]
+    low = float(mesh.vertices[:, 2].min())
+    table = TriangleMesh(
+        mesh.vertices.new_tensor([[-3, -3, low], [3, -3, low], [3, 3, low], [-3, 3, low]]), [[0, 1, 2], [0, 2, 3]]
+    )
+    with pytest.warns(FileWarning, match=f"4 of {mesh.num_vertices + 4} points of mesh lie on the plane") as told:
+        skeleton = skeletonize(concatenate([mesh, table]))
+    assert len(told) == 1
+    assert skeleton.topology == STAR
+    assert skeletonize(concatenate([mesh, table]), support="keep").topology != STAR
 
 
 def test_fragments_by_policy(star):

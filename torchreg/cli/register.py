@@ -14,6 +14,7 @@ from torchreg.cli.cameras import Depth, DepthRange, Seen, check_used, seen_folde
 from torchreg.cli.outputs import Force, Quiet, check_outputs, tell_origin, with_ending
 from torchreg.cli.reporting import ExitCode, reporting
 from torchreg.cli.robot import RobotFiles, check_alone, write_scanned_robot
+from torchreg.cli.support_option import Support
 from torchreg.cli.upright import Up, known_up, remembering
 from torchreg.errors import InputError
 
@@ -67,6 +68,7 @@ def register(
         typer.Option(help="Metres, or another unit, per unit of the scans; twice for source and target."),
     ] = None,
     nan_policy: NanPolicy = "raise",
+    support: Support = "auto",
     time: Annotated[
         list[float] | None,
         typer.Option(help="Seconds of the animation of a .glb file at which a scan is read; twice for both."),
@@ -104,7 +106,8 @@ def register(
     scans = cloud_files(scans) if not depth else scans
     if urdf:
         check_alone({"--depth": depth, "--intrinsics": intrinsics, "--depth-range": depth_range, "--seen": seen,
-                     "--smoothing": smoothing, "--weights": weights, "--errors": errors, "--up": up})  # fmt: skip
+                     "--smoothing": smoothing, "--weights": weights, "--errors": errors, "--up": up,
+                     "--support": support != "auto"})  # fmt: skip
         units = _common(scale, "--scale"), _common(time, "--time"), _common(frame, "--frame")
         _write_robot(scans, output, bones, grid, units, nan_policy, force=force, quiet=quiet)
         return
@@ -139,7 +142,7 @@ def register(
             raise InputError(f"{source} has no triangles, which a .glb needs; name an output that ends in .safetensors")
         scene = None
     with tqdm(desc="initialize", unit="step", leave=False, disable=quiet) as bar:
-        found = run(first, second, bones, grid, on_step=partial(_show, bar))
+        found = run(first, second, bones, grid, on_step=partial(_show, bar), support=support)
     found = remembering(found, known_up(up, scans, camera=depth))
     _write(found, scene, weights, errors)
     if depth:

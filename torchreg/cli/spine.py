@@ -24,6 +24,7 @@ from torchreg.cli.outputs import (
     with_ending,
 )
 from torchreg.cli.reporting import interruption, reporting
+from torchreg.cli.support_option import Support
 from torchreg.cli.upright import Up, known_up, remembering
 
 if TYPE_CHECKING:
@@ -61,6 +62,7 @@ def spine(
     seen: Seen = None,
     scale: Scale = 1.0,
     nan_policy: NanPolicy = "raise",
+    support: Support = "auto",
     swc: Annotated[
         Path | None, typer.Option(metavar="OUT.swc", help="Also write the curves as SWC, one numbered file per frame.")
     ] = None,
@@ -148,8 +150,8 @@ def spine(
         if silhouettes:
             meshes: Sequence[TriangleMesh] = _hulls(source, seen_folder(seen, glb, force), progress, quiet)
         else:
-            meshes = FrameSurfaces.of_frames(files, names, workers=workers, progress=progress)
-        found = _extracted(meshes, known, config, workers, progress, quiet, growing=growing)
+            meshes = FrameSurfaces.of_frames(files, names, workers=workers, progress=progress, support=support)
+        found = _extracted(meshes, known, config, workers, progress, quiet, growing=growing, support=support)
         found = remembering(found, upright)
         found.save(result)
         _write(found, meshes, glb, curves, npz, fps)
@@ -198,6 +200,7 @@ def _extracted(
     quiet: bool,
     *,
     growing: bool,
+    support: str,
 ) -> SpineSequence:
     from tqdm import tqdm
 
@@ -206,7 +209,7 @@ def _extracted(
     with tqdm(total=len(meshes), unit="frame", desc="skeletons", leave=False, disable=quiet) as bar:
         return extract_spine(
             meshes, prior=known, growing=growing, config=config, workers=workers, on_step=lambda _: bar.update(),
-            progress=progress,
+            progress=progress, support=support,
         )  # fmt: skip
 
 

@@ -27,6 +27,8 @@ class Budget:
     view_side: int = 4096
     # Times that the faces of an icosahedron are split: 655,362 vertices.
     subdivisions: int = 8
+    # Points whose nearest neighbors tell how far apart all are.
+    spacings: int = 20_000
 
 
 BUDGET = Budget()

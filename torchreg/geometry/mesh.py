@@ -155,11 +155,13 @@ def _corner_angles(first: Tensor, second: Tensor, flat: Tensor) -> Tensor:
     stand_in = torch.eye(3, dtype=first.dtype, device=first.device)
     first = torch.where(flat[:, None], stand_in[0], first)
     second = torch.where(flat[:, None], stand_in[1], second)
-    sides = torch.stack((first, second - first, -second), dim=1)
-    outgoing = _unit_or_zero(sides)[0]
-    incoming = -outgoing.roll(1, dims=1)
-    sine = torch.linalg.vector_norm(torch.linalg.cross(outgoing, incoming, dim=-1), dim=-1)
-    angles = torch.atan2(sine, (outgoing * incoming).sum(dim=-1))
+    # Scaled by the largest component first: squares of tiny lengths underflow in float32.
+    scale = torch.maximum(first.detach().abs().amax(-1), second.detach().abs().amax(-1))[:, None]
+    first, second = first / scale, second / scale
+    # Twice the area is the product of two sides and the sine of the angle between them, at each corner.
+    across, opposite = torch.linalg.vector_norm(torch.linalg.cross(first, second, dim=-1), dim=-1), second - first
+    along = ((first * second).sum(-1), -(first * opposite).sum(-1), (second * opposite).sum(-1))
+    angles = torch.atan2(across[:, None], torch.stack(along, dim=1))
     return torch.where(flat[:, None], torch.zeros_like(angles), angles)
 
 

@@ -141,13 +141,15 @@ def sampling_distance(points: Tensor, subset: Tensor | None = None) -> float:
 
     Args:
         points: (N, D) finite; points at one position are zero apart.
-        subset: (M, D) those of the points over which the median is taken; all by default.
+        subset: (M, D) those of the points over which the median is taken; by default all, or of very many some.
 
     Differentiable: no.
     """
     if len(points) < 2:
         return math.inf
-    return float(k_nearest(points if subset is None else subset, points, 2)[1][:, 1].median())
+    if subset is None:
+        subset = points[:: max(1, len(points) // BUDGET.spacings)]
+    return float(k_nearest(subset, points, 2)[1][:, 1].median())
 
 
 def weld(points: Tensor) -> Tensor:

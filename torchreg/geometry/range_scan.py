@@ -125,7 +125,7 @@ class RangeScan:
         for name, value in {"points": points, "diagonal": diagonal, "_even": {}, **values}.items():
             object.__setattr__(self, name, value)
 
-    def _with(self, **values: Any) -> RangeScan:
+    def replaced(self, **values: Any) -> RangeScan:
         """Return the scan with some fields replaced; the others are not computed anew."""
         names = ("points", "faces", "normals", "boundary", "spacing", "viewpoint")
         scan = RangeScan.__new__(RangeScan)
@@ -180,7 +180,7 @@ class RangeScan:
     def shifted(self, offset: Tensor) -> RangeScan:
         """Return the scan moved by an offset (3,)."""
         viewpoint = None if self.viewpoint is None else self.viewpoint + offset.to(self.viewpoint)
-        return self._with(points=self.points + offset.to(self.points), viewpoint=viewpoint)
+        return self.replaced(points=self.points + offset.to(self.points), viewpoint=viewpoint)
 
     def __len__(self) -> int:
         return self.points.shape[0]
@@ -251,7 +251,7 @@ class RangeScan:
                 guide = torch.zeros_like(positions).index_copy(0, position, normals.detach().cpu().double())
                 near, _ = k_nearest_others(positions, BOUNDARY.num_neighbors)
                 boundary = boundary | boundary_of_points(positions, guide, near)[position].to(boundary.device)
-        return self._with(points=points, faces=faces, normals=normals, boundary=boundary, spacing=spacing)
+        return self.replaced(points=points, faces=faces, normals=normals, boundary=boundary, spacing=spacing)
 
     def _indices(self, which: Any) -> Tensor:
         which = as_tensor(which, "which", "bool or integers")
@@ -286,7 +286,7 @@ class RangeScan:
         motion = as_float_tensor(motion, "motion", like=self.points)
         scale = _similarity_scale(motion, "motion")
         normals = torch.nn.functional.normalize(self.normals @ motion[:3, :3].mT, dim=-1)
-        return self._with(
+        return self.replaced(
             points=transform_points(motion, self.points),
             normals=normals,
             spacing=self.spacing * scale,
@@ -297,7 +297,7 @@ class RangeScan:
         """Return the scan on another device or in another dtype; takes what ``Tensor.to`` takes."""
         points = self.points.to(*args, **kwargs)
         _check_precision(points)
-        return self._with(
+        return self.replaced(
             points=points,
             faces=None if self.faces is None else self.faces.to(points.device),
             normals=self.normals.to(points),
@@ -363,8 +363,12 @@ def _measure(
 ) -> tuple[Tensor, Tensor, float]:
     """Return normals and boundary on the device of the points, and the spacing."""
     positions, which = _three_positions(points)
-    near, distance = k_nearest_others(positions, 1 if faces is not None else BOUNDARY.num_neighbors)
     corners = None if faces is None else distinct_faces(which[faces.cpu()])
+    if corners is not None and normals is None:
+        near, spacing = which.new_zeros(0, 1), sampling_distance(positions)
+    else:
+        near, distance = k_nearest_others(positions, 1 if corners is not None else BOUNDARY.num_neighbors)
+        spacing = float(distance[:, 0].median())
     if normals is not None:
         normals = _given_normals(points, normals.detach(), near, which, viewpoint)
     elif corners is not None:
@@ -379,7 +383,7 @@ def _measure(
     else:
         guide = torch.zeros_like(positions).index_copy(0, which, normals.cpu().double())
         edge = boundary_of_points(positions, guide, near)
-    return normals, edge[which].to(points.device), float(distance[:, 0].median())
+    return normals, edge[which].to(points.device), spacing
 
 
 def _given_normals(points: Tensor, normals: Tensor, near: Tensor, which: Tensor, viewpoint: Tensor | None) -> Tensor:

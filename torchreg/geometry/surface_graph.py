@@ -130,7 +130,7 @@ def _used_vertices(faces: Tensor, count: int) -> tuple[Tensor, Tensor]:
     return flags.nonzero()[:, 0], (flags.cumsum(0) - 1)[faces]
 
 
-def coarsened(mesh: TriangleMesh, count: int) -> TriangleMesh:
+def coarsened(mesh: TriangleMesh, count: int, area: Tensor | None = None) -> TriangleMesh:
     """Return a surface with about ``count`` vertices at most, each the mean of a patch of the given ones.
 
     A patch is a connected part of the surface within a cubic cell, so that sheets and limbs that only come near each
@@ -139,6 +139,7 @@ def coarsened(mesh: TriangleMesh, count: int) -> TriangleMesh:
     Args:
         mesh: returned as it is if it has no more vertices.
         count: wanted number of vertices; triangles at points where several patches meet may leave small holes.
+        area: of the surface, if it is known.
 
     Differentiable: no.
 
@@ -149,7 +150,7 @@ def coarsened(mesh: TriangleMesh, count: int) -> TriangleMesh:
     if mesh.num_vertices <= count:
         return mesh
     vertices, faces = mesh.vertices, mesh.faces
-    size = _REPAIR.cell * (mesh.face_areas().sum() / count).sqrt()
+    size = _REPAIR.cell * ((mesh.face_areas().sum() if area is None else area) / count).sqrt()
     cells = ((vertices - vertices.amin(0)) / size).floor().long()
     number = cells.amax(0) + 1
     cell = (cells[:, 0] * number[1] + cells[:, 1]) * number[2] + cells[:, 2]

@@ -12,15 +12,25 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, as_tensor, check_count, check_finite, check_shape, warn_about_rounding
+from torchreg._checks import (
+    as_float_tensor,
+    as_tensor,
+    check_choice,
+    check_count,
+    check_finite,
+    check_shape,
+    warn_about_rounding,
+)
 from torchreg._threads import one_thread
 from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.loaded import as_scan
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.range_scan import RangeScan
+from torchreg.geometry.scan_clusters import clustered_scan
 from torchreg.geometry.spread import SPREADS, spread_dimensions
-from torchreg.registration.bones.alternation import ReducedFit, Samples
+from torchreg.geometry.support import SUPPORTS, split_support, warn_about_support
+from torchreg.registration.bones.alternation import ReducedFit, Samples, turned_normals
 from torchreg.registration.bones.config import BoneConfig, OnRegisterStep
 from torchreg.registration.bones.labels import CellData, labels_of_parts
 from torchreg.registration.bones.sparse_grid import MAX_RESOLUTION, SparseGrid
@@ -31,6 +41,16 @@ from torchreg.registration.normalization import Normalization
 from torchreg.registration.paper.algorithm import PaperFit
 from torchreg.registration.results import RegisterRecord, ScanRegistration
 from torchreg.result import Status
+
+
+@dataclass(frozen=True)
+class _Most:
+    """How much of large scans is fitted to."""
+
+    points: int = 16_000  # several for each sample, so that matches lie on the surface; all are moved in the end
+
+
+_MOST = _Most()
 
 
 @torch.no_grad()
@@ -47,6 +67,7 @@ def register(
     start: Tensor | None = None,
     confidence: Tensor | None = None,
     parts: Tensor | None = None,
+    support: str = "auto",
 ) -> ScanRegistration:
     """Return the bones, weights and deformation that take one range scan onto another, without a template.
 
@@ -70,6 +91,8 @@ def register(
         confidence: (N,) from 0 to 1, of ``start``; ones by default.
         parts: (N,) integers from zero, less than ``num_bones``, the parts from which bones start, such as the limbs of
             a spine, ``skeletonize(mesh).limb_of(source.points)``; by default patches that move as one.
+        support: "auto" leaves out a table or a floor that a scanned thing stands on, see `split_support`, so that N is
+            the number of the other points; "keep" keeps it.
 
     Returns:
         a `ScanRegistration`.
@@ -82,24 +105,33 @@ def register(
     Warns:
         DegenerateDataWarning: if a scan lies on a line or on a plane; the status is DEGENERATE.
         UnitsWarning: if one scan is more than thirty times larger than the other.
+        FileWarning: if a support is left out.
 
     Differentiable: no; `GridLBS` is, for refining what was found.
 
-    Cost: 1.3 to 3.5 s for scans of 8,000 points on one core, the alignment three quarters of it.
+    Cost: 1.3 to 3.5 s for scans of 8,000 points on one core, the alignment three quarters of it; a second
+    more for 400,000, of which 16,000 to 32,000 stand for all until the end, see `clustered_scan`.
 
     References: Chang and Zwicker 2009, algorithm 1; Le and Deng 2012, for motions and weights in turn.
     """
     config = RegisterConfig() if config is None else config
+    check_choice(support, "support", SUPPORTS)
     source, target = _checked_scans(source, target, num_bones, grid_resolution)
+    _check_start(source, start, confidence, config)
+    parts = _checked_parts(source, parts, num_bones, config)
+    if support == "auto":
+        (source, kept), (target, _) = _without_support(source, "source"), _without_support(target, "target")
+        start, confidence, parts = (
+            rows if rows is None or kept is None else rows[kept.to(rows.device)] for rows in (start, confidence, parts)
+        )
     origin = far_origin((source.points, target.points))
     if origin is not None:
         return register(
             source.shifted(-origin), target.shifted(-origin), num_bones, grid_resolution, config, generator, on_step,
             start=None if start is None else start - origin, confidence=confidence, parts=parts,
+            support="keep",
         ).moved(origin)  # fmt: skip
     degenerate = warn_about_flat_scans((source, target), stacklevel=4)
-    _check_start(source, start, confidence, config)
-    parts = _checked_parts(source, parts, num_bones, config)
     return _registered(
         source, target, num_bones, grid_resolution, config, generator, on_step,
         start=start, confidence=confidence, parts=parts, degenerate=degenerate,
@@ -122,11 +154,16 @@ def _registered(
 ) -> ScanRegistration:
     """Run algorithm 1 on checked scans; arguments as of `register`."""
     clock = _Clock()
+    fine_source, fine_target = source, target
+    (source, chosen, nearest), (target, _, _) = (clustered_scan(scan, _MOST.points) for scan in (source, target))
+    start, confidence, parts = (
+        rows if rows is None else rows[chosen.to(rows.device)] for rows in (start, confidence, parts)
+    )
     index = source_samples(source, config, generator)
     normalization = Normalization.from_points(source.points[index])
     normalized_source, normalized_target = (normalization.normalize_scan(scan) for scan in (source, target))
-    # Line 1 of the algorithm: the grid.
-    grid = SparseGrid.from_points(normalized_source.points, grid_resolution)
+    # Line 1 of the algorithm: the grid, around all points.
+    grid = SparseGrid.from_points(normalization.normalize(fine_source.points), grid_resolution)
     data = CellData(grid, normalized_source.points[index], CellData.PER_BONE * num_bones)
     clock.lap()
     # Line 2: first matches; by default a first alignment of all points, which alone tells how sure it is.
@@ -152,11 +189,11 @@ def _registered(
     # Line 9: continuous weights.
     converged = fit.refine() and converged
     clock.lap()
-    result = _scan_registration(source, normalized_source, normalization, fit, converged, degenerate, clock.seconds)
-    return result if sure is None else _trusted(result, sure, confidence)
+    result = _scan_registration(fine_source, fine_target, normalization, fit, converged, degenerate, clock.seconds)
+    return result if sure is None or confidence is None else _trusted(result, sure, confidence[nearest])
 
 
-def _trusted(result: ScanRegistration, sure: float, confidence: Tensor | None) -> ScanRegistration:
+def _trusted(result: ScanRegistration, sure: float, confidence: Tensor) -> ScanRegistration:
     """Return a result with how far it can be trusted: doubtful where its alignment is."""
     doubtful = sure < SCAN_CALIBRATION.doubtful and result.status.usable
     status = Status.DOUBTFUL if doubtful else result.status
@@ -173,6 +210,16 @@ def _checked_scans(source: Any, target: Any, num_bones: int, grid_resolution: in
     return source, target
 
 
+def _without_support(scan: RangeScan, name: str) -> tuple[RangeScan, Tensor | None]:
+    """Return a scan without what the scanned thing stands on, and a mask (N,) of its points; None for all of them."""
+    split = split_support(scan)
+    if split.plane is None:
+        return scan, None
+    # From the caller of `register` and its two decorators.
+    warn_about_support(f"{int(split.mask.sum())} of {len(scan)} points of {name}", stacklevel=5)
+    return scan.subset(~split.mask, mark_cut=True), ~split.mask
+
+
 def _aligned_samples(source: RangeScan, index: Tensor, start: Tensor, confidence: Tensor | None) -> Samples:
     """Return the samples of a source whose points (N, 3) start at known positions, all confident by default."""
     confidence = torch.ones_like(start[:, 0]) if confidence is None else confidence.detach().cpu()
@@ -181,17 +228,19 @@ def _aligned_samples(source: RangeScan, index: Tensor, start: Tensor, confidence
 
 def _scan_registration(
     source: RangeScan,
-    normalized_source: RangeScan,
+    target: RangeScan,
     normalization: Normalization,
     fit: ReducedFit | PaperFit,
     converged: bool,
     degenerate: bool,
     seconds: Tensor,
 ) -> ScanRegistration:
-    """Return the registration in the unit and frame of the source, from that of the normalized scans."""
+    """Return the registration of all points in the unit and frame of the source, from that of normalized scans."""
     config, like = fit.config, source.points
-    weights = fit.model.weights_at(normalized_source.points)
-    (moved,), (normals,) = fit.moved(normalized_source.points, normalized_source.normals)
+    points = normalization.normalize(source.points)
+    weights, transforms = fit.model.weights_at(points), fit.model.transforms
+    moved = fit.model.move(points, weights)[0]
+    normals = turned_normals(source.normals.detach().cpu().double(), weights, transforms)[0]
     (matcher,) = fit.matchers
     matches = matcher.match(moved, normals, max_distance=config.max_distance[1], max_angle=config.max_angle[1])
     fit.model.set_transforms_(fit.model.transforms.detach()[0])
@@ -204,7 +253,7 @@ def _scan_registration(
         labels=weights.argmax(-1).to(like.device),
         transforms=model.transforms.detach(),
         weights=weights.to(like),
-        distances=(normalization.scale * nearest_neighbor(moved, matcher.target.points)[1]).to(like),
+        distances=(normalization.scale * nearest_neighbor(moved, normalization.normalize(target.points))[1]).to(like),
         matched=matches.kept.to(like.device),
         status=fit_status(int(matches.kept.sum()) / len(moved), converged, config, degenerate=degenerate),
         seconds=seconds,

@@ -100,6 +100,7 @@ def extract_spine(
     workers: int | None = None,
     on_step: Callable[[SpineRecord], None] | None = None,
     progress: str | os.PathLike[str] | None = None,
+    support: str = "auto",
 ) -> SpineSequence:
     """Return the spine of a moving creature: one graph of limbs, their curves in every frame, tips that keep names.
 
@@ -134,6 +135,7 @@ def extract_spine(
         on_step: called with every frame that is skeletonized.
         progress: folder in which each of these is kept as soon as it is done, so that a call that was interrupted goes
             on where it ended.
+        support: "auto" leaves out a table or a floor that the creature stands on, see `split_support`; "keep" keeps it.
 
     Returns:
         A `SpineSequence`; `warnings` tell the irregularities frame by frame. Frames without a body, or with another
@@ -147,6 +149,9 @@ def extract_spine(
         InputTypeError: if something else than meshes is given, or another prior than a skeleton or a spine.
         SolverError: if a worker process is killed twice.
 
+    Warns:
+        FileWarning: if a support is left out.
+
     Differentiable: no; `SpineSequence.model` is.
 
     Cost: about 1 s per frame of 15,000 vertices and CPU core; half a second more where limbs are transferred, 1 s more
@@ -158,7 +163,7 @@ def extract_spine(
     _check_settings(config, prior, workers, growing=growing)
     surfaces = meshes
     if not isinstance(surfaces, FrameSurfaces):
-        surfaces = FrameSurfaces.of_frames(meshes, workers=workers, progress=progress)
+        surfaces = FrameSurfaces.of_frames(meshes, workers=workers, progress=progress, support=support)
     origin = far_origin(surfaces.samples)
     if origin is not None:
         surfaces = surfaces.shifted(-origin)

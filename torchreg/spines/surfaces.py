@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_points
+from torchreg._checks import as_float_tensor, check_choice, check_points
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.cloud_surface import cloud_surface, enough_places
 from torchreg.geometry.loaded import as_mesh
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.poisson_body import poisson_body
 from torchreg.geometry.spread import SPREADS, spread_dimensions
+from torchreg.geometry.support import SUPPORTS, SupportSplit, split_support, warn_about_support
 from torchreg.spines.frame_workers import Job, KeptResults, do_jobs
 
 ONE_SIDED = "the points do not enclose a body, as those of a single view: limbs follow the side that they show"
@@ -31,6 +32,24 @@ class _SurfaceSampling:
 
 
 _SAMPLING = _SurfaceSampling()
+
+
+def split_surface(value: Any, name: str, support: str) -> tuple[TriangleMesh | Tensor, SupportSplit | None]:
+    """Return a mesh, or points without faces, and what it stands on, which is left out of it; None for nothing.
+
+    Raises:
+        InputTypeError: if it is neither; names the argument.
+        InputError: if a point is not finite.
+    """
+    points = _cloud(value)
+    if points is None:
+        mesh = as_mesh(value, name)
+        split = split_support(mesh) if support == "auto" and mesh.num_faces else None
+        return (mesh, None) if split is None or split.plane is None else (split.rest(mesh), split)
+    points = as_float_tensor(points, name)
+    check_points(points, name, batch=False)
+    split = split_support(points) if support == "auto" else None
+    return (points, None) if split is None or split.plane is None else (points[~split.mask], split)
 
 
 def as_surface(value: Any, name: str) -> tuple[TriangleMesh, tuple[str, ...]]:
@@ -72,8 +91,9 @@ _Surface = tuple[TriangleMesh, tuple[str, ...]]
 class _Making:
     """The surfaces of frames in the making."""
 
-    def __init__(self, frames: Sequence[Any], names: tuple[str, ...], kept: KeptResults) -> None:
-        self._frames, self._names, self._kept = frames, names, kept
+    def __init__(self, frames: Sequence[Any], names: tuple[str, ...], kept: KeptResults, support: str) -> None:
+        self._frames, self._names, self._kept, self._support = frames, names, kept, support
+        self.supports: dict[int, SupportSplit] = {}
         self.made: dict[int, TriangleMesh] = {}
         self.samples: dict[int, Tensor] = {}
         self.notes: list[tuple[str, ...]] = [()] * len(names)
@@ -81,10 +101,11 @@ class _Making:
     def jobs(self) -> Iterator[Job[_Surface]]:
         """Yield the making of each cloud's surface that was not kept; meshes are looked at on the way."""
         for number, name in enumerate(self._names):
-            frame = self._frames[number]
-            points = _cloud(frame)
-            if points is None:
-                self._sample(number, as_mesh(frame, name))
+            points, split = split_surface(self._frames[number], name, self._support)
+            if split is not None:
+                self.supports[number] = split
+            if isinstance(points, TriangleMesh):
+                self._sample(number, points)
                 continue
             source = self._kept.digest(str(points.dtype), points)
             found = self._kept.load(_kept_name(number), source, _from_tensors)
@@ -133,6 +154,7 @@ class FrameSurfaces(Sequence[TriangleMesh]):
         notes: on each frame.
         samples: some vertices of each frame, as many as tell its size and place.
         shift: (3,) added to vertices; None for nothing.
+        supports: what meshes stand on, which is cut off, by the number of the frame.
     """
 
     frames: Sequence[Any]
@@ -141,6 +163,7 @@ class FrameSurfaces(Sequence[TriangleMesh]):
     notes: tuple[tuple[str, ...], ...]
     samples: tuple[Tensor, ...]
     shift: Tensor | None = None
+    supports: Mapping[int, SupportSplit] = field(default_factory=dict)
 
     @classmethod
     def of_frames(
@@ -150,6 +173,7 @@ class FrameSurfaces(Sequence[TriangleMesh]):
         *,
         workers: int | None = None,
         progress: str | os.PathLike[str] | None = None,
+        support: str = "auto",
     ) -> FrameSurfaces:
         """Return the surfaces of frames, each of which is taken when its turn comes.
 
@@ -158,21 +182,29 @@ class FrameSurfaces(Sequence[TriangleMesh]):
             names: of the frames, for errors.
             workers: processes for the surfaces of clouds, see `do_jobs`.
             progress: a folder in which each of these is kept as soon as it is done, see `KeptResults`.
+            support: "auto" leaves out what they stand on, see `split_support`; "keep" keeps it.
 
         Raises:
             InputTypeError: if a frame is neither a mesh nor points; names it.
             InputError: if there is no frame, or one of them has no surface.
+
+        Warns:
+            FileWarning: if a support is left out.
         """
+        check_choice(support, "support", SUPPORTS)
         if isinstance(frames, TriangleMesh):
             raise InputTypeError("meshes must be a sequence of TriangleMesh, got one mesh; put it into a list")
         names = tuple(names or (f"meshes[{frame}]" for frame in range(len(frames))))
         if not names:
             raise InputError("meshes must hold at least one frame, got none")
-        making = _Making(frames, names, KeptResults.in_folder(progress))
+        making = _Making(frames, names, KeptResults.in_folder(progress), support)
         first, jobs = _cloud(frames[0]), making.jobs()
         do_jobs(lambda: next(jobs, None), len(names), 1 if first is not None and first.is_cuda else workers)
         samples = tuple(making.samples[number] for number in range(len(names)))
-        return cls(frames, names, making.made, tuple(making.notes), samples)
+        if making.supports:
+            count = sum(int(split.mask.sum()) for split in making.supports.values())
+            warn_about_support(f"{count} points in {len(making.supports)} of {len(names)} frames", stacklevel=3)
+        return cls(frames, names, making.made, tuple(making.notes), samples, supports=making.supports)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -180,6 +212,8 @@ class FrameSurfaces(Sequence[TriangleMesh]):
     def __getitem__(self, index: int) -> TriangleMesh:  # type: ignore[override]
         index = range(len(self))[index]
         mesh = self.made[index] if index in self.made else as_mesh(self.frames[index], self.names[index])
+        if index in self.supports and index not in self.made:
+            mesh = self.supports[index].rest(mesh)
         return mesh if self.shift is None else TriangleMesh(mesh.vertices + self.shift.to(mesh.vertices), mesh.faces)
 
     def chosen(self, numbers: Sequence[int]) -> FrameSurfaces:
@@ -191,6 +225,7 @@ class FrameSurfaces(Sequence[TriangleMesh]):
             tuple(self.notes[number] for number in numbers),
             tuple(self.samples[number] for number in numbers),
             self.shift,
+            {place: self.supports[number] for place, number in enumerate(numbers) if number in self.supports},
         )
 
     def shifted(self, shift: Tensor) -> FrameSurfaces:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -143,7 +144,9 @@ class BoneProblem:
         batch = self.correspondences.targets.shape[:-2]
         if transforms.shape[:-3] == batch:
             return transforms
-        return transforms.expand(*torch.broadcast_shapes(transforms.shape[:-3], batch), *transforms.shape[-3:])
+        return transforms.expand(
+            *np.broadcast_shapes(tuple(transforms.shape[:-3]), tuple(batch)), *transforms.shape[-3:]
+        )
 
     def inertia(self, transforms: Tensor) -> Tensor:
         """Return the quadratic forms (..., B, 6, 6) of twists that give the bodies' mean squared displacement."""
@@ -221,7 +224,7 @@ class BoneProblem:
         if not springs:
             return None
         weights = [_per_spring(weight, len(pairs), self.points) for pairs, _, _, weight in springs]
-        batch = torch.broadcast_shapes(*(weight.shape[:-1] for weight in weights))
+        batch = np.broadcast_shapes(*(tuple(weight.shape[:-1]) for weight in weights))
         weight = torch.cat([weight.expand(*batch, weight.shape[-1]) for weight in weights], dim=-1)
         pairs, centers, spreads = (torch.cat(column) for column in list(zip(*springs, strict=True))[:3])
         first, second = pairs.unbind(-1)

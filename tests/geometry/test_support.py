@@ -1,0 +1,166 @@
+"""What scanned things stand on, at any scale and turn; and things that are flat themselves, which stand on nothing."""
+
+import math
+
+import pytest
+import torch
+
+from torchreg.datasets.solids import RoundBox, RoundCone, mesh_of
+from torchreg.errors import InputError
+from torchreg.geometry.mesh import TriangleMesh, concatenate, unit_sphere
+from torchreg.geometry.range_scan import RangeScan
+from torchreg.geometry.rigid import se3_exp, transform_points
+from torchreg.geometry.support import split_support
+
+LEGS = [RoundCone((0.5 * x, 0.1, 0.3 * z), (0.4 * x, 0.9, 0.2 * z), 0.1, 0.13) for x in (-1, 1) for z in (-1, 1)]
+ANIMAL = [*LEGS, RoundCone((-0.6, 1, 0), (0.7, 1, 0), 0.25, 0.25), RoundCone((0.7, 1, 0), (1.1, 1.5, 0), 0.12, 0.15)]
+TURN = se3_exp(torch.tensor([3.0, -2.0, 7.0, 0.9, -1.3, 0.6], dtype=torch.float64))
+
+
+def solid(*parts):
+    mesh = mesh_of(parts, 0.06, 0.03)
+    return TriangleMesh(mesh.vertices.double(), mesh.faces)
+
+
+@pytest.fixture(scope="module")
+def animal():
+    """An animal whose feet touch y = 0."""
+    return solid(*ANIMAL)
+
+
+def sheet(half, height=0.0, count=30):
+    """A square table top as a grid of triangles."""
+    steps = torch.linspace(-half, half, count, dtype=torch.float64)
+    x, z = (rows.reshape(-1) for rows in torch.meshgrid(steps, steps, indexing="ij"))
+    corner = torch.arange(count * count).reshape(count, count)[:-1, :-1].reshape(-1)
+    faces = (
+        torch.stack((corner, corner + 1, corner + count), 1),
+        torch.stack((corner + 1, corner + count + 1, corner + count), 1),
+    )
+    return TriangleMesh(torch.stack((x, torch.full_like(x, height), z), 1), torch.cat(faces))
+
+
+def disc(radius, count, height=0.0):
+    share = torch.rand(count, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    angle, reach = 2 * math.pi * share[:, 0], radius * share[:, 1].sqrt()
+    return torch.stack((reach * angle.cos(), torch.full_like(reach, height), reach * angle.sin()), 1)
+
+
+def noise(points, deviation, seed=0):
+    return points + deviation * torch.randn(
+        points.shape, dtype=points.dtype, generator=torch.Generator().manual_seed(seed)
+    )
+
+
+def after(animal, mask):
+    """Which points behind those of the animal are on the support, and the share of the animal's that are."""
+    return mask[animal.num_vertices :], float(mask[: animal.num_vertices].double().mean())
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("half", [1.0, 2.0, 6.0])
+@pytest.mark.parametrize("gap", [0.0, 0.05])
+def test_a_table_below_a_mesh_is_found_wherever_it_is(animal, scale, half, gap):
+    mesh = concatenate([animal, sheet(half, -gap)])
+    moved = TriangleMesh(scale * transform_points(TURN, mesh.vertices), mesh.faces)
+    found = split_support(moved)
+    table, wrong = after(animal, found.mask)
+    assert bool(table.all())
+    assert wrong < 0.01
+    up = TURN[:3, 1]
+    torch.testing.assert_close(found.plane[:3], up, atol=1e-6, rtol=0)
+    assert abs(float(found.plane[3] / scale + up @ TURN[:3, 3]) - gap) < 1e-6
+    rest = found.rest(moved)
+    assert torch.equal(rest.vertices, moved.vertices[~found.mask])
+    assert abs(rest.num_faces - animal.num_faces) < 0.01 * animal.num_faces
+
+
+@pytest.mark.parametrize("support", ["two triangles", "slab", "table with legs", "corners that are not shared"])
+def test_tables_of_other_makes_are_found_too(animal, support):
+    if support == "two triangles":
+        table = sheet(2.0, count=2)
+    elif support == "slab":
+        table = solid(RoundBox((0, -0.13, 0), (1.0, 0.1, 1.0), 0.02))
+    else:
+        legs = [RoundBox((1.5 * x, -0.9, 1.5 * z), (0.1, 0.75, 0.1), 0.02) for x in (-1, 1) for z in (-1, 1)]
+        table = solid(RoundBox((0, -0.1, 0), (1.8, 0.08, 1.8), 0.02), *legs)
+    mesh = concatenate([animal, table])
+    truth = torch.arange(mesh.num_vertices) >= animal.num_vertices
+    if support == "corners that are not shared":
+        truth = truth[mesh.faces].reshape(-1)
+        mesh = TriangleMesh(mesh.vertices[mesh.faces].reshape(-1, 3), torch.arange(3 * mesh.num_faces).reshape(-1, 3))
+    found = split_support(mesh)
+    assert float((found.mask != truth).double().mean()) < 0.01
+
+
+@pytest.mark.parametrize("top_only", [False, True])
+def test_a_table_that_is_one_with_the_feet_is_cut_off(animal, top_only):
+    mesh = solid(*ANIMAL, RoundBox((0, -0.1, 0), (1.8, 0.1, 1.8), 0.01))
+    if top_only:  # as a scanner sees it
+        mesh = RangeScan(mesh.vertices, mesh.faces).subset(mesh.vertices[:, 1] > -0.01)
+        mesh = TriangleMesh(mesh.points, mesh.faces)
+    found = split_support(mesh)
+    high = mesh.vertices[:, 1]
+    assert float(found.mask[high < 1e-3].double().mean()) > 0.98  # but for the rims of the feet
+    assert not bool(found.mask[high > 0.05].any())
+    rest = found.rest(mesh)
+    assert rest.num_vertices < 0.6 * mesh.num_vertices
+    assert float(rest.vertices[rest.faces][:, :, 1].amax(1).min()) > 0
+
+
+@pytest.mark.parametrize("deviation", [0.0, 0.005, 0.015])
+@pytest.mark.parametrize(("radius", "count"), [(1.0, 2000), (1.5, 20_000), (5.0, 4000)])
+def test_a_turntable_in_a_cloud_is_found_through_noise(animal, deviation, radius, count):
+    points = noise(torch.cat((animal.vertices, disc(radius, count))), deviation)
+    found = split_support(transform_points(TURN, points).float())
+    table, wrong = after(animal, found.mask)
+    assert float(table.double().mean()) > 0.998
+    assert wrong < 0.05  # soles lie on the plane
+    assert float(found.plane[:3] @ TURN[:3, 1]) > 0.9998
+
+
+def star(points, arms=5):
+    angle = torch.atan2(points[:, 2], points[:, 0])
+    return points * torch.stack((reach := 1 + 0.6 * (arms * angle).cos(), torch.ones_like(reach), reach), 1)
+
+
+FLAT = [[0.4, 0.08, 0.45], *[[0.07, 0.06, 0.45]] * 4]
+HAND = [
+    RoundBox((x, 0, z), tuple(half), 0.05)
+    for half, x, z in zip(FLAT, (0, -0.33, -0.11, 0.11, 0.33), (0, 0.85, 0.85, 0.85, 0.85), strict=True)
+]
+THUMB = RoundCone((0.45, 0, 0), (0.7, 0.6, 0.1), 0.09, 0.07)
+ALONE = {
+    "disc": lambda: disc(1.0, 4000),
+    "noisy disc": lambda: noise(disc(1.0, 4000), 0.01),
+    "bowl": lambda: disc(1.0, 4000) + 0.3 * disc(1.0, 4000).square().sum(1, keepdim=True) * torch.eye(3).double()[1],
+    "plate with five arms": lambda: noise(star(disc(1.0, 6000)), 0.003),
+    "thick plate": lambda: torch.cat((star(disc(1.0, 3000)), star(disc(1.0, 3000, 0.1)))),
+    "box": lambda: solid(RoundBox((0, 0, 0), (0.5, 0.15, 0.3), 0.01)),
+    "box seen from one side": lambda: (v := ALONE["box"]().vertices)[(v[:, 1] > 0.13) | (v[:, 0] > 0.48)],
+    "flat hand": lambda: solid(*HAND),
+    "flat hand, thumb up": lambda: solid(*HAND, THUMB),
+    "sole": lambda: solid(RoundBox((0, 0, 0), (1, 0.1, 0.1), 0.02), RoundBox((0, 0, 0), (0.1, 0.1, 1), 0.02)),
+    "ball": lambda: unit_sphere(4),
+    "animal": lambda: solid(*ANIMAL),
+    "three points": lambda: torch.eye(3),
+    "line": lambda: torch.linspace(0, 1, 500)[:, None].expand(500, 3),
+    "one place": lambda: torch.ones(500, 3),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_what_stands_on_nothing_is_kept(name):
+    data = ALONE[name]()
+    for shown in (data, getattr(data, "vertices", data)):
+        found = split_support(shown)
+        assert found.plane is None
+        assert not bool(found.mask.any())
+    if isinstance(data, TriangleMesh):
+        assert found.rest(data) is data
+
+
+def test_bad_points_are_refused():
+    for points in (torch.zeros(0, 3), torch.full((5, 3), torch.nan)):
+        with pytest.raises(InputError, match="data must"):
+            split_support(points)
