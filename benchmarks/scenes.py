@@ -294,7 +294,7 @@ def calibrated(rows: Sequence[Row]) -> tuple[float, ...]:
 def render(rows: Sequence[Row]) -> str:
     """Return the table by kind, with its bars."""
     lines = []
-    for kind in ("hand", "arm"):
+    for kind in sorted({row.kind for row in rows}):
         shown = [row for row in rows if row.kind == kind and row.there]
         absent = [row for row in rows if row.kind == kind and not row.there]
         right, lies = sum(row.right for row in shown), sum(row.sure and not row.right for row in shown)
