@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchreg.errors import FormatError, InputError, InputTypeError
-from torchreg.io.frames import Frames, load_frames, natural_key, save_frames
+from torchreg.io.frames import Frames, load_frames, save_frames
 from torchreg.io.limits import FileLimits
+from torchreg.io.natural_order import natural_key
 from torchreg.io.points import save_points
 
 
@@ -137,7 +138,7 @@ def test_arrays_per_frame(tmp_path):
 
 
 def test_frames_that_are_not_finite(tmp_path):
-    stack = np.zeros((2, 3, 3))
+    stack = np.ones((2, 3, 3))
     stack[1, 1, 2], stack[1, 2] = np.nan, np.inf
     np.savez(tmp_path / "n.npz", points=stack)
     frames = load_frames(tmp_path / "n.npz")

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from torchreg.io import calibration, points
+from torchreg.io import calibration
+from torchreg.io.cloud_formats import FORMATS as CLOUDS
 from torchreg.io.colmap import load_colmap
 from torchreg.io.file_format import FileFormat
 from torchreg.io.frames import load_frames
@@ -47,7 +48,7 @@ def _table(path: Path, *, limits: FileLimits) -> Any:
 
 
 FORMATS: tuple[FileFormat, ...] = (
-    *points.FORMATS,
+    *CLOUDS,
     _row("stacks of frames", "sequences of clouds", (".npz", ".npy"), "(T, M, 3), or one array per frame", load_frames),
     _row(
         "rigged glTF",
