@@ -49,7 +49,13 @@ def _table(path: Path, *, limits: FileLimits) -> Any:
 
 FORMATS: tuple[FileFormat, ...] = (
     *CLOUDS,
-    _row("stacks of frames", "sequences of clouds", (".npz", ".npy"), "(T, M, 3), or one array per frame", load_frames),
+    _row(
+        "stacks of frames",
+        "sequences of clouds",
+        (".npz", ".npy"),
+        "(T, M, 3), one array per frame, or vertices (T, V, 3) and faces",
+        load_frames,
+    ),
     _row(
         "rigged glTF",
         "shapes",
@@ -74,7 +80,7 @@ FORMATS: tuple[FileFormat, ...] = (
         "masks",
         "masks",
         (*PICTURES, ".npy"),
-        "two values, labels, soft edges, transparency",
+        "two values, labels, soft edges, halos, transparency",
         load_mask,
         "SilhouetteFrames",
     ),

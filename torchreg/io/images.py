@@ -100,7 +100,8 @@ def load_mask(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMI
     """Return a mask (H, W), bool.
 
     Transparency that varies is the mask. Otherwise the brighter of two values is set, whatever they are; in a picture
-    of labels all but black or zero; elsewhere what is at least half as bright as the picture's own white.
+    of labels all but black or zero; elsewhere, also where a halo surrounds what is white, what is at least half as
+    bright as the picture's own white.
 
     Args:
         path: a PNG, JPEG, TIFF or BMP file of any bit depth, also with a palette, or a ``.npy`` array (H, W).
@@ -111,7 +112,7 @@ def load_mask(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMI
         FileNotFoundError: if there is no such file.
 
     Warns:
-        FileWarning: if the mask keeps all or nothing, or the file holds several labels.
+        FileWarning: if the mask keeps all or nothing, or the file holds several labels or a halo.
     """
     file = local_path(path)
     content = read_bytes(file, limits)

@@ -92,6 +92,8 @@ def read_npz(content: bytes, limits: FileLimits) -> RawCloud:
         arrays = {name: _read_array(archive, names[name]) for name in wanted}
     points = arrays[key]
     check_allowed(len(points) if points.ndim else 0, "points", limits)
+    if points.ndim == 3 and points.shape[2] == 3:
+        raise FormatError(f"{key} has the shape {points.shape}, several clouds; load_frames reads it as a sequence")
     told = _with_columns(points) if points.ndim == 2 and points.shape[1] > 3 else RawCloud(points)
     faces = arrays.get(corners)
     if faces is not None:
