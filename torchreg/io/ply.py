@@ -105,7 +105,8 @@ def _to_cloud(tables: dict[str, _Columns], kinds: dict[str, dict[str, str]]) -> 
         kind = kinds["vertex"][list(vertex)[channels[0]]]
         colors = colors if kind[0] == "f" else as_integers(colors, kind, "colors")
     parts = [part for element, cut in _FACES.items() if (part := _triangles(tables.get(element, {}), cut)) is not None]
-    return RawCloud(points, stack_named(vertex, "normals"), colors, np.concatenate(parts) if parts else None)
+    faces = np.concatenate(parts) if len(parts) > 1 else parts[0] if parts else None
+    return RawCloud(points, stack_named(vertex, "normals"), colors, faces)
 
 
 # Elements whose lists of vertices are faces, and how these are cut.

@@ -236,8 +236,8 @@ def _of_rows(
 def _measured_rows(points: Tensor, faces: Tensor | None) -> Tensor:
     """Return which rows (N,) were measured: corners of faces, and all but 0 0 0; a single one may be the origin."""
     measured = points.any(dim=-1)
-    if faces is not None:
-        measured[faces] = True
+    if faces is not None and not measured.all():
+        measured[faces.reshape(-1)] = True
     missing = len(points) - int(measured.sum())
     if missing < 2:
         return torch.ones_like(measured)
