@@ -162,6 +162,9 @@ def load_frames(
             or holds no frames; other defects of files are found when they are read.
         InputError: if ``nan_policy`` is unknown.
         InputTypeError: if ``path`` or ``dtype`` is of another type.
+
+    Warns:
+        FileWarning: if points 0 0 0 are left out, of an archive at once, of files at the first that is read.
     """
     check_choice(nan_policy, "nan_policy", ("raise", "omit"))
     check_dtype(dtype)
