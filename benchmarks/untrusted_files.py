@@ -115,6 +115,8 @@ def valid_files(folder: Path) -> list[tuple[Path, Read]]:
     for ending in ("ply", "pcd", "xyz", "obj", "stl", "glb", "npz"):
         write = export if ending in ("obj", "stl", "glb") else lambda path: save_points(path, points)
         add(f"cloud.{ending}", write, load_points)
+    scan = "2\n3\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n5 6 7 1\n" + "0.1 0.2 0.3 0.5 9 8 7\n" * 5
+    add("cloud.ptx", lambda path: path.write_text(2 * (scan + "0 0 0 0.5 0 0 0\n")), load_points)
     add("frames.npz", lambda path: save_frames(path, [points, points[:9]]), lambda path: list(load_frames(path)))
     add("cameras.json", lambda path: save_cameras(path, CameraRig(tuple(cameras))), tr.load_cameras)
     add("depth.json", lambda path: save_depth_camera(path, cameras[0]), load_depth_camera)

@@ -21,7 +21,7 @@ The first line of a table of points may name its columns (`X,Y,Z,R,G,B`, `x [m];
 behind `//` or `#`), or hold the number of points alone. Without names x, y, z come first, and what follows is told
 by its numbers: unit vectors are normals; whole numbers up to 255 or 65535, or numbers from 0 to 1, are colors; the
 rest is passed over, as intensity and time are. Numbers may have decimal commas where semicolons, tabs or blanks
-stand between the columns.
+stand between the columns, in tables of poses too.
 
 ## What is put right, and what is told
 
@@ -31,13 +31,19 @@ stand between the columns.
   more than thirtyfold give a warning that names the factor.
 * A skinned glTF mesh stands as viewers show it: in the pose of its nodes, or at `time=` or `frame=` of its
   animation.
-* Files sort by the numbers in their names: `0.5, 1.25, 1.5, 10`.
+* Files sort by the numbers in their names: `0.5, 1.25, 1.5, 10`, and `5e-05` before `0.0001`.
+* Rows `0 0 0` of clouds, as depth cameras, scanners and padded stacks leave where nothing was measured, are left out
+  with a warning that counts them, once for a sequence. A single one stays, as a point may be the origin, and so do
+  corners of faces.
 * In a mask the brighter of two values is set, whatever they are; transparency that varies is the mask; in a picture
-  of labels all but zero is set.
+  of labels all but zero is set; soft edges are cut at half of the white, and so are halos of one value around it,
+  with a warning.
 * Whole numbers in depth images are millimeters, floating-point ones metres, unless `depth_scale` says otherwise;
   65535 is no depth.
 * A piece of a file that cannot be used is left out with a warning that counts it: faces of two corners, normals
-  that are not finite, vertices without skin weight, links whose mesh is missing.
+  that are not finite or of length zero, vertices without skin weight, links whose mesh is missing.
+* Files of scanners, recordings and CAD programs that are not read (E57, LAS, ROS bags, FBX, STEP and others) are
+  refused with a way to convert them.
 """
 
 

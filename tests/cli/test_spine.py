@@ -111,7 +111,7 @@ def test_nothing_is_overwritten_unasked(error_of, frames, tmp_path):
 
 def test_errors_take_one_line(error_of, frames, tmp_path):
     out = ("-o", tmp_path / "a.glb")
-    assert "not of arrays" in error_of("spine", tmp_path / "x.npz", *out)
+    assert "x.npz: No such file" in error_of("spine", tmp_path / "x.npz", *out)
     assert "must end in .swc" in error_of("spine", frames, *out, "--swc", tmp_path / "a.txt")
     assert "num_tips must be what a frame shows" in error_of("spine", frames, *out, "--tips", 9)
     assert "--fps must be positive" in error_of("spine", frames, *out, "--fps", 0)

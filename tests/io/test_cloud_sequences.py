@@ -9,9 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchreg.errors import FormatError, InputError, InputTypeError
-from torchreg.io.frames import Frames, load_frames, natural_key, save_frames
+from torchreg.io.frames import Frames, load_frames, save_frames
 from torchreg.io.limits import FileLimits
-from torchreg.io.points import save_points
+from torchreg.io.natural_order import natural_key
+from torchreg.io.points import load_mesh, load_points, save_points
 
 
 def clouds(*counts, dtype=torch.float32, seed=0):
@@ -136,8 +137,39 @@ def test_arrays_per_frame(tmp_path):
     assert all(bool((frame == number).all()) for number, frame in enumerate(frames))
 
 
+@pytest.mark.parametrize("name", ["arr_{}", "cloud{}", "{}"])
+def test_lists_as_numpy_saves_them_are_in_order_of_their_numbers(tmp_path, name):
+    made = clouds(*range(50, 62))
+    np.savez(tmp_path / "f.npz", **{name.format(number): cloud.numpy() for number, cloud in enumerate(made)})
+    assert same(load_frames(tmp_path / "f.npz"), made)
+
+
+def test_numbered_arrays_of_one_cloud_are_no_frames(tmp_path):
+    points = clouds(20)[0].numpy()
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    for other in (normals, np.array([[0, 1, 2]])):
+        np.savez(tmp_path / "f.npz", points, other)
+        assert len(load_frames(tmp_path / "f.npz")) == 1
+
+
+@pytest.mark.parametrize(("vertices", "faces"), [("verts", "faces"), ("vertices", "f"), ("v", "f")])
+def test_bodies_of_one_topology_are_meshes(tmp_path, vertices, faces):
+    stack = np.random.default_rng(0).normal(size=(3, 5, 3)).astype("f4")
+    np.savez(tmp_path / "b.npz", **{vertices: stack, faces: np.array([[0, 1, 2, 3], [2, 3, 4, 0]], "u4")})
+    frames = load_frames(tmp_path / "b.npz", scale=0.5)
+    assert torch.equal(frames[1], torch.from_numpy(stack[1]) / 2)
+    meshes = frames[1:].clouds()
+    assert len(meshes) == 2
+    assert torch.equal(meshes[1].points, frames[2])
+    assert meshes[1].faces.tolist() == [[0, 1, 2], [0, 2, 3], [2, 3, 4], [2, 4, 0]]
+    np.savez(tmp_path / "one.npz", **{vertices: stack[0], faces: [[0, 1, 2]]})
+    assert load_mesh(tmp_path / "one.npz").num_faces == 1
+    with pytest.raises(FormatError, match="load_frames reads it as a sequence"):
+        load_points(tmp_path / "b.npz")
+
+
 def test_frames_that_are_not_finite(tmp_path):
-    stack = np.zeros((2, 3, 3))
+    stack = np.ones((2, 3, 3))
     stack[1, 1, 2], stack[1, 2] = np.nan, np.inf
     np.savez(tmp_path / "n.npz", points=stack)
     frames = load_frames(tmp_path / "n.npz")

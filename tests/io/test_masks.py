@@ -68,6 +68,31 @@ def test_a_wide_blur_is_soft_and_labels_are_not(tmp_path):
         assert (saved(tmp_path, labels) == (labels > 0)).all()
 
 
+@pytest.mark.parametrize("value", [1, 20, 100, 127])
+@pytest.mark.parametrize("kind", ["gray", "rgb", "alpha", "u2", "soft"])
+def test_halos_of_one_value_are_beside_the_mask(tmp_path, value, kind):
+    distance = np.hypot(ROW - 24, COLUMN - 32)
+    gray = np.where(DISK, 255, np.where(distance < 20, value, 0)).astype("u1")
+    if kind == "soft":  # pixels between the halo and what is around it
+        gray[(distance >= 20) & (distance < 20.7)] = value // 2
+    pictures = {"rgb": np.repeat(gray[..., None], 3, 2), "u2": gray.astype("u2") * 257}
+    pictures["alpha"] = np.concatenate([np.full((48, 64, 3), 90, "u1"), gray[..., None]], -1)
+    with pytest.warns(FileWarning, match=r"m\.png: what is (255|65535) has a halo"):
+        assert (saved(tmp_path, pictures.get(kind, gray)) == DISK).all()
+
+
+def test_labels_that_nest_or_touch_are_no_halos(tmp_path):
+    inner, angle = np.hypot(ROW - 24, COLUMN - 32) < 7, np.arctan2(ROW - 24, COLUMN - 32)
+    for labels in (
+        np.select([inner, DISK], [2, 1], 0),
+        np.select([inner, DISK], [255, 127], 0),
+        np.select([DISK & (COLUMN < 32), DISK], [255, 128], 0),
+        np.where(DISK, 20 * (1 + (angle + np.pi) // 0.6), 0),
+    ):
+        with pytest.warns(FileWarning, match=r"holds \d+ labels: all but 0 are set"):
+            assert (saved(tmp_path, labels.astype("u1")) == DISK).all()
+
+
 @pytest.mark.parametrize("kind", [bool, "u1", "i8", "f4"])
 def test_arrays_of_two_values(tmp_path, kind):
     np.save(tmp_path / "m.npy", DISK.astype(kind))

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchreg.errors import FileWarning, FormatError
-from torchreg.io.raw_cloud import RawCloud, as_indices, as_integers, fan_triangles, parse_table, stack_columns
+from torchreg.io.columns import stack_named
+from torchreg.io.raw_cloud import RawCloud, as_indices, as_integers, fan_triangles, parse_table, strip_triangles
 
 
 @given(st.lists(st.tuples(*[st.floats(width=64)] * 3), min_size=1, max_size=5))
@@ -90,13 +91,25 @@ def test_integers_must_fit_their_type(kind, low, high):
     assert as_integers(np.zeros(0), kind, "red").shape == (0,)
 
 
-def test_columns_are_stacked_in_the_order_asked_for():
-    columns = {"z": np.array([3.0, 6.0]), "x": np.array([1, 4], np.float32), "y": np.array([2, 5], np.float32)}
-    stacked = stack_columns(columns, ["x", "y", "z"])
+def test_columns_are_stacked_by_any_of_their_names():
+    columns = {"z": np.array([3.0, 6.0]), "x": np.array([1, 4], np.float32), "Y": np.array([2, 5], np.float32)}
+    stacked = stack_named(columns, "points")
     assert stacked.dtype == np.float64
     assert stacked.tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert stack_columns(columns, ["x", "y"]).dtype == np.float32
-    assert stack_columns(columns, ["x", "nx"]) is None
+    assert stack_named(columns, "normals") is None
+
+
+@given(st.lists(st.lists(st.integers(-1, 5), max_size=9), max_size=4))
+def test_strips_are_those_of_a_plain_loop(strips):
+    expected, one = [], []
+    for number in [number for strip in strips for number in [*strip, -1]]:
+        one = [*one, number] if number >= 0 else []
+        if len(set(one[-3:])) == 3:
+            a, b, c = one[-3:]
+            expected.append([a, b, c] if len(one) % 2 else [b, a, c])
+    counts = np.array([len(strip) for strip in strips], np.int64)
+    indices = np.array([number for strip in strips for number in strip], np.int64)
+    assert strip_triangles(counts, indices).tolist() == expected
 
 
 @given(st.lists(st.integers(3, 7), max_size=6), st.randoms(use_true_random=False))

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from torchreg.errors import FileWarning
-from torchreg.io.frames import load_frames, natural_sorted
+from torchreg.io.frames import load_frames
 from torchreg.io.images import list_frames, list_pictures
+from torchreg.io.natural_order import natural_sorted
 
 
 @pytest.mark.parametrize(
@@ -22,6 +23,12 @@ from torchreg.io.images import list_frames, list_pictures
         ["walk.1.ply", "walk.2.ply", "walk.10.ply"],
         ["a1b2.ply", "a1b10.ply", "a2b1.ply"],
         ["9.ply", "10.ply", "10a.ply", "b.ply"],
+        ["0.0.xyz", "5e-05.xyz", "0.0001.xyz", "0.00015.xyz", "1.5E-3.xyz", "1e+02.xyz", "1.25e3.xyz"],
+        ["t=-1e-3.ply", "t=-2e-04.ply", "t_0.ply", "t_1e-3_b2.ply", "t_1e-3_b10.ply", "t_0.01.ply"],
+        ["s1e2.ply", "s1e10.ply", "s2e1.ply"],
+        ["3e-9f.ply", "3e-10f.ply"],
+        ["12_95000000.ply", "12_100000000.ply", "13_5.ply"],
+        ["v1.2.9.ply", "v1.2.10.ply", "v1.10.1.ply"],
     ],
 )
 def test_names_sort_as_a_person_would(names):
@@ -45,6 +52,8 @@ def test_frames_and_pictures_come_in_this_order(tmp_path):
             (tmp_path / side / f"t={time}.png").touch()
     assert [path.name for path in list_pictures(tmp_path / "left")] == [f"t={t}.png" for t in (0.05, 0.1, 0.25, 0.3)]
     assert list_frames([tmp_path / "left", tmp_path / "right"])[0][1].name == "t=0.05.png"
+    (tmp_path / "left" / "t=0.05.png").rename(tmp_path / "left" / "t=5e-2.png")
+    assert list_frames([tmp_path / "left", tmp_path / "right"])[0][0].name == "t=5e-2.png"
 
 
 def test_notes_beside_frames_are_passed_over_and_told(tmp_path):

@@ -154,3 +154,36 @@ def test_float_colors_and_normals_and_empty_faces():
     cloud = read_ply(binary, DEFAULT_LIMITS)
     assert cloud.points.tolist() == [[0, 1, 2]]
     assert cloud.faces.shape == (0, 3)
+
+
+@pytest.mark.parametrize("names", [("normal_x", "normal_y", "normal_z"), ("Nx", "Ny", "Nz"), ("nx", "ny", "nz")])
+@pytest.mark.parametrize("colors", [("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue")])
+def test_names_of_other_programs(names, colors):
+    header = "ply\nformat ascii 1.0\nelement vertex 1\n"
+    header += "".join(f"property float {name}\n" for name in ("x", "y", "z", *names))
+    header += "".join(f"property uchar {name}\n" for name in colors) + "end_header\n"
+    cloud = read_ply(header.encode() + b"1 2 3 0 0 1 10 20 30\n", DEFAULT_LIMITS)
+    assert cloud.normals.tolist() == [[0, 0, 1]]
+    assert cloud.colors.dtype == np.uint8
+    assert cloud.colors.tolist() == [[10, 20, 30]]
+
+
+@pytest.mark.parametrize("kind", ["int", "uint"])
+@pytest.mark.parametrize("also_faces", [False, True])
+def test_triangle_strips_are_cut_with_one_side_outward(kind, also_faces):
+    # Corners of a strip of a grid, then after a restart a triangle alone, and a strip joined by a flat triangle.
+    corners = np.array([[x, y, 0.0] for x in range(4) for y in range(2)])
+    strips = [0, 2, 1, 3, -1, 2, 4, 3, -1, 4, 6, 5, 7, 7]
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(corners)}\n"
+    header += "".join(f"property float {name}\n" for name in "xyz")
+    body = corners.astype("<f4").tobytes()
+    if also_faces:
+        header += "element face 1\nproperty list uchar int vertex_indices\n"
+        body += struct.pack("<B3i", 3, 3, 4, 5)
+    header += f"element tristrips 1\nproperty list int {kind} vertex_indices\nend_header\n"
+    body += struct.pack("<i", len(strips)) + np.array(strips, "<i4").tobytes()
+    faces = read_ply(header.encode() + body, DEFAULT_LIMITS).faces
+    assert len(faces) == 5 + also_faces
+    a, b, c = (corners[faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    assert (normals[also_faces:, 2] == 1).all()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -66,6 +66,7 @@ def test_meshes_written_by_trimesh(tmp_path, name, content):
 def test_what_is_saved_comes_back_exactly(tmp_path, points, ending, double, with_normals, with_colors):
     dtype = torch.float64 if double else torch.float32
     wanted = torch.tensor(points, dtype=dtype)
+    assume(int((wanted == 0).all(-1).sum()) < 2)  # several points 0 0 0 were not measured
     normals = torch.nn.functional.normalize(wanted + 0.3, dim=-1) if with_normals else None
     colors = torch.linspace(0, 1, points.size, dtype=dtype).reshape(-1, 3) if with_colors else None
     if ending in ("xyz", "txt"):
@@ -204,7 +205,9 @@ def test_npz_keys(tmp_path):
         archive(points=np.asfortranarray(cloud.astype(">f8"))),
     ):
         np.testing.assert_array_equal(load_points(path, dtype=torch.float64).points, cloud)
-    colored = load_points(archive(points=cloud.astype(int), colors=np.full((5, 3), 255, np.uint8), normals=cloud))
+    colored = load_points(
+        archive(points=(10 * cloud).astype(int), colors=np.full((5, 3), 255, np.uint8), normals=cloud)
+    )
     assert colored.colors.eq(1).all()
     for arrays, words in (
         ({"one": cloud, "two": cloud}, r"must hold an array 'points' of shape \(N, 3\), .* got one, two"),

@@ -10,6 +10,7 @@ import trimesh
 
 from torchreg.errors import FileWarning, FormatError, InputError
 from torchreg.geometry.mesh import unit_sphere
+from torchreg.io.frames import load_frames
 from torchreg.io.points import load_mesh, load_points, save_points
 
 RNG = np.random.default_rng(4)
@@ -179,6 +180,29 @@ def test_content_decides_where_the_ending_is_wrong(tmp_path):
 def test_what_stands_in_for_a_file_is_told(tmp_path, content, words):
     with pytest.raises(FormatError, match=words):
         read(tmp_path, "a.scan", content)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("a.e57", b"ASTM-E57" + bytes(40), "E57.*CloudCompare.*PLY.*pye57"),
+        ("a.E57", b"", "E57.*CloudCompare"),
+        ("a.xyz", b"ASTM-E57" + bytes(40), "E57.*CloudCompare"),
+        ("a.laz", b"LASF" + bytes(40), "LAS or LAZ.*CloudCompare.*laspy"),
+        ("a.rcs", bytes(9), "scanner's own format.*PTX or PLY"),
+        ("a.bag", b"#ROSBAG V2.0", "ROS recording.*PCD"),
+        ("a.fbx", b"Kaydara FBX Binary", r"glTF \(\.glb\)"),
+        ("a.step", b"ISO-10303-21;", "CAD model.*STL"),
+    ],
+)
+def test_other_formats_are_told_with_a_way_to_convert_them(tmp_path, name, content, words):
+    (tmp_path / name).write_bytes(content)
+    for call in (load_points, load_mesh, *([] if name.endswith("xyz") else [load_frames])):
+        with pytest.raises(FormatError, match=rf"{name}: is of a format that is not read \(.*{words}"):
+            call(tmp_path / name)
+    if not name.endswith("xyz"):
+        with pytest.raises(FormatError, match=words):
+            load_frames(tmp_path)
 
 
 def ascii_ply(columns, values, faces=""):

@@ -10,8 +10,9 @@ from typing import Any, overload
 
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import FormatError
-from torchreg.io.frames import file_fingerprint, natural_sorted
+from torchreg.io.frames import file_fingerprint
 from torchreg.io.images import list_pictures
+from torchreg.io.natural_order import natural_sorted
 
 PathLike = str | os.PathLike[str]
 

@@ -65,7 +65,8 @@ def cloud_files(paths: Sequence[Path]) -> list[Path]:
     """Return the files that are meant: those of a folder, or that match a pattern, in the order of their numbers."""
     import glob
 
-    from torchreg.io.frames import frames_in, natural_sorted
+    from torchreg.io.frames import frames_in
+    from torchreg.io.natural_order import natural_sorted
 
     files: list[Path] = []
     for path in paths:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -42,7 +41,7 @@ def spine(
         typer.Argument(
             metavar="FRAMES",
             help="The meshes, or clouds of points, in any unit: files, which are put in the order of the numbers in "
-            "their names, or one folder of them. With --silhouettes one folder of masks per camera.",
+            "their names, one folder of them, or one .npz of them. With --silhouettes one folder of masks per camera.",
         ),
     ],
     output: Annotated[
@@ -133,7 +132,9 @@ def spine(
         source = _silhouettes(frames, calibration, bool(screen), resolution, scale)
         count, names = len(source), source.names
     else:
-        files = _files(frames, scale, nan_policy)
+        from torchreg.io.frames import load_frames
+
+        files = load_frames(cloud_files(frames), scale=scale, nan_policy=nan_policy)
         count, names = len(files), files.names
     curves = [numbered(swc, frame, count) for frame in range(count)] if swc is not None else []
     check_outputs([glb, result, result.with_suffix(".json"), npz, table, plot, movie, *curves], force)
@@ -150,7 +151,8 @@ def spine(
         if silhouettes:
             meshes: Sequence[TriangleMesh] = _hulls(source, seen_folder(seen, glb, force), progress, quiet)
         else:
-            meshes = FrameSurfaces.of_frames(files, names, workers=workers, progress=progress, support=support)
+            clouds = files.clouds()
+            meshes = FrameSurfaces.of_frames(clouds, names, workers=workers, progress=progress, support=support)
         found = _extracted(meshes, known, config, workers, progress, quiet, growing=growing, support=support)
         found = remembering(found, upright)
         found.save(result)
@@ -228,33 +230,6 @@ def _read_prior(path: Path | None) -> Skeleton | SpineSequence | None:
     if not isinstance(spine, SpineSequence):
         raise InputError(f"--prior must be a spine (.safetensors) or a skeleton (.swc), got {path}")
     return spine
-
-
-@dataclass(frozen=True)
-class _Files(Sequence[Any]):
-    """What files hold, read when it is asked for and not kept."""
-
-    names: tuple[str, ...]
-    scale: float
-    nan_policy: NanPolicy
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    def __getitem__(self, index: Any) -> Any:
-        from torchreg.io.points import load_points
-
-        return load_points(self.names[index], scale=self.scale, nan_policy=self.nan_policy)
-
-
-def _files(frames: list[Path], scale: float, nan_policy: NanPolicy) -> _Files:
-    """Return the files of meshes and clouds in the order of time."""
-    from torchreg.errors import InputError
-    from torchreg.io.frames import load_frames
-
-    if any(frame.suffix.lower() == ".npz" for frame in frames):
-        raise InputError("FRAMES must be files of meshes, not of arrays; give a folder, or files such as *.ply")
-    return _Files(load_frames(cloud_files(frames)).names, scale, nan_policy)
 
 
 def _silhouettes(

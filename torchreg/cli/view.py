@@ -183,18 +183,11 @@ def _serve(scene: Scene, port: int, browser: bool, quiet: bool) -> None:
 
 def _read(paths: list[Path], scale: float = 1.0) -> list[Tensor | TriangleMesh]:
     """Return the meshes or clouds of files, or the frames of a folder or one .npz, in their order."""
-    from torchreg.geometry.mesh import TriangleMesh
     from torchreg.io.frames import load_frames
-    from torchreg.io.points import load_points
 
     if not paths:
         return []
-    files = cloud_files(paths)
-    frames = load_frames(files, scale=scale)
-    if any(path.suffix.lower() == ".npz" for path in files):
-        return list(frames)
-    clouds = [load_points(name, scale=scale) for name in frames.names]
     return [
-        cloud.points if cloud.faces is None or not len(cloud.faces) else TriangleMesh(cloud.points, cloud.faces)
-        for cloud in clouds
+        cloud.points if cloud.faces is None or not len(cloud.faces) else cloud.to_mesh()
+        for cloud in load_frames(cloud_files(paths), scale=scale).clouds()
     ]

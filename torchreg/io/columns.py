@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +30,7 @@ _NAMES: dict[str, tuple[tuple[str, ...], ...]] = {
         ("diffusered", "diffusegreen", "diffuseblue"), ("rf", "gf", "bf"),
     ),
 }  # fmt: skip
+_DECIMAL_COMMA = re.compile(rb"[+-]?\d*,\d+([eE][+-]?\d+)?|[+-]?\d+([eE][+-]?\d+)?|[+-]?nan")
 _UNIT = re.compile(r"[\[(][^\])]*[\])]|_(m|mm|cm)$")
 
 
@@ -49,15 +50,32 @@ def column_name(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", _UNIT.sub("", name.strip().strip("\"'").strip().lower()))
 
 
+def named_columns(names: Sequence[str], kind: str) -> list[int] | None:
+    """Return the numbers of three columns among named ones: those of "points", "normals" or "colors"; None without."""
+    plain = [column_name(name) for name in names]
+    found = next((triple for triple in _NAMES[kind] if all(name in plain for name in triple)), None)
+    return None if found is None else [plain.index(name) for name in found]
+
+
+def stack_named(columns: Mapping[str, Array], kind: str) -> Array | None:
+    """Return the columns (N, 3) of a kind, see `named_columns`, among those of a file; None without."""
+    found, names = named_columns(list(columns), kind), list(columns)
+    return None if found is None else np.stack([columns[names[k]] for k in found], axis=-1)
+
+
+def have_decimal_commas(fields: Iterable[bytes]) -> bool:
+    """Return whether all fields of a table are numbers, whole ones or with decimals behind a comma."""
+    return all(_DECIMAL_COMMA.fullmatch(field) for field in fields)
+
+
 def names_points(names: Sequence[str]) -> bool:
     """Return whether the names of columns tell where x, y and z are."""
-    return _named([column_name(name) for name in names], "points") is not None
+    return named_columns(names, "points") is not None
 
 
 def wanted_columns(names: Sequence[str]) -> list[int]:
     """Return the numbers of the columns, among named ones, that a cloud is made of."""
-    plain = [column_name(name) for name in names]
-    return [column for kind in _NAMES for column in _named(plain, kind) or ()]
+    return [column for kind in _NAMES for column in named_columns(names, kind) or ()]
 
 
 def cloud_of_columns(table: Array, names: Sequence[str] | None = None, *, intensity_first: bool = False) -> RawCloud:
@@ -70,8 +88,7 @@ def cloud_of_columns(table: Array, names: Sequence[str] | None = None, *, intens
         intensity_first: whether an intensity stands before colors where both orders are possible, as in .pts files.
     """
     if names is not None:
-        plain = [column_name(name) for name in names]
-        where = {kind: _named(plain, kind) for kind in _NAMES}
+        where = {kind: named_columns(names, kind) for kind in _NAMES}
         if where["points"] is None:
             raise FormatError(
                 f"the columns must name x, y and z, got {' '.join(names)[:80]}; rename three of them, or remove the "
@@ -86,21 +103,14 @@ def cloud_of_columns(table: Array, names: Sequence[str] | None = None, *, intens
     points, colors = parts["points"], parts["colors"]
     if points is None:
         raise FormatError("holds no columns x, y and z")
-    return RawCloud(points.reshape(-1, 3), parts["normals"], None if colors is None else _typed(colors))
-
-
-def _named(names: Sequence[str], kind: str) -> list[int] | None:
-    for triple in _NAMES[kind]:
-        if all(name in names for name in triple):
-            return [names.index(name) for name in triple]
-    return None
+    return RawCloud(points.reshape(-1, 3), parts["normals"], None if colors is None else typed_colors(colors))
 
 
 def _guessed(table: Array, intensity_first: bool) -> dict[str, list[int] | None]:
     """Return the columns of normals and of colors behind x y z, told by their numbers."""
     width = table.shape[1] if len(table) else 0
     begins = range(3, width - 2)
-    normals = next((k for k in begins if _are_normals(table[:, k : k + 3])), None)
+    normals = next((k for k in begins if are_normals(table[:, k : k + 3])), None)
     order = reversed(begins) if intensity_first else begins
     taken = set() if normals is None else {normals, normals + 1, normals + 2}
     colors = next((k for k in order if not taken & {k, k + 1, k + 2} and _are_colors(table[:, k : k + 3])), None)
@@ -116,7 +126,7 @@ def _guessed(table: Array, intensity_first: bool) -> dict[str, list[int] | None]
     return {kind: None if k is None else [k, k + 1, k + 2] for kind, k in found.items()}
 
 
-def _are_normals(columns: Array) -> bool:
+def are_normals(columns: Array) -> bool:
     """Return whether nearly all rows (N, 3) that are finite and not zero are of length one."""
     length = np.linalg.norm(columns, axis=-1)
     told = np.isfinite(length) & (length > 0)
@@ -132,7 +142,7 @@ def _are_colors(columns: Array) -> bool:
     return bool(finite.max() <= 1 or (finite.max() <= 65535 and np.all(finite == np.floor(finite))))
 
 
-def _typed(colors: Array) -> Array:
+def typed_colors(colors: Array) -> Array:
     """Return colors read as text in the integer type that they were written in; fractions of one stay."""
     known = np.isfinite(colors)
     largest = colors.max(initial=0.0, where=known)

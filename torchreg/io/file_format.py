@@ -27,6 +27,55 @@ _UTF16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _CHUNK = 1 << 20
 
 
+@dataclass(frozen=True)
+class _Foreign:
+    """Formats that are not read.
+
+    Args:
+        name: as people call them.
+        endings: lower case, with the dot.
+        starts: first bytes of their content, where these tell.
+        way: what to do about such a file.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    starts: tuple[bytes, ...]
+    way: str
+
+
+# A new format is one more row.
+_FOREIGN = (
+    _Foreign(
+        "E57", (".e57",), (b"ASTM-E57",),
+        "CloudCompare opens it and saves it as PLY; in Python pye57 reads it, and save_points writes its arrays",
+    ),
+    _Foreign(
+        "LAS or LAZ", (".las", ".laz"), (b"LASF",),
+        "CloudCompare opens it and saves it as PLY; in Python laspy reads it, and save_points writes its arrays",
+    ),
+    _Foreign(
+        "a scanner's own format",
+        (".rcs", ".rcp", ".fls", ".lsproj", ".zfs", ".rxp", ".rdb", ".rdbx", ".ptg", ".ptz", ".3dd", ".cl3"), (),
+        "export it as PTX or PLY from the scanner's program; CloudCompare reads some of these and saves them as PLY",
+    ),
+    _Foreign(
+        "a ROS recording", (".bag", ".mcap", ".db3"), (b"#ROSBAG", b"\x89MCAP"),
+        "export its clouds as PCD files, one per message, as pcl_ros does",
+    ),
+    _Foreign(
+        "a scene of another program",
+        (".fbx", ".blend", ".usd", ".usda", ".usdc", ".usdz", ".abc", ".3ds", ".dae", ".ma", ".mb", ".max", ".c4d"),
+        (b"Kaydara FBX", b"BLENDER", b"PXR-USDC", b"#usda"),
+        "export it as glTF (.glb), from Blender for example",
+    ),
+    _Foreign(
+        "a CAD model", (".step", ".stp", ".iges", ".igs", ".sldprt", ".3dm", ".dwg", ".dxf"), (b"ISO-10303-21",),
+        "export it as STL or OBJ from the CAD program, or from FreeCAD",
+    ),
+)  # fmt: skip
+
+
 @dataclass(frozen=True, kw_only=True)
 class FileFormat:
     """One format of files: a row of the table that loaders look in, `torchreg formats` prints and the docs show.
@@ -68,7 +117,8 @@ def choose(formats: Sequence[FileFormat], content: bytes, path: Path) -> FileFor
     """Return the format of a file: told by its content for sure, else by its ending.
 
     Raises:
-        FormatError: if neither tells; lists the endings. Also if content only stands in for a file elsewhere.
+        FormatError: if neither tells; lists the endings, or names the way to convert what is of another known format.
+            Also if content only stands in for a file elsewhere.
     """
     check_stand_in(content)
     ending = ending_of(path)
@@ -77,10 +127,18 @@ def choose(formats: Sequence[FileFormat], content: bytes, path: Path) -> FileFor
     for row in (*named, *formats):
         if row.sniff is not None and row.sniff(content):
             return row
+    refuse_foreign(path, content)
     if named:
         return named[0]
     known = ", ".join(ending for row in formats for ending in row.endings)
     raise FormatError(f"has the unknown ending {path.suffix!r}, and its content tells no format; known: {known}")
+
+
+def refuse_foreign(path: Path, content: bytes = b"") -> None:
+    """Raise FormatError, with the way to convert it, if a file's ending or content is of a known format not read."""
+    for row in _FOREIGN:
+        if ending_of(path) in row.endings or (row.starts and content.startswith(row.starts)):
+            raise FormatError(f"is of a format that is not read ({row.name}): {row.way}")
 
 
 def check_stand_in(content: bytes) -> None:

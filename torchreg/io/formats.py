@@ -9,7 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from torchreg.io import calibration, points
+from torchreg.io import calibration
+from torchreg.io.cloud_formats import FORMATS as CLOUDS
 from torchreg.io.colmap import load_colmap
 from torchreg.io.file_format import FileFormat
 from torchreg.io.frames import load_frames
@@ -47,8 +48,14 @@ def _table(path: Path, *, limits: FileLimits) -> Any:
 
 
 FORMATS: tuple[FileFormat, ...] = (
-    *points.FORMATS,
-    _row("stacks of frames", "sequences of clouds", (".npz", ".npy"), "(T, M, 3), or one array per frame", load_frames),
+    *CLOUDS,
+    _row(
+        "stacks of frames",
+        "sequences of clouds",
+        (".npz", ".npy"),
+        "(T, M, 3), one array per frame, or vertices (T, V, 3) and faces",
+        load_frames,
+    ),
     _row(
         "rigged glTF",
         "shapes",
@@ -73,7 +80,7 @@ FORMATS: tuple[FileFormat, ...] = (
         "masks",
         "masks",
         (*PICTURES, ".npy"),
-        "two values, labels, soft edges, transparency",
+        "two values, labels, soft edges, halos, transparency",
         load_mask,
         "SilhouetteFrames",
     ),

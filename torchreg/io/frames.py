@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import io
-import math
 import os
 import re
 import warnings
-import zipfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from decimal import Decimal
-from functools import partial
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, overload
 
@@ -23,27 +22,16 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_choice, check_finite, check_positive, check_shape
 from torchreg.errors import FileWarning, FormatError, InputError, InputTypeError
 from torchreg.io.atomic import write_atomic
-from torchreg.io.file_format import check_stand_in, ending_of
-from torchreg.io.limits import (
-    DEFAULT_LIMITS,
-    FILE_BUDGET,
-    FileLimits,
-    check_allowed,
-    check_budget,
-    local_path,
-    open_zip,
-    read_bytes,
-)
-from torchreg.io.npz import array_of, read_npy_header
-from torchreg.io.points import ENDINGS, PARSER_ERRORS, check_dtype, load_points, needed_dtype, save_points
-from torchreg.io.raw_cloud import Array, as_indices
+from torchreg.io.cloud_formats import ENDINGS
+from torchreg.io.file_format import ending_of, naming, refuse_foreign
+from torchreg.io.frame_archives import read_frame_archive
+from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
+from torchreg.io.natural_order import natural_sorted
+from torchreg.io.points import PointCloud, check_dtype, checked_cloud, load_points, save_points
+from torchreg.io.raw_cloud import Array, RawCloud
 
-# A number in a name: with a decimal point, or a sign that is no hyphen between words.
-_NUMBER = re.compile(r"((?:(?<![^\W_])-)?\d+(?:\.\d+)*)")
 # Beside meshes and clouds in one folder, files of these endings tell of them: times, poses, notes.
 _NOTES = (".csv", ".txt", ".dat", ".tsv", ".npy", ".asc")
-_NUMBERED = re.compile(r"frame_?(\d+)")
-_ARRAY = b"\x93NUMPY"
 PathLike = str | os.PathLike[str]
 
 
@@ -51,8 +39,8 @@ class Frames(Sequence[Tensor]):
     """Clouds in the order of time, each read on request, and not kept.
 
     Indexing and iterating give (M, 3) tensors on the CPU, a slice gives `Frames` again. M may be zero in archives.
-    Reading raises what `load_points` raises; every message names the file, and in an archive the frame. Made by
-    `load_frames`.
+    Reading raises what `load_points` raises; every message names the file, and in an archive the frame. What is left
+    out of frames is told of the first that it concerns. Made by `load_frames`.
 
     Args:
         names: of the frames: the path of its file, in an archive also its number.
@@ -61,14 +49,16 @@ class Frames(Sequence[Tensor]):
         limits: see `load_points`.
         dtype: of the tensors.
         scale: see `load_points`.
+        faces: (F, 3) that all frames of an archive share; None where they are clouds.
     """
 
     def __init__(
         self, names: Sequence[str], sources: Sequence[Path | Array], nan_policy: str, limits: FileLimits,
-        dtype: torch.dtype | None, scale: float = 1.0,
+        dtype: torch.dtype | None, scale: float = 1.0, faces: Array | None = None,
     ) -> None:  # fmt: skip
-        self.names, self._scale = tuple(names), scale
-        self._sources, self._nan_policy, self._limits, self._dtype = tuple(sources), nan_policy, limits, dtype
+        self.names, self._sources, self._faces = tuple(names), tuple(sources), faces
+        self._options: dict[str, Any] = {"scale": scale, "nan_policy": nan_policy, "limits": limits, "dtype": dtype}
+        self._told = set[str]()
 
     def __len__(self) -> int:
         return len(self._sources)
@@ -81,31 +71,60 @@ class Frames(Sequence[Tensor]):
 
     def __getitem__(self, index: int | slice) -> Tensor | Frames:
         if isinstance(index, slice):
-            sources = self._sources[index]
-            return Frames(self.names[index], sources, self._nan_policy, self._limits, self._dtype, self._scale)
-        source = self._sources[index]
-        if isinstance(source, Path):
-            options = {"nan_policy": self._nan_policy, "limits": self._limits, "dtype": self._dtype}
-            return load_points(source, scale=self._scale, **options).points  # type: ignore[arg-type]
-        return self._rows(self.names[index], source)
+            chosen = copy.copy(self)
+            chosen.names, chosen._sources = self.names[index], self._sources[index]
+            return chosen
+        return self.cloud(index).points
 
     def __iter__(self) -> Iterator[Tensor]:
         return (self[index] for index in range(len(self)))
+
+    def cloud(self, index: int) -> PointCloud:
+        """Return a frame with its faces, normals and colors where it has them."""
+        source, name = self._sources[index], self.names[index]
+        with self._telling_once(name):
+            if isinstance(source, Path):
+                return load_points(source, **self._options)
+            with naming(name), np.errstate(all="ignore"):  # what overflows becomes infinite and is judged as that
+                return checked_cloud(RawCloud(source, faces=self._faces), **self._options, may_be_empty=True)
+
+    def clouds(self) -> Sequence[PointCloud]:
+        """Return the frames as `cloud` gives them, each read on request."""
+        return _Clouds(self)
+
+    @contextmanager
+    def _telling_once(self, name: str) -> Iterator[None]:
+        """Tell what is left out of a frame only if nothing of the kind was told of an earlier one."""
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", FileWarning)
+            yield
+        for row in caught:
+            text = str(row.message)
+            kind = re.sub(r"[\d.,]+", "", text.removeprefix(name))
+            if issubclass(row.category, FileWarning) and kind not in self._told:
+                self._told.add(kind)
+                more = "; of other frames this is not told again" if len(self) > 1 else ""
+                warnings.warn(f"{text}{more}", row.category, stacklevel=5)
+            elif not issubclass(row.category, FileWarning):
+                warnings.warn(row.message, row.category, stacklevel=5)
 
     def fingerprint(self, index: int) -> str:
         """Return a digest of what a frame holds now; empty if its file cannot be read."""
         source = self._sources[index]
         return file_fingerprint(source) if isinstance(source, Path) else _digest(np.ascontiguousarray(source).tobytes())
 
-    def _rows(self, name: str, rows: Array) -> Tensor:
-        with np.errstate(all="ignore"):  # what overflows becomes infinite and is judged as that
-            points = torch.from_numpy(rows.astype(np.float64)) * self._scale
-            points = points.to(self._dtype or needed_dtype(points))
-        finite = torch.isfinite(points).all(dim=-1)
-        bad = len(points) - int(finite.sum())
-        if bad and self._nan_policy == "raise":
-            raise FormatError(f'{name}: {bad} of {len(points)} points are not finite; nan_policy="omit" drops them')
-        return points[finite] if bad else points
+
+@dataclass(frozen=True, eq=False)
+class _Clouds(Sequence[PointCloud]):
+    """Frames with all that they hold."""
+
+    frames: Frames
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int) -> PointCloud:  # type: ignore[override]
+        return self.frames.cloud(index)
 
 
 def load_frames(
@@ -121,9 +140,11 @@ def load_frames(
 
     Args:
         path: a folder whose files are frames, all of one format; a list of files; one file; one NPY of shape
-            (T, M, 3); or one NPZ of frames: an array ``points`` (or ``vertices``, or the only one of three dimensions)
-            of shape (T, M, 3), with ``counts`` (T,), the rows of each frame that count, or ``mask`` (T, M), or neither;
-            or T arrays (M, 3) called ``frame_0``, ``frame_1``, ... An archive is read at once, the rest is not.
+            (T, M, 3) or (T, H, W, 3); or one NPZ of frames: an array ``points`` (or ``vertices``, ``verts``, ``v``, or
+            the only one of three dimensions) of such a shape, with ``counts`` (T,), the rows of each frame that count,
+            or ``mask`` (T, M), or ``faces`` (or ``f``) (F, 3), which make every frame a mesh, or none of these; or T
+            arrays (M, 3) called ``frame_0``, ``frame_1``, ..., or ``arr_0``, ``arr_1``, ..., as ``numpy.savez`` calls
+            those of a list. An archive is read at once, the rest is not.
         sort: order files by their paths with numbers counted as numbers, so that frame2 comes before frame10, as they
             rarely do where a shell wrote the list. False keeps the order of a list.
         scale: see `load_points`.
@@ -141,6 +162,9 @@ def load_frames(
             or holds no frames; other defects of files are found when they are read.
         InputError: if ``nan_policy`` is unknown.
         InputTypeError: if ``path`` or ``dtype`` is of another type.
+
+    Warns:
+        FileWarning: if points 0 0 0 are left out, of an archive at once, of files at the first that is read.
     """
     check_choice(nan_policy, "nan_policy", ("raise", "omit"))
     check_dtype(dtype)
@@ -152,12 +176,13 @@ def load_frames(
         files = _listed(path)
     if sort:
         files = natural_sorted(files)
+    names, sources, faces = [str(file) for file in files], list[Path | Array](files), None
     if len(files) == 1 and files[0].suffix.lower() in (".npz", ".npy"):
-        stacked = _read_archive(files[0], limits)
-        if stacked is not None:
-            names = [f"{files[0]}, frame {number}" for number in range(len(stacked))]
-            return Frames(names, stacked, nan_policy, limits, dtype, scale)
-    return Frames([str(file) for file in files], files, nan_policy, limits, dtype, scale)
+        archive = read_frame_archive(files[0], limits)
+        if archive is not None:
+            names = [f"{files[0]}, frame {number}" for number in range(len(archive.rows))]
+            sources, faces = list(archive.rows), archive.faces
+    return Frames(names, sources, nan_policy, limits, dtype, scale, faces)
 
 
 def save_frames(path: PathLike, frames: Sequence[Any]) -> list[Path]:
@@ -207,40 +232,14 @@ def _digest(*contents: bytes) -> str:
     return digest.hexdigest()
 
 
-def natural_sorted(paths: Iterable[Path]) -> list[Path]:
-    """Return paths in the order of the numbers in their names: frame2 before frame10, 1.25 before 1.5.
-
-    Where two names would be one number, as 1.1 and 1.10, the point separates two counters.
-    """
-    files = list(paths)
-    values = [tuple((kind, value) for kind, value, _ in natural_key(file)) for file in files]
-    return sorted(files, key=natural_key if len(set(values)) == len(files) else partial(natural_key, decimals=False))
-
-
-def natural_key(path: PathLike, *, decimals: bool = True) -> list[tuple[int, Any, str]]:
-    """Return a key that sorts paths with the numbers in them as numbers: frame2 before frame10, 1.25 before 1.5.
-
-    Args:
-        path: of a file.
-        decimals: whether one point between digits is a decimal point; several, as in dates, never are.
-    """
-    key = list[tuple[int, Any, str]]()
-    for number, piece in enumerate(_NUMBER.split(os.fspath(path))):
-        # Digits of other scripts and leading zeros are distinguished by the text itself.
-        if number % 2 == 0:
-            key.append((1, piece, piece))
-        elif decimals and piece.count(".") == 1:
-            key.append((0, Decimal(piece), piece))
-        else:
-            key += [(0, Decimal(part), part) for part in piece.split(".")]
-    return key
-
-
 def frames_in(folder: Path) -> list[Path]:
     """Return the files of a folder that are frames, all of one format, in any order; FormatError if there are none."""
     files = [file for file in folder.iterdir() if ending_of(file) in ENDINGS and not file.name.startswith(".")]
     kinds = Counter(ending_of(file) for file in files)
     if not files:
+        for file in sorted(folder.iterdir()):
+            with naming(file):
+                refuse_foreign(file)
         raise FormatError(f"{folder} holds no frames: no file ends in one of {', '.join(ENDINGS)}")
     geometry = [kind for kind in kinds if kind not in _NOTES]
     if len(kinds) > 1 and len(geometry) == 1:
@@ -274,100 +273,10 @@ def _checked(files: list[Path]) -> list[Path]:
         if file.is_dir():
             raise IsADirectoryError(f"{file} is a folder; pass it alone, or the files in it")
         if ending_of(file) not in ENDINGS:
+            with naming(file):
+                refuse_foreign(file)
             raise FormatError(f"{file} has the unknown ending {file.suffix!r}; known: {', '.join(ENDINGS)}")
     return files
-
-
-def _read_archive(file: Path, limits: FileLimits) -> list[Array] | None:
-    """Return the rows of each frame of an archive, None if it does not hold frames."""
-    content = read_bytes(file, limits)
-    try:
-        if content.startswith(_ARRAY):
-            return _frames_of(content, limits)
-        check_stand_in(content)
-        with open_zip(content, limits) as archive:
-            return _frames_in(archive, limits)
-    except FormatError as error:
-        raise FormatError(f"{file}: {error}") from error
-    except PARSER_ERRORS as error:
-        raise FormatError(f"{file}: cannot be read as NPZ ({type(error).__name__}: {error})") from error
-
-
-def _frames_of(content: bytes, limits: FileLimits) -> list[Array] | None:
-    """Return the frames of an array (T, M, 3), None if it is one of another shape."""
-    array = array_of(content, "the array")
-    if array.ndim != 3 or array.shape[2] != 3 or array.dtype.names is not None or not len(array):
-        return None
-    check_allowed(array.shape[1], "points", limits)
-    return list(array)
-
-
-def _frames_in(archive: zipfile.ZipFile, limits: FileLimits) -> list[Array] | None:
-    shapes = {
-        info.filename.removesuffix(".npy"): _shape_of(archive, info)
-        for info in archive.infolist()
-        if info.filename.endswith(".npy")
-    }
-    numbered = {int(match[1]): key for key in shapes if (match := _NUMBERED.fullmatch(key))}
-    if numbered:
-        frames = [_array(archive, numbered[number], "iuf") for number in sorted(numbered)]
-    else:
-        named: list[str] = [key for key in ("points", "vertices") if key in shapes]
-        stacks = named[:1] or [key for key, shape in shapes.items() if len(shape) == 3 and shape[2] == 3]
-        if len(stacks) != 1 or len(shapes[stacks[0]]) != 3:
-            return None
-        frames = _cut(archive, _array(archive, stacks[0], "iuf"), stacks[0], shapes)
-    if not frames:
-        raise FormatError("holds no frames")
-    for number, frame in enumerate(frames):
-        if frame.ndim != 2 or frame.shape[1] != 3:
-            raise FormatError(f"frame {number} must have shape (M, 3), got {frame.shape}")
-        check_allowed(len(frame), "points", limits)
-    return frames
-
-
-def _cut(archive: zipfile.ZipFile, points: Array, name: str, shapes: dict[str, tuple[int, ...]]) -> list[Array]:
-    """Return the frames of a stack (T, M, 3) without their padding."""
-    count, most = points.shape[:2]
-    check_budget(count, FILE_BUDGET.frames, "frames")
-    if "counts" in shapes and "mask" in shapes:
-        raise FormatError("must hold counts or mask, not both")
-    if "counts" in shapes:
-        counts = as_indices(_array(archive, "counts", "iuf"), "counts")
-        if counts.shape != (count,) or (count and not (counts.min() >= 0 and counts.max() <= most)):
-            raise FormatError(f"counts must be {count} numbers from 0 to {most}, one per frame of {name}")
-        return [frame[:rows] for frame, rows in zip(points, counts.tolist(), strict=True)]
-    if "mask" in shapes:
-        mask = _array(archive, "mask", "biu")
-        if mask.shape != (count, most):
-            raise FormatError(f"mask must have the shape {(count, most)}, got {mask.shape}")
-        return [frame[rows] for frame, rows in zip(points, mask.astype(bool), strict=True)]
-    return list(points)
-
-
-def _shape_of(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> tuple[int, ...]:
-    """Return the shape that a member claims, compared with its bytes before memory is allocated."""
-    with archive.open(info) as stream:
-        shape, _, dtype = read_npy_header(stream, f"member {info.filename!r}")
-        held = info.file_size - stream.tell()
-    if not dtype.hasobject and (any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize != held):
-        raise FormatError(f"member {info.filename!r} claims the shape {shape} of {dtype} but holds {held} bytes")
-    return shape
-
-
-def _array(archive: zipfile.ZipFile, key: str, kinds: str) -> Array:
-    with archive.open(f"{key}.npy") as stream:
-        try:
-            array = np.lib.format.read_array(stream, allow_pickle=False)
-        except ValueError as error:  # objects among others
-            raise FormatError(
-                f"array {key!r} must hold numbers, and pickled objects are never loaded ({error})"
-            ) from error
-    if array.dtype.kind not in kinds:
-        raise FormatError(
-            f"array {key!r} must hold {'truth values' if 'b' in kinds else 'real numbers'}, got {array.dtype}"
-        )
-    return array
 
 
 def _archive(clouds: list[Tensor]) -> bytes:

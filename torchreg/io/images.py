@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import io
 import os
-import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from decimal import Decimal
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,9 +19,9 @@ from torchreg.geometry.budget import BUDGET
 from torchreg.geometry.camera import Camera
 from torchreg.io.atomic import write_atomic
 from torchreg.io.file_format import check_stand_in, naming
-from torchreg.io.frames import natural_sorted
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 from torchreg.io.masks import mask_of_numbers, mask_of_picture
+from torchreg.io.natural_order import last_number, natural_sorted
 from torchreg.io.npz import read_npy_header
 
 Found = TypeVar("Found")
@@ -67,17 +65,12 @@ def list_frames(folders: Sequence[str | os.PathLike[str]]) -> list[tuple[Path, .
     if len({len(found) for found in files}) > 1:
         counts = ", ".join(f"{os.fspath(folder)} {len(found)}" for folder, found in zip(folders, files, strict=True))
         raise FormatError(f"folders must hold equally many pictures, one per frame; got {counts}")
-    numbers = [[_last_number(file) for file in found] for found in files]
+    numbers = [[last_number(file) for file in found] for found in files]
     for listed, found in zip(numbers, files, strict=True):
         if listed != numbers[0] and set(listed) & set(numbers[0]):
             frame = next(k for k, pair in enumerate(zip(listed, numbers[0], strict=True)) if pair[0] != pair[1])
             raise FormatError(f"a frame is missing: {files[0][frame]} and {found[frame]} have different numbers")
     return list(zip(*files, strict=True))
-
-
-def _last_number(file: Path) -> Decimal | None:
-    digits = re.findall(r"\d+(?:\.\d+)?", file.stem)
-    return Decimal(digits[-1]) if digits else None
 
 
 def load_image(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMITS) -> Tensor:
@@ -107,7 +100,8 @@ def load_mask(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMI
     """Return a mask (H, W), bool.
 
     Transparency that varies is the mask. Otherwise the brighter of two values is set, whatever they are; in a picture
-    of labels all but black or zero; elsewhere what is at least half as bright as the picture's own white.
+    of labels all but black or zero; elsewhere, also where a halo surrounds what is white, what is at least half as
+    bright as the picture's own white.
 
     Args:
         path: a PNG, JPEG, TIFF or BMP file of any bit depth, also with a palette, or a ``.npy`` array (H, W).
@@ -118,7 +112,7 @@ def load_mask(path: str | os.PathLike[str], *, limits: FileLimits = DEFAULT_LIMI
         FileNotFoundError: if there is no such file.
 
     Warns:
-        FileWarning: if the mask keeps all or nothing, or the file holds several labels.
+        FileWarning: if the mask keeps all or nothing, or the file holds several labels or a halo.
     """
     file = local_path(path)
     content = read_bytes(file, limits)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from torchreg.errors import FormatError
 from torchreg.io.detected_hands import detected_keypoints, is_detection
-from torchreg.io.frames import natural_sorted
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
+from torchreg.io.natural_order import natural_sorted
 
 
 def load_keypoints(

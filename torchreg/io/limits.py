@@ -67,6 +67,8 @@ class FileBudget:
     members: int = 20_000
     # Cameras of one file, at 0.5 ms each.
     cameras: int = 2_000
+    # Laser scans of one file, at 0.2 ms each.
+    scans: int = 2_000
     # Nodes of one glTF document; at 10 us each.
     nodes: int = 100_000
     # Joints of one skin.

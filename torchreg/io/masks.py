@@ -14,9 +14,13 @@ from torchreg.io.raw_cloud import Array
 
 @dataclass(frozen=True)
 class _Labels:
-    """How pictures of labels are told from masks with soft edges."""
+    """How pictures of labels are told from masks with soft edges and halos."""
 
     interior: float = 0.5  # share of the pixels between dark and bright whose four neighbors are equal to them
+    # Of a halo, which has regions of one value too: labels are fewer, touch what is around them, and are larger.
+    white: int = 30  # least value inside
+    contact: float = 0.05  # most of the border of what is brightest that touches what is darkest
+    area: float = 1.5  # largest, as a share of that of what is brightest
 
 
 _LABELS = _Labels()
@@ -26,8 +30,8 @@ def mask_of_picture(image: Any) -> Array:
     """Return the mask (H, W) of an open picture of PIL.
 
     Transparency that varies is the mask. Otherwise the brighter of two values is set, whatever they are; in a picture
-    of labels all but black or zero; elsewhere what is at least as bright as half between the darkest and the brightest
-    pixel.
+    of labels all but black or zero; elsewhere, also where a halo surrounds what is white, what is at least as bright as
+    half between the darkest and the brightest pixel.
     """
     kind = str(image.mode)
     if kind in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info:
@@ -45,6 +49,7 @@ def mask_of_numbers(values: Array) -> Array:
     """Return the mask (H, W) of numbers (H, W), or colors (H, W, 3); see `mask_of_picture`. NaN is not set."""
     if values.dtype == bool:
         return _told(values)
+    is_gray = values.ndim == 2 or bool((values == values[..., :1])[..., :3].all())
     values = _brightness(values) if values.ndim == 3 else values
     known = np.isfinite(values) if values.dtype.kind == "f" else np.ones(values.shape, bool)
     if not known.any():
@@ -57,6 +62,13 @@ def mask_of_numbers(values: Array) -> Array:
         return _told(known & (values == high))
     if values.dtype.kind != "f" and low == 0 and _has_labels(values, ~ends):
         count = len(np.unique(values)) - 1
+        if is_gray and _has_halo(values == 0, values == high, high):
+            warnings.warn(
+                f"what is {high:g} has a halo of {count - 1} other value(s): what is at least half as bright is set",
+                FileWarning,
+                stacklevel=2,
+            )
+            return values >= 0.5 * high
         warnings.warn(f"holds {count} labels: all but 0 are set", FileWarning, stacklevel=2)
         return values != 0
     if values.dtype.kind == "f" and low < 0:  # scores whose sign decides
@@ -80,6 +92,17 @@ def _has_labels(values: Array, between: Array) -> bool:
         border = np.ones_like(step[:1] if axis == 0 else step[:, :1])
         same &= np.concatenate((step, border), axis) & np.concatenate((border, step), axis)
     return bool((same & between).sum() > _LABELS.interior * between.sum())
+
+
+def _has_halo(dark: Array, bright: Array, white: float) -> bool:
+    """Return whether what is neither dark nor bright (H, W) surrounds what is bright as a soft edge does."""
+    between = int((~dark & ~bright).sum())
+    border = contact = 0
+    for a, b in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        border += int((bright[a] ^ bright[b]).sum())
+        contact += int((bright[a] & dark[b]).sum() + (dark[a] & bright[b]).sum())
+    is_around = contact <= _LABELS.contact * border
+    return white >= _LABELS.white and is_around and between <= _LABELS.area * int(bright.sum())
 
 
 def _told(mask: Array) -> Array:

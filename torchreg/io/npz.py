@@ -19,7 +19,11 @@ from torchreg.io.atomic import write_atomic
 from torchreg.io.columns import cloud_of_columns
 from torchreg.io.file_format import naming
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, open_zip, read_bytes
-from torchreg.io.raw_cloud import Array, RawCloud, as_indices
+from torchreg.io.raw_cloud import Array, RawCloud, as_indices, fan_triangles
+
+# What arrays of points and of faces are called.
+POINTS = ("points", "vertices", "verts", "v")
+FACES = ("faces", "f", "triangles")
 
 
 def read_npy(content: bytes, limits: FileLimits) -> RawCloud:
@@ -74,26 +78,37 @@ def array_of(content: bytes, what: str) -> Array:
 
 
 def read_npz(content: bytes, limits: FileLimits) -> RawCloud:
-    """Return the cloud of an archive: the array ``points`` (or ``vertices``), or the only (N, 3) array.
+    """Return the cloud of an archive: the array of a name in `POINTS`, or the only (N, 3) array.
 
-    ``normals``, ``colors`` and ``faces`` are read where present. Shapes are compared with the sizes of the members
-    before memory is allocated; arrays of Python objects are refused.
+    ``normals``, ``colors`` and faces are read where present. Shapes are compared with the sizes of the members before
+    memory is allocated; arrays of Python objects are refused.
     """
     with open_zip(content, limits) as archive:
         names = {name.removesuffix(".npy"): name for name in archive.namelist() if name.endswith(".npy")}
-        named = [key for key in ("points", "vertices") if key in names]
+        named = [key for key in POINTS if key in names]
         key = named[0] if named else _only_points(archive, names)
-        wanted = [name for name in (key, "normals", "colors", "faces") if name in names]
+        corners = next((name for name in FACES if name in names), "faces")
+        wanted = [name for name in (key, "normals", "colors", corners) if name in names]
         arrays = {name: _read_array(archive, names[name]) for name in wanted}
     points = arrays[key]
     check_allowed(len(points) if points.ndim else 0, "points", limits)
+    if points.ndim == 3 and points.shape[2] == 3:
+        raise FormatError(f"{key} has the shape {points.shape}, several clouds; load_frames reads it as a sequence")
     told = _with_columns(points) if points.ndim == 2 and points.shape[1] > 3 else RawCloud(points)
-    faces = arrays.get("faces")
+    faces = arrays.get(corners)
     if faces is not None:
         check_allowed(len(faces) if faces.ndim else 0, "faces", limits)
-        faces = as_indices(faces, "faces")
+        faces = triangles_of(faces)
     normals, colors = arrays.get("normals", told.normals), arrays.get("colors", told.colors)
     return RawCloud(told.points, normals, colors, faces)
+
+
+def triangles_of(faces: Array) -> Array:
+    """Return faces (F, K) as triangles (F, 3), polygons cut; what has another shape is checked with the points."""
+    indices = as_indices(faces, "faces")
+    if indices.ndim != 2 or indices.shape[1] <= 3:
+        return indices
+    return fan_triangles(np.full(len(indices), indices.shape[1]), indices.reshape(-1))
 
 
 def _only_points(archive: zipfile.ZipFile, names: dict[str, str]) -> str:

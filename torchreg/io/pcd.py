@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchreg.errors import FormatError
+from torchreg.io.columns import stack_named
 from torchreg.io.limits import FileLimits, check_allowed, check_expansion
-from torchreg.io.raw_cloud import Array, RawCloud, as_integers, parse_table, stack_columns
+from torchreg.io.raw_cloud import Array, RawCloud, as_integers, parse_table
 
 _DATA_LINE = re.compile(rb"^DATA[ \t]+(\w+)[ \t]*\r?(\n|$)", re.MULTILINE)
 _KINDS = {"I": "i", "U": "u", "F": "f"}
@@ -41,10 +42,10 @@ def read_pcd(content: bytes, limits: FileLimits) -> RawCloud:
         columns = _read_compressed(body, fields, count, limits)
     else:
         raise FormatError(f"DATA {data.decode('latin-1')!r} is unknown; known: ascii, binary, binary_compressed")
-    points = stack_columns(columns, ("x", "y", "z"))
+    points = stack_named(columns, "points")
     if points is None:
         raise FormatError(f"must have the fields x, y and z, got {', '.join(f.name for f in fields)}")
-    return RawCloud(points, stack_columns(columns, ("normal_x", "normal_y", "normal_z")), _colors(columns))
+    return RawCloud(points, stack_named(columns, "normals"), _colors(columns))
 
 
 def _parse_header(text: str, limits: FileLimits) -> tuple[list[_Field], int]:
@@ -173,7 +174,7 @@ def _colors(columns: dict[str, Array]) -> Array | None:
         if packed is not None and packed.dtype.itemsize == 4:
             bits = np.ascontiguousarray(packed).view("<u4")
             return np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8)
-    return None
+    return stack_named(columns, "colors")
 
 
 def write_pcd(cloud: RawCloud) -> bytes:

@@ -1,16 +1,18 @@
-"""PLY: ASCII and both binary byte orders, any scalar properties, polygons cut into triangles."""
+"""PLY: ASCII and both binary byte orders, any scalar properties, polygons and strips cut into triangles."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from torchreg.errors import FormatError
+from torchreg.io.columns import named_columns, stack_named
 from torchreg.io.limits import FileLimits, check_allowed
-from torchreg.io.raw_cloud import Array, RawCloud, as_indices, as_integers, fan_triangles, parse_table, stack_columns
+from torchreg.io.raw_cloud import Array, RawCloud, as_indices, as_integers, fan_triangles, parse_table, strip_triangles
 
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -19,7 +21,8 @@ _TYPES = {
 }  # fmt: skip
 _FORMATS = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
 _HEADER_END = re.compile(rb"^end_header[ \t]*\r?(\n|$)", re.MULTILINE)
-_COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+# -1 in 32 bits without a sign, which begins a new strip.
+_RESTART = 2**32 - 1
 
 
 @dataclass(frozen=True)
@@ -94,21 +97,29 @@ def _parse_header(lines: list[str], limits: FileLimits) -> tuple[str | None, lis
 
 def _to_cloud(tables: dict[str, _Columns], kinds: dict[str, dict[str, str]]) -> RawCloud:
     vertex = {name: values for name, values in tables.get("vertex", {}).items() if not isinstance(values, _Ragged)}
-    points = stack_columns(vertex, ("x", "y", "z"))
+    points = stack_named(vertex, "points")
     if points is None:
         raise FormatError("must have an element 'vertex' with the properties x, y and z")
-    colors = None
-    for names in _COLORS:
-        found = stack_columns(vertex, names)
-        colors = found if colors is None else colors
-        if found is not None and found.dtype.kind == "f" and kinds["vertex"][names[0]][0] != "f":
-            colors = as_integers(found, kinds["vertex"][names[0]], "colors")
-    faces = None
-    for name in ("vertex_indices", "vertex_index"):
-        polygons = tables.get("face", {}).get(name)
-        if isinstance(polygons, _Ragged):
-            faces = fan_triangles(polygons.counts, as_indices(polygons.values, "vertex indices"))
-    return RawCloud(points, stack_columns(vertex, ("nx", "ny", "nz")), colors, faces)
+    colors, channels = stack_named(vertex, "colors"), named_columns(list(vertex), "colors")
+    if colors is not None and channels and colors.dtype.kind == "f":  # text, of whole numbers too
+        kind = kinds["vertex"][list(vertex)[channels[0]]]
+        colors = colors if kind[0] == "f" else as_integers(colors, kind, "colors")
+    parts = [part for element, cut in _FACES.items() if (part := _triangles(tables.get(element, {}), cut)) is not None]
+    faces = np.concatenate(parts) if len(parts) > 1 else parts[0] if parts else None
+    return RawCloud(points, stack_named(vertex, "normals"), colors, faces)
+
+
+# Elements whose lists of vertices are faces, and how these are cut.
+_FACES = {"face": fan_triangles, "tristrips": strip_triangles}
+
+
+def _triangles(columns: _Columns, cut: Callable[[Array, Array], Array]) -> Array | None:
+    """Return the triangles (F, 3) of an element, None if it has no lists of vertices."""
+    lists = next((columns[name] for name in ("vertex_indices", "vertex_index") if name in columns), None)
+    if not isinstance(lists, _Ragged):
+        return None
+    indices = as_indices(lists.values, "vertex indices")
+    return cut(lists.counts, np.where(indices == _RESTART, -1, indices) if cut is strip_triangles else indices)
 
 
 def _read_ascii(body: bytes, elements: list[_Element]) -> dict[str, _Columns]:
@@ -262,7 +273,7 @@ def write_ply(cloud: RawCloud) -> bytes:
     if cloud.normals is not None:
         fields += [(f"n{name}", cloud.points.dtype, cloud.normals[:, k]) for k, name in enumerate("xyz")]
     if cloud.colors is not None:
-        fields += [(name, np.dtype("u1"), cloud.colors[:, k]) for k, name in enumerate(_COLORS[0])]
+        fields += [(name, np.dtype("u1"), cloud.colors[:, k]) for k, name in enumerate(("red", "green", "blue"))]
     rows = np.zeros(len(cloud.points), [(name, dtype.newbyteorder("<")) for name, dtype, _ in fields])
     for name, _, values in fields:
         rows[name] = values

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import os
-import re
 import struct
 import tokenize
 import warnings
 import zipfile
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,16 +20,11 @@ from torchreg.errors import FileWarning, FormatError, InputError, InputTypeError
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.io.atomic import write_atomic
-from torchreg.io.file_format import FileFormat, begins, choose, ending_of, naming, unpacked
+from torchreg.io.cloud_formats import FORMATS
+from torchreg.io.file_format import FileFormat, choose, naming, unpacked
 from torchreg.io.glb import read_gltf
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, check_allowed, local_path, read_bytes
-from torchreg.io.npz import read_npy, read_npz, write_npz
-from torchreg.io.off import read_off
-from torchreg.io.pcd import read_pcd, write_pcd
-from torchreg.io.ply import read_ply, write_ply
-from torchreg.io.raw_cloud import Array, RawCloud
-from torchreg.io.stl import is_binary_stl, read_stl
-from torchreg.io.text_formats import looks_like_table, read_obj, read_table, write_csv, write_xyz
+from torchreg.io.raw_cloud import Array, RawCloud, not_measured
 
 # Exceptions that struct, json, zipfile and numpy's text and header readers raise on damaged bytes.
 PARSER_ERRORS = (
@@ -40,150 +32,6 @@ PARSER_ERRORS = (
     NotImplementedError, RuntimeError, SyntaxError, OSError, struct.error, tokenize.TokenError, zipfile.BadZipFile,
     zlib.error,
 )  # fmt: skip
-
-CLOUDS = "point clouds and meshes"
-# Of Wavefront's lines, those that may come before the first vertex.
-_OBJ_NAMES = (b"mtllib", b"usemtl", b"o", b"g", b"s")
-
-
-def _from_content(read: Callable[[bytes, FileLimits], RawCloud]) -> Callable[[bytes, Path, FileLimits], RawCloud]:
-    """Return a reader that needs no path."""
-    return lambda content, _, limits: read(content, limits)
-
-
-def _read_text(content: bytes, path: Path, limits: FileLimits) -> RawCloud:
-    """Return the points of a table of text."""
-    return read_table(content, limits, intensity_first=ending_of(path) == ".pts")
-
-
-def _is_obj(content: bytes) -> bool:
-    """Return whether the first line of a text that is no comment and no name is one of Wavefront's."""
-    for line in content[:4096].splitlines():
-        words = line.split(None, 2)
-        if not words or words[0].startswith(b"#") or words[0] in _OBJ_NAMES:
-            continue
-        return len(words) > 1 and words[0] in (b"v", b"vn") and words[1][:1] in b"-+.0123456789"
-    return False
-
-
-def _is_glb(content: bytes) -> bool:
-    return content.startswith(b"glTF") or (
-        content.lstrip()[:1] == b"{" and b'"asset"' in content and b'"meshes"' in content
-    )
-
-
-def _is_pcd(content: bytes) -> bool:
-    return re.match(rb"\s*(#[^\n]*\n\s*)*VERSION\s+\S+\s+FIELDS\s", content[:4096]) is not None
-
-
-def _is_stl(content: bytes) -> bool:
-    start = content[:1024].lstrip().lower()
-    return is_binary_stl(content) or (start.startswith(b"solid") and b"facet" in start)
-
-
-# Told by content in this order, after the row of the ending. A new format is one more row.
-FORMATS: tuple[FileFormat, ...] = (
-    FileFormat(
-        name="PLY",
-        kind=CLOUDS,
-        endings=(".ply",),
-        read=_from_content(read_ply),
-        holds="ASCII, binary of both byte orders; polygons are cut",
-        loader="load_points",
-        sniff=begins(b"ply\n", b"ply\r", b"ply "),
-        write=write_ply,
-        written=("normals", "colors", "faces"),
-    ),
-    FileFormat(
-        name="PCD",
-        kind=CLOUDS,
-        endings=(".pcd",),
-        read=_from_content(read_pcd),
-        holds="ASCII, binary, binary_compressed",
-        loader="load_points",
-        sniff=_is_pcd,
-        write=write_pcd,
-        written=("normals", "colors"),
-    ),
-    FileFormat(
-        name="XYZ and other tables",
-        kind=CLOUDS,
-        endings=(".xyz", ".txt", ".pts", ".asc", ".xyzn", ".xyzrgb", ".tsv", ".dat"),
-        read=_read_text,
-        holds="x y z, normals, colors, intensity, with or without names of columns",
-        loader="load_points",
-        sniff=looks_like_table,
-        write=write_xyz,
-        written=("normals",),
-    ),
-    FileFormat(
-        name="CSV",
-        kind=CLOUDS,
-        endings=(".csv",),
-        read=_read_text,
-        holds="the same tables; also those of pandas, CloudCompare and ParaView",
-        loader="load_points",
-        write=write_csv,
-        written=("normals", "colors"),
-    ),
-    FileFormat(
-        name="OBJ",
-        kind=CLOUDS,
-        endings=(".obj",),
-        read=_from_content(read_obj),
-        holds="vertices, faces, normals, colors; no materials",
-        loader="load_points",
-        sniff=_is_obj,
-    ),
-    FileFormat(
-        name="STL",
-        kind=CLOUDS,
-        endings=(".stl",),
-        read=_from_content(read_stl),
-        holds="binary, ASCII; corners at one place become one vertex",
-        loader="load_points",
-        sniff=_is_stl,
-    ),
-    FileFormat(
-        name="OFF",
-        kind=CLOUDS,
-        endings=(".off",),
-        read=_from_content(read_off),
-        holds="vertices and faces",
-        loader="load_points",
-        sniff=begins(b"OFF", b"COFF", b"NOFF", b"CNOFF"),
-    ),
-    FileFormat(
-        name="glTF",
-        kind=CLOUDS,
-        endings=(".glb", ".gltf"),
-        read=read_gltf,
-        holds="the default scene as viewers show it, skins and clips posed",
-        loader="load_points",
-        sniff=_is_glb,
-    ),
-    FileFormat(
-        name="NPZ",
-        kind=CLOUDS,
-        endings=(".npz",),
-        read=_from_content(read_npz),
-        holds="points (or vertices), normals, colors, faces",
-        loader="load_points",
-        sniff=begins(b"PK\x03\x04"),
-        write=write_npz,
-        written=("normals", "colors", "faces"),
-    ),
-    FileFormat(
-        name="NPY",
-        kind=CLOUDS,
-        endings=(".npy",),
-        read=_from_content(read_npy),
-        holds="(N, 3) or more columns, (H, W, 3), fields x y z",
-        loader="load_points",
-        sniff=begins(b"\x93NUMPY"),
-    ),
-)
-ENDINGS = tuple(ending for row in FORMATS for ending in row.endings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +91,8 @@ def load_points(
 
     The format is told by the content, and by the ending where content does not tell; ``torchreg formats`` lists them.
     Files may be packed by gzip. Points keep the order and the unit of the file. What cannot be used - normals that are
-    not finite, faces of two corners, colors of some vertices only - is left out with a warning that counts it.
+    not finite or zero, faces of two corners, colors of some vertices only, and points 0 0 0, where organized clouds and
+    padded ones have nothing - is left out with a warning that counts it; a single point at the origin stays.
 
     Args:
         path: a local file; addresses are refused.
@@ -281,7 +130,7 @@ def load_points(
         try:
             with np.errstate(all="ignore"):  # overflowing numbers become infinite and are treated as such
                 raw = kind.read(content, file, limits, **_clip(kind, time, frame))
-                return _checked_cloud(raw, scale, nan_policy, limits, dtype)
+                return checked_cloud(raw, scale, nan_policy, limits, dtype)
         except (FormatError, InputError):
             raise
         except PARSER_ERRORS as error:
@@ -335,39 +184,36 @@ def load_mesh(
     return cloud.to_mesh()
 
 
-def _checked_cloud(
-    raw: RawCloud, scale: float, nan_policy: str, limits: FileLimits, dtype: torch.dtype | None
+def checked_cloud(
+    raw: RawCloud,
+    scale: float,
+    nan_policy: str,
+    limits: FileLimits,
+    dtype: torch.dtype | None,
+    *,
+    may_be_empty: bool = False,
 ) -> PointCloud:
+    """Return the cloud of a file's arrays, see `load_points`; without any points only where it may be."""
     points = _rows(raw.points, "points", None)
-    points = points if scale == 1 else points.double() * scale
     count = len(points)
     check_allowed(count, "points", limits)
-    if count == 0:
+    if count == 0 and not may_be_empty:
         raise FormatError("holds no points")
+    normals = None if raw.normals is None else _rows(raw.normals, "normals", count)
+    told = None if raw.colors is None else _unit_colors(raw.colors)
+    colors = None if told is None else _rows(told, "colors", count)
+    faces = None if raw.faces is None else _face_rows(raw.faces, count, limits)
+    measured = _measured_rows(points, faces)
+    points, normals, colors, faces = _of_rows(measured, points, normals, colors, faces)
+    points = points if scale == 1 else points.double() * scale
     dtype = dtype or needed_dtype(points)
     points = points.to(dtype)
-    normals = None if raw.normals is None else _rows(raw.normals, "normals", count).to(dtype)
-    told = None if raw.colors is None else _unit_colors(raw.colors)
-    colors = None if told is None else _rows(told, "colors", count).to(dtype)
-    faces = None if raw.faces is None else _face_rows(raw.faces, count, limits)
-    finite = _finite_rows(points)
-    if nan_policy == "omit":
-        for values in (normals, colors):
-            if values is not None:
-                finite &= torch.isfinite(values).all(dim=-1)
-    bad = count - int(finite.sum())
-    if bad and nan_policy == "raise":
-        raise FormatError(
-            f"{bad} of {count} points are not finite in {str(dtype).removeprefix('torch.')} (NaN, infinity or "
-            f'overflow); nan_policy="omit" drops them'
-        )
-    if bad == count:
+    normals, colors = (None if values is None else values.to(dtype) for values in (normals, colors))
+    finite = _finite_rows(points, [values for values in (normals, colors) if values is not None], nan_policy)
+    if not finite.any() and not may_be_empty:
         raise FormatError(f"none of its {count} points is finite")
-    if bad:
-        faces = None if faces is None else (torch.cumsum(finite, 0) - 1)[faces[finite[faces].all(dim=-1)]]
-        points = points[finite]
-        normals, colors = (None if values is None else values[finite] for values in (normals, colors))
-    normals = None if normals is None else _finite_normals(normals, points, faces)
+    points, normals, colors, faces = _of_rows(finite, points, normals, colors, faces)
+    normals = None if normals is None else _usable_normals(normals, points, faces)
     if colors is not None and not bool(colors.isfinite().all()):
         damaged = int((~colors.isfinite()).any(-1).sum())
         _warn(f"colors are left out: {damaged} of {len(colors)} are not finite")
@@ -375,11 +221,46 @@ def _checked_cloud(
     return PointCloud(points=points, normals=normals, faces=faces, colors=colors)
 
 
-def _finite_rows(values: Tensor) -> Tensor:
-    """Return which rows (N,) are finite, quickly where all are."""
-    if all_finite(values):
-        return torch.ones(len(values), dtype=torch.bool)
-    return torch.isfinite(values).all(dim=-1)
+def _of_rows(
+    kept: Tensor, points: Tensor, normals: Tensor | None, colors: Tensor | None, faces: Tensor | None
+) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor | None]:
+    """Return the parts of a cloud at the rows (N,) that are kept, and the faces between these, renumbered."""
+    if kept.all():
+        return points, normals, colors, faces
+    if faces is not None:
+        faces = (torch.cumsum(kept, 0) - 1)[faces[kept[faces].all(dim=-1)]]
+    normals, colors = (None if values is None else values[kept] for values in (normals, colors))
+    return points[kept], normals, colors, faces
+
+
+def _measured_rows(points: Tensor, faces: Tensor | None) -> Tensor:
+    """Return which rows (N,) were measured: corners of faces, and all but 0 0 0; a single one may be the origin."""
+    measured = points.any(dim=-1)
+    if faces is not None and not measured.all():
+        measured[faces.reshape(-1)] = True
+    missing = len(points) - int(measured.sum())
+    if missing < 2:
+        return torch.ones_like(measured)
+    if missing == len(points):
+        raise FormatError(f"all of its {missing} points are 0 0 0: nothing was measured")
+    _warn(not_measured(missing, len(points)))
+    return measured
+
+
+def _finite_rows(points: Tensor, others: list[Tensor], nan_policy: str) -> Tensor:
+    """Return which rows (N,) are finite, where they are omitted also in other values; raise where they are not."""
+    tables = [points, *others] if nan_policy == "omit" else [points]
+    finite = torch.ones(len(points), dtype=torch.bool)
+    for values in tables:
+        if not all_finite(values):
+            finite &= torch.isfinite(values).all(dim=-1)
+    bad = len(points) - int(finite.sum())
+    if bad and nan_policy == "raise":
+        raise FormatError(
+            f"{bad} of {len(points)} points are not finite in {str(points.dtype).removeprefix('torch.')} (NaN, "
+            f'infinity or overflow); nan_policy="omit" drops them'
+        )
+    return finite
 
 
 def needed_dtype(points: Tensor) -> torch.dtype:
@@ -387,17 +268,21 @@ def needed_dtype(points: Tensor) -> torch.dtype:
     return torch.float32 if far_origin(points) is None else torch.float64
 
 
-def _finite_normals(normals: Tensor, points: Tensor, faces: Tensor | None) -> Tensor | None:
-    """Return normals (N, 3); those that are not finite come from the faces, or all are left out."""
-    bad = ~normals.isfinite().all(-1)
+def _usable_normals(normals: Tensor, points: Tensor, faces: Tensor | None) -> Tensor | None:
+    """Return normals (N, 3); those that have no direction come from the faces, or all are left out."""
+    infinite, zero = ~normals.isfinite().all(-1), ~normals.any(-1)
+    bad = infinite | zero
     if not bool(bad.any()):
         return normals
-    count = f"{int(bad.sum())} of {len(normals)} normals are not finite"
-    if faces is None or not len(faces):
-        _warn(f"normals are left out: {count}")
-        return None
-    _warn(f"{count}; they are computed from the faces")
-    return torch.where(bad.unsqueeze(-1), TriangleMesh(points, faces).vertex_normals(), normals)
+    counts = [f"{int(rows.sum())} of {len(normals)} normals are {what}" for rows, what in
+              ((infinite, "not finite"), (zero, "of length zero")) if bool(rows.any())]  # fmt: skip
+    if faces is not None and len(faces):
+        told = TriangleMesh(points, faces).vertex_normals()
+        if bool(told[bad].any(-1).all()):
+            _warn(f"{', '.join(counts)}; they are computed from the faces")
+            return torch.where(bad.unsqueeze(-1), told, normals)
+    _warn(f"normals are left out: {', '.join(counts)}")
+    return None
 
 
 def _warn(message: str) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 from torchreg.errors import FormatError
 from torchreg.io.atomic import write_atomic
+from torchreg.io.columns import have_decimal_commas
 from torchreg.io.file_format import plain_text
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 
@@ -39,12 +40,13 @@ def load_pose_table(
     """Return the numbers by name of every row of a table; columns of other names are let be.
 
     Args:
-        path: with commas, semicolons or tabs between the columns.
+        path: with commas, semicolons or tabs between the columns; numbers may have decimal commas.
         names: of the columns that are read, those of them that are there.
         limits: ``max_bytes`` applies.
 
     Raises:
-        FormatError: if none of the names is there, or an entry is no finite number; names file, row and column.
+        FormatError: if none of the names is there, a row is longer than their line, or an entry is no finite number;
+            names file, row and column.
         FileNotFoundError: if there is no such file.
     """
     file = local_path(path)
@@ -52,7 +54,7 @@ def load_pose_table(
         lines = plain_text(read_bytes(file, limits)).decode("utf-8").splitlines()
     except UnicodeDecodeError as error:
         raise FormatError(f"{file}: is no text ({error})") from error
-    separator = max(",;\t", key=lines[0].count) if lines else ","
+    separator = max(";,\t", key=lines[0].count) if lines else ","
     try:
         table = [row for row in csv.reader(lines, delimiter=separator) if row]
     except csv.Error as error:
@@ -64,15 +66,24 @@ def load_pose_table(
         raise FormatError(
             f"{file}: must hold a line of names, such as {', '.join(names[:4])}, and a line of numbers{got}"
         )
+    rows = [[entry.strip() for entry in row] for row in table[1:]]
+    for number, row in enumerate(rows, start=2):
+        if any(row[len(head) :]):
+            raise FormatError(
+                f"{file}: row {number} holds {len(row)} entries, the line of names {len(head)}; between columns of "
+                f"numbers with decimal commas write semicolons"
+            )
+    if have_decimal_commas(row[k].encode() for row in rows for k, _ in known if k < len(row) and row[k]):
+        rows = [[entry.replace(",", ".") for entry in row] for row in rows]
     return [
         {name: _number(row, column, f"{file}: row {number}, {name}") for column, name in known}
-        for number, row in enumerate(table[1:], start=2)
+        for number, row in enumerate(rows, start=2)
     ]
 
 
 def _number(row: Sequence[str], column: int, where: str) -> float:
     """Return an entry of a row, NaN where it is empty."""
-    text = row[column].strip() if column < len(row) else ""
+    text = row[column] if column < len(row) else ""
     try:
         value = float(text or "nan")
     except ValueError as error:

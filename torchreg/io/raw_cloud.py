@@ -35,6 +35,11 @@ class RawCloud:
     faces: Array | None = None
 
 
+def not_measured(missing: int, count: int, where: str = "") -> str:
+    """Return the sentence that tells of rows that are left out, as depth cameras and padding leave them."""
+    return f"{missing} of {count} points{where} are 0 0 0, where nothing was measured; they are left out"
+
+
 def parse_table(lines: Sequence[bytes], columns: int | None, what: str) -> Array:
     """Return lines of numbers as a float64 (rows, columns) table.
 
@@ -133,13 +138,6 @@ def as_integers(values: Array, kind: str, what: str) -> Array:
     return integers.astype(kind)
 
 
-def stack_columns(columns: dict[str, Array], names: Sequence[str]) -> Array | None:
-    """Return the named columns side by side in their common type, or None if one of them is missing."""
-    if not all(name in columns for name in names):
-        return None
-    return np.stack([columns[name] for name in names], axis=-1)
-
-
 # Polygons that are cut together.
 _POLYGONS = 4096
 
@@ -166,6 +164,25 @@ def fan_triangles(counts: Array, indices: Array) -> Array:
         count = _fill_fans(result[before:], part, indices[start:])
         before, start = before + count, start + int(part.sum())
     return result
+
+
+def strip_triangles(counts: Array, indices: Array) -> Array:
+    """Return the (F, 3) triangles of strips, all of the side of their strip's first; flat ones join strips, and go.
+
+    Args:
+        counts: (S,) entries of each list of strips, int64.
+        indices: (sum of counts,) vertex indices of all lists, one after the other; -1 begins a new strip.
+    """
+    number = np.arange(len(indices))
+    begins = np.isin(number, np.cumsum(counts) - counts)
+    begins[1:] |= indices[:-1] < 0
+    start = np.maximum.accumulate(np.where(begins, number, 0))
+    corners = np.stack([indices[k : max(len(indices) - 2 + k, 0)] for k in range(3)], axis=-1)
+    a, b, c = corners.T
+    first = number[: len(corners)]
+    whole = (corners >= 0).all(axis=1) & (start[: len(corners)] == start[2:]) & (a != b) & (b != c) & (c != a)
+    odd = ((first - start[: len(corners)]) % 2 == 1)[:, None]
+    return np.where(odd, corners[:, [1, 0, 2]], corners)[whole]
 
 
 def _fill_fans(triangles: Array, counts: Array, indices: Array) -> int:

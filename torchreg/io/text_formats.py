@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchreg.errors import FileWarning, FormatError
-from torchreg.io.columns import cloud_of_columns, names_points, wanted_columns
+from torchreg.io.columns import cloud_of_columns, have_decimal_commas, names_points, wanted_columns
 from torchreg.io.file_format import plain_text
 from torchreg.io.limits import FileLimits, check_allowed
 from torchreg.io.raw_cloud import Array, RawCloud, as_indices, fan_triangles, parse_numbers, parse_table
@@ -17,7 +17,6 @@ from torchreg.io.raw_cloud import Array, RawCloud, as_indices, fan_triangles, pa
 _COMMENT = re.compile(rb"(#|//).*")
 _SEPARATORS = bytes.maketrans(b",;\t", b"   ")
 _FIELDS = re.compile(rb"[;\s]+")
-_DECIMAL_COMMA = re.compile(rb"[+-]?\d*,\d+([eE][+-]?\d+)?|[+-]?\d+([eE][+-]?\d+)?|[+-]?nan")
 # Lines by which the separator is told.
 _TOLD_BY = 50
 
@@ -134,7 +133,7 @@ def _separated(text: bytes) -> bytes:
     lines = [line for line in text[: 200 * _TOLD_BY].split(b"\n")[:_TOLD_BY] if line.strip()]
     fields = [_FIELDS.split(line.strip().strip(b";")) for line in lines]
     mixed = [line for line, row in zip(lines, fields, strict=True) if len(row) >= 3 and re.search(rb"\d,\d", line)]
-    if mixed and all(_DECIMAL_COMMA.fullmatch(field) for row in fields[:-1] or fields for field in row):
+    if mixed and have_decimal_commas(field for row in fields[:-1] or fields for field in row):
         return text.replace(b",", b".").translate(_SEPARATORS)
     if mixed and any(re.search(rb"[;\t]", line) for line in mixed):
         shown = mixed[0].strip()[:60].decode("utf-8", "replace")

@@ -1,0 +1,172 @@
+"""The formats of point clouds and meshes, and how their content is told."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from torchreg.io.file_format import FileFormat, begins, ending_of
+from torchreg.io.glb import read_gltf
+from torchreg.io.limits import FileLimits
+from torchreg.io.npz import read_npy, read_npz, write_npz
+from torchreg.io.off import read_off
+from torchreg.io.pcd import read_pcd, write_pcd
+from torchreg.io.ply import read_ply, write_ply
+from torchreg.io.ptx import is_ptx, read_ptx
+from torchreg.io.raw_cloud import RawCloud
+from torchreg.io.stl import is_binary_stl, read_stl
+from torchreg.io.text_formats import looks_like_table, read_obj, read_table, write_csv, write_xyz
+
+CLOUDS = "point clouds and meshes"
+# Of Wavefront's lines, those that may come before the first vertex.
+_OBJ_NAMES = (b"mtllib", b"usemtl", b"o", b"g", b"s")
+
+
+def _from_content(read: Callable[[bytes, FileLimits], RawCloud]) -> Callable[[bytes, Path, FileLimits], RawCloud]:
+    """Return a reader that needs no path."""
+    return lambda content, _, limits: read(content, limits)
+
+
+def _read_text(content: bytes, path: Path, limits: FileLimits) -> RawCloud:
+    """Return the points of a table of text."""
+    return read_table(content, limits, intensity_first=ending_of(path) == ".pts")
+
+
+def _is_obj(content: bytes) -> bool:
+    """Return whether the first line of a text that is no comment and no name is one of Wavefront's."""
+    for line in content[:4096].splitlines():
+        words = line.split(None, 2)
+        if not words or words[0].startswith(b"#") or words[0] in _OBJ_NAMES:
+            continue
+        return len(words) > 1 and words[0] in (b"v", b"vn") and words[1][:1] in b"-+.0123456789"
+    return False
+
+
+def _is_glb(content: bytes) -> bool:
+    return content.startswith(b"glTF") or (
+        content.lstrip()[:1] == b"{" and b'"asset"' in content and b'"meshes"' in content
+    )
+
+
+def _is_pcd(content: bytes) -> bool:
+    return re.match(rb"\s*(#[^\n]*\n\s*)*VERSION\s+\S+\s+FIELDS\s", content[:4096]) is not None
+
+
+def _is_stl(content: bytes) -> bool:
+    start = content[:1024].lstrip().lower()
+    return is_binary_stl(content) or (start.startswith(b"solid") and b"facet" in start)
+
+
+# Told by content in this order, after the row of the ending. A new format is one more row.
+FORMATS: tuple[FileFormat, ...] = (
+    FileFormat(
+        name="PLY",
+        kind=CLOUDS,
+        endings=(".ply",),
+        read=_from_content(read_ply),
+        holds="ASCII, binary of both byte orders; polygons and triangle strips are cut",
+        loader="load_points",
+        sniff=begins(b"ply\n", b"ply\r", b"ply "),
+        write=write_ply,
+        written=("normals", "colors", "faces"),
+    ),
+    FileFormat(
+        name="PCD",
+        kind=CLOUDS,
+        endings=(".pcd",),
+        read=_from_content(read_pcd),
+        holds="ASCII, binary, binary_compressed",
+        loader="load_points",
+        sniff=_is_pcd,
+        write=write_pcd,
+        written=("normals", "colors"),
+    ),
+    FileFormat(
+        name="PTX",
+        kind=CLOUDS,
+        endings=(".ptx",),
+        read=_from_content(read_ptx),
+        holds="x y z, colors, each scan moved to its registered place",
+        loader="load_points",
+        sniff=is_ptx,
+    ),
+    FileFormat(
+        name="XYZ and other tables",
+        kind=CLOUDS,
+        endings=(".xyz", ".txt", ".pts", ".asc", ".xyzn", ".xyzrgb", ".tsv", ".dat"),
+        read=_read_text,
+        holds="x y z, normals, colors, intensity, with or without names of columns",
+        loader="load_points",
+        sniff=looks_like_table,
+        write=write_xyz,
+        written=("normals",),
+    ),
+    FileFormat(
+        name="CSV",
+        kind=CLOUDS,
+        endings=(".csv",),
+        read=_read_text,
+        holds="the same tables; also those of pandas, CloudCompare and ParaView",
+        loader="load_points",
+        write=write_csv,
+        written=("normals", "colors"),
+    ),
+    FileFormat(
+        name="OBJ",
+        kind=CLOUDS,
+        endings=(".obj",),
+        read=_from_content(read_obj),
+        holds="vertices, faces, normals, colors; no materials",
+        loader="load_points",
+        sniff=_is_obj,
+    ),
+    FileFormat(
+        name="STL",
+        kind=CLOUDS,
+        endings=(".stl",),
+        read=_from_content(read_stl),
+        holds="binary, ASCII; corners at one place become one vertex",
+        loader="load_points",
+        sniff=_is_stl,
+    ),
+    FileFormat(
+        name="OFF",
+        kind=CLOUDS,
+        endings=(".off",),
+        read=_from_content(read_off),
+        holds="vertices and faces",
+        loader="load_points",
+        sniff=begins(b"OFF", b"COFF", b"NOFF", b"CNOFF"),
+    ),
+    FileFormat(
+        name="glTF",
+        kind=CLOUDS,
+        endings=(".glb", ".gltf"),
+        read=read_gltf,
+        holds="the default scene as viewers show it, skins and clips posed",
+        loader="load_points",
+        sniff=_is_glb,
+    ),
+    FileFormat(
+        name="NPZ",
+        kind=CLOUDS,
+        endings=(".npz",),
+        read=_from_content(read_npz),
+        holds="points (or vertices, verts, v), normals, colors, faces (or f)",
+        loader="load_points",
+        sniff=begins(b"PK\x03\x04"),
+        write=write_npz,
+        written=("normals", "colors", "faces"),
+    ),
+    FileFormat(
+        name="NPY",
+        kind=CLOUDS,
+        endings=(".npy",),
+        read=_from_content(read_npy),
+        holds="(N, 3) or more columns, (H, W, 3), fields x y z",
+        loader="load_points",
+        sniff=begins(b"\x93NUMPY"),
+    ),
+)
+ENDINGS = tuple(ending for row in FORMATS for ending in row.endings)
