@@ -84,8 +84,8 @@ class Calibration:
 
     A pose is right if the ends of the shape's limbs are off by at most `right` of its size on average. Fitted by
     ``benchmarks/confidence.py --calibrate`` to 143 made-up alignments of hands, a robot arm and a fox, and tested on
-    310 others (``docs/measured/confidence.txt``), of which halves give no better one. The last two weights, of what else
-    may explain a picture, are fitted by ``benchmarks/scenes.py --calibrate`` to 68 made-up rooms, the others held.
+    310 others (``docs/measured/confidence.txt``), of which halves give no better one. The last two weights, of what
+    else may explain a picture, are fitted by ``benchmarks/scenes.py --calibrate`` to 68 made-up rooms, others held.
     """
 
     bias: float = 5.35
