@@ -3,14 +3,9 @@ import math
 import pytest
 import torch
 
+from experiments.made_up.shape_sequences import other_hand, rig_sequence
 from torchreg.datasets.hand import hand_motion, surface_skin
-from torchreg.datasets.sequences import (
-    _bar,
-    hand_sequence,
-    other_hand,
-    range_clouds,
-    rig_sequence,
-)
+from torchreg.datasets.sequences import _bar, hand_sequence, range_clouds
 from torchreg.datasets.stereo import StereoView, _forearm, stereo_clouds
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import TriangleMesh

@@ -5,11 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchreg.datasets.bodies import Proportions
+from experiments.made_up.bodies import Proportions
+from experiments.made_up.toys import excavator, random_toy
+from experiments.made_up.walks import walking_animal, walking_figure
 from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import ScanSequence, jointed_toy, walking_animal, walking_figure
+from torchreg.datasets.scan_sequences import ScanSequence, jointed_toy
 from torchreg.datasets.solids import RoundBox, RoundCone, mesh_of, union_distance
-from torchreg.datasets.toys import Hinge, excavator, random_toy, robot
+from torchreg.datasets.toys import Hinge, robot
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import interpolate
 from torchreg.geometry.range_scan import RangeScan

@@ -3,11 +3,11 @@ import itertools
 import pytest
 import torch
 
-from torchreg.datasets.creature_kinds import HELD_OUT_KINDS, TRAINING_KINDS
-from torchreg.datasets.creature_parts import Draw
+from experiments.made_up.creature_kinds import HELD_OUT_KINDS, TRAINING_KINDS
+from experiments.made_up.creature_parts import Draw, FlatCone
+from experiments.made_up.matching_pairs import PosableBody, matching_pairs
 from torchreg.datasets.figures import bending_figure, jointed_figure
-from torchreg.datasets.matching_pairs import PosableBody, matching_pairs
-from torchreg.datasets.solids import FlatCone, RoundCone
+from torchreg.datasets.solids import RoundCone
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,9 @@ import math
 import pytest
 import torch
 
-from torchreg.datasets.bodies import Proportions, person, quadruped
+from experiments.made_up.bodies import Proportions, person, quadruped
+from experiments.made_up.gaits import GAITS, animal_walk, person_walk
 from torchreg.datasets.figures import Part, bending_figure, jointed_figure
-from torchreg.datasets.gaits import GAITS, animal_walk, person_walk
 from torchreg.datasets.solids import RoundBox, RoundCone, mesh_of, union_distance
 from torchreg.errors import InputError
 from torchreg.geometry.rotation import so3_exp, so3_log

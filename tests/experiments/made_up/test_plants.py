@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from torchreg.datasets.plants import PlantForm, growing_plant
+from experiments.made_up.plants import PlantForm, growing_plant
 from torchreg.errors import InputError
 from torchreg.geometry.neighbors import nearest_neighbor
 

@@ -1,8 +1,7 @@
 import pytest
 import torch
 
-from torchreg.datasets.hand import hand_motion, placed
-from torchreg.datasets.pictures import (
+from experiments.made_up.pictures import (
     PictureStyle,
     backdrop,
     camera_ring,
@@ -11,7 +10,8 @@ from torchreg.datasets.pictures import (
     stereo_cameras,
     value_noise,
 )
-from torchreg.datasets.videos import shape_video
+from experiments.made_up.videos import shape_video
+from torchreg.datasets.hand import hand_motion, placed
 from torchreg.errors import InputError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
