@@ -14,6 +14,7 @@ from torchreg.datasets.solids import ball, mesh_of
 from torchreg.datasets.stereo import StereoView, stereo_clouds
 from torchreg.datasets.toys import Hinge, Toy, robot
 from torchreg.errors import InputError
+from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.skin import LinearBlendSkin
@@ -64,6 +65,8 @@ def test_seeds_repeat_and_differ_and_the_global_generator_is_left_alone(make, ha
     assert torch.equal(state, torch.get_rng_state())
 
 
+CORNERS = torch.tensor([[-2.0, -2, 0.2], [2, -2, 0.2], [2, 2, 0.2], [-2, 2, 0.2]])
+WALL = TriangleMesh(CORNERS, torch.tensor([[0, 2, 1], [0, 3, 2]]))
 CLOUD, MOTION = partial(make_hand_cloud, HAND), partial(hand_motion, HAND)
 STEREO = partial(stereo_clouds, HAND, stereo=SMALL)
 
@@ -89,6 +92,7 @@ STEREO = partial(stereo_clouds, HAND, stereo=SMALL)
         (lambda skin: STEREO(POSES, skin=skin, outlier_ratio=1.0), "outlier_ratio must be at least 0 and below 1"),
         (lambda skin: STEREO(REST, skin=skin), r"poses must have shape \(T, 27\)"),
         (lambda skin: STEREO(0 * POSES, skin=skin), "beside or behind"),
+        (lambda skin: STEREO(POSES, skin=skin, obstacle=WALL), "poses must show the shape to both cameras"),
         *((lambda skin, name=name: StereoView(**{name: -1}), f"{name} must be") for name in vars(SMALL)),
         (lambda skin: creature_sequence(num_frames=0), "num_frames must be at least 1"),
         (lambda skin: creature_sequence(touching="all"), "touching must be one of none, flanks, tips"),

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchreg.datasets.hand import MOTIONS, hand_motion, make_hand_cloud, placed, random_hand_pose, surface_skin
+from torchreg.datasets.hand import MOTIONS, hand_motion, make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.visibility import visible_points
@@ -167,10 +167,3 @@ def test_motions_turn_and_pass_as_they_promise(hand, seed):
     x = hand.part_transforms(hand_motion(hand, "occlusion", 160, distance=0.6, seed=seed))[..., 0, 3].mean(-1)
     assert float(x[:30].abs().min()) > 0.12
     assert bool((x[:30].sign() == -x[70:100].sign()).all() and (x[-6:].sign() == x[:6].sign()).all())
-
-
-def test_placed_moves_the_middle_and_clamps(hand):
-    moved = placed(hand, torch.randn(3, 27, generator=torch.Generator().manual_seed(0)), torch.tensor([0.1, 0.2, 0.3]))
-    middle = hand.part_transforms(moved)[..., :3, 3].mean(-2)
-    torch.testing.assert_close(middle, torch.tensor([0.1, 0.2, 0.3]).expand(3, 3), atol=1e-5, rtol=0)
-    assert within_limits(hand, moved)

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from torchreg.datasets.hand import hand_motion, surface_skin
-from torchreg.datasets.sequences import _bar, hand_sequence, range_clouds
-from torchreg.datasets.stereo import StereoView, _forearm, stereo_clouds
-from torchreg.errors import InputError
+from torchreg.datasets.sequences import hand_sequence, range_clouds
+from torchreg.datasets.stereo import StereoView, stereo_clouds
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.geometry.visibility import visible_points
@@ -59,10 +58,6 @@ def test_outliers_lie_on_forearm_and_wall_and_in_the_volume(hand, bending):
         assert float(hand.distance(points[on_arm], cloud.pose).median()) > 0.02
         rest = points[~wall & ~on_arm]
         assert bool((rest > vertices.amin(0) - 0.1).all() and (rest < vertices.amax(0) + 0.1).all())
-    for mesh, sides in ((_forearm(hand, torch.ones(2)), 24), (_bar(0.6, torch.Generator().manual_seed(0)), 4)):
-        middles = mesh.vertices.unflatten(0, (-1, sides)).mean(1).repeat_interleave(sides, dim=0)
-        outwards = (mesh.vertices - middles)[mesh.faces].mean(1)
-        assert float((outwards * mesh.face_normals()).sum(-1).min()) > 0
 
 
 def test_a_bar_hides_the_passing_hand(hand, passing):
@@ -70,19 +65,15 @@ def test_a_bar_hides_the_passing_hand(hand, passing):
     assert int(counts.min()) < 30
     assert int(counts.max()) == 300
     assert 5 <= int((counts < 200).sum()) <= 14, "about half a second at 20 frames per second"
-    bar, tips = _bar(0.6, torch.Generator().manual_seed(0)), list(hand.fingertip_parts)
+    tips = list(hand.fingertip_parts)
     seen_tips = torch.stack([cloud.seen_parts[tips].any() for cloud in passing])
     assert bool(seen_tips.any() and not seen_tips.all())
     for cloud in passing:
         on_bar = cloud.points[~cloud.inliers & (cloud.points[:, 2] < 0.45)]
         assert len(on_bar) > 20
-        lower, upper = bar.bounds().to(on_bar)
-        assert float(((on_bar > lower - 0.02) & (on_bar < upper + 0.02)).all(-1).float().mean()) > 0.8
-        for side in (-0.05, 0.05):
-            camera = torch.tensor([side, 0.0, 0.0], dtype=torch.float64)
-            seen = visible_points(bar, cloud.points[cloud.inliers].double(), camera)
-            # Noise moves some points at its edges into its shadow.
-            assert int((~seen).sum()) <= 3 + 0.03 * len(seen)
+        # Upright and narrow, in the middle between both cameras.
+        assert float((on_bar[:, 0].abs() < 0.12).float().mean()) > 0.8
+        assert float(on_bar[:, 1].std()) > 2 * float(on_bar[:, 0].std())
 
 
 def test_double_precision_defaults_and_no_poses():
@@ -148,18 +139,3 @@ def test_clean_points_lie_on_the_surface_and_both_cameras_see_them(arm, arm_skin
         # Shapes that are no hands have no forearm.
         assert int((others[:, 2] > 0.8).sum()) == 60
         assert len(others) == 200
-
-
-def test_obstacles_of_ones_own(arm, arm_skin):
-    poses = torch.stack([hand_motion(arm, "bend", 1, distance=0.6)[0]] * 2)
-    poses[1, 0] += 0.15
-    corners = torch.tensor([[-0.06, -0.12, 0.3], [0.06, -0.12, 0.3], [0.06, 0.12, 0.3], [-0.06, 0.12, 0.3]])
-    sheet = TriangleMesh(corners, torch.tensor([[0, 2, 1], [0, 3, 2]]))
-    options = {"stereo": SMALL, "skin": arm_skin, "num_points": 100, "outlier_ratio": 0.0, "obstacle": sheet}
-    hidden, seen = stereo_clouds(arm, poses, **options)
-    assert not bool(hidden.inliers.any() or hidden.seen_parts.any())
-    assert hidden.part_labels.dtype == torch.int64
-    assert float((hidden.points[:, 2] - 0.3).abs().max()) < 0.02
-    assert int(seen.inliers.sum()) == 100
-    with pytest.raises(InputError, match="poses must show the shape to both cameras"):
-        stereo_clouds(arm, poses[:1], **options)

@@ -88,23 +88,15 @@ def pair():
     return stereo_cameras(width=80, height=60, focal=100.0)
 
 
-def test_video_is_what_single_pictures_show_with_the_noise_drawn_anew(plain_hand, plain_hand_surface, pair):
+def test_video_is_what_single_pictures_show(plain_hand, plain_hand_surface, pair):
     style = PictureStyle(wall=0.9, noise=0.0, supersampling=1)
-    poses = hand_motion(plain_hand, "rotation", 2, distance=0.6)
-    frames = list(shape_video(plain_hand, poses, pair, skin=plain_hand_surface, style=style, forearm=False, seed=3))
-    assert [len(frame) for frame in frames] == [2, 2]
-    rest = plain_hand_surface(plain_hand.rest_pose())
-    for pose, frame in zip(poses, frames, strict=True):
-        mesh = TriangleMesh(plain_hand_surface(pose), plain_hand_surface.faces)
-        for camera, picture in zip((pair.left, pair.right), frame, strict=True):
-            single = render(mesh, camera, rest, style=style, seed=3)
-            assert torch.allclose(picture.image, single.image, atol=1e-6)
-            assert torch.equal(picture.mask, single.mask)
-    noisy = PictureStyle(wall=0.9, noise=0.05, supersampling=1)
-    still = poses[:1].expand(2, -1)
-    first, second = shape_video(plain_hand, still, pair, skin=plain_hand_surface, style=noisy)
-    assert not torch.equal(first[0].image, second[0].image)
-    assert torch.equal(first[0].depth, second[0].depth)
+    (pose,) = hand_motion(plain_hand, "rotation", 1, distance=0.6)
+    (frame,) = shape_video(plain_hand, pose[None], pair, skin=plain_hand_surface, style=style, forearm=False, seed=3)
+    mesh = TriangleMesh(plain_hand_surface(pose), plain_hand_surface.faces)
+    for camera, picture in zip((pair.left, pair.right), frame, strict=True):
+        single = render(mesh, camera, plain_hand_surface(plain_hand.rest_pose()), style=style, seed=3)
+        assert torch.allclose(picture.image, single.image, atol=1e-6)
+        assert torch.equal(picture.mask, single.mask)
 
 
 def test_the_forearm_is_seen_but_not_in_the_mask(plain_hand, plain_hand_surface, pair):
@@ -117,7 +109,3 @@ def test_the_forearm_is_seen_but_not_in_the_mask(plain_hand, plain_hand_surface,
     assert torch.equal(alone.mask, alone.face_index >= 0)
     assert ((with_arm.face_index >= 0).sum() - alone.mask.sum()) > 100
     assert (with_arm.mask & ~alone.mask).sum() == 0
-    # It hides the wrist at most.
-    assert with_arm.mask.sum() > 0.9 * alone.mask.sum()
-    # It goes on beyond the picture.
-    assert (with_arm.face_index[-1] >= 0).any()
