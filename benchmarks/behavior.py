@@ -27,13 +27,16 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
+from experiments.made_up.pictures import PictureStyle, camera_ring, stereo_cameras
+from experiments.made_up.videos import shape_video
+from experiments.made_up.walks import walking_figure
 from torchreg.datasets.creatures import STARFISH, creature_sequence
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.hand import hand_motion, make_hand_cloud, random_hand_pose
-from torchreg.datasets.pictures import PictureStyle, camera_ring, stereo_cameras
-from torchreg.datasets.scan_sequences import jointed_toy, walking_figure
-from torchreg.datasets.videos import shape_video
+from torchreg.datasets.scan_sequences import jointed_toy
 
 # Fields that hold wall times.
 CLOCKS = {"seconds"}

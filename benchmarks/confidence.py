@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 import warnings
 from collections.abc import Sequence
@@ -33,12 +34,14 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
+from experiments.made_up.shape_sequences import other_hand
 from torchreg.alignment.confidence import limb_ends
 from torchreg.alignment.reliability import CALIBRATION, Calibration, Evidence, confidence_of
 from torchreg.capture.depth_noise import DepthNoise
 from torchreg.datasets.hand import make_hand_cloud, surface_skin
-from torchreg.datasets.sequences import other_hand
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.geometry.visibility import rasterize

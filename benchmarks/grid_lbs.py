@@ -15,16 +15,21 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from bones import make_tube, refinement_scene
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
+from experiments.made_up.walks import walking_figure
 from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import jointed_toy, walking_figure
+from torchreg.datasets.scan_sequences import jointed_toy
 from torchreg.registration.bones import step_record
 from torchreg.registration.bones.sparse_grid import SparseGrid
 from torchreg.registration.bones.weights import WeightsConfig, refine_weights

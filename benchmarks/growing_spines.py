@@ -18,6 +18,7 @@ truth for them, a table of tips is printed.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,8 +27,10 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
-from torchreg.datasets.plants import GrowingPlant, PlantForm, growing_plant
+from experiments.made_up.plants import GrowingPlant, PlantForm, growing_plant
 from torchreg.geometry.cloud_surface import cloud_surface
 from torchreg.solvers.assignment import assign
 from torchreg.viz.strips import spine_strip

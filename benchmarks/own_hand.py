@@ -20,18 +20,23 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
+from experiments.made_up.shape_sequences import other_hand
 from torchreg.alignment.objectives import GaussianPosePrior, SurfaceObjective
 from torchreg.datasets.hand import HandCloud, hand_motion, make_hand_cloud, random_hand_pose, surface_skin
-from torchreg.datasets.sequences import other_hand, range_clouds
+from torchreg.datasets.sequences import range_clouds
 from torchreg.shapes.surface import FusedSurface
 from torchreg.solvers.levenberg_marquardt import levenberg_marquardt
 

@@ -23,10 +23,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
-from torchreg.datasets.bodies import Proportions
+from experiments.made_up.bodies import Proportions
+from experiments.made_up.walks import walking_animal, walking_figure
 from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import ScanSequence, jointed_toy, walking_animal, walking_figure
+from torchreg.datasets.scan_sequences import ScanSequence, jointed_toy
 from torchreg.registration.dense.align_scans import align_scans
 from torchreg.registration.dense.config import ScanAlignConfig
 

@@ -21,7 +21,9 @@ import torch
 from confidence import area_under_curve, fitted_model
 from scan_matching import Pair, held_out, known, moved_points
 
-from torchreg.datasets.matching_pairs import matching_pairs
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from experiments.made_up.matching_pairs import matching_pairs
 from torchreg.registration.dense.align_scans import align_problem, evidence_against
 from torchreg.registration.dense.config import ScanAlignConfig
 from torchreg.registration.dense.problem import describe

@@ -27,9 +27,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
-from torchreg.datasets.creature_kinds import HELD_OUT_KINDS
-from torchreg.datasets.matching_pairs import matching_pairs
+from experiments.made_up.creature_kinds import HELD_OUT_KINDS
+from experiments.made_up.matching_pairs import matching_pairs
 from torchreg.registration.blend import blend_linear
 from torchreg.registration.dense.align_scans import align_problem
 from torchreg.registration.dense.config import ScanAlignConfig

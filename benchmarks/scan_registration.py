@@ -38,10 +38,14 @@ import torch
 from captured_scans import CapturedSequence, captured_sequences
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
+from experiments.made_up.moving_labels import moving_labels, moving_labels_over_time
+from experiments.made_up.toys import random_toy
+from experiments.made_up.walks import walking_animal, walking_figure
 from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import ScanPair, ScanSequence, jointed_toy, walking_animal, walking_figure
-from torchreg.datasets.toys import random_toy
+from torchreg.datasets.scan_sequences import ScanPair, ScanSequence, jointed_toy
 from torchreg.geometry.neighbors import nearest_neighbor
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.metrics import adjusted_rand
@@ -103,13 +107,13 @@ class PartTruth:
     @classmethod
     def of_pair(cls, pair: ScanPair) -> PartTruth:
         """Return the truth of a pair's source."""
-        moving = pair.moving_labels(APART)
+        moving = moving_labels(pair, APART)
         return cls(moving, pair.labels, pair.joint_parts, pair.joints, pair.source.diagonal)
 
     @classmethod
     def of_sequence(cls, sequence: ScanSequence) -> PartTruth:
         """Return the truth of the first frame; parts moved apart if they did in any."""
-        moving, size = sequence.moving_labels(0, APART), sequence[0].diagonal
+        moving, size = moving_labels_over_time(sequence, 0, APART), sequence[0].diagonal
         return cls(moving, sequence.labels(0), sequence.joint_parts, sequence.joints(0), size)
 
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -30,11 +31,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
-from torchreg.datasets.bodies import person, quadruped
+from experiments.made_up.bodies import person, quadruped
+from experiments.made_up.gaits import animal_walk, person_walk
 from torchreg.datasets.creatures import OCTOPUS, STARFISH, creature_sequence
 from torchreg.datasets.figures import Figure
-from torchreg.datasets.gaits import animal_walk, person_walk
 from torchreg.geometry.isosurface import isosurface
 from torchreg.geometry.voxels import voxelize
 from torchreg.spines.clearance import Inside

@@ -35,6 +35,7 @@ from __future__ import annotations
 
 import argparse
 import resource
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -47,11 +48,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
-from torchreg.datasets.bodies import person, quadruped
+from experiments.made_up.bodies import person, quadruped
+from experiments.made_up.gaits import animal_walk, person_tucks, person_walk
 from torchreg.datasets.creatures import OCTOPUS, STARFISH, CreatureForm, CreatureSequence, creature_sequence
 from torchreg.datasets.figures import Figure
-from torchreg.datasets.gaits import animal_walk, person_tucks, person_walk
 from torchreg.geometry.mesh import concatenate, sample_surface, unit_sphere
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp

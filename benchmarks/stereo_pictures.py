@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -23,11 +24,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
+from experiments.made_up.pictures import PictureStyle, stereo_cameras
+from experiments.made_up.videos import shape_video
 from torchreg.capture.disparity import match_disparity
 from torchreg.datasets.hand import hand_motion, surface_skin
-from torchreg.datasets.pictures import PictureStyle, stereo_cameras
-from torchreg.datasets.videos import shape_video
 from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.io.images import save_image
 from torchreg.io.npz import save_arrays

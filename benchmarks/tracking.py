@@ -30,6 +30,7 @@ import argparse
 import math
 import resource
 import runpy
+import sys
 import time
 import warnings
 from collections import Counter
@@ -41,10 +42,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
+from experiments.made_up.shape_sequences import other_hand, rig_sequence
 from torchreg.alignment.objectives import GaussianPosePrior, SurfaceObjective
 from torchreg.datasets.hand import HandCloud, surface_skin
-from torchreg.datasets.sequences import hand_sequence, other_hand, rig_sequence
+from torchreg.datasets.sequences import hand_sequence
 from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.shapes.surface import FusedSurface
 from torchreg.solvers.levenberg_marquardt import levenberg_marquardt

@@ -12,15 +12,19 @@ from __future__ import annotations
 import argparse
 import math
 import resource
+import sys
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
+from experiments.made_up.pictures import camera_ring
 from torchreg.datasets.creatures import STARFISH, creature_sequence
-from torchreg.datasets.pictures import camera_ring
 from torchreg.geometry.visibility import rasterize
 
 CENTER, RADII = (0.1, -0.05, 0.2), (0.3, 0.2, 0.15)

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 import torchreg as tr
+from experiments.made_up.pictures import camera_ring, render, stereo_cameras
 from torchreg.capture.depth import depth_scan
 from torchreg.datasets.creatures import STARFISH, creature_sequence
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.hand import make_hand_cloud, random_hand_pose
-from torchreg.datasets.pictures import camera_ring, render, stereo_cameras
 from torchreg.datasets.scan_sequences import jointed_toy
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import unit_sphere

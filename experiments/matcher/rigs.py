@@ -11,12 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchreg.datasets.creature_parts import Draw
 from torchreg.datasets.figures import Figure
-from torchreg.datasets.matching_pairs import PosableBody
 from torchreg.errors import MissingExtraError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.io.gltf import load_rig
+
+from ..made_up.creature_parts import Draw
+from ..made_up.matching_pairs import PosableBody
 
 # Joints turn by so much at most, degrees; those that carry most of the body, the root and the spine, a quarter of that.
 _LIMIT = 60.0

@@ -12,11 +12,11 @@ import torch
 import typer
 from torch import Tensor
 
-from torchreg.datasets.creature_kinds import HELD_OUT_KINDS, TRAINING_KINDS
-from torchreg.datasets.creature_parts import Draw
-from torchreg.datasets.matching_pairs import MatchingPair, matching_pairs
 from torchreg.registration.dense.scan_tokens import SIZES, ScanTokens
 
+from ..made_up.creature_kinds import HELD_OUT_KINDS, TRAINING_KINDS
+from ..made_up.creature_parts import Draw
+from ..made_up.matching_pairs import MatchingPair, matching_pairs
 from ..matcher.rigs import people as drawn_people
 from ..matcher.rigs import rig_bodies
 

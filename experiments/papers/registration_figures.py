@@ -10,11 +10,11 @@ from torch import Tensor
 
 import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.viz.bone_colors import bone_palette, error_colors, weight_colors
 from torchreg.viz.figures import show_pixels
 
 from ..library_settings import with_settings
+from ..made_up.walks import walking_figure
 from ..papers.blocks import PAIR_SETS, PairSet
 from ..papers.pictures import SOURCE, TARGET, Drawing, line_plot, mesh_drawing, panels, square_view
 from ..papers.table import pair_trial

@@ -15,14 +15,17 @@ from torch import Tensor
 import torchreg as tr
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.hand import faces_of, hand_motion, surface_skin
-from torchreg.datasets.scan_sequences import ScanPair, ScanSequence, jointed_toy, walking_animal, walking_figure
-from torchreg.datasets.toys import excavator, robot
+from torchreg.datasets.scan_sequences import ScanPair, ScanSequence, jointed_toy
+from torchreg.datasets.toys import robot
 from torchreg.viz.bone_colors import error_colors
 from torchreg.viz.figures import draw_mesh, new_figure, save_picture, watch
 from torchreg.viz.scan_gltf import save_grid_animation
 
 from ..errors import SkippedTrial
 from ..library_settings import with_settings
+from ..made_up.moving_labels import moving_labels
+from ..made_up.toys import excavator
+from ..made_up.walks import walking_animal, walking_figure
 from ..registry import Bench, TrialOutcome
 from ..schema import RegistrationTrial, ScanPairConfig
 from ..tasks.peers import PACKAGES, moved_by
@@ -194,7 +197,7 @@ def _model_metrics(problem: Problem, found: tr.ScanRegistration) -> dict[str, fl
     pair = problem.pair
     if pair is None:
         return metrics
-    metrics["rand_index"] = float(tr.metrics.adjusted_rand(found.parts(), pair.moving_labels()))
+    metrics["rand_index"] = float(tr.metrics.adjusted_rand(found.parts(), moving_labels(pair)))
     gaps = _joint_gaps(found, pair)
     metrics["joints_right"] = sum(gap < JOINT for gap in gaps) / len(gaps) if gaps else math.nan
     return metrics
@@ -202,7 +205,7 @@ def _model_metrics(problem: Problem, found: tr.ScanRegistration) -> dict[str, fl
 
 def _joint_gaps(found: tr.ScanRegistration, pair: ScanPair) -> list[float]:
     """Return distances of true joints, of parts that moved apart, from the nearest ones found; shares of the size."""
-    moving, labels = pair.moving_labels(), pair.labels
+    moving, labels = moving_labels(pair), pair.labels
     part = {int(label): int(moving[labels == label][0]) for label in labels.unique()}
     centers, gaps = found.model.joints().centers, []
     for (parent, child), place in zip(pair.joint_parts.tolist(), pair.joints, strict=True):

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
+from experiments.made_up.walks import walking_figure
 from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import walking_figure
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchreg.datasets.bodies import person
+from experiments.made_up.bodies import person
 
 
 @pytest.fixture(scope="module")

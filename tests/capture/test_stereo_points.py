@@ -1,9 +1,9 @@
 import pytest
 import torch
 
+from experiments.made_up.pictures import PictureStyle, render, stereo_cameras
 from torchreg.capture.stereo import StereoConfig, StereoPoints, rectify, stereo_points
 from torchreg.capture.stereo_frames import StereoFrames, far_end
-from torchreg.datasets.pictures import PictureStyle, render, stereo_cameras
 from torchreg.errors import FormatError, InputError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.camera_rig import StereoPair

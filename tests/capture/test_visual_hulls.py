@@ -3,11 +3,11 @@ import math
 import pytest
 import torch
 
+from experiments.made_up.pictures import camera_ring
 from torchreg.capture.color import chroma_key
 from torchreg.capture.mask_distance import signed_mask_distance
 from torchreg.capture.silhouette_frames import SilhouetteFrames
 from torchreg.capture.silhouettes import visual_hull
-from torchreg.datasets.pictures import camera_ring
 from torchreg.errors import FileWarning, FormatError, InputError, InputTypeError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.camera_rig import CameraRig

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from experiments.made_up.pictures import PictureStyle, render, stereo_cameras
 from torchreg.cli.cameras import check_used, load_calibration, seen_folder, stereo_job, stereo_source
-from torchreg.datasets.pictures import PictureStyle, render, stereo_cameras
 from torchreg.errors import InputError
 from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere

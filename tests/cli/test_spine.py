@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from experiments.made_up.pictures import camera_ring
 from torchreg.datasets.creatures import STARFISH, creature_sequence
-from torchreg.datasets.pictures import camera_ring
 from torchreg.io.calibration import save_cameras
 from torchreg.io.images import save_image
 from torchreg.io.points import load_mesh, save_points

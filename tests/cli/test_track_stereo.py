@@ -5,9 +5,9 @@ import json
 import pytest
 import torch
 
+from experiments.made_up.pictures import PictureStyle, stereo_cameras
+from experiments.made_up.videos import shape_video
 from torchreg.datasets.hand import hand_motion
-from torchreg.datasets.pictures import PictureStyle, stereo_cameras
-from torchreg.datasets.videos import shape_video
 from torchreg.geometry.camera_rig import CameraRig
 from torchreg.io.calibration import save_cameras
 from torchreg.io.images import load_image, save_image

@@ -5,10 +5,10 @@ import torch
 
 pytest.importorskip("hydra", reason="experiments take the extra experiments")
 
+from experiments.made_up.matching_pairs import matching_pairs
 from experiments.matcher.shards import PairStore, make_shards, stacked, tokens_of_pair
 from experiments.matcher.train import TrainConfig, assignment_loss, train, validate
 from experiments.matcher.weights import export_weights
-from torchreg.datasets.matching_pairs import matching_pairs
 from torchreg.io.tensors import load_tensors
 from torchreg.registration.dense.scan_matcher import ScanMatcher
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from torchreg.datasets.bodies import person
+from experiments.made_up.bodies import person
 from torchreg.geometry.joined_pieces import join_pieces
 from torchreg.geometry.mesh import sample_surface, unit_sphere
 from torchreg.geometry.neighbors import NeighborTree

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from torchreg.datasets.bodies import person
-from torchreg.datasets.gaits import person_tucks
+from experiments.made_up.bodies import person
+from experiments.made_up.gaits import person_tucks
 from torchreg.spines.body_mirror import _exchanges, _images, find_mirror
 from torchreg.spines.name_chain import name_over_time
 from torchreg.spines.name_model import _background

@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 import torch
 
-from torchreg.datasets.plants import PlantForm, growing_plant
+from experiments.made_up.plants import PlantForm, growing_plant
 from torchreg.errors import InputError
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.spines.extract_spine import SpineConfig, extract_spine

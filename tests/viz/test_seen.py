@@ -1,6 +1,6 @@
 import torch
 
-from torchreg.datasets.pictures import camera_ring
+from experiments.made_up.pictures import camera_ring
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.mesh import TriangleMesh, unit_sphere
 from torchreg.viz.seen import (

@@ -1,4 +1,4 @@
-"""Surfaces of unions of balls, meshed from voxels on randomly shifted grids."""
+"""Arms as balls along bent axes, and the surfaces of many balls, meshed from voxels on randomly shifted grids."""
 
 from __future__ import annotations
 
@@ -21,6 +21,22 @@ class _Painting:
 
 
 _PAINTING = _Painting()
+
+
+def bent_axes(along: Tensor, across: Tensor, elevations: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+    """Return axes (..., S, 3) of arms that begin at the origin and bend on the way, and their directions (..., S, 3).
+
+    Args:
+        along: (..., S) cosines of the azimuths at even steps along each axis.
+        across: (..., S) sines of the same.
+        elevations: (..., S) radians.
+        lengths: (...) of the axes.
+    """
+    flat = elevations.cos()
+    directions = torch.stack((flat * along, flat * across, elevations.sin()), dim=-1)
+    steps = (lengths / (elevations.shape[-1] - 1))[..., None, None]
+    steps = 0.5 * (directions[..., 1:, :] + directions[..., :-1, :]) * steps
+    return torch.nn.functional.pad(steps.cumsum(-2), (0, 0, 1, 0)), directions
 
 
 def ball_surface(

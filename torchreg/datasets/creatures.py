@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_choice, check_count, check_positive
-from torchreg.datasets.ball_surface import ball_surface
+from torchreg.datasets.ball_surface import ball_surface, bent_axes
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import so3_exp
 
@@ -154,7 +154,7 @@ def _moving_axes(
     raised = curl.unsqueeze(-1) * share
     if touching != "none":
         _bring_together(form, turned, raised, lengths, merged, touching)
-    axes, headings = _integrated(turned, raised, lengths)
+    axes, headings = _axes(turned, raised, lengths)
     spin = 0.04 * time.unsqueeze(-1) * torch.tensor([0.3, 0.2, 1.0], dtype=torch.float64)
     pose = so3_exp(spin + (2 * draw(3) - 1))
     drift = 0.02 * time[:, None] * (2 * draw(3) - 1)
@@ -162,11 +162,10 @@ def _moving_axes(
     return moved, torch.einsum("tij,tkj->tki", pose, headings), merged
 
 
-def _integrated(turned: Tensor, raised: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
+def _axes(turned: Tensor, raised: Tensor, lengths: Tensor) -> tuple[Tensor, Tensor]:
     """Return axes (T, K, S, 3) from the origin along headings and elevations (T, K, S), and their last directions."""
-    direction = torch.stack((turned.cos() * raised.cos(), turned.sin() * raised.cos(), raised.sin()), dim=-1)
-    steps = 0.5 * (direction[:, :, 1:] + direction[:, :, :-1]) * (lengths / (_MOTION.num_samples - 1))[:, None, None]
-    return torch.nn.functional.pad(steps.cumsum(2), (0, 0, 1, 0)), direction[:, :, -1]
+    axes, directions = bent_axes(turned.cos(), turned.sin(), raised, lengths)
+    return axes, directions[..., -1, :]
 
 
 def _bring_together(
@@ -184,7 +183,7 @@ def _bring_together(
     for _ in range(40):  # bisection for the turn that brings the axes to that distance
         middle = 0.5 * (low + high)
         turned[:, :2] = start[:, :2] + middle * signs * bend
-        axes, _ = _integrated(turned[:, :2], raised[:, :2], lengths[:2])
+        axes, _ = _axes(turned[:, :2], raised[:, :2], lengths[:2])
         outer = axes[:, :, _MOTION.num_samples // 3 :]
         near = torch.cdist(outer[:, 0], outer[:, 1]).amin((1, 2))[:, None, None] < distance
         high, low = torch.where(near, middle, high), torch.where(near, low, middle)

@@ -1,4 +1,4 @@
-"""Bodies of parts in a kinematic tree: one bending skin, or rigid pieces."""
+"""Solids on a tree of parts, meshed as one bending skin or as rigid pieces, and posed: the bodies of made-up data."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from torch import Tensor
 from torchreg._checks import check_positive
 from torchreg.datasets.solids import Solid, Vector, mesh_of, union_distance
 from torchreg.errors import InputError
-from torchreg.geometry.mesh import TriangleMesh
+from torchreg.geometry.mesh import TriangleMesh, concatenate
 from torchreg.geometry.rigid import rigid_matrix
+
+SIDES = {"left": 1.0, "right": -1.0}  # signs of x
 
 
 @dataclass(frozen=True)
@@ -62,15 +64,12 @@ class Figure:
         return self.part_names.index(name)
 
     def transforms(self, rotations: Tensor, base: Tensor | None = None) -> Tensor:
-        """Return the rigid motion of every part from the rest pose.
+        """Return the rigid motions (..., P, 4, 4) of all parts from the rest pose.
 
         Args:
             rotations: (..., P, 3, 3) of each part about its joint relative to its parent, in the axes of the rest
                 pose; the root turns about its own middle.
             base: (..., 4, 4) motion of the figure after that; the identity by default.
-
-        Returns:
-            Motions (..., P, 4, 4) of points in the rest pose.
         """
         joints = self.joints.to(rotations)
         about = joints - (rotations @ joints.unsqueeze(-1)).squeeze(-1)
@@ -92,62 +91,46 @@ class Figure:
         return (moved[..., :3, :3] @ self.joints[1:].to(moved).unsqueeze(-1)).squeeze(-1) + moved[..., :3, 3]
 
 
-def bending_figure(parts: Sequence[Part], *, spacing: float, blend: float, softness: float) -> Figure:
-    """Return a body of one closed skin, smoothly fused and smoothly skinned.
+def meshed_figure(
+    parts: Sequence[Part], *, spacing: float, blend: float = 0.0, softness: float | None = None
+) -> Figure:
+    """Return a body of rigid pieces, each with a closed surface, or of one closed, smoothly fused and skinned surface.
 
-    Weights are ``softmax(-d_p / softness)`` over the distances d_p to the parts in the rest pose, so that the skin
+    Weights of a skin are ``softmax(-d_p / softness)`` over the distances d_p to the parts in the rest pose, so that it
     bends over about four times ``softness``; parts that must not fuse lie apart in the rest pose.
 
     Args:
         parts: parents before children.
         spacing: of the mesh, metres.
-        blend: approximate radius of the seams, metres.
-        softness: length scale of the weights, metres.
+        blend: approximate radius of the seams of a skin, metres.
+        softness: length scale of its weights, metres; None leaves the pieces rigid.
 
     Raises:
         InputError: if a name is unknown or doubled, or a number is not positive.
     """
-    check_positive(softness, "softness")
     check_positive(spacing, "spacing")
     check_positive(blend, "blend", allow_zero=True)
     parents = _parents(parts)
-    mesh = mesh_of([solid for part in parts for solid in part.solids], spacing, blend)
-    distances = torch.stack([union_distance(part.solids, mesh.vertices, 0.0) for part in parts], dim=-1)
-    return _figure(parts, parents, mesh, torch.softmax(-distances / softness, dim=-1))
-
-
-def jointed_figure(parts: Sequence[Part], *, spacing: float) -> Figure:
-    """Return a body of rigid pieces, each with a closed surface.
-
-    Args:
-        parts: parents before children.
-        spacing: of the meshes, metres.
-
-    Raises:
-        InputError: if a name is unknown or doubled, or the spacing is not positive.
-    """
-    check_positive(spacing, "spacing")
-    parents = _parents(parts)
-    meshes = [mesh_of(part.solids, spacing) for part in parts]
-    counts = torch.tensor([mesh.num_vertices for mesh in meshes])
-    starts = (counts.cumsum(0) - counts).tolist()
-    faces = torch.cat([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
-    surface = TriangleMesh(torch.cat([mesh.vertices for mesh in meshes]), faces)
-    owner = torch.arange(len(parts)).repeat_interleave(counts)
-    return _figure(parts, parents, surface, torch.nn.functional.one_hot(owner, len(parts)).to(surface.vertices))
+    if softness is None:
+        pieces = [mesh_of(part.solids, spacing) for part in parts]
+        mesh = concatenate(pieces)
+        owner = torch.arange(len(parts)).repeat_interleave(torch.tensor([piece.num_vertices for piece in pieces]))
+        weights = torch.nn.functional.one_hot(owner, len(parts)).to(mesh.vertices)
+    else:
+        check_positive(softness, "softness")
+        mesh = mesh_of([solid for part in parts for solid in part.solids], spacing, blend)
+        distances = torch.stack([union_distance(part.solids, mesh.vertices, 0.0) for part in parts], dim=-1)
+        weights = torch.softmax(-distances / softness, dim=-1)
+    joints = torch.tensor([part.joint for part in parts], dtype=mesh.vertices.dtype)
+    return Figure(mesh=mesh, weights=weights, joints=joints, parents=parents, part_names=tuple(p.name for p in parts))
 
 
 def _parents(parts: Sequence[Part]) -> tuple[int, ...]:
+    """Return the number of each part's parent, -1 for the root."""
     names = [part.name for part in parts]
     if len(set(names)) != len(names):
         raise InputError(f"parts must have different names, got {', '.join(names)}")
     for index, part in enumerate(parts):
-        if (part.parent is None) != (index == 0) or (part.parent is not None and part.parent not in names[:index]):
+        if (part.parent is not None) != (index > 0) or (part.parent is not None and part.parent not in names[:index]):
             raise InputError(f"part {part.name!r} hangs on {part.parent!r}: parents come first, and the root has none")
     return tuple(-1 if part.parent is None else names.index(part.parent) for part in parts)
-
-
-def _figure(parts: Sequence[Part], parents: tuple[int, ...], mesh: TriangleMesh, weights: Tensor) -> Figure:
-    joints = torch.tensor([part.joint for part in parts], dtype=mesh.vertices.dtype)
-    names = tuple(part.name for part in parts)
-    return Figure(mesh=mesh, weights=weights, joints=joints, parents=parents, part_names=names)

@@ -1,4 +1,4 @@
-"""Range scans of moving figures with exact truth: a walking person or animal, a toy whose joints turn."""
+"""Range scans of moving figures with exact truth, such as a toy whose joints turn."""
 
 from __future__ import annotations
 
@@ -11,18 +11,15 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_count, check_positive
-from torchreg.datasets.bodies import Proportions, person, quadruped
 from torchreg.datasets.depth_scanner import DepthScanner, SurfaceScan
 from torchreg.datasets.figures import Figure
-from torchreg.datasets.gaits import animal_walk, person_walk
 from torchreg.datasets.toys import Toy, robot
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.range_scan import RangeScan
-from torchreg.geometry.rigid import invert_rigid, rigid_matrix, transform_points
+from torchreg.geometry.rigid import invert_rigid, rigid_matrix
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.visibility import View, visible_points
-from torchreg.solvers.rigid_groups import merge_alike
 
 
 @dataclass(frozen=True)
@@ -71,38 +68,6 @@ class ScanPair:
     def error(self, deformed: Tensor) -> Tensor:
         """Return distances (N,) of moved source points (N, 3) from the truth, as shares of the source's diagonal."""
         return (deformed - self.truth.to(deformed)).norm(dim=-1) / self.source.diagonal
-
-    def moving_labels(self, tolerance: float = 0.01) -> Tensor:
-        """Return labels (N,) in which parts that moved rigidly together between the two poses share a label.
-
-        A pair of scans does not distinguish such parts. Of adjacent parts those with the most similar motions are
-        merged first, and move as the part with more scanned points afterwards, as long as the mean distance between
-        the points moved by either motion is at most ``tolerance``. `ScanRegistration.parts` merges bones alike.
-
-        Args:
-            tolerance: share of the source's diagonal.
-        """
-        motions = self.transforms.unsqueeze(0)
-        return _labels_of_motion(self.source, self.labels, self.joint_parts, motions, tolerance)
-
-
-def _labels_of_motion(
-    scan: RangeScan, labels: Tensor, joint_parts: Tensor, transforms: Tensor, tolerance: float
-) -> Tensor:
-    """Return labels (N,) in which parts that move rigidly together in all motions (T, P, 4, 4) share a label."""
-    check_positive(tolerance, "tolerance", allow_zero=True)
-    counts = torch.bincount(labels, minlength=transforms.shape[1])
-    apart = torch.zeros(len(transforms), len(counts), len(counts), dtype=scan.points.dtype, device=labels.device)
-    for part in counts.nonzero()[:, 0]:
-        points = scan.points[labels == part]
-        relative = invert_rigid(transforms[:, part]).unsqueeze(1) @ transforms
-        apart[:, :, part] = (transform_points(relative, points) - points).norm(dim=-1).sum(-1) / scan.diagonal
-    meet = torch.zeros(len(counts), len(counts), dtype=torch.bool, device=labels.device)
-    meet[joint_parts[:, 0], joint_parts[:, 1]] = meet[joint_parts[:, 1], joint_parts[:, 0]] = True
-    for hidden in (counts == 0).nonzero()[:, 0]:
-        # The neighbors of a part that is not seen count as adjacent.
-        meet |= meet[hidden].unsqueeze(1) & meet[hidden]
-    return merge_alike(apart, counts, meet, tolerance)[labels]
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,17 +149,6 @@ class ScanSequence(Sequence[RangeScan]):
         """Return the true parts (N,) of the scanned points of a frame."""
         return self._labels(self.scanned(frame))
 
-    def moving_labels(self, frame: int, tolerance: float = 0.01) -> Tensor:
-        """Return labels (N,) of a frame's points in which parts that move rigidly together in all frames share a label.
-
-        Args:
-            frame: the source of all motions.
-            tolerance: see `ScanPair.moving_labels`.
-        """
-        found = self.scanned(frame)
-        motions = (self.transforms @ invert_rigid(self.transforms[frame])).to(self.dtype)
-        return _labels_of_motion(found.scan, self._labels(found), self.joint_parts, motions, tolerance)
-
     @property
     def joint_parts(self) -> Tensor:
         """(P - 1, 2) parts that meet at the joints, the parent first."""
@@ -238,77 +192,6 @@ class ScanSequence(Sequence[RangeScan]):
         """Return the mask (F,) of the figure's faces on parts that were not taken off."""
         missing = self.missing[frame] if self.missing else -1
         return (self.figure.weights.argmax(-1) != missing)[self.figure.mesh.faces].any(-1)
-
-
-def walking_figure(
-    frames: int = 190,
-    seed: int = 0,
-    *,
-    proportions: Proportions | None = None,
-    cycles_per_frame: float = 0.08,
-    turn: float = math.radians(2),
-    scanner: DepthScanner | None = None,
-    dtype: torch.dtype = torch.float32,
-) -> ScanSequence:
-    """Return scans of a person who walks on the spot while turning before a depth camera.
-
-    At 0.08 cycles a frame (12 frames a second) the knees turn by up to about 28 degrees between adjacent frames and
-    the hips by 13.
-
-    Args:
-        frames: number of frames; 190 give 189 adjacent pairs, as in the paper.
-        seed: of the walk, of its first phase, and of the noise.
-        proportions: of the `person`; all 1 by default.
-        cycles_per_frame: share of two steps from frame to frame.
-        turn: rotation of the person from frame to frame, radians: 2 degrees show every side in 180 frames.
-        scanner: the camera; `DepthScanner` by default, 4,500 points.
-        dtype: of scans and truth.
-
-    References: Chang and Zwicker 2009, section 5, "walking figure": 189 pairs of about 4,502 vertices.
-
-    Raises:
-        InputError: if a number is out of range.
-
-    Cost: 1 s for the figure.
-    """
-    generator, phase = _gait_phase(frames, seed, cycles_per_frame)
-    figure = person(proportions)
-    rotations, heights = person_walk(figure, phase, generator)
-    return _before_camera(figure, rotations, heights, turn, scanner, seed, dtype)
-
-
-def walking_animal(
-    frames: int = 100,
-    seed: int = 0,
-    *,
-    gait: str = "trot",
-    proportions: Proportions | None = None,
-    cycles_per_frame: float = 0.08,
-    turn: float = math.radians(2),
-    scanner: DepthScanner | None = None,
-    dtype: torch.dtype = torch.float32,
-) -> ScanSequence:
-    """Return scans of a four-legged animal that moves on the spot while turning before a depth camera.
-
-    Args:
-        frames: number of frames.
-        seed: see `walking_figure`.
-        gait: see `animal_walk`.
-        proportions: of the `quadruped`; all 1 by default.
-        cycles_per_frame: share of the gait cycle from frame to frame.
-        turn: see `walking_figure`.
-        scanner: see `walking_figure`.
-        dtype: of scans and truth.
-
-    Raises:
-        InputError: if a number is out of range.
-
-    Cost: 1 s for the figure.
-    """
-    generator, phase = _gait_phase(frames, seed, cycles_per_frame)
-    figure = quadruped(proportions)
-    rotations, heights = animal_walk(figure, phase, gait, generator)
-    return _before_camera(figure, rotations, heights, turn, scanner, seed, dtype)
 
 
 def jointed_toy(
@@ -356,38 +239,12 @@ def jointed_toy(
     ends = [part for part in range(1, figure.num_parts) if part not in figure.parents]
     drawn = torch.randint(len(ends), (frames,), generator=generator).tolist()
     absent = tuple(ends[number] if missing and frame % 2 else -1 for frame, number in enumerate(drawn))
-    base = _facing_camera(figure, change.cumsum(0), tilt.expand(frames), torch.zeros_like(change))
+    base = facing_camera(figure, change.cumsum(0), tilt.expand(frames), torch.zeros_like(change))
     transforms = figure.transforms(toy.rotations(angles), base)
     return ScanSequence(figure, transforms, scanner or DepthScanner(), absent, seed, dtype)
 
 
-def _gait_phase(frames: int, seed: int, cycles_per_frame: float) -> tuple[torch.Generator, Tensor]:
-    """Return the source of randomness of a walk and its phases (T,), from a random start on."""
-    check_count(frames, "frames", 2)
-    check_positive(cycles_per_frame, "cycles_per_frame")
-    generator = torch.Generator().manual_seed(seed)
-    start = torch.rand(1, generator=generator, dtype=torch.float64)
-    return generator, start + cycles_per_frame * torch.arange(frames, dtype=torch.float64)
-
-
-def _before_camera(
-    figure: Figure,
-    rotations: Tensor,
-    heights: Tensor,
-    turn: float,
-    scanner: DepthScanner | None,
-    seed: int,
-    dtype: torch.dtype,
-) -> ScanSequence:
-    """Return the sequence of a figure that begins at a random angle to the camera and turns by ``turn`` a frame."""
-    generator = torch.Generator().manual_seed(seed)
-    begin = 2 * math.pi * torch.rand(1, generator=generator, dtype=torch.float64)
-    angle = begin + turn * torch.arange(len(rotations), dtype=torch.float64)
-    base = _facing_camera(figure, angle, torch.zeros_like(angle), heights)
-    return ScanSequence(figure, figure.transforms(rotations, base), scanner or DepthScanner(), seed=seed, dtype=dtype)
-
-
-def _facing_camera(figure: Figure, angle: Tensor, tilt: Tensor, heights: Tensor) -> Tensor:
+def facing_camera(figure: Figure, angle: Tensor, tilt: Tensor, heights: Tensor) -> Tensor:
     """Return motions (T, 4, 4) of a figure to before the camera, from angles, tilts (radians) and heights (T,)."""
     zero = torch.zeros_like(angle)
     lower, upper = figure.mesh.bounds()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -49,32 +50,6 @@ class RoundCone:
 
 
 @dataclass(frozen=True)
-class FlatCone:
-    """A round cone flattened across its axis: an ear, a wing, a foot.
-
-    Args:
-        cone: before it is flattened.
-        normal: unit vector at right angles to its axis, along which it is flattened.
-        flatness: thickness over width, in (0, 1].
-    """
-
-    cone: RoundCone
-    normal: Vector
-    flatness: float
-
-    def distance(self, points: Tensor) -> Tensor:
-        """Return lower bounds (N,) of the signed distances of points (N, 3), exact across the axis."""
-        normal = points.new_tensor(self.normal)
-        height = (points - points.new_tensor(self.cone.start)) @ normal
-        stretched = points + ((1 / self.flatness - 1) * height).unsqueeze(-1) * normal
-        return self.flatness * self.cone.distance(stretched)
-
-    def bounds(self) -> tuple[Vector, Vector]:
-        """Return the lower and upper corner of a box that holds the solid."""
-        return self.cone.bounds()
-
-
-@dataclass(frozen=True)
 class RoundBox:
     """A box along the axes with rounded edges.
 
@@ -99,7 +74,16 @@ class RoundBox:
         return _vector([middle - half for middle, half in pairs]), _vector([middle + half for middle, half in pairs])
 
 
-Solid = RoundCone | FlatCone | RoundBox
+def ball(center: Vector, radius: float) -> RoundCone:
+    """Return a ball."""
+    return RoundCone(center, center, radius, radius)
+
+
+class Solid(Protocol):
+    """A distance field that is negative inside, and a box that holds all of that."""
+
+    def distance(self, points: Tensor) -> Tensor: ...  # noqa: D102
+    def bounds(self) -> tuple[Vector, Vector]: ...  # noqa: D102
 
 
 def union_distance(solids: Sequence[Solid], points: Tensor, blend: float) -> Tensor:

@@ -5,8 +5,9 @@ from threading import get_ident
 import pytest
 import torch
 
+from experiments.made_up.walks import walking_animal, walking_figure
 from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import jointed_toy, walking_animal, walking_figure
+from torchreg.datasets.scan_sequences import jointed_toy
 from torchreg.errors import InputError
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import se3_exp, transform_points

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
+from experiments.made_up.walks import walking_figure
 from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.registration.dense.coarse_fit import fit_coarsely
 from torchreg.registration.dense.config import ScanAlignConfig
 from torchreg.registration.dense.match_prior import MatchPrior

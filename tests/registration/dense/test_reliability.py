@@ -3,8 +3,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from experiments.made_up.walks import walking_figure
 from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.registration.dense.align_scans import align_problem, evidence_against
 from torchreg.registration.dense.config import ScanAlignConfig
 from torchreg.registration.dense.problem import describe

@@ -4,9 +4,9 @@ import pytest
 import torch
 
 import torchreg as tr
-from torchreg.datasets.creature_kinds import HELD_OUT_KINDS
-from torchreg.datasets.creature_parts import Draw
-from torchreg.datasets.matching_pairs import matching_pairs
+from experiments.made_up.creature_kinds import HELD_OUT_KINDS
+from experiments.made_up.creature_parts import Draw
+from experiments.made_up.matching_pairs import matching_pairs
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
 from torchreg.registration.dense.scan_matcher import ScanMatcher, match_probabilities

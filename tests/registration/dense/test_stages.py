@@ -3,8 +3,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from experiments.made_up.walks import walking_figure
 from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.geometry.rigid import se3_exp
 from torchreg.registration.dense.config import ScanAlignConfig
 from torchreg.registration.dense.problem import ExpectedPlaces, describe

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
+from experiments.made_up.walks import walking_figure
 from torchreg.datasets.depth_scanner import DepthScanner
-from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.geometry.rigid import se3_exp, transform_points
 from torchreg.registration.paper.config import PaperConfig
 from torchreg.registration.paper.spin_matches import spin_matches

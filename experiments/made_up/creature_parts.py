@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchreg.datasets.figures import Part
-from torchreg.datasets.solids import FlatCone, RoundCone, Solid
+from torchreg.datasets.solids import RoundCone, Solid, Vector, ball
 
 # Left (+x) and right, with y up and z forward.
 LEFT_RIGHT = (1.0, -1.0)
@@ -37,6 +39,10 @@ class Draw:
     def count(self, low: int, high: int) -> int:
         """Return an integer from ``low`` to ``high``, both included."""
         return int(torch.randint(low, high + 1, (), generator=self.generator))
+
+    def order(self, count: int) -> list[int]:
+        """Return the numbers below a count in random order."""
+        return torch.randperm(count, generator=self.generator).tolist()
 
     def log_uniform(self, low: float, high: float) -> float:
         """Return a number whose logarithm is drawn evenly."""
@@ -66,6 +72,32 @@ class Creature:
     rigid: bool = False
 
 
+@dataclass(frozen=True)
+class FlatCone:
+    """A round cone flattened across its axis: an ear, a wing, a foot.
+
+    Args:
+        cone: before it is flattened.
+        normal: unit vector at right angles to its axis, along which it is flattened.
+        flatness: thickness over width, in (0, 1].
+    """
+
+    cone: RoundCone
+    normal: Vector
+    flatness: float
+
+    def distance(self, points: Tensor) -> Tensor:
+        """Return lower bounds (N,) of the signed distances of points (N, 3), exact across the axis."""
+        normal = points.new_tensor(self.normal)
+        height = (points - points.new_tensor(self.cone.start)) @ normal
+        stretched = points + ((1 / self.flatness - 1) * height).unsqueeze(-1) * normal
+        return self.flatness * self.cone.distance(stretched)
+
+    def bounds(self) -> tuple[Vector, Vector]:
+        """Return the lower and upper corner of a box that holds the solid."""
+        return self.cone.bounds()
+
+
 def towards(elevation: float, azimuth: float = 0.0) -> Tensor:
     """Return the unit vector (3,) at an elevation and an azimuth from forward to the left, degrees."""
     rise, turn = math.radians(elevation), math.radians(azimuth)
@@ -85,8 +117,8 @@ class Builder:
 
     draw: Draw
     rigid: bool = False
-    _solids: list[list[Solid]] = field(default_factory=list)
-    _rows: list[tuple[int, Tensor, float]] = field(default_factory=list)
+    _parts: list[Part] = field(default_factory=list)
+    _limits: list[float] = field(default_factory=list)
 
     def add(
         self,
@@ -114,9 +146,11 @@ class Builder:
         """
         axis = torch.nn.functional.normalize(direction.double(), dim=0)
         end = start + length * axis
-        self._rows.append((parent, start, limit))
-        self._solids.append([cone_of(start, end, radii, flat, normal)])
-        return len(self._rows) - 1, end
+        number, hangs_on = len(self._parts), None if parent < 0 else f"part {parent}"
+        solid = cone_of(start, end, radii, flat, normal)
+        self._parts.append(Part(f"part {number}", hangs_on, as_tuple(start), (solid,)))
+        self._limits.append(math.radians(limit))
+        return number, end
 
     def chain(
         self,
@@ -125,42 +159,26 @@ class Builder:
         directions: Sequence[Tensor],
         lengths: Sequence[float],
         radii: Sequence[float],
-        *,
-        limit: float = 80.0,
-        flat: float = 1.0,
-        normal: Tensor | None = None,
+        **form: Any,
     ) -> tuple[list[int], Tensor]:
         """Add parts one after the other, radii (K + 1) at their ends; return their numbers and the last end."""
         numbers = []
-        for index, (direction, length) in enumerate(zip(directions, lengths, strict=True)):
-            parent, start = self.add(
-                parent,
-                start,
-                direction,
-                length,
-                (radii[index], radii[index + 1]),
-                limit=limit,
-                flat=flat,
-                normal=normal,
-            )
+        for direction, length, ends in zip(directions, lengths, pairwise(radii), strict=True):
+            parent, start = self.add(parent, start, direction, length, ends, **form)
             numbers.append(parent)
         return numbers, start
 
     def attach(self, part: int, solid: Solid) -> None:
         """Add a solid to a part."""
-        self._solids[part].append(solid)
+        self._parts[part] = replace(self._parts[part], solids=(*self._parts[part].solids, solid))
 
     def blob(self, part: int, center: Tensor, radius: float) -> None:
         """Add a ball to a part."""
-        self.attach(part, RoundCone(as_tuple(center), as_tuple(center), radius, radius))
+        self.attach(part, ball(as_tuple(center), radius))
 
     def finish(self) -> Creature:
         """Return the creature."""
-        parts = tuple(
-            Part(f"part {number}", None if parent < 0 else f"part {parent}", as_tuple(joint), tuple(solids))
-            for number, ((parent, joint, _), solids) in enumerate(zip(self._rows, self._solids, strict=True))
-        )
-        return Creature(parts, tuple(math.radians(limit) for _, _, limit in self._rows), self.rigid)
+        return Creature(tuple(self._parts), tuple(self._limits), self.rigid)
 
 
 def cone_of(start: Tensor, end: Tensor, radii: tuple[float, float], flat: float, normal: Tensor | None) -> Solid:
@@ -175,7 +193,7 @@ def cone_of(start: Tensor, end: Tensor, radii: tuple[float, float], flat: float,
     return FlatCone(cone, as_tuple(torch.nn.functional.normalize(across, dim=0)), flat)
 
 
-def as_tuple(vector: Tensor) -> tuple[float, float, float]:
+def as_tuple(vector: Tensor) -> Vector:
     """Return a vector (3,) as numbers."""
     x, y, z = vector.tolist()
     return x, y, z

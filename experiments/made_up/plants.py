@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_count, check_positive
-from torchreg.datasets.ball_surface import ball_surface
+from torchreg.datasets.ball_surface import ball_surface, bent_axes
 from torchreg.geometry.mesh import TriangleMesh
 
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))  # between organs that follow each other on a stem
@@ -219,9 +219,8 @@ def _axes(form: PlantForm, organs: _Organs, frame: int, num_frames: int) -> tupl
 def _bent(root: Tensor, azimuth: float, elevation: float, rise: float, length: float, share: Tensor) -> Tensor:
     """Return an axis (S, 3) from a root in a direction that turns upwards on the way."""
     up = elevation + rise * share
-    steps = torch.stack((up.cos() * math.cos(azimuth), up.cos() * math.sin(azimuth), up.sin()), dim=-1)
-    steps = 0.5 * (steps[1:] + steps[:-1]) * (length / (len(share) - 1))
-    return root + torch.nn.functional.pad(steps.cumsum(0), (0, 0, 1, 0))
+    along, across = up.new_tensor(math.cos(azimuth)), up.new_tensor(math.sin(azimuth))
+    return root + bent_axes(along, across, up, up.new_tensor(length))[0]
 
 
 def _direction(axis: Tensor) -> Tensor:

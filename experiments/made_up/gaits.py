@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_choice
-from torchreg.datasets.bodies import REST_ARM, REST_LEG, SIDES
-from torchreg.datasets.figures import Figure
+from torchreg.datasets.figures import SIDES, Figure
 from torchreg.geometry.rotation import so3_exp
+
+from ..made_up.bodies import REST_ARM, REST_LEG
 
 # Phases of an animal's feet behind its left hind foot, as shares of the cycle.
 GAITS = {
@@ -42,11 +43,8 @@ def person_walk(figure: Figure, phase: Tensor, generator: torch.Generator | None
 
     References: Winter 2009, the angles of natural cadence.
     """
-    generator = torch.Generator().manual_seed(0) if generator is None else generator
-    phase = phase.double()
-    wander = _Wander(phase, generator)
+    phase, wander, turns = _begun(figure, phase, generator)
     stride, swing = wander(0.15, 1.0), wander(0.3, 1.0)
-    turns = _Turns(figure, len(phase))
     beat = torch.cos(2 * math.pi * phase)
     turns.add("pelvis", y=-6 * stride * beat, z=3 * torch.sin(2 * math.pi * phase))
     turns.add("torso", x=wander(5.0, 5.0), y=12 * stride * beat + wander(8.0), z=wander(4.0))
@@ -86,10 +84,7 @@ def person_tucks(figure: Figure, phase: Tensor, generator: torch.Generator | Non
     Raises:
         InputError: if the figure is no person.
     """
-    generator = torch.Generator().manual_seed(0) if generator is None else generator
-    phase = phase.double()
-    wander = _Wander(phase, generator)
-    turns = _Turns(figure, len(phase))
+    phase, wander, turns = _begun(figure, phase, generator)
     turns.add("torso", x=wander(6.0, 4.0), y=wander(8.0), z=wander(4.0))
     turns.add("head", x=wander(12.0), y=wander(20.0), z=wander(5.0))
     for side, sign in SIDES.items():
@@ -133,10 +128,7 @@ def animal_walk(
         InputError: if the gait is unknown or the figure no quadruped.
     """
     check_choice(gait, "gait", tuple(GAITS))
-    generator = torch.Generator().manual_seed(0) if generator is None else generator
-    phase = phase.double()
-    wander = _Wander(phase, generator)
-    turns = _Turns(figure, len(phase))
+    phase, wander, turns = _begun(figure, phase, generator)
     stride, beat, twice = wander(0.15, 1.0), torch.sin(2 * math.pi * phase), torch.cos(4 * math.pi * phase)
     rocking = 8.0 if gait == "gallop" else 1.0
     turns.add("chest", x=rocking * beat, y=wander(4.0) + 3 * beat)
@@ -150,6 +142,13 @@ def animal_walk(
         turns.add(f"{leg} shin", x=stride * (4 + 45 * _bump(cycle, 0.72, 0.1)))
         turns.add(f"{leg} foot", x=stride * (15 * _bump(cycle, 0.6, 0.07) + 20 * _bump(cycle, 0.75, 0.08)))
     return turns.rotations, -0.015 * twice
+
+
+def _begun(figure: Figure, phase: Tensor, generator: torch.Generator | None) -> tuple[Tensor, _Wander, _Turns]:
+    """Return the phases (T,) in float64, the source of variations, and the turns of a figure that stands still."""
+    generator = torch.Generator().manual_seed(0) if generator is None else generator
+    phase = phase.double()
+    return phase, _Wander(phase, generator), _Turns(figure, len(phase))
 
 
 class _Turns:

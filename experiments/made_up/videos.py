@@ -10,7 +10,6 @@ from torch import Tensor
 
 from torchreg._checks import check_shape
 from torchreg.datasets.hand import faces_of, surface_skin
-from torchreg.datasets.pictures import Picture, PictureStyle, backdrop, cameras_of, render
 from torchreg.datasets.stereo import drawn_forearm
 from torchreg.geometry.camera_rig import CameraRig, StereoPair
 from torchreg.geometry.mesh import TriangleMesh
@@ -18,6 +17,8 @@ from torchreg.geometry.rigid import transform_points
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.skin import LinearBlendSkin
+
+from ..made_up.pictures import Picture, PictureStyle, backdrop, cameras_of, render
 
 
 def shape_video(

@@ -5,20 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchreg.datasets.creature_kinds import TRAINING_KINDS, Kind
-from torchreg.datasets.creature_parts import Draw
 from torchreg.datasets.depth_scanner import DepthScanner, SurfaceScan
-from torchreg.datasets.figures import Figure, bending_figure, jointed_figure
+from torchreg.datasets.figures import Figure, meshed_figure
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh, interpolate
 from torchreg.geometry.neighbors import NeighborTree
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
+
+from ..made_up.creature_kinds import TRAINING_KINDS, Kind
+from ..made_up.creature_parts import Draw
 
 
 @dataclass(frozen=True)
@@ -128,16 +130,11 @@ def drawn_body(kind: Kind, draw: Draw) -> PosableBody:
     creature = kind(draw)
     corners = torch.tensor([corner for part in creature.parts for solid in part.solids for corner in solid.bounds()])
     size = float((corners.amax(0) - corners.amin(0)).norm())
-    spacing = size / _VARIETY.cells
-    if creature.rigid:
-        figure = jointed_figure(creature.parts, spacing=spacing)
-    else:
-        figure = bending_figure(
-            creature.parts,
-            spacing=spacing,
-            blend=size * draw.log_uniform(*_VARIETY.blend),
-            softness=size * draw.log_uniform(*_VARIETY.softness),
-        )
+    skin: dict[str, Any] = {}
+    if not creature.rigid:
+        skin["blend"] = size * draw.log_uniform(*_VARIETY.blend)
+        skin["softness"] = size * draw.log_uniform(*_VARIETY.softness)
+    figure = meshed_figure(creature.parts, spacing=size / _VARIETY.cells, **skin)
     return PosableBody(figure, torch.tensor(creature.limits, dtype=torch.float64), creature.rigid)
 
 

@@ -12,8 +12,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from torchreg.datasets.creature_parts import LEFT_RIGHT, Builder, Creature, Draw, as_tuple, at, cone_of, towards
 from torchreg.datasets.solids import RoundBox, RoundCone
+
+from ..made_up.creature_parts import LEFT_RIGHT, Builder, Creature, Draw, as_tuple, at, cone_of, towards
 
 X, Y, Z = torch.eye(3, dtype=torch.float64)
 

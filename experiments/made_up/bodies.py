@@ -8,12 +8,11 @@ from dataclasses import dataclass, fields, replace
 import torch
 
 from torchreg._checks import check_positive
-from torchreg.datasets.figures import Figure, Part, bending_figure
-from torchreg.datasets.solids import RoundCone, Vector
+from torchreg.datasets.figures import SIDES, Figure, Part, meshed_figure
+from torchreg.datasets.solids import RoundCone, Vector, ball
 
 # Angles of arms and legs from the trunk in the rest pose, so that they do not fuse with it; gaits undo them.
 REST_ARM, REST_LEG = math.radians(40), math.radians(5)
-SIDES = {"left": 1.0, "right": -1.0}
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ def _trunk(shape: Proportions, hip: float, waist: float) -> list[Part]:
     pelvis = (
         RoundCone((-hips, hip + 0.03, -0.01), (hips, hip + 0.03, -0.01), 0.1 * girth, 0.1 * girth),
         RoundCone((0, hip + 0.03, 0), (0, waist, 0), 0.1 * girth, 0.105 * girth),
-        *(_ball((s * 0.8 * hips, hip, -0.05), 0.08 * girth) for s in (-1, 1)),
+        *(ball((s * 0.8 * hips, hip, -0.05), 0.08 * girth) for s in (-1, 1)),
     )
     torso = (
         *(
@@ -107,7 +106,7 @@ def _trunk(shape: Proportions, hip: float, waist: float) -> list[Part]:
     size = shape.head
     face = (
         RoundCone((0, neck + 0.14 * size, 0), (0, neck + 0.19 * size, -0.005), 0.085 * size, 0.092 * size),
-        _ball((0, neck + 0.08 * size, 0.05 * size), 0.045 * size),
+        ball((0, neck + 0.08 * size, 0.05 * size), 0.045 * size),
         RoundCone((0, neck + 0.13 * size, 0.09 * size), (0, neck + 0.16 * size, 0.085 * size), 0.02, 0.015),
         RoundCone((0, neck - 0.02, -0.01), (0, neck + 0.1 * size, 0), 0.055, 0.052),
     )
@@ -150,16 +149,16 @@ def _leg(shape: Proportions, side: str, sign: float, hip: float) -> list[Part]:
         return sign * (start + reach * math.sin(REST_LEG)), hip - reach * math.cos(REST_LEG), forward
 
     ankle = along(0.85)
-    ball = (ankle[0] + sign * 0.02, 0.03, 0.12)
+    sole = (ankle[0] + sign * 0.02, 0.03, 0.12)
     thigh = (RoundCone(along(0.03), along(0.43), 0.088 * thick, 0.055 * thick),)
     shin = (
         RoundCone(along(0.43), along(0.85, -0.01), 0.055 * thick, 0.036 * thick),
         RoundCone(along(0.5, -0.02), along(0.6, -0.02), 0.045 * thick, 0.05 * thick),
     )
     foot = (
-        _ball((ankle[0], 0.042, -0.045), 0.042),
-        RoundCone((ankle[0], 0.055, -0.01), ball, 0.04, 0.03),
-        RoundCone(ball, (ball[0], 0.028, 0.17), 0.034, 0.025),
+        ball((ankle[0], 0.042, -0.045), 0.042),
+        RoundCone((ankle[0], 0.055, -0.01), sole, 0.04, 0.03),
+        RoundCone(sole, (sole[0], 0.028, 0.17), 0.034, 0.025),
     )
     return [
         Part(f"{side} thigh", "pelvis", along(0), thigh),
@@ -194,11 +193,11 @@ def _long_trunk(shape: Proportions, back: float, half: float) -> list[Part]:
     muzzle = (0.0, nape[1] - 0.11 * size, nape[2] + 0.21 * size)
     chest = (
         RoundCone((0, back - 0.03, 0.02), (0, back - 0.03, half), 0.145 * girth, 0.15 * girth),
-        _ball((0, back + 0.05, half - 0.05), 0.11 * girth),
+        ball((0, back + 0.05, half - 0.05), 0.11 * girth),
     )
     rump = (
         RoundCone((0, back - 0.01, -0.02), (0, back, -half), 0.135 * girth, 0.14 * girth),
-        *(_ball((s * 0.05, back - 0.02, -half), 0.12 * girth) for s in (-1, 1)),
+        *(ball((s * 0.05, back - 0.02, -half), 0.12 * girth) for s in (-1, 1)),
     )
     neck = (RoundCone((0, back + 0.05, half + 0.05), nape, 0.105 * girth, 0.065 * size),)
     crown = nape[1] + 0.06 * size
@@ -233,13 +232,9 @@ def _animal_leg(shape: Proportions, name: str, parent: str, top: Vector) -> list
     ]
 
 
-def _ball(center: Vector, radius: float) -> RoundCone:
-    return RoundCone(center, center, radius, radius)
-
-
 def _sized(parts: list[Part], size: float, spacing: float) -> Figure:
     """Return the figure of the parts, larger by ``size``."""
     # Seams of 1.5 cm, and skin that bends over 8 cm.
-    figure = bending_figure(parts, spacing=spacing, blend=0.015, softness=0.02)
+    figure = meshed_figure(parts, spacing=spacing, blend=0.015, softness=0.02)
     mesh = replace(figure.mesh, vertices=size * figure.mesh.vertices)
     return replace(figure, mesh=mesh, joints=size * figure.joints)
