@@ -36,11 +36,17 @@ UNTRACED = {
 }  # fmt: skip
 
 
+# Smoke tests of benchmarks, compilation, training and the papers' twins: .ci/nightly runs them.
+SLOW = {"benchmarks", "test_compiled_shapes.py", "test_matcher_training.py", "test_neural_init.py", "test_papers.py"}
+
+
 def pytest_collection_modifyitems(items):
-    """Leave coverage out of long runs."""
+    """Leave coverage out of long runs, and mark the slow ones."""
     for item in items:
-        if UNTRACED.intersection(item.path.relative_to(Path(__file__).parent).parts):
-            item.add_marker("no_cover")
+        parts = item.path.relative_to(Path(__file__).parent).parts
+        for marker, names in (("no_cover", UNTRACED), ("slow", SLOW)):
+            if names.intersection(parts):
+                item.add_marker(marker)
 
 
 def pytest_collection_finish():
