@@ -12,10 +12,8 @@ from torchreg.datasets.hand import faces_of
 from torchreg.geometry.upright import Direction
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.tracking.results import FrameResult
-from torchreg.viz.figures import SKIN_COLOR
-from torchreg.viz.result_scenes import inlier_paint
-from torchreg.viz.scene import Cloud, Layer, MovingMesh, Scene
-from torchreg.viz.tracking import PREDICTED_COLOR, frame_label
+from torchreg.viz.posed_scenes import frame_label, inlier_paint
+from torchreg.viz.scene import PREDICTED_COLOR, SKIN_COLOR, Cloud, Layer, MovingMesh, Scene
 from torchreg.viz.viser_nodes import as_bytes, as_floats
 from torchreg.viz.viser_server import page_url, point_camera, start_server, stop_server
 
