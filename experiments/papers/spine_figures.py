@@ -8,14 +8,12 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from torch import Tensor
 
 import torchreg as tr
-from torchreg.geometry.geodesics import GeodesicGraph
-from torchreg.viz.bone_colors import scale_colors
 from torchreg.viz.figures import draw_scene, scene_view
 from torchreg.viz.result_scenes import result_scene
 from torchreg.viz.scene import Scene
+from torchreg.viz.spines import tip_distance_paint
 
 from ..papers.pictures import (
     PANEL,
@@ -32,8 +30,6 @@ from ..tasks.spine import count_tips, make_sequence
 
 _GRAY = (0.8, 0.8, 0.8)
 _LEVELS = 100
-# Colors of geodesic distances from the tip to the farthest point.
-_DISTANCES = ((0.15, 0.25, 0.6), (0.2, 0.65, 0.7), (0.95, 0.9, 0.4), (0.85, 0.25, 0.15))
 
 
 def _configs() -> dict[str, tr.SpineConfig]:
@@ -58,24 +54,13 @@ def _scene_drawing(scene: Scene, frame: int = 0) -> Drawing:
     return lambda ax: draw_scene(replace(scene, title=""), frame, ax, view=view)
 
 
-def _distance_paint(mesh: tr.TriangleMesh, tip: Tensor, levels: int | None = None) -> Tensor:
-    """Return colors (V, 3) of the geodesic distance from a tip, or of its level sets, light and dark in turn."""
-    start = (mesh.vertices - tip.to(mesh.vertices)).norm(dim=-1).argmin()
-    share = GeodesicGraph.from_mesh(mesh).distances(start[None])[0].float()
-    share = share / share.max().clamp_min(torch.finfo(share.dtype).tiny)
-    if levels is None:
-        return scale_colors(share, _DISTANCES)
-    level = (share * levels).floor().clamp(max=levels - 1)
-    return torch.where(level % 2 == 0, 1.0, 0.55)[:, None] * scale_colors(level / levels, _DISTANCES)
-
-
 def _surface_steps(mesh: tr.TriangleMesh, skeleton: tr.Skeleton) -> list[tuple[str, Drawing]]:
     """Return the surface, the geodesic distance from a tip, and its level sets."""
     view, tip = square_view(mesh.vertices), skeleton.nodes[skeleton.tips[0]]
     return [
         ("surface", mesh_drawing(mesh, view, _GRAY)),
-        ("distance from a tip", mesh_drawing(mesh, view, _distance_paint(mesh, tip))),
-        ("level sets, every fourth", mesh_drawing(mesh, view, _distance_paint(mesh, tip, _LEVELS // 4))),
+        ("distance from a tip", mesh_drawing(mesh, view, tip_distance_paint(mesh, tip))),
+        ("level sets, every fourth", mesh_drawing(mesh, view, tip_distance_paint(mesh, tip, _LEVELS // 4))),
     ]
 
 

@@ -15,7 +15,7 @@ from torchreg.viz.bone_colors import bone_palette
 from torchreg.viz.figures import draw_scene, scene_view
 from torchreg.viz.plots import plot
 from torchreg.viz.result_scenes import result_scene
-from torchreg.viz.spines import draw_measurements, save_spine_movie, save_spine_pictures
+from torchreg.viz.spines import draw_measurements, save_spine_movie, save_spine_pictures, tip_distance_paint
 
 SPHERE = unit_sphere(2)
 
@@ -73,3 +73,15 @@ def test_a_single_skeleton_is_drawn_in_its_surface():
     ax = plot(Skeleton(ends, [[0, 1], [0, 2], [0, 3]], torch.ones(4)), SPHERE)
     assert [line.get_color() for line in ax.lines if len(line.get_xdata()) > 1] == bone_palette(3).tolist()
     assert len(ax.images) == 1
+
+
+def test_distances_from_a_tip_go_from_cold_to_warm_and_levels_alternate():
+    ball = unit_sphere(4)
+    order = ball.vertices[:, 2].argsort(descending=True)  # away from the tip
+    paint = tip_distance_paint(ball, torch.tensor([0.0, 0.0, 2.0]))[order]
+    assert paint[0, 2] > paint[0, 0]
+    assert paint[-1, 0] > paint[-1, 2]
+    striped = tip_distance_paint(ball, torch.tensor([0.0, 0.0, 2.0]), 6)[order]
+    assert len(striped.unique(dim=0)) == 6
+    brightness = [striped[int(share * (len(striped) - 1))].amax() for share in (0.02, 0.15, 0.37, 0.63, 0.85, 0.98)]
+    assert (torch.stack(brightness).diff().sign() == torch.tensor([-1, 1, -1, 1, -1])).all()

@@ -7,19 +7,41 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import torch
+from torch import Tensor
+
 from torchreg.errors import InputError
+from torchreg.geometry.geodesics import GeodesicGraph
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.visibility import View
 from torchreg.spines.measurements import SpineMeasurements
 from torchreg.spines.results import SpineSequence
 from torchreg.viz.animation import animate_scene
-from torchreg.viz.bone_colors import bone_palette
+from torchreg.viz.bone_colors import bone_palette, scale_colors
 from torchreg.viz.figures import draw_scene, new_figure, picture_size, save_picture, scene_view
 from torchreg.viz.result_scenes import result_scene
 from torchreg.viz.scene import Scene
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+# Colors of geodesic distances from the tip to the farthest point.
+_DISTANCES = ((0.15, 0.25, 0.6), (0.2, 0.65, 0.7), (0.95, 0.9, 0.4), (0.85, 0.25, 0.15))
+
+
+def tip_distance_paint(mesh: TriangleMesh, tip: Tensor, levels: int | None = None) -> Tensor:
+    """Return colors (V, 3) of the geodesic distance from the vertex nearest to a tip (3,), or of its level sets.
+
+    References: Brostow, Essa, Steedly and Kwatra 2004, figures 2 and 6.
+    """
+    start = (mesh.vertices - tip.to(mesh.vertices)).norm(dim=-1).argmin()
+    share = GeodesicGraph.from_mesh(mesh).distances(start[None])[0].float()
+    share = share / share.max().clamp_min(torch.finfo(share.dtype).tiny)
+    if levels is None:
+        return scale_colors(share, _DISTANCES)
+    level = (share * levels).floor().clamp(max=levels - 1)
+    return torch.where(level % 2 == 0, 1.0, 0.55)[:, None] * scale_colors(level / levels, _DISTANCES)
 
 
 def draw_measurements(measurements: SpineMeasurements) -> Figure:
