@@ -18,7 +18,7 @@ from torchreg.datasets.hand import faces_of, hand_motion, surface_skin
 from torchreg.datasets.scan_sequences import ScanPair, ScanSequence, jointed_toy, walking_animal, walking_figure
 from torchreg.datasets.toys import excavator, robot
 from torchreg.viz.bone_colors import error_colors
-from torchreg.viz.figures import draw_scene, save_picture
+from torchreg.viz.figures import save_scene
 from torchreg.viz.scan_gltf import save_grid_animation
 from torchreg.viz.scene import MovingMesh, Scene
 
@@ -217,6 +217,6 @@ def _artifacts(problem: Problem, faces: Tensor, found: tr.ScanRegistration, benc
     """Keep the model, and a picture of the moved source: blue where it is right, red from the bound of near on."""
     errors = (found.deformed - problem.truth).norm(dim=-1) / problem.diagonal
     shown = Scene("", (MovingMesh("errors", found.deformed, faces, error_colors(errors, NEAR)),))
-    save_picture(draw_scene(shown, size=PICTURE_PIXELS).figure, bench.file("errors.png"))
+    save_scene(bench.file("errors.png"), shown, size=PICTURE_PIXELS)
     save_grid_animation(bench.file("bones.glb"), found.model, problem.source.points, faces)
     return {"errors": "errors.png", "bones": "bones.glb"}

@@ -13,7 +13,7 @@ from torch import Tensor
 
 import torchreg as tr
 from torchreg.datasets.creatures import OCTOPUS, STARFISH, CreatureSequence, creature_sequence
-from torchreg.viz.figures import draw_scene, save_picture
+from torchreg.viz.figures import save_scene
 from torchreg.viz.result_scenes import result_scene
 from torchreg.viz.spine_gltf import save_spine_animation
 
@@ -147,6 +147,6 @@ def _peer_tips(mesh: tr.TriangleMesh) -> int:
 
 def _artifacts(sequence: Sequence, spine: tr.SpineSequence, bench: Bench) -> dict[str, str]:
     shown = result_scene(spine, data=sequence.meshes)
-    save_picture(draw_scene(shown, spine.reference, size=PICTURE_PIXELS).figure, bench.file("spine.png"))
+    save_scene(bench.file("spine.png"), shown, spine.reference, size=PICTURE_PIXELS)
     save_spine_animation(bench.file("spine.glb"), spine.model)
     return {"spine": "spine.png", "spine, moving": "spine.glb"}

@@ -147,6 +147,16 @@ def draw_scene(
     return ax
 
 
+def save_scene(
+    path: str | Path, scene: Scene, frame: int = 0, *, size: tuple[int, int] = (480, 480), view: View | None = None
+) -> Path:
+    """Return the path of a picture of a scene in one frame; see `draw_scene` and `save_picture`."""
+    shown = scene_view(scene, size=size) if view is None else view
+    figure, (ax,) = new_figure(*picture_size(shown))
+    draw_scene(scene, frame, ax, view=shown)
+    return save_picture(figure, path)
+
+
 def _draw_surface(ax: Axes, view: View, layer: MovingMesh | Meshes, frame: int) -> list[TriangleMesh]:
     """Draw a surface, and return it if it hides what is behind it; without a position it is not shown."""
     points = layer.points(frame).detach().cpu().double()

@@ -18,7 +18,7 @@ from torchreg.spines.measurements import SpineMeasurements
 from torchreg.spines.results import SpineSequence
 from torchreg.viz.animation import animate_scene
 from torchreg.viz.bone_colors import bone_palette, scale_colors
-from torchreg.viz.figures import draw_scene, new_figure, picture_size, save_picture, scene_view
+from torchreg.viz.figures import new_figure, save_scene, scene_view
 from torchreg.viz.result_scenes import result_scene
 from torchreg.viz.scene import Scene
 
@@ -91,9 +91,7 @@ def save_spine_pictures(
     Path(folder).mkdir(exist_ok=True)
     paths = []
     for number in range(len(meshes)):
-        figure, (ax,) = new_figure(*picture_size(shown))
-        draw_scene(scene, number, ax, view=shown)
-        paths.append(save_picture(figure, Path(folder) / f"frame_{number:04d}.png"))
+        paths.append(save_scene(Path(folder) / f"frame_{number:04d}.png", scene, number, view=shown))
         if on_frame is not None:
             on_frame(number + 1, len(meshes))
     return paths

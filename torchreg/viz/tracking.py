@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from torch import Tensor
 
@@ -16,12 +15,9 @@ from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.tracking.results import FrameResult, TrackResult
 from torchreg.viz.animation import animate_scene, check_animation_path
-from torchreg.viz.figures import draw_scene, save_picture, scene_view
+from torchreg.viz.figures import save_scene, scene_view
 from torchreg.viz.gltf import save_shape_animation
 from torchreg.viz.posed_scenes import coarse_skin, frame_label, frame_labels, near_surface, posed_scene
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 class FrameOverlays:
@@ -58,8 +54,7 @@ class FrameOverlays:
         # The margin keeps the view while the shape moves a little.
         if self._view is None or not _shows(self._view, scene.sample()):
             self._view = scene_view(scene, size=self._size, margin=0.2)
-        figure: Figure = draw_scene(scene, view=self._view).figure  # type: ignore[assignment]
-        return save_picture(figure, path)
+        return save_scene(path, scene, view=self._view)
 
 
 def animate_track(
