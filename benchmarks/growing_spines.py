@@ -21,7 +21,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -33,7 +33,8 @@ import torchreg as tr
 from experiments.made_up.plants import GrowingPlant, PlantForm, growing_plant
 from torchreg.geometry.cloud_surface import cloud_surface
 from torchreg.solvers.assignment import assign
-from torchreg.viz.strips import spine_strip
+from torchreg.viz.figures import draw_scene, new_figure, save_picture, scene_view
+from torchreg.viz.result_scenes import result_scene
 
 BAR, WITHIN, NEAR, STEPS = 0.95, 2, 0.06, (1, 2, 4)
 
@@ -124,7 +125,12 @@ def scanned(folder: Path, picture: Path | None) -> None:
     spine = tr.extract_spine(meshes, growing=True)
     print(f"scans: {', '.join(path.stem for path in paths)}\n{organ_table(spine)}")
     if picture is not None:
-        print(spine_strip(picture, spine, meshes, columns=len(meshes)))
+        scene, size = result_scene(spine, data=meshes), 300
+        view = scene_view(scene, size=(size, size))
+        figure, axes = new_figure(size * len(meshes), size, len(meshes))
+        for frame, ax in enumerate(axes):
+            draw_scene(replace(scene, title=f"frame {frame}"), frame, ax, view=view)
+        print(save_picture(figure, picture))
 
 
 def organ_table(spine: tr.SpineSequence) -> str:

@@ -6,6 +6,7 @@ With --data FOLDER, a folder with samba.npz and range_pairs, captured data are d
 import argparse
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,92 @@ from torchreg.datasets.creatures import creature_sequence
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.hand import make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.datasets.scan_sequences import jointed_toy
-from torchreg.viz.figures import bending_picture, watch
+from torchreg.viz.bone_colors import error_colors, weight_colors
+from torchreg.viz.figures import bending_picture, draw_scene, new_figure, save_picture, scene_view, watch
+from torchreg.viz.posed_scenes import posed_scene
+from torchreg.viz.result_scenes import result_scene
+from torchreg.viz.scene import MovingMesh, Scene
 from torchreg.viz.spines import save_spine_movie
-from torchreg.viz.strips import annealing_strip, convergence_figure, registration_strip, spine_strip
 
 HERE = Path(__file__).parent
+PANEL = 300  # pixels
+SOURCE, TARGET = (0.80, 0.78, 0.76), (0.55, 0.63, 0.75)
+
+
+def draw_row(path, panels, *, view=None, margin=0.0, unit="", largest=None):
+    """Draw scenes, each (caption, scene, frame), side by side; with ``largest``, a scale of errors on the right."""
+    if view is None:
+        view = watch(torch.cat([scene.sample() for _, scene, _ in panels]), up=panels[0][1].up, size=(PANEL, PANEL))
+    width, height = int((len(panels) + margin) * PANEL), int(PANEL / 0.91)
+    figure, _ = new_figure(width, height, 0)
+    for column, (caption, scene, frame) in enumerate(panels):
+        ax = figure.add_axes((column * PANEL / width, 0.09, PANEL / width, 0.91))
+        draw_scene(replace(scene, title=""), frame, ax, view=view)
+        figure.text((column + 0.5) * PANEL / width, 0.03, caption, ha="center", fontsize=10)
+    if largest is not None:
+        from matplotlib.cm import ScalarMappable
+        from matplotlib.colors import ListedColormap, Normalize
+
+        shades = error_colors(torch.linspace(0, 1, 256), 1.0).numpy()
+        scale = ScalarMappable(Normalize(0, largest), ListedColormap(shades))
+        figure.colorbar(scale, cax=ax.inset_axes((1.06, 0.1, 0.05, 0.8)), label=f"error{f', {unit}' if unit else ''}")
+    save_picture(figure, path)
+
+
+def annealing_row(path, shape, points, result, start, skin, columns=5):
+    """Draw the shape on the data as sigma shrinks, from the start to the end; figure 4 of the first paper."""
+    chosen = np.unique(np.linspace(0, len(result.history) - 1, columns - 1).round().astype(int))
+    steps = [("start", start)]
+    for record in (result.history[step] for step in chosen):
+        em = f"EM, sigma {1000 * float(record.sigma[0]):.1f} mm"
+        steps.append((em if record.stage == "em" else f"surface fit, step {record.step + 1}", record.pose[0]))
+    scenes = [posed_scene(shape, pose[None], [points], [result.inliers], skin=skin, up=result.up) for _, pose in steps]
+    draw_row(path, [(name, scene, 0) for (name, _), scene in zip(steps, scenes, strict=True)])
+
+
+def registration_row(path, result, target, *, errors=None, unit="", view=None):
+    """Draw source, target, and the moved source by bones and by error."""
+    known = (result.distances if errors is None else errors).detach().nan_to_num(0.0, 0.0).clamp(min=0)
+    largest = float(known.double().quantile(0.98)) or 1.0
+    moved = result.deformed.detach()
+    panels = [
+        ("source", MovingMesh("source", result.points, result.faces, SOURCE)),
+        ("target", MovingMesh("target", target.vertices, target.faces, TARGET)),
+        ("moved, by bones", MovingMesh("bones", moved, result.faces, weight_colors(result.weights).clamp(0, 1))),
+        ("moved, by error", MovingMesh("error", moved, result.faces, error_colors(known, largest))),
+    ]
+    row = [(name, Scene("", (layer,), up=result.up), 0) for name, layer in panels]
+    draw_row(path, row, view=view, margin=0.35, unit=unit, largest=largest)
+
+
+def spine_row(path, spine, meshes, *, columns=4, view=None):
+    """Draw a spine over time, limbs in constant colors and numbers."""
+    scene = result_scene(spine, data=meshes)
+    view = scene_view(scene, size=(PANEL, PANEL)) if view is None else view
+    chosen = np.unique(np.linspace(0, len(meshes) - 1, columns).round().astype(int))
+    draw_row(path, [(f"frame {number}", scene, number) for number in chosen.tolist()], view=view)
+
+
+def convergence_figure(path, curves, ylabel):
+    """Plot numbers over steps, a line for each name."""
+    from matplotlib.ticker import LogFormatter, MaxNLocator
+
+    figure, _ = new_figure(520, 320, 0)
+    figure.set_layout_engine("constrained")
+    ax = figure.add_subplot()
+    for name, values in curves.items():
+        line = np.where(np.asarray(values, dtype=float) > 0, values, np.nan)
+        if np.isfinite(line).any():
+            ax.plot(np.arange(1, len(line) + 1), line, marker="o", markersize=3, linewidth=1.4, label=name)
+    ax.set(xlabel="step", ylabel=ylabel, yscale="log")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    for setter in (ax.yaxis.set_major_formatter, ax.yaxis.set_minor_formatter):
+        setter(LogFormatter(labelOnlyBase=False, minor_thresholds=(2.0, 0.5)))
+    ax.grid(True, which="both", alpha=0.25)
+    ax.spines[["top", "right"]].set_visible(False)
+    if ax.lines:
+        ax.legend(frameon=False)
+    save_picture(figure, path)
 
 
 def draw_alignment(folder, smoke):
@@ -40,7 +122,7 @@ def draw_alignment(folder, smoke):
         )
     skin = None if smoke else surface_skin(hand)
     first = found["10 steps of sigma"]
-    annealing_strip(folder / "annealing.png", hand, cloud.points, first, start=start, skin=skin)
+    annealing_row(folder / "annealing.png", hand, cloud.points, first, start, skin)
     distance = {
         name: [1000 * float(r.sigma[0]) for r in result.history if r.stage == "em"] for name, result in found.items()
     }
@@ -56,7 +138,7 @@ def draw_registration(folder, smoke):
     found = tr.register(pair.source, pair.target, 6 if smoke else 10, 25 if smoke else 50)
     target = tr.TriangleMesh(pair.target.points, pair.target.faces)
     errors = 1000 * (found.deformed - pair.truth).norm(dim=-1)
-    registration_strip(folder / "registration.png", found, target, errors=errors, unit="mm")
+    registration_row(folder / "registration.png", found, target, errors=errors, unit="mm")
     curves = {"distance": [record.distance for record in found.history], "joints": [r.joint for r in found.history]}
     convergence_figure(folder / "registration_cost.png", curves, ylabel="squared shares of the diagonal")
     return f"median error {float(pair.error(found.deformed).median()):.2%} of the diagonal"
@@ -67,7 +149,7 @@ def draw_spine(folder, smoke):
     creature = creature_sequence(num_frames=3 if smoke else 16, resolution=48 if smoke else 96, seed=1)
     meshes = list(creature.meshes)
     spine = tr.extract_spine(meshes, workers=1)
-    spine_strip(folder / "spine.png", spine, meshes)
+    spine_row(folder / "spine.png", spine, meshes)
     save_spine_movie(folder / "spine.gif", spine, meshes, fps=8.0)
     same = sum(own == whole for own, whole in zip(spine.own_topologies, spine.topologies, strict=True))
     return f"{spine.num_tips} tips; {same} of {len(meshes)} frames have the tree by themselves"
@@ -88,12 +170,12 @@ def draw_captured(folder, data):
     )
     found = tr.register(source, target, 15, 60)
     mesh = tr.TriangleMesh(target.points, target.faces)
-    registration_strip(folder / "dancer.png", found, mesh, view=_upright(torch.cat([source.points, target.points])))
+    registration_row(folder / "dancer.png", found, mesh, view=_upright(torch.cat([source.points, target.points])))
     samba = np.load(data / "samba.npz")
     faces = torch.from_numpy(samba["faces"]).long()
     meshes = [tr.TriangleMesh(torch.from_numpy(vertices).float(), faces) for vertices in samba["vertices"][::6]]
     view = _upright(torch.cat([mesh.vertices for mesh in meshes]))
-    spine_strip(folder / "dancer_spine.png", tr.extract_spine(meshes), meshes, view=view)
+    spine_row(folder / "dancer_spine.png", tr.extract_spine(meshes), meshes, view=view)
     return f"median distance {float(found.distances.median() / source.diagonal):.2%} of the diagonal"
 
 

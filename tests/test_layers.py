@@ -206,9 +206,9 @@ def test_systems_are_entered_through_their_doors(path):
 @pytest.mark.parametrize(
     ("path", "source", "count"),
     [
-        ("viz/strips.py", "from torchreg.alignment.align import align, _frame", 1),
-        ("viz/strips.py", "from torchreg.spines import tips", 1),
-        ("viz/strips.py", "def f():\n    from torchreg.registration.dense.graph_fit import fit_graph", 1),
+        ("viz/plots.py", "from torchreg.alignment.align import align, _frame", 1),
+        ("viz/plots.py", "from torchreg.spines import tips", 1),
+        ("viz/plots.py", "def f():\n    from torchreg.registration.dense.graph_fit import fit_graph", 1),
         ("tracking/frame.py", "from torchreg.alignment.problem import AlignProblem, alignment_cost", 0),
         ("spines/tips.py", "from torchreg.spines.curves import anything", 0),
     ],

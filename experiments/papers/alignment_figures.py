@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -13,7 +13,8 @@ from torch import Tensor
 import torchreg as tr
 from torchreg.datasets.hand import HandCloud, make_hand_cloud, random_hand_pose, surface_skin
 from torchreg.datasets.sequences import hand_sequence
-from torchreg.viz.figures import bending_picture, draw_alignment, posed_mesh, watch
+from torchreg.viz.figures import bending_picture, draw_scene, scene_view
+from torchreg.viz.posed_scenes import posed_scene
 
 from ..papers.pictures import PANEL, Drawing, panels
 from ..registry import Bench, TrialOutcome
@@ -45,18 +46,17 @@ def _model_data_alignment(config: PaperTrial, bench: Bench) -> TrialOutcome:
     cloud = make_hand_cloud(
         hand, pose, num_points=600, outlier_ratio=0.3, camera=torch.zeros(3), skin=skin, generator=generator
     )
-    view = watch(posed_mesh(hand, pose, skin).vertices, size=(PANEL, PANEL))
-    unknown = torch.ones(len(cloud.points), dtype=torch.bool)
+    view = scene_view(posed_scene(hand, pose[None], skin=skin), size=(PANEL, PANEL))
 
-    def drawing(where: Tensor, inliers: Tensor | None) -> Drawing:
-        data = None if inliers is None else cloud.points
-        return lambda ax: draw_alignment(ax, hand, where, data, inliers, skin=skin, view=view, point_size=2.5)
+    def drawing(where: Tensor, data: Sequence[Tensor] = (), inliers: Tensor | None = None) -> Drawing:
+        scene = posed_scene(hand, where[None], data, None if inliers is None else [inliers], skin=skin)
+        return lambda ax: draw_scene(scene, ax=ax, view=view)
 
-    drawings = [("model, previous pose", drawing(start, None)), ("and the data", drawing(start, unknown))]
+    drawings = [("model, previous pose", drawing(start)), ("and the data", drawing(start, [cloud.points]))]
     metrics = {"start: fingertips, mm": _tips_mm(hand, start, pose)}
     for name, settings in _align_configs().items():
         found = tr.align(hand, cloud.points, start, config=settings)
-        drawings.append((f"aligned, {name}", drawing(found.pose, found.inliers)))
+        drawings.append((f"aligned, {name}", drawing(found.pose, [cloud.points], found.inliers)))
         metrics[f"{name}: fingertips, mm"] = _tips_mm(hand, found.pose, pose)
     return TrialOutcome(metrics, artifacts={"alignment": panels(bench.file("alignment.png"), drawings)})
 
@@ -140,8 +140,9 @@ def _tracked(hand: tr.Hand, clouds: list[HandCloud], settings: tr.TrackConfig) -
 
 
 def _frame(hand: tr.Hand, skin: tr.LinearBlendSkin, cloud: HandCloud, pose: Tensor) -> Drawing:
-    view = watch(posed_mesh(hand, cloud.pose, skin).vertices, size=(PANEL, PANEL))
-    return lambda ax: draw_alignment(ax, hand, pose, cloud.points, cloud.inliers, skin=skin, view=view, point_size=2.0)
+    view = scene_view(posed_scene(hand, cloud.pose[None], skin=skin), size=(PANEL, PANEL))
+    scene = posed_scene(hand, pose[None], [cloud.points], [cloud.inliers], skin=skin)
+    return lambda ax: draw_scene(scene, ax=ax, view=view)
 
 
 def _good(errors: Tensor, seen: Tensor) -> float:

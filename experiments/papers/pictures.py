@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 import torchreg as tr
-from torchreg.viz.figures import draw_mesh, new_figure, save_picture, watch
+from torchreg.viz.figures import draw_scene, new_figure, save_picture, watch
+from torchreg.viz.scene import MovingMesh, Scene
 
 PANEL = 260
 SOURCE, TARGET = (0.85, 0.45, 0.40), (0.45, 0.55, 0.85)
@@ -41,8 +41,8 @@ def square_view(points: Tensor) -> Any:
 
 def mesh_drawing(mesh: tr.TriangleMesh, view: Any, color: tuple[float, float, float] | Tensor) -> Drawing:
     """Return what draws a surface in one color, or in colors (V, 3)."""
-    paint = color if isinstance(color, Tensor) else torch.tensor(color).expand(mesh.num_vertices, 3)
-    return lambda ax: draw_mesh(ax, mesh, view, paint)
+    scene = Scene("", (MovingMesh("surface", mesh.vertices, mesh.faces, color),))
+    return lambda ax: draw_scene(scene, ax=ax, view=view)
 
 
 def line_plot(

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
 
 import torchreg as tr
-from torchreg.viz.spines import draw_spine_frame, draw_tip_distance, spine_view
+from torchreg.viz.figures import draw_scene, scene_view
+from torchreg.viz.result_scenes import result_scene
+from torchreg.viz.scene import Scene
+from torchreg.viz.spines import tip_distance_paint
 
 from ..papers.pictures import (
     PANEL,
@@ -26,8 +30,6 @@ from ..tasks.spine import count_tips, make_sequence
 
 _GRAY = (0.8, 0.8, 0.8)
 _LEVELS = 100
-# Samples along the limbs of a single skeleton.
-_SAMPLES = 48
 
 
 def _configs() -> dict[str, tr.SpineConfig]:
@@ -47,17 +49,9 @@ def _creatures(config: PaperTrial, creature: str = "starfish", touching: str = "
     return make_sequence(trial)
 
 
-def _skeleton_drawing(mesh: tr.TriangleMesh, skeleton: tr.Skeleton) -> Drawing:
-    view = spine_view([mesh], size=(PANEL, PANEL))
-    curves = skeleton.resample(_SAMPLES)[0]
-    return lambda ax: draw_spine_frame(ax, mesh, curves, len(skeleton.tips), view=view)
-
-
-def _spine_drawing(meshes: Sequence[tr.TriangleMesh], spine: tr.SpineSequence, frame: int) -> Drawing:
-    view = spine_view([meshes[frame]], size=(PANEL, PANEL))
-    return lambda ax: draw_spine_frame(
-        ax, meshes[frame], spine.curves[frame], spine.num_tips, view=view, transferred=~spine.own[frame]
-    )
+def _scene_drawing(scene: Scene, frame: int = 0) -> Drawing:
+    view = scene_view(scene, size=(PANEL, PANEL))
+    return lambda ax: draw_scene(replace(scene, title=""), frame, ax, view=view)
 
 
 def _surface_steps(mesh: tr.TriangleMesh, skeleton: tr.Skeleton) -> list[tuple[str, Drawing]]:
@@ -65,8 +59,8 @@ def _surface_steps(mesh: tr.TriangleMesh, skeleton: tr.Skeleton) -> list[tuple[s
     view, tip = square_view(mesh.vertices), skeleton.nodes[skeleton.tips[0]]
     return [
         ("surface", mesh_drawing(mesh, view, _GRAY)),
-        ("distance from a tip", lambda ax: draw_tip_distance(ax, mesh, tip, view=view)),
-        ("level sets, every fourth", lambda ax: draw_tip_distance(ax, mesh, tip, view=view, levels=_LEVELS // 4)),
+        ("distance from a tip", mesh_drawing(mesh, view, tip_distance_paint(mesh, tip))),
+        ("level sets, every fourth", mesh_drawing(mesh, view, tip_distance_paint(mesh, tip, _LEVELS // 4))),
     ]
 
 
@@ -75,11 +69,12 @@ def _subject_to_spine(config: PaperTrial, bench: Bench) -> TrialOutcome:
     meshes = _creatures(config, frames=8).meshes
     skeleton = tr.skeletonize(meshes[0])
     spine = tr.extract_spine(meshes, workers=1)
+    scene = result_scene(spine, data=meshes)
     drawings = [
         ("surface", mesh_drawing(meshes[0], square_view(meshes[0].vertices), _GRAY)),
-        ("skeleton", _skeleton_drawing(meshes[0], skeleton)),
-        ("spine, first frame", _spine_drawing(meshes, spine, 0)),
-        ("spine, last frame", _spine_drawing(meshes, spine, len(meshes) - 1)),
+        ("skeleton", _scene_drawing(result_scene(skeleton, data=[meshes[0]]))),
+        ("spine, first frame", _scene_drawing(scene)),
+        ("spine, last frame", _scene_drawing(scene, len(meshes) - 1)),
     ]
     return TrialOutcome({"tips": float(spine.num_tips)}, artifacts={"spine": panels(bench.file("spine.png"), drawings)})
 
@@ -89,7 +84,10 @@ def _steps(config: PaperTrial, bench: Bench) -> TrialOutcome:
     (mesh, *_) = _creatures(config, frames=1).meshes
     skeletons = {name: tr.skeletonize(mesh, settings.skeletons) for name, settings in _configs().items()}
     drawings = _surface_steps(mesh, skeletons["default"])
-    drawings += [(f"skeleton, {name}", _skeleton_drawing(mesh, skeleton)) for name, skeleton in skeletons.items()]
+    drawings += [
+        (f"skeleton, {name}", _scene_drawing(result_scene(skeleton, data=[mesh])))
+        for name, skeleton in skeletons.items()
+    ]
     metrics = {f"{name}: tips": float(len(skeleton.tips)) for name, skeleton in skeletons.items()}
     return TrialOutcome(metrics, artifacts={"steps": panels(bench.file("steps.png"), drawings)})
 
@@ -104,11 +102,12 @@ def _imposing(config: PaperTrial, bench: Bench) -> TrialOutcome:
         before = [
             (
                 f"alone, frame {frame}",
-                _skeleton_drawing(meshes[frame], tr.skeletonize(meshes[frame], settings.skeletons)),
+                _scene_drawing(result_scene(tr.skeletonize(meshes[frame], settings.skeletons), data=[meshes[frame]])),
             )
             for frame in chosen
         ]
-        after = [(f"spine, frame {frame}", _spine_drawing(meshes, spine, frame)) for frame in chosen]
+        scene = result_scene(spine, data=meshes)
+        after = [(f"spine, frame {frame}", _scene_drawing(scene, frame)) for frame in chosen]
         outcome.artifacts[name] = panels(bench.file(f"imposing_{number}.png"), before + after, rows=2)
         final = max(set(spine.topologies), key=spine.topologies.count)
         outcome.metrics |= {
@@ -130,7 +129,9 @@ def _subjects(config: PaperTrial, bench: Bench) -> TrialOutcome:
         (mesh, *_) = _creatures(config, creature, frames=1).meshes
         skeletons = {name: tr.skeletonize(mesh, settings.skeletons) for name, settings in _configs().items()}
         drawings = _surface_steps(mesh, skeletons["default"])
-        drawings += [(f"skeleton, {name}", _skeleton_drawing(mesh, one)) for name, one in skeletons.items()]
+        drawings += [
+            (f"skeleton, {name}", _scene_drawing(result_scene(one, data=[mesh]))) for name, one in skeletons.items()
+        ]
         outcome.artifacts[creature] = panels(bench.file(f"{creature}.png"), drawings)
         outcome.metrics |= {f"{creature}, {name}: tips": float(len(one.tips)) for name, one in skeletons.items()}
         outcome.metrics[f"{creature}: vertices"] = float(mesh.num_vertices)

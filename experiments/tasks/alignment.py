@@ -12,8 +12,9 @@ from torch import Tensor
 
 import torchreg as tr
 from torchreg.datasets.hand import HandCloud, make_hand_cloud, random_hand_pose, surface_skin
-from torchreg.viz.figures import draw_alignment, new_figure, save_picture, watch
+from torchreg.viz.figures import save_scene, watch
 from torchreg.viz.gltf import save_shape_animation
+from torchreg.viz.posed_scenes import posed_scene
 
 from ..library_settings import with_settings
 from ..registry import Bench, TrialOutcome
@@ -185,9 +186,8 @@ def _artifacts(hand: tr.Hand, scene: Scene, found: tr.AlignResult, bench: Bench)
     with torch.no_grad():
         points = torch.cat([skin(pose) for pose in (scene.start, scene.cloud.pose)])
     view = watch(points.cpu(), size=PICTURE_PIXELS)
-    figure, (ax,) = new_figure(*PICTURE_PIXELS)
-    draw_alignment(ax, hand, found.pose, scene.cloud.points, scene.cloud.inliers, skin=skin, view=view, point_size=3.0)
-    save_picture(figure, bench.file("alignment.png"))
+    shown = posed_scene(hand, found.pose[None], [scene.cloud.points], [scene.cloud.inliers], skin=skin)
+    save_scene(bench.file("alignment.png"), shown, view=view)
     every = torch.stack([scene.start, *(step.pose[0] for step in found.history), found.pose])
     save_shape_animation(bench.file("alignment.glb"), hand, every, fps=10.0, skin=skin)
     return {"alignment": "alignment.png", "alignment, step by step": "alignment.glb"}

@@ -18,8 +18,9 @@ from torchreg.datasets.hand import faces_of, hand_motion, surface_skin
 from torchreg.datasets.scan_sequences import ScanPair, ScanSequence, jointed_toy
 from torchreg.datasets.toys import robot
 from torchreg.viz.bone_colors import error_colors
-from torchreg.viz.figures import draw_mesh, new_figure, save_picture, watch
+from torchreg.viz.figures import save_scene
 from torchreg.viz.scan_gltf import save_grid_animation
+from torchreg.viz.scene import MovingMesh, Scene
 
 from ..errors import SkippedTrial
 from ..library_settings import with_settings
@@ -218,10 +219,7 @@ def _joint_gaps(found: tr.ScanRegistration, pair: ScanPair) -> list[float]:
 def _artifacts(problem: Problem, faces: Tensor, found: tr.ScanRegistration, bench: Bench) -> dict[str, str]:
     """Keep the model, and a picture of the moved source: blue where it is right, red from the bound of near on."""
     errors = (found.deformed - problem.truth).norm(dim=-1) / problem.diagonal
-    mesh = tr.TriangleMesh(found.deformed.cpu(), faces)
-    view = watch(mesh.vertices, size=PICTURE_PIXELS)
-    figure, (ax,) = new_figure(*PICTURE_PIXELS)
-    draw_mesh(ax, mesh, view, error_colors(errors, NEAR))
-    save_picture(figure, bench.file("errors.png"))
+    shown = Scene("", (MovingMesh("errors", found.deformed, faces, error_colors(errors, NEAR)),))
+    save_scene(bench.file("errors.png"), shown, size=PICTURE_PIXELS)
     save_grid_animation(bench.file("bones.glb"), found.model, problem.source.points, faces)
     return {"errors": "errors.png", "bones": "bones.glb"}

@@ -13,9 +13,9 @@ from torch import Tensor
 
 import torchreg as tr
 from torchreg.datasets.creatures import OCTOPUS, STARFISH, CreatureSequence, creature_sequence
-from torchreg.viz.figures import new_figure, save_picture
+from torchreg.viz.figures import save_scene
+from torchreg.viz.result_scenes import result_scene
 from torchreg.viz.spine_gltf import save_spine_animation
-from torchreg.viz.spines import draw_spine_frame, spine_view
 
 from ..errors import SkippedTrial
 from ..library_settings import with_settings
@@ -146,11 +146,7 @@ def _peer_tips(mesh: tr.TriangleMesh) -> int:
 
 
 def _artifacts(sequence: Sequence, spine: tr.SpineSequence, bench: Bench) -> dict[str, str]:
-    frame = spine.reference
-    view = spine_view([sequence.meshes[frame]], size=PICTURE_PIXELS)
-    figure, (ax,) = new_figure(*PICTURE_PIXELS)
-    curves, transferred = spine.curves[frame], ~spine.own[frame]
-    draw_spine_frame(ax, sequence.meshes[frame], curves, spine.num_tips, view=view, transferred=transferred)
-    save_picture(figure, bench.file("spine.png"))
+    shown = result_scene(spine, data=sequence.meshes)
+    save_scene(bench.file("spine.png"), shown, spine.reference, size=PICTURE_PIXELS)
     save_spine_animation(bench.file("spine.glb"), spine.model)
     return {"spine": "spine.png", "spine, moving": "spine.glb"}

@@ -6,27 +6,10 @@ import pytest
 import torch
 from PIL import Image
 
-from torchreg.datasets.hand import hand_motion, surface_skin
-from torchreg.datasets.sequences import range_clouds
 from torchreg.errors import InputError, MissingExtraError
-from torchreg.shapes.hand import Hand
-from torchreg.viz.animation import animate_alignment, save_animation
-
-
-@pytest.fixture(scope="module")
-def hand():
-    return Hand()
-
-
-@pytest.fixture(scope="module")
-def skin(hand):
-    return surface_skin(hand, spacing=0.007)
-
-
-@pytest.fixture(scope="module")
-def clouds(hand, skin):
-    poses = hand_motion(hand, "bend", 4, 5.0)
-    return range_clouds(hand, poses, skin=skin, num_points=200, camera=torch.zeros(3))
+from torchreg.geometry.mesh import unit_sphere
+from torchreg.viz.animation import animate_scene, save_animation
+from torchreg.viz.scene import MovingMesh, Scene
 
 
 def frames_of(path):
@@ -160,46 +143,18 @@ def test_mp4_needs_ffmpeg(tmp_path, monkeypatch):
         save_animation(tmp_path / "a.mp4", [plain(0)])
 
 
-def test_an_alignment_plays_in_a_small_file(hand, skin, clouds, tmp_path):
-    poses = torch.stack([cloud.pose for cloud in clouds])
-    path = animate_alignment(
-        tmp_path / "a.gif",
-        hand,
-        poses,
-        [cloud.points for cloud in clouds],
-        inliers=[cloud.inliers for cloud in clouds],
-        skin=skin,
-    )
-    assert path.stat().st_size / len(clouds) < 1.5e6 / 40
-    pictures, _ = frames_of(path)
-    assert [picture.shape for picture, _ in pictures] == [(360, 360, 3)] * 4
-    assert pictures[0][1] == 50
-    assert np.abs(pictures[0][0].astype(int) - pictures[2][0]).mean() > 1
-
-
-def test_a_coarse_surface_and_all_points_by_default(hand, clouds, tmp_path):
-    told = []
-    path = animate_alignment(
-        tmp_path / "a.gif",
-        hand,
-        clouds[0].pose[None],
-        [clouds[0].points],
-        camera=torch.tensor([0.1, -0.1, 0.0]),
-        size=(60, 50),
-        on_frame=lambda done, total: told.append((done, total)),
-    )
-    assert frames_of(path)[0][0][0].shape == (50, 60, 3)
-    assert told == [(1, 1)]
-
-
-def test_animate_alignment_refuses(hand, skin, clouds, tmp_path):
-    path, points = tmp_path / "a.gif", [clouds[0].points]
-    pose = hand.rest_pose()[None]
-    with pytest.raises(InputError, match=r"poses must have shape \(1, 27\), got \(2, 27\)"):
-        animate_alignment(path, hand, pose.expand(2, -1), points, skin=skin)
-    with pytest.raises(InputError, match=r"inliers must hold one mask per cloud \(1\), got 0"):
-        animate_alignment(path, hand, pose, points, inliers=[], skin=skin)
-    with pytest.raises(InputError, match="clouds must hold at least one cloud"):
-        animate_alignment(path, hand, pose[:0], [], skin=skin)
+def test_a_scene_plays_in_one_view(tmp_path):
+    ball, told = unit_sphere(1), []
+    moving = torch.stack([ball.vertices + torch.tensor([shift, 0, 0]) for shift in (0.0, 3.0, torch.nan)])
+    scene = Scene("", (MovingMesh("ball", moving, ball.faces, (1.0, 0.0, 0.0)),), captions=("0", "1", "2"))
+    path = animate_scene(tmp_path / "a.gif", scene, 10, size=(90, 60), on_frame=lambda *n: told.append(n))
+    pictures = [picture.astype(int) for picture, _ in frames_of(path)[0]]
+    assert [picture.shape for picture in pictures] == [(60, 90, 3)] * 3
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    red = [picture[..., 0] - picture[..., 1] > 60 for picture in pictures]
+    across, down = [np.nonzero(mask)[1].mean() for mask in red[:2]], [mask.sum() for mask in red]
+    assert abs(across[0] - across[1]) > 10
+    assert down[1] > 0.5 * down[0] > 0
+    assert down[2] == 0  # the shape was not found
     with pytest.raises(InputError, match="path must end in"):
-        animate_alignment(tmp_path / "a.avi", hand, pose, points, skin=skin)
+        animate_scene(tmp_path / "a.avi", scene)

@@ -10,8 +10,8 @@ from torchreg.errors import InputError
 from torchreg.result import Status
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.tracking.results import FrameResult
-from torchreg.viz.animation import coarse_skin
 from torchreg.viz.live_track import LiveTrack
+from torchreg.viz.posed_scenes import coarse_skin
 
 pytest.importorskip("viser", reason="the viewer needs viser")
 

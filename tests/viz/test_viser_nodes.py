@@ -22,7 +22,7 @@ def server():
 
 def test_every_layer_goes_from_frame_to_frame(server):
     moving = torch.stack([torch.full_like(BALL.vertices, torch.nan), BALL.vertices])
-    curves = torch.stack([torch.zeros(1, 3, 3), torch.ones(1, 3, 3)])
+    curves = torch.stack([torch.zeros(2, 3, 3), torch.arange(18.0).reshape(2, 3, 3)])
     clouds = [BALL.vertices[:0], BALL.vertices]
     scene = Scene(
         "all",
@@ -31,7 +31,7 @@ def test_every_layer_goes_from_frame_to_frame(server):
             MovingMesh("painted", BALL.vertices, BALL.faces, (BALL.vertices + 1) / 2),
             Meshes("meshes", [unit_sphere(0), BALL]),
             Cloud("cloud", clouds, [cloud.abs() for cloud in clouds]),
-            Curves("curves", curves, torch.ones(1, 3), labels=("tip",)),
+            Curves("curves", curves, torch.eye(3)[:2], labels=("tip",)),
             Cloud("hidden", [BALL.vertices], (1.0, 0.0, 0.0), visible=False),
         ),
     )
@@ -50,8 +50,9 @@ def test_every_layer_goes_from_frame_to_frame(server):
     ]  # fmt: skip
     np.testing.assert_array_equal(node("0/0").vertices, BALL.vertices)
     np.testing.assert_array_equal(node("3").points, BALL.vertices)
-    np.testing.assert_array_equal(node("4/lines").points, 1.0)
-    np.testing.assert_array_equal(node("4/label_0").position, 1.0)
+    pieces = torch.stack([curves[1, limb, [step, step + 1]] for limb in range(2) for step in range(2)])
+    np.testing.assert_array_equal(node("4/lines").points, pieces)
+    np.testing.assert_array_equal(node("4/label_0").position, curves[1, 0, 0])
     drawn.set_visible("plain", False)
     drawn.set_visible("hidden", True)
     assert not node("0/0").visible

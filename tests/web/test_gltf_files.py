@@ -19,9 +19,9 @@ from torchreg.io.gltf_morph import save_vertex_animation
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.spines.spine import Spine
-from torchreg.viz.animation import coarse_skin
 from torchreg.viz.gltf import save_shape_animation
 from torchreg.viz.pose_editor import PoseEditor
+from torchreg.viz.posed_scenes import coarse_skin
 from torchreg.viz.scan_gltf import save_grid_animation
 from torchreg.viz.spine_gltf import save_spine_animation
 

@@ -1,6 +1,6 @@
 """Articulated alignment: the pose of a shape in 3-D points.
 
-Besides the public names, other rooms may use `AlignRecord` and `label_frames`, and tracking, which builds on them,
+Besides the public names, other rooms may use `label_frames`, and tracking, which builds on them,
 
 - the problem: `AlignProblem`, `centered_problem`, `alignment_cost`, `GaussianPosePrior`;
 - the annealed EM: `anneal`, `outlier_level`;

@@ -325,13 +325,14 @@ class _AlignRun:
 
             save_points(files.ply, result.registered)
         if files.picture is not None:
-            from torchreg.viz.figures import draw_alignment, save_picture
+            from torchreg.viz.figures import save_scene
+            from torchreg.viz.posed_scenes import posed_scene
 
             shown = result.local(self.shape.rest)
             near = data if result.origin is None else (data - result.origin).to(self.shape.rest)
             shape, surface = self.fitted(result)
-            ax = draw_alignment(None, shape, shown.pose, near, result.inliers, skin=surface, up=self.up)
-            save_picture(ax.get_figure(), files.picture)  # type: ignore[arg-type]
+            scene = posed_scene(shape, shown.pose[None], [near], [result.inliers], skin=surface, up=self.up)
+            save_scene(files.picture, scene)
         if files.rig is not None:
             result.to_gltf(files.rig, self.source[0], skin=self.source[1])
         # The result is written last: if it exists, all others do.

@@ -179,7 +179,8 @@ def _draw_frames(
     import torch
 
     from torchreg.geometry.rotation import so3_log
-    from torchreg.viz.figures import draw_alignment, save_picture
+    from torchreg.viz.figures import save_scene
+    from torchreg.viz.posed_scenes import posed_scene
 
     base = found.T_camera_base
     vector = torch.cat([base[:3, 3], so3_log(base[None, :3, :3])[0]])
@@ -192,8 +193,7 @@ def _draw_frames(
             _draw_over(picture, frame, skin(pose), skin.faces)
         else:
             points = frame.points if hasattr(frame, "points") else frame
-            ax = draw_alignment(None, shape, pose, points.to(pose), skin=skin)
-            save_picture(ax.get_figure(), picture)  # type: ignore[arg-type]
+            save_scene(picture, posed_scene(shape, pose[None], [points.to(pose)], skin=skin))
 
 
 def _draw_over(picture: Path, frame: DepthFrame, vertices: Tensor, faces: Tensor) -> None:

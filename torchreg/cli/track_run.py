@@ -251,7 +251,7 @@ class TrackRun:
     @cached_property
     def surface(self) -> LinearBlendSkin:
         """What pictures show, meshed once."""
-        from torchreg.viz.animation import coarse_skin
+        from torchreg.viz.posed_scenes import coarse_skin
 
         return coarse_skin(self.tracker.shape)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -101,3 +102,13 @@ def _is_steadier(frames: Sequence[Tensor], lower: Tensor) -> bool:
     middle = torch.stack([points.mean(0) for points in frames])
     motion = lower.std(0) * middle.std(0)
     return bool(_RULE.steadier * motion[1] < motion[2])
+
+
+def from_front(up: Tensor, points: Tensor) -> Tensor:
+    """Return the direction (3,) to a camera in front of upright points (N, 3), the higher the flatter they lie."""
+    along_z = -1.0 if float(up[1]) < 0 else 1.0  # a camera's y points down, and it looks along z
+    front = up.new_tensor([0.0, -1.0, 0.0] if abs(float(up[2])) > 0.5 else [0.0, 0.0, along_z])
+    level = torch.nn.functional.normalize(0.6 * torch.linalg.cross(up, front) + front, dim=0)
+    height, width = (float((points.to(up) @ axis).std(correction=0)) for axis in (up, torch.linalg.cross(up, level)))
+    sine = min(max(0.4, 0.9 - height / max(width, 1e-9)), 0.8)  # of the elevation: 24 to 53 degrees
+    return math.sqrt(1 - sine**2) * level + sine * up

@@ -1,4 +1,4 @@
-"""Moving pictures of shapes that follow clouds, as animated GIF or MP4."""
+"""Moving pictures of scenes, as animated GIF or MP4."""
 
 from __future__ import annotations
 
@@ -7,29 +7,25 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchreg._checks import check_positive, check_shape
+from torchreg._checks import check_positive
 from torchreg.errors import InputError, MissingExtraError
-from torchreg.geometry.upright import Direction
 from torchreg.geometry.visibility import View
 from torchreg.io.atomic import write_atomic
-from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.skin import BendingSkin, LinearBlendSkin
-from torchreg.viz.figures import draw_alignment, new_figure, watch
+from torchreg.viz.figures import draw_scene, new_figure, picture_size, scene_view
+from torchreg.viz.scene import Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 ANIMATION_ENDINGS = (".gif", ".mp4")
-# Diameter of data points in moving pictures, points (1/72 inch).
-MOVIE_POINT_SIZE = 2.8
 
 Frame = Callable[["Axes"], object] | NDArray[Any] | Tensor
 
@@ -93,79 +89,38 @@ def save_animation(
     return path
 
 
-def animate_alignment(
+def animate_scene(
     path: str | Path,
-    shape: ArticulatedShape,
-    poses: Tensor,
-    clouds: Sequence[Tensor],
-    *,
-    inliers: Sequence[Tensor] | None = None,
+    scene: Scene,
     fps: float = 20.0,
-    skin: LinearBlendSkin | None = None,
-    camera: Tensor | None = None,
-    up: Tensor | None = None,
+    *,
+    view: View | None = None,
     size: tuple[int, int] = (360, 360),
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Return the path of a moving picture of a shape that follows clouds.
+    """Return the path of a moving picture of all frames of a scene, drawn as by `draw_scene`, in one view.
 
     Args:
         path: to write; see `save_animation`.
-        shape: the articulated shape.
-        poses: (T, num_dofs), one per frame.
-        clouds: T clouds (M, 3), metres.
-        inliers: T masks (M,) bool; all by default.
+        scene: to draw.
         fps: frames per second.
-        skin: the surface to draw, with faces; by default a coarse one.
-        camera: (3,) position in all frames, see `watch`.
-        up: (3,) see `watch`.
-        size: width and height, pixels.
+        view: camera and pixels; by default `scene_view`.
+        size: width and height, pixels, of the default view.
         on_frame: called with (frames done, all frames) after each.
 
     Raises:
-        InputError: if the numbers of poses, clouds and masks differ, or as for `save_animation`.
+        InputError: as for `save_animation`.
 
     Cost: about 0.1 s and 25 kB per frame.
     """
     path = check_animation_path(path)
-    poses = shape.check_pose(poses, "poses").detach()
-    check_shape(poses, "poses", (len(clouds), shape.num_dofs))
-    if inliers is not None and len(inliers) != len(clouds):
-        raise InputError(f"inliers must hold one mask per cloud ({len(clouds)}), got {len(inliers)}")
-    if not len(clouds):
-        raise InputError("clouds must hold at least one cloud, got none")
-    surface = coarse_skin(shape) if skin is None else skin
-    view = common_view(surface, poses, camera, up, size)
-
-    def draw(index: int) -> Callable[[Axes], object]:
-        mask = None if inliers is None else inliers[index]
-        return lambda ax: draw_alignment(
-            ax, shape, poses[index], clouds[index], mask, skin=surface, view=view, point_size=MOVIE_POINT_SIZE
-        )
-
-    return save_animation(path, [draw(index) for index in range(len(clouds))], fps, size=size, on_frame=on_frame)
+    shown = scene_view(scene, size=size, margin=0.1) if view is None else view
+    frames = [partial(_draw_frame, scene, number, shown) for number in range(scene.num_frames)]
+    return save_animation(path, frames, fps, size=picture_size(shown), on_frame=on_frame)
 
 
-def common_view(
-    skin: LinearBlendSkin,
-    poses: Tensor,
-    camera: Tensor | None = None,
-    up: Tensor | Direction | None = None,
-    size: tuple[int, int] = (360, 360),
-) -> View:
-    """Return the view that shows a surface in all poses (T, num_dofs); see `watch`."""
-    sample = poses[:: max(1, len(poses) // 32)]  # enough poses for the bounds
-    with torch.no_grad():
-        points = torch.cat([skin(pose) for pose in sample]).cpu()
-    return watch(points, camera=camera, up=up, size=size, margin=0.1)
-
-
-def coarse_skin(shape: ArticulatedShape) -> LinearBlendSkin:
-    """Return the surface of a shape: the mesh of its file, else a coarse one, fine enough for small pictures."""
-    if shape.surface is not None:
-        return shape.file_skin()
-    mesh = shape.coarse_surface_mesh()
-    return BendingSkin(shape, mesh.vertices, shape.rest_pose(), faces=mesh.faces)
+def _draw_frame(scene: Scene, number: int, view: View, ax: Axes) -> None:
+    draw_scene(scene, number, ax, view=view)
 
 
 def _picture(frame: Frame, size: tuple[int, int], index: int) -> NDArray[np.uint8]:

@@ -1,4 +1,4 @@
-"""Pictures of articulated shapes: shaded surfaces with the measured points."""
+"""Pictures of scenes: shaded surfaces with points and curves, and those of the README and of the paper."""
 
 from __future__ import annotations
 
@@ -10,131 +10,41 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from torchreg._checks import as_float_tensor, check_points, check_shape
-from torchreg.datasets.hand import faces_of, hand_motion, make_hand_cloud, surface_skin
+from torchreg._checks import as_float_tensor, check_points
+from torchreg.datasets.hand import hand_motion, make_hand_cloud, surface_skin
 from torchreg.errors import InputError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
-from torchreg.geometry.mesh import TriangleMesh, interpolate
+from torchreg.geometry.mesh import TriangleMesh, concatenate, interpolate
 from torchreg.geometry.rigid import rigid_matrix
-from torchreg.geometry.upright import Direction, guess_up, is_before_camera
-from torchreg.geometry.visibility import View, aim, rasterize, visible_points
+from torchreg.geometry.upright import Direction
+from torchreg.geometry.visibility import View, aim, visible_points
 from torchreg.io.atomic import write_atomic
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.shapes.primitives import Primitive
-from torchreg.shapes.skin import BendingSkin, LinearBlendSkin
+from torchreg.shapes.skin import BendingSkin
+from torchreg.viz.posed_scenes import posed_scene
+from torchreg.viz.rendering import OVERSAMPLING, render_mesh
+from torchreg.viz.scene import SKIN_COLOR, Cloud, Curves, Meshes, MovingMesh, Scene
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-SKIN_COLOR = (0.90, 0.76, 0.66)
-INLIER_COLOR = "#0b4f9e"
-OUTLIER_COLOR = "#8d8d8d"
-DATA_COLOR = "#157f6b"
-# Rendered pixels per pixel of a picture, each way: smooth outlines.
-_OVERSAMPLING = 2
-
 
 @dataclass(frozen=True)
-class _Shading:
-    """Light and material of rendered surfaces."""
+class _Marks:
+    """Points and curves in pictures."""
 
-    # Direction towards each light as (right, down, forward), and its strength: a main one from the upper left before
-    # the surface, and a weak one.
-    lights: tuple[tuple[tuple[float, float, float], float], ...] = (
-        ((-0.45, -0.65, -0.75), 0.66),
-        ((0.8, 0.1, -0.5), 0.20),
-    )
-    ambient: float = 0.42
-    shine: float = 0.12  # strength of the highlight of the main light
-    shine_power: int = 24  # the larger, the smaller the highlight
-    normal_passes: int = 2  # of averaging over neighbors: meshed fields have uneven triangles
-    crevice_radius: float = 0.02  # of the surroundings of a pixel, as a share of the picture
-    crevice_depth: float = 0.06  # behind its surroundings at which a pixel is darkest, as a share of all depths
-    blur_step: int = 4  # pixels that a wide blur needs as one
+    point: float = 1.7  # diameter of points, in those of pages
+    hidden: float = 0.2  # opacity of points behind a surface
+    behind: float = 0.02  # depth behind the surface from which they are, as a share of the diagonal of the scene
+    curve: float = 2.2  # width of curves, points (1/72 inch)
 
 
-_SHADING = _Shading()
-
-
-def render_mesh(mesh: TriangleMesh, view: View, paint: Tensor | None = None) -> Tensor:
-    """Return a shaded picture of a surface, with smooth normals, two lights and dark crevices.
-
-    Args:
-        mesh: a surface that faces outwards.
-        view: camera and rendered pixels, 2 x 2 for each pixel of the picture, see `watch`.
-        paint: (V, 3) colors in [0, 1], or (view.height, view.width, 3), one for every rendered pixel.
-
-    Returns:
-        Red, green, blue and opacity (view.height / 2, view.width / 2, 4) in [0, 1].
-    """
-    raster = rasterize(mesh, view, cull_back=True)
-    seen = raster.face_index >= 0
-    face, weights = raster.face_index[seen], raster.barycentric[seen].float()
-    normals = interpolate(_smooth_normals(mesh), mesh.faces, face, weights)
-    normals = nn.functional.normalize(normals @ view.rotation.float().to(normals.device).mT, dim=-1)
-    picture = torch.zeros(view.height, view.width, 4, device=normals.device)
-    color = _surface_color(mesh, paint, seen, face, weights)
-    shade, shine = _light(normals)
-    shade = shade * (1 - _crevices(raster.depth, seen)[seen].unsqueeze(-1))
-    picture[seen] = torch.cat([(color * shade + shine).clamp(0, 1), torch.ones_like(shade)], dim=-1)
-    # Colors are weighted by opacity, or the background's black would stain the outline.
-    planes = torch.cat([picture[..., :3] * picture[..., 3:], picture[..., 3:]], dim=-1).permute(2, 0, 1)
-    small = nn.functional.avg_pool2d(planes, _OVERSAMPLING).permute(1, 2, 0)
-    return torch.cat([small[..., :3] / small[..., 3:].clamp(min=1e-6), small[..., 3:]], dim=-1)
-
-
-def _smooth_normals(mesh: TriangleMesh) -> Tensor:
-    """Return vertex normals (V, 3) averaged with those of their neighbors."""
-    normals = mesh.vertex_normals("area").float()
-    for _ in range(_SHADING.normal_passes):
-        around = normals[mesh.faces].sum(1, keepdim=True).expand(-1, 3, -1)
-        total = torch.zeros_like(normals).index_add(0, mesh.faces.reshape(-1), around.reshape(-1, 3))
-        normals = nn.functional.normalize(total, dim=-1)
-    return normals
-
-
-def _surface_color(mesh: TriangleMesh, paint: Tensor | None, seen: Tensor, face: Tensor, weights: Tensor) -> Tensor:
-    """Return the colors (n, 3) of n seen pixels, before any light."""
-    if paint is None:
-        return weights.new_tensor(SKIN_COLOR)
-    paint = paint.to(weights)
-    return paint[seen] if paint.ndim == 3 else interpolate(paint, mesh.faces, face, weights)
-
-
-def _light(normals: Tensor) -> tuple[Tensor, Tensor]:
-    """Return brightness (n, 1) and highlight (n, 1) of unit normals in camera coordinates."""
-    shade = _SHADING.ambient * (1 - 0.25 * normals[:, 1:2])
-    for direction, strength in _SHADING.lights:
-        towards = nn.functional.normalize(normals.new_tensor(direction), dim=0)
-        shade = shade + strength * (normals @ towards).clamp(min=0).unsqueeze(-1)
-    main = nn.functional.normalize(normals.new_tensor(_SHADING.lights[0][0]), dim=0)
-    halfway = nn.functional.normalize(main + normals.new_tensor([0.0, 0.0, -1.0]), dim=0)
-    highlight = (normals @ halfway).clamp(min=0).pow(_SHADING.shine_power)
-    return shade, _SHADING.shine * highlight.unsqueeze(-1)
-
-
-def _crevices(depth: Tensor, seen: Tensor) -> Tensor:
-    """Return the darkening (H, W) of pixels that lie behind their surroundings, 0 to 0.5.
-
-    References: Luft, Colditz and Deussen 2006, unsharp masking of the depth buffer.
-    """
-    if not bool(seen.any()):
-        return torch.zeros(depth.shape, device=depth.device)
-    known = depth[seen]
-    height = torch.where(seen, (depth.nan_to_num(posinf=0.0) - known.min()) / (known.max() - known.min() + 1e-12), 0.0)
-    stack = torch.stack([height.float(), seen.float()]).unsqueeze(0)
-    # A blur this wide needs no full resolution.
-    coarse = nn.functional.avg_pool2d(stack, _SHADING.blur_step, ceil_mode=True)
-    radius = max(1, round(_SHADING.crevice_radius * max(depth.shape) / _SHADING.blur_step))
-    for _ in range(2):
-        coarse = nn.functional.avg_pool2d(coarse, 2 * radius + 1, stride=1, padding=radius)
-    blurred = nn.functional.interpolate(coarse, size=depth.shape, mode="bilinear")[0]
-    around = blurred[0] / blurred[1].clamp(min=1e-6)
-    return ((height.float() - around) / _SHADING.crevice_depth).clamp(0, 1) * 0.5
+_MARKS = _Marks()
 
 
 def watch(
@@ -149,9 +59,7 @@ def watch(
 
     Args:
         points: (N, 3), metres.
-        camera: (3,) position. By default, points away from the origin are taken for measurements of a camera at the
-            origin that looks along +z with -y up, and are viewed from a little right of and above it; other points
-            from before and above.
+        camera: (3,) position; by default that of `Scene.camera`.
         up: (3,) upright direction; by default as `geometry.upright.guess_up` tells it, or -y when a camera is given.
         size: width and height of the picture, pixels.
         margin: on each side, as a share of the picture.
@@ -159,34 +67,24 @@ def watch(
     Returns:
         The view, with the pixels that `render_mesh` averages.
     """
-    points = as_float_tensor(points, "points").detach().double()
+    points = as_float_tensor(points, "points").detach().double().cpu()
     check_points(points, "points", batch=False)
     upright = None if up is None else as_float_tensor(up, "up", like=points)
     if camera is None:
-        lower, upper = points.amin(0), points.amax(0)
-        middle, length = (lower + upper) / 2, float((upper - lower).norm().clamp(min=1e-6))
-        if is_before_camera(lower, upper):
-            away = float(middle.norm())
-            camera = points.new_tensor([0.35 * away, -0.25 * away, 0.0])
-        else:
-            upright = points.new_tensor(guess_up([points])) if upright is None else upright
-            camera = middle + 3 * length * _from_before(upright, points)
+        axis = None if upright is None else (float(upright[0]), float(upright[1]), float(upright[2]))
+        camera, _, upright = Scene("points", (Cloud("points", [points], SKIN_COLOR),), up=axis).camera()
     width, height = size
-    return aim(points, camera, up=upright, size=(_OVERSAMPLING * width, _OVERSAMPLING * height), margin=margin)
+    return aim(points, camera, up=upright, size=(OVERSAMPLING * width, OVERSAMPLING * height), margin=margin)
 
 
-def _from_before(up: Tensor, points: Tensor) -> Tensor:
-    """Return the direction (3,) from which upright points (N, 3) are seen: from before, a little right and above.
-
-    The less they spread along up, beside their width, the further above.
-    """
-    along_z = -1.0 if float(up[1]) < 0 else 1.0  # a camera's y points down, and it looks along z
-    front = up.new_tensor([0.0, -1.0, 0.0] if abs(float(up[2])) > 0.5 else [0.0, 0.0, along_z])
-    right = torch.linalg.cross(up, front)
-    level = nn.functional.normalize(0.6 * right + front, dim=0)
-    height, width = (float((points @ axis).std()) for axis in (up, torch.linalg.cross(up, level)))
-    sine = min(max(0.4, 0.9 - height / max(width, 1e-9)), 0.8)  # of the elevation: 24 to 53 degrees
-    return math.sqrt(1 - sine**2) * level + sine * up
+def scene_view(
+    scene: Scene, *, camera: Tensor | None = None, size: tuple[int, int] = (480, 480), margin: float = 0.08
+) -> View:
+    """Return the view that shows all frames of a scene, from its own camera by default; see `watch`."""
+    if camera is not None:
+        return watch(scene.sample(), camera=camera, up=scene.up, size=size, margin=margin)
+    camera, _, up = scene.camera()
+    return watch(scene.sample(), camera=camera, up=up, size=size, margin=margin)
 
 
 def new_figure(width: int, height: int, columns: int = 1) -> tuple[Figure, list[Axes]]:
@@ -203,19 +101,6 @@ def new_figure(width: int, height: int, columns: int = 1) -> tuple[Figure, list[
     return figure, axes
 
 
-def draw_mesh(ax: Axes, mesh: TriangleMesh, view: View, paint: Tensor | None = None) -> None:
-    """Draw a shaded picture of a mesh on axes whose coordinates become the view's pixels."""
-    draw_rendered(ax, render_mesh(mesh, view, paint), view)
-
-
-def draw_rendered(ax: Axes, picture: Tensor, view: View) -> None:
-    """Draw a picture of `render_mesh` on axes whose coordinates become the view's pixels."""
-    ax.imshow(picture.cpu().numpy(), extent=(0, view.width, view.height, 0), interpolation="antialiased", zorder=1)
-    show_pixels(ax, view)
-    ax.set_aspect("equal")
-    ax.set_axis_off()
-
-
 def show_pixels(ax: Axes, view: View) -> None:
     """Make the coordinates of axes the view's pixels."""
     ax.set_xlim(0, view.width)
@@ -224,96 +109,108 @@ def show_pixels(ax: Axes, view: View) -> None:
 
 def picture_size(view: View) -> tuple[int, int]:
     """Return width and height of the picture of a view, pixels."""
-    return view.width // _OVERSAMPLING, view.height // _OVERSAMPLING
+    return view.width // OVERSAMPLING, view.height // OVERSAMPLING
 
 
-def draw_alignment(
-    ax: Axes | None,
-    shape: ArticulatedShape,
-    pose: Tensor,
-    data: Tensor | None = None,
-    inliers: Tensor | None = None,
-    *,
-    skin: LinearBlendSkin | None = None,
+def draw_scene(
+    scene: Scene, frame: int = 0, ax: Axes | None = None, *, size: tuple[int, int] = (480, 480),
     view: View | None = None,
-    up: Direction | None = None,
-    point_size: float = 5.0,
-) -> Axes:
-    """Return axes with a shaded picture of a shape in a pose and of the data.
-
-    Inliers are blue, outliers gray, other data green; hidden inliers and data are pale, hidden outliers omitted.
+) -> Axes:  # fmt: skip
+    """Return axes with a picture of the visible layers of a scene in one frame; points behind surfaces are pale.
 
     Args:
-        ax: to draw on; None makes a new figure, ``ax.figure``.
-        shape: the articulated shape.
-        pose: (num_dofs,).
-        data: (M, 3) measured points, metres.
-        inliers: (M,) bool; unknown by default.
-        skin: the surface to draw, with faces; by default `surface_skin`, which is made anew at every call.
-        view: camera and pixels, see `watch`; by default of shape and inliers.
-        up: the upright direction of the default view, see `watch`.
-        point_size: diameter of a data point, points (1/72 inch).
-
-    Raises:
-        InputError: if sizes do not fit or the skin has no faces.
+        scene: to draw.
+        frame: number of the frame.
+        ax: to draw on; its coordinates become the view's pixels. By default axes of a new figure, ``ax.figure``.
+        size: width and height, pixels, of the default view.
+        view: camera and pixels; by default `scene_view`, which shows all frames.
     """
-    mesh = posed_mesh(shape, pose, skin)
-    color = DATA_COLOR if inliers is None else INLIER_COLOR
-    data, inliers = _checked_data(mesh, data, inliers)
-    view = watch(torch.cat([mesh.vertices, data[inliers]]), up=up) if view is None else view
+    view = scene_view(scene, size=size) if view is None else view
     if ax is None:
         ax = new_figure(*picture_size(view))[1][0]
-    draw_mesh(ax, mesh, view)
-    draw_points(ax, mesh, view, data, inliers, tolerance=2 * shape.nu, point_size=point_size, color=color)
+    ax.set_axis_off()
+    layers = [layer for layer in scene.layers if layer.visible]
+    solid: list[TriangleMesh] = []
+    for layer in layers:
+        if isinstance(layer, (MovingMesh, Meshes)):
+            solid += _draw_surface(ax, view, layer, frame)
+    for layer in layers:
+        if isinstance(layer, Cloud):
+            _draw_cloud(ax, view, layer, frame, solid, _MARKS.behind * scene.diagonal)
+        elif isinstance(layer, Curves):
+            _draw_curves(ax, view, layer, frame)
+    show_pixels(ax, view)
+    ax.set_aspect("equal")
+    ax.set_title(scene.title, fontsize=9, y=0.95)
+    if scene.captions:
+        ax.text(0.02, 0.02, scene.captions[frame], transform=ax.transAxes, fontsize=9.0, color="#444444", va="bottom")
     return ax
 
 
-def posed_mesh(shape: ArticulatedShape, pose: Tensor, skin: LinearBlendSkin | None = None) -> TriangleMesh:
-    """Return the surface of a shape in a pose (num_dofs,), moved by ``skin`` or by a new `surface_skin`, on the CPU."""
-    skin = surface_skin(shape) if skin is None else skin
-    faces = faces_of(skin)
-    pose = shape.check_pose(pose)
-    check_shape(pose, "pose", (shape.num_dofs,))
-    with torch.no_grad():
-        return TriangleMesh(skin(pose).detach().cpu(), faces.cpu())
+def save_scene(
+    path: str | Path, scene: Scene, frame: int = 0, *, size: tuple[int, int] = (480, 480), view: View | None = None
+) -> Path:
+    """Return the path of a picture of a scene in one frame; see `draw_scene` and `save_picture`."""
+    shown = scene_view(scene, size=size) if view is None else view
+    figure, (ax,) = new_figure(*picture_size(shown))
+    draw_scene(scene, frame, ax, view=shown)
+    return save_picture(figure, path)
 
 
-def _checked_data(mesh: TriangleMesh, data: Tensor | None, inliers: Tensor | None) -> tuple[Tensor, Tensor]:
-    data = mesh.vertices.new_zeros(0, 3) if data is None else as_float_tensor(data, "data", like=mesh.vertices).detach()
-    check_points(data, "data", min_count=0, batch=False)
-    inliers = torch.ones(len(data), dtype=torch.bool) if inliers is None else torch.as_tensor(inliers).cpu()
-    check_shape(inliers, "inliers", (len(data),))
-    if inliers.dtype != torch.bool:
-        raise InputError(f"inliers must be bool, got {inliers.dtype}; compare with a threshold first")
-    return data, inliers
+def _draw_surface(ax: Axes, view: View, layer: MovingMesh | Meshes, frame: int) -> list[TriangleMesh]:
+    """Draw a surface, and return it if it hides what is behind it; without a position it is not shown."""
+    points = layer.points(frame).detach().cpu().double()
+    faces = layer.faces if isinstance(layer, MovingMesh) else layer.frames[frame if layer.num_frames > 1 else 0].faces
+    if not len(faces) or not bool(points.isfinite().all()):
+        return []
+    mesh = TriangleMesh(points, faces.cpu())
+    paint = layer.paint if isinstance(layer, MovingMesh) else layer.color
+    picture = render_mesh(mesh, view, paint)
+    picture[..., 3] *= layer.opacity
+    _show(ax, picture, view)
+    return [mesh] if layer.opacity >= 1 else []
 
 
-def draw_points(
-    ax: Axes,
-    mesh: TriangleMesh,
-    view: View,
-    data: Tensor,
-    inliers: Tensor,
-    *,
-    tolerance: float | None = None,
-    point_size: float = 5.0,
-    color: str = INLIER_COLOR,
+def _show(ax: Axes, picture: Tensor, view: View) -> None:
+    """Draw a picture of `render_mesh` on axes whose coordinates become the view's pixels."""
+    ax.imshow(picture.cpu().numpy(), extent=(0, view.width, view.height, 0), interpolation="antialiased", zorder=1)
+    show_pixels(ax, view)
+    ax.set_axis_off()
+    ax.set_aspect("equal")
+
+
+def _draw_cloud(
+    ax: Axes, view: View, layer: Cloud, frame: int, solid: Sequence[TriangleMesh], tolerance: float
 ) -> None:
-    """Draw data points (M, 3) on axes with the view's pixels as coordinates; see `draw_alignment`."""
-    if not len(data):
-        return
-    pixels, _ = view.project(data)
-    seen = torch.ones_like(inliers)
-    if not view.parallel:
-        seen = visible_points(mesh, data, view.position, tolerance=tolerance)
-    for chosen, paint, alpha, scale in (
-        (~inliers & seen, OUTLIER_COLOR, 0.9, 0.6),
-        (inliers & ~seen, color, 0.22, 0.8),
-        (inliers & seen, color, 1.0, 1.0),
-    ):
-        if bool(chosen.any()):
-            x, y = pixels[chosen].numpy().T
-            ax.scatter(x, y, s=(scale * point_size) ** 2, c=paint, alpha=alpha, linewidths=0, zorder=2)
+    points, paint = layer.points(frame).detach().cpu().double(), layer.paint(frame)
+    pixels, depth = view.project(points)
+    opacity = torch.ones(len(points), 1)
+    if solid and len(points) and not view.parallel:
+        seen = visible_points(concatenate(solid), points, view.position, tolerance=tolerance)
+        opacity[~seen] = _MARKS.hidden
+    order = opacity[:, 0].argsort(stable=True)  # what is in front is drawn last
+    order = order[depth[order] > 0]
+    size = max(1.5, 72 * _MARKS.point * layer.size * min(picture_size(view)) / ax.figure.dpi)
+    scale = torch.where(opacity < 1, 0.6, 1.0)[order, 0]  # what is hidden is smaller
+    x, y = pixels[order].mT.numpy()
+    ax.scatter(
+        x, y, s=(size * scale).square().numpy(), c=torch.cat([paint, opacity], 1)[order].numpy(), linewidths=0, zorder=2
+    )
+
+
+def _draw_curves(ax: Axes, view: View, layer: Curves, frame: int) -> None:
+    curves = layer.points(frame).detach().cpu()
+    for number, (curve, color) in enumerate(zip(curves, layer.paint.tolist(), strict=True)):
+        if not bool(curve.isfinite().all()) or bool((curve == curve[0]).all()):
+            continue  # an organ that is not there
+        x, y = view.project(curve)[0].mT.numpy()
+        dashed = layer.dashed is not None and bool(layer.dashed[frame, number])
+        ax.plot(x, y, "--" if dashed else "-", color=color, linewidth=_MARKS.curve, zorder=3)
+        if number < len(layer.labels):
+            ax.plot(x[:1], y[:1], "o", color=color, markersize=6, zorder=4)
+            ax.annotate(
+                layer.labels[number], (x[0], y[0]), xytext=(4, -4), textcoords="offset points", fontsize=7, zorder=5
+            )
 
 
 def save_picture(figure: Figure, path: str | Path, *, dpi: float | None = None) -> Path:
@@ -371,10 +268,13 @@ def draw_bending(ax: Axes, sharpness: float, *, size: tuple[int, int] = (400, 40
     skin = BendingSkin(finger, mesh.vertices, sharpness=sharpness, faces=mesh.faces)
     pose = finger.rest_pose()
     pose[6:] = math.radians(80.0)
-    bent = posed_mesh(finger, pose, skin)
+    bent = TriangleMesh(skin(pose).detach(), mesh.faces)
     camera = bent.vertices.new_tensor([0.40, 0.12, 0.09])
     view = watch(bent.vertices, camera=camera, up=camera.new_tensor([0.0, 1.0, 0.0]), size=size, margin=0.05)
-    draw_mesh(ax, bent, view, _checkers(mesh, bent, view))
+    picture = render_mesh(
+        bent, view, lambda face, share: _checkers(interpolate(mesh.vertices, mesh.faces, face, share))
+    )
+    _show(ax, picture, view)
 
 
 def readme_picture(path: str | Path) -> Path:
@@ -390,10 +290,10 @@ def readme_picture(path: str | Path) -> Path:
     start[6:] = hand.rest_pose()[6:]
     result = align(hand, cloud.points, start)
     figure, _ = new_figure(1200, 400)
-    view = watch(torch.cat([skin(truth), skin(start)]).detach(), size=(420, 350), margin=0.07)
-    before, after = (figure.add_axes((0.35 * number, 0.125, 0.35, 0.875)) for number in range(2))
-    draw_alignment(before, hand, start, cloud.points, skin=skin, view=view, point_size=3.5)
-    draw_alignment(after, hand, result.pose, cloud.points, result.inliers, skin=skin, view=view, point_size=3.5)
+    view = watch(torch.cat([skin(truth), skin(start)]).detach(), size=(420, 350), margin=0.12)
+    for number, (pose, inliers) in enumerate(((start, None), (result.pose, [result.inliers]))):
+        ax = figure.add_axes((0.35 * number, 0.125, 0.35, 0.875))
+        draw_scene(posed_scene(hand, pose[None], [cloud.points], inliers, skin=skin), ax=ax, view=view)
     for number, sharpness in enumerate((2.0, 10.0)):
         ax = figure.add_axes((0.73, 0.57 - 0.445 * number, 0.26, 0.42))
         draw_bending(ax, sharpness, size=(312, 168))
@@ -417,15 +317,9 @@ def _finger() -> ArticulatedShape:
     return ArticulatedShape(KinematicTree(tuple(joints)), ["phalanx_0", "phalanx_1"], primitives, nu=0.005)
 
 
-def _checkers(rest: TriangleMesh, bent: TriangleMesh, view: View) -> Tensor:
-    """Return colors (height, width, 3) of a checkered pattern that moves with the mesh."""
-    raster = rasterize(bent, view, cull_back=True)
-    seen = raster.face_index >= 0
-    points = interpolate(rest.vertices, rest.faces, raster.face_index[seen], raster.barycentric[seen].float())
-    x, y, z = points.unbind(-1)
-    row = (z / 0.0026).floor().long()
-    column = (torch.atan2(x, y) / (math.pi / 9)).floor().long()
-    dark = (row + column) % 2 == 0
-    paint = torch.ones(view.height, view.width, 3)
-    paint[seen] = torch.where(dark.unsqueeze(-1), torch.tensor([0.20, 0.36, 0.58]), torch.tensor([0.97, 0.95, 0.90]))
-    return paint
+def _checkers(rest: Tensor) -> Tensor:
+    """Return colors (V, 3) of a checkered pattern on points at rest."""
+    x, y, z = rest.unbind(-1)
+    row, column = (z / 0.0026).floor(), (torch.atan2(x, y) / (math.pi / 9)).floor()
+    dark = ((row + column) % 2 == 0).unsqueeze(-1)
+    return torch.where(dark, torch.tensor([0.20, 0.36, 0.58]), torch.tensor([0.97, 0.95, 0.90]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,18 +11,16 @@ from torchreg.datasets.hand import faces_of
 from torchreg.geometry.upright import Direction
 from torchreg.shapes.skin import LinearBlendSkin
 from torchreg.tracking.results import FrameResult
-from torchreg.viz.figures import SKIN_COLOR
-from torchreg.viz.result_scenes import inlier_paint
-from torchreg.viz.scene import Cloud, Layer, MovingMesh, Scene
-from torchreg.viz.tracking import PREDICTED_COLOR, frame_label
+from torchreg.viz.posed_scenes import frame_label, inlier_paint
+from torchreg.viz.scene import PREDICTED_COLOR, SKIN_COLOR, Cloud, Layer, MovingMesh, Scene
 from torchreg.viz.viser_nodes import as_bytes, as_floats
-from torchreg.viz.viser_server import page_url, point_camera, start_server, stop_server
+from torchreg.viz.viser_server import Page, point_camera
 
 if TYPE_CHECKING:
     import viser
 
 
-class LiveTrack:
+class LiveTrack(Page):
     """A page that shows the last frame of a tracker; usable in a ``with`` statement, at whose end the server stops.
 
     Args:
@@ -34,15 +31,10 @@ class LiveTrack:
 
     def __init__(self, skin: LinearBlendSkin, *, port: int = 8080, up: Direction | None = None) -> None:
         self._skin, self._faces, self._up = skin, faces_of(skin).cpu(), up
-        self.server = start_server("torchreg track", port)
+        super().__init__("torchreg track", port)
         self._label = self.server.gui.add_markdown("waiting for the first frame")
         self._surface: viser.MeshHandle | None = None
         self._cloud: viser.PointCloudHandle | None = None
-
-    @property
-    def url(self) -> str:
-        """Address for a browser on this machine."""
-        return page_url(self.server)
 
     def show(self, points: Tensor, frame: FrameResult) -> None:
         """Show a frame: the data (M, 3) and the tracker's result for them.
@@ -65,18 +57,6 @@ class LiveTrack:
             if self._cloud is not None:
                 self._cloud.points, self._cloud.colors = as_floats(data), as_bytes(paint)
         self._label.content = frame_label(frame.frame, frame.statuses[0], frame.acquired)
-
-    def close(self) -> None:
-        """Stop the server."""
-        stop_server(self.server)
-
-    def __enter__(self) -> LiveTrack:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def _begin(self, data: Tensor, paint: Tensor, vertices: Tensor | None) -> None:
         """Draw the first frame that is not empty, and point the camera at it."""

@@ -6,7 +6,6 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from torchreg.viz.picking import pick_vertex
 from torchreg.viz.pose_editor import PoseEditor
 from torchreg.viz.scene import Cloud, MovingMesh, Scene
 from torchreg.viz.viser_nodes import as_floats, draw_patches
-from torchreg.viz.viser_server import page_url, point_camera, start_server, stop_server
+from torchreg.viz.viser_server import Page, point_camera
 
 if TYPE_CHECKING:
     import viser
@@ -45,7 +44,7 @@ class _PageStyle:
 _STYLE = _PageStyle()
 
 
-class PoseApp:
+class PoseApp(Page):
     """A page on which a registered scan is posed; usable in a ``with`` statement, at whose end the server stops.
 
     Dragging only stores the newest target: one thread solves, from the previous pose, and moves the shape, so that no
@@ -66,7 +65,7 @@ class PoseApp:
     ) -> None:
         self.editor = editor
         self._output = Path(output)
-        self.server = start_server("torchreg pose", port)
+        super().__init__("torchreg pose", port)
         self._lock = threading.RLock()
         self._gizmos: list[viser.TransformControlsHandle] = []
         self._balls: list[viser.IcosphereHandle] = []
@@ -79,11 +78,6 @@ class PoseApp:
         self._refresh()
 
     @property
-    def url(self) -> str:
-        """Address for a browser on this machine."""
-        return page_url(self.server)
-
-    @property
     def selected(self) -> int:
         """Number of the handle that the buttons act on, -1 without one."""
         return self._selected
@@ -93,15 +87,7 @@ class PoseApp:
         self._stopped.set()
         self._playing.clear()
         self.worker.close()
-        stop_server(self.server)
-
-    def __enter__(self) -> PoseApp:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+        super().close()
 
     def pick(self, origin: Tensor, direction: Tensor) -> int | None:
         """Make the point that a ray points at a handle and return its number; None if there is no such point."""

@@ -12,22 +12,22 @@ from torch import Tensor
 
 from torchreg._checks import check_shape
 from torchreg.alignment.results import AlignResult, Calibration, PoseStarts
-from torchreg.datasets.hand import faces_of
 from torchreg.errors import InputError, InputTypeError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import transform_points
+from torchreg.geometry.skeleton import Skeleton
 from torchreg.io.points import PointCloud
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.registration.results import ScanRegistration, SequenceRegistration
+from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.hand import Hand
 from torchreg.spines.results import SpineSequence
 from torchreg.tracking.results import DemoResult, TrackResult
-from torchreg.viz.animation import coarse_skin
 from torchreg.viz.bone_colors import bone_palette, error_colors, weight_colors
-from torchreg.viz.figures import SKIN_COLOR
 from torchreg.viz.key_poses import between_poses
+from torchreg.viz.posed_scenes import DATA_COLORS, frame_labels, inlier_paint, near_surface, posed_scene, shape_layers
 from torchreg.viz.scene import Cloud, Color, Curves, Layer, Meshes, MovingMesh, Scene
 
 Data = Sequence[Tensor | TriangleMesh]
@@ -40,12 +40,9 @@ class _SceneStyle:
     source: Color = (0.62, 0.62, 0.64)
     target: Color = (0.45, 0.52, 0.62)
     body: Color = (0.78, 0.76, 0.74)
-    inlier: Color = (0.04, 0.31, 0.62)
-    outlier: Color = (0.62, 0.62, 0.62)
     keypoint: Color = (0.85, 0.25, 0.2)
-    palest: float = 0.35  # share of its color in an inlier of posterior zero, the rest white
+    num_samples: int = 64  # points of a limb of a skeleton
     num_steps: int = 25  # frames from a scan to its registration
-    near: float = 0.02  # data are inliers of a tracked shape within this distance, as a share of its size
 
 
 _STYLE = _SceneStyle()
@@ -62,7 +59,7 @@ def result_scene(result: Any, *, shape: ArticulatedShape | None = None, data: Da
     Args:
         result: of any system: an `AlignResult`, `TrackResult`, `DemoResult`, `PoseStarts`, `Calibration`,
             `ScanRegistration`, `SequenceRegistration` or `SpineSequence`; or an `ArticulatedShape`, `TriangleMesh`,
-            `RangeScan`, `PointCloud` or tensor (N, 3), or a list of meshes or tensors, one per frame.
+            `RangeScan`, `PointCloud`, `Skeleton` or tensor (N, 3), or a list of meshes or tensors, one per frame.
         shape: that was aligned or tracked, by default the one that the result keeps; where there is none, keypoints and
             registered points alone are shown.
         data: measurements, one cloud or mesh per frame: the clouds of alignments and sequences, the target of a
@@ -91,8 +88,10 @@ def _align_scene(result: AlignResult, shape: ArticulatedShape | None, data: Data
     poses = _batched(result.pose, 1)
     masks, posterior = _batched(result.inliers, 1), _batched(result.posterior, 1)
     clouds = _clouds(data, len(poses))
-    layers = _shape_layers(shape, poses)
-    layers.append(_points("registered points", _batched(result.registered, 2), _STYLE.inlier, visible=shape is None))
+    layers = shape_layers(shape, poses)
+    layers.append(
+        _points("registered points", _batched(result.registered, 2), DATA_COLORS.inlier, visible=shape is None)
+    )
     layers.append(_keypoints(_batched(result.keypoints, 2), visible=shape is None))
     for frame, cloud in enumerate(clouds):
         check_shape(masks[frame], "result.inliers", (len(cloud),))
@@ -119,14 +118,22 @@ def _align_facts(result: AlignResult) -> dict[str, str]:
 @_scene.register
 def _track_scene(result: TrackResult, shape: ArticulatedShape | None, data: Data) -> Scene:
     clouds = _clouds(data, len(result.poses))
-    layers = _shape_layers(shape, result.poses)
-    layers.append(_keypoints(result.keypoints, visible=shape is None))
-    if clouds:
-        layers.append(
-            _cloud("data", clouds, [_nearness(shape, *pair) for pair in zip(clouds, result.poses, strict=True)])
-        )
     title = counted(len(result.poses), "tracked frame")
+    if shape is not None:
+        scene = posed_scene(
+            shape, result.poses, clouds, near_surface(shape, result.poses), usable=_usable(result.statuses),
+            captions=frame_labels(result), times=result.times, up=result.up, title=title,
+        )  # fmt: skip
+        keypoints = _keypoints(result.keypoints, visible=False)
+        return replace(scene, layers=(*scene.layers, keypoints), facts=_status_facts(result))
+    layers: list[Layer] = [_keypoints(result.keypoints, visible=True)]
+    if clouds:
+        layers.append(_cloud("data", clouds, DATA_COLORS.inlier))
     return Scene(title, tuple(layers), result.times, result.up, _status_facts(result))
+
+
+def _usable(statuses: Sequence[Status]) -> list[bool]:
+    return [status.usable for status in statuses]
 
 
 def _status_facts(result: TrackResult) -> dict[str, str]:
@@ -138,12 +145,14 @@ def _status_facts(result: TrackResult) -> dict[str, str]:
 @_scene.register
 def _demo_scene(result: DemoResult, shape: ArticulatedShape | None, data: Data) -> Scene:
     hand = Hand() if shape is None else shape
-    paints = [inlier_paint(mask, torch.ones(len(mask))) for mask in result.inliers]
-    layers = [*_shape_layers(hand, result.track.poses), _cloud("data", result.clouds, paints)]
     facts = _status_facts(result.track)
     if result.tips_seen.any():
         facts["error of seen fingertips"] = f"{1e3 * float(result.tip_errors[result.tips_seen].mean()):.1f} mm"
-    return Scene(f"demo, seed {result.seed}", tuple(layers), result.track.times, facts=facts)
+    scene = posed_scene(
+        hand, result.track.poses, result.clouds, result.inliers, usable=_usable(result.track.statuses),
+        captions=frame_labels(result.track), times=result.track.times, title=f"demo, seed {result.seed}",
+    )  # fmt: skip
+    return replace(scene, facts=facts)
 
 
 @_scene.register
@@ -151,20 +160,20 @@ def _starts_scene(result: PoseStarts, shape: ArticulatedShape | None, data: Data
     if shape is None:
         raise InputError("shape must be given to show a PoseStarts, which holds poses alone")
     poses = result.poses.reshape(-1, result.poses.shape[-1])
-    layers = _shape_layers(shape, poses)
+    layers = shape_layers(shape, poses)
     if data:
-        layers.append(_cloud("data", _clouds(data, 1), _STYLE.inlier))
+        layers.append(_cloud("data", _clouds(data, 1), DATA_COLORS.inlier))
     return Scene("poses found, best first", tuple(layers), torch.arange(float(len(poses))))
 
 
 @_scene.register
 def _calibration_scene(result: Calibration, shape: ArticulatedShape | None, data: Data) -> Scene:
     clouds = _clouds(data, len(result.poses))
-    layers = _shape_layers(result.shape, result.poses)
+    layers = shape_layers(result.shape, result.poses)
     if shape is not None:
-        layers += [_renamed(layer, f"given {layer.name}") for layer in _shape_layers(shape, result.poses)]
+        layers += [_renamed(layer, f"given {layer.name}") for layer in shape_layers(shape, result.poses)]
     if clouds:
-        layers.append(_cloud("data", clouds, _STYLE.inlier))
+        layers.append(_cloud("data", clouds, DATA_COLORS.inlier))
     return Scene("calibrated shape", tuple(layers))
 
 
@@ -220,7 +229,7 @@ def _spine_scene(result: SpineSequence, shape: None, data: Data) -> Scene:
     tips = tuple(str(number) for number in range(result.num_tips))
     # Organs that are not there have no length.
     curves = torch.where(result.curves.isnan(), result.model(result.times).detach(), result.curves)
-    layers: list[Layer] = [Curves("limbs", curves, paint, labels=tips, thickness=0.009)]
+    layers: list[Layer] = [Curves("limbs", curves, paint, labels=tips, dashed=~result.own, thickness=0.009)]
     if data and len(data) != len(result.curves):
         raise InputError(f"data must hold one surface per frame ({len(result.curves)}), got {len(data)}")
     layers += _surface_frames(data)
@@ -232,9 +241,17 @@ def _spine_scene(result: SpineSequence, shape: None, data: Data) -> Scene:
 
 
 @_scene.register
+def _skeleton_scene(result: Skeleton, shape: None, data: Data) -> Scene:
+    curves = result.resample(_STYLE.num_samples)[0]
+    tips = tuple(str(number) for number in range(len(result.tips)))
+    layers = [Curves("limbs", curves, bone_palette(len(curves)), labels=tips, thickness=0.009), *_surface_frames(data)]
+    return Scene(counted(len(curves), "limb"), tuple(layers))
+
+
+@_scene.register
 def _shape_scene(result: ArticulatedShape, shape: None, data: Data) -> Scene:
     title = f"{counted(result.num_parts, 'part')}, {result.num_dofs} degrees of freedom"
-    return Scene(title, tuple(_shape_layers(result, result.rest_pose()[None])))
+    return Scene(title, tuple(shape_layers(result, result.rest_pose()[None])))
 
 
 @_scene.register
@@ -267,33 +284,13 @@ def _frames_scene(result: list, shape: None, data: Data) -> Scene:
 
 def _surface_frames(data: Data, opacity: float = 0.3) -> list[Layer]:
     """Return the layer of meshes, one per frame, or else of their points; none without data."""
+    if not isinstance(data, (list, tuple)):
+        return [Meshes("surface", data, _STYLE.body, opacity=opacity)]  # type: ignore[arg-type]  # read when shown
     meshes = [item for item in data if isinstance(item, TriangleMesh)]
     if meshes and len(meshes) == len(data):
         return [Meshes("surface", meshes, _STYLE.body, opacity=opacity)]
     clouds = [(item.vertices if isinstance(item, TriangleMesh) else item).detach() for item in data]
     return [Cloud("surface", clouds, _STYLE.body, size=0.003)] if clouds else []
-
-
-def _shape_layers(shape: ArticulatedShape | None, poses: Tensor) -> list[Layer]:
-    """Return the surface and the bones of a shape in poses (T, num_dofs), NaN in frames without a pose."""
-    if shape is None:
-        return []
-    poses = poses.to(shape.rest)
-    check_shape(poses, "poses", ("T", shape.num_dofs))
-    found = poses.isfinite().all(-1)
-    safe = torch.where(found.unsqueeze(-1), poses, shape.rest_pose())
-    skin = coarse_skin(shape)
-    faces = faces_of(skin)
-    with torch.no_grad():
-        vertices = torch.where(found[:, None, None], skin(safe), torch.nan)
-        origins = torch.where(found[:, None, None], shape.part_transforms(safe)[..., :3, 3], torch.nan)
-    colors = None if shape.surface is None else shape.surface.colors
-    paint = SKIN_COLOR if colors is None else colors[skin.weights.argmax(-1).cpu()].float()
-    layers: list[Layer] = [MovingMesh("shape", vertices, faces, paint)]
-    pairs = [(parent, part) for part, parent in enumerate(shape.part_parents) if parent >= 0]
-    if pairs:
-        layers.append(Curves("bones", origins[:, torch.tensor(pairs)], bone_palette(len(pairs)), visible=False))
-    return layers
 
 
 def _bones(model: GridLBS, poses: Tensor) -> Curves:
@@ -342,27 +339,6 @@ def _points(
 
 def _keypoints(points: Tensor, *, visible: bool) -> Cloud:
     return _points("keypoints", points, _STYLE.keypoint, 0.02, visible=visible)
-
-
-def inlier_paint(inliers: Tensor, posterior: Tensor) -> Tensor:
-    """Return colors (M, 3): outliers gray, inliers from pale to full blue by their posterior."""
-    share = posterior.double().nan_to_num(0.0)
-    share = (share / share.max().clamp(min=1e-12) if len(share) else share).unsqueeze(-1).clamp(0, 1)
-    strength = _STYLE.palest + (1 - _STYLE.palest) * share
-    blue = 1 - strength * (1 - torch.tensor(_STYLE.inlier, dtype=torch.float64))
-    return torch.where(inliers.unsqueeze(-1), blue, torch.tensor(_STYLE.outlier, dtype=torch.float64)).float()
-
-
-def _nearness(shape: ArticulatedShape | None, cloud: Tensor, pose: Tensor) -> Tensor:
-    """Return colors (M, 3) of data: blue near the surface of the shape in its pose, else gray."""
-    near = torch.zeros(len(cloud), dtype=torch.bool)
-    known = cloud.isfinite().all(-1)
-    if shape is not None and bool(pose.isfinite().all()) and bool(known.any()):
-        with torch.no_grad():
-            points = shape.keypoints(shape.rest_pose())
-            reach = _STYLE.near * float((points.amax(0) - points.amin(0)).norm())
-            near[known] = (shape.distance(cloud[known].to(shape.rest), pose.to(shape.rest)).abs() < reach).cpu()
-    return inlier_paint(near | torch.tensor(shape is None), torch.ones(len(cloud)))
 
 
 def _clouds(data: Data, count: int) -> list[Tensor]:

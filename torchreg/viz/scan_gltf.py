@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,10 +13,11 @@ from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.upright import Direction
-from torchreg.io.gltf_write import save_animated_skin
 from torchreg.registration.blend import blend_linear, check_rigid_motions
 from torchreg.registration.bones.grid_lbs import GridLBS
 from torchreg.viz.bone_colors import weight_colors
+from torchreg.viz.gltf import gltf_of_scene
+from torchreg.viz.scene import Joints, Scene, SkinnedMesh
 
 HIERARCHIES = ("tree", "flat")
 
@@ -40,7 +40,7 @@ class GridAnimation:
 
 @torch.no_grad()
 def save_grid_animation(
-    path: str | os.PathLike[str],
+    path: str | Path,
     model: GridLBS,
     points: Tensor,
     faces: Tensor,
@@ -67,7 +67,7 @@ def save_grid_animation(
         poses: (T, B, 4, 4) to play; by default the rest pose, then the model's own, one or several.
         times: (T,) seconds, not negative, strictly increasing; a second apart by default.
         normals: (V, 3) at the points; those of the faces by default.
-        colors: (V, 3) or (V, 4) in [0, 1]; those of the weights by default.
+        colors: (V, 3) in [0, 1]; those of the weights by default.
         most_weights: weights kept per vertex, 4, or 8, of which some viewers ignore the second four.
         hierarchy: "tree", or "flat" for nodes without parents: between the poses bones then move on straight lines
             instead of about their joints.
@@ -90,33 +90,28 @@ def save_grid_animation(
     mesh = TriangleMesh(points, faces)
     moving = _poses(model, poses)
     seconds = torch.arange(len(moving), dtype=torch.float64) if times is None else as_float_tensor(times, "times")
-    check_shape(seconds, "times", (len(moving),))
     check_finite(seconds, "times")
     tree = model.skeleton(moving)
-    parents = tree.parents if hierarchy == "tree" else (-1,) * model.num_bones
     # In double precision: the viewer multiplies the relative motions again.
     identity = torch.eye(3, dtype=torch.float64).expand(model.num_bones, 3, 3)
     rest = rigid_matrix(identity, tree.origins.double().cpu())
     weights = model.vertex_weights(points, most=most_weights)
     exact = weights.double().cpu()
-    file = save_animated_skin(
-        Path(path),
-        vertices=points,
-        faces=mesh.faces,
-        weights=exact / exact.sum(-1, keepdim=True),
-        joint_names=[f"bone_{number}" for number in range(model.num_bones)],
-        parents=parents,
-        rest_transforms=rest,
-        joint_transforms=_orthogonal(moving.double().cpu()) @ rest,
-        times=seconds,
-        normals=mesh.vertex_normals() if normals is None else normals,
-        colors=weight_colors(model.weights_at(points)).clamp(0, 1) if colors is None else colors,
-        most_weights=most_weights,
-        up=up,
+    joints = Joints(
+        [f"bone_{number}" for number in range(model.num_bones)],
+        tree.parents if hierarchy == "tree" else (-1,) * model.num_bones,
+        rest,
+        _orthogonal(moving.double().cpu()) @ rest,
     )
+    skin = SkinnedMesh(
+        name="scan", vertices=points, faces=mesh.faces, joints=joints, normals=normals,
+        weights=exact / exact.sum(-1, keepdim=True),
+        paint=weight_colors(model.weights_at(points)).clamp(0, 1) if colors is None else colors,
+    )  # fmt: skip
+    file = gltf_of_scene(path, Scene("scan", (skin,), seconds, up), most_weights=most_weights)
     shown = blend_linear(points, weights, moving)
     residual = torch.linalg.vector_norm(shown - model(points, moving), dim=-1).max()
-    return GridAnimation(file, float(residual), parents)
+    return GridAnimation(file, float(residual), tuple(joints.parents))
 
 
 def _poses(model: GridLBS, poses: Tensor | None) -> Tensor:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -12,11 +13,16 @@ from torch import Tensor
 from torchreg._checks import as_float_tensor, check_shape
 from torchreg.errors import InputError
 from torchreg.geometry.mesh import TriangleMesh
-from torchreg.geometry.upright import Direction, guess_up, is_before_camera
+from torchreg.geometry.rigid import invert_rigid
+from torchreg.geometry.upright import Direction, from_front, guess_up, is_before_camera
+from torchreg.registration.blend import blend_linear
 
 Color = tuple[float, float, float]
 
 FIELD_OF_VIEW = math.radians(45)
+SKIN_COLOR: Color = (0.90, 0.76, 0.66)
+# Of a surface whose pose is predicted, without support by data.
+PREDICTED_COLOR: Color = (0.72, 0.73, 0.76)
 
 
 @dataclass(frozen=True)
@@ -25,10 +31,25 @@ class _CameraRule:
 
     one_sided: float = 0.3  # surfaces were seen from one side if the mean of their normals is longer
     num_points: int = 4000  # from which the bounds of the scene are taken
-    num_frames: int = 24  # from which the upright direction is told
+    num_frames: int = 64  # from which bounds and the upright direction are taken
 
 
 _CAMERA = _CameraRule()
+
+
+class Frames(Sequence[Tensor]):
+    """Points or colors that are made when they are shown, by the number of their frame."""
+
+    def __init__(self, count: int, make: Callable[[int], Tensor]) -> None:
+        self._count, self._make = count, make
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, frame: int) -> Tensor:  # type: ignore[override]
+        if not 0 <= frame < self._count:
+            raise IndexError(frame)
+        return self._make(frame)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +65,6 @@ class MovingMesh:
         paint: (V, 3) colors in [0, 1], or one color.
         opacity: from 0 to 1.
         visible: whether it is shown at first.
-
-    Raises:
-        InputError: if a shape does not fit.
     """
 
     name: str
@@ -93,6 +111,51 @@ class MovingMesh:
 
 
 @dataclass(frozen=True, eq=False)
+class Joints:
+    """Joints that move meshes.
+
+    Args:
+        names: J different ones.
+        parents: J numbers of the joints above, -1 of roots.
+        rest: (J, 4, 4) rigid ``T_world_joint`` of the pose that vertices are in.
+        moving: (T, J, 4, 4) rigid ``T_world_joint`` of the frames; NaN in those in which they were not found.
+    """
+
+    names: Sequence[str]
+    parents: Sequence[int]
+    rest: Tensor
+    moving: Tensor
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SkinnedMesh(MovingMesh):
+    """Triangles whose vertices (V, 3), those at rest, are moved by joints.
+
+    Args:
+        weights: (V, J) of the joints, rows sum to one.
+        joints: that move the vertices.
+        rigid: whether every triangle hangs on one joint, as the links of robots do.
+        normals: (V, 3) at rest; by default those of the triangles.
+    """
+
+    weights: Tensor
+    joints: Joints
+    rigid: bool = False
+    normals: Tensor | None = None
+
+    @property
+    def num_frames(self) -> int:
+        """Number T of frames."""
+        return len(self.joints.moving)
+
+    def points(self, frame: int) -> Tensor:
+        """Return the vertices (V, 3) of a frame."""
+        joints = self.joints
+        motions = joints.moving[frame if self.num_frames > 1 else 0] @ invert_rigid(joints.rest)
+        return blend_linear(self.vertices, self.weights.to(self.vertices), motions.to(self.vertices)).detach()
+
+
+@dataclass(frozen=True, eq=False)
 class Meshes:
     """Unrelated meshes, one per frame.
 
@@ -126,13 +189,10 @@ class Cloud:
 
     Args:
         name: in the viewer.
-        frames: T clouds (N_t, 3), or a single still one.
+        frames: T clouds (N_t, 3), or a single still one; `Frames` are checked when they are shown.
         paints: as many colorings, (N_t, 3) in [0, 1] each; or one color.
         size: diameter of a point as a share of the diagonal of the scene.
         visible: whether it is shown at first.
-
-    Raises:
-        InputError: if a shape does not fit.
     """
 
     name: str
@@ -142,6 +202,8 @@ class Cloud:
     visible: bool = True
 
     def __post_init__(self) -> None:
+        if isinstance(self.frames, Frames):
+            return
         for frame, points in enumerate(self.frames):
             check_shape(points, f"frames[{frame}] of {self.name}", ("N", 3))
         if not self.one_color:
@@ -181,17 +243,16 @@ class Curves:
         curves: (T, L, S, 3), or (L, S, 3) of still curves.
         paint: (L, 3) colors in [0, 1].
         labels: of the first points of the first curves; none by default.
+        dashed: (T, L) curves that pictures show dashed; none by default.
         thickness: as a share of the diagonal of the scene.
         visible: whether they are shown at first.
-
-    Raises:
-        InputError: if a shape does not fit.
     """
 
     name: str
     curves: Tensor
     paint: Tensor
     labels: tuple[str, ...] = ()
+    dashed: Tensor | None = None
     thickness: float = 0.006
     visible: bool = True
 
@@ -210,15 +271,6 @@ class Curves:
         """Return the curves (L, S, 3) of a frame."""
         return self.curves[frame] if self.curves.ndim == 4 else self.curves
 
-    def segments(self, frame: int) -> Tensor:
-        """Return the segments (L (S - 1), 2, 3) of a frame, curve by curve."""
-        points = self.points(frame)
-        return torch.stack((points[:, :-1], points[:, 1:]), dim=2).flatten(0, 1)
-
-    def segment_paint(self) -> Tensor:
-        """Return the colors (L (S - 1), 3) of the segments."""
-        return self.paint.repeat_interleave(self.curves.shape[-2] - 1, dim=0)
-
 
 Layer = MovingMesh | Meshes | Cloud | Curves
 
@@ -233,6 +285,7 @@ class Scene:
         times: (T,) seconds, strictly increasing; one frame every 1 / 20 second by default.
         up: upright direction; by default as `geometry.upright.guess_up` tells it.
         facts: key figures in words, by name, shown beside the scene.
+        captions: of the frames, in pictures; none by default.
 
     Raises:
         InputError: if there is no layer, two have one name, or numbers of frames differ.
@@ -243,6 +296,7 @@ class Scene:
     times: Tensor | None = None
     up: Direction | None = None
     facts: Mapping[str, str] = field(default_factory=dict)
+    captions: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         names = [layer.name for layer in self.layers]
@@ -273,12 +327,8 @@ class Scene:
                 return layer
         raise InputError(f"the scene has no layer {name!r}; it has {', '.join(item.name for item in self.layers)}")
 
-    def camera(self, field_of_view: float = FIELD_OF_VIEW) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the position, the target and the upright direction of a camera that sees all frames, (3,) each.
-
-        Args:
-            field_of_view: radians, of the shorter side of the picture.
-        """
+    def camera(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the position, the target and the upright direction of a camera that sees all frames, (3,) each."""
         lower, upper = self.bounds()
         middle = (lower + upper) / 2
         size = (upper - lower).norm().clamp(min=1e-9)
@@ -292,23 +342,20 @@ class Scene:
         elif from_camera and float(up[1]) < 0:
             direction = middle - middle.norm() * middle.new_tensor([0.35, -0.25, 0.0])
         else:
-            side = torch.linalg.cross(up, middle.new_tensor([1.0, 0.0, 0.0]) if abs(up[0]) < 0.5 else up.roll(1))
-            direction = -(0.5 * up - 0.6 * torch.linalg.cross(side, up) - side)
+            direction = -from_front(up, self.sample())
         direction = direction / direction.norm()
-        return middle - 0.5 * size / math.sin(field_of_view / 2) * direction, middle, up
+        return middle - 0.5 * size / math.sin(FIELD_OF_VIEW / 2) * direction, middle, up
 
     def _guessed_up(self) -> Direction:
         """Return the likely upright direction, told from what moves, or else from all that is seen."""
-        layers = self._shown()
+        layers = self._shown
         count = max(layer.num_frames for layer in layers)
         moving = [layer for layer in layers if layer.num_frames == count]
-        frames = range(0, count, max(1, count // _CAMERA.num_frames))
-        return guess_up([torch.cat([layer.points(frame).reshape(-1, 3) for layer in moving]) for frame in frames])
+        return guess_up([torch.cat([layer.points(k).reshape(-1, 3) for layer in moving]) for k in _some_frames(count)])
 
     def bounds(self) -> tuple[Tensor, Tensor]:
         """Return the lower and upper corner (3,) of all visible layers in all frames."""
-        points = self.sample()
-        return points.amin(0), points.amax(0)
+        return self.sample().amin(0), self.sample().amax(0)
 
     @property
     def diagonal(self) -> float:
@@ -326,19 +373,28 @@ class Scene:
                 total, area = total + normal.sum(0), area + float(normal.norm(dim=-1).sum())
         return total / area if area > 0 else total
 
+    @cached_property
     def _shown(self) -> list[Layer]:
-        """Return the visible layers; clouds, whose outliers reach far, only if there are no others."""
+        """Visible layers; clouds, whose outliers reach far, only if nothing else is there."""
         visible = [layer for layer in self.layers if layer.visible] or list(self.layers)
-        return [layer for layer in visible if not isinstance(layer, Cloud)] or visible
+        solid = [layer for layer in visible if not isinstance(layer, Cloud)]
+        return [layer for layer in solid if any(bool(x.isfinite().any()) for x in _all_points(layer))] or visible
 
     def sample(self) -> Tensor:
         """Return evenly chosen points (N, 3) of the visible layers."""
-        found = [points for layer in self._shown() for points in _all_points(layer)]
-        points = torch.cat(found) if found else torch.zeros(1, 3)
+        return self._sample
+
+    @cached_property
+    def _sample(self) -> Tensor:
+        points = torch.cat([points for layer in self._shown for points in _all_points(layer)])
         points = points[points.isfinite().all(-1)]
-        return points[:: max(1, len(points) // _CAMERA.num_points)] if len(points) else torch.zeros(1, 3)
+        return points[:: max(1, len(points) // _CAMERA.num_points)] if len(points) else points.new_zeros(1, 3)
 
 
 def _all_points(layer: Layer) -> Iterator[Tensor]:
-    for frame in range(layer.num_frames):
+    for frame in _some_frames(layer.num_frames):
         yield layer.points(frame).detach().reshape(-1, 3).cpu().double()
+
+
+def _some_frames(count: int) -> range:
+    return range(0, count, max(1, count // _CAMERA.num_frames))

@@ -14,10 +14,11 @@ from torchreg.geometry.mesh import TriangleMesh, concatenate
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.skeleton import Skeleton
 from torchreg.geometry.upright import Direction
-from torchreg.io.gltf_write import save_animated_skin
 from torchreg.spines.labeled_tree import path_lengths
 from torchreg.spines.spine import Spine
 from torchreg.viz.bone_colors import bone_palette
+from torchreg.viz.gltf import gltf_of_scene
+from torchreg.viz.scene import Color, Joints, Scene, SkinnedMesh
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class _SpineStyle:
 
     radius: float = 0.004  # of the tubes, as a share of the length of all limbs
     num_sides: int = 8  # of the tubes
-    body: tuple[float, float, float, float] = (0.80, 0.78, 0.76, 0.35)  # red, green, blue, opacity
+    body: Color = (0.80, 0.78, 0.76)
+    opacity: float = 0.35  # of the surface
 
 
 _STYLE = _SpineStyle()
@@ -64,30 +66,24 @@ def save_spine_animation(
     curves = spine(spine.times)
     limbs = spine.num_limbs
     axes = spine.frames(spine.times)
-    tubes = [_tube(curves[frame, limb], axes[frame, limb], float(skeleton.length)) for limb in range(limbs)]
-    parts = [tube.to(torch.float64) for tube in tubes]
-    colors = [bone_palette(limbs)[limb].expand(tube.num_vertices, 3) for limb, tube in enumerate(tubes)]
-    paint = torch.cat((torch.cat(colors), torch.ones(sum(map(len, colors)), 1)), dim=1)
-    if mesh is not None:
-        parts.append(TriangleMesh(mesh.vertices.detach().cpu().double(), mesh.faces.cpu()))
-        paint = torch.cat((paint, torch.tensor(_STYLE.body).expand(mesh.num_vertices, 4)))
-    surface = concatenate(parts)
     moving = rigid_matrix(axes[:, :, picked], curves[:, :, picked]).flatten(1, 2)
-    return save_animated_skin(
-        path,
-        vertices=surface.vertices,
-        faces=surface.faces,
-        weights=_weights(surface.vertices, skeleton, spine.limb_nodes[:, picked].reshape(-1)),
-        joint_names=[f"limb_{limb}_{k}" for limb in range(limbs) for k in range(len(picked))],
-        parents=[-1] * (limbs * len(picked)),
-        rest_transforms=moving[frame],
-        joint_transforms=moving,
-        times=(spine.times - spine.times[0]) / fps,
-        normals=surface.vertex_normals(),
-        colors=paint,
-        most_weights=4,  # all that many viewers read
-        up=up,
-    )
+    names = [f"limb_{limb}_{k}" for limb in range(limbs) for k in range(len(picked))]
+    joints = Joints(names, [-1] * len(names), moving[frame], moving)
+    tubes = [_tube(curves[frame, limb], axes[frame, limb], float(skeleton.length)) for limb in range(limbs)]
+    colors = [color.expand(tube.num_vertices, 3) for color, tube in zip(bone_palette(limbs), tubes, strict=True)]
+    parts = [("limbs", concatenate(tubes), torch.cat(colors), 1.0)]
+    if mesh is not None:
+        body = torch.tensor(_STYLE.body).expand(mesh.num_vertices, 3)
+        parts.append(("surface", TriangleMesh(mesh.vertices.detach().cpu(), mesh.faces.cpu()), body, _STYLE.opacity))
+    layers = tuple(
+        SkinnedMesh(
+            name=name, vertices=part.vertices.double(), faces=part.faces, paint=paint, opacity=opacity, joints=joints,
+            weights=_weights(part.vertices.double(), skeleton, spine.limb_nodes[:, picked].reshape(-1)),
+        )
+        for name, part, paint, opacity in parts
+    )  # fmt: skip
+    scene = Scene("spine", layers, spine.times / fps, up)
+    return gltf_of_scene(path, scene, most_weights=4)  # all that many viewers read
 
 
 def _weights(points: Tensor, skeleton: Skeleton, joints: Tensor) -> Tensor:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from torchreg.errors import InputError
 from torchreg.io.atomic import write_atomic
 from torchreg.viz.scene import Cloud, Layer, Meshes, Scene
 from torchreg.viz.viser_nodes import DrawnScene
-from torchreg.viz.viser_server import page_url, point_camera, start_server, stop_server
+from torchreg.viz.viser_server import Page, point_camera, start_server, stop_server
 
 if TYPE_CHECKING:
     import viser
@@ -42,7 +41,7 @@ def _bounded(value: float, low: float, high: float) -> float:
     return min(max(float(value), low), high) if value == value else low
 
 
-class SceneViewer:
+class SceneViewer(Page):
     """A scene on a running server, with a control per layer, and a timeline if a layer moves.
 
     Usable in a ``with`` statement, at whose end the server stops.
@@ -54,7 +53,7 @@ class SceneViewer:
 
     def __init__(self, scene: Scene, *, port: int = 8080) -> None:
         self.scene = scene
-        self.server = start_server(scene.title, port)
+        super().__init__(scene.title, port)
         self._drawn = DrawnScene(self.server.scene, scene)
         self.server.gui.add_markdown(description(scene))
         self._timeline = Timeline(self.server, scene.seconds, self._drawn.show) if scene.num_frames > 1 else None
@@ -62,11 +61,6 @@ class SceneViewer:
             for layer in scene.layers:
                 self._add_toggle(layer)
         point_camera(self.server, scene)
-
-    @property
-    def url(self) -> str:
-        """Address for a browser on this machine."""
-        return page_url(self.server)
 
     @property
     def frame(self) -> int:
@@ -84,15 +78,7 @@ class SceneViewer:
         """Stop the timeline and the server."""
         if self._timeline is not None:
             self._timeline.close()
-        stop_server(self.server)
-
-    def __enter__(self) -> SceneViewer:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+        super().close()
 
     def _add_toggle(self, layer: Layer) -> None:
         box = self.server.gui.add_checkbox(layer.name, initial_value=layer.visible)

@@ -134,9 +134,15 @@ def _draw_cloud(api: viser.SceneApi, name: str, layer: Cloud, size: float) -> _D
 
 
 def _draw_curves(api: viser.SceneApi, name: str, layer: Curves, size: float) -> _DrawnLayer:
-    paint = np.repeat(as_floats(layer.segment_paint())[:, None], 2, axis=1)
+    pieces = layer.curves.shape[-2] - 1  # of a curve
+    paint = np.repeat(as_floats(layer.paint), pieces, axis=0)[:, None].repeat(2, axis=1)
+
+    def segments_of(frame: int) -> NDArray[np.float32]:
+        points = as_floats(layer.points(frame))
+        return np.stack((points[:, :-1], points[:, 1:]), axis=2).reshape(-1, 2, 3)
+
     node = api.add_line_segments(
-        f"{name}/lines", np.nan_to_num(as_floats(layer.segments(0))), paint, thickness=layer.thickness * size,
+        f"{name}/lines", np.nan_to_num(segments_of(0)), paint, thickness=layer.thickness * size,
         visible=layer.visible,
     )  # fmt: skip
     first = np.nan_to_num(as_floats(layer.points(0)))
@@ -146,7 +152,7 @@ def _draw_curves(api: viser.SceneApi, name: str, layer: Curves, size: float) -> 
     ]
 
     def update(frame: int) -> list[Any]:
-        segments = as_floats(layer.segments(frame))
+        segments = segments_of(frame)
         if not np.isfinite(segments).all():
             return []
         node.points = segments

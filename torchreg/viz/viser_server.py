@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-from typing import TYPE_CHECKING, Any
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,35 @@ if TYPE_CHECKING:
 Point = NDArray[np.floating]
 
 HOST = "127.0.0.1"
+
+
+class Page:
+    """A page on a server; usable in a ``with`` statement, at whose end the server stops.
+
+    Args:
+        title: above the controls.
+        port: to listen on at 127.0.0.1, or a later one if it is taken.
+    """
+
+    def __init__(self, title: str, port: int) -> None:
+        self.server = start_server(title, port)
+
+    @property
+    def url(self) -> str:
+        """Address for a browser on this machine."""
+        return page_url(self.server)
+
+    def close(self) -> None:
+        """Stop the server, and what draws on it."""
+        stop_server(self.server)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
 
 def import_viser() -> Any:
