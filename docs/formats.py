@@ -27,8 +27,9 @@ stand between the columns.
 
 * Coordinates far from the origin, as in maps, are read in double precision, and every system computes about an
   origin near them, which results tell as `origin`. What they return is in the coordinates of the file.
-* `scale=0.001` (`--scale 0.001`) reads millimeters as metres. Data and shape, or two scans, whose sizes differ by
-  more than thirtyfold give a warning that names the factor.
+* `scale=0.001` (`--scale 0.001`) reads millimeters as metres. Data and shape whose sizes differ by more than
+  thirtyfold, two scans by more than sevenfold, and links, joints or slides of a robot that are in another unit than
+  the rest give a warning that names the factor.
 * A skinned glTF mesh stands as viewers show it: in the pose of its nodes, or at `time=` or `frame=` of its
   animation.
 * Files sort by the numbers in their names: `0.5, 1.25, 1.5, 10`.
