@@ -92,13 +92,13 @@ def test_the_same_again(pair, known):
 
 SIZES = [
     (10, r"target is 1\d\.\d+ times as large as source.*target is in millimeters and source in centimeters, load "
-         r"target with scale=0\.1 \(command line: --scale 1 --scale 0\.1\)"),
-    (0.1, r"source is .* as large as target.*source is in millimeters .*scale=0\.1 .*--scale 0\.1 --scale 1\)"),
-    (25.4, r"target is in millimeters and source in inches, load target with scale=0\.03937"),
-    (39.37, r"target is in inches and source in metres, load target with scale=0\.0254"),
-    (100, r"target is in centimeters and source in metres, load target with scale=0\.01"),
-    (1000, r"target is in millimeters and source in metres, load target with scale=0\.001"),
-    (0.001, r"source is in millimeters and target in metres, load source with scale=0\.001"),
+         r"target with a scale of 0\.1 \(--scale 1 --scale 0\.1\)"),
+    (0.1, r"source is .* as large as target.*source is in millimeters .*scale of 0\.1 \(--scale 0\.1 --scale 1\)"),
+    (25.4, r"target is in millimeters and source in inches, load target with a scale of 0\.03937"),
+    (39.37, r"target is in inches and source in metres, load target with a scale of 0\.0254"),
+    (100, r"target is in centimeters and source in metres, load target with a scale of 0\.01"),
+    (1000, r"target is in millimeters and source in metres, load target with a scale of 0\.001"),
+    (0.001, r"source is in millimeters and target in metres, load source with a scale of 0\.001"),
 ]  # fmt: skip
 
 

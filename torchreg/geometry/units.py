@@ -37,4 +37,3 @@ def robust_size(points: Tensor) -> float:
     middle = points.median(0).values
     size = 2 * float((points - middle).norm(dim=-1).median())
     return size or float((points.amax(0) - points.amin(0)).norm())
-

@@ -25,6 +25,7 @@ class _Plausible:
 
     least: float = 3.0  # lengths below are never told, as those of household robots
     link: float = 20.0  # a link over the longest step between joints; inches make 39 of it
+    longest: float = 1.8  # the largest link over that step, in the median of 60 robots
     thin: float = 0.1  # its thinnest side over that step: grounds and walls are large and thin
     step: float = 100.0  # a step between joints over the largest link: cable robots span tens of it
     slide: float = 20.0  # a slide over the largest other length
@@ -58,10 +59,9 @@ def _warn_about_joints(record: UrdfRecord, path: object, steps: Sequence[float],
     joints = record.tree.joints
     far = [step > max(_PLAUSIBLE.least, _PLAUSIBLE.step * size) and size > 0 for step in steps]
     if any(far):
-        unit, factor = likely_unit(max(steps) / size)
         _warn(
             f"{path}: {_names('joint', far, [joint.name for joint in joints])} up to {max(steps):.4g} m from the parent, "
-            f"beside links of at most {size:.3g} m: the origin seems to be in {unit}; write {factor:g} times its xyz"
+            f"beside links of at most {size:.3g} m: the origin seems to be in millimeters; write 0.001 times its xyz"
         )
     return far
 
@@ -73,11 +73,13 @@ def _warn_about_links(
     most = max(sizes)
     beside = f"beside joints {step:.3g} m apart" if step else f"beside links of {_median(sizes):.3g} m"
     if any(large):
-        size = _median([size for size, is_large in zip(sizes, large, strict=True) if is_large])
-        unit, factor = likely_unit(size / (step or _median(sizes)))
+        usual = (step or _median(sizes)) * (_PLAUSIBLE.longest if sum(large) > 1 else 1.0)
+        unit, factor = likely_unit(most / usual)
         is_mesh = any(record.link_meshes[link] is not None for link, is_large in enumerate(large) if is_large)
         scale = f'scale="{factor:g} {factor:g} {factor:g}"'
-        remedy = f"give <mesh> {scale}, or multiply the scale it has" if is_mesh else f"multiply the sizes by {factor:g}"
+        remedy = (
+            f"give <mesh> {scale}, or multiply the scale it has" if is_mesh else f"multiply the sizes by {factor:g}"
+        )
         _warn(
             f"{path}: {_names('link', large, record.link_names)} up to {most:.4g} m large, {beside}: the geometry "
             f"seems to be in {unit}; {remedy}"
@@ -100,11 +102,10 @@ def _warn_about_slides(record: UrdfRecord, path: object, sizes: Sequence[float],
         if joint.kind != "prismatic" or joint.parent < 0 or not carried[joint.parent] or joint.mimic is not None:
             continue
         if reach > max(_PLAUSIBLE.least, _PLAUSIBLE.slide * known) and known > 0:
-            unit, factor = likely_unit(reach / known)
             _warn(
                 f"{path}: joint {joint.name!r} slides from {joint.lower:g} to {joint.upper:g} m, on a robot of links "
-                f"and joints of at most {known:.3g} m: its limits seem to be in {unit}; write {factor * joint.lower:.4g} "
-                f"to {factor * joint.upper:.4g}"
+                f"and joints of at most {known:.3g} m: its limits seem to be in millimeters; write "
+                f"{0.001 * joint.lower:.4g} to {0.001 * joint.upper:.4g}"
             )
 
 

@@ -308,7 +308,7 @@ def warn_about_units(scans: Sequence[RangeScan], names: Sequence[str], *, stackl
     warnings.warn(
         f"{names[odd]} is {max(ratio, 1 / ratio):.4g} times as {'large' if ratio > 1 else 'small'} as "
         f"{names[typical]}: are they in one unit? If {names[odd]} is in {unit} and {names[typical]} in {other}, "
-        f"load {names[odd]} with scale={factor:.4g}{f' (command line: {options})' if len(scans) == 2 else ''}",
+        f"load {names[odd]} with a scale of {factor:.4g}{f' ({options})' if len(scans) == 2 else ''}",
         UnitsWarning,
         stacklevel=stacklevel + 1,
     )
