@@ -35,8 +35,13 @@ stand between the columns.
 * Files sort by the numbers in their names: `0.5, 1.25, 1.5, 10`.
 * In a mask the brighter of two values is set, whatever they are; transparency that varies is the mask; in a picture
   of labels all but zero is set.
-* Whole numbers in depth images are millimeters, floating-point ones metres, unless `depth_scale` says otherwise;
-  65535 is no depth.
+* Whole numbers in depth images are millimeters, floating-point ones metres, unless the camera's file says otherwise:
+  `depth_scale`, `depth_units` (metres per unit), `depth_factor`, `png_depth_scale`, `DepthMapFactor` (units per
+  metre); 65535 is no depth.
+* Lenses of other kinds than a pinhole camera's (fisheye, equidistant, Kannala-Brandt, omnidirectional) are refused
+  under every name that programs have for them; so are four numbers without a model that are hardly k1 k2 p1 p2.
+* Of ROS's camera_info K and D are those of the raw picture; where D is zero P holds. P tells where the right camera
+  of a pair stands: a folder with `left.yaml` and `right.yaml` is a pair.
 * A piece of a file that cannot be used is left out with a warning that counts it: faces of two corners, normals
   that are not finite, vertices without skin weight, links whose mesh is missing.
 """

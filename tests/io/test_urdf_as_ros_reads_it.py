@@ -201,9 +201,9 @@ def times(numbers, factor, only=None):
     [
         (chained(times(RIGHT, 1000)), r"links 'base', 'turret', 'upper' and 1 more are .*in millimeters; .* by 0\.001"),
         (chained(times(RIGHT, 1000), mesh="unit.stl"), r"in millimeters; give <mesh> scale=\"0\.001 0\.001 0\.001\""),
-        (chained(times(RIGHT, 1000, 2), mesh="unit.stl"), r"link 'upper' is .* beside joints 0\.4 m apart.*millimeters"),
+        (chained(times(RIGHT, 1000, 2), mesh="unit.stl"), r"link 'upper' is .* beside joints 0\.4 m .*millimeters"),
         (chained(times(RIGHT, 100), mesh="unit.stl"), r"in centimeters; give <mesh> scale=\"0\.01 0\.01 0\.01\""),
-        (chained(times(RIGHT, 1 / 0.0254), mesh="unit.stl"), r"in inches; give <mesh> scale=\"0\.0254 0\.0254 0\.0254\""),
+        (chained(times(RIGHT, 1 / 0.0254), mesh="unit.stl"), r"in inches; give <mesh> scale=\"0\.0254 0\.0254 0"),
         (chained(RIGHT, times(STEPS, 1000)), r"joints .*'to_upper'.* up to 400 m from .*beside links .*in millimeters"),
         (chained(RIGHT, times(STEPS, 1000, 1)), r"joint 'to_upper' is up to 400 m from the parent"),
         (chained(RIGHT, slide="0 85"), r"joint 'grip' slides from 0 to 85 m, .* in millimeters; write 0 to 0\.085"),
@@ -240,3 +240,18 @@ def test_geometry_that_is_scaled_twice_is_told(tmp_path):
 )  # fmt: skip
 def test_large_robots_and_free_ones_are_as_they_are(tmp_path, content):
     load_urdf(saved(tmp_path, content))  # warnings are errors in tests
+
+
+def test_names_of_joints_and_parts_are_told_apart_from_others(tmp_path):
+    """A joint called like a degree of freedom of the base, and a link called like the second solid of another."""
+    second = "<visual><geometry><sphere radius='0.1'/></geometry></visual>"
+    base = link("base").replace("</link>", f"{second}</link>")
+    text = robot(base, link("base_1"), link("tip"), joint("base_1"), joint("tip"))
+    text = text.replace("'to_tip'", "'base_x'").replace("'to_base_1'", "'base_x_joint'")
+    with pytest.warns(FileWarning, match="joint 'base_x' is called 'base_x_joint_' here, as base_x moves the whole"):
+        shape = ArticulatedShape.from_urdf(saved(tmp_path, text))
+    assert shape.dof_names[6:] == ("base_x_joint", "base_x_joint_")
+    assert shape.part_names == ("base", "base_1_", "base_1", "tip")
+    pose = shape.pose_from_dict({"base_x": 0.5, "base_x_joint_": 0.25})
+    assert shape.pose_to_dict(pose)["base_x"] == 0.5
+    assert pose.tolist() == [0.5, 0, 0, 0, 0, 0, 0, 0.25]

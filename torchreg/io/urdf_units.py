@@ -59,9 +59,10 @@ def _warn_about_joints(record: UrdfRecord, path: object, steps: Sequence[float],
     joints = record.tree.joints
     far = [step > max(_PLAUSIBLE.least, _PLAUSIBLE.step * size) and size > 0 for step in steps]
     if any(far):
+        names = _names("joint", far, [joint.name for joint in joints])
         _warn(
-            f"{path}: {_names('joint', far, [joint.name for joint in joints])} up to {max(steps):.4g} m from the parent, "
-            f"beside links of at most {size:.3g} m: the origin seems to be in millimeters; write 0.001 times its xyz"
+            f"{path}: {names} up to {max(steps):.4g} m from the parent, beside links of at most {size:.3g} m: the "
+            f"origin seems to be in millimeters; write 0.001 times its xyz"
         )
     return far
 
