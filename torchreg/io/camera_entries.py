@@ -183,9 +183,9 @@ def _add_lens(entry: dict[str, Any], given: Mapping[str, Any], where: str) -> No
         named, lens = {**named, "distortion_type": lens}, None
     numbers = _numbers([] if lens is None else lens, "distortion", where).reshape(-1)
     fx, width = entry.get("fx"), entry.get("width")
-    has_view = isinstance(fx, (int, float)) and isinstance(width, int) and width > 0
+    focal = fx / width if isinstance(fx, (int, float)) and isinstance(width, int) and width > 0 else 1.0
     # Our own format says what its four numbers are.
-    check_lens(named, numbers, where, None if "distortion" in given else fx / width if has_view else 1.0)
+    check_lens(named, numbers, where, None if "distortion" in given else focal)
     if lens is None:
         return
     numbers = numbers[:0] if not numbers.any() else numbers

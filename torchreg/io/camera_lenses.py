@@ -38,8 +38,8 @@ def check_lens(given: Mapping[str, Any], numbers: Array, where: str, focal: floa
     other = _other_lens(given)
     if other is not None or not known:
         raise FormatError(
-            f"{where}: the lens model {other or model!r} is not a pinhole camera's (plumb_bob, rational_polynomial), so "
-            f"its numbers mean something else; undistort the pictures first, and give the camera of those"
+            f"{where}: the lens model {other or model!r} is not a pinhole camera's (plumb_bob, rational_polynomial), "
+            f"so its numbers mean something else; undistort the pictures first, and give the camera of those"
         )
     wide = focal is not None and focal < _FOUR.focal
     if focal is None or model or numbers.size != 4 or not (wide or abs(numbers[2:]).max() > _FOUR.tangential):
