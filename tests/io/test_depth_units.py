@@ -140,7 +140,7 @@ def test_a_unit_that_its_name_contradicts_is_told(tmp_path):
         ({"depth_units": 0.001, "depth_factor": 5000}, "not the same unit of depth; keep one"),
         ({"depth_units": "furlongs"}, "depth_units must hold numbers"),
         ({"depth_factor": 0}, "depth_factor must be positive"),
-        ({"depth_factor": [1]}, "depth_factor must hold numbers"),
+        ({"depth_factor": [1]}, "depth_factor must be a number"),
     ):
         with pytest.raises(FormatError, match=rf"k\.json: .*{words}"):
             depths(tmp_path, np.round(1000 * DOME).astype("u2"), **entry)

@@ -114,7 +114,7 @@ def depth_unit(given: Mapping[str, Any], where: str) -> float | None:
         FileWarning: if a number can only be the inverse of what its name says.
     """
     given = _flat(given)
-    units = {name: _metres(given, name, where) for name in _DEPTHS if given.get(name) is not None}
+    units = {name: _metres(given, name, where) for name in _DEPTHS if name in given}
     # Beside depths a scale is one of the picture.
     known = {name: unit for name, unit in units.items() if name != "scale" or unit <= 0.01}
     if known and max(known.values()) > 1.01 * min(known.values()):
@@ -128,8 +128,10 @@ def _metres(given: Mapping[str, Any], name: str, where: str) -> float:
     word = str(given[name]).strip().lower()
     if word.removesuffix("s") in _UNIT_WORDS:
         return _UNIT_WORDS[word.removesuffix("s")]
-    value = given[name] if isinstance(given[name], (str, int, float)) and not isinstance(given[name], bool) else "none"
-    number = float(_numbers(value, name, where))
+    value = _numbers(given[name], name, where)
+    if value.ndim:
+        raise FormatError(f"{where}: {name} must be a number, got {str(given[name])[:80]}")
+    number = float(value)
     if not 0 < number < np.inf:
         raise FormatError(f"{where}: {name} must be positive, got {number:g}")
     # Open3D's recorders write units per metre; what depth_scale means elsewhere, depth images tell.
@@ -182,8 +184,9 @@ def _add_lens(entry: dict[str, Any], given: Mapping[str, Any], where: str) -> No
     if isinstance(lens, str):
         named, lens = {**named, "distortion_type": lens}, None
     numbers = _numbers([] if lens is None else lens, "distortion", where).reshape(-1)
-    fx, width = entry.get("fx"), entry.get("width")
-    focal = fx / width if isinstance(fx, (int, float)) and isinstance(width, int) and width > 0 else 1.0
+    sides = [value if isinstance(value := entry.get(name), (int, float)) else 1.0 for name in ("fx", "width")]
+    fx, width = _numbers(sides, "fx and width", where).tolist()
+    focal = fx / width if width > 0 else 1.0
     # Our own format says what its four numbers are.
     check_lens(named, numbers, where, None if "distortion" in given else focal)
     if lens is None:
@@ -298,11 +301,14 @@ def _finite(value: Any, name: str, where: str) -> torch.Tensor:
 
 def _numbers(values: Any, name: str, where: str) -> Array:
     try:
-        return np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+        numbers = np.array(values)
+        if numbers.dtype.kind not in "biuf":  # nor words that look like numbers
+            raise TypeError(f"got {numbers.dtype}")
+    except (TypeError, ValueError, OverflowError) as error:
         raise FormatError(
             f"{where}: {name} must hold numbers, got {str(values)[:80]}; all rows equally many"
         ) from error
+    return numbers.astype(np.float64)
 
 
 def _refuse_misspelled(entry: Mapping[str, Any], given: Mapping[str, Any], where: str) -> None:
