@@ -27,8 +27,9 @@ stand between the columns, in tables of poses too.
 
 * Coordinates far from the origin, as in maps, are read in double precision, and every system computes about an
   origin near them, which results tell as `origin`. What they return is in the coordinates of the file.
-* `scale=0.001` (`--scale 0.001`) reads millimeters as metres. Data and shape, or two scans, whose sizes differ by
-  more than thirtyfold give a warning that names the factor.
+* `scale=0.001` (`--scale 0.001`) reads millimeters as metres. Data and shape whose sizes differ by more than
+  thirtyfold, two scans by more than sevenfold, and links, joints or slides of a robot that are in another unit than
+  the rest give a warning that names the factor.
 * A skinned glTF mesh stands as viewers show it: in the pose of its nodes, or at `time=` or `frame=` of its
   animation.
 * Files sort by the numbers in their names: `0.5, 1.25, 1.5, 10`, and `5e-05` before `0.0001`.
@@ -38,8 +39,13 @@ stand between the columns, in tables of poses too.
 * In a mask the brighter of two values is set, whatever they are; transparency that varies is the mask; in a picture
   of labels all but zero is set; soft edges are cut at half of the white, and so are halos of one value around it,
   with a warning.
-* Whole numbers in depth images are millimeters, floating-point ones metres, unless `depth_scale` says otherwise;
-  65535 is no depth.
+* Whole numbers in depth images are millimeters, floating-point ones metres, unless the camera's file says otherwise:
+  `depth_scale`, `depth_units` (metres per unit), `depth_factor`, `png_depth_scale`, `DepthMapFactor` (units per
+  metre); 65535 is no depth.
+* Lenses of other kinds than a pinhole camera's (fisheye, equidistant, Kannala-Brandt, omnidirectional) are refused
+  under every name that programs have for them; so are four numbers without a model that are hardly k1 k2 p1 p2.
+* Of ROS's camera_info K and D are those of the raw picture; where D is zero P holds. P tells where the right camera
+  of a pair stands: a folder with `left.yaml` and `right.yaml` is a pair.
 * A piece of a file that cannot be used is left out with a warning that counts it: faces of two corners, normals
   that are not finite or of length zero, vertices without skin weight, links whose mesh is missing.
 * Files of scanners, recordings and CAD programs that are not read (E57, LAS, ROS bags, FBX, STEP and others) are

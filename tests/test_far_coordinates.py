@@ -143,7 +143,9 @@ def test_registering_far_away(tmp_path):
 
 def test_scans_in_other_units_are_told():
     (source, faces), (target, _) = bent_tube(0.0), bent_tube(0.4)
-    with pytest.warns(UnitsWarning, match=r"target is 10\d\d times as large as source.* load target with scale=0\.001"):
+    with pytest.warns(
+        UnitsWarning, match=r"target is 10\d\d times as large as source.* load target with a scale of 0\.001"
+    ):
         tr.register(tr.RangeScan(source, faces), tr.RangeScan(1000 * target, faces), 3, 20)
 
 

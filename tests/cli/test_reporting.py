@@ -4,6 +4,7 @@ import warnings
 
 import pytest
 import typer
+from tqdm import tqdm
 
 from torchreg.cli import info
 from torchreg.cli.reporting import reporting, show_warning
@@ -23,6 +24,13 @@ def test_an_interruption_elsewhere_ends_with_the_same_code(run, monkeypatch):
 def test_other_warnings_say_where_they_come_from(capsys):
     show_warning(UserWarning("a\n  b"), UserWarning, "file.py", 3)
     assert capsys.readouterr().err == "torchreg: warning: file.py:3: a b\n"
+
+
+def test_warnings_stand_on_a_line_of_their_own_beside_a_progress_bar(capsys):
+    with tqdm(total=2, desc="initialize"):
+        show_warning(TorchregWarning("a b"), TorchregWarning, "file.py", 3)
+    shown = [line.split("\r")[-1] for line in capsys.readouterr().err.split("\n")]
+    assert "torchreg: warning: a b" in shown
 
 
 def test_broken_pipes_are_left_to_the_application(run, monkeypatch):

@@ -1,6 +1,8 @@
 """Cameras as other programs write them, and numbers that cannot be what they are taken for."""
 
 import json
+import math
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -79,6 +81,14 @@ def test_yaml_of_ros(tmp_path, name, text):
 
 def test_lenses_are_kept(tmp_path):
     lens = [0.1, -0.2, 0.01, 0.02, 0.3]
+    beside = {
+        "fov": 60,
+        "type": "depth",
+        "is_fisheye": False,
+        "xi": None,
+        "distortion": {"model": "radtan", "coeffs": lens},
+    }
+    assert load_cameras(saved(tmp_path, PLAIN | beside))[0].distortion.tolist() == [*lens, 0, 0, 0]
     by_name = dict(zip(("k1", "k2", "p1", "p2", "k3"), lens, strict=True))
     for entry in (PLAIN | {"coeffs": lens, "model": "brown_conrady"}, PLAIN | by_name, PLAIN | {"D": [lens]}):
         assert load_cameras(saved(tmp_path, entry))[0].distortion.tolist() == [*lens, 0, 0, 0]
@@ -97,14 +107,156 @@ def test_poses_of_polycam_and_open3d(tmp_path):
     np.testing.assert_allclose(load_cameras(saved(tmp_path, trajectory))[0].world_to_camera, whole)
 
 
-@pytest.mark.parametrize("model", ["equidistant", "fisheye", "distortion.kannala_brandt4", "inverse_brown_conrady"])
+FISHEYE = [0.01, -0.02, 0.005, -0.002]  # as small as k1 k2 p1 p2
+K4 = dict(zip(("k1", "k2", "k3", "k4"), FISHEYE, strict=True))
+KALIBR = (
+    "cam0:\n  cam_overlaps: [1]\n  camera_model: {0}\n  distortion_coeffs: [0.1, -0.2, 0.001, 0.002]\n"
+    "  distortion_model: {1}\n  intrinsics: [60.0, 61.0, 31.5, 23.5]\n  resolution: [64, 48]\n  rostopic: /cam0/raw\n"
+    "cam1:\n  T_cn_cnm1:\n  - [1.0, 0.0, 0.0, -0.11]\n  - [0.0, 1.0, 0.0, 0.0]\n  - [0.0, 0.0, 1.0, 0.0]\n"
+    "  - [0.0, 0.0, 0.0, 1.0]\n  camera_model: {0}\n  distortion_coeffs: [0.1, -0.2, 0.001, 0.002]\n"
+    "  distortion_model: {1}\n  intrinsics: [60.0, 61.0, 31.5, 23.5]\n  resolution: [64, 48]\n"
+)
+
+
+@pytest.mark.parametrize(
+    "model", ["equidistant", "fisheye", "distortion.kannala_brandt4", "inverse_brown_conrady", "KANNALA-BRANDT", "kb4"]
+)
 def test_lenses_of_other_kinds_are_refused(tmp_path, model):
-    lens = [0.2, -0.1, 0.05, -0.02]
-    with pytest.raises(FormatError, match=rf"camera\.json.*'{model}' is not a pinhole camera's"):
-        load_cameras(saved(tmp_path, PLAIN | {"distortion_model": model, "D": lens}))
-    yaml = f"width: 64\nheight: 48\ndistortion_model: {model}\nK: {ROWS}\nD: {lens}\n"
-    with pytest.raises(FormatError, match=rf"camera\.yml: .*'{model}' is not a pinhole camera's"):
-        load_cameras(saved(tmp_path, yaml, "camera.yml"))
+    words = rf"'{model}' is not a pinhole camera's"
+    for entry in (
+        PLAIN | {"distortion_model": model, "D": FISHEYE},
+        PLAIN | {"camera_model": "pinhole", "distortion_model": model} | K4,
+        PLAIN | {"distortion": {"model": model, "coefficients": FISHEYE}},
+    ):
+        with pytest.raises(FormatError, match=rf"camera\.json.*{words}"):
+            load_cameras(saved(tmp_path, entry))
+    for text in (
+        f"width: 64\nheight: 48\ndistortion_model: {model}\nK: {ROWS}\nD: {FISHEYE}\n",
+        f"%YAML:1.0\n---\nimage_width: 64\nimage_height: 48\ncamera_model: {model}\nM: {ROWS}\nD: {FISHEYE}\n",
+        CAMERA_INFO.replace("plumb_bob", model).replace(
+            "- 0.0\n- 0.0\n- 0.0\n- 0.0\n- 0.0", "- 0.1\n- 0.0\n- 0.0\n- 0.0"
+        ),
+        KALIBR.format("pinhole", model),
+    ):
+        with pytest.raises(FormatError, match=rf"camera\.yml: .*{words}"):
+            load_cameras(saved(tmp_path, text, "camera.yml"))
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        PLAIN | {"camera_type": "fisheye", "D": FISHEYE},
+        PLAIN | {"lens_model": "Equidistant", "D": FISHEYE},
+        PLAIN | {"projection": "equidistant", "coeffs": FISHEYE},
+        PLAIN | {"type": "KannalaBrandt8", "coeffs": FISHEYE},
+        PLAIN | {"fisheye": True, "D": FISHEYE},
+        PLAIN | {"w": 64, "is_fisheye": True} | K4,
+        PLAIN | {"camera_model": "OPENCV_FISHEYE"} | K4,
+        PLAIN | {"camera_model": "OPENCV_FISHEYE"},  # without numbers it is still no pinhole
+        PLAIN | {"camera_model": "OPENCV"} | K4,  # k4 belongs to a fisheye, or to a longer polynomial
+        PLAIN | K4,
+        PLAIN | {"xi": 1.2, "D": FISHEYE},
+        PLAIN | {"lens": {"model": "fisheye", "k": FISHEYE}},
+        PLAIN | {"intrinsics": PLAIN | {"camera_type": "ds"}},
+    ],
+)
+def test_lenses_are_named_in_many_ways(tmp_path, entry):
+    with pytest.raises(FormatError, match=r"camera\.json.*is not a pinhole camera's"):
+        load_cameras(saved(tmp_path, entry))
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        (SIZE | {"K": ROWS, "D": [0.2, -0.1, 0.05, -0.02]}, "p1 and p2 are hardly as large"),
+        (SIZE | {"intrinsics": [20.0, 20.0, 31.5, 23.5], "D": FISHEYE}, "the view is as wide as its"),
+    ],
+)
+def test_four_numbers_without_a_model_must_be_like_those_of_a_pinhole(tmp_path, entry, words):
+    with pytest.raises(FormatError, match=rf"four numbers .*{words}; add distortion_model: plumb_bob"):
+        load_cameras(saved(tmp_path, entry))
+    text = "".join(f"{name}: {value}\n" for name, value in entry.items())
+    with pytest.raises(FormatError, match=rf"camera\.yml: four numbers .*{words}"):
+        load_cameras(saved(tmp_path, text, "camera.yml"))
+    lens = load_cameras(saved(tmp_path, entry | {"distortion_model": "plumb_bob"}))[0].distortion
+    assert lens.tolist() == [*entry["D"], 0, 0, 0, 0]
+    own = PLAIN | {"distortion": entry["D"]}  # k1 k2 p1 p2 by the format's own definition
+    assert load_cameras(saved(tmp_path, own))[0].distortion.tolist()[:4] == entry["D"]
+
+
+def test_chains_of_kalibr(tmp_path):
+    first, second = load_cameras(saved(tmp_path, KALIBR.format("pinhole", "radtan"), "camchain.yaml"))
+    assert first.intrinsics.tolist() == second.intrinsics.tolist() == WANTED
+    assert first.distortion.tolist()[:4] == [0.1, -0.2, 0.001, 0.002]
+    np.testing.assert_allclose(second.position, [0.11, 0, 0], atol=1e-15)
+    with pytest.raises(FormatError, match="cam1 lacks T_cn_cnm1"):
+        load_cameras(saved(tmp_path, KALIBR.format("pinhole", "radtan").replace("T_cn_cnm1", "T_imu"), "c.yaml"))
+
+
+def rectified(*, lens, fx=50.0, baseline=0.0, turn=0.0):
+    """Return ROS's camera_info: K, D, R about y, and P with a baseline."""
+    cos, sin = math.cos(turn), math.sin(turn)
+    return {
+        "width": 64, "height": 48, "distortion_model": "plumb_bob", "D": [lens, 0.0, 0.0, 0.0, 0.0], "K": ROWS,
+        "R": [cos, 0.0, sin, 0.0, 1.0, 0.0, -sin, 0.0, cos],
+        "P": [fx, 0.0, 30.0, -fx * baseline, 0.0, fx, 22.0, 0.0, 0.0, 0.0, 1.0, 0.0],
+    }  # fmt: skip
+
+
+def as_yaml(entry):
+    return "".join(f"{name}: {value}\n" for name, value in entry.items())
+
+
+def projected(entry, points):
+    """Return the pixels (N, 2) of points in the rectified frame of the left camera, by K, R and P themselves."""
+    rows = np.array(entry["P"]).reshape(3, 4)
+    if not any(entry["D"]):
+        pixels = np.c_[points, np.ones(len(points))] @ rows.T
+        return pixels[:, :2] / pixels[:, 2:]
+    place = -rows[0, 3] / rows[0, 0]
+    raw = (points - [place, 0, 0]) @ np.array(entry["R"]).reshape(3, 3)  # the inverse of R
+    x, y = raw[:, 0] / raw[:, 2], raw[:, 1] / raw[:, 2]
+    bent = 1 + entry["D"][0] * (x**2 + y**2)
+    return np.c_[60 * bent * x + 31.5, 61 * bent * y + 23.5]
+
+
+@pytest.mark.parametrize("lens", [0.0, 0.1])
+@pytest.mark.parametrize("baseline", [0.0, 0.12])
+@pytest.mark.parametrize("written", [json.dumps, as_yaml])
+def test_the_baseline_of_ros_is_in_p(tmp_path, lens, baseline, written):
+    entry = rectified(lens=lens, baseline=baseline, turn=0.05 if lens else 0.0)
+    path = saved(tmp_path, written(entry), "camera.json" if written is json.dumps else "camera.yaml")
+    told = nullcontext() if lens else pytest.warns(FileWarning, match="fx, fy, cx, cy are those of P.*not of K")
+    with told:
+        (camera,) = load_cameras(path)
+    np.testing.assert_allclose(camera.position, [baseline, 0, 0], atol=1e-12)
+    points = np.array([[0.1, 0.2, 1.0], [-0.3, 0.1, 2.0], [0.4, -0.2, 1.5]])
+    np.testing.assert_allclose(camera.project(torch.from_numpy(points))[0], projected(entry, points), atol=1e-9)
+
+
+def test_two_files_of_ros_are_a_pair(tmp_path):
+    for side, baseline in (("left", 0.0), ("right", 0.12)):
+        saved(tmp_path, as_yaml(rectified(lens=0.1, baseline=baseline, turn=0.03)), f"{side}.yaml")
+    rig = load_cameras(tmp_path)
+    assert rig.names == ("left", "right")
+    assert rig.stereo().baseline == pytest.approx(0.12)
+    np.testing.assert_allclose(rig.stereo().rotation, np.eye(3), atol=1e-12)  # turned alike
+
+
+ORB_SLAM = (
+    '%YAML:1.0\n\n# Camera Parameters\nCamera.type: "{}"\nCamera.fx: 60.0 # pixels\nCamera.fy: 61.0\n'
+    "Camera.cx: 31.5\nCamera.cy: 23.5\nCamera.k1: 0.2\nCamera.k2: -0.1\nCamera.p1: 0.01\nCamera.p2: 0.02\n"
+    "Camera.k3: 0.3\nCamera.width: 64\nCamera.height: 48\nDepthMapFactor: 5000.0\n"
+)
+
+
+def test_settings_of_orb_slam(tmp_path):
+    camera, scale = load_depth_camera(saved(tmp_path, ORB_SLAM.format("PinHole"), "TUM1.yaml"))
+    assert camera.intrinsics.tolist() == WANTED
+    assert camera.distortion.tolist() == [0.2, -0.1, 0.01, 0.02, 0.3, 0, 0, 0]
+    assert scale == pytest.approx(1 / 5000)
+    with pytest.raises(FormatError, match="'KannalaBrandt8' is not a pinhole camera's"):
+        load_cameras(saved(tmp_path, ORB_SLAM.format("KannalaBrandt8"), "TUM1.yaml"))
 
 
 @pytest.mark.parametrize(

@@ -92,6 +92,60 @@ def test_units_of_open3ds_recorder_are_per_metre(tmp_path):
     assert load_depth_camera(tmp_path / "k.json")[1] is None
 
 
+UNITS = [
+    ({"depth_scale": 0.001}, 0.001),
+    ({"depth_units": 0.0001}, 0.0001),
+    ({"depth_unit": 0.00025}, 0.00025),
+    ({"depthScale": 0.001}, 0.001),
+    ({"depth_unit": "mm"}, 0.001),
+    ({"depth_units": "Millimeters"}, 0.001),
+    ({"depth_factor": 5000.0}, 0.0002),
+    ({"depth_factor": 1000}, 0.001),
+    ({"DepthMapFactor": 5000}, 0.0002),
+    ({"RGBD.DepthMapFactor": 5000}, 0.0002),
+    ({"png_depth_scale": 6553.5}, 1 / 6553.5),
+    ({"scale": 6553.5}, 1 / 6553.5),
+    ({"depth_scale": 0.001, "depth_factor": 1000}, 0.001),
+    ({"scale": 0.5}, None),  # of the picture
+    ({"scale": 2.0}, None),
+    ({}, None),
+]
+
+
+@pytest.mark.parametrize(("entry", "unit"), UNITS)
+@pytest.mark.parametrize("nested", [None, "camera", "cam", "intrinsics", "depth"])
+def test_units_of_depth_under_the_names_of_other_programs(tmp_path, entry, unit, nested):
+    document = PLAIN | entry if nested is None else {"note": "x", nested: PLAIN | entry}
+    (tmp_path / "k.json").write_text(json.dumps(document))
+    camera, found = load_depth_camera(tmp_path / "k.json")
+    assert found == (unit if unit is None else pytest.approx(unit))
+    assert camera.intrinsics.tolist() == [60.0, 61.0, 31.5, 23.5]
+    lines = "".join(f"  {name}: {value}\n" for name, value in (PLAIN | entry).items())
+    text = lines.replace("  ", "") if nested is None else f"note: x\n{nested}:\n{lines}"
+    (tmp_path / "k.yaml").write_text(text)
+    camera, found = load_depth_camera(tmp_path / "k.yaml")
+    assert found == (unit if unit is None else pytest.approx(unit))
+    assert (camera.width, camera.intrinsics.tolist()) == (64, [60.0, 61.0, 31.5, 23.5])
+
+
+def test_a_unit_that_its_name_contradicts_is_told(tmp_path):
+    for entry, words in (
+        ({"depth_units": 1000}, "depth_units 1000 is taken for units per metre"),
+        ({"depth_factor": 0.001}, "depth_factor 0.001 is taken for metres per unit"),
+    ):
+        with pytest.warns(FileWarning, match=rf"k\.json: {words}"):
+            found = depths(tmp_path, np.round(1000 * DOME).astype("u2"), **entry)
+        np.testing.assert_allclose(found, (0.95, 1.2), atol=2e-3)
+    for entry, words in (
+        ({"depth_units": 0.001, "depth_factor": 5000}, "not the same unit of depth; keep one"),
+        ({"depth_units": "furlongs"}, "depth_units must hold numbers"),
+        ({"depth_factor": 0}, "depth_factor must be positive"),
+        ({"depth_factor": [1]}, "depth_factor must be a number"),
+    ):
+        with pytest.raises(FormatError, match=rf"k\.json: .*{words}"):
+            depths(tmp_path, np.round(1000 * DOME).astype("u2"), **entry)
+
+
 def test_a_pointer_in_place_of_a_picture_is_told(tmp_path):
     (tmp_path / "d.png").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0f\nsize 48213\n")
     with pytest.raises(FormatError, match=r"d\.png: is a Git LFS pointer"):

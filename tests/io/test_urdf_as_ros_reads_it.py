@@ -3,7 +3,7 @@
 import pytest
 import trimesh
 
-from torchreg.errors import FileWarning, FormatError, ModelError
+from torchreg.errors import FileWarning, FormatError, ModelError, UnitsWarning
 from torchreg.io.urdf import load_urdf
 from torchreg.shapes.articulated import ArticulatedShape
 
@@ -167,3 +167,91 @@ def test_a_missing_visual_mesh_gives_way_to_other_geometry(tmp_path):
     (tmp_path / "gone.stl").write_text("version https://git-lfs.github.com/spec/v1\nsize 1\n")
     with pytest.warns(FileWarning, match=r"gone\.stl is a Git LFS pointer.*it is left out"):
         assert [solid.kind for solid in load_urdf(path).link_primitives[0]] == ["box"]
+
+
+def chained(sizes, steps=(0.12, 0.4, 0.36), slide="0 0.08", mount="base", mesh=None):
+    """Return a robot of four links, one upon the other, and a finger that slides on the last."""
+    names = ("base", "turret", "upper", "fore")
+    shapes = [f"<box size='{0.3 * s} {0.3 * s} {s}'/>" for s in sizes]
+    shapes = [f"<mesh filename='{mesh}' scale='{s} {s} {s}'/>" for s in sizes] if mesh else shapes
+    turns = [
+        f"<joint name='to_{child}' type='revolute'><parent link='{parent}'/><child link='{child}'/>"
+        f"<origin xyz='0 0 {step}'/><limit lower='-2' upper='2'/></joint>"
+        for parent, child, step in zip(names, names[1:], steps, strict=False)
+    ]
+    lower, upper = slide.split()
+    finger = (
+        f"<joint name='grip' type='prismatic'><parent link='{mount}'/><child link='finger'/><origin xyz='0 0 0.1'/>"
+        f"<axis xyz='1 0 0'/><limit lower='{lower}' upper='{upper}'/></joint>"
+    )
+    bodies = [link(name, shape) for name, shape in zip(names, shapes, strict=True)]
+    return robot(*bodies, link("finger", "<box size='0.02 0.02 0.08'/>"), *turns, finger)
+
+
+RIGHT = (0.3, 0.2, 0.45, 0.4)
+STEPS = (0.12, 0.4, 0.36)
+
+
+def times(numbers, factor, only=None):
+    return tuple(factor * x if only is None or k == only else x for k, x in enumerate(numbers))
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (chained(times(RIGHT, 1000)), r"links 'base', 'turret', 'upper' and 1 more are .*in millimeters; .* by 0\.001"),
+        (chained(times(RIGHT, 1000), mesh="unit.stl"), r"in millimeters; give <mesh> scale=\"0\.001 0\.001 0\.001\""),
+        (chained(times(RIGHT, 1000, 2), mesh="unit.stl"), r"link 'upper' is .* beside joints 0\.4 m .*millimeters"),
+        (chained(times(RIGHT, 100), mesh="unit.stl"), r"in centimeters; give <mesh> scale=\"0\.01 0\.01 0\.01\""),
+        (chained(times(RIGHT, 1 / 0.0254), mesh="unit.stl"), r"in inches; give <mesh> scale=\"0\.0254 0\.0254 0"),
+        (chained(RIGHT, times(STEPS, 1000)), r"joints .*'to_upper'.* up to 400 m from .*beside links .*in millimeters"),
+        (chained(RIGHT, times(STEPS, 1000, 1)), r"joint 'to_upper' is up to 400 m from the parent"),
+        (chained(RIGHT, slide="0 85"), r"joint 'grip' slides from 0 to 85 m, .* in millimeters; write 0 to 0\.085"),
+        (chained(RIGHT, slide="-40 0"), r"joint 'grip' slides from -40 to 0 m, .*write -0\.04 to 0"),
+    ],
+)  # fmt: skip
+def test_links_joints_and_slides_in_another_unit_are_told(tmp_path, content, words):
+    trimesh.creation.box(extents=(0.3, 0.3, 1)).export(tmp_path / "unit.stl")
+    with pytest.warns(UnitsWarning, match=rf"arm\.urdf: {words}|arm\.urdf: .*{words}") as caught:
+        load_urdf(saved(tmp_path, content))
+    assert len(caught) == 1
+
+
+def test_geometry_that_is_scaled_twice_is_told(tmp_path):
+    trimesh.creation.box(extents=(0.3, 0.3, 1)).export(tmp_path / "unit.stl")
+    text = chained(times(RIGHT, 0.001), mesh="unit.stl").replace("0.02 0.02 0.08", "0.00002 0.00002 0.00008")
+    with pytest.warns(UnitsWarning, match=r"all links are at most 0\.\d+ mm large.*multiply it by 1000"):
+        load_urdf(saved(tmp_path, text))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        chained(RIGHT),
+        chained(times(RIGHT, 40), times(STEPS, 40), slide="0 12"),  # a crane
+        chained((8.0, 0.5, 0.5, 0.4), (3.0, 0.4, 0.3), slide="0 12"),  # a gantry on its rail
+        chained((0.3, 0.01, 0.01, 0.01)),  # markers at joints
+        robot(link("base", "<box size='30 30 0.01'/>"), link("tip"), joint("tip")),  # on the ground
+        # Free in the world: a platform on two slides without geometry.
+        robot("<link name='world'/><link name='x'/>", link("base"), joint("base", "prismatic", "<limit lower='-50' "
+              "upper='50'/>", "x"), joint("x", "prismatic", "<limit lower='-50' upper='50'/>", "world")),
+        chained(RIGHT, slide="-3 3"),
+    ],
+)  # fmt: skip
+def test_large_robots_and_free_ones_are_as_they_are(tmp_path, content):
+    load_urdf(saved(tmp_path, content))  # warnings are errors in tests
+
+
+def test_names_of_joints_and_parts_are_told_apart_from_others(tmp_path):
+    """A joint called like a degree of freedom of the base, and a link called like the second solid of another."""
+    second = "<visual><geometry><sphere radius='0.1'/></geometry></visual>"
+    base = link("base").replace("</link>", f"{second}</link>")
+    text = robot(base, link("base_1"), link("tip"), joint("base_1"), joint("tip"))
+    text = text.replace("'to_tip'", "'base_x'").replace("'to_base_1'", "'base_x_joint'")
+    with pytest.warns(FileWarning, match="joint 'base_x' is called 'base_x_joint_' here, as base_x moves the whole"):
+        shape = ArticulatedShape.from_urdf(saved(tmp_path, text))
+    assert shape.dof_names[6:] == ("base_x_joint", "base_x_joint_")
+    assert shape.part_names == ("base", "base_1_", "base_1", "tip")
+    pose = shape.pose_from_dict({"base_x": 0.5, "base_x_joint_": 0.25})
+    assert shape.pose_to_dict(pose)["base_x"] == 0.5
+    assert pose.tolist() == [0.5, 0, 0, 0, 0, 0, 0, 0.25]

@@ -10,7 +10,7 @@ import torchreg as tr
 from experiments.made_up.moving_labels import moving_labels
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.scan_sequences import jointed_toy
-from torchreg.errors import DegenerateDataWarning, FileWarning, InputError, InputTypeError
+from torchreg.errors import DegenerateDataWarning, FileWarning, InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.rigid import rigid_matrix, se3_exp, transform_points
@@ -140,6 +140,35 @@ def test_the_same_again(pair, known):
     again = register(pair.source, pair.target, 8, 30, start=start)
     assert torch.equal(again.deformed, found.deformed)
     assert torch.equal(again.weights, found.weights)
+
+
+SIZES = [
+    (10, r"target is 1\d\.\d+ times as large as source.*target is in millimeters and source in centimeters, load "
+         r"target with a scale of 0\.1 \(--scale 1 --scale 0\.1\)"),
+    (0.1, r"source is .* as large as target.*source is in millimeters .*scale of 0\.1 \(--scale 0\.1 --scale 1\)"),
+    (25.4, r"target is in millimeters and source in inches, load target with a scale of 0\.03937"),
+    (39.37, r"target is in inches and source in metres, load target with a scale of 0\.0254"),
+    (100, r"target is in centimeters and source in metres, load target with a scale of 0\.01"),
+    (1000, r"target is in millimeters and source in metres, load target with a scale of 0\.001"),
+    (0.001, r"source is in millimeters and target in metres, load source with a scale of 0\.001"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("factor", "message"), SIZES)
+def test_scans_of_two_units_are_told_with_the_likely_factor(pair, factor, message):
+    other = tr.RangeScan(factor * pair.target.points, pair.target.faces)
+    with pytest.raises(UnitsWarning, match=message):  # warnings are errors in tests
+        register(pair.source, other, 8, 30, FEW)
+    if factor == 10:
+        with pytest.raises(UnitsWarning, match=r"scans\[1\] is in millimeters and scans\[.\] in centimeters"):
+            tr.register_sequence([pair.source, other, pair.target], 8, 30, FEW)
+
+
+def test_a_crop_and_a_stray_point_are_no_other_unit(pair):
+    points = pair.source.points
+    far = tr.RangeScan(torch.cat([points, points.mean(0, keepdim=True) + 20 * pair.source.diagonal]))
+    crop = pair.target.points[pair.target.points[:, 2] > pair.target.points[:, 2].quantile(0.6)]
+    register(far, tr.RangeScan(crop), 2, 10, FEW)
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e3])

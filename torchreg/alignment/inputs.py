@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,6 +19,7 @@ from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, U
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.loaded import as_points
 from torchreg.geometry.spread import SAME_SHARE, SPREADS, spread_dimensions
+from torchreg.geometry.units import LENGTHS, likely_unit
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
 
@@ -30,7 +30,6 @@ class UnitsCheck:
 
     ratio: float = 30.0  # of their sizes: no pose and no crop explains more
     min_data: int = 10  # with a reliable size
-    factors: ClassVar[dict[str, float]] = {"millimeters": 0.001, "centimeters": 0.01, "kilometers": 1000.0}
 
 
 UNITS = UnitsCheck()
@@ -149,7 +148,8 @@ def check_clouds(
 
 def _remedy(ratio: float) -> str:
     """Return what to do about data that spread over some sizes of the model; those in metres do over about one."""
-    unit, factor = min(UNITS.factors.items(), key=lambda item: abs(math.log(max(ratio, 1e-30) * item[1])))
+    # Inches differ too little from centimeters, which are far more common, for the size of a cloud to tell.
+    unit, factor = likely_unit(ratio, {name: size for name, size in LENGTHS.items() if name != "inches"})
     return f"If they are in {unit}, load them with scale={factor:g}"
 
 

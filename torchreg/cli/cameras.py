@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 
 Calibration = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="The cameras: .json, OpenCV's .yml, or a folder of COLMAP's text files."),
+    typer.Option(
+        metavar="FILE",
+        help="The cameras: .json, OpenCV's .yml, a folder of COLMAP's text files or of ROS's left.yaml and right.yaml.",
+    ),
 ]
 DepthRange = Annotated[
     tuple[float, float] | None,

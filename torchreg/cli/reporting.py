@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import sys
 import warnings
 from collections.abc import Callable
 from contextvars import ContextVar
@@ -69,7 +70,10 @@ def show_warning(
     """Print a warning in one line, with file and line if it is not one of the library's."""
     origin = "" if issubclass(category, TorchregWarning) else f"{filename}:{lineno}: "
     told = in_options(str(message), _options.get())
-    typer.echo(f"torchreg: warning: {origin}{told}", err=True)
+    from tqdm import tqdm
+
+    with tqdm.external_write_mode(sys.stderr):  # on a line of its own, not behind a progress bar
+        typer.echo(f"torchreg: warning: {origin}{told}", err=True)
 
 
 def options_of(command: Callable[..., None]) -> tuple[str, ...]:

@@ -11,8 +11,9 @@ The JSON is one object::
 or one of those cameras alone. Pixels are OpenCV's: whole numbers are the middles of pixels. The motion is in metres and
 maps world coordinates to camera coordinates (right, down, forward); ``camera_to_world`` may give its inverse instead,
 and without either the camera is at the origin. Name and distortion (0, 4, 5 or 8 numbers, see `Camera`) may be missing.
-The camera of a depth image may have ``depth_scale``, metres per unit of the file's numbers; see `load_depth` for those
-without. `own_entry` tells which programs' files are understood beside these.
+The camera of a depth image may have ``depth_scale``, metres per unit of the file's numbers, or what other programs
+write in its place (``depth_units``, ``depth_factor``, ...); see `load_depth` for those without. `own_entry` tells which
+programs' files are understood beside these.
 """
 
 from __future__ import annotations
@@ -23,35 +24,39 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
-import torch
-
 from torchreg._checks import check_positive
 from torchreg.errors import FormatError, InputError
 from torchreg.geometry.camera import Camera
 from torchreg.geometry.camera_rig import CameraRig
-from torchreg.geometry.rigid import invert_rigid
 from torchreg.io.atomic import write_atomic
-from torchreg.io.camera_entries import check_baseline, check_principal_point, own_entry
+from torchreg.io.camera_entries import (
+    NUMBERS,
+    camera_of,
+    cameras_of,
+    check_baseline,
+    check_principal_point,
+    depth_unit,
+    own_entry,
+)
 from torchreg.io.colmap import load_colmap
 from torchreg.io.file_format import FileFormat, begins, check_stand_in, choose, naming, plain_text
 from torchreg.io.images import MILLIMETER
 from torchreg.io.limits import DEFAULT_LIMITS, FILE_BUDGET, FileLimits, check_budget, local_path, read_bytes
-from torchreg.io.opencv_yaml import PAIRS, read_opencv, read_opencv_values, values_of
+from torchreg.io.opencv_yaml import PAIRS, read_opencv, read_opencv_values, values_of, yaml_object
 
 FORMAT = "torchreg-cameras"
 _VERSION = 1
-_NUMBERS = ("fx", "fy", "cx", "cy")
-
-
 CAMERAS = "cameras"
+_SIDES = ("left", "right")
 
 
 def load_cameras(path: str | os.PathLike[str], *, scale: float = 1.0, limits: FileLimits = DEFAULT_LIMITS) -> CameraRig:
     """Return the cameras of a calibration file, float64.
 
     Args:
-        path: a ``.json`` file as above or of another program, a ``.yml`` or ``.yaml`` file of OpenCV's or ROS's, or a
-            folder with COLMAP's ``cameras.txt`` and ``images.txt``.
+        path: a ``.json`` file as above or of another program, a ``.yml`` or ``.yaml`` file of OpenCV's, ROS's, Kalibr's
+            or ORB-SLAM's, a folder with COLMAP's ``cameras.txt`` and ``images.txt``, or one with the files ``left`` and
+            ``right`` of ROS's stereo calibration, whose P tells the distance of the cameras.
         scale: metres per unit of the lengths in the file, such as 0.001 where the board was measured in millimeters.
         limits: ``max_bytes`` applies.
 
@@ -66,7 +71,7 @@ def load_cameras(path: str | os.PathLike[str], *, scale: float = 1.0, limits: Fi
     check_positive(scale, "scale")
     file = local_path(path)
     if file.is_dir():
-        rig = load_colmap(file, limits=limits)
+        rig = _stereo_folder(file, limits) or load_colmap(file, limits=limits)
     else:
         content = read_bytes(file, limits)
         with naming(file):
@@ -74,9 +79,19 @@ def load_cameras(path: str | os.PathLike[str], *, scale: float = 1.0, limits: Fi
     rig = rig if scale == 1 else _scaled(rig, scale)
     for number, camera in enumerate(rig):
         check_principal_point(camera, f"{file}: camera {camera.name or number}")
-    if len(rig) == 2 and {camera.name for camera in rig} == {"left", "right"}:
+    if len(rig) == 2 and {camera.name for camera in rig} == set(_SIDES):
         check_baseline(float((rig[0].camera_to_world[:3, 3] - rig[1].camera_to_world[:3, 3]).norm()), str(file))
     return rig
+
+
+def _stereo_folder(folder: Path, limits: FileLimits) -> CameraRig | None:
+    """Return the pair of the files left and right of a folder, as ROS's calibrator writes them; None without both."""
+    endings = [ending for row in FORMATS for ending in row.endings]
+    files = {side: [file for end in endings if (file := folder / f"{side}{end}").is_file()] for side in _SIDES}
+    if not all(len(found) == 1 for found in files.values()):
+        return None
+    pair = [load_cameras(found[0], limits=limits)[0] for found in files.values()]
+    return CameraRig(tuple(replace(camera, name=side) for camera, side in zip(pair, _SIDES, strict=True)))
 
 
 def _scaled(rig: CameraRig, scale: float) -> CameraRig:
@@ -91,20 +106,27 @@ def _read_json(content: bytes, file: Path, limits: FileLimits) -> CameraRig:
     document = json_object(content, file)
     if any(names[0] in document for names in PAIRS):
         return read_opencv_values(values_of(document), file)
-    entries = document.get("cameras", document.get("parameters", [document]))
+    entries = document.get("cameras", document.get("parameters"))
     if "cameras" in document and (document.get("format"), document.get("version")) != (FORMAT, _VERSION):
         raise FormatError(
             f'{file}: must hold "format": "{FORMAT}" and "version": {_VERSION}, got {document.get("format")!r} and '
             f"{document.get('version')!r}"
         )
-    if not isinstance(entries, list) or not entries:
-        raise FormatError(f"{file}: cameras must be a list of at least one camera")
-    _check_number(len(entries), file)
-    cameras = tuple(_camera(entry, f"{file}: camera {number}") for number, entry in enumerate(entries))
     try:
-        return CameraRig(cameras)
+        if entries is None:
+            return CameraRig(tuple(cameras_of(document, f"{file}: camera 0")))
+        if not isinstance(entries, list) or not entries:
+            raise FormatError(f"{file}: cameras must be a list of at least one camera")
+        _check_number(len(entries), file)
+        return CameraRig(tuple(_camera(entry, f"{file}: camera {number}") for number, entry in enumerate(entries)))
     except InputError as error:
         raise FormatError(f"{file}: {error}") from error
+
+
+def _camera(given: Any, where: str) -> Camera:
+    if not isinstance(given, dict):
+        raise FormatError(f"{where} must be a JSON object, got {type(given).__name__}")
+    return camera_of(own_entry(given, where), where)
 
 
 def _check_number(count: int, file: Path) -> None:
@@ -134,7 +156,7 @@ FORMATS: tuple[FileFormat, ...] = (
         kind=CAMERAS,
         endings=(".yml", ".yaml"),
         read=read_opencv,
-        holds="one camera or a pair; also of ROS's calibrator and camera_info",
+        holds="one camera or a pair; also of ROS's calibrator and camera_info, Kalibr, ORB-SLAM",
         loader="load_cameras",
         sniff=begins(b"%YAML"),
     ),
@@ -147,7 +169,7 @@ def load_depth_camera(
     """Return the camera of a depth image, float64, and its scale in metres per unit, None where the file has none.
 
     Args:
-        path: a file of one camera, see `load_cameras`; its JSON may have depth_scale.
+        path: a file of one camera, see `load_cameras`, which may have depth_scale, or depth_units, depth_factor, ...
         limits: ``max_bytes`` applies.
 
     Raises:
@@ -159,22 +181,18 @@ def load_depth_camera(
     """
     file = local_path(path)
     content = read_bytes(file, limits)
-    document = json_object(content, file) if file.suffix.lower() == ".json" or _is_json(content) else {}
-    entries = document.get("cameras", [document])
-    if not isinstance(entries, list) or len(entries) != 1:
-        raise FormatError(f"{file}: must hold the one camera of the depth image")
-    rig = load_cameras(file, limits=limits) if not document else CameraRig((_camera(entries[0], str(file)),))
+    if file.suffix.lower() == ".json" or _is_json(content):
+        document = json_object(content, file)
+        entries = document.get("cameras", [document])
+        if not isinstance(entries, list) or len(entries) != 1:
+            raise FormatError(f"{file}: must hold the one camera of the depth image")
+        rig, document = CameraRig((_camera(entries[0], str(file)),)), entries[0]
+        check_principal_point(rig[0], str(file))
+    else:
+        rig, document = load_cameras(file, limits=limits), yaml_object(content, file)
     if len(rig) != 1:
         raise FormatError(f"{file}: must hold the one camera of the depth image, got {len(rig)}")
-    if document:
-        check_principal_point(rig[0], str(file))
-    entry = own_entry(entries[0], str(file)) if document else {}
-    if "depth_scale" not in entry:
-        return rig[0], None
-    scale = _number(entry["depth_scale"], "depth_scale", str(file))
-    if scale <= 0:
-        raise FormatError(f"{file}: depth_scale must be positive, got {scale}")
-    return rig[0], scale
+    return rig[0], depth_unit(document, str(file))
 
 
 def save_cameras(path: str | os.PathLike[str], cameras: CameraRig) -> None:
@@ -214,7 +232,7 @@ def _entry(camera: Camera) -> dict[str, Any]:
     length = next(size for size in (0, 4, 5, 8) if not any(lens[size:]))
     named = {"name": camera.name} if camera.name else {}
     size = {"width": camera.width, "height": camera.height}
-    numbers = dict(zip(_NUMBERS, camera.intrinsics.tolist(), strict=True))
+    numbers = dict(zip(NUMBERS, camera.intrinsics.tolist(), strict=True))
     distortion = {"distortion": lens[:length]} if length else {}
     return named | size | numbers | distortion | {"world_to_camera": camera.world_to_camera.tolist()}
 
@@ -233,45 +251,3 @@ def json_object(content: bytes, file: Path) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise FormatError(f"{file}: must hold a JSON object, got {type(document).__name__}")
     return document
-
-
-def _camera(given: Any, where: str) -> Camera:
-    if not isinstance(given, dict):
-        raise FormatError(f"{where} must be a JSON object, got {type(given).__name__}")
-    entry = own_entry(given, where)
-    missing = [key for key in ("width", "height", *_NUMBERS) if key not in entry]
-    if missing:
-        raise FormatError(f"{where} lacks {', '.join(missing)}")
-    if "world_to_camera" in entry and "camera_to_world" in entry:
-        raise FormatError(f"{where} holds both world_to_camera and camera_to_world; keep one")
-    name = entry.get("name", "")
-    if not isinstance(name, str):
-        raise FormatError(f"{where}: name must be text, got {name!r}")
-    key = "camera_to_world" if "camera_to_world" in entry else "world_to_camera"
-    motion = _numbers(entry.get(key, torch.eye(4).tolist()), key, where)
-    lens = _numbers(entry.get("distortion", []), "distortion", where)
-    intrinsics = [_number(entry[number], number, where) for number in _NUMBERS]
-    try:
-        camera = Camera(
-            entry["width"], entry["height"], torch.tensor(intrinsics, dtype=torch.float64), motion, lens, name
-        )
-    except (ValueError, TypeError, OverflowError) as error:
-        raise FormatError(f"{where}: {str(error).replace('world_to_camera', key)}") from error
-    return replace(camera, world_to_camera=invert_rigid(motion)) if key == "camera_to_world" else camera
-
-
-def _number(value: Any, name: str, where: str) -> float:
-    numbers = _numbers([value], name, where)
-    if numbers.shape != (1,):
-        raise FormatError(f"{where}: {name} must be a number, got {value!r:.80}")
-    return float(numbers)
-
-
-def _numbers(value: Any, name: str, where: str) -> torch.Tensor:
-    try:
-        numbers = torch.tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise FormatError(f"{where}: {name} must hold numbers, all rows equally many, got {value!r:.80}") from error
-    if not bool(numbers.isfinite().all()):
-        raise FormatError(f"{where}: {name} must be finite, got {value!r:.80}")
-    return numbers

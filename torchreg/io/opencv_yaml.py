@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,12 @@ from torchreg.geometry.camera_rig import CameraRig
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.geometry.rotation import so3_exp
 from torchreg.io.atomic import write_atomic
-from torchreg.io.camera_entries import check_lens_model
+from torchreg.io.camera_entries import MATRICES, cameras_of
+from torchreg.io.camera_lenses import check_lens
 from torchreg.io.file_format import plain_text
 from torchreg.io.limits import DEFAULT_LIMITS, FileLimits, local_path, read_bytes
 
-_KEY = re.compile(r"^([A-Za-z_]\w*):[ \t]*(.*)$", re.MULTILINE)
+_KEY = re.compile(r"^([A-Za-z_][\w.]*):[ \t]*(.*)$", re.MULTILINE)
 _FIELD = re.compile(r"^[ \t]+(rows|cols|dt|data):[ \t]*", re.MULTILINE)
 # Names of the same entries in calibrations of different origin.
 _SINGLE = (
@@ -35,9 +37,10 @@ PAIRS = (
     ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"),
     ("K1", "D1", "K2", "D2"),
 )
+_DEEPEST = 3  # objects within each other
 _WIDTHS, _HEIGHTS, _SIZES = ("image_width", "width"), ("image_height", "height"), ("image_size", "imageSize", "size")
 
-Values = dict[str, "Tensor | str"]
+Values = dict[str, "Tensor | str | Values"]
 
 
 def load_opencv(
@@ -52,7 +55,8 @@ def load_opencv(
     A pair has ``M1 D1 M2 D2 R T`` (or ``cameraMatrix1 distCoeffs1 ...``, ``K1 ...``), where R and T map coordinates of
     the left camera to the right one; the left one is at the origin. One camera has ``camera_matrix`` and
     ``distortion_coefficients`` (or ``cameraMatrix distCoeffs``, ``K D``), and maybe R and T from the world. ROS's files
-    have ``K D R P``, whose R straightens pictures and is let be.
+    have ``K D R P``: the world is then that of the rectified pictures of the left camera. Kalibr's chains of cameras
+    and ORB-SLAM's settings are read as well.
 
     Args:
         path: the file.
@@ -79,6 +83,21 @@ def read_opencv(
     content: bytes, file: Path, _: FileLimits, *, size: tuple[int, int] | None = None, unit: float = 1.0
 ) -> CameraRig:
     """Return the cameras in the bytes of a file; see `load_opencv`."""
+    values = _parsed(_text(content, file), file)
+    if _is_opencvs(values):
+        return read_opencv_values(values, file, size=size, unit=unit)
+    try:
+        return CameraRig(tuple(cameras_of(_as_object(values), str(file))))
+    except InputError as error:
+        raise FormatError(f"{file}: {error}") from error
+
+
+def yaml_object(content: bytes, file: Path) -> dict[str, Any]:
+    """Return what a YAML file holds as its JSON would."""
+    return _as_object(_parsed(_text(content, file), file))
+
+
+def _text(content: bytes, file: Path) -> str:
     try:
         text = plain_text(content).decode("utf-8")
     except UnicodeDecodeError as error:
@@ -87,7 +106,40 @@ def read_opencv(
         raise FormatError(
             f"{file}: must begin with %YAML, as OpenCV's FileStorage writes it, or hold `name: value` lines"
         )
-    return read_opencv_values(_parsed(text, file), file, size=size, unit=unit)
+    return text
+
+
+def _is_opencvs(values: Values) -> bool:
+    """Return whether the matrices are named as OpenCV's programs name them, or nothing in them is a camera's."""
+    if any(names[0] in values for names in PAIRS) or "T" in values:
+        return True
+    if any(name in values for name in ("P", "p", "projection_matrix")):
+        return False
+    if any(names[0] in values for names in _SINGLE):
+        return True
+    cameras = (isinstance(value, dict) or name in MATRICES or name.endswith("x") for name, value in values.items())
+    return not any(cameras)
+
+
+def _as_object(values: Values) -> dict[str, Any]:
+    """Return matrices, words and what is nested in them as JSON would hold them."""
+    found = dict[str, Any]()
+    for name, value in values.items():
+        if isinstance(value, dict):
+            found[name] = _as_object(value)
+        else:
+            found[name] = value.tolist() if isinstance(value, Tensor) else _number(value)
+    return found
+
+
+def _number(word: str) -> str | int | float:
+    """Return a word as a number where it is one."""
+    if _is_count(word):
+        return int(word)
+    try:
+        return float(word)
+    except ValueError:
+        return word
 
 
 def read_opencv_values(
@@ -147,18 +199,21 @@ def _written(name: str, matrix: Tensor) -> str:
     return f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {data} ]"
 
 
-def _parsed(text: str, path: Path) -> Values:
-    """Return the matrices, lists of numbers and other words of a file by their names."""
+def _parsed(text: str, path: Path, depth: int = 0) -> Values:
+    """Return the matrices, lists of numbers, other words and what is nested in a file by their names."""
     marks = list(_KEY.finditer(text))
     ends = [*(mark.start() for mark in marks[1:]), len(text)][: len(marks)]
     values: Values = {}
     for mark, end in zip(marks, ends, strict=True):
-        name, first = mark.group(1), mark.group(2).strip()
+        name, first = mark.group(1), re.sub(r"(^|\s)#.*", "", mark.group(2)).strip()
         body = text[mark.start(2) : end]
+        inner = textwrap.dedent(text[mark.end() + 1 : end]) if not first else ""
         if "opencv-matrix" in first or (not first and re.search(r"^[ \t]+data:", body, re.MULTILINE)):
             values[name] = _matrix(body, f"{path}: {name}")
         elif first.startswith("[") or (not first and re.match(r"\s*-\s", body)):
             values[name] = _squared(_listed(body, f"{path}: {name}"))
+        elif depth < _DEEPEST and _KEY.search(inner):
+            values[name] = _parsed(inner, path, depth + 1)
         else:
             values[name] = first.strip("\"'")
     return values
@@ -237,34 +292,29 @@ def _cameras(values: Values, width: int, height: int, unit: float, path: Path) -
         if names[0] in values:
             if motion is None:
                 raise FormatError(f"{path}: lacks R and T of the stereo pair, which OpenCV keeps in extrinsics.yml")
-            first, second = _lens(values, names[:2], path), _lens(values, names[2:], path)
+            first, second = _lens(values, names[:2], width, path), _lens(values, names[2:], width, path)
             left = Camera(width, height, first[0], distortion=first[1], name="left")
             rig = CameraRig((left, Camera(width, height, second[0], motion, second[1], "right")))
             rig.stereo()  # refuses swapped cameras
             return list(rig)
     for single in sorted(_SINGLE, key=lambda names: names[1] not in values):
         if single[0] in values:
-            intrinsics, lens = _lens(values, single, path)
+            intrinsics, lens = _lens(values, single, width, path)
             name = values.get("camera_name", "")
             pose = torch.eye(4) if motion is None else motion
             return [Camera(width, height, intrinsics, pose, lens, name if isinstance(name, str) else "")]
     raise FormatError(f"{path}: holds neither camera_matrix nor M1 and M2, but {', '.join(values) or 'nothing'}")
 
 
-def _lens(values: Values, names: tuple[str, ...], path: Path) -> tuple[Tensor, Tensor]:
+def _lens(values: Values, names: tuple[str, ...], width: int, path: Path) -> tuple[Tensor, Tensor]:
     """Return fx, fy, cx, cy and the distortion."""
     matrix, lens = values.get(names[0]), values.get(names[1], torch.zeros(0, dtype=torch.float64))
     if not isinstance(matrix, Tensor) or matrix.shape != (3, 3):
         raise FormatError(f"{path}: {names[0]} must be a 3 x 3 matrix")
     if isinstance(lens, Tensor) and not bool(lens.any()):
         lens = lens[:0]  # no distortion, however many zeros
-    model = next((values[name] for name in ("distortion_model", "camera_model", "model") if name in values), "")
-    if isinstance(lens, Tensor) and isinstance(model, str):
-        check_lens_model(model, lens.numpy(), str(path))
-    if "xi" in values:
-        raise FormatError(
-            f"{path}: holds xi, of an omnidirectional camera, which is not supported; undistort the pictures"
-        )
+    if isinstance(lens, Tensor):
+        check_lens(values, lens.numpy().reshape(-1), str(path), float(matrix[0, 0]) / width)
     if not isinstance(lens, Tensor) or lens.numel() not in (0, 1, 4, 5, 8, 12, 14) or bool(lens.flatten()[8:].any()):
         raise FormatError(
             f"{path}: {names[1]} must hold 4, 5 or 8 numbers; prisms and tilted sensors are not supported"
@@ -276,8 +326,7 @@ def _lens(values: Values, names: tuple[str, ...], path: Path) -> tuple[Tensor, T
 
 
 def _motion(values: Values, unit: float, path: Path) -> Tensor | None:
-    # ROS's R straightens the picture of one camera, and says nothing of the world.
-    if "T" not in values and ("R" not in values or "P" in values):
+    if "T" not in values and "R" not in values:
         return None
     turn, step = values.get("R"), values.get("T")
     if not isinstance(turn, Tensor) or not isinstance(step, Tensor) or step.numel() != 3 or turn.numel() not in (3, 9):

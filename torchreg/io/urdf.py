@@ -20,6 +20,7 @@ from torchreg.io.file_format import check_stand_in, naming
 from torchreg.io.limits import DEFAULT_LIMITS, FILE_BUDGET, FileLimits, check_allowed, local_path, read_bytes
 from torchreg.io.mesh_files import MeshFiles
 from torchreg.io.strict_xml import parse_lenient_xml
+from torchreg.io.urdf_units import warn_about_lengths
 
 # Attributes of a mimic joint: added to its multiple of the other.
 _MIMIC = ("offset", "multiplier")
@@ -116,11 +117,14 @@ def load_urdf(
 
     Warns:
         FileWarning: if something is left out or held fixed, an element has two origins, or angles seem to be degrees.
+        UnitsWarning: if links, joints or slides seem to be in another unit than the rest.
     """
     check_choice(meshes, "meshes", ("warn", "require", "skip"))
     source = local_path(path)
     with naming(source):
-        return _read_robot(source, [Path(folder) for folder in package_dirs], meshes, limits)
+        record = _read_robot(source, [Path(folder) for folder in package_dirs], meshes, limits)
+        warn_about_lengths(record, source)
+    return record
 
 
 def _read_robot(source: Path, package_dirs: Sequence[Path], meshes: str, limits: FileLimits) -> UrdfRecord:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -30,6 +29,7 @@ from torchreg.geometry.range_scan import RangeScan
 from torchreg.geometry.scan_clusters import clustered_scan
 from torchreg.geometry.spread import SPREADS, spread_dimensions
 from torchreg.geometry.support import SUPPORTS, split_support, warn_about_support
+from torchreg.geometry.units import likely_pair, robust_size
 from torchreg.registration.bones.alternation import ReducedFit, Samples, turned_normals
 from torchreg.registration.bones.config import BoneConfig, OnRegisterStep
 from torchreg.registration.bones.labels import CellData, labels_of_parts
@@ -104,7 +104,7 @@ def register(
 
     Warns:
         DegenerateDataWarning: if a scan lies on a line or on a plane; the status is DEGENERATE.
-        UnitsWarning: if one scan is more than thirty times larger than the other.
+        UnitsWarning: if one scan is more than seven times larger than the other, unless ``start`` is given.
         FileWarning: if a support is left out.
 
     Differentiable: no; `GridLBS` is, for refining what was found.
@@ -132,6 +132,8 @@ def register(
             support="keep",
         ).moved(origin)  # fmt: skip
     degenerate = warn_about_flat_scans((source, target), stacklevel=4)
+    if start is None:
+        warn_about_units((source, target), ("source", "target"), stacklevel=4)
     return _registered(
         source, target, num_bones, grid_resolution, config, generator, on_step,
         start=start, confidence=confidence, parts=parts, degenerate=degenerate,
@@ -206,7 +208,6 @@ def _checked_scans(source: Any, target: Any, num_bones: int, grid_resolution: in
     check_inputs((source, target), num_bones, grid_resolution)
     # From the caller of `register` and its two decorators.
     warn_about_rounding(source.points, "points of source", source.diagonal, stacklevel=5)
-    _warn_about_units(source, target)
     return source, target
 
 
@@ -335,26 +336,30 @@ def warn_about_flat_scans(scans: Sequence[RangeScan], *, stacklevel: int) -> boo
 
 @dataclass(frozen=True)
 class _Units:
-    """When two scans of one thing seem to be in different units."""
+    """When scans of one thing seem to be in different units."""
 
-    ratio: float = 30.0  # of their sizes
+    ratio: float = 7.0  # of their sizes: no pose and no crop of one thing explains more, and units differ by 10 or more
 
 
 _UNITS = _Units()
 
 
-def _warn_about_units(source: RangeScan, target: RangeScan) -> None:
-    """Warn if one scan is so much larger than the other that no crop explains it."""
-    ratio = float(target.diagonal / source.diagonal)
+def warn_about_units(scans: Sequence[RangeScan], names: Sequence[str], *, stacklevel: int) -> None:
+    """Warn if the size of a scan differs so much from the typical one that no pose and no crop explains it."""
+    sizes = torch.tensor([robust_size(scan.points) for scan in scans])
+    typical = int(sizes.median(0).indices)
+    odd = int((sizes / sizes[typical]).log().abs().argmax())
+    ratio = float(sizes[odd] / sizes[typical])
     if 1 / _UNITS.ratio < ratio < _UNITS.ratio:
         return
-    larger, smaller = ("target", "source") if ratio > 1 else ("source", "target")
-    factor = 10.0 ** -round(abs(math.log10(ratio)))
+    unit, other, factor = likely_pair(ratio)
+    options = " ".join(f"--scale {factor if number == odd else 1:.4g}" for number in range(len(scans)))
     warnings.warn(
-        f"{larger} is {max(ratio, 1 / ratio):.4g} times as large as {smaller}: are they in one unit? "
-        f"If not, load {larger} with scale={factor:g}",
+        f"{names[odd]} is {max(ratio, 1 / ratio):.4g} times as {'large' if ratio > 1 else 'small'} as "
+        f"{names[typical]}: are they in one unit? If {names[odd]} is in {unit} and {names[typical]} in {other}, "
+        f"load {names[odd]} with a scale of {factor:.4g}{f' ({options})' if len(scans) == 2 else ''}",
         UnitsWarning,
-        stacklevel=6,
+        stacklevel=stacklevel + 1,
     )
 
 

@@ -31,6 +31,7 @@ from torchreg.registration.register import (
     register,
     source_samples,
     warn_about_flat_scans,
+    warn_about_units,
 )
 from torchreg.registration.results import SequenceRegistration
 from torchreg.result import Status
@@ -179,6 +180,7 @@ def register_sequence(
 
     Warns:
         DegenerateDataWarning: if a scan lies on a line or on a plane; the status is DEGENERATE.
+        UnitsWarning: if one scan is more than seven times larger or smaller than the others.
 
     Differentiable: no.
 
@@ -208,6 +210,7 @@ def register_sequence(
             near, num_bones, grid_resolution, config, generator, on_step, reference=reference
         ).moved(origin)  # fmt: skip
     degenerate = warn_about_flat_scans(scans, stacklevel=4)
+    warn_about_units(scans, [f"scans[{number}]" for number in range(len(scans))], stacklevel=4)
     source = scans[reference]
     index = source_samples(source, config, generator)
     normalization = Normalization.from_points(source.points[index])

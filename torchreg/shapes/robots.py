@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,13 +12,14 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import check_choice
-from torchreg.errors import ModelError
+from torchreg.errors import FileWarning, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh, concatenate, sample_surface
 from torchreg.geometry.rigid import rigid_matrix, transform_points
 from torchreg.geometry.rotation import rotation_between
 from torchreg.io.urdf import UrdfPrimitive, UrdfRecord, load_urdf
 from torchreg.shapes.kinematics import ForwardKinematics, read_chain
+from torchreg.shapes.pose_algebra import BASE_DOF_NAMES
 from torchreg.shapes.primitives import Primitive
 from torchreg.shapes.spec import SOLID_CHOICES, RigSurface, ShapeSpec, fitted_solid, fusion_length, with_long_axis
 
@@ -96,7 +98,7 @@ def _bone(end: Tensor, radius: float) -> UrdfPrimitive:
 def _spec_of(record: UrdfRecord, primitive: str, empty: str) -> ShapeSpec:
     """Return the `ShapeSpec` of a robot with solids of a kind; ``empty`` is the error's message if it has none."""
     surfaces = [_link_surface(record, link) for link in range(len(record.link_names))]
-    joints, part_frames, part_names, links, solids = list(record.tree.joints), [], [], [], []
+    joints, part_frames, part_names, links, solids = _own_names(record.tree.joints), [], [], [], []
     for link, surface in enumerate(surfaces):
         if surface is None:
             continue
@@ -104,10 +106,11 @@ def _spec_of(record: UrdfRecord, primitive: str, empty: str) -> ShapeSpec:
             frame = joints[link].name
             if number > 0:
                 # A further solid of a link is carried by a fixed frame of its own.
-                frame = _new_name(f"{frame}_{number}", joints)
+                frame = _new_name(f"{frame}_{number}", [joint.name for joint in joints])
                 joints.append(Joint(frame, link, torch.eye(4, dtype=torch.float64)))
             part_frames.append(frame)
-            part_names.append(record.link_names[link] + (f"_{number}" if number else ""))
+            name = record.link_names[link]
+            part_names.append(_new_name(f"{name}_{number}", record.link_names) if number else name)
             links.append(link)
             solids.append(solid)
     if not solids:
@@ -120,6 +123,20 @@ def _spec_of(record: UrdfRecord, primitive: str, empty: str) -> ShapeSpec:
         part_names=tuple(part_names),
         surface=_robot_surface(record, surfaces, links),
     )
+
+
+def _own_names(joints: Sequence[Joint]) -> list[Joint]:
+    """Return joints none of which is called like a degree of freedom of the base; warn about those that were."""
+    found = list(joints)
+    for index, joint in enumerate(joints):
+        if joint.name in BASE_DOF_NAMES and joint.kind != "fixed" and joint.mimic is None:
+            found[index] = replace(joint, name=_new_name(f"{joint.name}_joint", [other.name for other in joints]))
+            warnings.warn(
+                f"joint {joint.name!r} is called {found[index].name!r} here, as {joint.name} moves the whole robot",
+                FileWarning,
+                stacklevel=2,
+            )
+    return found
 
 
 def _link_surface(record: UrdfRecord, link: int) -> TriangleMesh | None:
@@ -242,8 +259,7 @@ def _part_colors(record: UrdfRecord, links: Sequence[int]) -> Tensor:
     return torch.tensor([known[link] or _FIT.color for link in links])
 
 
-def _new_name(name: str, joints: Sequence[Joint]) -> str:
-    taken = {joint.name for joint in joints}
+def _new_name(name: str, taken: Sequence[str]) -> str:
     while name in taken:
         name += "_"
     return name
