@@ -15,12 +15,11 @@ from torchreg.geometry.camera import Camera, distort, lens_jacobian
 
 @dataclass(frozen=True, eq=False)
 class FreeSpace:
-    """The free space of F depth pictures, for B problems, each of which sees one of them.
+    """The free space of F depth pictures, for B problems, each of which uses one of them.
 
-    A point at depth z whose pixel shows a surface at D intrudes into free space by ``D - z`` if that is positive.
-    Beside the mask it intrudes by the shorter of that and the way to the mask, ``z / f`` times its distance in pixels.
-    What lies behind the surface is hidden; where nothing was measured within the mask, beside the picture and behind
-    the camera, nothing is known.
+    A point at depth z whose pixel has a surface at depth D intrudes by ``D - z`` if that is positive; outside of the
+    mask by the smaller of that and ``z / f`` times its distance from the mask in pixels. Nothing is known behind the
+    surface, without a measurement within the mask, outside of the picture and behind the camera.
 
     Args:
         depth: (F, H, W) metres, zero where nothing was measured.
@@ -109,11 +108,7 @@ class FreeSpace:
         return seen.intrusion, self._gradient(seen)
 
     def intruding(self, points: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return which points of (B, N, 3) intrude by more than is tolerated in any problem, most often few.
-
-        Returns:
-            Their numbers (K,), by how much they intrude (B, K), and the gradients of that (B, K, 3).
-        """
+        """Return the indices (K,) of points that intrude in any problem, by how much (B, K), and its gradients."""
         seen = self._look(points)
         index = (seen.intrusion > tolerance).any(0).nonzero()[:, 0]
         seen = seen.part(index)
@@ -194,14 +189,13 @@ class FreeSpace:
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """What pictures show at points: all (B, N) but plane and slope, which are (B, N, 2).
+    """What pictures show at points, (B, N): distance from the mask (pixels), depth and side margins (metres).
 
     Args:
-        plane: the points on the plane at depth one.
-        distance: from the mask, pixels.
-        slope: of the distance.
-        ahead: how far before the surface that was measured, metres.
-        sideways: how far beside the mask, metres; infinite inside.
+        plane: (B, N, 2) the points on the plane at depth one.
+        slope: (B, N, 2) of the distance.
+        ahead: how far before the measured surface.
+        sideways: how far outside of the mask; infinite inside.
         counts: whether the point is in free space.
     """
 

@@ -182,22 +182,9 @@ def stereo_points(
 
 
 def rectify(left: Tensor, right: Tensor, pair: StereoPair) -> tuple[Tensor, Tensor, StereoPair]:
-    """Return both pictures as two cameras at the same positions take them, with rows along the baseline.
+    """Return both pictures as two cameras at the same positions take them, with rows along the baseline, and that pair.
 
-    Args:
-        left: (H, W) or (H, W, 3) from 0 to 1.
-        right: likewise.
-        pair: the cameras, with or without distortion.
-
-    Returns:
-        The pictures, zero where nothing was seen, and their rectified pair.
-
-    Raises:
-        InputError: if sizes do not fit.
-
-    Differentiable: in the pictures.
-
-    References: Fusiello et al. 2000.
+    Pixels outside of the given pictures are zero. References: Fusiello et al. 2000.
     """
     for image, camera, name in ((left, pair.left, "left"), (right, pair.right, "right")):
         _check_size(as_float_tensor(image, name), camera, name)

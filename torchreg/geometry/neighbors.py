@@ -13,21 +13,9 @@ from torchreg.geometry.budget import BUDGET
 
 
 def nearest_neighbor(points: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the index of the target nearest to each point, and its distance.
+    """Return the index (..., N) of the target (..., K, 3) nearest to each point (..., N, 3), and its distance.
 
-    Args:
-        points: (..., N, 3).
-        targets: (..., K, 3) of the same dtype and device, at least one, with batch dimensions that broadcast with the
-            points'.
-
-    Returns:
-        Indices (..., N) int64 into the targets, and distances (..., N).
-
-    Differentiable: the distance, in both, away from zero. Not under `torch.func` on a CPU.
-
-    Cost: O((N + K) log K) per problem on a CPU with finite coordinates; O(N K) in bounded memory otherwise.
-
-    References: Maneewongvatana and Mount 1999, the tree of `scipy.spatial.cKDTree`.
+    Differentiable in the distance; on a CPU by a k-d tree (Maneewongvatana and Mount 1999), not under `torch.func`.
     """
     batch = points.shape[:-2]
     if batch != targets.shape[:-2]:  # broadcast_shapes is slow, and imports sympy when first called
@@ -63,17 +51,7 @@ def _by_table(points: Tensor, targets: Tensor) -> Tensor:
 
 
 class NeighborTree:
-    """Points in any number of dimensions, to be searched repeatedly for those nearest to query points.
-
-    Args:
-        targets: (K, D) finite, at least one.
-
-    Differentiable: no.
-
-    Cost: O(K log K) to build, O(log K) per neighbor where D is small or targets are near; always on the CPU.
-
-    References: Maneewongvatana and Mount 1999, the tree of `scipy.spatial.cKDTree`.
-    """
+    """A k-d tree of targets (K, D), always on the CPU (Maneewongvatana and Mount 1999)."""
 
     def __init__(self, targets: Tensor) -> None:
         self._tree = cKDTree(_coordinates(targets))
@@ -93,15 +71,7 @@ class NeighborTree:
         return torch.from_numpy(index).to(points.device), torch.from_numpy(distance).to(points.device)
 
     def k_nearest(self, points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """Return the ``count`` targets nearest to each point, nearest first.
-
-        Args:
-            points: (N, D) finite.
-            count: 1 to K.
-
-        Returns:
-            Indices (N, count) int64 and distances (N, count) float64, both on the points' device.
-        """
+        """Return the indices and distances (N, count) float64 of the targets nearest to points, nearest first."""
         distance, index = self._tree.query(_coordinates(points), list(range(1, count + 1)))
         return torch.from_numpy(index).to(points.device), torch.from_numpy(distance).to(points.device)
 
@@ -112,15 +82,7 @@ def k_nearest(points: Tensor, targets: Tensor, count: int) -> tuple[Tensor, Tens
 
 
 def k_nearest_others(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the nearest neighbors of each point, itself excluded, nearest first.
-
-    Args:
-        points: (N, D) finite, at least two; points at one position are zero apart.
-        count: neighbors of each point, at least one; N - 1 at most are returned.
-
-    Returns:
-        Indices (N, K) int64 and distances (N, K) float64, both on the points' device.
-    """
+    """Return the indices and distances (N, K) of each point's nearest others, nearest first; K is N - 1 at most."""
     index, distance = k_nearest(points, points, min(count + 1, len(points)))
     is_self = index == torch.arange(len(points), device=points.device).unsqueeze(1)
     if bool(is_self[:, 0].all()):
@@ -137,13 +99,9 @@ def pairs_within(points: Tensor, radius: float) -> Tensor:
 
 
 def sampling_distance(points: Tensor, subset: Tensor | None = None) -> float:
-    """Return the median distance of a point to its nearest neighbor; infinite for fewer than two points.
+    """Return the median distance of a point to its nearest neighbor, infinite for fewer than two points.
 
-    Args:
-        points: (N, D) finite; points at one position are zero apart.
-        subset: (M, D) those of the points over which the median is taken; by default all, or of very many some.
-
-    Differentiable: no.
+    Over the points ``subset`` (M, D); by default over all, or a sample of very many.
     """
     if len(points) < 2:
         return math.inf

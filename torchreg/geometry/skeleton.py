@@ -233,19 +233,9 @@ class Skeleton:
 
 
 def resample_curve(points: Tensor, radii: Tensor, frames: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return samples of a polyline at equal steps of its arc length, with radii and frames.
+    """Return points (count, 3), radii and frames of a polyline at equal steps of its arc length, both ends included.
 
-    Args:
-        points: (n, 3) in order, at least two.
-        radii: (n,).
-        frames: (n, 3, 3) rotations.
-        count: samples, with the two ends; at least 2.
-
-    Returns:
-        Points (count, 3) and radii (count,), linear between those given, and frames (count, 3, 3), the rotations
-        nearest to the linear mean.
-
-    Differentiable: in points and radii; the arc lengths of the samples are held fixed.
+    Differentiable in points and radii, with arc lengths held fixed.
     """
     with torch.no_grad():
         along = torch.cat((points.new_zeros(1), (points[1:] - points[:-1]).norm(dim=-1).cumsum(0)))
@@ -276,16 +266,10 @@ def nearest_rotation(matrices: Tensor) -> Tensor:
 def build_skeleton(
     limbs: Sequence[tuple[Tensor, Tensor, Tensor]], ends: Sequence[tuple[int, int]], notes: Sequence[str] = ()
 ) -> Skeleton:
-    """Return the skeleton whose limbs are given as polylines that share their end nodes.
+    """Return the skeleton of limbs, polylines (points (n, 3), radii (n,), frames (n, 3, 3)) that share end nodes.
 
-    Args:
-        limbs: points (n, 3), radii (n,) and frames (n, 3, 3) of each limb, n >= 2, all of one dtype and device.
-        ends: names of the first and last node of each limb, any integers; limbs meet at nodes of the same name. The
-            position, radius and frame of such a node come from the first limb that names it.
-        notes: see `Skeleton`.
-
-    Raises:
-        InputError: if the limbs do not make a tree.
+    ``ends`` names the first and last node of each limb by integers; a node's position, radius and frame come from the
+    first limb that names it.
     """
     number: dict[int, int] = {}
     values: list[tuple[Tensor, Tensor, Tensor]] = []

@@ -153,12 +153,7 @@ def _samples(points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True, eq=False)
 class _Plane:
-    """A plane, up to its noise.
-
-    Args:
-        coefficients: (4,) float64 on the CPU: unit normal and d, ``normal . x + d = 0``.
-        reach: distance up to which points lie on it.
-    """
+    """A plane ``normal . x + d = 0``, (4,) float64 on the CPU, and the distance up to which points lie on it."""
 
     coefficients: Tensor
     reach: float
