@@ -127,9 +127,9 @@ def without_flying_pixels(depth: Tensor, focal: tuple[float, float], *, max_stee
 def bilateral_filter(depth: Tensor, noise: float, *, radius: int = 2, spread: float = 1.5) -> Tensor:
     """Return depth images averaged over neighbors near in the picture and in depth (Tomasi and Manduchi 1998).
 
-    ``z_p' = z_p + sum_q w_q (z_q - z_p) / sum_q w_q`` with ``w_q = exp(-|p - q|^2 / 2 spread^2 - (z_q - z_p)^2 / 2
-    s^2)`` and ``s = 3 noise z_p^2``, ``noise`` the deviation at one metre. Opposite pixels are averaged first, so that
-    slopes are not flattened.
+    ``z_p' = z_p + sum_q w_q (z_q - z_p) / sum_q w_q`` with
+    ``w_q = exp(-|p - q|^2 / 2 spread^2 - (z_q - z_p)^2 / 2 s^2)`` and ``s = 3 noise z_p^2``, ``noise`` the deviation at
+    one metre. Opposite pixels are averaged first, so that slopes are not flattened.
     """
     with torch.no_grad():
         clean = _measured(depth)

@@ -32,9 +32,9 @@ def match_disparity(left: Tensor, right: Tensor, max_disparity: int, *, method: 
     """Return the disparity (..., H, W) of every left pixel, ``x_left - x_right``, NaN where it is not known.
 
     Costs are differing bits of census transforms (7 x 9; Zabih and Woodfill 1994). Semi-global matching (Hirschmueller
-    2008) sums along four directions r the costs of the cheapest paths, ``L(p, d) = C(p, d) + min(L(p - r, d), L(p - r,
-    d +- 1) + P1, min_k L(p - r, k) + P2) - min_k L(p - r, k)``; block matching averages over 9 x 9 pixels. Minima are
-    refined by a parabola, and kept where the right picture agrees.
+    2008) sums along four directions r the costs of the cheapest paths,
+    ``L(p, d) = C(p, d) + min(L(p - r, d), L(p - r, d +- 1) + P1, min_k L(p - r, k) + P2) - min_k L(p - r, k)``; block
+    matching averages over 9 x 9 pixels. Minima are refined by a parabola, and kept where the right picture agrees.
     """
     with torch.no_grad():
         pairs = left.reshape(-1, *left.shape[-2:]), right.reshape(-1, *left.shape[-2:])

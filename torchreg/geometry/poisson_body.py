@@ -42,7 +42,7 @@ class PoissonBody:
 
     Args:
         mesh: its closed surface, facing outwards, float64, with the pieces joined by `join_pieces`.
-        joined: number of the bars.
+        joined: number of pieces that were joined.
         shown: share of its points whose far side is shown by points as well: near one for a body scanned from all
             sides, near zero for one view.
     """
@@ -61,10 +61,10 @@ def poisson_body(points: Tensor) -> PoissonBody:
     """Return the body whose surface points (N, 3) lie on, all different, float64 on the CPU.
 
     With outward normals ``n_i`` and areas ``a_i`` of points ``p_i``, the field ``V = sum a_i n_i delta(x - p_i)`` is
-    that of a closed surface if it is the gradient of an indicator function. The iteration ``n_i <- (P V)(p_i) / |(P
-    V)(p_i)|`` maximizes ``|P V|^2``, convex in the normals, with the part ``P V`` of the blurred field that is a
-    gradient; normals of parts that are inside out, where the indicator is less than outside, are turned over on the
-    way.
+    that of a closed surface if it is the gradient of an indicator function. The iteration
+    ``n_i <- (P V)(p_i) / |(P V)(p_i)|`` maximizes ``|P V|^2``, convex in the normals, with the part ``P V`` of the
+    blurred field that is a gradient; normals of parts that are inside out, where the indicator is less than outside,
+    are turned over on the way.
 
     References: Kazhdan, Bolitho and Hoppe 2006, Poisson's equation; Lin, Shi and Liu 2024, normals from the field;
     Journee, Nesterov, Richtarik and Sepulchre 2010, maxima of convex functions.

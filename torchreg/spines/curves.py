@@ -40,15 +40,7 @@ def points_along(curve: Tensor, lengths: Tensor) -> Tensor:
 
 
 def moving_average(curve: Tensor, window: float, count: int) -> Tensor:
-    """Return a curve (n, 3) as ``count`` points at equal intervals, averaged over a window; its ends stay.
-
-    Differentiable: in the curve, with the positions along it held fixed.
-
-    Args:
-        curve: (n, 3).
-        window: a share of the curve's length.
-        count: number of points returned.
-    """
+    """Return a curve as ``count`` points at equal intervals, averaged over a share of its length; its ends stay."""
     length = float(curve_lengths(curve.detach()))
     even = points_along(curve, torch.linspace(0, length, count, dtype=curve.dtype, device=curve.device))
     half = min(round(0.5 * window * (count - 1)), count - 1)
@@ -83,9 +75,7 @@ def bend_angles(curves: Tensor) -> Tensor:
 def tangents(curves: Tensor) -> Tensor:
     """Return the unit tangents (..., S, 3) of curves (..., S, 3): central differences, one-sided at the ends.
 
-    Where points coincide the tangent is the direction of the chord from end to end; +x for a curve without length.
-
-    Differentiable: in the curves.
+    Where points coincide it is the direction of the chord from end to end; +x for a curve without length.
     """
     steps = curves[..., 1:, :] - curves[..., :-1, :]
     padded = torch.cat((steps[..., :1, :], steps, steps[..., -1:, :]), dim=-2)
@@ -109,13 +99,9 @@ def align_frames(frames: Tensor, directions: Tensor) -> Tensor:
 
 
 def curve_frames(curves: Tensor) -> Tensor:
-    """Return rotation-minimizing frames ``R_world_curve`` (..., S, 3, 3) along curves (..., S, 3).
+    """Return rotation-minimizing frames ``R_world_curve`` (..., S, 3, 3) along curves (..., S, 3) (Bishop 1975).
 
     The third column is the tangent. The first frame is the smallest rotation of the world's axes.
-
-    Differentiable: in the curves.
-
-    References: Bishop 1975.
     """
     directions = tangents(curves)
     eye = torch.eye(3, dtype=curves.dtype, device=curves.device).expand(*curves.shape[:-2], 3, 3)

@@ -30,15 +30,9 @@ _DESCENT = DepthDescent()
 
 
 class DepthField:
-    """The signed distance to a surface on a grid, positive inside; a hole does no harm, see `voxelize`.
+    """The signed distance to a surface on a grid, positive inside, right to about one voxel; see `voxelize` for holes.
 
-    The depth of a voxel is found when it is first asked for, as curves pass through few of them.
-
-    Args:
-        mesh: the surface.
-        resolution: voxels along its longest side; depths are right to about one voxel.
-
-    Cost: 0.03 s at the default resolution on one CPU core.
+    The depth of a voxel is computed when it is first asked for, as curves pass through few of them.
     """
 
     def __init__(self, mesh: TriangleMesh, resolution: int = 96) -> None:
@@ -106,14 +100,10 @@ def _beside_others(inside: Tensor) -> Tensor:
 def move_inside(
     field: DepthField, curves: Tensor, radii: Tensor, free: Tensor, stiffness: float = _DESCENT.stiffness
 ) -> Tensor:
-    """Return curves moved by small steps until they lie at their depths, or in the middle, and are smooth.
+    """Return curves (..., S, 3) moved by small steps until they lie at their depths and are smooth.
 
-    Args:
-        field: of the surface.
-        curves: (..., S, 3).
-        radii: (..., S) depth that is enough; where the body is thinner, the curve stays in its middle.
-        free: (..., S) bool, False for points that stay.
-        stiffness: see `DepthDescent`; zero moves every point independently.
+    ``radii`` (..., S) is the depth that is enough; where the body is thinner, the curve stays in its middle. Points not
+    ``free`` stay; zero stiffness moves every point independently.
     """
     movable = free.any(-1)  # other curves stay as they are
     moved, radii, mask = curves[movable], radii.expand(free.shape)[movable], free[movable].unsqueeze(-1)

@@ -36,13 +36,7 @@ _POOL = _Pool()
 
 @dataclass(frozen=True, eq=False)
 class Job(Generic[_Found]):
-    """A piece of work.
-
-    Args:
-        frame: the frame that it is for.
-        task: gives the result; can be pickled, see `functools.partial`.
-        done: called with the result, in this process.
-    """
+    """A piece of work for a frame; the task can be pickled, and done is called with its result in this process."""
 
     frame: int
     task: Callable[[], _Found]
@@ -52,13 +46,8 @@ class Job(Generic[_Found]):
 def do_jobs(next_job: Callable[[], Job[Any] | None], num_frames: int, workers: int | None) -> None:
     """Do jobs, and call `Job.done` with each result in the order in which they come.
 
-    Args:
-        next_job: returns the next job, None if there is none before others are done; asked when a process is idle.
-        num_frames: about as many jobs; few are all done in this process, as where processes cannot be forked.
-        workers: processes; by default one per core that may be used.
-
-    Raises:
-        SolverError: if a process is killed, and again on the second attempt.
+    ``next_job`` is asked when a process is idle, and returns None if there is no job before others are done. Few jobs
+    are all done in this process, as where processes cannot be forked; by default there is one per core.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = min(cores if workers is None else workers, num_frames)
@@ -129,11 +118,7 @@ def _pickled(value: Any) -> bytes:
 
 @dataclass(frozen=True)
 class KeptResults:
-    """Results of jobs in a folder, each kept as soon as it is done, for a later call.
-
-    Args:
-        folder: None keeps nothing.
-    """
+    """Results of jobs in a folder, each kept as soon as it is done, for a later call; no folder keeps nothing."""
 
     folder: Path | None
 

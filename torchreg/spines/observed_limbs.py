@@ -67,16 +67,10 @@ def smooth_rough_limbs(skeleton: Skeleton) -> Skeleton:
 
 
 def observe_limbs(skeleton: Skeleton, labels: Sequence[int], graph: LimbGraph, num_samples: int) -> FrameLimbs:
-    """Return the limbs of a graph that a frame's skeleton has.
+    """Return the limbs of a graph, as curves of S points, that a frame's skeleton has.
 
-    A junction is observed if tips behind three of its limbs are; a limb is the path along the tree between two observed
-    nodes, unless it has much of its path in common with another.
-
-    Args:
-        skeleton: the tree.
-        labels: K indices into `Skeleton.tips`, -1 for a tip that was not found.
-        graph: with K tips.
-        num_samples: S points per limb.
+    A junction is observed if tips behind three of its limbs are; a limb is the path between two observed nodes, unless
+    it has much of its path in common with another.
     """
     nodes, node_radii = skeleton.nodes.detach().cpu().double(), skeleton.radii.detach().cpu().double()
     index = _graph_nodes(skeleton, labels, graph)
@@ -133,13 +127,9 @@ def median_lengths(frames: Sequence[FrameLimbs]) -> Tensor:
 
 
 def reject_odd_lengths(frame: FrameLimbs, median: Tensor, graph: LimbGraph, *, touching: bool) -> FrameLimbs:
-    """Return the frame without the limbs, and the tips of these, whose length is far from the median.
+    """Return the frame without limbs, and their tips, whose length is far from the median (L,).
 
-    Args:
-        frame: what its own skeleton shows.
-        median: (L,) lengths.
-        graph: of the limbs.
-        touching: whether limbs touched, see `LimbLimits`.
+    ``touching``: whether limbs touched, see `LimbLimits`.
     """
     ratio = curve_lengths(frame.curves) / median
     least, most = _LIMITS.length_range_touching if touching else _LIMITS.length_range

@@ -62,30 +62,18 @@ class OrganTracks:
 
 
 def track_organs(frames: Sequence[TipObservations], certainties: Sequence[Tensor]) -> OrganTracks:
-    """Return the organs of all frames.
+    """Return the organs of all frames, from log-odds (M,) of each frame that a tip is no bump of the surface.
 
-    Each organ is a chain of states: not there, there, hidden, ended. Tips are organs or bumps by their own certainty.
-    One becomes another by t-distributed changes of its place and of its direction, as they are or moved with the whole
-    body, against ones drawn evenly. The most probable set of all organs is found at once, then the scales of the
-    changes, in turn.
-
-    Args:
-        frames: T of them.
-        certainties: (M,) of each frame: log-odds that a tip is no bump of the surface.
-
-    References: Zhang, Li and Nevatia 2008, tracks as one problem of optimization.
+    Each organ is a chain of states: unborn, observed, hidden, ended. Links have t-distributed changes of position and
+    direction, with or without the motion of the whole body, against uniform ones. The most probable set of tracks
+    (Zhang, Li and Nevatia 2008) and the scales of the changes are estimated in turn.
     """
     searches = [_Search(frames, certainties, start) for start in LIFE.starts]
     return max(searches, key=lambda search: search.score).tracks()
 
 
 class _Search:
-    """One search for the tracks of N tips.
-
-    Args:
-        frames, certainties: see `track_organs`.
-        displacement: scale of displacements at first.
-    """
+    """One search for the tracks of N tips, with a scale of displacements at first."""
 
     def __init__(self, frames: Sequence[TipObservations], certainties: Sequence[Tensor], displacement: float) -> None:
         # (N, 2, 3): where each limb ends, and a point before that.
@@ -139,10 +127,10 @@ class _Search:
         return torch.stack([(_steps(target) - _steps(rows)).square().sum(-1) for rows in ways])
 
     def _first_motion(self, before: Tensor, after: Tensor) -> Tensor:
-        """Return how the body moves (4, 4) between two frames with such tips (n,) and (m,), if any limb may be any.
+        """Return the motion (4, 4) of the body between two frames with tips (n,) and (m,) of unknown names.
 
-        Of the motions that take two of the surest tips to two others, and of none, it is the one that takes all tips
-        nearest to some, and turns little.
+        Of the motions that take two of the surest tips to two others, and of none, it brings all tips nearest, by a
+        small rotation.
         """
         salient = [tips[self.graph.real[tips].argsort(descending=True, stable=True)[: LIFE.num_salient]]
                    for tips in (before, after)]  # fmt: skip

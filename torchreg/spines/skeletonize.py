@@ -149,13 +149,7 @@ def skeletonize_surface(mesh: TriangleMesh, config: SkeletonizeConfig | None = N
 
 @dataclass(frozen=True, eq=False)
 class _Body:
-    """A closed surface in one piece, float64 on the CPU, without long loops.
-
-    Args:
-        opened: the surface, and where its loops were cut.
-        bridges: (B, 2) vertices at which pieces were joined.
-        notes: for the skeleton.
-    """
+    """A closed surface in one piece, float64 on the CPU, with long loops cut; ``bridges`` (B, 2) join its pieces."""
 
     opened: OpenedLoops
     bridges: Tensor
@@ -190,10 +184,10 @@ def _prepared(mesh: TriangleMesh, config: SkeletonizeConfig) -> _Body:
 
 @dataclass(frozen=True, eq=False)
 class _SurfaceTips:
-    """The tips of a body.
+    """The K tips of a body, two or more.
 
     Args:
-        positions: (K, 3), at least two.
+        positions: (K, 3).
         vertices: (K,) of the surface.
         confidence: (K,).
         distances: (K, V) geodesic distances from them.
@@ -258,13 +252,7 @@ def _grow_trees(
 
 @dataclass(frozen=True, eq=False)
 class _Limb:
-    """A limb between two nodes, of which the tips come first, then the junctions.
-
-    Args:
-        points: (n, 3).
-        frames: (n, 3, 3).
-        ends: numbers of its first and last node.
-    """
+    """A limb, points (n, 3) and frames, between two nodes, of which the tips are numbered first, then the junctions."""
 
     points: Tensor
     frames: Tensor
