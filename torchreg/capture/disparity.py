@@ -75,7 +75,7 @@ def _set_bits(code: Tensor) -> Tensor:
 
 
 def _cost_volume(left: Tensor, right: Tensor, highest: int) -> Tensor:
-    """Return (B, H, W, D) int16 costs; the largest where the right pixel lies beside the picture."""
+    """Return (B, H, W, D) int16 costs; the largest where the right pixel lies outside of the picture."""
     width = left.shape[-1]
     shape = (*left.shape, highest + 1)
     volume = torch.full(shape, _MATCHING.num_bits, dtype=torch.int16, device=left.device)
@@ -125,10 +125,7 @@ def _minima(volume: Tensor) -> Tensor:
 
 
 def _seen_from_right(volume: Tensor) -> Tensor:
-    """Return the cost volume (B, H, W, D) of the right picture, as a view: its column x is x + d on the left.
-
-    Beyond the left picture costs are the largest.
-    """
+    """Return the cost volume of the right picture, a view: column x is x + d on the left; largest beyond it."""
     batch, height, width, count = volume.shape
     padded = volume.new_full((batch, height, width + count, count), volume.max().item())
     padded[:, :, :width] = volume

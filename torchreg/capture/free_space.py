@@ -79,15 +79,15 @@ class FreeSpace:
         return replace(self, picture=self.picture[index], origin=self.origin[index], datum_area=self.datum_area[index])
 
     def moved(self, origin: Tensor) -> FreeSpace:
-        """Return the same with coordinates that begin farther on, by (B, 3) or (3,), metres."""
+        """Return the free space with coordinates whose origin is moved by (B, 3) or (3,), metres."""
         return replace(self, origin=self.origin + origin.to(self.origin))
 
     def thinned(self, factor: Tensor) -> FreeSpace:
-        """Return the same where each datum stands for (B,) times as many."""
+        """Return the free space for data of which each stands for (B,) times as many."""
         return replace(self, datum_area=self.datum_area * factor.to(self.datum_area))
 
     def to(self, like: Tensor) -> FreeSpace:
-        """Return the same on the device and in the dtype of a tensor; motions and origins stay in float64."""
+        """Return the free space on the device and in the dtype of a tensor; motions and origins stay in float64."""
         exact = ("picture", "origin", "world_to_camera")
         return replace(
             self,
@@ -99,11 +99,11 @@ class FreeSpace:
         )
 
     def intrusion(self, points: Tensor) -> Tensor:
-        """Return how far points (B, ..., 3) of the problems lie in free space, (B, ...), metres."""
+        """Return the depths (B, ...), metres, by which points (B, ..., 3) of the problems intrude into free space."""
         return self._look(points.reshape(len(points), -1, 3)).intrusion.reshape(points.shape[:-1])
 
     def intrusion_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the same for points (B, N, 3), and its gradient (B, N, 3) by their coordinates."""
+        """Return the intrusion of points (B, N, 3) and its gradient (B, N, 3) by their coordinates."""
         seen = self._look(points)
         return seen.intrusion, self._gradient(seen)
 
@@ -146,7 +146,7 @@ class FreeSpace:
         return points @ motion[:, :3, :3].mT.to(points) + offset.unsqueeze(1).to(points)
 
     def _look(self, points: Tensor) -> _Look:
-        """Return what the pictures show at points (B, N, 3)."""
+        """Return the pictures' values at points (B, N, 3)."""
         local = self._local(points)
         depth = local[..., 2]
         plane = local[..., :2] / torch.where(depth > 0, depth, 1.0).unsqueeze(-1)
@@ -212,5 +212,5 @@ class _Look:
         return torch.where(self.counts, torch.minimum(self.ahead, self.sideways), 0.0)
 
     def part(self, index: Tensor) -> _Look:
-        """Return the same for some of the points (K,)."""
+        """Return the values at some of the points (K,)."""
         return _Look(**{item.name: getattr(self, item.name)[:, index] for item in fields(self)})

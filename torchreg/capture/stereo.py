@@ -182,10 +182,7 @@ def stereo_points(
 
 
 def rectify(left: Tensor, right: Tensor, pair: StereoPair) -> tuple[Tensor, Tensor, StereoPair]:
-    """Return both pictures as two cameras at the same positions take them, with rows along the baseline, and that pair.
-
-    Pixels outside of the given pictures are zero. References: Fusiello et al. 2000.
-    """
+    """Return both pictures with rows along the baseline, zero beyond the given ones, and their pair (Fusiello 2000)."""
     for image, camera, name in ((left, pair.left, "left"), (right, pair.right, "right")):
         _check_size(as_float_tensor(image, name), camera, name)
     first, second = pair.left.to(torch.float64), pair.right.to(torch.float64)

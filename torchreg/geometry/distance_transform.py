@@ -25,7 +25,7 @@ def signed_distance(mask: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
 
 
 def distance_beside(mask: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return the same where that is positive and zero inside, in half the time."""
+    """Return the distance from the mask, zero inside; in half the time of the signed one."""
     inside = mask.cpu().numpy()
     if not inside.any():
         return torch.full(mask.shape, torch.inf, dtype=dtype, device=mask.device)

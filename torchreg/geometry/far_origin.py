@@ -14,7 +14,7 @@ class _Far:
     """When points are far from the origin."""
 
     ratio: float = 200.0  # distance over spread from which float32 rounds by more than 1e-5 of the spread
-    sample: int = 10_000  # points that tell
+    sample: int = 10_000  # points that decide
 
 
 _FAR = _Far()

@@ -31,10 +31,7 @@ class Graph:
 
     @classmethod
     def from_edges(cls, edges: Tensor, lengths: Tensor, count: int) -> Self:
-        """Return the graph of ``count`` nodes with edges (E, 2) int64 of given lengths (E,), not negative.
-
-        Of an edge that is given twice the shorter counts.
-        """
+        """Return the graph of edges (E, 2) and lengths (E,), not negative; the shorter of equal edges counts."""
         first, second = edges.cpu().numpy().T
         # Zero would be no edge.
         length = np.maximum(lengths.detach().cpu().double().numpy(), np.finfo(np.float64).tiny)
@@ -60,10 +57,7 @@ class Graph:
         return f"{type(self).__name__}({len(self)} nodes, {len(self.ends) // 2} edges)"
 
     def distances(self, sources: Tensor | Sequence[int] | None = None, limit: float = math.inf) -> Tensor:
-        """Return the distances (S, V) float64 from sources (S,), infinite beyond the limit or without a path.
-
-        References: Dijkstra 1959.
-        """
+        """Return the distances (S, V) float64 from sources (S,), infinite beyond the limit (Dijkstra 1959)."""
         if sources is not None and len(sources) == 0:
             return self.lengths.new_zeros(0, len(self))
         indices = None if sources is None else _node_indices(sources)
@@ -179,9 +173,9 @@ def component_links(points: Tensor, component: Tensor, count: int = 3) -> tuple[
 
 
 def sorting_order(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stable order (N,) that sorts integers (N,) from 0 to count - 1, and where each begins, (count + 1,).
+    """Return the stable order (N,) that sorts integers (N,) below count, and the start of each, (count + 1,).
 
-    By counting, which takes a fifth of the time of `numpy.argsort`: the transpose of a sparse matrix.
+    By the transpose of a sparse matrix, in a fifth of the time of `numpy.argsort`.
     """
     numbers = np.arange(len(values) + 1, dtype=np.int32)
     entries = csr_array((numbers[:-1], values.astype(np.int32), numbers), shape=(len(values), count)).tocsc()

@@ -173,10 +173,7 @@ def cross_2d(first: Tensor, second: Tensor) -> Tensor:
 def sample_surface(
     mesh: TriangleMesh, count: int, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return ``count`` points drawn uniformly by area, with face_index (count,) and barycentric weights (count, 3).
-
-    Differentiable in the vertices, with faces and weights held fixed.
-    """
+    """Return ``count`` points drawn uniformly by area, with face_index (count,) and barycentric weights."""
     device, dtype = mesh.vertices.device, mesh.vertices.dtype
     # Cumulative areas in double precision: float32 sums stop growing on large meshes.
     cumulative = TriangleMesh(mesh.vertices.detach().double(), mesh.faces).face_areas().cumsum(dim=0)

@@ -62,7 +62,7 @@ class NeighborTree:
         return torch.from_numpy(index).to(points.device), torch.from_numpy(distance).to(points.device)
 
     def nearest_within(self, points: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-        """Return what `nearest` does; where no target is within the radius, index 0 and an infinite distance.
+        """Return the result of `nearest`, but index 0 and infinity without a target within the radius.
 
         Many times quicker than `nearest` where most points are far from all targets.
         """
@@ -99,10 +99,7 @@ def pairs_within(points: Tensor, radius: float) -> Tensor:
 
 
 def sampling_distance(points: Tensor, subset: Tensor | None = None) -> float:
-    """Return the median distance of a point to its nearest neighbor, infinite for fewer than two points.
-
-    Over the points ``subset`` (M, D); by default over all, or a sample of very many.
-    """
+    """Return the median distance of points, or of a subset of them, to the nearest neighbor; infinite below two."""
     if len(points) < 2:
         return math.inf
     if subset is None:
@@ -111,10 +108,7 @@ def sampling_distance(points: Tensor, subset: Tensor | None = None) -> float:
 
 
 def weld(points: Tensor) -> Tensor:
-    """Return the index (N,) int64 of each point's position among the distinct positions, sorted lexicographically.
-
-    If no two points coincide, the index is that of the point.
-    """
+    """Return the index (N,) int64 of each point's position among the sorted distinct ones; its own if all differ."""
     values = _coordinates(points) + 0.0  # -0 is 0
     if _all_differ(values):
         return torch.arange(len(values))
@@ -128,10 +122,7 @@ def weld(points: Tensor) -> Tensor:
 
 
 def _all_differ(values: np.ndarray) -> bool:
-    """Return whether no two rows (N, D) of numbers are alike, told in half the time of sorting them by all columns.
-
-    False also where two of them have one hash by chance, once in 10^7 sets of a million rows.
-    """
+    """Return whether no two rows (N, D) have equal hashes, wrong once in 10^7 sets of a million rows."""
     bits = np.ascontiguousarray(values).view(np.uint64)
     hashes = np.zeros(len(bits), dtype=np.uint64)
     for column in bits.T:

@@ -20,7 +20,7 @@ class NormalSettings:
     num_neighbors: int = 16
     # Weight of the farthest neighbors: next to nothing, so that the choice between two equally far ones hardly counts.
     least_weight: float = 1e-3
-    # Points of the coarse copy that tells convex from concave sides, and their neighbors.
+    # Points of the coarse copy that distinguishes convex from concave sides, and their neighbors.
     num_coarse: int = 2000
     coarse_neighbors: int = 12
     # Share of normals on one side from which a scan counts as taken from there.

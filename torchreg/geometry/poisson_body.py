@@ -18,7 +18,7 @@ from torchreg.geometry.neighbors import NeighborTree, k_nearest_others
 class PoissonFit:
     """How normals and the body are found; lengths in gaps, the median distance of a point to its last neighbor."""
 
-    neighbors: int = 6  # around a point, which tell its share of the surface
+    neighbors: int = 6  # around a point, for its share of the surface
     widths: tuple[float, ...] = (1.5, 1.0)  # of the blur under which normals agree; wider ones mix sides of thin limbs
     num_rounds: int = 8  # of new normals for each width
     turned_after: int = 2  # rounds, normals of inverted parts are turned over; in between parts turn by themselves
@@ -28,7 +28,7 @@ class PoissonFit:
     bar: float = 0.25  # of the fall of the indicator function, by which bars between pieces are inside
     max_resolution: int = 128  # gaps along the longest side; of more points, gaps count as so wide
     border: int = 6  # empty voxels around the points: the equation is solved on a torus
-    num_rays: int = 500  # through the body, which tell whether the far side is shown
+    num_rays: int = 500  # through the body, to test whether the far side is shown
     near: float = 3.0  # along a ray, within which points are those that it starts from
     least_shown: float = 0.5  # share of points with a far side: about one of a whole body, zero of what one view shows
 

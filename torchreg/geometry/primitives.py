@@ -73,10 +73,7 @@ class PrimitiveKind(ABC):
         """Return solids that fit surface points (N, 3) float64, with the axes of a frame (4, 4) at their center."""
 
     def distance(self, points: Tensor, sizes: Tensor) -> Tensor:
-        """Return the distances (...) of points (..., 3) to solids of sizes (..., S).
-
-        Differentiable: in both; the gradient at the center, or on the axis, is zero.
-        """
+        """Return the distances (...) of points (..., 3) to solids of sizes (..., S); zero gradient on the axis."""
         return self.plane_distance(_planes(points), sizes)
 
     def gradient(self, points: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:

@@ -46,10 +46,7 @@ def left_jacobian(rotation_vector: Tensor) -> Tensor:
 
 
 def compose_rotation_vectors(first: Tensor, second: Tensor) -> Tensor:
-    """Return the rotation vector of ``exp(first) exp(second)``, wrapped to an angle of at most pi.
-
-    On unit quaternions, which are exact at half turns where the matrix logarithm is not.
-    """
+    """Return the rotation vector of ``exp(first) exp(second)``; quaternions are exact at half turns."""
     # In one tensor, since the time of a solver's step goes into the number of such small operations.
     scalars, vectors = _exp_quaternion(torch.stack(torch.broadcast_tensors(first, second)))
     (w1, w2), (v1, v2) = scalars.unbind(), vectors.unbind()

@@ -39,10 +39,7 @@ def rotation_from_6d(columns: Tensor) -> Tensor:
 
 
 def rotation_to_6d(rotation: Tensor) -> Tensor:
-    """Return the first two columns (..., 6) of rotation matrices (..., 3, 3), see `rotation_from_6d`.
-
-    Differentiable: in ``rotation``.
-    """
+    """Return the first two columns (..., 6) of rotation matrices (..., 3, 3), see `rotation_from_6d`."""
     return rotation[..., :2].mT.flatten(-2)
 
 
@@ -92,10 +89,7 @@ def rotation_vector_from_quaternion(quaternion: Tensor) -> Tensor:
 
 
 def quaternion_from_rotation_vector(rotation_vector: Tensor) -> Tensor:
-    """Return the unit quaternion (..., 4), scalar first and not negative, of rotation vectors (..., 3), radians.
-
-    Differentiable: in ``rotation_vector``, also at zero.
-    """
+    """Return the unit quaternion (w, x, y, z), w not negative, of rotation vectors (..., 3), radians."""
     return quaternion_from_rotation(so3_exp(rotation_vector))
 
 
@@ -105,18 +99,12 @@ def rotation_vector_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def rotation_vector_from_6d(columns: Tensor) -> Tensor:
-    """Return the rotation vectors (..., 3), radians, of six numbers (..., 6), see `rotation_from_6d`.
-
-    Differentiable: in ``columns``, see `rotation_from_6d`.
-    """
+    """Return the rotation vectors (..., 3), radians, of six numbers (..., 6), see `rotation_from_6d`."""
     return rotation_vector_from_rotation(rotation_from_6d(columns))
 
 
 def rotation_vector_to_6d(rotation_vector: Tensor) -> Tensor:
-    """Return the six numbers (..., 6) of rotation vectors (..., 3), radians, see `rotation_to_6d`.
-
-    Differentiable: in ``rotation_vector``, also at zero.
-    """
+    """Return the six numbers (..., 6) of rotation vectors (..., 3), radians, see `rotation_to_6d`."""
     return rotation_to_6d(so3_exp(rotation_vector))
 
 

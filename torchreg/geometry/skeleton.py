@@ -233,10 +233,7 @@ class Skeleton:
 
 
 def resample_curve(points: Tensor, radii: Tensor, frames: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return points (count, 3), radii and frames of a polyline at equal steps of its arc length, both ends included.
-
-    Differentiable in points and radii, with arc lengths held fixed.
-    """
+    """Return points (count, 3), radii and frames of a polyline at equal steps of its arc length, ends included."""
     with torch.no_grad():
         along = torch.cat((points.new_zeros(1), (points[1:] - points[:-1]).norm(dim=-1).cumsum(0)))
         wanted = torch.linspace(0, 1, count, dtype=points.dtype, device=points.device) * along[-1]
@@ -253,10 +250,7 @@ def resample_curve(points: Tensor, radii: Tensor, frames: Tensor, count: int) ->
 
 
 def nearest_rotation(matrices: Tensor) -> Tensor:
-    """Return the rotations (..., 3, 3) nearest to matrices (..., 3, 3) in the sum of squared differences.
-
-    References: Arun, Huang and Blostein 1987; Umeyama 1991 for the determinant.
-    """
+    """Return the rotations (..., 3, 3) nearest to matrices in least squares (Arun et al. 1987; Umeyama 1991)."""
     u, _, vh = torch.linalg.svd(matrices)
     sign = torch.ones_like(matrices[..., 0])
     sign[..., 2] = torch.linalg.det(u @ vh)

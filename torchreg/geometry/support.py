@@ -47,7 +47,7 @@ class _Rule:
     small: float = 0.04  # share of the points up to which the thing must be small against its support
     floor: float = 2.0  # least width of the support of what is small, in those of the thing
     height: float = 0.05  # least height of the thing, in widths of its own
-    lowest: float = 0.05  # share of the thing, next to the plane, that tells where it stands
+    lowest: float = 0.05  # share of the thing, next to the plane, that gives its position
     rim: float = 0.05  # of a plane, on which a thing does not stand, in widths of the plane
     inside: float = 0.6  # share of the lowest part that is inside of the rim
     filled: float = 0.75  # share of its convex hull that a plane fills: tables and floors are no stars, nor hands
@@ -61,7 +61,7 @@ class _Rule:
     apart: float = 0.9  # share of the points on a plane that are of pieces without anything above
     num_directions: int = 24  # in which widths are measured
     num_cells: int = 24  # along the sides of the grid on which areas are measured
-    near: float = 4.0  # points on a plane within the radius about a cell that tells whether it is full: all but 2 %
+    near: float = 4.0  # points on a plane within the radius about a cell that decide whether it is full: all but 2 %
 
 
 _SEARCH, _RULE = _Search(), _Rule()

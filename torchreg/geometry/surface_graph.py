@@ -173,10 +173,7 @@ def _kept_pieces(
 
 
 def _bridges(vertices: Tensor, labels: Tensor, count: int) -> Tensor:
-    """Return the vertex pairs (count - 1, 2) of least total length that join all pieces.
-
-    Of many pieces each is compared with those of the nearest boxes.
-    """
+    """Return the vertex pairs of least total length that join all pieces; of many, those in the nearest boxes."""
     groups = [(labels == label).nonzero()[:, 0] for label in labels.unique().tolist()]
     trees = [NeighborTree(vertices[group]) for group in groups]
     pairs = _near_pairs([vertices[group] for group in groups])

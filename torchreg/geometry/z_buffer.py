@@ -92,7 +92,7 @@ class FlatMesh:
 
 
 def flatten(mesh: TriangleMesh, view: View) -> FlatMesh:
-    """Return a mesh projected into a view; InputError if a vertex lies beside or behind a pinhole."""
+    """Return a mesh projected into a view; InputError if a vertex is not before a pinhole."""
     pixels, depth = view.project(mesh.vertices.detach())
     depths = depth[mesh.faces]
     if not view.parallel and bool((depths <= 0).any()):

@@ -16,7 +16,7 @@ from torchreg.spines.tip_features import TipFeatures, TipObservations
 class SymmetrySearch:
     """Which exchanges of tips are tried and believed."""
 
-    num_tips: tuple[int, int] = (3, 10)  # of two, a mirror tells nothing; of more there are too many: 9,496 of ten
+    num_tips: tuple[int, int] = (3, 10)  # with two, no mirror is observable; with more there are too many: 9,496 of ten
     num_frames: int = 16  # of a sequence, evenly spaced, that are looked at: poses recur
     least_evidence: float = 5.0  # log-odds of a mirror against none and any other: of stars 4, of animals 6 to 20
     least_difference: float = 1e-3  # squared, in variances of random names, below which none is measured
@@ -137,6 +137,6 @@ def _sizes(background: GroupedDensity, columns: Tensor, signs: Tensor) -> Tensor
 
 
 def _levels(background: GroupedDensity, offsets: Tensor, sizes: Tensor) -> Tensor:
-    """Return how much mirror images differ (M, G) by offsets (M, n), in variances of random names."""
+    """Return the differences (M, G) of mirror images by offsets (M, n), in variances of random names."""
     squares = torch.stack([rows.square().sum(-1) for rows in background.whitened(offsets)], -1) / 4
     return (squares / sizes.clamp_min(1)).clamp_min(SEARCH.least_difference)

@@ -38,7 +38,7 @@ class Inside:
         self._grids = [_RayGrid(corners, torch.tensor(ray, dtype=torch.float64)) for ray in _RAYS]
 
     def __call__(self, points: Tensor) -> Tensor:
-        """Return which points (..., 3) lie inside, (...,) bool."""
+        """Return a mask (...,) of the points (..., 3) inside."""
         flat = points.detach().cpu().double().reshape(-1, 3)
         votes = torch.stack([grid.crosses_odd(flat) for grid in self._grids]).sum(0)
         return (votes >= 2).reshape(points.shape[:-1])

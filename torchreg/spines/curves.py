@@ -12,10 +12,7 @@ _DEGENERATE = 1e-6
 
 
 def curve_lengths(curves: Tensor) -> Tensor:
-    """Return the lengths (...,) of curves (..., S, 3), in their unit.
-
-    Differentiable: in the curves; a step of length zero has the gradient zero.
-    """
+    """Return the lengths (...,) of curves (..., S, 3), in their unit; zero gradient at steps without length."""
     return _safe_norm(curves[..., 1:, :] - curves[..., :-1, :]).sum(-1)
 
 
@@ -26,10 +23,7 @@ def arc_lengths(curve: Tensor) -> Tensor:
 
 
 def points_along(curve: Tensor, lengths: Tensor) -> Tensor:
-    """Return the points (..., 3) of a curve (n, 3) at arc lengths (...,); its last point beyond the end.
-
-    Differentiable: in the curve, with the positions along it held fixed.
-    """
+    """Return the points (..., 3) of a curve (n, 3) at arc lengths (...,); its last point beyond the end."""
     along = torch.cat((curve.new_zeros(1), _safe_norm(curve[1:] - curve[:-1]).cumsum(0))).detach()
     lengths = lengths.clamp(0, float(along[-1]))
     after = torch.searchsorted(along, lengths).clamp(min(1, len(curve) - 1), len(curve) - 1)
@@ -59,10 +53,7 @@ def binomial_smoothing(values: Tensor, passes: int) -> Tensor:
 
 
 def bend_angles(curves: Tensor) -> Tensor:
-    """Return the turning angles (..., S - 2) of curves (..., S, 3) at their inner points, radians from 0 to pi.
-
-    Differentiable: in the curves; straight, turned back or without length, the gradient is zero.
-    """
+    """Return the turning angles (..., S - 2), 0 to pi, of curves (..., S, 3) at their inner points."""
     steps = curves[..., 1:, :] - curves[..., :-1, :]
     before, after = steps[..., :-1, :], steps[..., 1:, :]
     cross = torch.linalg.cross(before, after, dim=-1)
@@ -91,10 +82,7 @@ def tangents(curves: Tensor) -> Tensor:
 
 
 def align_frames(frames: Tensor, directions: Tensor) -> Tensor:
-    """Return frames (..., 3, 3) turned by the smallest angle that makes ``directions`` (..., 3) their third columns.
-
-    Differentiable: in both.
-    """
+    """Return frames (..., 3, 3) turned by the smallest angle that makes ``directions`` their third columns."""
     return rotation_between(frames[..., 2], directions) @ frames
 
 

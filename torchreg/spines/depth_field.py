@@ -30,10 +30,7 @@ _DESCENT = DepthDescent()
 
 
 class DepthField:
-    """The signed distance to a surface on a grid, positive inside, right to about one voxel; see `voxelize` for holes.
-
-    The depth of a voxel is computed when it is first asked for, as curves pass through few of them.
-    """
+    """The signed distance to a surface on a grid, positive inside, computed for voxels as they are needed."""
 
     def __init__(self, mesh: TriangleMesh, resolution: int = 96) -> None:
         grid, border = voxelize(mesh, resolution, touching=False), _DESCENT.border
@@ -88,7 +85,7 @@ class DepthField:
 
 
 def _beside_others(inside: Tensor) -> Tensor:
-    """Return which voxels (X, Y, Z) have a neighbor along an axis on the other side of a surface."""
+    """Return a mask (X, Y, Z) of the voxels with a neighbor along an axis on the other side of a surface."""
     beside = torch.zeros_like(inside)
     for axis, size in enumerate(inside.shape):
         changes = inside.narrow(axis, 1, size - 1) != inside.narrow(axis, 0, size - 1)

@@ -124,7 +124,7 @@ class KeptResults:
 
     @classmethod
     def in_folder(cls, folder: str | os.PathLike[str] | None) -> KeptResults:
-        """Return what is kept in a folder, which is created if absent."""
+        """Return the results in a folder, which is created if absent."""
         if folder is None:
             return cls(None)
         Path(folder).mkdir(parents=True, exist_ok=True)
@@ -145,10 +145,7 @@ class KeptResults:
     def load(
         self, name: str, source: str, make: Callable[[Mapping[str, Tensor], Sequence[str]], _Found]
     ) -> _Found | None:
-        """Return what is made of the kept tensors and notes of a name; None if there are none from that source.
-
-        A damaged file counts as none.
-        """
+        """Return ``make`` of the kept tensors and notes of a name and source; None if there are none undamaged."""
         if self.folder is None:
             return None
         try:

@@ -112,10 +112,7 @@ def _cut(rows: _ShownLimbs, lengths: Tensor, num_samples: int) -> Tensor:
 
 
 def _over_time(values: Tensor) -> Tensor:
-    """Return values (T, L, ...), of which whole rows are NaN, interpolated in time, and held before and after.
-
-    Rows that are NaN in all frames stay.
-    """
+    """Return values (T, L, ...) with rows of NaN interpolated in time, unless NaN in all frames."""
     filled, numbers = values.clone(), torch.arange(len(values))
     for limb, known in enumerate(~values.flatten(2).isnan().any(-1).mT):
         frames = known.nonzero()[:, 0]

@@ -73,7 +73,7 @@ def level_sets(mesh: MeshEdges, values: Tensor, spacing: float) -> LevelSets:
     crossings = _Crossings(mesh, bands)
     points, ring = crossings.segments(heights)
     count = int(ring.max()) + 1 if len(ring) else 0
-    # One segment of each ring tells its level and the bands on its two sides.
+    # One segment of each ring gives its level and the bands on its two sides.
     segment = np.zeros(count, dtype=np.int64)
     segment[ring] = np.arange(len(ring))
     face, levels = crossings.face[segment], crossings.level[segment]

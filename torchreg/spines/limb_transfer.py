@@ -211,7 +211,7 @@ def _known_nodes(frame: FrameLimbs, graph: LimbGraph, limb_nodes: Tensor) -> Ten
 
 
 def _reliable_nodes(frame: FrameLimbs, graph: LimbGraph) -> Tensor:
-    """Return which nodes (N,) have a known position: observed tips, and junctions in which an observed limb ends."""
+    """Return a mask (N,) of nodes with known positions: observed tips, and ends of observed limbs."""
     reliable = frame.node_observed.clone()
     touched = torch.zeros_like(reliable)
     touched[graph.edges[frame.observed].reshape(-1)] = True

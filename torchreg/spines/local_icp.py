@@ -74,10 +74,7 @@ def transfer_nodes(
 def _correspondences(
     source: SurfacePoints, target: SurfacePoints, tree: NeighborTree, motions: Tensor, min_cosine: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the target points (V, 3) nearest to source points under motions (V, 4, 4), and whether normals agree.
-
-    The tree is that of the target's points.
-    """
+    """Return the target points (V, 3) nearest to source points under motions, and whether normals agree."""
     moved = transform_points(motions, source.points.unsqueeze(1)).squeeze(1)
     normals = (motions[:, :3, :3] @ source.normals.unsqueeze(-1)).squeeze(-1)
     index, _ = tree.nearest(moved)

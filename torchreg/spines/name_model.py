@@ -18,7 +18,7 @@ from torchreg.spines.tip_features import SAMPLING, TipFeatures, TipObservations
 
 @dataclass(frozen=True)
 class NamingPriors:
-    """What is assumed of names before any frame is seen; lengths in sizes of the body."""
+    """Assumptions on names before any frame; lengths in sizes of the body."""
 
     missing: float = -1.0  # log-probability of a tip that a frame lacks, against one that it shows
     independent_points: float = 2.0  # of a limb: the others move with these
@@ -152,7 +152,7 @@ class NameModel:
         return self.background(torch.where(self.mean.isnan(), torch.nan, features) - self.background_mean)
 
     def motion_scores(self, before: TipObservations, after: TipObservations, tips: Tensor) -> Tensor:
-        """Return those (P,) of the limbs' places, for tips (P, M) that those of the frame before become, -1 for none.
+        """Return log-probabilities (P,) of limb positions for tips (P, M) that those before become, -1 for none.
 
         The rigid motion of the body is fitted to each mapping, see `rank_mappings`.
         """

@@ -50,10 +50,7 @@ class FrameLimbs:
 
 
 def smooth_rough_limbs(skeleton: Skeleton) -> Skeleton:
-    """Return the skeleton with limbs that zigzag, as in a surface full of noise, smoothed; tips keep their order.
-
-    A limb zigzags if it is much longer than its moving average.
-    """
+    """Return the skeleton with limbs smoothed that are much longer than their moving average; tips keep their order."""
     rows, rough = [], False
     for limb in skeleton.limbs:
         nodes, radii = skeleton.nodes[limb], skeleton.radii[limb]
@@ -105,7 +102,7 @@ def _graph_nodes(skeleton: Skeleton, labels: Sequence[int], graph: LimbGraph) ->
 
 
 def _overlapping(nodes: Tensor, paths: list[list[int]]) -> Tensor:
-    """Return which paths (L,) along a tree of nodes (N, 3) have much in common with another."""
+    """Return a mask (L,) of the paths along a tree of nodes (N, 3) that have much in common with another."""
     steps = [{(min(pair), max(pair)) for pair in pairwise(path)} for path in paths]
     overlapping = torch.zeros(len(paths), dtype=torch.bool)
 
@@ -127,10 +124,7 @@ def median_lengths(frames: Sequence[FrameLimbs]) -> Tensor:
 
 
 def reject_odd_lengths(frame: FrameLimbs, median: Tensor, graph: LimbGraph, *, touching: bool) -> FrameLimbs:
-    """Return the frame without limbs, and their tips, whose length is far from the median (L,).
-
-    ``touching``: whether limbs touched, see `LimbLimits`.
-    """
+    """Return the frame without limbs, and their tips, whose length is far from the median (L,)."""
     ratio = curve_lengths(frame.curves) / median
     least, most = _LIMITS.length_range_touching if touching else _LIMITS.length_range
     odd = frame.observed & ((ratio < least) | (ratio > most))

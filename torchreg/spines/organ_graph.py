@@ -151,7 +151,7 @@ def _start_sides(graph: LimbGraph) -> list[Tips]:
 
 
 def limbs_between(graph: LimbGraph, alive: Tensor) -> Tensor:
-    """Return which limbs (T, L) join organs that are there, (T, K)."""
+    """Return a mask (T, L) of the limbs that join existing organs (T, K)."""
     sides = torch.zeros(len(graph.edges), graph.num_tips, dtype=torch.bool)
     for limb, side in enumerate(_start_sides(graph)):
         sides[limb, list(side)] = True

@@ -23,15 +23,15 @@ class OrganLife:
 
     birth: float = -1.0  # an organ appears, rather than a bump of the surface
     end: float = -1.5  # an organ ends
-    hidden: float = -0.75  # an organ that lasts is not seen
+    hidden: float = -0.75  # an organ that lasts is not observed
     max_hidden: int = 3  # frames in a row
     max_certainty: float = 1.5  # of a single tip: log-odds that it is no bump
     starts: tuple[float, ...] = (0.04, 0.15)  # scales of displacements with which searches start, in sizes of the body
     num_rounds: int = 6  # of the best tracks and new scales, at most
     dof: float = 8.0  # of displacements: what grows does not jump
-    inner: int = 2  # sample of a limb that tells, from its tip, where it points
-    num_body: int = 3  # organs that tell how the whole body moved
-    num_salient: int = 4  # surest tips of a frame, of which two tell how the body may have moved at first
+    inner: int = 2  # sample of a limb that gives, from its tip, its direction
+    num_body: int = 3  # organs that determine the motion of the whole body
+    num_salient: int = 4  # surest tips of a frame, of which two give candidates for the first motion of the body
 
 
 LIFE = OrganLife()
@@ -56,7 +56,7 @@ class OrganTracks:
 
     @property
     def alive(self) -> Tensor:
-        """Which organs are there (T, K), seen or hidden."""
+        """Return a mask (T, K) of the organs that exist, observed or hidden."""
         numbers = torch.arange(len(self.labels))[:, None]
         return (numbers >= self.births) & (numbers <= self.ends)
 
@@ -178,7 +178,7 @@ class _Search:
 
 
 def _body_motion(source: Tensor, target: Tensor, used: Tensor, first: Tensor) -> Tensor:
-    """Return how the body moves (4, 4) between two frames whose links (n,) are used or not; else as at first."""
+    """Return the motion (4, 4) of the body between two frames by the used links (n,), or the first guess."""
     return fit_rigid(source[used, 0], target[used, 0]) if int(used.sum()) >= LIFE.num_body else first
 
 

@@ -33,7 +33,7 @@ def check_sizes(samples: Sequence[Tensor], *, growing: bool) -> None:
     """Raise InputError if a frame differs far in size from most, or, growing, from the one before it."""
     sizes = torch.stack([_size(points) for points in samples])
     usual = torch.cat((sizes[:1], sizes[:-1])) if growing else sizes.median().expand_as(sizes)
-    ratios = torch.where((sizes > 0) & (usual > 0), (sizes / usual).log().abs().exp(), 1.0)  # points: told elsewhere
+    ratios = torch.where((sizes > 0) & (usual > 0), (sizes / usual).log().abs().exp(), 1.0)  # points: checked elsewhere
     frame = int(ratios.argmax())
     if float(ratios[frame]) > _LIMITS.most:
         than = "the frame before it" if growing else "most frames"

@@ -266,10 +266,7 @@ def _best_limbs(
     interior: Interior | None,
     tips: _SurfaceTips,
 ) -> list[_Limb]:
-    """Return every limb as a curve through the rings of the tree in which they are best.
-
-    Its ends are moved inside the body, if there is an interior.
-    """
+    """Return every limb as a curve through its best tree's rings, with ends inside the body if interior is given."""
 
     def cap(tip: int, rings: Rings) -> tuple[Tensor, Rings]:
         position = tips.positions[tip]
@@ -318,10 +315,7 @@ def _centered_limbs(limbs: Sequence[_Limb], mesh: TriangleMesh, interior: Interi
 def _assembled(
     limbs: Sequence[_Limb], interior: Interior, tips: _SurfaceTips, like: Tensor
 ) -> tuple[Skeleton, TipRelations]:
-    """Return the skeleton of limbs that share their end nodes, in the dtype and device of ``like``.
-
-    With it come the relations of its tips.
-    """
+    """Return the skeleton of limbs that share end nodes, and the relations of its tips, in the dtype of ``like``."""
     rows = [(limb.points, interior.clearance(limb.points), limb.frames) for limb in limbs]
     skeleton = build_skeleton(rows, [limb.ends for limb in limbs], tips.notes)
     # Tips are nodes in the order in which limbs name them first.

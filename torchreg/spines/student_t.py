@@ -68,7 +68,7 @@ class GroupedDensity:
 class Shrinkage:
     """How much a covariance of few samples leans on the one that is known beforehand."""
 
-    samples: float = 2.0  # that the known one counts for, beside one for each dimension
+    samples: float = 2.0  # that the known one counts for, and one more for each dimension
     variance: float = 0.25  # known beforehand, in those of the background
 
 

@@ -28,7 +28,7 @@ ONE_SIDED = "the points do not enclose a body, as those of a single view: limbs 
 class _SurfaceSampling:
     """What is kept of the surface of every frame."""
 
-    num_vertices: int = 2000  # tell its size, its place and what is upright, as all of them would
+    num_vertices: int = 2000  # for its size, position and upright direction, as good as all of them
 
 
 _SAMPLING = _SurfaceSampling()

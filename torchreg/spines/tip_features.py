@@ -117,9 +117,9 @@ class TipFeatures:
         return torch.where((first >= 0) & (second >= 0), values, torch.nan)
 
     def __call__(self, frame: TipObservations, maps: Tensor, usual: Tensor) -> Tensor:
-        """Return the features (P, n) of a frame under mappings (P, K) of names to tips, NaN where a tip is missing.
+        """Return the features (P, n) of a frame under mappings (P, K) of names to tips, NaN for missing tips.
 
-        In place of distances to missing tips stand those usual between named tips, (K (K - 1) / 2,).
+        Distances to missing tips are replaced by the usual ones between named tips, (K (K - 1) / 2,).
         """
         index, found = maps.clamp_min(0), maps >= 0
         distances = self.distances(frame, maps)

@@ -25,7 +25,7 @@ class MappingSearch:
     length_weight: float = 0.5  # of the term that compares path lengths
     max_missing: int = 2  # known tips missing beyond those that must be, where all mappings are tried
     max_mappings: int = 10_000  # that are tried; if there are more, with fewer tips missing, or by assignments
-    num_rotations: int = 24  # about axes all over the sphere, from which assignments start, beside the identity
+    num_rotations: int = 24  # about axes all over the sphere, from which assignments start, and the identity
     max_rounds: int = 20  # of an assignment and a rigid fit
 
 

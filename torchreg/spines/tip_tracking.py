@@ -82,10 +82,7 @@ def has_loops(skeleton: Skeleton) -> bool:
 
 
 def _clean_frames(skeletons: Sequence[Skeleton], num_tips: int, topology: str | None) -> list[bool]:
-    """Return which frames may be references: those with K tips, a topology and no loops, if any.
-
-    Without a topology, or if none of them has it, it is their most frequent one.
-    """
+    """Return which frames may be references: those of K tips, the topology, or the most frequent one, and no loops."""
     topologies = [skeleton.topology for skeleton in skeletons if len(skeleton.tips) == num_tips]
     if not topologies:  # a K that no frame has: the frame nearest to it
         counts = [len(skeleton.tips) for skeleton in skeletons]
@@ -99,7 +96,7 @@ def _clean_frames(skeletons: Sequence[Skeleton], num_tips: int, topology: str | 
 
 
 def _along_skeleton(skeleton: Skeleton) -> TipRelations:
-    """Return the relations of tips as a skeleton tells them: without sides."""
+    """Return the relations of tips along a skeleton, which has no volumes."""
     lengths = path_lengths(skeleton, skeleton.tips)[:, skeleton.tips.cpu()]
     return TipRelations(lengths, lengths.new_zeros(len(lengths), len(lengths), len(lengths)))
 
