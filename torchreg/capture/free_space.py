@@ -1,4 +1,4 @@
-"""Free space: a depth picture tells also where nothing is, in front of what was measured and beside the mask."""
+"""Free space of depth pictures: nothing is in front of the measured surface or outside of the mask."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A closed surface around points of a surface, without normals: what is left of a body after closing its gaps."""
+"""A closed surface around points of a surface, without normals, by morphological closing."""
 
 from __future__ import annotations
 

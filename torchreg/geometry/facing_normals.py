@@ -1,4 +1,4 @@
-"""Normals of scans from one side, which all face one camera that nobody told."""
+"""Normals of scans from one side, towards a camera of unknown position."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What loaders return, as each system takes it: points of clouds, scans and meshes; scans and meshes of clouds."""
+"""Loaded clouds, scans and meshes in the form that each system takes."""
 
 from __future__ import annotations
 

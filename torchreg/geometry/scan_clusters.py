@@ -1,4 +1,4 @@
-"""Scans of few points that stand for many."""
+"""Scans reduced to cluster points."""
 
 from __future__ import annotations
 

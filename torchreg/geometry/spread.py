@@ -1,4 +1,4 @@
-"""How many dimensions points fill: none in one place, one on a line, two on a plane."""
+"""The numerical rank of a point set: zero for one position, one for a line, two for a plane."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a scanned thing stands on: a table, a turntable, a floor, told from the thing."""
+"""Segmentation of a scan into a thing and its support: a table, a turntable, a floor."""
 
 from __future__ import annotations
 

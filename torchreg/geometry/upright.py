@@ -1,4 +1,4 @@
-"""Which direction is upright: files of points do not say, so it is told from where things stand and how they move."""
+"""The upright direction of points, estimated from how things stand and move."""
 
 from __future__ import annotations
 

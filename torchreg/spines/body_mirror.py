@@ -1,4 +1,4 @@
-"""The mirror symmetry of a body: which limbs are each other's mirror images, so that their poses tell no names."""
+"""The mirror symmetry of a body: limbs that are each other's mirror images, which poses do not identify."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is told of the frames of a sequence: irregularities, and the statuses that follow from them."""
+"""Warnings on the frames of a sequence: irregularities, and the statuses that follow from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Junctions, tips and curves placed inside a body: what level sets leave beside the middle or outside."""
+"""Junctions, tips and curves placed inside a body, if level sets leave them off the axis or outside."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames that do not fit a sequence: of another unit, an error, or with another body, passed over."""
+"""Outlier frames of a sequence: of another unit, with an error, or with another body."""
 
 from __future__ import annotations
 

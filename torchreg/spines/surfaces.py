@@ -1,4 +1,4 @@
-"""What spines are drawn from: meshes as they are, clouds as the surface around their points."""
+"""Surfaces of the frames of a spine: meshes as they are, clouds as the surface around their points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is measured of the tips of a frame, and the features of a frame whose tips are named in some way."""
+"""Measurements of the tips of a frame, and the features of a frame with named tips."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a surface tells of its tips whatever their pose: how far apart they are along it, and on which side."""
+"""Relations between tips that do not depend on pose: geodesic distances and signed volumes."""
 
 from __future__ import annotations
 
