@@ -19,24 +19,10 @@ def brightness(colors: Tensor) -> Tensor:
 
 
 def chroma_key(image: Tensor, background: Sequence[float] | None = None, *, tolerance: float = 0.12) -> Tensor:
-    """Return the mask of pixels that differ from a background of one color, in light and in shade.
+    """Return the masks (..., H, W) of pixels of images (..., H, W, 3) that differ from a background of one color.
 
-    Pixels are compared by chroma, their blue and red less their brightness: ``(B - Y, R - Y)``, with that of the
-    background scaled to each pixel's own brightness, since in shade a screen keeps its hue. Specks are removed and
-    pinholes closed, one pixel wide.
-
-    Args:
-        image: (..., H, W, 3) from 0 to 1.
-        background: its red, green and blue; the median of the border of each picture by default.
-        tolerance: distance in chroma from which a pixel is foreground.
-
-    Returns:
-        Masks (..., H, W), bool.
-
-    Raises:
-        InputError: if the shape does not fit or ``tolerance`` is not positive.
-
-    Differentiable: no.
+    Pixels differ by chroma ``(B - Y, R - Y)`` from the background scaled to their own brightness, as a screen keeps its
+    hue in shade. The background is the median of each border by default; specks and pinholes are removed.
     """
     image = as_float_tensor(image, "image")
     check_shape(image, "image", ("H", "W", 3), batch=True)

@@ -109,18 +109,10 @@ def _undistorted(scan: RangeScan, camera: Camera) -> RangeScan:
 
 
 def without_flying_pixels(depth: Tensor, focal: tuple[float, float], *, max_steepness: float = 6.0) -> Tensor:
-    """Return depth images with zero at flying pixels, which lie between two surfaces at edges and steep slopes.
+    """Return depth images (..., H, W) with zero at flying pixels, which lie between two surfaces at edges.
 
-    A pixel stays if at least three of its eight neighbors could lie on one surface with it: their depths differ by no
-    more than ``max_steepness`` times the distance between the two rays there. A straight edge leaves its pixels five
-    such neighbors, a right-angled corner three.
-
-    Args:
-        depth: (..., H, W) metres; zero, negative or not finite where nothing was measured.
-        focal: fx and fy, pixels.
-        max_steepness: tangent of the steepest slope; 6 is 80 degrees.
-
-    Differentiable: no.
+    A pixel stays if for three of its eight neighbors the depth differs by at most ``max_steepness`` times the distance
+    between the two rays there: a right-angled corner leaves three, a straight edge five.
     """
     with torch.no_grad():
         clean = _measured(depth)
@@ -133,23 +125,11 @@ def without_flying_pixels(depth: Tensor, focal: tuple[float, float], *, max_stee
 
 
 def bilateral_filter(depth: Tensor, noise: float, *, radius: int = 2, spread: float = 1.5) -> Tensor:
-    """Return depth images averaged over neighbors that are near in the picture and in depth; edges stay sharp.
+    """Return depth images averaged over neighbors near in the picture and in depth (Tomasi and Manduchi 1998).
 
     ``z_p' = z_p + sum_q w_q (z_q - z_p) / sum_q w_q`` with
-    ``w_q = exp(-|p - q|^2 / 2 spread^2 - (z_q - z_p)^2 / 2 s^2)`` and ``s = 3 noise z_p^2``. Opposite pixels are taken
-    together, their mean standing for both, so that slopes are not flattened.
-
-    Args:
-        depth: (..., H, W) metres; zero, negative or not finite where nothing was measured, and zero there afterwards.
-        noise: standard deviation of depths at one metre, metres; it grows with the square of the depth.
-        radius: of the window, pixels.
-        spread: standard deviation in the picture, pixels.
-
-    Differentiable: no.
-
-    Cost: (2 radius + 1)^2 operations per pixel, no memory beyond a few pictures.
-
-    References: Tomasi and Manduchi 1998.
+    ``w_q = exp(-|p - q|^2 / 2 spread^2 - (z_q - z_p)^2 / 2 s^2)`` and ``s = 3 noise z_p^2``, ``noise`` the deviation at
+    one metre. Opposite pixels are averaged first, so that slopes are not flattened.
     """
     with torch.no_grad():
         clean = _measured(depth)
@@ -168,25 +148,11 @@ def bilateral_filter(depth: Tensor, noise: float, *, radius: int = 2, spread: fl
 def plane_normals(
     depth: Tensor, intrinsics: Sequence[float], noise: float, *, radius: int = 5, max_steepness: float = 6.0
 ) -> Tensor:
-    """Return the normals of depth images, each that of the plane which fits a window best, towards the camera.
+    """Return the normals (..., H, W, 3) of the planes that fit windows of depth images, towards the camera.
 
-    On a plane ``n . X = d`` the inverse depth ``1 / z`` is ``n . (x, y, 1) / d``, linear in the picture: a linear fit
-    to inverse depths is exact however the plane is tilted. Only neighbors that could be on one surface with the middle
-    count: those closer in depth than three standard deviations of the noise and the steepest slope allow.
-
-    Args:
-        depth: (..., H, W) metres; zero, negative or not finite where nothing was measured.
-        intrinsics: fx, fy, cx, cy, pixels.
-        noise: standard deviation of depths at one metre, metres; it grows with the square of the depth.
-        radius: of the window, pixels.
-        max_steepness: tangent of the steepest slope.
-
-    Returns:
-        Normals (..., H, W, 3) in camera coordinates, zero where fewer than three pixels determine no plane.
-
-    Differentiable: no.
-
-    Cost: (2 radius + 1)^2 / 2 passes over the picture with a few operations: 1 s for 640 x 480 on one CPU core.
+    On a plane ``n . X = d`` the inverse depth ``1 / z`` is ``n . (x, y, 1) / d``, linear in the picture: the fit is
+    exact. Only neighbors within three standard deviations of the noise and the steepest slope count; zero below three
+    pixels.
     """
     fx, fy, cx, cy = intrinsics
     with torch.no_grad():

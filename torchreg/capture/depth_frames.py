@@ -20,18 +20,11 @@ PathLike = str | os.PathLike[str]
 class DepthFrames(Sequence[DepthFrame]):
     """Depth pictures of one camera in the order of the numbers in their names, each read on request, and not kept.
 
-    Reading raises what `DepthFrame.load` raises.
-
     Args:
         paths: pictures, folders of them, or patterns such as ``frames/*.png``.
         intrinsics: the camera's file, see `load_depth_camera`.
         masks: one mask for all, or a folder or pattern of as many as there are pictures; None for all pixels.
-        nearest: nearer pixels are left out, metres.
-        farthest: pixels beyond are left out, metres.
-
-    Raises:
-        FormatError: if there are no pictures, or not as many masks.
-        FileNotFoundError: if a file or folder is missing.
+        nearest, farthest: range of depths that is kept, metres.
     """
 
     def __init__(

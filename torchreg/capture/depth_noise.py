@@ -14,20 +14,15 @@ from torchreg.errors import InputError
 
 @dataclass(frozen=True)
 class DepthNoise:
-    """Error model of a depth camera.
-
-    The standard deviation of a depth z is ``sqrt(constant^2 + (quadratic z^2)^2)``, metres.
+    """Error model of a depth camera, with ``std(z) = sqrt(constant^2 + (quadratic z^2)^2)``, metres.
 
     Args:
         constant: deviation from errors of timing, metres.
         quadratic: deviation from errors of disparity, 1 / metre.
-        step: 1 / metre; depths are rounded to multiples of that in ``1 / z``, as disparities are. Zero does not round.
-        jitter: standard deviation of the position at which a pixel measures, pixels: it ruffles edges.
+        step: depths are rounded to multiples of it in ``1 / z``, 1 / metre; zero does not round.
+        jitter: deviation of the position at which a pixel measures, pixels: it ruffles edges.
         flying: share of pixels at a jump in depth that mix both sides.
         dropout: share of pixels that measure nothing, everywhere.
-
-    Raises:
-        InputError: if a number is negative or not finite, or a share above one.
 
     References: Khoshelham and Elberink 2012 (structured light); Foix et al. 2011 (time of flight).
     """
@@ -62,15 +57,7 @@ class DepthNoise:
         return torch.sqrt(self.constant**2 + (self.quadratic**2 + rounding**2) * depth**4)
 
     def measured(self, depth: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return true depth images with the camera's errors.
-
-        Args:
-            depth: (..., H, W) metres; zero or not finite where there is nothing.
-            generator: source of randomness on the CPU; None draws from a fresh one with seed 0, the same at every call.
-
-        Returns:
-            Measured depths (..., H, W), metres; zero where nothing is measured.
-        """
+        """Return true depth images (..., H, W), metres, with the camera's errors; zero where nothing is measured."""
         check_shape(depth, "depth", ("H", "W"), batch=True)
         generator = torch.Generator().manual_seed(0) if generator is None else generator
 

@@ -29,32 +29,12 @@ _MATCHING = _Matching()
 
 
 def match_disparity(left: Tensor, right: Tensor, max_disparity: int, *, method: str = "semi-global") -> Tensor:
-    """Return the disparity of every left pixel, ``x_left - x_right``, NaN where it is not known.
+    """Return the disparity (..., H, W) of every left pixel, ``x_left - x_right``, NaN where it is not known.
 
-    The cost of a disparity is the number of differing bits of the two census transforms (7 x 9). Semi-global matching
-    sums along four directions r the costs of the cheapest paths to a pixel,
-    ``L(p, d) = C(p, d) + min(L(p - r, d), L(p - r, d +- 1) + P1, min_k L(p - r, k) + P2) - min_k L(p - r, k)``;
-    block matching averages costs over 9 x 9 pixels instead. Minima are refined to fractions by a parabola, and kept
-    where the right picture, matched with the left one, agrees.
-
-    Args:
-        left: (..., H, W) gray pictures of one scale, rectified.
-        right: (..., H, W).
-        max_disparity: the largest disparity, pixels; from 2 to below the width.
-        method: "semi-global", "block", or "opencv" for OpenCV's own semi-global matcher (extra ``stereo``).
-
-    Returns:
-        Disparities (..., H, W), pixels, in the dtype of ``left``.
-
-    Raises:
-        MissingExtraError: if ``method`` is OpenCV's and OpenCV is not installed.
-
-    Differentiable: no.
-
-    Cost: about 60 operations per pixel and disparity, and three numbers of 16 bits: 2 s for 640 x 480 pixels and 128
-        disparities on one CPU core. Batches and GPUs run the same code.
-
-    References: Zabih and Woodfill 1994 (census); Hirschmueller 2008 (semi-global matching).
+    Costs are differing bits of census transforms (7 x 9; Zabih and Woodfill 1994). Semi-global matching (Hirschmueller
+    2008) sums along four directions r the costs of the cheapest paths,
+    ``L(p, d) = C(p, d) + min(L(p - r, d), L(p - r, d +- 1) + P1, min_k L(p - r, k) + P2) - min_k L(p - r, k)``; block
+    matching averages over 9 x 9 pixels. Minima are refined by a parabola, and kept where the right picture agrees.
     """
     with torch.no_grad():
         pairs = left.reshape(-1, *left.shape[-2:]), right.reshape(-1, *left.shape[-2:])
@@ -95,7 +75,7 @@ def _set_bits(code: Tensor) -> Tensor:
 
 
 def _cost_volume(left: Tensor, right: Tensor, highest: int) -> Tensor:
-    """Return (B, H, W, D) int16 costs; the largest where the right pixel lies beside the picture."""
+    """Return (B, H, W, D) int16 costs; the largest where the right pixel lies outside of the picture."""
     width = left.shape[-1]
     shape = (*left.shape, highest + 1)
     volume = torch.full(shape, _MATCHING.num_bits, dtype=torch.int16, device=left.device)
@@ -145,10 +125,7 @@ def _minima(volume: Tensor) -> Tensor:
 
 
 def _seen_from_right(volume: Tensor) -> Tensor:
-    """Return the cost volume (B, H, W, D) of the right picture, as a view: its column x is x + d on the left.
-
-    Beyond the left picture costs are the largest.
-    """
+    """Return the cost volume of the right picture, a view: column x is x + d on the left; largest beyond it."""
     batch, height, width, count = volume.shape
     padded = volume.new_full((batch, height, width + count, count), volume.max().item())
     padded[:, :, :width] = volume

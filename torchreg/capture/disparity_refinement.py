@@ -32,13 +32,7 @@ _FIT = _WindowFit()
 
 @dataclass(frozen=True, eq=False)
 class RefinedDisparity:
-    """Disparities of N pixels.
-
-    Args:
-        disparity: (N,) pixels.
-        std: (N,) standard deviation, pixels.
-        good: (N,) bool, whether the fit stayed near the dense disparity and the windows look alike.
-    """
+    """Disparities (N,) and standard deviations, pixels; good: near the dense disparity, windows that correlate."""
 
     disparity: Tensor
     std: Tensor
@@ -50,8 +44,7 @@ class _Windows:
     """The K pixels around each of N pixels, all numbers float64.
 
     Args:
-        column: (N, K) int64, within the picture.
-        row: (N, K) int64, within the picture.
+        column, row: (N, K) int64, within the picture.
         basis: (K, 3) of a plane in the window: one, the step along the row, the step down.
         disparity: (N, K) dense disparity, NaN where it is not known.
         weights: (N, K) Gaussian in the picture, zero on other surfaces.
@@ -85,25 +78,11 @@ class _Windows:
 
 
 def refine_disparity(left: Tensor, right: Tensor, dense: Tensor, pixels: Tensor) -> RefinedDisparity:
-    """Return the disparities of N pixels to a fraction of a pixel, from windows of 11 x 11.
+    """Return disparities of N pixels (column, row) to a fraction of a pixel, from 11 x 11 (Lucas and Kanade 1981).
 
-    Minimizes ``sum_q w_q (I_L(q) - g I_R(q - d - s . (q - p)) - b)^2`` over disparity d and slopes s by Gauss-Newton,
-    the gain g and offset b taken from the windows' means and deviations. The weights are a Gaussian, zero where the
-    dense disparity says another surface. The variance of d is that of weighted least squares, the noise from the
-    residuals. Both pictures are smoothed first; without it, noise draws fractions towards a half.
-
-    Args:
-        left: (H, W) gray, rectified.
-        right: (H, W).
-        dense: (H, W) disparity, NaN where it is not known.
-        pixels: (N, 2) int64 as (column, row), where ``dense`` is known.
-
-    Returns:
-        Refined disparities (N,), their standard deviations and whether each fit is good.
-
-    Differentiable: no.
-
-    References: Lucas and Kanade 1981.
+    Gauss-Newton minimizes ``sum_q w_q (I_L(q) - g I_R(q - d - s . (q - p)) - b)^2`` over disparity d and slopes s, with
+    gain g and offset b from the windows' means and deviations; w is a Gaussian, zero on other surfaces. Both pictures
+    are smoothed first; without it, noise biases fractions towards a half.
     """
     windows = _Windows.from_dense(dense, pixels)
     start = dense[pixels[:, 1], pixels[:, 0]].double()
@@ -119,11 +98,7 @@ def refine_disparity(left: Tensor, right: Tensor, dense: Tensor, pixels: Tensor)
 
 
 def _fit_planes(first: Tensor, second: Tensor, windows: _Windows, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return planes of disparity in windows, fitted by Gauss-Newton from disparities ``start`` (N,).
-
-    Returns:
-        Disparity and slopes (N, 3), variances (N,) of the disparities, correlations (N,) of the windows.
-    """
+    """Return disparity and slopes (N, 3), variances of the disparities and correlations (N,), by Gauss-Newton."""
     target = first[windows.row, windows.column]
     plane = torch.stack((start, torch.zeros_like(start), torch.zeros_like(start)), dim=-1)
     prior = torch.diag(plane.new_tensor([1e-9, 1.0, 1.0])) / _FIT.slope_std**2

@@ -1,4 +1,4 @@
-"""Free space: a depth picture tells also where nothing is, in front of what was measured and beside the mask."""
+"""Free space of depth pictures: nothing is in front of the measured surface or outside of the mask."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ from torchreg.geometry.camera import Camera, distort, lens_jacobian
 
 @dataclass(frozen=True, eq=False)
 class FreeSpace:
-    """The free space of F depth pictures, for B problems, each of which sees one of them.
+    """The free space of F depth pictures, for B problems, each of which uses one of them.
 
-    A point at depth z whose pixel shows a surface at D intrudes into free space by ``D - z`` if that is positive.
-    Beside the mask it intrudes by the shorter of that and the way to the mask, ``z / f`` times its distance in pixels.
-    What lies behind the surface is hidden; where nothing was measured within the mask, beside the picture and behind
-    the camera, nothing is known.
+    A point at depth z whose pixel has a surface at depth D intrudes by ``D - z`` if that is positive; outside of the
+    mask by the smaller of that and ``z / f`` times its distance from the mask in pixels. Nothing is known behind the
+    surface, without a measurement within the mask, outside of the picture and behind the camera.
 
     Args:
         depth: (F, H, W) metres, zero where nothing was measured.
@@ -80,15 +79,15 @@ class FreeSpace:
         return replace(self, picture=self.picture[index], origin=self.origin[index], datum_area=self.datum_area[index])
 
     def moved(self, origin: Tensor) -> FreeSpace:
-        """Return the same with coordinates that begin farther on, by (B, 3) or (3,), metres."""
+        """Return the free space with coordinates whose origin is moved by (B, 3) or (3,), metres."""
         return replace(self, origin=self.origin + origin.to(self.origin))
 
     def thinned(self, factor: Tensor) -> FreeSpace:
-        """Return the same where each datum stands for (B,) times as many."""
+        """Return the free space for data of which each stands for (B,) times as many."""
         return replace(self, datum_area=self.datum_area * factor.to(self.datum_area))
 
     def to(self, like: Tensor) -> FreeSpace:
-        """Return the same on the device and in the dtype of a tensor; motions and origins stay in float64."""
+        """Return the free space on the device and in the dtype of a tensor; motions and origins stay in float64."""
         exact = ("picture", "origin", "world_to_camera")
         return replace(
             self,
@@ -100,20 +99,16 @@ class FreeSpace:
         )
 
     def intrusion(self, points: Tensor) -> Tensor:
-        """Return how far points (B, ..., 3) of the problems lie in free space, (B, ...), metres."""
+        """Return the depths (B, ...), metres, by which points (B, ..., 3) of the problems intrude into free space."""
         return self._look(points.reshape(len(points), -1, 3)).intrusion.reshape(points.shape[:-1])
 
     def intrusion_gradient(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the same for points (B, N, 3), and its gradient (B, N, 3) by their coordinates."""
+        """Return the intrusion of points (B, N, 3) and its gradient (B, N, 3) by their coordinates."""
         seen = self._look(points)
         return seen.intrusion, self._gradient(seen)
 
     def intruding(self, points: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Return which points of (B, N, 3) intrude by more than is tolerated in any problem, most often few.
-
-        Returns:
-            Their numbers (K,), by how much they intrude (B, K), and the gradients of that (B, K, 3).
-        """
+        """Return the indices (K,) of points that intrude in any problem, by how much (B, K), and its gradients."""
         seen = self._look(points)
         index = (seen.intrusion > tolerance).any(0).nonzero()[:, 0]
         seen = seen.part(index)
@@ -151,7 +146,7 @@ class FreeSpace:
         return points @ motion[:, :3, :3].mT.to(points) + offset.unsqueeze(1).to(points)
 
     def _look(self, points: Tensor) -> _Look:
-        """Return what the pictures show at points (B, N, 3)."""
+        """Return the pictures' values at points (B, N, 3)."""
         local = self._local(points)
         depth = local[..., 2]
         plane = local[..., :2] / torch.where(depth > 0, depth, 1.0).unsqueeze(-1)
@@ -194,14 +189,13 @@ class FreeSpace:
 
 @dataclass(frozen=True, eq=False)
 class _Look:
-    """What pictures show at points: all (B, N) but plane and slope, which are (B, N, 2).
+    """What pictures show at points, (B, N): distance from the mask (pixels), depth and side margins (metres).
 
     Args:
-        plane: the points on the plane at depth one.
-        distance: from the mask, pixels.
-        slope: of the distance.
-        ahead: how far before the surface that was measured, metres.
-        sideways: how far beside the mask, metres; infinite inside.
+        plane: (B, N, 2) the points on the plane at depth one.
+        slope: (B, N, 2) of the distance.
+        ahead: how far before the measured surface.
+        sideways: how far outside of the mask; infinite inside.
         counts: whether the point is in free space.
     """
 
@@ -218,5 +212,5 @@ class _Look:
         return torch.where(self.counts, torch.minimum(self.ahead, self.sideways), 0.0)
 
     def part(self, index: Tensor) -> _Look:
-        """Return the same for some of the points (K,)."""
+        """Return the values at some of the points (K,)."""
         return _Look(**{item.name: getattr(self, item.name)[:, index] for item in fields(self)})

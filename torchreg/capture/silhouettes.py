@@ -138,13 +138,7 @@ def _paired(masks: Sequence[Tensor], cameras: CameraRig | Sequence[Camera]) -> l
 
 @dataclass(frozen=True, eq=False)
 class _Silhouette:
-    """A mask as seen by its camera.
-
-    Args:
-        camera: float32.
-        distance: (1, 1, H, W) signed distance to the outline, pixels.
-        stretch: largest factor by which the lens stretches the picture.
-    """
+    """A mask as signed distance (1, 1, H, W) to its outline, pixels, and the largest stretch by the lens."""
 
     camera: Camera
     distance: Tensor
@@ -218,13 +212,7 @@ def _carved(silhouettes: list[_Silhouette], box: Tensor, resolution: int) -> Vis
 
 
 def _decided(silhouettes: list[_Silhouette], centers: Tensor, radius: float) -> Tensor:
-    """Return states (N,) int8 of blocks: 1 outside of one mask or more, -1 inside all of them, 0 undecided.
-
-    Args:
-        silhouettes: of all cameras.
-        centers: (N, 3) of the blocks.
-        radius: of the balls around them.
-    """
+    """Return states (N,) int8 of blocks in balls: 1 outside of a mask, -1 inside all of them, 0 undecided."""
     state = torch.full(centers.shape[:1], -1, dtype=torch.int8, device=centers.device)
     remaining = torch.arange(len(centers), device=centers.device)
     for silhouette in silhouettes:

@@ -182,23 +182,7 @@ def stereo_points(
 
 
 def rectify(left: Tensor, right: Tensor, pair: StereoPair) -> tuple[Tensor, Tensor, StereoPair]:
-    """Return both pictures as two cameras at the same positions take them, with rows along the baseline.
-
-    Args:
-        left: (H, W) or (H, W, 3) from 0 to 1.
-        right: likewise.
-        pair: the cameras, with or without distortion.
-
-    Returns:
-        The pictures, zero where nothing was seen, and their rectified pair.
-
-    Raises:
-        InputError: if sizes do not fit.
-
-    Differentiable: in the pictures.
-
-    References: Fusiello et al. 2000.
-    """
+    """Return both pictures with rows along the baseline, zero beyond the given ones, and their pair (Fusiello 2000)."""
     for image, camera, name in ((left, pair.left, "left"), (right, pair.right, "right")):
         _check_size(as_float_tensor(image, name), camera, name)
     first, second = pair.left.to(torch.float64), pair.right.to(torch.float64)

@@ -33,14 +33,7 @@ _FAR_END = _FarEnd()
 
 @dataclass(frozen=True, eq=False)
 class StereoSight:
-    """The points of a frame.
-
-    Args:
-        left: (H, W) or (H, W, 3) the left picture, rectified.
-        pair: the rectified cameras.
-        corners: all points of the pair.
-        points: those within reach of the far end.
-    """
+    """The points of a frame: all corners, and those within reach of the far end; picture and pair are rectified."""
 
     left: Tensor
     pair: StereoPair
@@ -135,14 +128,8 @@ class StereoFrames(Sequence[Tensor]):
 def far_end(corners: StereoPoints, pair: StereoPair, config: StereoConfig, reach: float) -> Tensor:
     """Return the mask (N,) of points near the far end of an object that enters through the border, as an arm does.
 
-    All points, if nothing in the depths of interest touches the border of what both cameras see. Else the far end is
-    the point farthest from where the object enters, and the reach is measured along the line between the two.
-
-    Args:
-        corners: points of a pair.
-        pair: the cameras.
-        config: the depths of interest.
-        reach: metres.
+    The far end is farthest from where the object enters, and the reach, metres, is measured along the line between the
+    two. All points, if nothing in the depths of interest touches the border.
     """
     dense = corners.dense
     depth = pair.depth(dense)

@@ -27,7 +27,7 @@ class Budget:
     view_side: int = 4096
     # Times that the faces of an icosahedron are split: 655,362 vertices.
     subdivisions: int = 8
-    # Points whose nearest neighbors tell how far apart all are.
+    # Points whose nearest neighbors give the spacing of all.
     spacings: int = 20_000
 
 

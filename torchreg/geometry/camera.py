@@ -288,12 +288,7 @@ def _float64(value: Any, name: str) -> Tensor:
 
 
 def distort(plane: Tensor, lens: Tensor) -> Tensor:
-    """Return the distorted positions (..., 2) of points (..., 2) of the plane at depth one.
-
-    Args:
-        plane: (..., 2).
-        lens: (8,) see `Camera`; (8, ...) for a lens of each point.
-    """
+    """Return the distorted positions of points (..., 2) at depth one; lens (8,) as in `Camera`, or (8, ...)."""
     k1, k2, p1, p2, k3, k4, k5, k6 = lens.unbind()
     u, v = plane.unbind(-1)
     square = u * u + v * v
@@ -304,12 +299,7 @@ def distort(plane: Tensor, lens: Tensor) -> Tensor:
 
 
 def lens_jacobian(plane: Tensor, lens: Tensor) -> Tensor:
-    """Return the derivative (..., 2, 2) of the distorted positions of points (..., 2) of the plane at depth one.
-
-    Args:
-        plane: (..., 2).
-        lens: (8,) see `Camera`; (8, ...) for a lens of each point.
-    """
+    """Return the derivative (..., 2, 2) of `distort` in the points (..., 2) at depth one."""
     k1, k2, p1, p2, k3, k4, k5, k6 = lens.unbind()
     u, v = plane.unbind(-1)
     square = u * u + v * v

@@ -57,11 +57,7 @@ class CameraRig:
         return iter(self.cameras)
 
     def __getitem__(self, which: int | str) -> Camera:
-        """Return a camera by its index or name.
-
-        Raises:
-            InputError: if there is no camera of that name.
-        """
+        """Return a camera by its index or name."""
         if isinstance(which, int):
             return self.cameras[which]
         if which not in self.names:

@@ -1,4 +1,4 @@
-"""A closed surface around points of a surface, without normals: what is left of a body after closing its gaps."""
+"""A closed surface around points of a surface, without normals, by morphological closing."""
 
 from __future__ import annotations
 
@@ -33,36 +33,17 @@ CLOSING = CloudClosing()
 
 @dataclass(frozen=True, eq=False)
 class CloudSurface:
-    """A surface around points.
-
-    Args:
-        mesh: closed, facing outwards, one voxel outside of the points, in their dtype.
-        encloses: whether the points surround a body, rather than show one side of it.
-    """
+    """A closed surface one voxel outside of points; ``encloses``: they surround a body, not one side of it."""
 
     mesh: TriangleMesh
     encloses: bool
 
 
 def cloud_surface(points: Tensor, name: str = "points") -> CloudSurface:
-    """Return the surface of the body that points lie on.
+    """Return the surface of the body that points (N, 3) lie on, in any order (morphological closing, Serra 1982).
 
-    Balls around the points are joined, what they enclose is filled, and the body is shrunk again by their radius
-    (morphological closing). The radius is the least of some, about that of the gaps between points, with which they
-    enclose something; of points on one side of a body only, the surface is that of a shell.
-
-    Args:
-        points: (N, 3) finite, in any order, also repeated.
-        name: of the argument, for errors.
-
-    Raises:
-        InputError: if there are fewer than 100 different points.
-
-    Differentiable: no.
-
-    Cost: 0.5 s for 12,000 points of a body, on one CPU core.
-
-    References: Serra 1982, closing.
+    The radius of the balls is the least, about that of the gaps between points, with which they enclose something;
+    points on one side of a body only give the surface of a shell.
     """
     places = enough_places(points, name)
     gap = float(k_nearest_others(places, CLOSING.neighbors)[1][:, -1].quantile(CLOSING.quantile))
@@ -74,11 +55,7 @@ def cloud_surface(points: Tensor, name: str = "points") -> CloudSurface:
 
 
 def enough_places(points: Tensor, name: str) -> Tensor:
-    """Return the different ones of points (N, 3), float64 on the CPU.
-
-    Raises:
-        InputError: if there are fewer than 100.
-    """
+    """Return the different ones of points (N, 3), float64 on the CPU, at least 100."""
     places = distinct_positions(points.detach().cpu().double())[0]
     if len(places) < CLOSING.min_points:
         raise InputError(f"{name} must hold {CLOSING.min_points} different points or more, got {len(places)}")

@@ -16,12 +16,7 @@ _SMOOTH = math.radians(30)
 def welded(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return which vertices of triangles to keep (V',), faces (F, 3) over these, and unit normals (V', 3), float64.
 
-    Corners at one position are one vertex, with the mean normal by area, where their triangles meet under less than 30
-    degrees, by themselves or over others at that position: edges stay sharp, round surfaces smooth.
-
-    Args:
-        vertices: (V, 3), which may differ for every triangle.
-        faces: (F, 3) of them.
+    Corners at one position whose triangles meet under less than 30 degrees are one vertex: edges stay sharp.
     """
     corners = faces.reshape(-1).cpu()
     points = vertices.detach().cpu()[corners]

@@ -12,18 +12,10 @@ _STEEPEST = 4.0
 
 
 def unproject(depth: Tensor, intrinsics: tuple[float, float, float, float], max_jump: float) -> tuple[Tensor, Tensor]:
-    """Return the points (N, 3) and triangles (F, 3) of a depth image in camera coordinates: right, down, forward.
+    """Return the points (N, 3) and triangles (F, 3) of a depth image (H, W), in camera coordinates.
 
-    Triangles are wound towards the camera; pixels without a triangle are left out. For the rule that joins pixels see
-    `RangeScan.from_depth`.
-
-    Args:
-        depth: (H, W) along the axis of the camera; zero, negative or not finite where nothing was measured.
-        intrinsics: fx, fy, cx, cy in pixels.
-        max_jump: allowed difference from a continued surface, in pixel widths.
-
-    Raises:
-        InputError: if no three pixels join.
+    Axes are right, down, forward; triangles are wound towards the camera. `RangeScan.from_depth` says which pixels
+    join: ``max_jump`` is the allowed difference from a continued surface, in pixel widths.
     """
     focal_x, focal_y, center_x, center_y = intrinsics
     depth = torch.where(depth.isfinite() & (depth > 0), depth, torch.nan)

@@ -9,20 +9,9 @@ from torch import Tensor
 
 
 def signed_distance(mask: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return the distance of every cell's center to the border of a mask, negative inside, in cells.
+    """Return the distance of every cell's center to the border of a mask of any shape, negative inside, in cells.
 
-    The border runs half a cell beside the centers of the cells along it.
-
-    Args:
-        mask: bool of any shape and at least one cell.
-        dtype: of the distances.
-
-    Returns:
-        Distances in the shape and on the device of the mask; infinite where there is no border.
-
-    Differentiable: no.
-
-    References: Maurer, Qi and Raghavan 2003, the transform of `scipy.ndimage.distance_transform_edt`.
+    The border runs half a cell outside of the centers inside; infinite without a border. Maurer, Qi and Raghavan 2003.
     """
     inside = mask.cpu().numpy()
     if inside.all() or not inside.any():
@@ -36,7 +25,7 @@ def signed_distance(mask: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
 
 
 def distance_beside(mask: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Return the same where that is positive and zero inside, in half the time."""
+    """Return the distance from the mask, zero inside; in half the time of the signed one."""
     inside = mask.cpu().numpy()
     if not inside.any():
         return torch.full(mask.shape, torch.inf, dtype=dtype, device=mask.device)
@@ -45,30 +34,16 @@ def distance_beside(mask: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
 
 
 def nearest_inside(mask: Tensor) -> Tensor:
-    """Return the flat index (...) int64 of the cell inside a mask that is nearest to each cell of its grid.
-
-    Args:
-        mask: (...) bool, at least one cell inside.
-
-    Differentiable: no.
-    """
+    """Return the flat index (...) int64 of the cell inside a mask (...) that is nearest to each cell of its grid."""
     indices = distance_transform_edt(~mask.cpu().numpy(), return_distances=False, return_indices=True)
     return torch.from_numpy(np.ravel_multi_index(tuple(indices), tuple(mask.shape))).to(mask.device)
 
 
 def fill_holes(mask: Tensor) -> Tensor:
-    """Return a mask with the cells that it encloses, those that no path along the axes joins to the grid's border.
-
-    Args:
-        mask: bool of any shape.
-    """
+    """Return a mask with the cells that no path along the axes joins to the grid's border."""
     return torch.from_numpy(binary_fill_holes(mask.cpu().numpy())).to(mask.device)
 
 
 def numbered_pieces(mask: Tensor) -> Tensor:
-    """Return the piece (...) int64 that each cell of a mask belongs to, from 1 on, joined along the axes; 0 outside.
-
-    Args:
-        mask: bool of any shape.
-    """
+    """Return the connected component (...) int64 of each cell of a mask, along the axes, from 1 on; 0 outside."""
     return torch.from_numpy(label(mask.cpu().numpy())[0]).long().to(mask.device)

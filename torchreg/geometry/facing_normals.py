@@ -1,4 +1,4 @@
-"""Normals of scans from one side, which all face one camera that nobody told."""
+"""Normals of scans from one side, towards a camera of unknown position."""
 
 from __future__ import annotations
 
@@ -31,17 +31,10 @@ _FACING = _Facing()
 
 
 def facing_normals(points: Tensor, viewpoint: Tensor | None = None) -> Tensor:
-    """Return the unit normals (N, 3) of a scan, which face the camera where it was taken from one side.
+    """Return the unit normals (N, 3) of a scan, towards the camera where all points were taken from one side.
 
-    A direction to the camera tells the side of every normal. The right one tears no smooth surface apart, and leaves
-    it convex on the whole; where every direction does tear, the scan is of all sides, and signs propagate between
-    neighbors, as those of `orient_normals`. Normals are zero where noise hides them.
-
-    Args:
-        points: (N, 3), any unit, at three distinct positions or more.
-        viewpoint: (3,) position of the camera; None if unknown.
-
-    Differentiable: no.
+    The direction of the camera is the one whose signs tear no smooth surface apart and leave it convex on the whole; if
+    every direction does tear, signs propagate as in `orient_normals`. Zero where noise hides the normal.
     """
     points = points.detach().double()
     spread = float((points.quantile(0.95, dim=0) - points.quantile(0.05, dim=0)).norm())

@@ -14,19 +14,16 @@ class _Far:
     """When points are far from the origin."""
 
     ratio: float = 200.0  # distance over spread from which float32 rounds by more than 1e-5 of the spread
-    sample: int = 10_000  # points that tell
+    sample: int = 10_000  # points that decide
 
 
 _FAR = _Far()
 
 
 def far_origin(points: Tensor | Sequence[Tensor]) -> Tensor | None:
-    """Return an origin (3,), float64 on the CPU, near double-precision points that lie far from that of coordinates.
+    """Return an origin (3,) float64 of whole numbers near double-precision points that lie far from zero.
 
-    Its coordinates are whole numbers. None for points that float32 holds well, and for those in it already.
-
-    Args:
-        points: (..., 3), or several such tensors that share their coordinates.
+    None for points that float32 holds well, and for those in it already.
     """
     tensors = [points] if isinstance(points, Tensor) else list(points)
     if not tensors or any(tensor.dtype != torch.float64 for tensor in tensors):

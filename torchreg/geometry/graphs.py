@@ -17,12 +17,12 @@ from torchreg.geometry.neighbors import NeighborTree
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Graph:
-    """Nodes joined by edges with lengths, to be searched for shortest paths; made by `from_edges`.
+    """Nodes joined by edges with lengths, in compressed rows, for shortest paths; made by `from_edges`.
 
     Args:
         starts: (V + 1,) int32, the index in ``ends`` of the first neighbor of each node.
-        ends: (2 E,) int32, the neighbors of all nodes.
-        lengths: (2 E,) float64, of the edges to them.
+        ends: (2 E,) int32 neighbors of all nodes.
+        lengths: (2 E,) float64 of the edges to them.
     """
 
     starts: Tensor
@@ -31,10 +31,7 @@ class Graph:
 
     @classmethod
     def from_edges(cls, edges: Tensor, lengths: Tensor, count: int) -> Self:
-        """Return the graph of ``count`` nodes with edges (E, 2) int64 of given lengths (E,), not negative.
-
-        Of an edge that is given twice the shorter counts.
-        """
+        """Return the graph of edges (E, 2) and lengths (E,), not negative; the shorter of equal edges counts."""
         first, second = edges.cpu().numpy().T
         # Zero would be no edge.
         length = np.maximum(lengths.detach().cpu().double().numpy(), np.finfo(np.float64).tiny)
@@ -60,29 +57,14 @@ class Graph:
         return f"{type(self).__name__}({len(self)} nodes, {len(self.ends) // 2} edges)"
 
     def distances(self, sources: Tensor | Sequence[int] | None = None, limit: float = math.inf) -> Tensor:
-        """Return the distance (S, V) float64 of every node from each source; infinite if no path is within the limit.
-
-        Args:
-            sources: (S,) nodes; all by default.
-            limit: length of the longest paths searched; a short one saves time.
-
-        Cost: O(V log V) per source; 0.06 s for 100,000 vertices of a mesh.
-
-        References: Dijkstra 1959.
-        """
+        """Return the distances (S, V) float64 from sources (S,), infinite beyond the limit (Dijkstra 1959)."""
         if sources is not None and len(sources) == 0:
             return self.lengths.new_zeros(0, len(self))
         indices = None if sources is None else _node_indices(sources)
         return torch.from_numpy(csgraph.dijkstra(self._matrix(), indices=indices, limit=limit))
 
     def nearest(self, sources: Tensor | Sequence[int]) -> tuple[Tensor, Tensor]:
-        """Return the distance (V,) float64 to the nearest source, and its index (V,) in sources, -1 without a path.
-
-        Args:
-            sources: (S,) nodes, at least one, no two alike.
-
-        Cost: that of a single source.
-        """
+        """Return the distance (V,) float64 to the nearest source, and its index (V,) in sources, -1 without a path."""
         indices = _node_indices(sources)
         distance, _, source = csgraph.dijkstra(self._matrix(), indices=indices, min_only=True, return_predecessors=True)
         number = np.full(len(self) + 1, -1)
@@ -118,10 +100,10 @@ def connected_components(edges: Tensor, count: int) -> Tensor:
 
 
 class SpanningForest(NamedTuple):
-    """One tree for each connected component of a graph.
+    """One tree for each connected component of a graph; its root is its lowest node.
 
     Args:
-        parents: (V,) int64 parent of each node; -1 for the root of a tree, its lowest node.
+        parents: (V,) int64 parent of each node; -1 for roots.
         edges: (V,) int64 index of the edge to the parent; -1 for roots.
         trees: (V,) int64 tree of each node, numbered from 0.
     """
@@ -136,19 +118,9 @@ class SpanningForest(NamedTuple):
 
 
 def minimum_spanning_forest(edges: Tensor, lengths: Tensor, count: int) -> SpanningForest:
-    """Return the trees of least total length that connect the components of a graph.
+    """Return the trees of least total length that connect the components of a graph with edges (E, 2) (Kruskal 1956).
 
-    Of equally long edges those at lower nodes come first, then those given first. Lengths may have any sign: their
-    negatives give the maximum spanning forest.
-
-    Args:
-        edges: (E, 2) int64.
-        lengths: (E,).
-        count: number of nodes.
-
-    Differentiable: no.
-
-    References: Kruskal 1956.
+    Of equally long edges those at lower nodes come first, then those given first. Lengths may have any sign.
     """
     edges, lengths, device = edges.cpu(), lengths.detach().cpu(), edges.device
     if bool((lengths <= 0).any()):  # zero would be no edge
@@ -172,11 +144,6 @@ def rooted(edges: Tensor, roots: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """Return the parent (count,) int64 of each node of a forest, and the nodes in an order with parents first.
 
     Roots, and nodes in no root's tree, have the parent -1; the latter are left out of the order.
-
-    Args:
-        edges: (E, 2) int64 without cycles.
-        roots: (R,) nodes, at most one of each tree.
-        count: number of nodes.
     """
     first, second = edges.cpu().numpy().T
     order, parents = _breadth_first(_adjacency(first, second, np.ones(len(first)), count), roots.cpu().numpy())
@@ -186,17 +153,7 @@ def rooted(edges: Tensor, roots: Tensor, count: int) -> tuple[Tensor, Tensor]:
 def component_links(points: Tensor, component: Tensor, count: int = 3) -> tuple[Tensor, Tensor]:
     """Return the shortest links that join components one by one to the largest, the nearest component first.
 
-    Args:
-        points: (N, D).
-        component: (N,) integers from 0, the component of each point; every number occurs.
-        count: links per component, from its nearest points; fewer if it has fewer points.
-
-    Returns:
-        Pairs of points (L, 2), the smaller index first, and their distances (L,) float64.
-
-    Differentiable: no.
-
-    Cost: O(N log N) for the largest component, and a query of all points outside it per component.
+    Per component ``count`` pairs of points (L, 2), the smaller index first, and their distances (L,) float64.
     """
     joined = component == component.bincount().argmax()
     distance = torch.full((len(points),), torch.inf, dtype=torch.float64, device=points.device)
@@ -216,9 +173,9 @@ def component_links(points: Tensor, component: Tensor, count: int = 3) -> tuple[
 
 
 def sorting_order(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stable order (N,) that sorts integers (N,) from 0 to count - 1, and where each begins, (count + 1,).
+    """Return the stable order (N,) that sorts integers (N,) below count, and the start of each, (count + 1,).
 
-    By counting, which takes a fifth of the time of `numpy.argsort`: the transpose of a sparse matrix.
+    By the transpose of a sparse matrix, in a fifth of the time of `numpy.argsort`.
     """
     numbers = np.arange(len(values) + 1, dtype=np.int32)
     entries = csr_array((numbers[:-1], values.astype(np.int32), numbers), shape=(len(values), count)).tocsc()

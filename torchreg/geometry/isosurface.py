@@ -27,28 +27,9 @@ _TRIANGLES = {
 
 
 def isosurface(field: Callable[[Tensor], Tensor], lower: Tensor, upper: Tensor, spacing: float) -> TriangleMesh:
-    """Return the triangle mesh on which a field is zero, oriented from negative to positive values.
+    """Return the mesh where a field of points (n, 3) in a box is zero, oriented from negative to positive values.
 
-    Marching tetrahedra: the field is linear on each tetrahedron of a cubic grid. The mesh is closed where the surface
-    stays inside the box.
-
-    Args:
-        field: (n, 3) points to (n,) finite values.
-        lower: (3,) lower corner of the box.
-        upper: (3,) upper corner of the box; the grid may reach up to one spacing beyond it.
-        spacing: edge length of the grid's cubes, in the unit of the box.
-
-    Returns:
-        The mesh; without faces if the field does not change sign on the grid.
-
-    Raises:
-        InputError: if the grid would hold more than 50 million samples.
-
-    Differentiable: no.
-
-    Cost: one evaluation of the field per sample.
-
-    References: Doi and Koide 1991.
+    By marching tetrahedra (Doi and Koide 1991); the mesh is closed where the surface stays inside the box.
     """
     grid = _Grid(lower, upper, spacing)
     with torch.no_grad():

@@ -24,15 +24,10 @@ JOINING = PieceJoining()
 
 
 def join_pieces(inside: Tensor) -> tuple[Tensor, int]:
-    """Return bars (X, Y, Z) between the pieces of a body, and their number.
+    """Return bars (X, Y, Z) bool that join the connected components of a body's voxels, and their number.
 
-    A piece is joined by the shortest bar if that is no longer than the piece: so limbs are that a gap cuts, while
-    what floats far away is not part of the body. A piece half as large as the largest is another body.
-
-    Args:
-        inside: (X, Y, Z) bool; pieces touch themselves along faces of cells.
-
-    Differentiable: no.
+    A component is joined by the shortest bar if that is no longer than the component, and not half as large as the
+    largest: so limbs that a gap cuts are joined, and clutter and other bodies are not.
     """
     numbers = numbered_pieces(inside)
     bars = torch.zeros(inside.shape, dtype=torch.bool)

@@ -18,17 +18,14 @@ JOINT_TYPES = ("fixed", "revolute", "prismatic")
 class Joint:
     """A frame of the tree and the joint that connects it to its parent.
 
-    A frame moves with its joint: ``T_parent_frame = offset @ motion(value)``, the motion about or along ``axis`` in the
-    frame's own coordinates. Joints with several degrees of freedom are stacked frames, which coincide.
+    ``T_parent_frame = offset @ motion(value)``, the motion about or along ``axis`` in the frame's own coordinates.
+    Joints with several degrees of freedom are stacked frames, which coincide.
 
     Args:
-        name: name of the frame and of its degree of freedom.
-        parent: index of the parent frame in the tree, -1 for the root.
-        offset: (4, 4) float64 rigid transform ``T_parent_frame`` at value zero.
+        parent: index of the parent frame, -1 for the root.
+        offset: (4, 4) float64 ``T_parent_frame`` at value zero.
         kind: one of ``JOINT_TYPES``.
-        axis: unit vector in frame coordinates (ignored for fixed joints).
-        lower: lower limit, radians or metres.
-        upper: upper limit, radians or metres.
+        lower, upper: limits, radians or metres.
         mimic: (index of the followed frame, multiplier, offset), or None; ``value = multiplier * followed + offset``.
     """
 
@@ -44,12 +41,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class KinematicTree:
-    """A validated tree of frames in topological order (every parent before its children, one root).
-
-    Raises:
-        ModelError: if the tree is empty, cyclic, disconnected, non-finite, has doubled names, impossible limits, or
-            joints that follow themselves, a fixed joint or none at all.
-    """
+    """A validated tree of frames in topological order (every parent before its children, one root)."""
 
     joints: tuple[Joint, ...]
 

@@ -1,4 +1,4 @@
-"""What loaders return, as each system takes it: points of clouds, scans and meshes; scans and meshes of clouds."""
+"""Loaded clouds, scans and meshes in the form that each system takes."""
 
 from __future__ import annotations
 
@@ -18,12 +18,7 @@ def as_points(value: Any) -> Any:
 
 
 def as_scan(value: Any, name: str) -> RangeScan:
-    """Return a scan as it is, and a cloud or a mesh as one.
-
-    Raises:
-        InputTypeError: if it is something else; names the argument.
-        InputError: if there is no surface in it.
-    """
+    """Return a scan as it is, and a cloud or a mesh as one; errors name the argument."""
     if isinstance(value, RangeScan):
         return value
     points = as_points(value)
@@ -36,11 +31,7 @@ def as_scan(value: Any, name: str) -> RangeScan:
 
 
 def as_mesh(value: Any, name: str) -> TriangleMesh:
-    """Return a mesh as it is, and a cloud or a scan with faces as one.
-
-    Raises:
-        InputTypeError: if it is something else, or has no faces; names the argument.
-    """
+    """Return a mesh as it is, and a cloud or a scan with faces as one; errors name the argument."""
     if isinstance(value, TriangleMesh):
         return value
     if not hasattr(value, "points"):

@@ -173,21 +173,7 @@ def cross_2d(first: Tensor, second: Tensor) -> Tensor:
 def sample_surface(
     mesh: TriangleMesh, count: int, generator: torch.Generator | None = None
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return ``count`` points drawn independently and uniformly by area from the surface.
-
-    Args:
-        mesh: the surface; at least one face with an area.
-        count: number of points.
-        generator: source of randomness; None draws from a fresh generator with seed 0, the same points at every call.
-
-    Returns:
-        Points (count, 3), face_index (count,) int64, barycentric (count, 3) weights of the face's three vertices.
-
-    Raises:
-        InputError: if the surface has no area.
-
-    Differentiable: in the vertices, with the drawn faces and weights held fixed.
-    """
+    """Return ``count`` points drawn uniformly by area, with face_index (count,) and barycentric weights."""
     device, dtype = mesh.vertices.device, mesh.vertices.dtype
     # Cumulative areas in double precision: float32 sums stop growing on large meshes.
     cumulative = TriangleMesh(mesh.vertices.detach().double(), mesh.faces).face_areas().cumsum(dim=0)
@@ -206,20 +192,9 @@ def sample_surface(
 
 
 def even_samples(mesh: TriangleMesh, count: int) -> tuple[Tensor, Tensor]:
-    """Return about ``count`` points spread evenly over a surface, without randomness: fewer gaps than random ones.
+    """Return about ``count`` points spread evenly over a surface, without randomness, and their face_index (count,).
 
-    Faces get their shares of the points by area, in their order; within a face they follow the R2 sequence.
-
-    Args:
-        mesh: the surface; at least one face with an area.
-        count: number of points.
-
-    Returns:
-        Points (count, 3) and face_index (count,) int64.
-
-    Differentiable: in the vertices.
-
-    References: Roberts 2018, "The unreasonable effectiveness of quasirandom sequences".
+    Within a face they follow the R2 sequence (Roberts 2018).
     """
     cumulative = mesh.face_areas().detach().double().cumsum(0)
     index = torch.arange(count, device=cumulative.device, dtype=torch.float64)
@@ -239,32 +214,12 @@ _R2_STEPS = (0.7548776662466927, 0.5698402909980532)
 
 
 def interpolate(values: Tensor, faces: Tensor, face_index: Tensor, barycentric: Tensor) -> Tensor:
-    """Return values given at the vertices, interpolated linearly at points of the surface.
-
-    Args:
-        values: (V, ...) floating-point values at the vertices.
-        faces: (F, 3) vertex indices.
-        face_index: (N,) face that each point lies on.
-        barycentric: (N, 3) weights of that face's vertices, of the dtype of the values.
-
-    Returns:
-        Interpolated values (N, ...).
-
-    Differentiable: in ``values`` and ``barycentric``.
-    """
+    """Return values (V, ...) at the vertices, interpolated linearly at N points of the surface, (N, ...)."""
     return torch.einsum("nc,nc...->n...", barycentric, values[faces[face_index]])
 
 
 def unit_sphere(subdivisions: int = 3, *, dtype: torch.dtype | None = None) -> TriangleMesh:
-    """Return a closed, outward-facing approximation of the unit sphere: an icosahedron with its faces split in four.
-
-    Args:
-        subdivisions: times that the faces are split, 0 to 8; there are 10 * 4**subdivisions + 2 vertices.
-        dtype: floating-point type of the vertices; torch's default when None.
-
-    Raises:
-        InputError: if ``subdivisions`` is out of range.
-    """
+    """Return a closed, outward-facing icosphere of radius one with 10 * 4**subdivisions + 2 vertices."""
     most = BUDGET.subdivisions
     if isinstance(subdivisions, bool) or not isinstance(subdivisions, int) or not 0 <= subdivisions <= most:
         raise InputError(f"subdivisions must be an integer from 0 to {most}, got {subdivisions!r}")
@@ -325,13 +280,7 @@ def _split_in_four(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def concatenate(meshes: Sequence[TriangleMesh]) -> TriangleMesh:
-    """Return one mesh that holds all vertices and faces, in order.
-
-    Args:
-        meshes: at least one mesh, all of one dtype and device.
-
-    Differentiable: in the vertices.
-    """
+    """Return one mesh that holds all vertices and faces, in order."""
     faces, offset = [], 0
     for mesh in meshes:
         faces.append(mesh.faces + offset)

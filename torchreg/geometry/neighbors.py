@@ -13,21 +13,9 @@ from torchreg.geometry.budget import BUDGET
 
 
 def nearest_neighbor(points: Tensor, targets: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the index of the target nearest to each point, and its distance.
+    """Return the index (..., N) of the target (..., K, 3) nearest to each point (..., N, 3), and its distance.
 
-    Args:
-        points: (..., N, 3).
-        targets: (..., K, 3) of the same dtype and device, at least one, with batch dimensions that broadcast with the
-            points'.
-
-    Returns:
-        Indices (..., N) int64 into the targets, and distances (..., N).
-
-    Differentiable: the distance, in both, away from zero. Not under `torch.func` on a CPU.
-
-    Cost: O((N + K) log K) per problem on a CPU with finite coordinates; O(N K) in bounded memory otherwise.
-
-    References: Maneewongvatana and Mount 1999, the tree of `scipy.spatial.cKDTree`.
+    Differentiable in the distance; on a CPU by a k-d tree (Maneewongvatana and Mount 1999), not under `torch.func`.
     """
     batch = points.shape[:-2]
     if batch != targets.shape[:-2]:  # broadcast_shapes is slow, and imports sympy when first called
@@ -63,17 +51,7 @@ def _by_table(points: Tensor, targets: Tensor) -> Tensor:
 
 
 class NeighborTree:
-    """Points in any number of dimensions, to be searched repeatedly for those nearest to query points.
-
-    Args:
-        targets: (K, D) finite, at least one.
-
-    Differentiable: no.
-
-    Cost: O(K log K) to build, O(log K) per neighbor where D is small or targets are near; always on the CPU.
-
-    References: Maneewongvatana and Mount 1999, the tree of `scipy.spatial.cKDTree`.
-    """
+    """A k-d tree of targets (K, D), always on the CPU (Maneewongvatana and Mount 1999)."""
 
     def __init__(self, targets: Tensor) -> None:
         self._tree = cKDTree(_coordinates(targets))
@@ -84,7 +62,7 @@ class NeighborTree:
         return torch.from_numpy(index).to(points.device), torch.from_numpy(distance).to(points.device)
 
     def nearest_within(self, points: Tensor, radius: float) -> tuple[Tensor, Tensor]:
-        """Return what `nearest` does; where no target is within the radius, index 0 and an infinite distance.
+        """Return the result of `nearest`, but index 0 and infinity without a target within the radius.
 
         Many times quicker than `nearest` where most points are far from all targets.
         """
@@ -93,15 +71,7 @@ class NeighborTree:
         return torch.from_numpy(index).to(points.device), torch.from_numpy(distance).to(points.device)
 
     def k_nearest(self, points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-        """Return the ``count`` targets nearest to each point, nearest first.
-
-        Args:
-            points: (N, D) finite.
-            count: 1 to K.
-
-        Returns:
-            Indices (N, count) int64 and distances (N, count) float64, both on the points' device.
-        """
+        """Return the indices and distances (N, count) float64 of the targets nearest to points, nearest first."""
         distance, index = self._tree.query(_coordinates(points), list(range(1, count + 1)))
         return torch.from_numpy(index).to(points.device), torch.from_numpy(distance).to(points.device)
 
@@ -112,15 +82,7 @@ def k_nearest(points: Tensor, targets: Tensor, count: int) -> tuple[Tensor, Tens
 
 
 def k_nearest_others(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Return the nearest neighbors of each point, itself excluded, nearest first.
-
-    Args:
-        points: (N, D) finite, at least two; points at one position are zero apart.
-        count: neighbors of each point, at least one; N - 1 at most are returned.
-
-    Returns:
-        Indices (N, K) int64 and distances (N, K) float64, both on the points' device.
-    """
+    """Return the indices and distances (N, K) of each point's nearest others, nearest first; K is N - 1 at most."""
     index, distance = k_nearest(points, points, min(count + 1, len(points)))
     is_self = index == torch.arange(len(points), device=points.device).unsqueeze(1)
     if bool(is_self[:, 0].all()):
@@ -137,14 +99,7 @@ def pairs_within(points: Tensor, radius: float) -> Tensor:
 
 
 def sampling_distance(points: Tensor, subset: Tensor | None = None) -> float:
-    """Return the median distance of a point to its nearest neighbor; infinite for fewer than two points.
-
-    Args:
-        points: (N, D) finite; points at one position are zero apart.
-        subset: (M, D) those of the points over which the median is taken; by default all, or of very many some.
-
-    Differentiable: no.
-    """
+    """Return the median distance of points, or of a subset of them, to the nearest neighbor; infinite below two."""
     if len(points) < 2:
         return math.inf
     if subset is None:
@@ -153,10 +108,7 @@ def sampling_distance(points: Tensor, subset: Tensor | None = None) -> float:
 
 
 def weld(points: Tensor) -> Tensor:
-    """Return the index (N,) int64 of each point's position among the distinct positions, sorted lexicographically.
-
-    If no two points coincide, the index is that of the point.
-    """
+    """Return the index (N,) int64 of each point's position among the sorted distinct ones; its own if all differ."""
     values = _coordinates(points) + 0.0  # -0 is 0
     if _all_differ(values):
         return torch.arange(len(values))
@@ -170,10 +122,7 @@ def weld(points: Tensor) -> Tensor:
 
 
 def _all_differ(values: np.ndarray) -> bool:
-    """Return whether no two rows (N, D) of numbers are alike, told in half the time of sorting them by all columns.
-
-    False also where two of them have one hash by chance, once in 10^7 sets of a million rows.
-    """
+    """Return whether no two rows (N, D) have equal hashes, wrong once in 10^7 sets of a million rows."""
     bits = np.ascontiguousarray(values).view(np.uint64)
     hashes = np.zeros(len(bits), dtype=np.uint64)
     for column in bits.T:

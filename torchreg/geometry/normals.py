@@ -20,7 +20,7 @@ class NormalSettings:
     num_neighbors: int = 16
     # Weight of the farthest neighbors: next to nothing, so that the choice between two equally far ones hardly counts.
     least_weight: float = 1e-3
-    # Points of the coarse copy that tells convex from concave sides, and their neighbors.
+    # Points of the coarse copy that distinguishes convex from concave sides, and their neighbors.
     num_coarse: int = 2000
     coarse_neighbors: int = 12
     # Share of normals on one side from which a scan counts as taken from there.
@@ -41,23 +41,10 @@ NORMALS = NormalSettings()
 
 
 def estimate_normals(points: Tensor, *, viewpoint: Tensor | None = None) -> Tensor:
-    """Return the unit normals of a surface sampled by points, consistently oriented.
+    """Return the unit normals (N, 3) of a surface sampled by points, with the signs of `orient_normals`.
 
-    Each normal is the direction of least spread of the point's nearest 16 neighbors, the nearer ones weighing more;
-    signs are those of `orient_normals`.
-
-    Args:
-        points: (N, 3), any unit, at three distinct positions or more; coincident points share a normal.
-        viewpoint: (3,) float64 position of the camera; None if unknown.
-
-    Returns:
-        Normals (N, 3), of the dtype and device of the points.
-
-    Differentiable: no.
-
-    Cost: 0.15 s for 20,000 points.
-
-    References: Hoppe et al., "Surface reconstruction from unorganized points", 1992.
+    Each is the direction of least spread of the nearest 16 neighbors, the nearer ones weighing more (Hoppe et al.
+    1992).
     """
     positions, which = distinct_positions(points)
     index, _ = k_nearest_others(positions, NORMALS.num_neighbors)
@@ -65,23 +52,10 @@ def estimate_normals(points: Tensor, *, viewpoint: Tensor | None = None) -> Tens
 
 
 def orient_normals(points: Tensor, normals: Tensor, *, viewpoint: Tensor | None = None) -> Tensor:
-    """Return the normals with signs that agree between neighbors and face the camera.
+    """Return the normals (N, 3) with signs that agree between neighbors and face the camera (Hoppe et al. 1992, 3.3).
 
-    Signs propagate along the minimum spanning tree of the neighbor graph, which crosses sharp edges last. Each
-    connected component then faces the viewpoint; without one, the largest component is taken to be convex, as the
-    visible side of a body is, and the others face the same side. Planar components face the origin.
-
-    Args:
-        points: (N, 3), any unit, at three distinct positions or more.
-        normals: (N, 3) of any sign.
-        viewpoint: (3,) float64 position of the camera; None if unknown.
-
-    Returns:
-        Normals (N, 3), each the given one or its opposite; coincident points take the side of the first.
-
-    Differentiable: no.
-
-    References: Hoppe et al., "Surface reconstruction from unorganized points", 1992, section 3.3.
+    Signs propagate along the minimum spanning tree of the neighbor graph. Without a viewpoint the largest component is
+    taken to be convex, the others face the same side, and planar ones face the origin.
     """
     positions, which = distinct_positions(points)
     first = torch.full((len(positions),), len(points)).scatter_reduce(0, which, torch.arange(len(points)), "amin")
@@ -118,13 +92,8 @@ def fit_normals_at(points: Tensor, index: Tensor) -> Tensor:
 def face_vertex_normals(points: Tensor, faces: Tensor, viewpoint: Tensor | None = None) -> Tensor:
     """Return unit normals (N, 3) at the points of a surface of triangles, zero where no face has an area.
 
-    Triangles wound against their neighbors are flipped. A connected component keeps the winding of three quarters of
-    its area or more; where there is no such majority, or a viewpoint is known, it faces the camera as points do.
-
-    Args:
-        points: (N, 3) float64, no two at one position.
-        faces: (F, 3) indices, no two equal in a row.
-        viewpoint: (3,) float64 or None.
+    Triangles wound against their neighbors are flipped. A component keeps the winding of three quarters of its area or
+    more; without such a majority, or with a viewpoint, it faces the camera as points do.
     """
     pairs, agree = _adjacent_faces(faces, len(points))
     if viewpoint is None and bool(agree.all()):

@@ -20,13 +20,7 @@ SEARCH = PlaneSearch()
 
 
 def distance_to_plane(points: Tensor, counts: Tensor, band: float, generator: torch.Generator) -> Tensor:
-    """Return the distances (B, M) of points (B, M, 3) from the plane near which most of those that count lie.
-
-    Args:
-        points: any unit.
-        counts: (B, M) bool.
-        band: distance of points on the plane, at most, same unit.
-        generator: on the CPU.
+    """Return the distances (B, M) of points (B, M, 3) from the plane with the most counted points within ``band``.
 
     References: Fischler and Bolles 1981; scores by Torr and Zisserman 2000.
     """

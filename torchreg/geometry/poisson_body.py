@@ -18,7 +18,7 @@ from torchreg.geometry.neighbors import NeighborTree, k_nearest_others
 class PoissonFit:
     """How normals and the body are found; lengths in gaps, the median distance of a point to its last neighbor."""
 
-    neighbors: int = 6  # around a point, which tell its share of the surface
+    neighbors: int = 6  # around a point, for its share of the surface
     widths: tuple[float, ...] = (1.5, 1.0)  # of the blur under which normals agree; wider ones mix sides of thin limbs
     num_rounds: int = 8  # of new normals for each width
     turned_after: int = 2  # rounds, normals of inverted parts are turned over; in between parts turn by themselves
@@ -28,7 +28,7 @@ class PoissonFit:
     bar: float = 0.25  # of the fall of the indicator function, by which bars between pieces are inside
     max_resolution: int = 128  # gaps along the longest side; of more points, gaps count as so wide
     border: int = 6  # empty voxels around the points: the equation is solved on a torus
-    num_rays: int = 500  # through the body, which tell whether the far side is shown
+    num_rays: int = 500  # through the body, to test whether the far side is shown
     near: float = 3.0  # along a ray, within which points are those that it starts from
     least_shown: float = 0.5  # share of points with a far side: about one of a whole body, zero of what one view shows
 
@@ -41,10 +41,10 @@ class PoissonBody:
     """A body around points.
 
     Args:
-        mesh: its surface, closed, facing outwards, float64; pieces that gaps part are joined, see `join_pieces`.
-        joined: number of these.
-        shown: share of its points whose far side is shown by points as well: near one for a body seen from all sides,
-            near zero for what one view shows.
+        mesh: its closed surface, facing outwards, float64, with the pieces joined by `join_pieces`.
+        joined: number of pieces that were joined.
+        shown: share of its points whose far side is shown by points as well: near one for a body scanned from all
+            sides, near zero for one view.
     """
 
     mesh: TriangleMesh
@@ -58,25 +58,16 @@ class PoissonBody:
 
 
 def poisson_body(points: Tensor) -> PoissonBody:
-    """Return the body whose surface points lie on.
+    """Return the body whose surface points (N, 3) lie on, all different, float64 on the CPU.
 
     With outward normals ``n_i`` and areas ``a_i`` of points ``p_i``, the field ``V = sum a_i n_i delta(x - p_i)`` is
-    that of a closed surface if it is the gradient of an indicator function. The normals are those with the largest
-    ``|P V|^2``, of the part ``P V`` of the blurred field that is a gradient, from normals that point away from where
-    the points are dense. As this is a convex function of the normals, ``n_i <- (P V)(p_i) / |(P V)(p_i)|`` never
-    makes it less. The maximum may be a local one, where thin parts, as hands and feet, are inside out: the indicator
-    function, ``laplace chi = div V``, is less at their points than outside of the body, and their normals are turned
-    over on the way. The surface is where the function has its mean value at the points.
-
-    Args:
-        points: (N, 3) different ones, float64 on the CPU.
-
-    Differentiable: no.
-
-    Cost: 1 s for 12,000 points, on one CPU core: a hundred Fourier transforms.
+    that of a closed surface if it is the gradient of an indicator function. The iteration
+    ``n_i <- (P V)(p_i) / |(P V)(p_i)|`` maximizes ``|P V|^2``, convex in the normals, with the part ``P V`` of the
+    blurred field that is a gradient; normals of parts that are inside out, where the indicator is less than outside,
+    are turned over on the way.
 
     References: Kazhdan, Bolitho and Hoppe 2006, Poisson's equation; Lin, Shi and Liu 2024, normals from the field;
-        Journee, Nesterov, Richtarik and Sepulchre 2010, maxima of convex functions.
+    Journee, Nesterov, Richtarik and Sepulchre 2010, maxima of convex functions.
     """
     distance = k_nearest_others(points, FIT.neighbors)[1][:, -1]
     areas = math.pi * distance.square() / FIT.neighbors
@@ -124,10 +115,9 @@ class _Spectrum:
         return self._gradients(self._transformed(weights), width)
 
     def improved_normals(self, vectors: Tensor, width: float) -> tuple[Tensor, Tensor]:
-        """Return better normals (N, 3) of the points, and which points (N,) are inside out, from vectors (N, 3) there.
+        """Return better normals (N, 3) from vectors (N, 3), and which points (N,) are inside out.
 
-        The normals are the directions of the blurred field of the vectors, as far as it is a gradient. Points are
-        inside out where the indicator function of the vectors is less than outside.
+        Those are the directions of the blurred field's gradient part, and the points of indicator below that outside.
         """
         potential = self._potential(vectors)
         indicator = self._indicator(potential, width)

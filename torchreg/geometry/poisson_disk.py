@@ -27,23 +27,10 @@ _THINNING = _Thinning()
 
 
 def poisson_disk(points: Tensor, radius: float, generator: torch.Generator | None = None) -> Tensor:
-    """Return the indices of points that are more than ``radius`` apart from each other and cover all points.
+    """Return the indices (M,), ascending, of points more than ``radius`` apart that cover all points (Cook 1986).
 
-    Points come in random order, each kept if no kept one is within the radius. Regions far denser than the radius are
-    thinned in steps of growing radii first, so that dense and sparse regions end alike; no point is then farther than
-    one and a half radii from a kept one, and without such steps than one.
-
-    Args:
-        points: (N, 3) finite, at least one; coincident points are fine.
-        radius: in the unit of the points, positive.
-        generator: source of the order; None draws from a fresh generator with seed 0, the same at every call.
-
-    Returns:
-        Indices (M,) int64, ascending, on the device of the points.
-
-    Cost: O(N log N); 0.1 s for 20,000 points.
-
-    References: Cook, "Stochastic sampling in computer graphics", 1986 (dart throwing).
+    Points come in random order. Regions far denser than the radius are thinned by growing radii first; no point is then
+    farther than one and a half radii from a kept one.
     """
     positions, index = _shuffled_positions(points, generator)
     kept = _thin(positions, np.arange(len(positions)), radius, _median_spacing(positions))
@@ -51,18 +38,7 @@ def poisson_disk(points: Tensor, radius: float, generator: torch.Generator | Non
 
 
 def poisson_disk_count(points: Tensor, count: int, generator: torch.Generator | None = None) -> Tensor:
-    """Return the indices of ``count`` points that lie about as far apart as that many can.
-
-    Args:
-        points: (N, 3) finite, at least one; coincident points are fine.
-        count: number of points, at least one; all if there are no more.
-        generator: see `poisson_disk`.
-
-    Returns:
-        Indices (min(count, N),) int64, ascending, on the device of the points.
-
-    Cost: O(N log N), a few times that of `poisson_disk`.
-    """
+    """Return the indices (min(count, N),), ascending, of points that lie about as far apart as that many can."""
     positions, index = _shuffled_positions(points, generator)
     if count >= len(points):
         return torch.arange(len(points), device=points.device)

@@ -16,14 +16,7 @@ _LINE_SHARE = 1e-6
 
 @dataclass(frozen=True)
 class FittedPrimitive:
-    """A solid fitted to points.
-
-    Args:
-        kind: name of the kind.
-        sizes: its sizes, metres.
-        pose: (4, 4) frame of the solid in the points' coordinates.
-        error: mean absolute distance of the points, metres.
-    """
+    """A solid fitted to points: its pose (4, 4) and the mean absolute distance of the points, metres."""
 
     kind: str
     sizes: tuple[float, ...]
@@ -32,19 +25,9 @@ class FittedPrimitive:
 
 
 def fit_primitive(points: Tensor, kind: str = "auto") -> FittedPrimitive:
-    """Return the solid of least mean distance to surface points.
+    """Return the solid of least mean distance to surface points, metres, each principal axis tried as the long one.
 
-    Its axes are the principal axes of the points; each of them is tried as the long one.
-
-    Args:
-        points: (N, 3) finite, metres; at least one.
-        kind: a kind's name, or "auto" for the kind of least mean distance.
-
-    Returns:
-        The best `FittedPrimitive`, in float64. With "auto", fewer than four points, or points on a line, say nothing
-        about the kind and give a thin ellipsoid around them.
-
-    Differentiable: no.
+    With "auto", the best kind; fewer than four points, or points on a line, give a thin ellipsoid around them.
     """
     points = points.detach().double()
     kinds = (kind,) if kind != "auto" else ("ellipsoid",) if _has_no_shape(points) else tuple(PRIMITIVE_KINDS)

@@ -1,12 +1,8 @@
 """Kinds of solids that make up an articulated shape: signed distances, analytic gradients and fits to points.
 
 Distances take points in the solid's own frame (long axis z, center at the origin) and one row of sizes per solid; they
-are negative inside and zero on the surface. They are Euclidean for capsules and cones, Euclidean to first order at the
-surface for ellipsoids, and measured along rays from the center for superquadrics.
-
-The formulas work on planes, all x, all y and all z, each contiguous: many times as fast as on interleaved points.
-
-A further kind is one subclass of `PrimitiveKind` and one entry of `PRIMITIVE_KINDS`.
+are negative inside. The formulas work on planes, all x, all y and all z, each contiguous: many times as fast as on
+interleaved points. A further kind is one subclass of `PrimitiveKind` and one entry of `PRIMITIVE_KINDS`.
 """
 
 from __future__ import annotations
@@ -51,13 +47,7 @@ FIT = FitSettings()
 
 @dataclass(frozen=True)
 class Size:
-    """One of the sizes of a kind of solid.
-
-    Args:
-        name: its name.
-        is_long: whether it lies along the long axis z.
-        is_length: whether it is a length; exponents are not.
-    """
+    """One size of a kind of solid: whether it lies along the long axis z, and whether it is a length or an exponent."""
 
     name: str
     is_long: bool = False
@@ -65,12 +55,7 @@ class Size:
 
 
 class PrimitiveKind(ABC):
-    """A kind of solid.
-
-    Attributes:
-        name: its name.
-        sizes: its sizes, in the order of size rows.
-    """
+    """A kind of solid; ``sizes`` are in the order of size rows."""
 
     name: str
     sizes: tuple[Size, ...]
@@ -88,10 +73,7 @@ class PrimitiveKind(ABC):
         """Return solids that fit surface points (N, 3) float64, with the axes of a frame (4, 4) at their center."""
 
     def distance(self, points: Tensor, sizes: Tensor) -> Tensor:
-        """Return the distances (...) of points (..., 3) to solids of sizes (..., S).
-
-        Differentiable: in both; the gradient at the center, or on the axis, is zero.
-        """
+        """Return the distances (...) of points (..., 3) to solids of sizes (..., S); zero gradient on the axis."""
         return self.plane_distance(_planes(points), sizes)
 
     def gradient(self, points: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
@@ -117,12 +99,10 @@ def _half_extents(points: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
 
 
 class Ellipsoid(PrimitiveKind):
-    """Ellipsoids with the pseudo-Euclidean distance ``k0 (k0 - 1) / k1``, ``k0 = |x / r|``, ``k1 = |x / r^2|``.
+    """Ellipsoids with radii along x, y, z and the distance ``k0 (k0 - 1) / k1``, ``k0 = |x / r|``, ``k1 = |x / r^2|``.
 
-    It agrees with the Euclidean distance to first order at the surface and is too deep inside; at the center, where
-    the ratio is 0/0, it is minus the smallest radius. Sizes are the radii along x, y and z, metres.
-
-    References: Dewaele et al. 2006, section 2.
+    Euclidean to first order at the surface, too deep inside, at the center minus the smallest radius. Dewaele et al.
+    2006, section 2.
     """
 
     name = "ellipsoid"
@@ -219,11 +199,7 @@ def _capsule_offset(points: Planes, sizes: Tensor) -> Planes:
 
 
 class Cone(PrimitiveKind):
-    """Truncated cones with flat ends on the z axis, with the exact distance; sizes in metres.
-
-    Inside it is the larger of the signed distances to mantle and end; outside, the distance to the nearest of mantle,
-    end and the rim between them. Where the nearest face changes, the gradient is that of one side.
-    """
+    """Truncated cones with flat ends on the z axis, with the exact distance; sizes in metres."""
 
     name = "cone"
     sizes = (Size("half_length", is_long=True), Size("radius_bottom"), Size("radius_top"))
@@ -290,12 +266,9 @@ class _ConeFaces:
 class Superquadric(PrimitiveKind):
     """Superquadrics with the radial distance ``|x| (1 - 1 / k)``, k the inside-outside function of degree one.
 
-    ``k = ((|x/a|^(2/e2) + |y/b|^(2/e2))^(e2/e1) + |z/c|^(2/e1))^(e1/2)``. It is measured along the ray from the center,
-    so it exceeds the Euclidean distance on oblique faces; at the center it is minus the smallest radius. Sizes are the
-    radii along x, y and z in metres, and the exponents e1 and e2 in [0.1, 1.9] (1: ellipsoid, 0.1: near a box), above 1
-    of which there is no derivative on the coordinate planes.
-
-    References: Gross and Boult 1988.
+    ``k = ((|x/a|^(2/e2) + |y/b|^(2/e2))^(e2/e1) + |z/c|^(2/e1))^(e1/2)``. It is measured along the ray from the center
+    and exceeds the Euclidean distance on oblique faces. Sizes are the radii, metres, and the exponents e1 and e2 in
+    [0.1, 1.9], above 1 of which there is no derivative on the coordinate planes. Gross and Boult 1988.
     """
 
     name = "superquadric"

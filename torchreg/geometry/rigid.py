@@ -32,48 +32,20 @@ def rotation_error(matrices: Tensor) -> float:
 
 
 def rigid_matrix(rotation: Tensor, translation: Tensor) -> Tensor:
-    """Return ``[[R, t], [0, 1]]``.
-
-    Args:
-        rotation: (..., 3, 3).
-        translation: (..., 3), metres.
-
-    Returns:
-        (..., 4, 4).
-
-    Differentiable: in both.
-    """
+    """Return ``[[R, t], [0, 1]]`` (..., 4, 4)."""
     top = torch.cat([rotation, translation.unsqueeze(-1)], dim=-1)
     bottom = torch.eye(4, dtype=top.dtype, device=top.device)[3:].expand(*top.shape[:-2], 1, 4)
     return torch.cat([top, bottom], dim=-2)
 
 
 def se3_exp(twist: Tensor) -> Tensor:
-    """Return the rigid motion of a twist, the exponential map of SE(3).
-
-    Convention: twists are (translation, rotation).
-
-    Args:
-        twist: (..., 6), metres and radians.
-
-    Returns:
-        (..., 4, 4).
-
-    Differentiable: in ``twist``, also at zero.
-    """
+    """Return the rigid motion (..., 4, 4) of a twist (..., 6), which is (translation, rotation), metres and radians."""
     translation, rotation = twist[..., :3], twist[..., 3:]
     return rigid_matrix(so3_exp(rotation), (left_jacobian(rotation) @ translation.unsqueeze(-1)).squeeze(-1))
 
 
 def se3_log(motion: Tensor) -> Tensor:
-    """Return the twist (..., 6) of a rigid motion (..., 4, 4), of which `se3_exp` is the motion; turns below pi.
-
-    Convention: twists are (translation, rotation).
-
-    Differentiable: in ``motion``, not at turns by pi.
-
-    References: Barfoot 2017, eq. 7.95 for the inverse of the left Jacobian.
-    """
+    """Return the twist (translation, rotation) of a rigid motion with a turn below pi (Barfoot 2017, eq. 7.95)."""
     turn = so3_log(motion[..., :3, :3])
     square = turn.square().sum(-1)[..., None, None]
     cross, eye = skew(turn), torch.eye(3, dtype=turn.dtype, device=turn.device)
@@ -85,64 +57,25 @@ def se3_log(motion: Tensor) -> Tensor:
 
 
 def adjoint(motion: Tensor) -> Tensor:
-    """Return the matrices (..., 6, 6) by which twists are seen from where motions (..., 4, 4) take their frame.
-
-    ``T exp(x) T^-1 = exp(adjoint(T) x)``; twists are (translation, rotation).
-
-    Differentiable: in ``motion``.
-    """
+    """Return the (..., 6, 6) with ``T exp(x) T^-1 = exp(adjoint(T) x)``; twists are (translation, rotation)."""
     turn = motion[..., :3, :3]
     above = torch.cat([turn, skew(motion[..., :3, 3]) @ turn], -1)
     return torch.cat([above, torch.cat([torch.zeros_like(turn), turn], -1)], -2)
 
 
 def invert_rigid(matrix: Tensor) -> Tensor:
-    """Return the inverse of rigid motions, ``[[R^T, -R^T t], [0, 1]]``.
-
-    Args:
-        matrix: (..., 4, 4) rigid motions.
-
-    Returns:
-        (..., 4, 4).
-
-    Differentiable: in ``matrix``.
-    """
+    """Return the inverse of rigid motions (..., 4, 4), ``[[R^T, -R^T t], [0, 1]]``."""
     rotation = matrix[..., :3, :3].mT
     return rigid_matrix(rotation, -(rotation @ matrix[..., :3, 3:]).squeeze(-1))
 
 
 def transform_points(matrix: Tensor, points: Tensor) -> Tensor:
-    """Return ``R x + t`` for every point.
-
-    Args:
-        matrix: (..., 4, 4).
-        points: (..., N, 3), with broadcastable batch dimensions and the same dtype.
-
-    Returns:
-        (..., N, 3).
-
-    Differentiable: in both.
-    """
+    """Return ``R x + t`` for every point (..., N, 3), with broadcastable batch dimensions."""
     return points @ matrix[..., :3, :3].mT + matrix[..., None, :3, 3]
 
 
 def fit_rigid(source: Tensor, target: Tensor, weights: Tensor | None = None) -> Tensor:
-    """Return the rigid motion that takes ``source`` to ``target`` in the weighted least-squares sense.
-
-    ``argmin_T sum_i w_i |T x_i - y_i|^2``, by SVD of the cross-covariance with det R = +1.
-
-    Args:
-        source: (..., N, 3).
-        target: (..., N, 3), matched point by point.
-        weights: (..., N), not negative; all ones by default.
-
-    Returns:
-        (..., 4, 4).
-
-    Differentiable: in all, where the singular values of the cross-covariance differ.
-
-    References: Umeyama 1991.
-    """
+    """Return the rigid motion (..., 4, 4) of least squares, ``argmin_T sum_i w_i |T x_i - y_i|^2`` (Umeyama 1991)."""
     weights = torch.ones_like(source[..., 0]) if weights is None else weights
     weights = (weights / weights.sum(-1, keepdim=True).clamp_min(torch.finfo(source.dtype).tiny)).unsqueeze(-1)
     source_mean = (weights * source).sum(-2, keepdim=True)
@@ -157,18 +90,7 @@ def fit_rigid(source: Tensor, target: Tensor, weights: Tensor | None = None) -> 
 
 
 def rescale_motions(transforms: Tensor, scale: float, origin: Tensor) -> Tensor:
-    """Return the same motions (..., 4, 4) in the coordinates ``x' = origin + scale x``.
-
-    Args:
-        transforms: (..., 4, 4) rigid motions in the coordinates x.
-        scale: of the new coordinates, positive.
-        origin: (3,) the old origin in the new coordinates.
-
-    Returns:
-        (..., 4, 4).
-
-    Differentiable: in ``transforms`` and ``origin``.
-    """
+    """Return the same motions (..., 4, 4) in the coordinates ``x' = origin + scale x``."""
     rotation = transforms[..., :3, :3]
     shift = origin - (rotation @ origin.unsqueeze(-1)).squeeze(-1)
     return rigid_matrix(rotation, scale * transforms[..., :3, 3] + shift)

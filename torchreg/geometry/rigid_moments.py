@@ -58,19 +58,7 @@ class RigidMoments:
 
 
 def rigid_moments(source: Tensor, target: Tensor, weights: Tensor, labels: Tensor, count: int) -> RigidMoments:
-    """Return the moments of groups of matched points, in every pose of a batch.
-
-    Args:
-        source: (N, 3).
-        target: (..., N, 3) the matches, of the same dtype and device.
-        weights: (..., N) not negative.
-        labels: (N,) int64, the group of each.
-        count: G.
-
-    Differentiable: in ``source``, ``target`` and ``weights``.
-
-    References: Horn 1987, on the moments that a rigid fit depends on.
-    """
+    """Return the moments of groups of source points (N, 3) and matches (..., N, 3), by labels (N,) (Horn 1987)."""
     source_origin, target_origin = source.mean(-2), target.mean(-2)
     x, y = (source - source_origin).expand(target.shape), target - target_origin.unsqueeze(-2)
     square = (x.square() + y.square()).sum(-1, keepdim=True)

@@ -14,33 +14,15 @@ _OPPOSITE = 1e-6
 
 
 def skew(vector: Tensor) -> Tensor:
-    """Return the matrix ``[v]x`` with ``[v]x u = v x u``.
-
-    Args:
-        vector: (..., 3).
-
-    Returns:
-        (..., 3, 3) antisymmetric matrices.
-
-    Differentiable: in ``vector``.
-    """
+    """Return the matrix (..., 3, 3) ``[v]x`` with ``[v]x u = v x u``."""
     identity = torch.eye(3, dtype=vector.dtype, device=vector.device)
     return torch.linalg.cross(vector.unsqueeze(-1), identity.expand(*vector.shape, 3), dim=-2)
 
 
 def so3_exp(rotation_vector: Tensor) -> Tensor:
-    """Return the rotation matrix of a rotation vector, ``R = I + 2 cos(angle / 2) [v]x + 2 [v]x^2``.
+    """Return the rotation matrix of a rotation vector (radians), ``R = I + 2 cos(angle / 2) [v]x + 2 [v]x^2``.
 
-    v is the vector part of the unit quaternion, ``sin(angle / 2) axis``. Convention: angle in radians times unit axis;
-    column vectors, right-hand rule.
-
-    Args:
-        rotation_vector: (..., 3), radians.
-
-    Returns:
-        (..., 3, 3) rotation matrices.
-
-    Differentiable: in ``rotation_vector``, to any order, also at zero.
+    v is ``sin(angle / 2) axis``, of the unit quaternion; column vectors, right-hand rule. Smooth at zero too.
     """
     scalar, vector = _exp_quaternion(rotation_vector)
     identity = torch.eye(3, dtype=rotation_vector.dtype, device=rotation_vector.device)
@@ -50,51 +32,21 @@ def so3_exp(rotation_vector: Tensor) -> Tensor:
 
 
 def so3_log(rotation: Tensor) -> Tensor:
-    """Return the rotation vector of a rotation matrix, with an angle in [0, pi].
-
-    Args:
-        rotation: (..., 3, 3) rotation matrices.
-
-    Returns:
-        (..., 3) rotation vectors, radians.
-
-    Differentiable: in ``rotation``, at angles below pi.
-    """
+    """Return the rotation vector (..., 3) of a rotation matrix, with an angle in [0, pi], radians."""
     from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
     return rotation_matrix_to_axis_angle(rotation)
 
 
 def left_jacobian(rotation_vector: Tensor) -> Tensor:
-    """Return J with ``exp(w + dw) = exp(J dw) exp(w)`` to first order.
-
-    Args:
-        rotation_vector: (..., 3), radians.
-
-    Returns:
-        (..., 3, 3).
-
-    Differentiable: in ``rotation_vector``, also at zero.
-    """
+    """Return J (..., 3, 3) with ``exp(w + dw) = exp(J dw) exp(w)`` to first order."""
     from kornia.geometry.liegroup import So3
 
     return So3.left_jacobian(rotation_vector.reshape(-1, 3)).reshape(*rotation_vector.shape, 3)
 
 
 def compose_rotation_vectors(first: Tensor, second: Tensor) -> Tensor:
-    """Return the rotation vector of ``exp(first) exp(second)``, wrapped to an angle of at most pi.
-
-    The product is taken on unit quaternions, which are exact at half turns where the matrix logarithm is not.
-
-    Args:
-        first: (..., 3), applied last.
-        second: (..., 3), applied first.
-
-    Returns:
-        (..., 3), radians.
-
-    Differentiable: in both, where the resulting angle is below pi.
-    """
+    """Return the rotation vector of ``exp(first) exp(second)``; quaternions are exact at half turns."""
     # In one tensor, since the time of a solver's step goes into the number of such small operations.
     scalars, vectors = _exp_quaternion(torch.stack(torch.broadcast_tensors(first, second)))
     (w1, w2), (v1, v2) = scalars.unbind(), vectors.unbind()
@@ -104,27 +56,13 @@ def compose_rotation_vectors(first: Tensor, second: Tensor) -> Tensor:
 
 
 def wrap_rotation_vector(rotation_vector: Tensor) -> Tensor:
-    """Return the rotation vector of the same rotation with an angle of at most pi.
-
-    Args:
-        rotation_vector: (..., 3), radians.
-
-    Returns:
-        (..., 3), radians.
-
-    Differentiable: in ``rotation_vector``, except at odd multiples of pi.
-    """
+    """Return the rotation vector of the same rotation with an angle of at most pi, radians."""
     scalar, vector = _exp_quaternion(rotation_vector)
     return _quaternion_log(scalar, vector)
 
 
 def rotation_between(start: Tensor, end: Tensor) -> Tensor:
-    """Return the rotations (..., 3, 3) of smallest angle that take unit vectors ``start`` (..., 3) to ``end`` (..., 3).
-
-    Opposite vectors are turned about an axis perpendicular to them that is otherwise arbitrary.
-
-    Differentiable: in both, away from opposite vectors.
-    """
+    """Return the rotations (..., 3, 3) of smallest angle from unit vectors ``start`` to ``end``."""
     start, end = torch.broadcast_tensors(start, end)
     cosine = (start * end).sum(-1, keepdim=True).unsqueeze(-1)
     opposite = cosine < _OPPOSITE - 1

@@ -1,8 +1,7 @@
 """Rotation representations for networks: six numbers or a quaternion of any length, and rotation vectors.
 
-Three numbers cannot parametrize all rotations continuously; six, or four up to a sign, can. The maps from outputs of a
-network to rotations, and on to rotation vectors, are such that the rotation of the vector is smooth at every angle: the
-vector itself changes its sign at a half turn, the rotation does not.
+Three numbers cannot parametrize all rotations continuously; six, or four up to a sign, can. Rotation vectors from them
+change sign at a half turn, but their rotation is smooth at every angle.
 """
 
 from __future__ import annotations
@@ -19,21 +18,10 @@ _LEAST_SINE = 1e-6
 
 
 def rotation_from_6d(columns: Tensor) -> Tensor:
-    """Return the rotation matrix of two columns made orthonormal, ``b1 = a1 / |a1|``, ``b2 ~ a2 - (b1 . a2) b1``.
+    """Return the rotation (..., 3, 3) of two columns (..., 6) made orthonormal (Zhou et al. 2019, eq. 15).
 
-    The third column is ``b1 x b2``. Zero or collinear columns determine no rotation: a first column of zero length
-    becomes x, a second one of zero length or along the first the coordinate axis nearest to perpendicular to the first.
-    The numbers so replaced get no gradient.
-
-    Args:
-        columns: (..., 6), the first column and then the second, of any length.
-
-    Returns:
-        (..., 3, 3) rotation matrices.
-
-    Differentiable: in ``columns``; finite everywhere, and smooth where the columns are not collinear.
-
-    References: Zhou et al. 2019, On the continuity of rotation representations in neural networks, eq. 15.
+    A first column of zero length becomes x, a second one of zero length or along the first the coordinate axis nearest
+    to perpendicular; the replaced numbers get no gradient.
     """
     axes = torch.eye(3, dtype=columns.dtype, device=columns.device)
     first, second = columns[..., :3], columns[..., 3:]
@@ -51,26 +39,12 @@ def rotation_from_6d(columns: Tensor) -> Tensor:
 
 
 def rotation_to_6d(rotation: Tensor) -> Tensor:
-    """Return the first two columns (..., 6) of rotation matrices (..., 3, 3), see `rotation_from_6d`.
-
-    Differentiable: in ``rotation``.
-    """
+    """Return the first two columns (..., 6) of rotation matrices (..., 3, 3), see `rotation_from_6d`."""
     return rotation[..., :2].mT.flatten(-2)
 
 
 def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
-    """Return the rotation matrix of a quaternion of any length but zero, which gives the identity and no gradient.
-
-    Convention: scalar first, ``(w, x, y, z)``; a quaternion and its negative are the same rotation.
-
-    Args:
-        quaternion: (..., 4).
-
-    Returns:
-        (..., 3, 3) rotation matrices.
-
-    Differentiable: in ``quaternion``; finite everywhere, and smooth away from zero.
-    """
+    """Return the rotation matrix of a quaternion (w, x, y, z) of any length; zero gives identity and no gradient."""
     w, x, y, z = _normalized_quaternion(quaternion).unbind(-1)
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
@@ -81,19 +55,9 @@ def rotation_from_quaternion(quaternion: Tensor) -> Tensor:
 
 
 def quaternion_from_rotation(rotation: Tensor) -> Tensor:
-    """Return the unit quaternion of a rotation matrix whose scalar is not negative.
+    """Return the unit quaternion (w, x, y, z), w not negative, of a rotation matrix (Shepperd 1978).
 
-    The column of ``4 q q^T`` with the largest diagonal, so no rotation is special.
-
-    Args:
-        rotation: (..., 3, 3) rotation matrices.
-
-    Returns:
-        (..., 4), scalar first.
-
-    Differentiable: in ``rotation``, also at zero; at half turns up to the sign, which may change there.
-
-    References: Shepperd 1978.
+    From the column of ``4 q q^T`` with the largest diagonal, so no rotation is special.
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in rotation.unbind(-2))
     outer = (
@@ -109,16 +73,9 @@ def quaternion_from_rotation(rotation: Tensor) -> Tensor:
 
 
 def rotation_vector_from_quaternion(quaternion: Tensor) -> Tensor:
-    """Return the rotation vector, of an angle of at most pi, of a quaternion of any length; zero gives no rotation.
+    """Return the rotation vector, of an angle of at most pi, of a quaternion (w, x, y, z); zero gives no rotation.
 
-    Args:
-        quaternion: (..., 4), scalar first.
-
-    Returns:
-        (..., 3), radians.
-
-    Differentiable: in ``quaternion``, also at zero rotation and, as a rotation, at half turns: there the vector jumps
-        to its negative, and ``so3_exp`` of it stays smooth.
+    At half turns the vector jumps to its negative, but `so3_exp` of it stays smooth.
     """
     unit = _positive_scalar(_normalized_quaternion(quaternion))
     scalar, vector = unit[..., :1], unit[..., 1:]
@@ -132,42 +89,22 @@ def rotation_vector_from_quaternion(quaternion: Tensor) -> Tensor:
 
 
 def quaternion_from_rotation_vector(rotation_vector: Tensor) -> Tensor:
-    """Return the unit quaternion (..., 4), scalar first and not negative, of rotation vectors (..., 3), radians.
-
-    Differentiable: in ``rotation_vector``, also at zero.
-    """
+    """Return the unit quaternion (w, x, y, z), w not negative, of rotation vectors (..., 3), radians."""
     return quaternion_from_rotation(so3_exp(rotation_vector))
 
 
 def rotation_vector_from_rotation(rotation: Tensor) -> Tensor:
-    """Return the rotation vector, of an angle of at most pi, of a rotation matrix.
-
-    Unlike the logarithm `so3_log` its gradient is right at half turns too, see `rotation_vector_from_quaternion`.
-
-    Args:
-        rotation: (..., 3, 3) rotation matrices.
-
-    Returns:
-        (..., 3), radians.
-
-    Differentiable: in ``rotation``, at every angle.
-    """
+    """Return the rotation vector, of an angle of at most pi, of a matrix; unlike `so3_log` smooth at half turns too."""
     return rotation_vector_from_quaternion(quaternion_from_rotation(rotation))
 
 
 def rotation_vector_from_6d(columns: Tensor) -> Tensor:
-    """Return the rotation vectors (..., 3), radians, of six numbers (..., 6), see `rotation_from_6d`.
-
-    Differentiable: in ``columns``, see `rotation_from_6d`.
-    """
+    """Return the rotation vectors (..., 3), radians, of six numbers (..., 6), see `rotation_from_6d`."""
     return rotation_vector_from_rotation(rotation_from_6d(columns))
 
 
 def rotation_vector_to_6d(rotation_vector: Tensor) -> Tensor:
-    """Return the six numbers (..., 6) of rotation vectors (..., 3), radians, see `rotation_to_6d`.
-
-    Differentiable: in ``rotation_vector``, also at zero.
-    """
+    """Return the six numbers (..., 6) of rotation vectors (..., 3), radians, see `rotation_to_6d`."""
     return rotation_to_6d(so3_exp(rotation_vector))
 
 

@@ -8,20 +8,7 @@ from torch import Tensor
 
 
 def farthest_points(points: Tensor, count: int, start: int = 0) -> Tensor:
-    """Return indices of points that cover a cloud evenly: each next one is the farthest from those chosen.
-
-    Args:
-        points: (N, 3) finite.
-        count: number of points, 1 to N.
-        start: index of the first.
-
-    Returns:
-        Indices (count,) int64, all different, in the order of choice.
-
-    Cost: O(N count).
-
-    References: Gonzalez 1985.
-    """
+    """Return the indices (count,) of points, each next one the farthest from those chosen (Gonzalez 1985)."""
     chosen = torch.empty(count, dtype=torch.long, device=points.device)
     chosen[0] = start
     nearest = torch.full_like(points[:, 0], torch.inf)
@@ -34,20 +21,9 @@ def farthest_points(points: Tensor, count: int, start: int = 0) -> Tensor:
 
 
 def even_order(points: Tensor, count: int | None = None) -> Tensor:
-    """Return points in an order of which every beginning covers the cloud evenly.
+    """Return the indices (count,) in an order of which every beginning covers the cloud evenly (Gonzalez 1985).
 
-    The first is the farthest from the centroid, each next one the farthest from those before, as by `farthest_points`.
-
-    Args:
-        points: (N, 3) finite, at least one, any unit.
-        count: number of points, 1 to N; all by default.
-
-    Returns:
-        Indices (count,) int64; the order of equally far points is not defined.
-
-    Cost: O(N count); 40 ms for 2,500 points.
-
-    References: Gonzalez 1985.
+    The first is the farthest from the centroid; the order of equally far points is not defined.
     """
     centered = points.detach().cpu().double().numpy()
     centered = centered - centered.mean(axis=0)

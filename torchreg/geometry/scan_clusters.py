@@ -1,4 +1,4 @@
-"""Scans of few points that stand for many."""
+"""Scans reduced to cluster points."""
 
 from __future__ import annotations
 
@@ -13,21 +13,10 @@ from torchreg.geometry.range_scan import RangeScan
 
 
 def clustered_scan(scan: RangeScan, count: int) -> tuple[RangeScan, Tensor, Tensor]:
-    """Return a scan with about ``count`` points, each of which stands for those around it that face the same way.
+    """Return a scan with about ``count`` cluster points, their indices (M,) in the scan, and each point's cluster (N,).
 
-    Args:
-        scan: N points; returned as it is if there are up to twice as many as wanted.
-        count: wanted number of points.
-
-    Returns:
-        The scan, on the boundary where one of the points is that a point stands for; the points (M,) of the given scan
-        that it has; and which of them (N,) stands for each point.
-
-    Differentiable: no.
-
-    Cost: 0.1 s for 400,000 points.
-
-    References: Rossignac and Borrel 1993, vertex clustering.
+    A cluster joins nearby points that face the same way (Rossignac and Borrel 1993); it is on the boundary if one of
+    its points is. Scans of up to twice as many points are returned as they are.
     """
     total, every = len(scan), torch.arange(len(scan), device=scan.points.device)
     if total <= 2 * count:

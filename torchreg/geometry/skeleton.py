@@ -233,20 +233,7 @@ class Skeleton:
 
 
 def resample_curve(points: Tensor, radii: Tensor, frames: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Return samples of a polyline at equal steps of its arc length, with radii and frames.
-
-    Args:
-        points: (n, 3) in order, at least two.
-        radii: (n,).
-        frames: (n, 3, 3) rotations.
-        count: samples, with the two ends; at least 2.
-
-    Returns:
-        Points (count, 3) and radii (count,), linear between those given, and frames (count, 3, 3), the rotations
-        nearest to the linear mean.
-
-    Differentiable: in points and radii; the arc lengths of the samples are held fixed.
-    """
+    """Return points (count, 3), radii and frames of a polyline at equal steps of its arc length, ends included."""
     with torch.no_grad():
         along = torch.cat((points.new_zeros(1), (points[1:] - points[:-1]).norm(dim=-1).cumsum(0)))
         wanted = torch.linspace(0, 1, count, dtype=points.dtype, device=points.device) * along[-1]
@@ -263,10 +250,7 @@ def resample_curve(points: Tensor, radii: Tensor, frames: Tensor, count: int) ->
 
 
 def nearest_rotation(matrices: Tensor) -> Tensor:
-    """Return the rotations (..., 3, 3) nearest to matrices (..., 3, 3) in the sum of squared differences.
-
-    References: Arun, Huang and Blostein 1987; Umeyama 1991 for the determinant.
-    """
+    """Return the rotations (..., 3, 3) nearest to matrices in least squares (Arun et al. 1987; Umeyama 1991)."""
     u, _, vh = torch.linalg.svd(matrices)
     sign = torch.ones_like(matrices[..., 0])
     sign[..., 2] = torch.linalg.det(u @ vh)
@@ -276,16 +260,10 @@ def nearest_rotation(matrices: Tensor) -> Tensor:
 def build_skeleton(
     limbs: Sequence[tuple[Tensor, Tensor, Tensor]], ends: Sequence[tuple[int, int]], notes: Sequence[str] = ()
 ) -> Skeleton:
-    """Return the skeleton whose limbs are given as polylines that share their end nodes.
+    """Return the skeleton of limbs, polylines (points (n, 3), radii (n,), frames (n, 3, 3)) that share end nodes.
 
-    Args:
-        limbs: points (n, 3), radii (n,) and frames (n, 3, 3) of each limb, n >= 2, all of one dtype and device.
-        ends: names of the first and last node of each limb, any integers; limbs meet at nodes of the same name. The
-            position, radius and frame of such a node come from the first limb that names it.
-        notes: see `Skeleton`.
-
-    Raises:
-        InputError: if the limbs do not make a tree.
+    ``ends`` names the first and last node of each limb by integers; a node's position, radius and frame come from the
+    first limb that names it.
     """
     number: dict[int, int] = {}
     values: list[tuple[Tensor, Tensor, Tensor]] = []

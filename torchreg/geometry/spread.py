@@ -1,4 +1,4 @@
-"""How many dimensions points fill: none in one place, one on a line, two on a plane."""
+"""The numerical rank of a point set: zero for one position, one for a line, two for a plane."""
 
 from __future__ import annotations
 
@@ -13,16 +13,9 @@ SPREADS = ("at one place", "on a line", "on a plane")
 
 
 def spread_dimensions(points: Tensor, size: float | Tensor, valid: Tensor | None = None) -> Tensor:
-    """Return the number (...) of perpendicular directions, 0 to 3, in which points spread.
+    """Return the rank (...), 0 to 3, of points (..., N, 3): directions of deviation above a thousandth of the largest.
 
-    A direction counts where the standard deviation along it exceeds a thousandth of the largest.
-
-    Args:
-        points: (..., N, 3), finite where valid.
-        size: of what they are points of, in their unit; points within a millionth of it are at one place.
-        valid: (..., N) False where padded; all by default.
-
-    Differentiable: no.
+    Points within a millionth of ``size`` are at one position.
     """
     points = points.detach().double()
     weights = torch.ones_like(points[..., 0]) if valid is None else valid.to(points)

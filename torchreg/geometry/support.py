@@ -1,4 +1,4 @@
-"""What a scanned thing stands on: a table, a turntable, a floor, told from the thing."""
+"""Segmentation of a scan into a thing and its support: a table, a turntable, a floor."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class _Rule:
     small: float = 0.04  # share of the points up to which the thing must be small against its support
     floor: float = 2.0  # least width of the support of what is small, in those of the thing
     height: float = 0.05  # least height of the thing, in widths of its own
-    lowest: float = 0.05  # share of the thing, next to the plane, that tells where it stands
+    lowest: float = 0.05  # share of the thing, next to the plane, that gives its position
     rim: float = 0.05  # of a plane, on which a thing does not stand, in widths of the plane
     inside: float = 0.6  # share of the lowest part that is inside of the rim
     filled: float = 0.75  # share of its convex hull that a plane fills: tables and floors are no stars, nor hands
@@ -61,7 +61,7 @@ class _Rule:
     apart: float = 0.9  # share of the points on a plane that are of pieces without anything above
     num_directions: int = 24  # in which widths are measured
     num_cells: int = 24  # along the sides of the grid on which areas are measured
-    near: float = 4.0  # points on a plane within the radius about a cell that tells whether it is full: all but 2 %
+    near: float = 4.0  # points on a plane within the radius about a cell that decide whether it is full: all but 2 %
 
 
 _SEARCH, _RULE = _Search(), _Rule()
@@ -153,12 +153,7 @@ def _samples(points: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
 
 @dataclass(frozen=True, eq=False)
 class _Plane:
-    """A plane, up to its noise.
-
-    Args:
-        coefficients: (4,) float64 on the CPU: unit normal and d, ``normal . x + d = 0``.
-        reach: distance up to which points lie on it.
-    """
+    """A plane ``normal . x + d = 0``, (4,) float64 on the CPU, and the distance up to which points lie on it."""
 
     coefficients: Tensor
     reach: float

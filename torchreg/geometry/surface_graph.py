@@ -39,10 +39,10 @@ class OnePiece:
     """A surface without holes or loose parts, made from any triangles.
 
     Args:
-        mesh: the surface; its vertices are float64 on the CPU, the centers of closed holes last.
+        mesh: float64 on the CPU, with the centers of closed holes as last vertices.
         vertex: (V,) original vertex of each vertex; -1 for the center of a hole.
         bridges: (B, 2) vertices that count as joined, empty unless pieces were bridged.
-        notes: the repairs, in words; empty for a clean surface.
+        notes: the repairs, in words.
     """
 
     mesh: TriangleMesh
@@ -52,11 +52,7 @@ class OnePiece:
 
 
 def unique_edges(faces: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the edges (E, 2) of triangles, smaller index first, and the edges 01, 12, 20 (F, 3) of each triangle.
-
-    Args:
-        faces: (F, 3) vertex indices.
-    """
+    """Return the edges (E, 2) of triangles, smaller index first, and the edges 01, 12, 20 (F, 3) of each triangle."""
     if faces.numel() == 0:
         return faces.new_zeros(0, 2), faces
     keys, count = _edge_keys(faces)
@@ -71,10 +67,9 @@ def _edge_keys(faces: Tensor) -> tuple[Tensor, int]:
 
 
 def _is_closed(faces: Tensor, keys: Tensor) -> bool:
-    """Return whether every edge (F, 3) of triangles is used as often in one direction as in the other.
+    """Return whether every edge of triangles is used as often in one direction as in the other.
 
-    Edges have pseudo-random numbers, added in one direction and subtracted in the other: a sum of zero tells, without
-    sorting, but for one chance in 2^64. False also of closed surfaces whose triangles are not wound alike.
+    By a sum of pseudo-random numbers of edges, signed by direction: wrong once in 2^64.
     """
     numbers = keys * -7046029254386353131  # the odd integer nearest to 2^64 over the golden ratio, as a signed one
     numbers = (numbers ^ (numbers >> 29)) * numbers
@@ -84,19 +79,9 @@ def _is_closed(faces: Tensor, keys: Tensor) -> bool:
 def one_piece(mesh: TriangleMesh, pieces: str = "largest") -> OnePiece:
     """Return a surface with duplicate vertices welded, holes closed and loose parts dropped or bridged.
 
-    A hole is closed by triangles from its rim to the mean of the rim. Triangles that repeat a vertex and vertices
-    without triangles are dropped. Edges with more than two triangles and any winding are fine.
-
-    Args:
-        mesh: at least one triangle with three distinct corners.
-        pieces: ``"largest"`` keeps the piece with the largest area; ``"bridge"`` also joins the others to it, each by
-            the shortest segment between vertices; ``"error"`` raises. Dust, pieces with less than a thousandth of the
-            triangles, is left out by all three.
-
-    Raises:
-        InputError: if there is no such triangle, all are without area, or ``pieces`` is "error" and there are several.
-
-    Differentiable: no.
+    Holes are closed by triangles to the mean of the rim. ``pieces``: "largest" keeps the piece of largest area,
+    "bridge" joins the others by the shortest segments between vertices, "error" raises. Pieces with less than a
+    thousandth of the triangles are left out.
     """
     position = weld(mesh.vertices.detach().cpu().double())
     faces = position[mesh.faces.cpu()]
@@ -133,19 +118,8 @@ def _used_vertices(faces: Tensor, count: int) -> tuple[Tensor, Tensor]:
 def coarsened(mesh: TriangleMesh, count: int, area: Tensor | None = None) -> TriangleMesh:
     """Return a surface with about ``count`` vertices at most, each the mean of a patch of the given ones.
 
-    A patch is a connected part of the surface within a cubic cell, so that sheets and limbs that only come near each
-    other stay apart; vertices of patches that are no disks, as where a limb is thinner than a cell, stay as they are.
-
-    Args:
-        mesh: returned as it is if it has no more vertices.
-        count: wanted number of vertices; triangles at points where several patches meet may leave small holes.
-        area: of the surface, if it is known.
-
-    Differentiable: no.
-
-    Cost: 0.2 s for 100,000 vertices.
-
-    References: Rossignac and Borrel 1993, vertex clustering; here within connected patches.
+    Vertex clustering (Rossignac and Borrel 1993) within connected patches of cubic cells, so that near sheets and limbs
+    stay apart; vertices of patches that are no disks stay as they are.
     """
     if mesh.num_vertices <= count:
         return mesh
@@ -199,10 +173,7 @@ def _kept_pieces(
 
 
 def _bridges(vertices: Tensor, labels: Tensor, count: int) -> Tensor:
-    """Return the vertex pairs (count - 1, 2) of least total length that join all pieces.
-
-    Of many pieces each is compared with those of the nearest boxes.
-    """
+    """Return the vertex pairs of least total length that join all pieces; of many, those in the nearest boxes."""
     groups = [(labels == label).nonzero()[:, 0] for label in labels.unique().tolist()]
     trees = [NeighborTree(vertices[group]) for group in groups]
     pairs = _near_pairs([vertices[group] for group in groups])

@@ -1,4 +1,4 @@
-"""Which direction is upright: files of points do not say, so it is told from where things stand and how they move."""
+"""The upright direction of points, estimated from how things stand and move."""
 
 from __future__ import annotations
 
@@ -42,15 +42,10 @@ def is_before_camera(lower: Tensor, upper: Tensor) -> bool:
 
 
 def guess_up(frames: Sequence[Tensor]) -> Direction:
-    """Return the likely upright direction of points over time, one of -y, y and z.
+    """Return the likely upright direction of points over time, clouds (N_t, 3): one of -y, y and z.
 
-    What lies before a camera at the origin hangs from -y, as cameras look along z with y down. Else that of y and z is
-    upright, if only one is, along which things end at zero, the ground of most files, or along which they would not
-    fall over: their middle is above what they rest on. Else y where things are tallest along y, or bob less along y
-    than along z: feet stay on the ground. Otherwise z.
-
-    Args:
-        frames: T clouds (N_t, 3), in any unit; those without a finite point are passed over.
+    Before a camera at the origin it is -y. Else that of y and z along which things end at zero, or rest stably, if only
+    one does; else y where things are tallest, or move less, along y than along z; otherwise z.
     """
     found = [frame[:: max(1, len(frame) // _RULE.num_points)].detach().double().cpu() for frame in frames]
     found = [points for frame in found if len(points := frame[frame.isfinite().all(-1)])]

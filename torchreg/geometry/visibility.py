@@ -31,18 +31,9 @@ _VISIBILITY = _Visibility()
 
 
 def view_rotation(camera: Tensor, target: Tensor, up: Tensor | None = None) -> Tensor:
-    """Return ``R_camera_world`` (3, 3) of a camera that looks at a target: rows right, down, forward.
+    """Return ``R_camera_world`` (3, 3) float64 of a camera that looks at a target: rows right, down, forward.
 
-    Args:
-        camera: (3,) position.
-        target: (3,) point that appears at the center.
-        up: (3,) direction that appears upright; -y by default, the up of a camera that looks along +z.
-
-    Returns:
-        The float64 rotation; a coordinate axis replaces ``up`` along which the view runs.
-
-    Raises:
-        InputError: if camera and target coincide, or one is not three finite numbers.
+    ``up`` is -y by default, for a camera that looks along +z; a coordinate axis replaces it if the view runs along it.
     """
     camera, target = as_float_tensor(camera, "camera").double(), as_float_tensor(target, "target").double()
     for value, name in ((camera, "camera"), (target, "target")):
@@ -74,21 +65,10 @@ def aim(
     size: int | tuple[int, int] = 256,
     margin: float = 0.0,
 ) -> View:
-    """Return the view from a camera that fits all points.
+    """Return the view from a camera that fits all points and looks at the center of their bounding box.
 
-    Args:
-        points: (N, 3), metres.
-        camera: (3,) position; for a parallel view the direction in which it looks.
-        parallel: parallel rays instead of a pinhole.
-        up: (3,) see `view_rotation`.
-        size: pixels along the longer side of a tight grid, or (width, height) in which the points are centered.
-        margin: empty share of the grid on each side, below 0.5.
-
-    Returns:
-        The view, looking at the center of the points' bounding box.
-
-    Raises:
-        InputError: if a point lies beside or behind the camera, or this is not three finite numbers.
+    For a parallel view ``camera`` is the direction in which it looks. ``size`` is the pixels of the longer side of a
+    tight grid, or (width, height); ``margin`` the empty share on each side.
     """
     camera = as_float_tensor(camera, "camera").detach().to(device=points.device, dtype=torch.float64)
     check_shape(camera, "camera", (3,))
@@ -131,20 +111,7 @@ def _fit_grid(plain: View, plane: Tensor, size: int | tuple[int, int], margin: f
 
 
 def rasterize(mesh: TriangleMesh, view: View, *, cull_back: bool = False) -> Raster:
-    """Return the nearest face at the center of every pixel, by a z-buffer.
-
-    Args:
-        mesh: the surface.
-        view: camera and pixels, see `aim`.
-        cull_back: leave out faces that face away from the camera.
-
-    Raises:
-        InputError: if a vertex lies beside or behind the pinhole.
-
-    Differentiable: no.
-
-    Cost: a few operations per pixel in the bounding box of every projected face; 0.05 s for 20,000 faces at 512 x 512.
-    """
+    """Return the nearest face at the center of every pixel, by a z-buffer."""
     with torch.no_grad():
         return draw(flatten(mesh, view), view, cull_back)
 
@@ -164,18 +131,7 @@ def visible_points(
 ) -> Tensor:
     """Return a mask (N,) of the points that a mesh does not hide from a camera; points behind the camera are hidden.
 
-    Along outlines of the mesh the mask is right to a pixel of a picture of 256 pixels.
-
-    Args:
-        mesh: the occluding surface, at least one face.
-        points: (N, 3), metres; on the surface or anywhere else.
-        camera: (3,) position.
-        tolerance: depth behind the nearest surface up to which a point counts as on it, metres; two pixels by default.
-
-    Raises:
-        InputError: if the mesh reaches beside or behind the camera.
-
-    Differentiable: no.
+    Points up to ``tolerance`` behind the nearest surface are on it, two pixels (of 256) by default.
     """
     points = points.to(mesh.vertices)
     with torch.no_grad():
@@ -220,22 +176,9 @@ def sample_visible(
     *,
     density: str = "area",
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return ``count`` points drawn independently and uniformly from the side of a surface that faces a camera.
+    """Return ``count`` points drawn from the side of a surface that faces a camera, with faces and barycentric weights.
 
-    Args:
-        mesh: the surface, at least one face.
-        camera: (3,) position.
-        count: number of points.
-        generator: source of randomness; None draws from a fresh generator with seed 0, the same points at every call.
-        density: "area" is uniform over the surface; "pixel" is uniform over the picture, as a range camera sees it.
-
-    Returns:
-        Points (count, 3), face_index (count,) int64, barycentric (count, 3) weights of the face's three vertices.
-
-    Raises:
-        InputError: if the camera sees (next to) nothing or the mesh reaches behind it.
-
-    Differentiable: in the vertices, with the drawn faces and weights held fixed.
+    "area" is uniform over the surface, "pixel" over the picture, as a range camera samples it.
     """
     still = TriangleMesh(mesh.vertices.detach().double(), mesh.faces)
     view = aim(_used_vertices(still), camera, size=_VISIBILITY.resolution)

@@ -24,12 +24,9 @@ class View:
 
     Args:
         position: (3,) float64, the pinhole; for a parallel view any point of the image plane.
-        rotation: (3, 3) float64 ``R_camera_world``, rows right, down, forward.
+        rotation: (3, 3) float64 ``R_camera_world``.
         corner: (2,) float64 image-plane coordinates of the upper left corner of the grid.
         pitch: size of a pixel: metres for a parallel view, tangent of the angle else.
-        width: number of columns.
-        height: number of rows.
-        parallel: True for parallel rays.
     """
 
     position: Tensor
@@ -41,15 +38,7 @@ class View:
     parallel: bool = False
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return pixel coordinates (..., N, 2) as (column, row), and depths (..., N) along the view, in float64.
-
-        Args:
-            points: (..., N, 3) in world coordinates, metres.
-
-        Points behind a pinhole have NaN pixels.
-
-        Differentiable: in ``points``.
-        """
+        """Return pixel coordinates (..., N, 2) as (column, row), NaN behind a pinhole, and depths (..., N), float64."""
         local = (points.double() - self.position.to(points.device)) @ self.rotation.to(points.device).mT
         plane, depth = local[..., :2], local[..., 2]
         if not self.parallel:
@@ -70,7 +59,7 @@ class Raster:
     """The z-buffer of a mesh: the nearest face at the center of every pixel.
 
     Args:
-        face_index: (H, W) int64 nearest face, -1 for none.
+        face_index: (H, W) int64, -1 for none.
         barycentric: (H, W, 3) float64 weights of that face's vertices, perspective-correct.
         depth: (H, W) float64 along the view, infinite without a face.
     """
@@ -103,7 +92,7 @@ class FlatMesh:
 
 
 def flatten(mesh: TriangleMesh, view: View) -> FlatMesh:
-    """Return a mesh projected into a view; InputError if a vertex lies beside or behind a pinhole."""
+    """Return a mesh projected into a view; InputError if a vertex is not before a pinhole."""
     pixels, depth = view.project(mesh.vertices.detach())
     depths = depth[mesh.faces]
     if not view.parallel and bool((depths <= 0).any()):

@@ -1,4 +1,4 @@
-"""The mirror symmetry of a body: which limbs are each other's mirror images, so that their poses tell no names."""
+"""The mirror symmetry of a body: limbs that are each other's mirror images, which poses do not identify."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchreg.spines.tip_features import TipFeatures, TipObservations
 class SymmetrySearch:
     """Which exchanges of tips are tried and believed."""
 
-    num_tips: tuple[int, int] = (3, 10)  # of two, a mirror tells nothing; of more there are too many: 9,496 of ten
+    num_tips: tuple[int, int] = (3, 10)  # with two, no mirror is observable; with more there are too many: 9,496 of ten
     num_frames: int = 16  # of a sequence, evenly spaced, that are looked at: poses recur
     least_evidence: float = 5.0  # log-odds of a mirror against none and any other: of stars 4, of animals 6 to 20
     least_difference: float = 1e-3  # squared, in variances of random names, below which none is measured
@@ -27,14 +27,13 @@ SEARCH = SymmetrySearch()
 
 @dataclass(frozen=True, eq=False)
 class BodyMirror:
-    """A mirror in which a body looks like itself, with some names exchanged.
+    """A mirror symmetry of a body, which exchanges some names.
 
     Args:
-        names: (K,) what each name is in the mirror.
-        columns: (n,) of features, where those of the mirror image are found.
+        names: (K,) the mirror image of each name.
+        columns: (n,) of features, those of the mirror image.
         signs: (n,) -1 for signed volumes, which a mirror turns inside out.
-        levels: (G,) variances that poses, which are seldom symmetric, give each group of features, in those of random
-            names.
+        levels: (G,) variance of each group of features from asymmetric poses, in those of random names.
     """
 
     names: Tensor
@@ -50,18 +49,11 @@ class BodyMirror:
 def find_mirror(
     kinds: TipFeatures, background: GroupedDensity, frames: Sequence[TipObservations], names: Tensor
 ) -> BodyMirror | None:
-    """Return the mirror in which a body looks like itself; None if none is certain.
+    """Return the mirror symmetry of a body; None if none is certain.
 
-    Distances along the surface are the same in a mirror, volumes change their sign, limbs of a pair change places. The
-    difference of body and image is drawn from a normal density of unknown scale in each group of features, or, if it
-    is no mirror, from that of random names. The frame with the most symmetric pose decides. Where all limbs are alike,
-    as a starfish's, no mirror is better than chance.
-
-    Args:
-        kinds: what features they are.
-        background: under random names.
-        frames: T of them.
-        names: (T, K) of which those of a pair of limbs may be exchanged.
+    Geodesic distances are the same in a mirror, volumes change sign, limbs of a pair change places. The difference of
+    body and image is drawn from a normal density of unknown scale in each group of features, or, if it is no mirror,
+    from that of random names (``background``). The frame with the most symmetric pose decides.
     """
     count, (least, most) = kinds.num_names, SEARCH.num_tips
     # Of frames that show all tips: one without a name has the name that is missing.
@@ -87,14 +79,7 @@ def find_mirror(
 
 
 def _most_certain(levels: Tensor, sizes: Tensor) -> tuple[tuple[int, int, Tensor], float]:
-    """Return the frame and the mirror that is most certain there, and by how much.
-
-    With them are the levels (G,) of a median frame in its own best mirror.
-
-    Args:
-        levels: (T, M, G) of differences, in variances of random names.
-        sizes: (M, G) of the spaces in which there are any.
-    """
+    """Return the frame, its most certain mirror and a median frame's levels (G,), and the margin of log-odds."""
     odds = 0.5 * sizes * (levels - 1 - levels.log())
     evidence = torch.where(levels < 1, odds, -odds).sum(-1)
     highest, mirrors = torch.nn.functional.pad(evidence, (0, 1)).topk(2, dim=1)
@@ -152,6 +137,6 @@ def _sizes(background: GroupedDensity, columns: Tensor, signs: Tensor) -> Tensor
 
 
 def _levels(background: GroupedDensity, offsets: Tensor, sizes: Tensor) -> Tensor:
-    """Return how much mirror images differ (M, G) by offsets (M, n), in variances of random names."""
+    """Return the differences (M, G) of mirror images by offsets (M, n), in variances of random names."""
     squares = torch.stack([rows.square().sum(-1) for rows in background.whitened(offsets)], -1) / 4
     return (squares / sizes.clamp_min(1)).clamp_min(SEARCH.least_difference)

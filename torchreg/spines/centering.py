@@ -34,19 +34,11 @@ _RECENTERING = Recentering()
 def centered_curves(
     curves: Sequence[Tensor], mesh: TriangleMesh, thickness: float, free: Sequence[tuple[bool, bool]]
 ) -> list[Tensor]:
-    """Return curves with their inner points moved to the centers of the slices of surface perpendicular to them.
+    """Return curves (n, 3) with inner points at the centers of perpendicular slices (Tagliasacchi et al. 2009).
 
-    Level sets of geodesic distance lean over in bends, where the path along the inside is shorter, and so their centers
-    are off the axis by up to a tenth of the radius. A triangle belongs to the curve, and to the stretch of it, that is
-    nearest. Where slices are not round, as at junctions, the curves stay.
-
-    Args:
-        curves: (n, 3) each.
-        mesh: the surface, any winding.
-        thickness: of a slice; about the distance between points.
-        free: whether the first and the last point of each curve move with those next to them.
-
-    References: Tagliasacchi, Zhang and Cohen-Or 2009, recentering across the axis.
+    Centers of geodesic level sets are off the axis in bends by up to a tenth of the radius. A triangle belongs to the
+    nearest curve and stretch of it; curves stay where slices are not round, as at junctions. ``free``: whether the
+    first and the last point move with those next to them.
     """
     samples, areas = mesh.vertices[mesh.faces].mean(1), mesh.face_areas()
     thickness = max(thickness, _RECENTERING.min_thickness * float(areas.mean().sqrt()))
@@ -74,15 +66,7 @@ def _smooth(offsets: Tensor, free_start: bool, free_end: bool) -> Tensor:
 
 
 def _axis_offsets(curve: Tensor, samples: Tensor, areas: Tensor, nearest: Tensor, thickness: float) -> Tensor:
-    """Return the offsets (n, 3) from a curve's points to the centers of their slices; zero where a slice is not round.
-
-    Args:
-        curve: (n, 3).
-        samples: (F, 3) centers of the triangles around the curve.
-        areas: (F,) of the triangles.
-        nearest: (F,) point of the curve nearest to each sample.
-        thickness: of a slice.
-    """
+    """Return the offsets (n, 3) from a curve's points to the centers of their slices; zero for slices not round."""
     count, reach = len(curve), _RECENTERING.neighbor_slices
     directions = tangents(curve)
     point = nearest[:, None] + torch.arange(-reach, reach + 1)

@@ -31,22 +31,14 @@ _ASCENT = ClearanceAscent()
 
 
 class Inside:
-    """The test for points inside a closed surface, whatever the winding of its triangles.
-
-    A ray from a point that lies inside crosses the surface an odd number of times; two of three rays decide.
-
-    Args:
-        mesh: closed; where it is not, the rays that miss the hole may still outvote the one that meets it.
-
-    Cost: O(triangles) to make; O(triangles along a line) per point.
-    """
+    """The test for points inside a closed surface of any winding: parity of crossings, two of three rays decide."""
 
     def __init__(self, mesh: TriangleMesh) -> None:
         corners = mesh.vertices.detach().cpu().double()[mesh.faces.cpu()]
         self._grids = [_RayGrid(corners, torch.tensor(ray, dtype=torch.float64)) for ray in _RAYS]
 
     def __call__(self, points: Tensor) -> Tensor:
-        """Return which points (..., 3) lie inside, (...,) bool."""
+        """Return a mask (...,) of the points (..., 3) inside."""
         flat = points.detach().cpu().double().reshape(-1, 3)
         votes = torch.stack([grid.crosses_odd(flat) for grid in self._grids]).sum(0)
         return (votes >= 2).reshape(points.shape[:-1])
@@ -126,14 +118,10 @@ class Clearance:
         return nearest + depth * torch.nn.functional.normalize(nearest - points, dim=-1)
 
     def ascend(self, points: Tensor, reach: float) -> Tensor:
-        """Return points (N, 3) on the medial axis near the given ones: local maxima of the clearance.
+        """Return points (N, 3) on the medial axis near those given inside the surface: local maxima of the clearance.
 
-        The ascent follows the mean direction away from the surface, whose nearest parts count most, as long as the
-        clearance grows and the point stays within reach. From inside the surface it stays inside.
-
-        Args:
-            points: (N, 3) inside the surface.
-            reach: largest distance to go.
+        The ascent follows the mean direction away from the nearest parts of the surface while the clearance grows and
+        the point stays inside and within reach.
         """
         start, samples = points.double(), self._coarse
         position, step = start, torch.full((len(points), 1), _ASCENT.step, dtype=torch.float64)

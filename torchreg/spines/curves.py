@@ -12,10 +12,7 @@ _DEGENERATE = 1e-6
 
 
 def curve_lengths(curves: Tensor) -> Tensor:
-    """Return the lengths (...,) of curves (..., S, 3), in their unit.
-
-    Differentiable: in the curves; a step of length zero has the gradient zero.
-    """
+    """Return the lengths (...,) of curves (..., S, 3), in their unit; zero gradient at steps without length."""
     return _safe_norm(curves[..., 1:, :] - curves[..., :-1, :]).sum(-1)
 
 
@@ -26,10 +23,7 @@ def arc_lengths(curve: Tensor) -> Tensor:
 
 
 def points_along(curve: Tensor, lengths: Tensor) -> Tensor:
-    """Return the points (..., 3) of a curve (n, 3) at arc lengths (...,); its last point beyond the end.
-
-    Differentiable: in the curve, with the positions along it held fixed.
-    """
+    """Return the points (..., 3) of a curve (n, 3) at arc lengths (...,); its last point beyond the end."""
     along = torch.cat((curve.new_zeros(1), _safe_norm(curve[1:] - curve[:-1]).cumsum(0))).detach()
     lengths = lengths.clamp(0, float(along[-1]))
     after = torch.searchsorted(along, lengths).clamp(min(1, len(curve) - 1), len(curve) - 1)
@@ -40,15 +34,7 @@ def points_along(curve: Tensor, lengths: Tensor) -> Tensor:
 
 
 def moving_average(curve: Tensor, window: float, count: int) -> Tensor:
-    """Return a curve (n, 3) as ``count`` points at equal intervals, averaged over a window; its ends stay.
-
-    Differentiable: in the curve, with the positions along it held fixed.
-
-    Args:
-        curve: (n, 3).
-        window: a share of the curve's length.
-        count: number of points returned.
-    """
+    """Return a curve as ``count`` points at equal intervals, averaged over a share of its length; its ends stay."""
     length = float(curve_lengths(curve.detach()))
     even = points_along(curve, torch.linspace(0, length, count, dtype=curve.dtype, device=curve.device))
     half = min(round(0.5 * window * (count - 1)), count - 1)
@@ -67,10 +53,7 @@ def binomial_smoothing(values: Tensor, passes: int) -> Tensor:
 
 
 def bend_angles(curves: Tensor) -> Tensor:
-    """Return the turning angles (..., S - 2) of curves (..., S, 3) at their inner points, radians from 0 to pi.
-
-    Differentiable: in the curves; straight, turned back or without length, the gradient is zero.
-    """
+    """Return the turning angles (..., S - 2), 0 to pi, of curves (..., S, 3) at their inner points."""
     steps = curves[..., 1:, :] - curves[..., :-1, :]
     before, after = steps[..., :-1, :], steps[..., 1:, :]
     cross = torch.linalg.cross(before, after, dim=-1)
@@ -83,9 +66,7 @@ def bend_angles(curves: Tensor) -> Tensor:
 def tangents(curves: Tensor) -> Tensor:
     """Return the unit tangents (..., S, 3) of curves (..., S, 3): central differences, one-sided at the ends.
 
-    Where points coincide the tangent is the direction of the chord from end to end; +x for a curve without length.
-
-    Differentiable: in the curves.
+    Where points coincide it is the direction of the chord from end to end; +x for a curve without length.
     """
     steps = curves[..., 1:, :] - curves[..., :-1, :]
     padded = torch.cat((steps[..., :1, :], steps, steps[..., -1:, :]), dim=-2)
@@ -101,21 +82,14 @@ def tangents(curves: Tensor) -> Tensor:
 
 
 def align_frames(frames: Tensor, directions: Tensor) -> Tensor:
-    """Return frames (..., 3, 3) turned by the smallest angle that makes ``directions`` (..., 3) their third columns.
-
-    Differentiable: in both.
-    """
+    """Return frames (..., 3, 3) turned by the smallest angle that makes ``directions`` their third columns."""
     return rotation_between(frames[..., 2], directions) @ frames
 
 
 def curve_frames(curves: Tensor) -> Tensor:
-    """Return rotation-minimizing frames ``R_world_curve`` (..., S, 3, 3) along curves (..., S, 3).
+    """Return rotation-minimizing frames ``R_world_curve`` (..., S, 3, 3) along curves (..., S, 3) (Bishop 1975).
 
     The third column is the tangent. The first frame is the smallest rotation of the world's axes.
-
-    Differentiable: in the curves.
-
-    References: Bishop 1975.
     """
     directions = tangents(curves)
     eye = torch.eye(3, dtype=curves.dtype, device=curves.device).expand(*curves.shape[:-2], 3, 3)

@@ -30,16 +30,7 @@ _DESCENT = DepthDescent()
 
 
 class DepthField:
-    """The signed distance to a surface on a grid, positive inside; a hole does no harm, see `voxelize`.
-
-    The depth of a voxel is found when it is first asked for, as curves pass through few of them.
-
-    Args:
-        mesh: the surface.
-        resolution: voxels along its longest side; depths are right to about one voxel.
-
-    Cost: 0.03 s at the default resolution on one CPU core.
-    """
+    """The signed distance to a surface on a grid, positive inside, computed for voxels as they are needed."""
 
     def __init__(self, mesh: TriangleMesh, resolution: int = 96) -> None:
         grid, border = voxelize(mesh, resolution, touching=False), _DESCENT.border
@@ -94,7 +85,7 @@ class DepthField:
 
 
 def _beside_others(inside: Tensor) -> Tensor:
-    """Return which voxels (X, Y, Z) have a neighbor along an axis on the other side of a surface."""
+    """Return a mask (X, Y, Z) of the voxels with a neighbor along an axis on the other side of a surface."""
     beside = torch.zeros_like(inside)
     for axis, size in enumerate(inside.shape):
         changes = inside.narrow(axis, 1, size - 1) != inside.narrow(axis, 0, size - 1)
@@ -106,14 +97,10 @@ def _beside_others(inside: Tensor) -> Tensor:
 def move_inside(
     field: DepthField, curves: Tensor, radii: Tensor, free: Tensor, stiffness: float = _DESCENT.stiffness
 ) -> Tensor:
-    """Return curves moved by small steps until they lie at their depths, or in the middle, and are smooth.
+    """Return curves (..., S, 3) moved by small steps until they lie at their depths and are smooth.
 
-    Args:
-        field: of the surface.
-        curves: (..., S, 3).
-        radii: (..., S) depth that is enough; where the body is thinner, the curve stays in its middle.
-        free: (..., S) bool, False for points that stay.
-        stiffness: see `DepthDescent`; zero moves every point independently.
+    ``radii`` (..., S) is the depth that is enough; where the body is thinner, the curve stays in its middle. Points not
+    ``free`` stay; zero stiffness moves every point independently.
     """
     movable = free.any(-1)  # other curves stay as they are
     moved, radii, mask = curves[movable], radii.expand(free.shape)[movable], free[movable].unsqueeze(-1)

@@ -1,4 +1,4 @@
-"""What is told of the frames of a sequence: irregularities, and the statuses that follow from them."""
+"""Warnings on the frames of a sequence: irregularities, and the statuses that follow from them."""
 
 from __future__ import annotations
 
@@ -23,15 +23,7 @@ def told_statuses(notes: Sequence[Sequence[str]]) -> dict[str, Any]:
 def frame_notes(
     skeleton: Skeleton, notes: Sequence[str], num_named: int, missing: Tensor, transferred: Tensor
 ) -> list[str]:
-    """Return the irregularities of a frame.
-
-    Args:
-        skeleton: its own.
-        notes: on its surface.
-        num_named: tips of the skeleton that have names.
-        missing: (K,) True for tips that it lacks.
-        transferred: (L,) True for limbs that it lacks.
-    """
+    """Return the irregularities of a frame, with missing tips (K,) and transferred limbs (L,)."""
     rows = [*notes, *skeleton.notes]
     superfluous = len(skeleton.tips) - num_named
     if superfluous > 0:

@@ -35,17 +35,8 @@ def skeletonize_frames(
 ) -> list[FrameSkeleton]:
     """Return the skeleton of every frame, and the relations of its tips along the surface.
 
-    Args:
-        meshes: T surfaces, each of which is taken when its turn comes.
-        config: see `skeletonize`.
-        workers: see `do_jobs`.
-        on_step: called with every frame, in the order in which they are done.
-        progress: a folder, created if absent, in which each skeleton is kept as soon as it is done; those of the same
-            surface and configuration are not computed again.
-
-    Raises:
-        InputError: if a surface cannot be skeletonized; names the frame.
-        SolverError: if a process is killed, and again on the second attempt.
+    ``on_step`` is called with every frame as it is done; ``progress`` is a folder that keeps skeletons for later calls
+    with the same surface and configuration.
     """
     skeletons: dict[int, FrameSkeleton] = {}
     kept = KeptResults.in_folder(progress)

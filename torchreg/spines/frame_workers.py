@@ -36,13 +36,7 @@ _POOL = _Pool()
 
 @dataclass(frozen=True, eq=False)
 class Job(Generic[_Found]):
-    """A piece of work.
-
-    Args:
-        frame: the frame that it is for.
-        task: gives the result; can be pickled, see `functools.partial`.
-        done: called with the result, in this process.
-    """
+    """A piece of work for a frame; the task can be pickled, and done is called with its result in this process."""
 
     frame: int
     task: Callable[[], _Found]
@@ -52,13 +46,8 @@ class Job(Generic[_Found]):
 def do_jobs(next_job: Callable[[], Job[Any] | None], num_frames: int, workers: int | None) -> None:
     """Do jobs, and call `Job.done` with each result in the order in which they come.
 
-    Args:
-        next_job: returns the next job, None if there is none before others are done; asked when a process is idle.
-        num_frames: about as many jobs; few are all done in this process, as where processes cannot be forked.
-        workers: processes; by default one per core that may be used.
-
-    Raises:
-        SolverError: if a process is killed, and again on the second attempt.
+    ``next_job`` is asked when a process is idle, and returns None if there is no job before others are done. Few jobs
+    are all done in this process, as where processes cannot be forked; by default there is one per core.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     count = min(cores if workers is None else workers, num_frames)
@@ -129,17 +118,13 @@ def _pickled(value: Any) -> bytes:
 
 @dataclass(frozen=True)
 class KeptResults:
-    """Results of jobs in a folder, each kept as soon as it is done, for a later call.
-
-    Args:
-        folder: None keeps nothing.
-    """
+    """Results of jobs in a folder, each kept as soon as it is done, for a later call; no folder keeps nothing."""
 
     folder: Path | None
 
     @classmethod
     def in_folder(cls, folder: str | os.PathLike[str] | None) -> KeptResults:
-        """Return what is kept in a folder, which is created if absent."""
+        """Return the results in a folder, which is created if absent."""
         if folder is None:
             return cls(None)
         Path(folder).mkdir(parents=True, exist_ok=True)
@@ -160,10 +145,7 @@ class KeptResults:
     def load(
         self, name: str, source: str, make: Callable[[Mapping[str, Tensor], Sequence[str]], _Found]
     ) -> _Found | None:
-        """Return what is made of the kept tensors and notes of a name; None if there are none from that source.
-
-        A damaged file counts as none.
-        """
+        """Return ``make`` of the kept tensors and notes of a name and source; None if there are none undamaged."""
         if self.folder is None:
             return None
         try:

@@ -22,10 +22,10 @@ class GrowingLimbs:
     """The L limbs of a growing thing in T frames.
 
     Args:
-        curves: (T, L, S, 3), without length where the limb is not there.
+        curves: (T, L, S, 3), without length where the limb does not exist.
         radii: (T, L, S).
         observed: (T, L) True where the frame's own skeleton has the limb.
-        present: (T, L) True where it is there.
+        present: (T, L) True where it exists.
     """
 
     curves: Tensor
@@ -39,15 +39,9 @@ def growing_limbs(
 ) -> GrowingLimbs:
     """Return the limbs of a graph of all organs in all frames.
 
-    What lies between two organs of a frame is cut where other organs grow out of it before or later, at the shares that
-    lengths have in the nearest frame that shows these. A limb that a frame hides is interpolated in time; one that is
-    not there has no length, and lies where it will grow or has grown.
-
-    Args:
-        skeletons: T of them.
-        tracks: their organs.
-        graph: of all K organs.
-        num_samples: S.
+    A path between two organs is cut where others grow out of it in other frames, at the shares of lengths in the
+    nearest frame that shows these. A hidden limb is interpolated in time; one that does not exist has no length, and
+    lies where it will grow or has grown.
     """
     whole = [
         _shown_limbs(skeleton, row, graph, num_samples) for skeleton, row in zip(skeletons, tracks.labels, strict=True)
@@ -118,10 +112,7 @@ def _cut(rows: _ShownLimbs, lengths: Tensor, num_samples: int) -> Tensor:
 
 
 def _over_time(values: Tensor) -> Tensor:
-    """Return values (T, L, ...), of which whole rows are NaN, interpolated in time, and held before and after.
-
-    Rows that are NaN in all frames stay.
-    """
+    """Return values (T, L, ...) with rows of NaN interpolated in time, unless NaN in all frames."""
     filled, numbers = values.clone(), torch.arange(len(values))
     for limb, known in enumerate(~values.flatten(2).isnan().any(-1).mT):
         frames = known.nonzero()[:, 0]

@@ -30,11 +30,7 @@ _NO_TIP = -50.0  # log-odds that no place on tracks makes up for
 def growing_spine(
     surfaces: FrameSurfaces, found: Sequence[FrameSkeleton], times: Tensor | None, num_samples: int,
 ) -> SpineSequence:  # fmt: skip
-    """Return the spine of surfaces that grow, whose skeletons were found.
-
-    Raises:
-        InputError: if fewer than two organs are found.
-    """
+    """Return the spine of growing surfaces with given skeletons, of two organs or more."""
     skeletons = [smooth_rough_limbs(skeleton) for skeleton, _ in found]
     certainties = [_certainty(skeleton.confidence.cpu().double()) for skeleton, _ in found]
     tracks = track_organs(observe_tips(skeletons, [relations for _, relations in found]), certainties)

@@ -19,13 +19,11 @@ Tips = frozenset[int]
 
 @dataclass(frozen=True)
 class LimbGraph:
-    """A tree of limbs with labeled tips, without positions: the G of a spine.
+    """A tree of limbs with labeled tips, without positions: the G of a spine (Buneman 1971).
 
     Args:
         num_tips: K, at least 2; the tips are the nodes 0 to K - 1, the junctions follow.
         splits: one per limb between two junctions; of any two, one contains the other or they share no tip.
-
-    References: Buneman 1971.
     """
 
     num_tips: int
@@ -71,10 +69,6 @@ def junctions_from_splits(splits: Collection[Tips], num_tips: int) -> list[tuple
     """Return the junctions of the tree of compatible splits, each as the sets of tips that its limbs lead to.
 
     The set that holds tip 0 comes first in each junction; the junction next to tip 0 is the first one.
-
-    Args:
-        splits: compatible, each the side without tip 0.
-        num_tips: K, three or more.
     """
     every = frozenset(range(num_tips))
     behind = sorted({every - {0}, *splits}, key=len, reverse=True)
@@ -113,23 +107,13 @@ def path_lengths(skeleton: Skeleton, starts: Tensor) -> Tensor:
 
 
 def tip_nodes(skeleton: Skeleton, labels: Sequence[int]) -> list[int]:
-    """Return the node of each label's tip, -1 for labels without a tip.
-
-    Args:
-        skeleton: the tree.
-        labels: K indices into `Skeleton.tips`, one per label, or -1 for a tip that the skeleton lacks.
-    """
+    """Return the node of each label's tip, -1 for labels without a tip; labels are K indices into `Skeleton.tips`."""
     tips = skeleton.tips.tolist()
     return [tips[index] if index >= 0 else -1 for index in labels]
 
 
 def skeleton_splits(skeleton: Skeleton, labels: Sequence[int]) -> frozenset[Tips]:
-    """Return the splits of the tree that joins the labeled tips; limbs to other tips are left out.
-
-    Args:
-        skeleton: the tree.
-        labels: see `tip_nodes`.
-    """
+    """Return the splits of the tree that joins the labeled tips; limbs to other tips are left out."""
     nodes = {node: label for label, node in enumerate(tip_nodes(skeleton, labels)) if node >= 0}
     present = frozenset(nodes.values())
     root = torch.tensor([next(iter(nodes), 0)])
@@ -153,14 +137,8 @@ def most_frequent_splits(rows: Sequence[frozenset[Tips]]) -> frozenset[Tips]:
 def place_junctions(skeleton: Skeleton, labels: Sequence[int], graph: LimbGraph) -> list[int]:
     """Return the node of the skeleton on which each junction of a graph lies.
 
-    A junction lies where the mean path lengths to the tips behind each of its limbs have the least sum: on a tree that
-    is where no limb holds more than half of all. The answer exists for any tree, also for one with other junctions. Of
-    several equally good nodes it is the middle one.
-
-    Args:
-        skeleton: the tree.
-        labels: see `tip_nodes`; at least one tip must be there.
-        graph: with K tips.
+    It has the least sum of mean path lengths to the tips behind each of the junction's limbs: on a tree, where no limb
+    holds more than half of all. Of several equally good nodes it is the middle one.
     """
     nodes = tip_nodes(skeleton, labels)
     present = [label for label, node in enumerate(nodes) if node >= 0]

@@ -61,18 +61,10 @@ class MeshEdges:
 
 
 def level_sets(mesh: MeshEdges, values: Tensor, spacing: float) -> LevelSets:
-    """Return the rings on which a function, linear on each triangle, is a multiple of ``spacing``.
+    """Return the rings on which a function (V,), linear on each triangle, is a multiple of ``spacing``.
 
-    The paper sorts vertices into bins and takes the mean of a bin's vertices for a node. The rings here are the curves
-    that cut the triangles instead: they do not depend on how the surface is meshed, stay thin where triangles are large
-    and have centers that uneven vertices do not bias.
-
-    Args:
-        mesh: the surface; edges with more than two triangles and any winding are fine.
-        values: (V,) at the vertices, float64, finite.
-        spacing: between levels, positive, in the unit of the values.
-
-    Cost: linear in triangles and in crossings of triangles with levels; 0.15 s for 100,000 vertices and 100 levels.
+    The paper sorts vertices into bins and takes their means as nodes; these rings cut the triangles instead, so they do
+    not depend on the meshing.
 
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1; Verroust and Lazarus 2000.
     """
@@ -81,7 +73,7 @@ def level_sets(mesh: MeshEdges, values: Tensor, spacing: float) -> LevelSets:
     crossings = _Crossings(mesh, bands)
     points, ring = crossings.segments(heights)
     count = int(ring.max()) + 1 if len(ring) else 0
-    # One segment of each ring tells its level and the bands on its two sides.
+    # One segment of each ring gives its level and the bands on its two sides.
     segment = np.zeros(count, dtype=np.int64)
     segment[ring] = np.arange(len(ring))
     face, levels = crossings.face[segment], crossings.level[segment]
@@ -104,8 +96,8 @@ def level_sets(mesh: MeshEdges, values: Tensor, spacing: float) -> LevelSets:
 class _Crossings:
     """The crossings of triangles and edges with levels, all levels at once.
 
-    The bands between levels are made of items: vertices first, then parts of edges between two levels that hold no
-    vertex, then such parts of triangles.
+    Bands are made of items: vertices, then parts of edges between two levels without a vertex, then such parts of
+    triangles.
     """
 
     def __init__(self, mesh: MeshEdges, bands: np.ndarray) -> None:

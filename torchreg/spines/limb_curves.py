@@ -28,12 +28,7 @@ _SMOOTHING = LimbSmoothing()
 
 @dataclass(frozen=True, eq=False)
 class JunctionBall:
-    """The volume of a junction: rings with their center inside belong to it, not to a limb.
-
-    Args:
-        center: (3,).
-        radius: of a ball inside the surface.
-    """
+    """A ball inside the surface: rings with their center in it belong to the junction, not to a limb."""
 
     center: Tensor
     radius: float
@@ -41,13 +36,7 @@ class JunctionBall:
 
 @dataclass(frozen=True, eq=False)
 class Rings:
-    """A stretch of rings, in order.
-
-    Args:
-        centers: (n, 3).
-        covariances: (n, 3, 3).
-        costs: (n,) C of eq. 4 over the largest of all skeletons.
-    """
+    """A stretch of n rings, in order; ``costs`` (n,) are C of eq. 4 over the largest of all skeletons."""
 
     centers: Tensor
     covariances: Tensor
@@ -82,19 +71,10 @@ def largest_cost(trees: Sequence[TipTree]) -> float:
 def best_rings(
     tips: Tips, trees: Sequence[TipTree], start: JunctionBall | None, end: JunctionBall | None, cost: float
 ) -> Rings:
-    """Return the rings of a limb from the tree in which its quality is best, without those of its junctions.
+    """Return the rings of a limb from ``start`` to ``end`` from the tree in which its quality is best (eq. 4 and 5).
 
-    Args:
-        tips: those beyond the limb.
-        trees: one per tip.
-        start: the junction at the end away from ``tips``; None where the limb ends in a tip.
-        end: the junction at their end, or None.
-        cost: the largest C, see `largest_cost`.
-
-    Returns:
-        Rings from ``start`` to ``end``; none if no tree has the limb, or it lies in the balls.
-
-    References: Brostow et al. 2004, eq. 4 and 5.
+    Rings in the balls of its junctions are left out; a limb that ends in a tip has None there. Empty if no tree has the
+    limb. Brostow et al. 2004.
     """
     every = frozenset(range(len(trees)))
     best = Rings(torch.zeros(0, 3).double(), torch.zeros(0, 3, 3).double(), torch.zeros(0).double())
@@ -128,15 +108,9 @@ def _outside(rings: Rings, ball: JunctionBall | None) -> Rings:
 def limb_curve(start: Tensor, rings: Rings, end: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
     """Return a limb as points (n, 3) at equal steps, and frames (n, 3, 3).
 
-    Args:
-        start: (3,) first point.
-        rings: those between.
-        end: (3,) last point.
-        spacing: about the length of a step.
-
     Convention: the columns of a frame are the major and minor axis of the ring across the limb, and, right-handed to
-    them, the direction of the limb; signs are continued along the limb. A round ring has no major axis: axes count by
-    how elongated the rings are, in double angles, and resist rotation, so that they neither jump nor spin.
+    them, the direction of the limb; signs are continued along the limb. Axes count by how elongated the rings are, in
+    double angles, so that they neither jump nor spin.
     """
     points, index = _resampled(torch.cat((start[None], rings.centers, end[None])), spacing)
     points, _ = _resampled(binomial_smoothing(points, _SMOOTHING.passes), spacing)
@@ -158,12 +132,7 @@ def _resampled(points: Tensor, spacing: float) -> tuple[Tensor, Tensor]:
 
 
 def _along_major_axes(frames: Tensor, covariances: Tensor) -> Tensor:
-    """Return frames (n, 3, 3) turned about their third columns so that the first are the major axes of the rings.
-
-    Args:
-        frames: (n, 3, 3).
-        covariances: (n, 3, 3) of the rings.
-    """
+    """Return frames (n, 3, 3) turned about their third columns so that the first are the major axes of the rings."""
     across = frames[..., :2].mT @ covariances @ frames[..., :2]
     # The major axis at angle a is (cos 2a, sin 2a) in double angles, times how much longer it is.
     double = torch.stack((across[:, 0, 0] - across[:, 1, 1], 2 * across[:, 0, 1]), dim=-1)
@@ -176,13 +145,9 @@ def _along_major_axes(frames: Tensor, covariances: Tensor) -> Tensor:
 
 
 def _smooth_angles(angles: Tensor, weights: Tensor) -> Tensor:
-    """Return angles (n,) near given ones, by weight and up to full turns, that change little from one to the next.
+    """Return smooth angles (n,), radians, near given ones by weight and up to full turns.
 
     Newton steps down ``sum w_k (1 - cos(x_k - a_k)) + s sum (x_k+1 - x_k)^2 / 2``, from the unwrapped angles.
-
-    Args:
-        angles: (n,) radians.
-        weights: (n,).
     """
     stiffness = _SMOOTHING.stiffness
     step = torch.remainder(angles[1:] - angles[:-1] + torch.pi, 2 * torch.pi) - torch.pi

@@ -1,4 +1,4 @@
-"""Junctions, tips and curves placed inside a body: what level sets leave beside the middle or outside."""
+"""Junctions, tips and curves placed inside a body, if level sets leave them off the axis or outside."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ class Interior:
     def cap_limb(self, tip: Tensor, rings: Rings) -> tuple[Tensor, Rings]:
         """Return the last point (3,) of a limb and its rings, which start at its tip (3,).
 
-        Rings nearer to the tip than they are wide, by a margin, do not yet go around the limb and are left out. The
-        limb extends straight from the others, to the height of the tip. Where that leads outside, as it may in the bend
-        of a foot, the point is between the tip and the nearest ring whose center is inside.
+        Rings nearer to the tip than they are wide are left out; the limb extends straight from the others to the height
+        of the tip, or, where that leads outside, to a point between the tip and the nearest ring whose center is
+        inside.
         """
         around = ((rings.centers - tip).norm(dim=-1) > _PLACEMENT.min_distance * rings.widths).nonzero()[:, 0]
         if len(around) and around[0] <= _PLACEMENT.max_skipped * len(rings):
@@ -88,13 +88,7 @@ class Interior:
         return points[int(inside.nonzero()[0, 0])] if height > 0 and inside[-1] else None
 
     def keep_inside(self, original: Tensor, points: Tensor, spacing: float) -> Tensor:
-        """Return a curve's points (n, 3) with those that lie outside, as in the bend of a flat foot, moved inside.
-
-        Args:
-            original: (n, 3) before the curve was centered; points that were inside and no longer are go back.
-            points: (n, 3).
-            spacing: between points of the curve.
-        """
+        """Return a curve's points (n, 3) with those outside moved inside; those that centering moved out go back."""
         points = torch.where((self.inside(original) & ~self.inside(points))[:, None], original, points)
         for depth in _PLACEMENT.depths:
             outside = (~self.inside(points)).nonzero()[:, 0]

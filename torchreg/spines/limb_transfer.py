@@ -25,12 +25,7 @@ from torchreg.spines.observed_limbs import FrameLimbs
 
 @dataclass(frozen=True)
 class _Step:
-    """One step of the transfer of limbs to a frame that lacks some.
-
-    Args:
-        frame: the frame.
-        side: -1: from the frame before, 1: from the frame after; 0: between the limbs that came from both sides.
-    """
+    """One step of the transfer of limbs to a frame: side -1 from the frame before, 1 from that after, 0 joins both."""
 
     frame: int
     side: int
@@ -51,16 +46,8 @@ def transfer_missing_limbs(
 ) -> list[FrameLimbs]:
     """Return the frames with all limbs: those that a frame lacks are transferred from the frames around it.
 
-    A limb is transferred from frame to frame: moved with what is observed, and moved inside the body to its own depth.
-    Between two frames that show it, it is transferred from both, and the two are interpolated in time.
-
-    Args:
-        frames: T frames; every limb must be observed in one of them.
-        graph: their graph.
-        meshes: the surfaces of the frames, of which few are held at a time.
-        workers: see `do_jobs`. The two sides of a stretch of frames that lack limbs are worked on in parallel, and all
-            stretches.
-        progress: a folder in which every step is kept as soon as it is done, see `KeptResults`.
+    A limb moves with the observed ones, and then inside the body to its own depth; between two frames that show it,
+    both transfers are interpolated in time. The sides of a gap, and all gaps, are worked on in parallel.
     """
     chains = _Chains(frames, graph, meshes, KeptResults.in_folder(progress))
     do_jobs(chains.next_job, len(chains.missing), 1 if meshes[0].vertices.is_cuda else workers)
@@ -158,13 +145,7 @@ def _from_tensors(like: FrameLimbs, tensors: Mapping[str, Tensor], _: Sequence[s
 
 @dataclass(frozen=True, eq=False)
 class _Target:
-    """A frame whose limbs are completed.
-
-    Args:
-        frame: with the limbs that it shows.
-        graph: of the limbs.
-        mesh: its surface.
-    """
+    """A frame whose limbs are completed, with the limbs that it shows and its surface."""
 
     frame: FrameLimbs
     graph: LimbGraph
@@ -176,17 +157,8 @@ def complete_from_prior(
 ) -> list[FrameLimbs]:
     """Return the frames; if none shows all limbs, the one that shows most gets the others from a prior skeleton.
 
-    The prior's limbs are moved rigidly with those that are shown, and then inside.
-
-    Args:
-        frames: T frames.
-        graph: their graph.
-        meshes: the surfaces of the frames.
-        prior: all limbs, of the size of the frames.
-        reference: of several frames that show most, the nearest to it is taken.
-
-    Raises:
-        InputError: if no frame shows a limb.
+    The prior's limbs are moved rigidly with those that are shown, and then inside. Of several such frames the nearest
+    to ``reference`` is taken.
     """
     if any(bool(frame.observed.all()) for frame in frames):
         return list(frames)
@@ -239,7 +211,7 @@ def _known_nodes(frame: FrameLimbs, graph: LimbGraph, limb_nodes: Tensor) -> Ten
 
 
 def _reliable_nodes(frame: FrameLimbs, graph: LimbGraph) -> Tensor:
-    """Return which nodes (N,) have a known position: observed tips, and junctions in which an observed limb ends."""
+    """Return a mask (N,) of nodes with known positions: observed tips, and ends of observed limbs."""
     reliable = frame.node_observed.clone()
     touched = torch.zeros_like(reliable)
     touched[graph.edges[frame.observed].reshape(-1)] = True
@@ -282,8 +254,8 @@ def _joined_limbs(limbs: FrameLimbs, target: _Target) -> FrameLimbs:
 def transported_frames(curves: Tensor, reference: int) -> Tensor:
     """Return frames ``R_world_curve`` (T, L, S, 3, 3) along curves (T, L, S, 3), transported through time.
 
-    In the reference frame they do not twist along the limbs; from there each frame's rotate with the whole body, and
-    then by the smallest angle into the new direction of the limb.
+    They do not twist along the limbs in the reference frame; others rotate with the body and then by the smallest
+    angle.
     """
     frames: dict[int, Tensor] = {reference: curve_frames(curves[reference])}
     for order in (range(reference + 1, len(curves)), range(reference - 1, -1, -1)):

@@ -30,12 +30,7 @@ LOCAL_FITS = LocalFits()
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
-    """Points on a surface.
-
-    Args:
-        points: (V, 3).
-        normals: (V, 3) unit normals.
-    """
+    """Points (V, 3) on a surface and their unit normals."""
 
     points: Tensor
     normals: Tensor
@@ -52,21 +47,9 @@ def transfer_nodes(
 ) -> Tensor:
     """Return the positions (N, 3) of a skeleton's nodes after the surface around them moved from source to target.
 
-    Each surface point x_i belongs to the node n(i) whose ball it is nearest to. Node p moves rigidly with what belongs
-    to the nodes near it: ``T_p = argmin sum_i w_i(p) |T x_i - y_i|^2``, ``w_i(p) = exp(-d(p, n(i))^2 / 2 width^2)``,
-    where y_i is the target point nearest to ``T_n(i) x_i``, if their normals agree. Distances d are path lengths along
-    the skeleton: an arm does not move with what it only touches. Known nodes are fitted, but not held.
-
-    Args:
-        nodes: (N, 3) before.
-        radii: (N,) of the balls around them.
-        path_lengths: (N, N) along the skeleton.
-        source: the surface before.
-        target: the surface after; unrelated to ``source``.
-        known: (N, 3) positions of the nodes after, NaN where they are unknown.
-        fits: see `LocalFits`.
-
-    Cost: 0.3 s for 150 nodes and 1,000 surface points on one CPU core.
+    Surface point x_i belongs to the node n(i) whose ball is nearest. ``T_p = argmin sum_i w_i(p) |T x_i - y_i|^2``,
+    ``w_i(p) = exp(-d(p, n(i))^2 / 2 width^2)``, with path lengths d along the skeleton and y_i the target point nearest
+    to ``T_n(i) x_i``, if normals agree. Known nodes (N, 3), NaN where unknown, are fitted, but not held.
 
     References: Besl and McKay 1992; Sumner, Schmid and Pauly 2007 for deformations held by nodes.
     """
@@ -91,10 +74,7 @@ def transfer_nodes(
 def _correspondences(
     source: SurfacePoints, target: SurfacePoints, tree: NeighborTree, motions: Tensor, min_cosine: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the target points (V, 3) nearest to source points under motions (V, 4, 4), and whether normals agree.
-
-    The tree is that of the target's points.
-    """
+    """Return the target points (V, 3) nearest to source points under motions, and whether normals agree."""
     moved = transform_points(motions, source.points.unsqueeze(1)).squeeze(1)
     normals = (motions[:, :3, :3] @ source.normals.unsqueeze(-1)).squeeze(-1)
     index, _ = tree.nearest(moved)

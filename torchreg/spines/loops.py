@@ -29,10 +29,9 @@ _CUTTING = LoopCutting()
 
 @dataclass(frozen=True, eq=False)
 class OpenedLoops:
-    """A surface whose long loops are cut.
+    """A surface whose long loops are cut, closed again at the C cuts.
 
     Args:
-        mesh: the surface, closed again at the cuts.
         stumps: (C, 2, 3) centers of the two ends of each cut.
         radii: (C,) half the length of the rim of each cut.
     """
@@ -47,11 +46,7 @@ class OpenedLoops:
         return cls(mesh, torch.zeros(0, 2, 3, dtype=torch.float64), torch.zeros(0, dtype=torch.float64))
 
     def keep_tips(self, protrusions: Protrusions) -> list[int]:
-        """Return the numbers of the protrusions that are tips: not the lower end of a cut whose other end is a tip.
-
-        Args:
-            protrusions: of `mesh`.
-        """
+        """Return the protrusions that are tips: not the lower end of a cut whose other end is a tip."""
         positions, keep = self.mesh.vertices[protrusions.tips], list(range(len(protrusions.tips)))
         for ends, radius in zip(self.stumps, self.radii, strict=True):
             near = torch.cdist(ends, positions) <= radius
@@ -63,20 +58,10 @@ class OpenedLoops:
 
 
 def open_loops(mesh: TriangleMesh, min_length: float, num_levels: int) -> OpenedLoops:
-    """Return a closed surface with every long loop cut through at its thinnest ring, and the ends closed.
+    """Return a closed surface with every long loop cut at its thinnest ring, and the ends closed (Wood et al. 2004).
 
-    A hand on the hip makes a loop of arm and trunk, which as a tree is cut best where the hand touches: a contact is
-    thinner than what leads to it. Loops are those of the level sets of the distance from a far vertex. A ring cut
-    into two limbs has two tips.
-
-    Args:
-        mesh: closed, in one piece, float64 on the CPU.
-        min_length: of a loop, as a share of the largest distance from the far vertex; shorter loops stay.
-        num_levels: level sets in that distance.
-
-    Cost: one source and one set of level sets, and again for each cut; nothing for a surface without handles.
-
-    References: Wood, Hoppe, Desbrun and Schroeder 2004, loops from level sets and cuts at short ones.
+    Loops are those of level sets of the distance from a far vertex, and ``min_length`` a share of its maximum. A
+    contact, as of a hand on the hip, is thinner than what leads to it; a ring cut into two limbs has two tips.
     """
     opened = OpenedLoops.from_uncut(mesh)
     for _ in range(_CUTTING.max_cuts):

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchreg.io.pose_table import save_pose_table
 from torchreg.spines.curves import curve_lengths
 
-# Of a limb, from a junction: its direction there, which the nodes at the junction itself do not tell.
+# Of a limb, from a junction: its direction there, which the nodes at the junction itself do not give.
 _ROOT_SHARE = 1 / 3
 
 
@@ -57,10 +57,7 @@ class SpineMeasurements:
 
 
 def measure_limbs(curves: Tensor, radii: Tensor, graph: Tensor, times: Tensor) -> SpineMeasurements:
-    """Return the measurements of curves (T, L, S, 3) with radii (T, L, S) of a graph (L, 2) at times (T,).
-
-    Differentiable: in curves and radii.
-    """
+    """Return the measurements of curves (T, L, S, 3) with radii of a graph (L, 2) at times (T,)."""
     edges = graph.tolist()
     pairs = torch.tensor(
         [(a, b) for a, b in combinations(range(len(edges)), 2) if set(edges[a]) & set(edges[b])], dtype=torch.int64

@@ -50,27 +50,16 @@ class TipNames:
 def name_over_time(
     frames: Sequence[TipObservations], reference: int, names: Tensor, workers: int | None = 1
 ) -> TipNames:
-    """Return the names of all frames, given those (K,) of one.
+    """Return the names of all frames, given those (K,) of one: the most probable of several searches.
 
-    The chain of names and the model of what stays the same under them are improved in turn, from a creature that
-    moves little, one that moves much between frames, and one of which nothing but its motion tells; the most probable
-    of the results is the answer.
-
-    Args:
-        frames: T of them.
-        reference: number of the frame whose names are known.
-        names: (K,) index of each name's tip there, -1 for none.
-        workers: processes for the different starts, see `do_jobs`.
-
-    Cost: 0.05 s a frame of six tips, on one CPU core.
-
-    References: Viterbi 1967; Rabiner 1989 for the probabilities of single states.
+    Names (Viterbi 1967; Rabiner 1989 for the probabilities of single states) and the model of what stays the same under
+    them are improved in turn, from small motion, from large motion, and from motion alone.
     """
     unknown: list[Tensor | None] = [None] * len(frames)
     model = NameModel.from_frame(frames, reference, names)
     # Without features a mirror changes nothing: of the last start this is the first round.
     by_motion = _Round(frames, reference, names, model.starting(*SEARCH.starts[-1]), unknown)
-    # What names do not tell, as motion where no two frames share a tip, is that of the first start.
+    # What names do not determine, as motion where no two frames share a tip, is that of the first start.
     model = model.mirrored(frames, by_motion.labels).starting(*SEARCH.starts[0])
     found = {len(SEARCH.starts) - 1: by_motion}
     jobs = (
@@ -104,17 +93,10 @@ def name_over_time(
 
 
 class _Round:
-    """One search for the names, with a model that does not change.
+    """One search for the names with a fixed model, near ``chosen`` names (K,) of each frame if there are any.
 
-    Args:
-        frames, reference, names: see `name_over_time`.
-        model: of the names.
-        chosen: (K,) names of each frame that were found before, or None.
-
-    Attributes:
-        labels: (T, K) the most probable names.
-        score: their log-probability, up to a constant.
-        confidence: (T, K) the probability of each.
+    Attributes: labels (T, K), the most probable names, their log-probability up to a constant, and the probability of
+    each.
     """
 
     def __init__(

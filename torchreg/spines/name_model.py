@@ -18,7 +18,7 @@ from torchreg.spines.tip_features import SAMPLING, TipFeatures, TipObservations
 
 @dataclass(frozen=True)
 class NamingPriors:
-    """What is assumed of names before any frame is seen; lengths in sizes of the body."""
+    """Assumptions on names before any frame; lengths in sizes of the body."""
 
     missing: float = -1.0  # log-probability of a tip that a frame lacks, against one that it shows
     independent_points: float = 2.0  # of a limb: the others move with these
@@ -35,13 +35,7 @@ PRIORS = NamingPriors()
 
 
 def relative_maps(before: Tensor, after: Tensor, num_tips: int) -> Tensor:
-    """Return the tips (A, B, M) of a frame that M tips of the one before become, -1 for none.
-
-    Args:
-        before: (A, K) tips of the names in the frame before, -1 for none.
-        after: (B, K) in the frame after.
-        num_tips: M, in the frame before.
-    """
+    """Return the tips (A, B, M) that M tips of the frame before become under names (A, K) and (B, K), -1 for none."""
     shape = (len(before), len(after), before.shape[1])
     tips = torch.full((*shape[:2], num_tips + 1), -1)
     where = torch.where(before >= 0, before, num_tips)[:, None].expand(shape)
@@ -53,9 +47,8 @@ class NameModel:
     """The probability of all frames' names: a chain.
 
     A frame's features are those of the frame before, and as far as they do not correlate, those of a mean frame; both
-    up to multivariate t-distributed errors. The points of each limb stay where they were, or move rigidly with the
-    whole body, up to t-distributed displacements. Tips without a name, and features and places under wrong names, are
-    background.
+    up to multivariate t-distributed errors. The points of each limb stay, or move rigidly with the whole body, up to
+    t-distributed displacements. Tips without a name, and features and positions under wrong names, are background.
 
     Args:
         features: that are compared.
@@ -64,13 +57,12 @@ class NameModel:
         background_mean: (n,) under random names.
         background: density of features under random names.
         correlation: (G,) of errors between two frames, of each group of features.
-        usual: (K (K - 1) / 2,) distances between named tips.
+        usual: (K (K - 1) / 2,) median distances between named tips.
         displacement: (S,) scale of the displacements of a limb's points.
         turn: mean of 1 - cos of the body's rotation between two frames.
         log_volume: of the space that limbs move in.
         weight: of features against motion: one, but before anything is known of them.
-        mirror: in which the body looks like itself, if it is symmetric. What tells a limb from its mirror image is then
-            its pose, and may be the other way around in other frames.
+        mirror: symmetry of the body, if it has one; a limb and its mirror image then differ by the pose alone.
     """
 
     features: TipFeatures
@@ -113,12 +105,7 @@ class NameModel:
         return replace(self, displacement=torch.full_like(self.displacement, displacement), weight=weight)
 
     def mirrored(self, frames: Sequence[TipObservations], names: Tensor) -> NameModel:
-        """Return the model of a symmetric body, if frames show that it is one; itself if not.
-
-        Args:
-            frames: T of them.
-            names: (T, K), see `find_mirror`.
-        """
+        """Return the model of a symmetric body, if frames show that it is one; itself if not."""
         mirror = find_mirror(self.features, self.background, frames, names)
         if mirror is None:
             return self
@@ -165,7 +152,7 @@ class NameModel:
         return self.background(torch.where(self.mean.isnan(), torch.nan, features) - self.background_mean)
 
     def motion_scores(self, before: TipObservations, after: TipObservations, tips: Tensor) -> Tensor:
-        """Return those (P,) of the limbs' places, for tips (P, M) that those of the frame before become, -1 for none.
+        """Return log-probabilities (P,) of limb positions for tips (P, M) that those before become, -1 for none.
 
         The rigid motion of the body is fitted to each mapping, see `rank_mappings`.
         """
@@ -178,13 +165,7 @@ class NameModel:
         return scores - 1.5 * (turn / self.turn + math.log(self.turn))  # of three angles, each with the same spread
 
     def _moved(self, source: Tensor, target: Tensor, found: Tensor) -> tuple[Tensor, Tensor]:
-        """Return squared distances (P, M, S) from target points to rigidly moved ones, and 1 - cos of the turns (P,).
-
-        Args:
-            source: (M, S, 3).
-            target: (P, M, S, 3).
-            found: (P, M) one where they belong together, else zero.
-        """
+        """Return squared distances (P, M, S) from targets to rigidly moved points, and 1 - cos of the rotations."""
         weights = found.unsqueeze(-1) / self.displacement.square()
         total = weights.sum((1, 2)).clamp_min(1e-12)[:, None]
         start = source - (torch.einsum("pks,ksi->pi", weights, source) / total)[:, None, None]

@@ -50,10 +50,7 @@ class FrameLimbs:
 
 
 def smooth_rough_limbs(skeleton: Skeleton) -> Skeleton:
-    """Return the skeleton with limbs that zigzag, as in a surface full of noise, smoothed; tips keep their order.
-
-    A limb zigzags if it is much longer than its moving average.
-    """
+    """Return the skeleton with limbs smoothed that are much longer than their moving average; tips keep their order."""
     rows, rough = [], False
     for limb in skeleton.limbs:
         nodes, radii = skeleton.nodes[limb], skeleton.radii[limb]
@@ -67,16 +64,10 @@ def smooth_rough_limbs(skeleton: Skeleton) -> Skeleton:
 
 
 def observe_limbs(skeleton: Skeleton, labels: Sequence[int], graph: LimbGraph, num_samples: int) -> FrameLimbs:
-    """Return the limbs of a graph that a frame's skeleton has.
+    """Return the limbs of a graph, as curves of S points, that a frame's skeleton has.
 
-    A junction is observed if tips behind three of its limbs are; a limb is the path along the tree between two observed
-    nodes, unless it has much of its path in common with another.
-
-    Args:
-        skeleton: the tree.
-        labels: K indices into `Skeleton.tips`, -1 for a tip that was not found.
-        graph: with K tips.
-        num_samples: S points per limb.
+    A junction is observed if tips behind three of its limbs are; a limb is the path between two observed nodes, unless
+    it has much of its path in common with another.
     """
     nodes, node_radii = skeleton.nodes.detach().cpu().double(), skeleton.radii.detach().cpu().double()
     index = _graph_nodes(skeleton, labels, graph)
@@ -111,7 +102,7 @@ def _graph_nodes(skeleton: Skeleton, labels: Sequence[int], graph: LimbGraph) ->
 
 
 def _overlapping(nodes: Tensor, paths: list[list[int]]) -> Tensor:
-    """Return which paths (L,) along a tree of nodes (N, 3) have much in common with another."""
+    """Return a mask (L,) of the paths along a tree of nodes (N, 3) that have much in common with another."""
     steps = [{(min(pair), max(pair)) for pair in pairwise(path)} for path in paths]
     overlapping = torch.zeros(len(paths), dtype=torch.bool)
 
@@ -133,14 +124,7 @@ def median_lengths(frames: Sequence[FrameLimbs]) -> Tensor:
 
 
 def reject_odd_lengths(frame: FrameLimbs, median: Tensor, graph: LimbGraph, *, touching: bool) -> FrameLimbs:
-    """Return the frame without the limbs, and the tips of these, whose length is far from the median.
-
-    Args:
-        frame: what its own skeleton shows.
-        median: (L,) lengths.
-        graph: of the limbs.
-        touching: whether limbs touched, see `LimbLimits`.
-    """
+    """Return the frame without limbs, and their tips, whose length is far from the median (L,)."""
     ratio = curve_lengths(frame.curves) / median
     least, most = _LIMITS.length_range_touching if touching else _LIMITS.length_range
     odd = frame.observed & ((ratio < least) | (ratio > most))

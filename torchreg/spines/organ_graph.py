@@ -19,11 +19,7 @@ ShownTree = tuple[Tips, frozenset[Tips]]
 
 @dataclass(frozen=True)
 class _Tree:
-    """A tree whose leaves are organs, 0, 1, ..., and whose other nodes are negative.
-
-    Args:
-        edges: pairs of nodes.
-    """
+    """A tree whose leaves are organs, 0, 1, ..., and whose other nodes are negative."""
 
     edges: tuple[tuple[int, int], ...]
 
@@ -83,15 +79,10 @@ def shown_tree(skeleton: Skeleton, labels: Sequence[int]) -> ShownTree:
 
 
 def common_graph(shown: Sequence[ShownTree], num_organs: int) -> LimbGraph:
-    """Return the tree of all K organs, two or more.
+    """Return the tree of all K organs, two or more, from the trees of T frames.
 
-    It begins as the most frequent tree of the largest number of organs that are ever shown together. The others are
-    added one by one, those shown with most others first, each where the trees that show it agree with most: by the
-    number of splits that two trees do not share (Robinson and Foulds 1981), over the organs of each frame.
-
-    Args:
-        shown: the trees of T frames.
-        num_organs: K; each is shown in a frame.
+    It begins as the most frequent tree of the largest number of organs shown together; others are added, those shown
+    with most first, at the position of least Robinson-Foulds distance (1981) over the organs of each frame.
     """
     counts = Counter(shown)
     most = max(counts, key=lambda row: (len(row[0]), counts[row], sorted(row[0])))[0]
@@ -122,24 +113,14 @@ def _best_tree(tree: _Tree, organ: int, counts: dict[ShownTree, int], present: s
 
 @dataclass(frozen=True)
 class LimbChain:
-    """A limb between shown organs, which is a chain of limbs of the tree of all.
-
-    Args:
-        limbs: their numbers, in the direction of the chain.
-        forward: whether each runs in this direction.
-    """
+    """A limb between shown organs as a chain of limbs of the tree of all; ``forward``: whether each runs along it."""
 
     limbs: tuple[int, ...]
     forward: tuple[bool, ...]
 
 
 def shown_graph(graph: LimbGraph, organs: Tips) -> tuple[LimbGraph, list[LimbChain]]:
-    """Return the graph of some organs, numbered from 0 in their order, and what chain each of its limbs is.
-
-    Args:
-        graph: of all K organs.
-        organs: two or more of them.
-    """
+    """Return the graph of some organs, two or more, numbered in their order, and the chain of each of its limbs."""
     order, every = sorted(organs), frozenset(range(graph.num_tips))
     starts = _start_sides(graph)
     number = {organ: rank for rank, organ in enumerate(order)}
@@ -170,7 +151,7 @@ def _start_sides(graph: LimbGraph) -> list[Tips]:
 
 
 def limbs_between(graph: LimbGraph, alive: Tensor) -> Tensor:
-    """Return which limbs (T, L) join organs that are there, (T, K)."""
+    """Return a mask (T, L) of the limbs that join existing organs (T, K)."""
     sides = torch.zeros(len(graph.edges), graph.num_tips, dtype=torch.bool)
     for limb, side in enumerate(_start_sides(graph)):
         sides[limb, list(side)] = True

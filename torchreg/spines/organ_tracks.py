@@ -23,15 +23,15 @@ class OrganLife:
 
     birth: float = -1.0  # an organ appears, rather than a bump of the surface
     end: float = -1.5  # an organ ends
-    hidden: float = -0.75  # an organ that lasts is not seen
+    hidden: float = -0.75  # an organ that lasts is not observed
     max_hidden: int = 3  # frames in a row
     max_certainty: float = 1.5  # of a single tip: log-odds that it is no bump
     starts: tuple[float, ...] = (0.04, 0.15)  # scales of displacements with which searches start, in sizes of the body
     num_rounds: int = 6  # of the best tracks and new scales, at most
     dof: float = 8.0  # of displacements: what grows does not jump
-    inner: int = 2  # sample of a limb that tells, from its tip, where it points
-    num_body: int = 3  # organs that tell how the whole body moved
-    num_salient: int = 4  # surest tips of a frame, of which two tell how the body may have moved at first
+    inner: int = 2  # sample of a limb that gives, from its tip, its direction
+    num_body: int = 3  # organs that determine the motion of the whole body
+    num_salient: int = 4  # surest tips of a frame, of which two give candidates for the first motion of the body
 
 
 LIFE = OrganLife()
@@ -56,36 +56,24 @@ class OrganTracks:
 
     @property
     def alive(self) -> Tensor:
-        """Which organs are there (T, K), seen or hidden."""
+        """Return a mask (T, K) of the organs that exist, observed or hidden."""
         numbers = torch.arange(len(self.labels))[:, None]
         return (numbers >= self.births) & (numbers <= self.ends)
 
 
 def track_organs(frames: Sequence[TipObservations], certainties: Sequence[Tensor]) -> OrganTracks:
-    """Return the organs of all frames.
+    """Return the organs of all frames, from log-odds (M,) of each frame that a tip is no bump of the surface.
 
-    Each organ is a chain of states: not there, there, hidden, ended. Tips are organs or bumps by their own certainty.
-    One becomes another by t-distributed changes of its place and of its direction, as they are or moved with the whole
-    body, against ones drawn evenly. The most probable set of all organs is found at once, then the scales of the
-    changes, in turn.
-
-    Args:
-        frames: T of them.
-        certainties: (M,) of each frame: log-odds that a tip is no bump of the surface.
-
-    References: Zhang, Li and Nevatia 2008, tracks as one problem of optimization.
+    Each organ is a chain of states: unborn, observed, hidden, ended. Links have t-distributed changes of position and
+    direction, with or without the motion of the whole body, against uniform ones. The most probable set of tracks
+    (Zhang, Li and Nevatia 2008) and the scales of the changes are estimated in turn.
     """
     searches = [_Search(frames, certainties, start) for start in LIFE.starts]
     return max(searches, key=lambda search: search.score).tracks()
 
 
 class _Search:
-    """One search for the tracks of N tips.
-
-    Args:
-        frames, certainties: see `track_organs`.
-        displacement: scale of displacements at first.
-    """
+    """One search for the tracks of N tips, with a scale of displacements at first."""
 
     def __init__(self, frames: Sequence[TipObservations], certainties: Sequence[Tensor], displacement: float) -> None:
         # (N, 2, 3): where each limb ends, and a point before that.
@@ -139,10 +127,10 @@ class _Search:
         return torch.stack([(_steps(target) - _steps(rows)).square().sum(-1) for rows in ways])
 
     def _first_motion(self, before: Tensor, after: Tensor) -> Tensor:
-        """Return how the body moves (4, 4) between two frames with such tips (n,) and (m,), if any limb may be any.
+        """Return the motion (4, 4) of the body between two frames with tips (n,) and (m,) of unknown names.
 
-        Of the motions that take two of the surest tips to two others, and of none, it is the one that takes all tips
-        nearest to some, and turns little.
+        Of the motions that take two of the surest tips to two others, and of none, it brings all tips nearest, by a
+        small rotation.
         """
         salient = [tips[self.graph.real[tips].argsort(descending=True, stable=True)[: LIFE.num_salient]]
                    for tips in (before, after)]  # fmt: skip
@@ -190,7 +178,7 @@ class _Search:
 
 
 def _body_motion(source: Tensor, target: Tensor, used: Tensor, first: Tensor) -> Tensor:
-    """Return how the body moves (4, 4) between two frames whose links (n,) are used or not; else as at first."""
+    """Return the motion (4, 4) of the body between two frames by the used links (n,), or the first guess."""
     return fit_rigid(source[used, 0], target[used, 0]) if int(used.sum()) >= LIFE.num_body else first
 
 

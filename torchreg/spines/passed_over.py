@@ -1,4 +1,4 @@
-"""Frames that do not fit a sequence: of another unit, an error, or with another body, passed over."""
+"""Outlier frames of a sequence: of another unit, with an error, or with another body."""
 
 from __future__ import annotations
 
@@ -30,15 +30,10 @@ _LIMITS = SizeLimits()
 
 
 def check_sizes(samples: Sequence[Tensor], *, growing: bool) -> None:
-    """Raise InputError if a frame is far larger or smaller than most, or of what grows, than the one before it.
-
-    Args:
-        samples: some vertices of every frame.
-        growing: whether the frames show what grows.
-    """
+    """Raise InputError if a frame differs far in size from most, or, growing, from the one before it."""
     sizes = torch.stack([_size(points) for points in samples])
     usual = torch.cat((sizes[:1], sizes[:-1])) if growing else sizes.median().expand_as(sizes)
-    ratios = torch.where((sizes > 0) & (usual > 0), (sizes / usual).log().abs().exp(), 1.0)  # points: told elsewhere
+    ratios = torch.where((sizes > 0) & (usual > 0), (sizes / usual).log().abs().exp(), 1.0)  # points: checked elsewhere
     frame = int(ratios.argmax())
     if float(ratios[frame]) > _LIMITS.most:
         than = "the frame before it" if growing else "most frames"
@@ -67,13 +62,9 @@ def frames_to_pass_over(skeletons: Sequence[Skeleton]) -> list[int]:
 def with_frames_between(
     spine: SpineSequence, kept: Sequence[int], times: Tensor, passed: Mapping[int, Skeleton]
 ) -> SpineSequence:
-    """Return the spine with the frames that were passed over: interpolated in time, at the ends as the nearest one.
+    """Return the spine with the outlier frames, interpolated in time, at the ends as the nearest one.
 
-    Args:
-        spine: of the frames that were kept.
-        kept: their numbers.
-        times: (T,) of all frames.
-        passed: the skeletons of the frames that were not, by number.
+    ``kept`` are the numbers of the spine's frames, ``passed`` the skeletons of the others.
     """
     count = len(kept) + len(passed)
     within = times.clamp(spine.times[0], spine.times[-1])

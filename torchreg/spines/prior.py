@@ -18,22 +18,13 @@ from torchreg.spines.tip_tracking import most_frequent_count
 
 @dataclass(frozen=True, eq=False)
 class PriorSkeleton:
-    """A skeleton whose limbs and names the frames of a sequence get.
-
-    Args:
-        skeleton: float64, on the CPU; its k-th tip gives the name k.
-    """
+    """A skeleton whose limbs and names the frames of a sequence get; its k-th tip gives the name k."""
 
     skeleton: Skeleton
 
     @classmethod
     def from_given(cls, prior: Skeleton | SpineSequence, num_tips: int | None) -> PriorSkeleton:
-        """Return the prior that a user gave; of a spine, its reference frame.
-
-        Raises:
-            InputError: if it has fewer than two tips or no extent, or not the ``num_tips`` that are asked for.
-            InputTypeError: if it is neither a skeleton nor a spine.
-        """
+        """Return the prior that a user gave; of a spine, its reference frame."""
         if isinstance(prior, SpineSequence):
             prior = prior.model.skeleton(float(prior.times[prior.reference]))
         if not isinstance(prior, Skeleton):
@@ -64,9 +55,6 @@ class PriorSkeleton:
         """Return the prior scaled to the frames with the number of tips nearest to its own.
 
         Sizes are compared by the mean path from tip to tip, which neither bending nor a lost limb changes much.
-
-        Raises:
-            InputError: if most frames show more tips, and no ``num_tips`` says that these are to be left out.
         """
         counts = [len(skeleton.tips) for skeleton in skeletons]
         usual = most_frequent_count(counts)

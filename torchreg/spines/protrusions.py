@@ -17,8 +17,8 @@ class Protrusions:
 
     Args:
         tips: (K,) nodes of the graph.
-        heights: (K,) persistence of each maximum: its value less that of the highest pass to a higher maximum, or for
-            the highest one less the least value; in the unit of the function.
+        heights: (K,) persistence of each maximum, in the unit of the function; for the highest one its value less the
+            least.
         confidence: (K,) from 0.5 for a tip of just the least height towards 1.
     """
 
@@ -30,15 +30,7 @@ class Protrusions:
 def average_geodesic_distance(graph: Graph, areas: Tensor, num_base: int) -> tuple[Tensor, float]:
     """Return the average geodesic distances (V,) of all nodes to the surface, and the largest from a base point.
 
-    Base points are farthest-point samples, and count by the area of the nodes nearest to them, so that neither uneven
-    vertices nor the choice of base points shows.
-
-    Args:
-        graph: of a surface in one piece.
-        areas: (V,) of surface around each node, not all zero.
-        num_base: number of base points.
-
-    Cost: that of ``num_base`` sources.
+    Base points are farthest-point samples, weighted by the area (V,) of the nodes nearest to them.
 
     References: Hilaga et al. 2001; Brostow et al. 2004, section 4.1.
     """
@@ -55,15 +47,8 @@ def average_geodesic_distance(graph: Graph, areas: Tensor, num_base: int) -> tup
 def find_protrusions(graph: Graph, values: Tensor, least_height: float) -> Protrusions:
     """Return the local maxima of a function whose persistence exceeds a height, and at least the highest one.
 
-    A maximum's persistence is the least fall on a path to a higher one. Noise of some amplitude makes maxima of no more
-    than twice that persistence, however many there are, so a threshold separates them.
-
-    Args:
-        graph: in one piece.
-        values: (V,) at the nodes, float64.
-        least_height: above 0, in the unit of the values.
-
-    References: Edelsbrunner, Letscher and Zomorodian 2002.
+    Persistence is the least fall on a path to a higher maximum (Edelsbrunner, Letscher and Zomorodian 2002); noise
+    makes maxima of no more than twice its amplitude.
     """
     edges = graph.edges()[0].numpy()
     peaks, basin = _basins(edges, values.numpy())

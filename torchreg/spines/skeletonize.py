@@ -149,13 +149,7 @@ def skeletonize_surface(mesh: TriangleMesh, config: SkeletonizeConfig | None = N
 
 @dataclass(frozen=True, eq=False)
 class _Body:
-    """A closed surface in one piece, float64 on the CPU, without long loops.
-
-    Args:
-        opened: the surface, and where its loops were cut.
-        bridges: (B, 2) vertices at which pieces were joined.
-        notes: for the skeleton.
-    """
+    """A closed surface in one piece, float64 on the CPU, with long loops cut; ``bridges`` (B, 2) join its pieces."""
 
     opened: OpenedLoops
     bridges: Tensor
@@ -190,10 +184,10 @@ def _prepared(mesh: TriangleMesh, config: SkeletonizeConfig) -> _Body:
 
 @dataclass(frozen=True, eq=False)
 class _SurfaceTips:
-    """The tips of a body.
+    """The K tips of a body, two or more.
 
     Args:
-        positions: (K, 3), at least two.
+        positions: (K, 3).
         vertices: (K,) of the surface.
         confidence: (K,).
         distances: (K, V) geodesic distances from them.
@@ -258,13 +252,7 @@ def _grow_trees(
 
 @dataclass(frozen=True, eq=False)
 class _Limb:
-    """A limb between two nodes, of which the tips come first, then the junctions.
-
-    Args:
-        points: (n, 3).
-        frames: (n, 3, 3).
-        ends: numbers of its first and last node.
-    """
+    """A limb, points (n, 3) and frames, between two nodes, of which the tips are numbered first, then the junctions."""
 
     points: Tensor
     frames: Tensor
@@ -278,10 +266,7 @@ def _best_limbs(
     interior: Interior | None,
     tips: _SurfaceTips,
 ) -> list[_Limb]:
-    """Return every limb as a curve through the rings of the tree in which they are best.
-
-    Its ends are moved inside the body, if there is an interior.
-    """
+    """Return every limb as a curve through its best tree's rings, with ends inside the body if interior is given."""
 
     def cap(tip: int, rings: Rings) -> tuple[Tensor, Rings]:
         position = tips.positions[tip]
@@ -330,10 +315,7 @@ def _centered_limbs(limbs: Sequence[_Limb], mesh: TriangleMesh, interior: Interi
 def _assembled(
     limbs: Sequence[_Limb], interior: Interior, tips: _SurfaceTips, like: Tensor
 ) -> tuple[Skeleton, TipRelations]:
-    """Return the skeleton of limbs that share their end nodes, in the dtype and device of ``like``.
-
-    With it come the relations of its tips.
-    """
+    """Return the skeleton of limbs that share end nodes, and the relations of its tips, in the dtype of ``like``."""
     rows = [(limb.points, interior.clearance(limb.points), limb.frames) for limb in limbs]
     skeleton = build_skeleton(rows, [limb.ends for limb in limbs], tips.notes)
     # Tips are nodes in the order in which limbs name them first.

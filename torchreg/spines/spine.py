@@ -193,10 +193,7 @@ class Spine(nn.Module):
         return torch.cat((slopes[:1], inner, slopes[-1:]))
 
     def _interval(self, t: float | Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return per time the frame before it, its position between this and the next from 0 to 1, and their distance.
-
-        The distance is in the unit of the times.
-        """
+        """Return per time the frame before it, its share of the interval to the next, and its length in time."""
         # Python's numbers would lose digits on the way through torch's default dtype.
         t = self.times.new_tensor(t) if isinstance(t, (int, float)) else t
         time = as_float_tensor(t, "t", like=self.times)

@@ -30,24 +30,14 @@ def t_log_density(squares: Tensor, scale: Tensor, size: int, dof: float = TAILS.
 
 @dataclass(frozen=True, eq=False)
 class FeatureGroup:
-    """Features that are wrong together.
-
-    Args:
-        index: (n,) columns.
-        rank: of their space, at most n.
-    """
+    """Features whose errors go together, columns ``index`` (n,), and the rank of their space, at most n."""
 
     index: Tensor
     rank: int
 
 
 class GroupedDensity:
-    """A t-density of zero mean for each of G groups of features.
-
-    Args:
-        groups: G of them.
-        covariances: (n, n) scatter matrices, positive definite on the leading ``rank`` dimensions.
-    """
+    """A t-density of zero mean for each of G groups, with scatter matrices of the leading ``rank`` dimensions."""
 
     def __init__(self, groups: Sequence[FeatureGroup], covariances: Sequence[Tensor]) -> None:
         self.groups, self.covariances = groups, covariances
@@ -78,7 +68,7 @@ class GroupedDensity:
 class Shrinkage:
     """How much a covariance of few samples leans on the one that is known beforehand."""
 
-    samples: float = 2.0  # that the known one counts for, beside one for each dimension
+    samples: float = 2.0  # that the known one counts for, and one more for each dimension
     variance: float = 0.25  # known beforehand, in those of the background
 
 
@@ -88,9 +78,7 @@ SHRINKAGE = Shrinkage()
 def fit_groups(samples: Tensor, background: GroupedDensity) -> tuple[Tensor, GroupedDensity]:
     """Return the means (n,) of samples (T, n) and the density around them; of a single sample nothing is known, NaN.
 
-    Covariances are shrunk to multiples of those of the background, whose shape they have where samples are few.
-
-    References: Lange, Little and Taylor 1989 for the weights; Ledoit and Wolf 2004 for shrinkage.
+    Weights by Lange, Little and Taylor 1989; covariances shrunk to the background's shape as by Ledoit and Wolf 2004.
     """
     samples = torch.where((~samples.isnan()).sum(0) > 1, samples, torch.nan)
     mean, covariances = samples.nanmedian(0).values, []

@@ -1,4 +1,4 @@
-"""What spines are drawn from: meshes as they are, clouds as the surface around their points."""
+"""Surfaces of the frames of a spine: meshes as they are, clouds as the surface around their points."""
 
 from __future__ import annotations
 
@@ -28,19 +28,14 @@ ONE_SIDED = "the points do not enclose a body, as those of a single view: limbs 
 class _SurfaceSampling:
     """What is kept of the surface of every frame."""
 
-    num_vertices: int = 2000  # tell its size, its place and what is upright, as all of them would
+    num_vertices: int = 2000  # for its size, position and upright direction, as good as all of them
 
 
 _SAMPLING = _SurfaceSampling()
 
 
 def split_surface(value: Any, name: str, support: str) -> tuple[TriangleMesh | Tensor, SupportSplit | None]:
-    """Return a mesh, or points without faces, and what it stands on, which is left out of it; None for nothing.
-
-    Raises:
-        InputTypeError: if it is neither; names the argument.
-        InputError: if a point is not finite.
-    """
+    """Return a mesh, or points without faces, without its support, and that; None for no support."""
     points = _cloud(value)
     if points is None:
         mesh = as_mesh(value, name)
@@ -57,10 +52,6 @@ def as_surface(value: Any, name: str) -> tuple[TriangleMesh, tuple[str, ...]]:
 
     Points that show most of a body from both sides have that of `poisson_body`; others, as of leaves or of a single
     view, that of `cloud_surface`.
-
-    Raises:
-        InputTypeError: if it is neither; names the argument.
-        InputError: if there are too few points or one is not finite.
     """
     points = _cloud(value)
     if points is None:
@@ -145,14 +136,13 @@ class FrameSurfaces(Sequence[TriangleMesh]):
     """The surfaces of frames.
 
     Meshes are taken from their sequence when they are asked for, as from files, and are not kept; the surfaces of
-    clouds, which are dear, are.
+    clouds, which are expensive, are.
 
     Args:
         frames: meshes, or points without faces; any sequence.
-        names: of the frames.
         made: the surfaces of clouds by the number of the frame.
         notes: on each frame.
-        samples: some vertices of each frame, as many as tell its size and place.
+        samples: some vertices of each frame, for its size and position.
         shift: (3,) added to vertices; None for nothing.
         supports: what meshes stand on, which is cut off, by the number of the frame.
     """
@@ -177,19 +167,8 @@ class FrameSurfaces(Sequence[TriangleMesh]):
     ) -> FrameSurfaces:
         """Return the surfaces of frames, each of which is taken when its turn comes.
 
-        Args:
-            frames: meshes, or points without faces.
-            names: of the frames, for errors.
-            workers: processes for the surfaces of clouds, see `do_jobs`.
-            progress: a folder in which each of these is kept as soon as it is done, see `KeptResults`.
-            support: "auto" leaves out what they stand on, see `split_support`; "keep" keeps it.
-
-        Raises:
-            InputTypeError: if a frame is neither a mesh nor points; names it.
-            InputError: if there is no frame, or one of them has no surface.
-
-        Warns:
-            FileWarning: if a support is left out.
+        Errors name the frame. ``progress`` is a folder that keeps the surfaces of clouds for later calls; for
+        ``support`` see `split_support`.
         """
         check_choice(support, "support", SUPPORTS)
         if isinstance(frames, TriangleMesh):

@@ -1,4 +1,4 @@
-"""What is measured of the tips of a frame, and the features of a frame whose tips are named in some way."""
+"""Measurements of the tips of a frame, and the features of a frame with named tips."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SAMPLING = TipSampling()
 
 @dataclass(frozen=True, eq=False)
 class TipObservations:
-    """What is measured of the M tips of a frame, lengths in sizes of the body, float64.
+    """Measurements of the M tips of a frame, lengths in sizes of the body, float64.
 
     Args:
         curves: (M, S, 3) points of the limbs, from the tips towards the middle of the body.
@@ -88,16 +88,11 @@ def _observed(
 
 
 class TipFeatures:
-    """Features of a frame whose tips have names: what should be the same in all frames if the names are right.
+    """Features of a frame whose tips have names, which are the same in all frames if the names are right.
 
-    Distances between tips are the sum of one term for each of the two tips, which depends on how a limb bends and where
-    its end is found, and of what is left, which tells the sides of the body. With the signed volumes and the limbs'
-    lengths and radii these are four groups.
-
-    Args:
-        num_names: K.
-        num_limb_features: F.
-        with_volumes: whether the surfaces tell them.
+    In four groups: one term for each tip of its distances, which depends on how a limb bends and where its end is
+    found; the rest of the distances, which differs between the sides of the body; volumes; the limbs' lengths and
+    radii.
     """
 
     def __init__(self, num_names: int, num_limb_features: int, *, with_volumes: bool) -> None:
@@ -122,12 +117,9 @@ class TipFeatures:
         return torch.where((first >= 0) & (second >= 0), values, torch.nan)
 
     def __call__(self, frame: TipObservations, maps: Tensor, usual: Tensor) -> Tensor:
-        """Return the features (P, n) of a frame under mappings (P, K) of names to tips, NaN where a tip is missing.
+        """Return the features (P, n) of a frame under mappings (P, K) of names to tips, NaN for missing tips.
 
-        Args:
-            frame: its M tips.
-            maps: index of a tip, or -1 for none.
-            usual: distances between named tips (K (K - 1) / 2,), which stand for missing ones.
+        Distances to missing tips are replaced by the usual ones between named tips, (K (K - 1) / 2,).
         """
         index, found = maps.clamp_min(0), maps >= 0
         distances = self.distances(frame, maps)

@@ -25,7 +25,7 @@ class MappingSearch:
     length_weight: float = 0.5  # of the term that compares path lengths
     max_missing: int = 2  # known tips missing beyond those that must be, where all mappings are tried
     max_mappings: int = 10_000  # that are tried; if there are more, with fewer tips missing, or by assignments
-    num_rotations: int = 24  # about axes all over the sphere, from which assignments start, beside the identity
+    num_rotations: int = 24  # about axes all over the sphere, from which assignments start, and the identity
     max_rounds: int = 20  # of an assignment and a rigid fit
 
 
@@ -60,25 +60,21 @@ def rank_mappings(
     """Return mappings (P, K) of known tips to given ones, -1 for none, and their costs (P,), the best first.
 
     A mapping m of K known tips A to tips B, or to none, costs, with ``s^2`` the mean squared distance of the A from
-    their mean and R, T the best rigid motion (det R = +1) of those that are mapped (for curves, squared errors are
-    means over their points: the roots of limbs stay apart where their ends pass each other)::
+    their mean and R, T the best rigid motion (det R = +1) of those that are mapped::
 
         1 / K [ sum_k |B_m(k) - R A_k - T|^2 / s^2  +  rotation_weight * sum_k |R A_k - A_k|^2 / s^2   (centered A)
                 + length_weight * sum_k mean_l (d(B_m(k), B_m(l)) - d(A_k, A_l))^2 / 2 s^2  +  missing_cost * number ]
 
-    The first term is the paper's (6). The second separates what the first cannot where a creature is symmetric: near in
-    time it has hardly rotated. The third compares lengths along the skeleton, which bending does not change. All
-    mappings are tried if they are few; else assignments are refined from many rotations.
+    The first term is the paper's (6), for curves the mean over their points. All mappings are tried if they are few;
+    else assignments are refined from many rotations.
 
     Args:
         references: frames whose tips are known, all with the same K and S; their weighted costs are added.
-        tips: (M, 3), or curves (M, S, 3), to be identified; or (M, K, S, 3): curves that depend on what they are
-            compared with, so that limbs can be cut to the length of the known one.
+        tips: (M, 3), or curves (M, S, 3), to be identified; or (M, K, S, 3): curves cut to the length of each known
+            one.
         lengths: (M, M) along the skeleton from tip to tip; None: not compared.
-        weights: (S,) of the points of a curve; their mean should be one. All one by default.
+        weights: (S,) of the points of a curve, of mean one; all one by default.
         missing_cost: see `MappingSearch`.
-
-    Cost: 20 ms for 5 tips of 6, on one CPU core.
 
     References: Brostow, Essa, Steedly and Kwatra 2004, eqs. 6-8; Arun, Huang and Blostein 1987.
     """
@@ -178,13 +174,7 @@ class _MappingCosts:
 
 
 def _length_errors(lengths: Tensor, known: Tensor, maps: Tensor) -> Tensor:
-    """Return the squared errors (P,) of path lengths from tip to tip: per tip the mean over the others, summed.
-
-    Args:
-        lengths: (M, M) between the given tips.
-        known: (K, K) between the known ones.
-        maps: (P, K).
-    """
+    """Return the squared errors (P,) of path lengths from tip to tip: per tip the mean over the others, summed."""
     index = maps.clamp_min(0)
     mapped = lengths[index.unsqueeze(-1), index.unsqueeze(-2)]
     paired = ((maps >= 0).unsqueeze(-1) & (maps >= 0).unsqueeze(-2)).to(known)

@@ -1,4 +1,4 @@
-"""What a surface tells of its tips whatever their pose: how far apart they are along it, and on which side."""
+"""Relations between tips that do not depend on pose: geodesic distances and signed volumes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ class TipRelations:
     """Relations between the K tips of a surface that bending does not change, float64.
 
     Args:
-        geodesics: (K, K) distances along the surface. From a hand to the foot of its own side is shorter than across.
+        geodesics: (K, K) distances along the surface.
         volumes: (K, K, K) ``1/6 integral of d_a dd_b ^ dd_c`` over the surface: the signed volume enclosed by the map
-            that takes each point to its distances from tips a, b and c. It changes its sign with the orientation of
-            the surface: of a body and its mirror image, which no distance tells apart, one has +v and the other -v.
+            that takes each point to its distances from tips a, b and c. A body has +v, its mirror image -v.
     """
 
     geodesics: Tensor
@@ -31,13 +30,7 @@ class TipRelations:
 
 
 def surface_relations(mesh: TriangleMesh, distances: Tensor, vertices: Tensor) -> TipRelations:
-    """Return the relations of the tips of a closed surface.
-
-    Args:
-        mesh: the surface, facing outwards or inwards.
-        distances: (K, V) geodesic distances from the tips.
-        vertices: (K,) of the surface, at the tips.
-    """
+    """Return the relations of the tips of a closed surface, from geodesic distances (K, V) of the tips."""
     corners = distances[:, mesh.faces]
     volumes = torch.stack(
         [torch.einsum("bfi,cfi->bc", torch.linalg.cross(row.expand_as(corners), corners, dim=-1), corners)

@@ -42,20 +42,11 @@ def track_tips(
     relations: Sequence[TipRelations] | None = None,
     workers: int | None = 1,
 ) -> TipNames:
-    """Return the names of the tips in all frames.
+    """Return the names of the tips in all frames, see `name_over_time`.
 
     The reference is the middle of the longest run of frames that have K tips, the most frequent topology of these and,
-    if there are such frames, no loops, in which limbs touch each other. Its tips give the names, which all frames get
-    at once, see `name_over_time`.
-
-    With a prior its tips are the K, and the reference is the frame, of some with K tips, that it fits best.
-
-    Args:
-        skeletons: one per frame.
-        num_tips: K; the most frequent number by default.
-        prior: float64 and of the size of the frames; names are the numbers of its tips.
-        relations: of the tips along the surface of each frame; by default those along the skeleton.
-        workers: processes, see `name_over_time`.
+    if there are such frames, no loops. With a prior its tips are the K, and the reference is the frame, of some with K
+    tips, that it fits best.
 
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.2.
     """
@@ -91,10 +82,7 @@ def has_loops(skeleton: Skeleton) -> bool:
 
 
 def _clean_frames(skeletons: Sequence[Skeleton], num_tips: int, topology: str | None) -> list[bool]:
-    """Return which frames may be references: those with K tips, a topology and no loops, if any.
-
-    Without a topology, or if none of them has it, it is their most frequent one.
-    """
+    """Return which frames may be references: those of K tips, the topology, or the most frequent one, and no loops."""
     topologies = [skeleton.topology for skeleton in skeletons if len(skeleton.tips) == num_tips]
     if not topologies:  # a K that no frame has: the frame nearest to it
         counts = [len(skeleton.tips) for skeleton in skeletons]
@@ -108,7 +96,7 @@ def _clean_frames(skeletons: Sequence[Skeleton], num_tips: int, topology: str | 
 
 
 def _along_skeleton(skeleton: Skeleton) -> TipRelations:
-    """Return the relations of tips as a skeleton tells them: without sides."""
+    """Return the relations of tips along a skeleton, which has no volumes."""
     lengths = path_lengths(skeleton, skeleton.tips)[:, skeleton.tips.cpu()]
     return TipRelations(lengths, lengths.new_zeros(len(lengths), len(lengths), len(lengths)))
 

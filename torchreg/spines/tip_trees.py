@@ -24,7 +24,7 @@ class Branch:
     """A stretch of a tree between two points at which paths diverge.
 
     Args:
-        tips: those that lie beyond it, seen from the root.
+        tips: those that lie beyond it, from the root.
         rings: (n,) away from the root. The first is the ring in which the branch diverges from others (not so for the
             branch that starts at the root), the last the one in which the paths to its tips diverge.
     """
@@ -35,13 +35,7 @@ class Branch:
 
 @dataclass(frozen=True, eq=False)
 class TipTree:
-    """The tree of rings around one tip.
-
-    Args:
-        root: number of the tip.
-        sets: the level sets of the distance from it.
-        branches: one per set of tips that paths lead to together; the one from the root, to all others, first.
-    """
+    """The tree of rings around one tip, the root; the branch from the root, to all other tips, comes first."""
 
     root: int
     sets: LevelSets
@@ -71,15 +65,9 @@ class TipTree:
 def grow_tip_tree(sets: LevelSets, bands: Tensor, root: int, bridges: Tensor | None = None) -> TipTree:
     """Return the tree that the paths from one tip to all others make together.
 
-    A path leads from band to band through the rings between, by the least number of rings; of two between the same
-    bands by the longer one. Only what lies on a path is in the tree: bumps that are no tips leave no branch. A surface
-    with handles has several paths around them; the shortest is taken, so that the result is a tree all the same.
-
-    Args:
-        sets: level sets of the distance from the root.
-        bands: (K,) band that each tip lies in.
-        root: number of the tip from which distances are measured, 0 to K - 1.
-        bridges: (B, 2) pairs of bands joined by a bridge between pieces, or None.
+    A path leads from band (K,) to band through the least number of rings; of two between the same bands through the
+    longer one. Bumps that are no tips leave no branch; around handles the shortest path is taken. ``bridges`` (B, 2)
+    are bands joined between pieces.
 
     References: Brostow et al. 2004, section 4.1, "walking along edges of the surface graph".
     """
@@ -135,11 +123,7 @@ def _groups(paths: dict[int, list[int]], tips: tuple[int, ...], position: int) -
 
 
 def majority_splits(trees: Sequence[TipTree]) -> list[Tips]:
-    """Return the splits of the tips that more than half of the trees show.
-
-    Any two of them fit into one tree, however much the trees contradict each other: more than half and more than half
-    share a tree. Where trees disagree there is no split, and so a junction of higher degree: two trees that show pairs
-    of three-way junctions, differently, have one four-way junction in common.
+    """Return the splits of the tips that more than half of the trees show, any two of which are compatible.
 
     References: Margush and McMorris 1981, majority-rule consensus; Brostow et al. 2004, figure 3B.
     """
@@ -156,8 +140,7 @@ def majority_splits(trees: Sequence[TipTree]) -> list[Tips]:
 def estimate_junction(junction: tuple[Tips, ...], trees: Sequence[TipTree]) -> tuple[Tensor, Tensor]:
     """Return the position (3,) of a junction, and the mean width () of its rings in the trees.
 
-    The position is the mean center of the rings in which paths between three of its limbs meet; trees count by how
-    compact these rings are.
+    The mean center of the rings in which paths between three of its limbs meet, weighted by how compact the rings are.
     """
     positions, widths = [], []
     for tree in trees:
@@ -171,10 +154,8 @@ def estimate_junction(junction: tuple[Tips, ...], trees: Sequence[TipTree]) -> t
 def consensus_junctions(trees: Sequence[TipTree], overlap: float) -> list[tuple[Tips, ...]]:
     """Return the junctions of the tree on which most trees agree, see `junctions_from_splits`.
 
-    Splits of a majority count, unless the two junctions at their ends overlap: are closer than ``overlap`` times the
-    sum of widths. Overlapping ones are merged, closest first, and estimated anew.
-
-    References: Brostow et al. 2004, section 4.1, "Merging Skeletons": the metanodes.
+    Of the majority's junctions, those closer than ``overlap`` times the sum of widths are merged, closest first, and
+    estimated anew: the metanodes of Brostow et al. 2004, section 4.1, "Merging Skeletons".
     """
     if len(trees) == 2:
         return []

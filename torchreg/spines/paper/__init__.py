@@ -1,1 +1,1 @@
-"""Spines of Brostow et al. 2004 as printed, beside what is done by default."""
+"""Spines of Brostow et al. 2004 as printed; the defaults differ."""

@@ -19,15 +19,8 @@ _NEVER_MISSING = 1e6
 def track_tips_rigidly(skeletons: Sequence[Skeleton], num_tips: int | None = None) -> tuple[Tensor, int]:
     """Return the labels (T, K) of the tips in all frames, see `tip_nodes`, and the reference frame.
 
-    The reference is the middle of the longest run of frames with K tips. Frames with K tips are compared with it alone;
-    others with it and with the frame with K tips that is nearest in time.
-
-    Args:
-        skeletons: one per frame.
-        num_tips: K; the most frequent number by default.
-
-    Raises:
-        InputError: if no frame has ``num_tips`` tips.
+    The reference is the middle of the longest run of frames with K tips. Those are compared with it alone; others with
+    it and with the frame with K tips that is nearest in time.
 
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.2, eqs. 6-8.
     """

@@ -15,13 +15,8 @@ _MOST_EDGES = 0.95
 def vertex_level_sets(mesh: MeshEdges, values: Tensor, spacing: float) -> LevelSets:
     """Return the connected parts of the bins of vertices as bands, and a ring on the way from each band to a next one.
 
-    A ring stands for the band behind it: its center is the mean of that band's vertices, its covariance theirs. Bins
-    narrower than edges would fall into single vertices: they are as wide as most edges are long at least.
-
-    Args:
-        mesh: the surface.
-        values: (V,) at the vertices, float64, finite.
-        spacing: width of a bin, positive, where edges are shorter.
+    The center and covariance of a ring are those of the band behind it. Bins are at least as wide as most edges are
+    long.
 
     References: Brostow, Essa, Steedly and Kwatra 2004, section 4.1, figures 2 and 3A.
     """
