@@ -37,9 +37,10 @@ class UnitsCheck:
 
 @dataclass(frozen=True)
 class _Fitted:
-    """Which data poses are fitted to."""
+    """How many data of a large cloud poses are fitted to."""
 
     most: int = 10_000  # of a cloud: more move a pose by far less than models are exact
+    searched: int = 4000  # of those, by candidates of a search, of which one is fitted again
     size_points: int = 200  # of a skin that tells the shape's size
 
 
@@ -100,28 +101,37 @@ class Observation:
         return replace(self, points=points, free_space=space, keypoints=keypoints, origin=origin)
 
     @torch.no_grad()
-    def drawn(self, shape: ArticulatedShape, nan_policy: str, seed: int) -> Observation:
+    def drawn(self, shape: ArticulatedShape, nan_policy: str, seed: int, *, to_search: bool = False) -> Observation:
         """Return the same with as many of the points of each cloud as poses are fitted to, where there are more.
 
         Dense regions and copies do not outvote others, see `draw_spread`; depth frames are taken at a coarser grid.
+
+        Args:
+            shape: that poses are of.
+            nan_policy: "raise", or "omit" to leave out points that are not finite.
+            seed: of the draw.
+            to_search: whether many poses are fitted, for which fewer points do, not one.
         """
         sizes = getattr(self.points, "shape", (len(self.points), 3))
-        if len(sizes) < 2 or sizes[-2] <= _FITTED.most:
+        is_large = len(sizes) > 1 and sizes[-2] > _FITTED.most
+        count = _FITTED.searched if to_search else _FITTED.most
+        if not is_large and (self.everything is None or not to_search):
             return self
         clouds, valid = check_clouds(shape, self.points, self.mask, nan_policy)
-        if int(valid.sum(-1).max()) <= _FITTED.most:
+        if is_large and int(valid.sum(-1).max()) <= _FITTED.most:
             return self
         if self.frames:
-            return replace(self._coarser(batched=clouds.ndim == 3), everything=(clouds, valid))
+            return replace(self._coarser(count, batched=clouds.ndim == 3), everything=(clouds, valid))
         size = model_size(sample_skin(shape, _FITTED.size_points))
         batch = zip(clouds.reshape(-1, *clouds.shape[-2:]), valid.reshape(-1, valid.shape[-1]), strict=True)
-        points, mask = _padded([_draw(cloud[chosen], size, seed) for cloud, chosen in batch])
+        points, mask = _padded([_draw(cloud[chosen], count, size, seed) for cloud, chosen in batch])
         points, mask = (points, mask) if clouds.ndim == 3 else (points[0], mask[0])
         return replace(self, points=points, mask=mask, everything=(clouds, valid))
 
-    def _coarser(self, *, batched: bool) -> Observation:
+    def _coarser(self, count: int, *, batched: bool) -> Observation:
+        """Return what depth frames show with so many points at most."""
         frames = [
-            DepthFrame(frame.depth, frame.camera, frame.mask, max_points=min(frame.max_points, _FITTED.most))
+            DepthFrame(frame.depth, frame.camera, frame.mask, max_points=min(frame.max_points, count))
             for frame in self.frames
         ]
         seen = Observation.of(frames if batched else frames[0], None)
@@ -145,11 +155,11 @@ def _padded(clouds: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
     return points, torch.arange(points.shape[1], device=counts.device) < counts.unsqueeze(-1)
 
 
-def _draw(cloud: Tensor, size: float, seed: int) -> Tensor:
-    """Return the points of a cloud (M, 3) that a pose is fitted to, the same alone and in a batch."""
-    if len(cloud) <= _FITTED.most:
+def _draw(cloud: Tensor, count: int, size: float, seed: int) -> Tensor:
+    """Return at most ``count`` points of a cloud (M, 3), the same alone and in a batch."""
+    if len(cloud) <= count:
         return cloud
-    return cloud[draw_spread(cloud, _FITTED.most, size, torch.Generator().manual_seed(seed))]
+    return cloud[draw_spread(cloud, count, size, torch.Generator().manual_seed(seed))]
 
 
 def check_clouds(
