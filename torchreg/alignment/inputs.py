@@ -112,7 +112,7 @@ class Observation:
             seed: of the draw.
             to_search: whether many poses are fitted, for which fewer points do, not one.
         """
-        sizes = getattr(self.points, "shape", (len(self.points), 3))
+        sizes = as_float_tensor(self.points, "data").shape
         is_large = len(sizes) > 1 and sizes[-2] > _FITTED.most
         count = _FITTED.searched if to_search else _FITTED.most
         if not is_large and (self.everything is None or not to_search):
