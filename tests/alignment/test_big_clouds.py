@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import torchreg as tr
+from torchreg.alignment.inputs import Observation
 from torchreg.datasets.hand import make_hand_cloud, surface_skin
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.visibility import rasterize
@@ -100,6 +101,17 @@ def test_no_start_and_any_kind_of_numbers(plain_hand, points, truth):
     assert float((plain_hand.keypoints(starts.best) - plain_hand.keypoints(truth)).norm(dim=-1).mean()) < 0.003
     # Of the data that are looked at, a tenth is left unexplained.
     assert float(starts.costs[0]) < 800
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_data_made_with_the_seed_of_the_draw_are_drawn_like_others(plain_hand, seed):
+    """The numbers with which a face of a mesh was drawn for each point must not choose among the points."""
+    generator = torch.Generator().manual_seed(seed)
+    made = torch.rand(50_000, generator=generator)
+    points = torch.cat([made[:, None], torch.rand(50_000, 2, generator=generator)], dim=1)
+    few = Observation.of(points, None).drawn(plain_hand, "raise", seed)
+    assert len(few.points) == 10_000
+    assert float(few.points[:, 0].mean()) == pytest.approx(0.5, abs=0.02)
 
 
 def test_far_from_the_origin(plain_hand, points, start, truth):

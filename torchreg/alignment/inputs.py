@@ -159,7 +159,10 @@ def _draw(cloud: Tensor, count: int, size: float, seed: int) -> Tensor:
     """Return at most ``count`` points of a cloud (M, 3), the same alone and in a batch."""
     if len(cloud) <= count:
         return cloud
-    return cloud[draw_spread(cloud, count, size, torch.Generator().manual_seed(seed))]
+    # Numbers drawn with a seed as it is may be those that made-up data were drawn with.
+    generator = torch.Generator().manual_seed(seed)
+    generator.manual_seed(int(torch.randint(2**31, (), generator=generator)))
+    return cloud[draw_spread(cloud, count, size, generator)]
 
 
 def check_clouds(
