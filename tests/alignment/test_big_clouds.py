@@ -77,12 +77,12 @@ def test_a_batch_of_clouds_of_different_sizes_is_aligned_as_each_alone(plain_han
     both = tr.align(plain_hand, clouds, start, mask=mask, model_points=plain_hand_skin, config=config)
     for row in range(2):
         alone = tr.align(plain_hand, clouds[row], start, mask=mask[row], model_points=plain_hand_skin, config=config)
-        torch.testing.assert_close(both.pose[row], alone.pose, atol=1e-4, rtol=0)
+        torch.testing.assert_close(both.pose[row], alone.pose, atol=1e-3, rtol=0)
         kept = mask[row] & clouds[row].isfinite().all(-1)
         assert torch.equal(both.distances[row].isnan(), ~kept)
         assert not both.inliers[row][~kept].any()
         assert float(both.posterior[row][~kept].abs().max()) == 0
-        torch.testing.assert_close(both.distances[row][kept], alone.distances[kept], atol=1e-4, rtol=0)
+        torch.testing.assert_close(both.distances[row][kept], alone.distances[kept], atol=2e-4, rtol=0)
 
 
 def test_copies_of_a_few_outliers_do_not_outvote_the_shape(plain_hand, plain_hand_skin, points, start, truth):
@@ -107,8 +107,7 @@ def test_no_start_and_any_kind_of_numbers(plain_hand, points, truth):
 def test_data_made_with_the_seed_of_the_draw_are_drawn_like_others(plain_hand, seed):
     """The numbers with which a face of a mesh was drawn for each point must not choose among the points."""
     generator = torch.Generator().manual_seed(seed)
-    made = torch.rand(50_000, generator=generator)
-    points = torch.cat([made[:, None], torch.rand(50_000, 2, generator=generator)], dim=1)
+    points = torch.rand(3, 50_000, generator=generator, dtype=torch.float64).T
     few = Observation.of(points, None).drawn(plain_hand, "raise", seed)
     assert len(few.points) == 10_000
     assert float(few.points[:, 0].mean()) == pytest.approx(0.5, abs=0.02)
