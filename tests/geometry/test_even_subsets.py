@@ -1,13 +1,14 @@
 """Subsets that cover a cloud evenly: Poisson disks and farthest points."""
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from torchreg.geometry.poisson_disk import poisson_disk, poisson_disk_count
-from torchreg.geometry.sampling import even_order, farthest_points
+from torchreg.geometry.sampling import draw_spread, even_order, farthest_points
 
 
 def cloud(count, seed=0):
@@ -151,3 +152,36 @@ def test_the_even_order_holds_duplicates_once():
     assert torch.equal(order.sort().values, torch.arange(20))
     assert len((order[:5] % 5).unique()) == 5
     assert even_order(sampled_cloud(1)).tolist() == [0]
+
+
+# Draws in which no crowded place outvotes others
+
+
+def drawn(points, count, seed=0):
+    index = draw_spread(points, count, 2.0, torch.Generator().manual_seed(seed))
+    assert len(index.unique()) == count
+    assert torch.equal(index, index.sort().values)
+    return index
+
+
+def test_points_that_lie_evenly_are_drawn_as_at_random_and_thin_outliers_stay_thin():
+    points = torch.cat([cloud(20_000), 3 * torch.rand(5000, 3, generator=torch.Generator().manual_seed(1))])
+    index = drawn(points, 4000)
+    assert float((index >= 20_000).double().mean()) == pytest.approx(0.2, abs=0.02)
+    # Each half of the ball as often.
+    assert float((points[index][index < 20_000, 2] > 0).double().mean()) == pytest.approx(0.5, abs=0.03)
+    assert not torch.equal(index, drawn(points, 4000, seed=1))
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.03])
+def test_a_clump_of_most_points_is_drawn_as_one_place_of_many(spread):
+    clump = torch.tensor([0.0, 0.0, 1.0]) + spread * torch.rand(95_000, 3, generator=torch.Generator().manual_seed(1))
+    index = drawn(torch.cat([cloud(5000), clump]), 2000)
+    # The clump fills up to eight cubes of the two hundred or more that count.
+    assert 0 < float((index >= 5000).double().mean()) < 0.05
+
+
+@pytest.mark.parametrize("points", [torch.zeros(50, 3), 1e12 * torch.eye(3).repeat(20, 1), torch.full((30, 3), -1e30)])
+def test_points_of_few_places_or_far_away_can_be_drawn(points):
+    drawn(points, 20)
+    drawn(points.double(), len(points))

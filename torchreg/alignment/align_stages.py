@@ -8,14 +8,16 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from torchreg.alignment.annealed_em import ANNEALING, OnStep, StageResult, anneal
+from torchreg.alignment.annealed_em import ANNEALING, OnStep, StageResult, anneal, outlier_level
 from torchreg.alignment.local_search import explore, needs_search
-from torchreg.alignment.problem import AlignProblem, alignment_cost
+from torchreg.alignment.problem import INLIER_SHARE, AlignProblem, alignment_cost
 from torchreg.alignment.reliability import curvature
 from torchreg.alignment.results import AlignRecord
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
+from torchreg.geometry.budget import BUDGET
 from torchreg.result import normal_copy
 from torchreg.shapes.pose_algebra import shifted
+from torchreg.solvers.e_step import expectation
 
 if TYPE_CHECKING:
     from torchreg.alignment.config import AlignConfig
@@ -50,6 +52,44 @@ class AlignBatch:
     def rows(self, index: Tensor) -> AlignBatch:
         """Return some rows of the batch."""
         return replace(self, problem=self.problem.rows(index), start=self.start[index], origin=self.origin[index])
+
+
+@dataclass(frozen=True, eq=False)
+class DataOnShape:
+    """How data lie on a shape, (B, M) each, see `AlignResult`."""
+
+    distances: Tensor
+    inliers: Tensor
+    posterior: Tensor
+
+    @classmethod
+    def of(cls, batch: AlignBatch, found: StageResult, config: AlignConfig, data: Tensor, valid: Tensor) -> DataOnShape:
+        """Return how data (B, M, 3), in the coordinates of the problem, lie on the shape found."""
+        problem, posed = batch.problem, batch.problem.skin(found.pose)
+        outlier = outlier_level(problem, posed, found.sigma)
+        distances = torch.where(valid, problem.surface.distance(data, found.pose), torch.nan)
+        return cls(
+            distances=distances,
+            inliers=distances.abs() < (config.inlier_distance or INLIER_SHARE * problem.size),
+            posterior=expectation(posed, data, found.sigma, outlier, mask=valid).inlier_posterior,
+        )
+
+    @classmethod
+    def of_all(
+        cls, batch: AlignBatch, found: StageResult, config: AlignConfig, clouds: Tensor, valid: Tensor
+    ) -> DataOnShape:
+        """Return the same for whole clouds ((B,) M, 3), in the world, of which the problem's data are a draw."""
+        count = len(found.pose)
+        clouds, valid = clouds.expand(count, *clouds.shape[-2:]), valid.expand(count, valid.shape[-1])
+        size, parts = max(1, BUDGET.field_points // count), []
+        for points, chosen in zip(clouds.split(size, 1), valid.split(size, 1), strict=True):
+            local = torch.where(chosen.unsqueeze(-1), points - batch.origin.unsqueeze(1), 0.0)
+            parts.append(cls.of(batch, found, config, local, chosen))
+        return cls(
+            distances=torch.cat([part.distances for part in parts], 1),
+            inliers=torch.cat([part.inliers for part in parts], 1),
+            posterior=torch.cat([part.posterior for part in parts], 1),
+        )
 
 
 def anneal_batch(batch: AlignBatch, config: AlignConfig) -> StageResult:

@@ -13,15 +13,17 @@ from torch.nn.utils.rnn import pad_sequence
 
 from torchreg._checks import as_float_tensor, check_shape
 from torchreg.alignment.landmarks import MeasuredKeypoints, keypoint_extent
+from torchreg.alignment.problem import model_size
 from torchreg.capture.depth_frame import DepthFrame
 from torchreg.capture.free_space import FreeSpace
 from torchreg.errors import DegenerateDataWarning, InputError, InputTypeError, UnitsWarning
 from torchreg.geometry.far_origin import far_origin
 from torchreg.geometry.loaded import as_points
+from torchreg.geometry.sampling import draw_spread
 from torchreg.geometry.spread import SAME_SHARE, SPREADS, spread_dimensions
 from torchreg.geometry.units import LENGTHS, likely_unit
 from torchreg.shapes.articulated import ArticulatedShape
-from torchreg.shapes.skin import LinearBlendSkin
+from torchreg.shapes.skin import LinearBlendSkin, sample_skin
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,17 @@ class UnitsCheck:
     min_data: int = 10  # with a reliable size
 
 
+@dataclass(frozen=True)
+class _Fitted:
+    """How many data of a large cloud poses are fitted to."""
+
+    most: int = 10_000  # of a cloud: more move a pose by far less than models are exact
+    searched: int = 4000  # of those, by candidates of a search, of which one is fitted again
+    size_points: int = 200  # of a skin that tells the shape's size
+
+
 UNITS = UnitsCheck()
+_FITTED = _Fitted()
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +57,9 @@ class Observation:
         free_space: of B pictures, or one, where the points are those of depth frames.
         frames: these frames.
         keypoints: measured beside, or None.
+        origin: (3,) that the points begin at, where it is not that of the frames.
+        everything: the clouds of which the points are a draw, checked, and which of their points are valid; None
+            where the points are all there are.
     """
 
     points: Any
@@ -52,6 +67,8 @@ class Observation:
     free_space: FreeSpace | None = None
     frames: tuple[DepthFrame, ...] = ()
     keypoints: MeasuredKeypoints | None = None
+    origin: Tensor | None = None
+    everything: tuple[Tensor, Tensor] | None = None
 
     @classmethod
     def of(cls, data: Any, mask: Tensor | None) -> Observation:
@@ -73,18 +90,51 @@ class Observation:
         clouds, space = [frame.points for frame in frames], FreeSpace.stacked([frame.free_space for frame in frames])
         if not several:
             return cls(clouds[0], None, space, tuple(frames))
-        counts = torch.tensor([len(cloud) for cloud in clouds], device=clouds[0].device)
-        points = pad_sequence(clouds, batch_first=True)
-        return cls(
-            points, torch.arange(points.shape[1], device=counts.device) < counts.unsqueeze(-1), space, tuple(frames)
-        )
+        return cls(*_padded(clouds), space, tuple(frames))
 
     def near(self, origin: Tensor) -> Observation:
         """Return the same in coordinates that begin at an origin (3,)."""
         space = None if self.free_space is None else self.free_space.moved(origin)
         keypoints = None if self.keypoints is None else self.keypoints.near(origin)
         points = self.points - origin.to(self.points.device)
-        return replace(self, points=points, free_space=space, keypoints=keypoints)
+        return replace(self, points=points, free_space=space, keypoints=keypoints, origin=origin)
+
+    @torch.no_grad()
+    def drawn(self, shape: ArticulatedShape, nan_policy: str, seed: int, *, to_search: bool = False) -> Observation:
+        """Return the same with as many of the points of each cloud as poses are fitted to, where there are more.
+
+        Dense regions and copies do not outvote others, see `draw_spread`; depth frames are taken at a coarser grid.
+
+        Args:
+            shape: that poses are of.
+            nan_policy: "raise", or "omit" to leave out points that are not finite.
+            seed: of the draw.
+            to_search: whether many poses are fitted, for which fewer points do, not one.
+        """
+        sizes = as_float_tensor(self.points, "data").shape
+        is_large = len(sizes) > 1 and sizes[-2] > _FITTED.most
+        count = _FITTED.searched if to_search else _FITTED.most
+        if not is_large and (self.everything is None or not to_search):
+            return self
+        clouds, valid = check_clouds(shape, self.points, self.mask, nan_policy)
+        if is_large and int(valid.sum(-1).max()) <= _FITTED.most:
+            return self
+        if self.frames:
+            return replace(self._coarser(count, batched=clouds.ndim == 3), everything=(clouds, valid))
+        size = model_size(sample_skin(shape, _FITTED.size_points))
+        batch = zip(clouds.reshape(-1, *clouds.shape[-2:]), valid.reshape(-1, valid.shape[-1]), strict=True)
+        points, mask = _padded([_draw(cloud[chosen], count, size, seed) for cloud, chosen in batch])
+        points, mask = (points, mask) if clouds.ndim == 3 else (points[0], mask[0])
+        return replace(self, points=points, mask=mask, everything=(clouds, valid))
+
+    def _coarser(self, count: int, *, batched: bool) -> Observation:
+        """Return what depth frames show with so many points at most."""
+        frames = [
+            DepthFrame(frame.depth, frame.camera, frame.mask, max_points=min(frame.max_points, count))
+            for frame in self.frames
+        ]
+        seen = Observation.of(frames if batched else frames[0], None)
+        return replace(seen if self.origin is None else seen.near(self.origin), keypoints=self.keypoints)
 
     def with_keypoints(self, shape: ArticulatedShape, keypoints: Any, std: Any) -> Observation:
         """Return the same with measured keypoints of a shape, None for none; see `MeasuredKeypoints`."""
@@ -95,6 +145,23 @@ class Observation:
         camera = self.frames[0].camera if self.frames else None
         size = keypoint_extent(shape)
         return replace(self, keypoints=MeasuredKeypoints.of(shape, keypoints, std, camera, size))
+
+
+def _padded(clouds: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+    """Return clouds (M, 3) of different sizes as one tensor (B, M, 3), and which of its points are theirs (B, M)."""
+    counts = torch.tensor([len(cloud) for cloud in clouds], device=clouds[0].device)
+    points = pad_sequence(list(clouds), batch_first=True)
+    return points, torch.arange(points.shape[1], device=counts.device) < counts.unsqueeze(-1)
+
+
+def _draw(cloud: Tensor, count: int, size: float, seed: int) -> Tensor:
+    """Return at most ``count`` points of a cloud (M, 3), the same alone and in a batch."""
+    if len(cloud) <= count:
+        return cloud
+    # Numbers drawn with a seed as it is may be those that made-up data were drawn with.
+    generator = torch.Generator().manual_seed(seed)
+    generator.manual_seed(int(torch.randint(2**31, (), generator=generator)))
+    return cloud[draw_spread(cloud, count, size, generator)]
 
 
 def check_clouds(

@@ -28,7 +28,8 @@ def far_origin(points: Tensor | Sequence[Tensor]) -> Tensor | None:
     tensors = [points] if isinstance(points, Tensor) else list(points)
     if not tensors or any(tensor.dtype != torch.float64 for tensor in tensors):
         return None
-    middle, spread = _middle(torch.cat([tensor.detach().reshape(-1, tensor.shape[-1]) for tensor in tensors]))
+    rows = [tensor.detach().reshape(-1, tensor.shape[-1]) for tensor in tensors]
+    middle, spread = _middle(rows[0] if len(rows) == 1 else torch.cat(rows))
     return middle.round() if middle is not None and float(middle.abs().max()) > _FAR.ratio * spread > 0 else None
 
 

@@ -1,10 +1,68 @@
-"""Farthest-point sampling: few points that cover many."""
+"""Few points that stand for many: those farthest apart, or a random draw in which no crowded place outvotes others."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
+
+
+@dataclass(frozen=True)
+class _Crowding:
+    """When places hold so many points that fewer of them are drawn."""
+
+    cells: float = 40.0  # cubes along the size of what is measured: its surface fills hundreds of them
+    places: int = 200  # that points are drawn from as if all of them held as many, at least
+    share: float = 0.5  # the same, of the places that hold any where these are fewer
+
+
+_CROWDING = _Crowding()
+
+
+def draw_spread(points: Tensor, count: int, size: float, generator: torch.Generator) -> Tensor:
+    """Return indices of points drawn at random, of which those in crowded places are drawn more rarely.
+
+    As long as points lie in some hundreds of places this is a plain draw, and thin outliers stay as rare as they are.
+    Where a few places hold most of the points, as of copies or of a sensor close by, they are drawn as if these held
+    only so many that hundreds of places count.
+
+    Args:
+        points: (M, 3) finite.
+        count: of points drawn, at most M.
+        size: of what was measured, in the points' unit, positive.
+        generator: of the draw.
+
+    Returns:
+        Indices (count,) int64, all different, ascending.
+
+    Cost: O(M log M); 1 s for five million points.
+
+    References: Efraimidis and Spirakis 2006, weighted sampling without replacement.
+    """
+    place, held = _places(points, size / _CROWDING.cells)
+    weight = (_crowded_from(held) / held).clamp_max(1).float()[place]
+    waiting = torch.empty(len(points), dtype=torch.float32).exponential_(generator=generator).to(points.device)
+    return waiting.div_(weight).topk(count, largest=False).indices.sort().values
+
+
+def _places(points: Tensor, cell: float) -> tuple[Tensor, Tensor]:
+    """Return the number (M,) of the cube that each of points (M, 3) lies in, and how many each cube holds."""
+    # 21 bits for each axis; what lies farther away than these reach shares a number with others.
+    code = torch.zeros(len(points), dtype=torch.int64, device=points.device)
+    for axis, values in enumerate(points.unbind(-1)):
+        code += (values / cell).floor_().clamp_(-(2.0**62), 2.0**62).long() << (21 * axis)
+    return torch.unique(code, return_inverse=True, return_counts=True)[1:]
+
+
+def _crowded_from(held: Tensor) -> Tensor:
+    """Return the number () of points from which on places that hold some numbers (K,) are crowded."""
+    held = held.double().sort(descending=True).values
+    # Of places as full as each one that hold all points if fuller ones are thinned to its number.
+    effective = torch.arange(len(held)).to(held) + held.flip(0).cumsum(0).flip(0) / held
+    wanted = min(float(_CROWDING.places), _CROWDING.share * len(held))
+    return held[(effective >= wanted).nonzero()[0, 0]]
 
 
 def farthest_points(points: Tensor, count: int, start: int = 0) -> Tensor:
