@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_choice, check_finite, check_shape
+from torchreg._threads import one_thread
 from torchreg.errors import FileWarning, InputError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
@@ -21,7 +23,7 @@ from torchreg.io.gltf import load_rig
 from torchreg.io.gltf_document import parents_first
 from torchreg.shapes.kinematics import neighbor_matrix, part_parents
 from torchreg.shapes.primitive_refinement import refine_primitives
-from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.primitives import DeferredSolids, Primitive
 from torchreg.shapes.spec import SOLID_CHOICES, RigSurface, ShapeSpec, fitted_solid, fusion_length, with_long_axis
 
 Axes = Mapping[str, Sequence[str | Sequence[float]]]
@@ -124,15 +126,17 @@ def spec_from_arrays(
     tree, last_frame = _ball_joint_tree(order, parent_list, names, frames, used, axes=axes or {}, limits=limits or {})
     parts = [index for index in order if bool(weights[:, index].max() > 0)]
     part_frames = tuple(last_frame[index] for index in parts)
+    found: tuple[Primitive, ...] | DeferredSolids
     if solids is None:
-        solids, nu = _fitted_solids(vertices, weights, parts, tree, part_frames, primitive)
-        solids = [_in_joint_frame(*pair, frames, parent_list) for pair in zip(solids, parts, strict=True)]
+        neighbors = neighbor_matrix(part_parents(tree, [tree.index(name) for name in part_frames]))
+        in_frames = partial(_in_joint_frames, joints=parts, frames=frames, parents=parent_list)
+        found, nu = _fitted_solids(vertices, weights, parts, neighbors, primitive, in_frames)
     else:
-        nu = fusion_length(solids, _FIT.nu_per_thickness)
+        found, nu = tuple(solids), fusion_length(solids, _FIT.nu_per_thickness)
     return ShapeSpec(
         tree=tree,
         part_frames=part_frames,
-        primitives=tuple(solids),
+        primitives=found,
         nu=nu,
         part_names=tuple(names[index] for index in parts),
         surface=RigSurface(vertices, mesh.faces, weights[:, parts]),
@@ -141,15 +145,33 @@ def spec_from_arrays(
 
 
 def _fitted_solids(
-    vertices: Tensor, weights: Tensor, parts: Sequence[int], tree: KinematicTree, frames: Sequence[str], primitive: str
-) -> tuple[list[Primitive], float]:
-    """Return solids (one per part) fitted to the vertices of the parts, in their coordinates, and a fusion length."""
+    vertices: Tensor,
+    weights: Tensor,
+    parts: Sequence[int],
+    neighbors: Tensor,
+    primitive: str,
+    in_frames: Callable[[Sequence[Primitive]], list[Primitive]],
+) -> tuple[DeferredSolids, float]:
+    """Return solids (one per part) fitted to the vertices of the parts, refined when needed, and a fusion length."""
     owners = weights.argmax(-1)
-    solids = [fitted_solid(_owned_vertices(vertices, weights[:, part], owners == part), primitive) for part in parts]
-    nu = fusion_length(solids, _FIT.nu_per_thickness)
-    neighbors = neighbor_matrix(part_parents(tree, [tree.index(name) for name in frames]))
+    with one_thread():
+        guess = [fitted_solid(_owned_vertices(vertices, weights[:, part], owners == part), primitive) for part in parts]
+    nu = fusion_length(guess, _FIT.nu_per_thickness)
     spread = torch.linspace(0, len(vertices) - 1, min(len(vertices), _FIT.refined_points)).long()
-    return refine_primitives(solids, neighbors, nu, vertices[spread], weights[spread][:, parts].argmax(-1)), nu
+    data = vertices[spread], weights[spread][:, parts].argmax(-1)
+    return DeferredSolids(in_frames(guess), partial(_refined_solids, guess, neighbors, nu, *data, in_frames)), nu
+
+
+def _refined_solids(
+    guess: Sequence[Primitive],
+    neighbors: Tensor,
+    nu: float,
+    points: Tensor,
+    owners: Tensor,
+    in_frames: Callable[[Sequence[Primitive]], list[Primitive]],
+) -> list[Primitive]:
+    """Return solids refined together, see `refine_primitives`, in their joints' frames."""
+    return in_frames(refine_primitives(guess, neighbors, nu, points, owners))
 
 
 def _skin_weights(weights: Tensor, shape: tuple[int, int]) -> Tensor:
@@ -280,10 +302,15 @@ def _owned_vertices(vertices: Tensor, weights: Tensor, owned: Tensor) -> Tensor:
     return vertices[owned]
 
 
-def _in_joint_frame(solid: Primitive, joint: int, frames: Tensor, parents: Sequence[int]) -> Primitive:
-    """Return the solid in its joint's frame, its long axis along the bone: to the next joints, or to its own center."""
-    to_joint = invert_rigid(frames[joint])
-    pose = to_joint @ solid.pose
-    children = [index for index, parent in enumerate(parents) if parent == joint]
-    end = transform_points(to_joint, frames[children, :3, 3]).mean(0) if children else pose[:3, 3]
-    return with_long_axis(Primitive(solid.kind, solid.sizes, pose), end)
+def _in_joint_frames(
+    solids: Sequence[Primitive], *, joints: Sequence[int], frames: Tensor, parents: Sequence[int]
+) -> list[Primitive]:
+    """Return solids in their joints' frames, the long axis along the bone: to the next joints, or to their center."""
+    placed = []
+    for solid, joint in zip(solids, joints, strict=True):
+        to_joint = invert_rigid(frames[joint])
+        pose = to_joint @ solid.pose
+        children = [index for index, parent in enumerate(parents) if parent == joint]
+        end = transform_points(to_joint, frames[children, :3, 3]).mean(0) if children else pose[:3, 3]
+        placed.append(with_long_axis(Primitive(solid.kind, solid.sizes, pose), end))
+    return placed
