@@ -369,6 +369,14 @@ def rotation_matrices(quaternions: Array) -> Array:
     return np.eye(3) + 2 * unit[:, 3, None, None] * cross + 2 * cross @ cross
 
 
+def turned_normals(normals: Array, linear: Array, determinants: Array) -> Array:
+    """Return unit normals (V, 3) moved by linear maps (1 or V, 3, 3) of given determinants."""
+    cofactors = np.stack([np.cross(linear[:, k - 2], linear[:, k - 1]) for k in range(3)], axis=1)
+    moved = (cofactors @ normals[..., None])[..., 0] * np.sign(determinants)[:, None]
+    length = np.linalg.norm(moved, axis=-1, keepdims=True)
+    return np.asarray(moved / np.where(length > 0, length, 1.0))
+
+
 def triangles(mode: int, corners: Array, what: str) -> Array:
     """Return the (F, 3) triangles of a primitive, none where ``mode`` draws points or lines.
 

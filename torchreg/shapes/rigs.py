@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -61,10 +61,14 @@ def spec_from_gltf(
     """Return the `ShapeSpec` of a rigged glTF file; see `ArticulatedShape.from_gltf`."""
     rig = load_rig(path, parents=parents, skin=skin)
     with naming(path):
-        return spec_from_arrays(
+        spec = spec_from_arrays(
             rig.vertices, rig.faces, rig.weights, rig.joint_transforms, _one_tree(rig.parents, rig.joint_names),
-            joint_names=rig.joint_names, axes=axes, limits=limits, primitive=primitive,
+            joint_names=rig.joint_names, axes={**dict.fromkeys(rig.fixed, ()), **(axes or {})}, limits=limits,
+            primitive=primitive, slides=rig.slides,
         )  # fmt: skip
+    if not rig.is_rigid or spec.surface is None:
+        return spec
+    return replace(spec, surface=replace(spec.surface, is_rigid=True))
 
 
 def _one_tree(parents: Sequence[int], names: Sequence[str]) -> list[int]:
@@ -104,11 +108,13 @@ def spec_from_arrays(
     limits: Limits | None = None,
     primitive: str = "ellipsoid",
     solids: Sequence[Primitive] | None = None,
+    slides: Sequence[str] = (),
     up: Direction = Y_UP,
 ) -> ShapeSpec:
     """Return the `ShapeSpec` of a skinned mesh; see `ArticulatedShape.from_skinned_mesh`.
 
-    Solids of the parts, in their joints' frames, are fitted unless they are given.
+    Solids of the parts, in their joints' frames, are fitted unless they are given. Joints in ``slides`` slide, too,
+    along the axes of their frames.
     """
     check_choice(primitive, "primitive", SOLID_CHOICES)
     vertices = as_float_tensor(vertices, "vertices").double()
@@ -123,7 +129,17 @@ def spec_from_arrays(
         raise InputError(f"{count} joints need {count} names and parents, got {len(names)} and {len(parent_list)}")
     order = topological_order(parent_list, names)
     used = _carries_skin(parent_list, order, weights)
-    tree, last_frame = _ball_joint_tree(order, parent_list, names, frames, used, axes=axes or {}, limits=limits or {})
+    reach = float((vertices.amax(0) - vertices.amin(0)).norm())
+    tree, last_frame = _ball_joint_tree(
+        order,
+        parent_list,
+        names,
+        frames,
+        used,
+        axes=axes or {},
+        limits=limits or {},
+        slides=dict.fromkeys(slides, reach),
+    )
     parts = [index for index in order if bool(weights[:, index].max() > 0)]
     part_frames = tuple(last_frame[index] for index in parts)
     found: tuple[Primitive, ...] | DeferredSolids
@@ -241,6 +257,23 @@ def _carries_skin(parents: Sequence[int], order: Sequence[int], weights: Tensor)
     return used
 
 
+@dataclass(frozen=True)
+class _Move:
+    """A degree of freedom of a rig's joint.
+
+    Args:
+        suffix: of its name.
+        axis: in the joint's frame.
+        kind: of `Joint`.
+        limits: smallest and largest value, radians or metres.
+    """
+
+    suffix: str
+    axis: str | Sequence[float]
+    kind: str
+    limits: tuple[float, float]
+
+
 def _ball_joint_tree(
     order: Sequence[int],
     parents: Sequence[int],
@@ -250,6 +283,7 @@ def _ball_joint_tree(
     *,
     axes: Axes,
     limits: Limits,
+    slides: Mapping[str, float],
 ) -> tuple[KinematicTree, dict[int, str]]:
     """Return the tree, with several stacked frames per rig joint, and the name of each rig joint's last frame."""
     unknown = sorted((set(axes) | set(limits)) - set(names))
@@ -259,6 +293,7 @@ def _ball_joint_tree(
         )
     joints: list[Joint] = []
     last: dict[int, int] = {}
+    taken = set(names)
     for index in order:
         parent, name = parents[index], names[index]
         offset = frames[index] if parent < 0 else invert_rigid(frames[parent]) @ frames[index]
@@ -267,20 +302,37 @@ def _ball_joint_tree(
         bounds = limits.get(name, [(-torch.pi, torch.pi)] * len(chosen))
         if len(bounds) != len(chosen):
             raise ModelError(f"joint {name!r} has {len(chosen)} axes but {len(bounds)} pairs of limits")
-        for number, (axis, (low, high)) in enumerate(zip(chosen, bounds, strict=True)):
+        far = slides.get(name, 0.0) if parent >= 0 else 0.0
+        moves = [_Move(f"slide_{axis}", axis, "prismatic", (-far, far)) for axis in _UNIT_AXES if far]
+        for number, (axis, bound) in enumerate(zip(chosen, bounds, strict=True)):
+            moves.append(_Move(axis if isinstance(axis, str) else str(number), axis, "revolute", bound))
+        for move in moves:
             joints.append(
                 Joint(
-                    name=f"{name}_{axis if isinstance(axis, str) else number}",
+                    name=_free_name(f"{name}_{move.suffix}", taken),
                     parent=len(joints) - 1,
                     offset=torch.eye(4, dtype=torch.float64),
-                    kind="revolute",
-                    axis=_as_unit_axis(axis, name),
-                    lower=float(low),
-                    upper=float(high),
+                    kind=move.kind,
+                    axis=_as_unit_axis(move.axis, name),
+                    lower=float(move.limits[0]),
+                    upper=float(move.limits[1]),
                 )
             )
         last[index] = len(joints) - 1
     return KinematicTree(tuple(joints)), {index: joints[frame].name for index, frame in last.items()}
+
+
+def _free_name(name: str, taken: set[str]) -> str:
+    """Return a name, with ``#`` behind it as often as another frame is called so, and take it."""
+    free = name
+    while free in taken:
+        free += "#"
+    if free != name:
+        warnings.warn(
+            f"a degree of freedom is called {free!r}, as a joint is called {name!r}", FileWarning, stacklevel=2
+        )
+    taken.add(free)
+    return free
 
 
 def _as_unit_axis(axis: str | Sequence[float], name: str) -> tuple[float, float, float]:
