@@ -11,7 +11,8 @@ import numpy as np
 
 from torchreg.errors import FormatError, ModelError
 from torchreg.io.gltf_clip import pose_nodes
-from torchreg.io.gltf_document import GltfDocument, Mode, rotation_matrices, triangles, turned_normals
+from torchreg.io.gltf_document import GltfDocument, Mode, rotation_matrices, triangles
+from torchreg.io.gltf_primitives import turned_normals
 from torchreg.io.limits import FileLimits, check_allowed
 from torchreg.io.raw_cloud import Array, RawCloud, as_indices
 

@@ -66,7 +66,10 @@ def _scale(skin: Skin, skeleton: Skeleton) -> float:
     motions = skin.motions(skeleton.world)[skin.used]
     if not np.isfinite(motions).all() or np.abs(motions[:, 3] - np.eye(4)[3]).max() > 1e-4:
         raise ModelError(f"the bind transforms of skin {skin.index} are not finite or not affine")
-    common = float(np.median(np.linalg.svd(motions[:, :3, :3], compute_uv=False).mean(1)))
+    stretches = np.linalg.svd(motions[:, :3, :3], compute_uv=False).mean(1)
+    # That of most joints; of the first ones where as many have another.
+    alike = np.abs(stretches[:, None] - stretches) <= SKIN_TOLERANCES.equal * stretches
+    common = float(stretches[alike[:, alike.sum(0).argmax()]].mean())
     if not 1 / SKIN_TOLERANCES.max_scale < common < SKIN_TOLERANCES.max_scale:
         raise ModelError(f"the skeleton scales the skin by {common:.4g}, which no rig does; check its nodes")
     return common if abs(common - 1) > SKIN_TOLERANCES.equal else 1.0
@@ -118,10 +121,33 @@ def _own_place(
     if off[:, :3, :3].max() <= tolerance and shifted <= tolerance * scale * _extent(skin):
         turned = (np.abs(place - common)[:3, :3].max() / scale for place in usual)
         return next((place for place, off in zip(usual, turned, strict=True) if off <= SKIN_TOLERANCES.equal), common)
-    return max(
-        [*usual, *_quarter_turns(scale)],
-        key=lambda place: round(float((place[:3, :3] * common[:3, :3]).sum()) / scale**2, 6),
-    )
+    return _nearest(usual, _quarter_turns(scale), motions[_top(skin, skeleton)] / scale, common / scale, scale)
+
+
+def _top(skin: Skin, skeleton: Skeleton) -> int:
+    """Return which of the joints that move vertices is the nearest to the root."""
+    depths = [len(list(ancestors(joint, skeleton.parents))) for joint in skin.joints[skin.used]]
+    return depths.index(min(depths))
+
+
+def _nearest(usual: list[Array], turns: list[Array], top: Array, mean: Array, scale: float) -> Array:
+    """Return the place that is meant by a skeleton that the nodes pose.
+
+    Args:
+        usual: places by the node above and as stored.
+        turns: all by quarters.
+        top: (4, 4) motion of the topmost joint, without scale.
+        mean: (4, 4) of all joints.
+        scale: of the places.
+    """
+    every = [*usual, *turns]
+    for place in every:
+        if np.abs(place / scale - top)[:3, :3].max() <= SKIN_TOLERANCES.equal:
+            return place  # the root is not posed
+    traces = [round(float((place[:3, :3] * mean[:3, :3]).sum()) / scale, 6) for place in every]
+    best = int(np.argmax(traces[: len(usual)]))
+    # Limbs may turn far, the whole hardly more than by 60 degrees.
+    return usual[best] if traces[best] >= 2.0 else every[int(np.argmax(traces))]
 
 
 def _above(document: GltfDocument, node_parents: Sequence[int], skin: Skin, scale: float) -> list[Array]:

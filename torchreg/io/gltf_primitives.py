@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from torchreg.errors import FileWarning, FormatError, ModelError
-from torchreg.io.gltf_document import GltfDocument, Mode, triangles, turned_normals
+from torchreg.io.gltf_document import GltfDocument, Mode, triangles
 from torchreg.io.limits import FILE_BUDGET, FileLimits
 from torchreg.io.raw_cloud import Array
 
@@ -259,3 +259,11 @@ def _weighted_rows(weights: Array, vertices: Array) -> Array:
     nearest, _ = NeighborTree(torch.from_numpy(vertices[weighted])).nearest(torch.from_numpy(vertices[empty]))
     weights[empty] = weights[weighted[nearest.numpy()]]
     return weights
+
+
+def turned_normals(normals: Array, linear: Array, determinants: Array) -> Array:
+    """Return unit normals (V, 3) moved by linear maps (1 or V, 3, 3) of given determinants."""
+    cofactors = np.stack([np.cross(linear[:, k - 2], linear[:, k - 1]) for k in range(3)], axis=1)
+    moved = (cofactors @ normals[..., None])[..., 0] * np.sign(determinants)[:, None]
+    length = np.linalg.norm(moved, axis=-1, keepdims=True)
+    return np.asarray(moved / np.where(length > 0, length, 1.0))
