@@ -37,7 +37,7 @@ class _SharedCount:
         with self._lock:
             before = torch.get_num_threads()
             if self._working == 0:
-                self._found = _in_new_thread(torch.get_num_threads)
+                self._found = in_new_thread(torch.get_num_threads)
             self._working += 1
             # Unless the caller began to use torch beside such work.
             before = self._found if before == 1 else before
@@ -50,10 +50,11 @@ class _SharedCount:
             self._working -= 1
             torch.set_num_threads(before)
             if self._working == 0 and before != self._found:
-                _in_new_thread(lambda: torch.set_num_threads(self._found))
+                in_new_thread(lambda: torch.set_num_threads(self._found))
 
 
-def _in_new_thread(call: Callable[[], _First]) -> _First:
+def in_new_thread(call: Callable[[], _First]) -> _First:
+    """Return the result of a call in a thread of its own, where no mode of torch is on that the caller is in."""
     with ThreadPoolExecutor(1) as pool:
         return pool.submit(call).result()
 

@@ -204,7 +204,7 @@ def test_buffers_from_elsewhere_are_refused(tmp_path):
     ("keys", "value", "words"),
     [
         (("asset",), {}, "must be glTF of version 2"),
-        (("extensionsRequired",), ["KHR_draco_mesh_compression"], "needs the extension KHR_draco"),
+        (("extensionsRequired",), ["EXT_meshopt_compression"], "needs the extension EXT_meshopt"),
         (("scene",), 3, r"refers to scenes\[3\], but there are 1"),
         (("scenes", 0, "nodes"), [], "holds no surface in its default scene"),
         (("nodes", 0, "children"), [0], "cyclic or shared"),

@@ -1,20 +1,26 @@
 """Shapes from rigs and robots: trees, names, solids near the mesh, the file's own skin, and what is refused."""
 
+import copy
 import math
+import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch import nn
 
 from torchreg.errors import FileWarning, FormatError, InputError, ModelError
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.gltf import load_rig
 from torchreg.io.urdf import UrdfPrimitive
+from torchreg.shapes import rigs
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.primitive_refinement import refine_primitives
 from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.record import build_shape, record_shape
 from torchreg.shapes.rigs import spec_from_arrays
 from torchreg.shapes.robots import solid_mesh
 from torchreg.shapes.skin import BendingSkin, sample_skin
@@ -188,6 +194,62 @@ def test_refining_recovers_solids_from_points_on_their_fused_surface():
     kept = refine_primitives(shaken, truth.adjacency, spec.nu, mesh.vertices, owners, max_steps=0)
     torch.testing.assert_close(kept[1].pose, shaken[1].pose)
     assert kept[1].sizes == pytest.approx(shaken[1].sizes)
+
+
+class Layer(nn.Module):
+    """The distance of points from a shape, as a layer."""
+
+    def __init__(self, shape):
+        super().__init__()
+        self.shape = shape
+
+    def forward(self, points):
+        return self.shape.distance(points, self.shape.rest_pose())
+
+
+def in_inference_first(shape, points):
+    with torch.inference_mode():
+        Layer(shape)(points)
+    return shape.distance(points, shape.rest_pose().requires_grad_()).detach()
+
+
+def of_a_loaded_state(shape, points):
+    other = ArticulatedShape.from_spec(spec_from_arrays(*arm(), [-1, 0, 1, 2]), dtype=torch.float64)
+    other.load_state_dict(shape.state_dict())
+    return Layer(other)(points)
+
+
+WAYS = {
+    "as it is": lambda shape, points: Layer(shape)(points),
+    "a copy": lambda shape, points: Layer(copy.deepcopy(shape))(points),
+    "pickled": lambda shape, points: Layer(pickle.loads(pickle.dumps(shape)))(points),
+    "in another precision first": lambda shape, points: Layer(shape.float().double())(points),
+    "in inference first": in_inference_first,
+    "under a transform": lambda shape, points: torch.func.vmap(Layer(shape))(points.unsqueeze(0))[0],
+    "one graph": lambda shape, points: torch.compile(Layer(shape), fullgraph=True, backend="aot_eager")(points),
+    "a functional call": lambda shape, points: torch.func.functional_call(
+        layer := Layer(shape), dict(layer.named_buffers()), points
+    ),
+    "a state": of_a_loaded_state,
+    "a record": lambda shape, points: Layer(build_shape(record_shape(shape)))(points),
+}
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+@pytest.mark.parametrize("way", WAYS)
+def test_solids_of_a_rig_are_refined_once_somebody_asks_for_them(way, monkeypatch):
+    spec, points = spec_from_arrays(*arm(), [-1, 0, 1, 2]), arm()[0]
+    calls = []
+    refine = rigs.refine_primitives
+    monkeypatch.setattr(rigs, "refine_primitives", lambda *arguments: calls.append(1) or refine(*arguments))
+    shape = ArticulatedShape.from_spec(spec, dtype=torch.float64)
+    shape.file_skin()(torch.zeros(shape.num_dofs, dtype=torch.float64))
+    assert calls == []
+    found = WAYS[way](shape, points)
+    eager = ArticulatedShape.from_spec(replace(spec, primitives=tuple(spec.primitives)), dtype=torch.float64)
+    torch.testing.assert_close(found, Layer(eager)(points), atol=1e-8, rtol=0)
+    guess = ArticulatedShape.from_spec(replace(spec, primitives=spec.primitives.guess), dtype=torch.float64)
+    assert float(found.abs().mean()) < 0.5 * float(Layer(guess)(points).abs().mean())
 
 
 def changed(**entries):

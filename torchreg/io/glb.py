@@ -12,6 +12,7 @@ import numpy as np
 from torchreg.errors import FormatError, ModelError
 from torchreg.io.gltf_clip import pose_nodes
 from torchreg.io.gltf_document import GltfDocument, Mode, rotation_matrices, triangles
+from torchreg.io.gltf_primitives import turned_normals
 from torchreg.io.limits import FileLimits, check_allowed
 from torchreg.io.raw_cloud import Array, RawCloud, as_indices
 
@@ -198,17 +199,9 @@ def _vertices(document: GltfDocument, primitive: dict[str, Any], instance: _Inst
     points = (linear @ points[..., None])[..., 0] + matrices[:, :3, 3]
     determinants = np.linalg.det(linear)
     if normal is not None:
-        normal = _turned(normal, linear, determinants)
+        normal = turned_normals(normal, linear, determinants)
     colors = None if color is None else color[:, :3].astype(np.float64)
     return RawCloud(points, normal, colors), bool(np.mean(determinants < 0) > 0.5)
-
-
-def _turned(normals: Array, linear: Array, determinants: Array) -> Array:
-    """Return unit normals (V, 3) moved by linear maps (1 or V, 3, 3)."""
-    cofactors = np.stack([np.cross(linear[:, k - 2], linear[:, k - 1]) for k in range(3)], axis=1)
-    moved = (cofactors @ normals[..., None])[..., 0] * np.sign(determinants)[:, None]
-    length = np.linalg.norm(moved, axis=-1, keepdims=True)
-    return moved / np.where(length > 0, length, 1.0)
 
 
 def _blended(document: GltfDocument, attributes: Mapping[str, Any], skin: Array, count: int) -> Array | None:

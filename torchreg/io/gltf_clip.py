@@ -10,6 +10,8 @@ from torchreg.errors import FormatError, InputError
 from torchreg.io.gltf_document import GltfDocument
 from torchreg.io.raw_cloud import Array
 
+# Change of a track, of numbers of one or more, that is rounding.
+_STILL = 1e-5
 _WIDTHS = {"translation": 3, "rotation": 4, "scale": 3}
 
 
@@ -45,6 +47,27 @@ def pose_nodes(document: GltfDocument, time: float | None, frame: int | None) ->
     for node, path, times, sampler in tracks:
         entry = document.item("nodes", node)
         entry[path] = _value(document, path, times, sampler, float(time or 0.0)).tolist()
+
+
+def moved_nodes(document: GltfDocument) -> dict[int, set[str]]:
+    """Return the nodes that a clip turns or slides, with "rotation" and "translation" for what it does.
+
+    Programs write tracks for nodes that stand still, too; these do not count.
+    """
+    found = dict[int, set[str]]()
+    for clip in document.items("animations"):
+        samplers = document.entry(clip, "samplers", list)
+        for channel in document.entry(clip, "channels", list):
+            track = _track(document, channel, samplers) if isinstance(channel, dict) else None
+            if track is None or track[1] not in ("rotation", "translation"):
+                continue
+            node, path, times, sampler = track
+            values = np.stack([_value(document, path, times, sampler, time) for time in times])
+            if path == "rotation":
+                values = values * np.where(values @ values[0] < 0, -1.0, 1.0)[:, None]
+            if np.ptp(values, axis=0).max() > _STILL * max(1.0, float(np.abs(values).max())):
+                found.setdefault(node, set()).add(path)
+    return found
 
 
 def _track(

@@ -14,6 +14,7 @@ from urllib.parse import unquote
 import numpy as np
 
 from torchreg.errors import FormatError, ModelError
+from torchreg.io.gltf_draco import DracoGeometry
 from torchreg.io.limits import FILE_BUDGET, FileLimits, check_budget, read_bytes
 from torchreg.io.raw_cloud import Array
 
@@ -37,7 +38,7 @@ _NODE_DEFAULTS: dict[str, list[float]] = {
     "scale": [1.0, 1.0, 1.0],
     "translation": [0.0, 0.0, 0.0],
 }
-_COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
+_COMPRESSED = ("EXT_meshopt_compression", "KHR_meshopt_compression")
 
 
 class GltfDocument:
@@ -65,9 +66,9 @@ class GltfDocument:
             raise FormatError(f"must be glTF of version 2, whose JSON is an object; got {type(self.json).__name__}")
         compressed = [name for name in self.entry(self.json, "extensionsRequired", list) if name in _COMPRESSED]
         if compressed:
-            raise FormatError(
-                f"needs the extension {compressed[0]}, which is not read; save it again without mesh compression"
-            )
+            hint = "save it again without mesh compression, as `npx @gltf-transform/cli copy in.glb out.glb` does"
+            raise FormatError(f"needs the extension {compressed[0]}, which is not read; {hint}")
+        self._draco = DracoGeometry(self)
 
     @property
     def size(self) -> int:
@@ -140,10 +141,13 @@ class GltfDocument:
         if item.get("bufferView") is not None:
             self._buffer_of(item, what)
         self.check_use(count * width * dtype.itemsize, what)
-        if item.get("bufferView") is None and sparse is None:
+        packed = self._draco.numbers(index, what, (count, width)) if item.get("bufferView") is None else None
+        if item.get("bufferView") is None and sparse is None and packed is None:
             raise FormatError(f"{what} has no data; save the file again without mesh compression")
-        if item.get("bufferView") is None:
-            values: Array = np.zeros((count, width), dtype)
+        if packed is not None:
+            values: Array = packed.astype(dtype)
+        elif item.get("bufferView") is None:
+            values = np.zeros((count, width), dtype)
         else:
             values = self._elements(item, count, width, dtype, what)
         if sparse is not None:
@@ -151,6 +155,18 @@ class GltfDocument:
         if item.get("normalized") is True and dtype.kind in "iu":
             return np.maximum(values / np.iinfo(dtype).max, -1.0)
         return values
+
+    def view(self, owner: dict[str, Any], what: str) -> memoryview:
+        """Return the bytes of the buffer view of an entry, of what messages call ``what``."""
+        index = owner.get("bufferView")
+        view = self.item("bufferViews", index, f"the bufferView of {what}")
+        data = self._buffer_of(owner, what)
+        start, length = (self._size(view, key, f"bufferViews[{index}]") for key in ("byteOffset", "byteLength"))
+        if start + length > len(data):
+            raise FormatError(
+                f"bufferViews[{index}] reaches beyond its buffer of {len(data)} bytes; the file is cut short or damaged"
+            )
+        return memoryview(data)[start : start + length]
 
     def _buffer_of(self, owner: dict[str, Any], what: str) -> bytes:
         """Return the buffer that the buffer view of an entry is part of."""
@@ -190,24 +206,17 @@ class GltfDocument:
 
     def _elements(self, owner: dict[str, Any], count: int, width: int, dtype: np.dtype[Any], what: str) -> Array:
         """Return a read-only (count, width) window into the buffer view of ``owner``, checked to lie inside."""
-        index = owner.get("bufferView")
-        view = self.item("bufferViews", index, f"the bufferView of {what}")
-        data = self._buffer_of(owner, what)
-        start, length = (self._size(view, key, f"bufferViews[{index}]") for key in ("byteOffset", "byteLength"))
-        if start + length > len(data):
-            raise FormatError(
-                f"bufferViews[{index}] reaches beyond its buffer of {len(data)} bytes; the file is cut short or damaged"
-            )
+        view, data = self.item("bufferViews", owner.get("bufferView")), self.view(owner, what)
         if count == 0:
             return np.zeros((0, width), dtype)
         offset, size = self._size(owner, "byteOffset", what), width * dtype.itemsize
         stride = self._size(view, "byteStride", what) or size
-        if offset + stride * (count - 1) + size > length:
+        if offset + stride * (count - 1) + size > len(data):
             raise FormatError(
-                f"{what} reaches beyond its buffer ({count} elements of {size} bytes, view of {length} bytes); "
+                f"{what} reaches beyond its buffer ({count} elements of {size} bytes, view of {len(data)} bytes); "
                 f"the file is cut short or damaged"
             )
-        return np.ndarray((count, width), dtype, data, start + offset, (stride, dtype.itemsize))
+        return np.ndarray((count, width), dtype, data, offset, (stride, dtype.itemsize))
 
     def _size(self, owner: dict[str, Any], key: str, what: str) -> int:
         value: int = self.entry(owner, key, int)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import struct
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,12 @@ from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rotation import rotation_between
 from torchreg.io.atomic import write_atomic
 from torchreg.io.file_format import naming
-from torchreg.io.gltf import RigRecord, bind_transforms, choose_skin, load_rig, rig_primitives
+from torchreg.io.gltf import RigRecord, load_rig
 from torchreg.io.gltf_builder import checked_numbers, checked_path
 from torchreg.io.gltf_document import GltfDocument
+from torchreg.io.gltf_placement import place_skins
+from torchreg.io.gltf_primitives import rig_primitives
+from torchreg.io.gltf_skins import Skeleton, ancestors, read_skeleton
 from torchreg.io.limits import DEFAULT_LIMITS, local_path, read_bytes
 from torchreg.io.raw_cloud import Array
 
@@ -69,10 +73,11 @@ def save_refitted_rig(
         source: the rigged .glb or .gltf file.
         vertices: (V, 3) in the bind pose, in the order of `load_rig`, metres.
         positions: (3,) of each joint in the bind pose by its name, metres.
-        skin: name or index of the skin, needed where the file has several.
+        skin: name or index of the one skin, as given to `load_rig`; all by default.
 
     Raises:
-        InputError: if vertices or joints are not those of the file, or a bone has another direction.
+        InputError: if vertices or joints are not those of the file, a bone has another direction, nothing is skinned,
+            or joints scale their parts of the skin unlike others.
         FormatError, ModelError: if the file cannot be read, see `load_rig`.
     """
     target, file = checked_path(path), local_path(source)
@@ -88,12 +93,25 @@ def save_refitted_rig(
             )
         points = checked_numbers(vertices, "vertices", rig.vertices.shape)
         joints = np.stack([checked_numbers(positions[name], f"positions[{name!r}]", (3,)) for name in rig.joint_names])
-        output = _Rewriter(document)
-        skin_index, meshes = choose_skin(document, None, skin)
-        _replace_surface(output, meshes, rig, points)
-        _replace_bones(output, document.item("skins", skin_index), rig, joints)
+        skeleton, output = _skeleton(document, skin), _Rewriter(document)
+        _replace_surface(output, skeleton, rig, points)
+        _replace_bones(output, skeleton, rig, joints)
         write_atomic(target, output.content())
     return target
+
+
+def _skeleton(document: GltfDocument, skin: str | int | None) -> Skeleton:
+    """Return the joints and skins of a file; InputError where they cannot be written with other bones."""
+    read = read_skeleton(document, None, skin, {}, DEFAULT_LIMITS)
+    if read is None:
+        raise InputError("has no skin: a rig of rigid parts is not written with other bones")
+    place_skins(document, read[0])
+    if read[0].is_baked or any(one.is_bent for one in read[0].skins):
+        raise InputError(
+            "has joints that scale their parts of the skin unlike others, or skins that were bound in different poses: "
+            "apply scale and pose in the program that made it, then it is written with other bones"
+        )
+    return read[0]
 
 
 class _Rewriter:
@@ -182,30 +200,29 @@ def _owners_of_views(value: Any) -> Iterator[dict[str, Any]]:
             yield from _owners_of_views(item)
 
 
-def _replace_surface(output: _Rewriter, meshes: Sequence[int], rig: RigRecord, vertices: Array) -> None:
-    """Replace positions, normals and tangents of a skinned mesh by those of new vertices (V, 3)."""
+def _replace_surface(output: _Rewriter, skeleton: Skeleton, rig: RigRecord, vertices: Array) -> None:
+    """Replace positions, normals and tangents of skinned meshes by those of new vertices (V, 3)."""
     turns = _surface_turns(rig.vertices, torch.from_numpy(vertices), rig.faces).numpy()
     document, begin = output.document, 0
-    primitives, blocks = rig_primitives(document, meshes)[0], dict[str, dict[str, Array]]()
-    for primitive in primitives:
-        attributes = primitive.attributes
-        if primitive.key not in blocks:
-            rows = slice(begin, begin + document.accessor_count(attributes["POSITION"]))
-            begin = rows.stop
-            block = {"POSITION": vertices[rows] / rig.scale}
-            for name in {"NORMAL", "TANGENT"} & set(attributes):
-                block[name] = document.accessor(attributes[name], name).astype(np.float64)
-                block[name][:, :3] = np.einsum("vij,vj->vi", turns[rows], block[name][:, :3])
-            blocks[primitive.key] = block
     replaced = dict[str, dict[str, int]]()
-    for primitive in primitives:
-        key, attributes = primitive.key, primitive.attributes
-        if key not in replaced:
-            replaced[key] = {
-                name: output.replace(attributes[name], values, f"VEC{values.shape[1]}", bounds=name == "POSITION")
-                for name, values in blocks[key].items()
-            }
-        attributes |= replaced[key]
+    for skin in skeleton.skins:
+        to_stored = np.linalg.inv(skin.to_scene)
+        unit = to_stored[:3, :3] / np.cbrt(np.linalg.det(to_stored[:3, :3]))
+        own, primitives = set[str](), rig_primitives(document, skin.meshes)[0]
+        for primitive, key in [(primitive, primitive.key) for primitive in primitives]:
+            attributes = primitive.attributes
+            if key not in own:
+                rows = slice(begin, begin + document.accessor_count(attributes["POSITION"]))
+                begin, block = rows.stop, {"POSITION": vertices[rows] @ to_stored[:3, :3].T + to_stored[:3, 3]}
+                own.add(key)
+                for name in {"NORMAL", "TANGENT"} & set(attributes):
+                    block[name] = document.accessor(attributes[name], name).astype(np.float64)
+                    block[name][:, :3] = np.einsum("vij,vj->vi", unit @ turns[rows] @ unit.T, block[name][:, :3])
+                replaced[key] = {
+                    name: output.replace(attributes[name], values, f"VEC{values.shape[1]}", bounds=name == "POSITION")
+                    for name, values in block.items()
+                }
+            attributes |= replaced[key]
 
 
 def _surface_turns(before: Tensor, after: Tensor, faces: Tensor) -> Tensor:
@@ -218,52 +235,46 @@ def _surface_turns(before: Tensor, after: Tensor, faces: Tensor) -> Tensor:
     return torch.where(known[:, None, None], turns, torch.eye(3, dtype=before.dtype))
 
 
-def _replace_bones(output: _Rewriter, skin: dict[str, Any], rig: RigRecord, positions: Array) -> None:
-    """Replace the bind pose of a skin by one with joints at new positions (J, 3), and stretch what moves its bones."""
-    document, joints = output.document, list(skin["joints"])
-    world = document.node_globals(document.node_parents())
-    weights, stored = rig.weights.numpy(), skin.get("inverseBindMatrices")
-    bind = (
-        world[joints].copy()
-        if stored is None
-        else bind_transforms(document, stored, rig.joint_names, weights, world[joints], rig.parents)
-    )
-    stretches = _stretches(document, joints, rig, world=world, bind=bind, positions=positions)
-    bind[:, :3, 3] = positions / rig.scale
-    inverse = np.linalg.inv(bind)
-    inverse[:, 3] = (0.0, 0.0, 0.0, 1.0)
-    skin["inverseBindMatrices"] = output.replace(stored, inverse.swapaxes(1, 2).reshape(-1, 16), "MAT4")
+def _replace_bones(output: _Rewriter, skeleton: Skeleton, rig: RigRecord, positions: Array) -> None:
+    """Replace the bind poses of skins, with joints at new positions (J, 3), and stretch what moves their bones."""
+    document, places = output.document, skeleton.places.copy()
+    stretches = _stretches(document, skeleton, rig, positions)
+    places[:, :3, 3] = positions
+    for skin in skeleton.skins:
+        inverse = np.linalg.inv(places[skin.joints]) @ skin.to_scene
+        inverse[:, 3] = (0.0, 0.0, 0.0, 1.0)
+        entry = document.item("skins", skin.index)
+        stored = entry.get("inverseBindMatrices")
+        entry["inverseBindMatrices"] = output.replace(stored, inverse.swapaxes(1, 2).reshape(-1, 16), "MAT4")
     for number, stretch in stretches.items():
         _stretch_node(document.item("nodes", number), stretch)
     _stretch_clips(output, stretches)
 
 
-def _stretches(
-    document: GltfDocument, joints: Sequence[int], rig: RigRecord, *, world: Array, bind: Array, positions: Array
-) -> dict[int, _Stretch]:
+def _stretches(document: GltfDocument, skeleton: Skeleton, rig: RigRecord, positions: Array) -> dict[int, _Stretch]:
     """Return how translations change, by node: of joints, and of nodes between a joint and its parent.
 
     Args:
         document: of the rig.
-        joints: their nodes.
+        skeleton: of the file.
         rig: that of the file.
-        world: (N, 4, 4) of all nodes at rest.
-        bind: (J, 4, 4) of the joints, as stored.
         positions: (J, 3) new ones in the bind pose, metres.
     """
     node_parents, old = document.node_parents(), rig.joint_transforms[:, :3, 3].numpy()
+    world, number = document.node_globals(node_parents), skeleton.number
     root = rig.parents.index(-1)
     spans = [np.linalg.norm(points - points[root], axis=1).sum() for points in (old, positions)]
     size = float(spans[1] / spans[0]) if spans[0] > 0 else 1.0
     shortest = _ROUNDING.position * float(np.ptp(old, axis=0).max())
-    to_scene = world[joints[root], :3, :3] @ np.linalg.inv(bind[root, :3, :3]) / rig.scale
+    to_rest = skeleton.world[root, :3, :3] @ np.linalg.inv(skeleton.places[root, :3, :3])
     found = dict[int, _Stretch]()
-    for joint, parent in enumerate(rig.parents):
-        node = joints[joint]
+    for node, joint in number.items():
+        chain = list(ancestors(node, node_parents))
+        parent = next((number[up] for up in chain if up in number), -1)
         if parent < 0:
             # Beside the first root, others go where the bind pose has them.
-            moved = to_scene @ ((positions[joint] - positions[root]) - size * (old[joint] - old[root]))
-            above = np.eye(3) if node_parents[node] < 0 else world[node_parents[node], :3, :3]
+            moved = to_rest @ ((positions[joint] - positions[root]) - size * (old[joint] - old[root]))
+            above = np.eye(3) if not chain else world[chain[0], :3, :3]
             found[node] = _Stretch(size, np.linalg.solve(above, moved))
             continue
         bones = [points[joint] - points[parent] for points in (old, positions)]
@@ -271,9 +282,8 @@ def _stretches(
         factor = lengths[1] / lengths[0] if lengths[0] > shortest else size
         if np.linalg.norm(bones[1] - factor * bones[0]) > _ROUNDING.turn * lengths[1] + shortest:
             raise InputError(f"the bone to joint {rig.joint_names[joint]!r} has another direction in this file")
-        while node != joints[parent]:
-            found[node] = _Stretch(factor, np.zeros(3))
-            node = node_parents[node]
+        between = itertools.takewhile(lambda up: up not in number, chain)
+        found |= dict.fromkeys((node, *between), _Stretch(factor, np.zeros(3)))
     return found
 
 

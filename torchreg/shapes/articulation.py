@@ -8,9 +8,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from typing import Any, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchreg._checks import check_direction, check_finite, check_positive, check_shape
 from torchreg.errors import InputError, ModelError
@@ -23,7 +24,7 @@ from torchreg.geometry.rigid import invert_rigid, rigid_matrix
 from torchreg.geometry.upright import Z_UP, Direction
 from torchreg.shapes.material_points import MaterialPoints, ShapeOutput, fused_points, mesh_points, onto_fused
 from torchreg.shapes.posed_tree import PosedTree, frozen
-from torchreg.shapes.primitives import Primitive, PrimitiveSet, fuse
+from torchreg.shapes.primitives import DeferredSolids, Primitive, PrimitiveSet, fuse
 from torchreg.shapes.shape_space import ShapeSpace
 from torchreg.shapes.spec import RigSurface
 
@@ -67,7 +68,7 @@ class Articulation(PosedTree):
         self,
         tree: KinematicTree,
         part_frames: Sequence[str],
-        primitives: Sequence[Primitive],
+        primitives: Sequence[Primitive] | DeferredSolids,
         *,
         nu: float = 0.003,
         sharpness: float = 2.0,
@@ -85,7 +86,9 @@ class Articulation(PosedTree):
                 f"a shape needs one primitive per part, got {len(primitives)} for {len(part_frames)} part frames"
             )
         super().__init__(tree, part_frames, part_names, free_base)
-        self.primitives = PrimitiveSet(primitives)
+        self._deferred = primitives if isinstance(primitives, DeferredSolids) else None
+        first = primitives.guess if isinstance(primitives, DeferredSolids) else primitives
+        self._modules["primitives"] = PrimitiveSet(first)
         self.surface = surface
         self.space = space
         self.up = check_direction(up, "up")
@@ -109,6 +112,33 @@ class Articulation(PosedTree):
         solids = copy.deepcopy(self.primitives).float().double()
         frames = transforms @ rigid_matrix(solids.rotations, solids.centers)
         return fused_points(solids, frames, self.adjacency, self.start_nu, to_parts)
+
+    @property
+    def primitives(self) -> PrimitiveSet:
+        """The solids of all parts; those of a rig are refined when they are first asked for."""
+        if self._deferred is not None:
+            self._make_solids(self._deferred)
+        return cast(PrimitiveSet, self._modules["primitives"])
+
+    @torch.compiler.assume_constant_result
+    def _make_solids(self, deferred: DeferredSolids) -> None:
+        """Put the solids that were deferred in the place of their guess."""
+        self._modules["primitives"] = PrimitiveSet(deferred.made).to(self.rest).train(self.training)
+        self._deferred = None
+
+    def state_dict(self, *args: Any, **kwargs: Any) -> Any:
+        """Return the state, see `torch.nn.Module.state_dict`."""
+        _ = self.primitives
+        return super().state_dict(*args, **kwargs)
+
+    def named_modules(self, *args: Any, **kwargs: Any) -> Iterator[tuple[str, nn.Module]]:
+        """Yield names and modules, see `torch.nn.Module.named_modules`; parameters and buffers are found by it."""
+        _ = self.primitives
+        return super().named_modules(*args, **kwargs)
+
+    def _load_from_state_dict(self, *args: Any, **kwargs: Any) -> None:
+        _ = self.primitives  # the state does not hold how they are turned
+        super()._load_from_state_dict(*args, **kwargs)
 
     @property
     def nu(self) -> float:

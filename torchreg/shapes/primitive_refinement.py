@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchreg.geometry.primitives import PRIMITIVE_KINDS
 from torchreg.geometry.rigid import rigid_matrix
@@ -28,6 +29,8 @@ class _RefinementSettings:
     excess_weight: float = 0.3
     # Residual, in fusion lengths, that costs as much as a change by the solid's own size.
     stiffness: float = 2.0
+    # Share in the gradient of the fused distance below which a solid does not count at a point.
+    least_share: float = 1e-9
     # Damped least-squares steps, and the step at which they end: metres, radians and logarithms of sizes.
     max_steps: int = 30
     atol: float = 1e-5
@@ -65,15 +68,48 @@ def refine_primitives(
     """
     solids = PrimitiveSet(primitives).requires_grad_(False)
     problem = _RefinementProblem(solids, neighbors, nu, points.double(), owners)
-    start = torch.zeros(1, len(primitives) * problem.width, dtype=torch.float64)
-    found = levenberg_marquardt(
-        problem.linearize, start, retract=problem.retract, max_steps=max_steps, atol=_REFINEMENT.atol
-    )
+    start = zero = torch.zeros(1, len(primitives) * problem.width, dtype=torch.float64)
+    lowest = torch.inf
+
+    def linearize(state: Tensor) -> Linearization:
+        nonlocal lowest
+        fields = problem.fields_at(state)
+        cost = problem.cost(fields)
+        if float(cost) > lowest:  # rejected, whatever its derivatives
+            return Linearization(cost.view(1), zero, zero.unsqueeze(-1).expand(-1, -1, zero.shape[-1]))
+        lowest = float(cost)
+        gradient, hessian = problem.derivatives(fields)
+        return Linearization(cost.view(1), gradient.view(1, -1), hessian.unsqueeze(0))
+
+    found = levenberg_marquardt(linearize, start, retract=problem.retract, max_steps=max_steps, atol=_REFINEMENT.atol)
     rotations, centers, sizes = problem.solids_at(found.state)
     members = [int(part) for kind in solids.kinds for part in solids.get_buffer(f"members_{kind}")]
     rows = dict(zip(members, (row.tolist() for size in sizes for row in size), strict=True))
     poses = rigid_matrix(rotations, centers)
     return [Primitive(first.kind, tuple(rows[part]), poses[part]) for part, first in enumerate(primitives)]
+
+
+@dataclass(frozen=True)
+class _Fields:
+    """The distances of all points in one state.
+
+    Args:
+        offset: (P, width) of the state from the start, centers in the solids' frames.
+        sizes: of the solids, kind by kind.
+        local: (P, 3, N) points in the frames of the solids.
+        shares: (N, P) of the solids in the fused distance.
+        nearest: (N,) numbers of the nearest solids.
+        residuals: (N, 3) fused distance, that to the own solid, and its excess over that to the nearest one.
+        squared: (N, 3) squares of the residuals, in robust scales.
+    """
+
+    offset: Tensor
+    sizes: list[Tensor]
+    local: Tensor
+    shares: Tensor
+    nearest: Tensor
+    residuals: Tensor
+    squared: Tensor
 
 
 @dataclass(frozen=True)
@@ -108,76 +144,64 @@ class _RefinementProblem:
         rotated = compose_rotation_vectors(rows[:, 3:6], change[:, 3:6])
         return torch.cat([centers, rotated, rows[:, 6:] + change[:, 6:]], dim=-1).view(1, -1)
 
-    def linearize(self, state: Tensor) -> Linearization:
-        """Return cost, gradient and Gauss-Newton Hessian at a state (1, D).
-
-        A point's residuals depend on the solids that fuse where it is and on its own, a few of many: points with the
-        same nearest solid are taken together, and only their solids' columns.
-        """
+    def fields_at(self, state: Tensor) -> _Fields:
+        """Return the distances in a state (1, D)."""
         rotations, centers, sizes = self.solids_at(state)
-        local = ((self.points.unsqueeze(-2) - centers).unsqueeze(-2) @ rotations).squeeze(-2)
-        distances = self.solids(local, sizes)
-        cost, gradient, hessian = self._prior(state, rotations)
-        scale, rows, shares = _REFINEMENT.robust_scale * self.nu, list[Tensor](), list[Tensor]()
-        for residual, weights, weight in self._residuals(distances):
-            scaled = (residual / scale).square()
-            cost = cost + 0.5 * weight * scale**2 * cauchy_loss(scaled).sum()
-            root = (weight * cauchy_weight(scaled)).sqrt()
-            rows.append(root * residual)
-            shares.append(root.unsqueeze(-1) * weights)
-        nearest = distances.argmin(-1)
-        order, columns = nearest.argsort(), self._columns(nearest)
-        points, parts = columns[nearest[order]].nonzero().unbind(-1)
-        points = order[points]
-        motions = self._motions(local[points, parts], parts, sizes)
-        jacobians = motions.unsqueeze(-1) * torch.stack(shares, -1)[points, parts].unsqueeze(-2)
-        residuals = torch.stack(rows, -1)[order]
-        self._add_groups(jacobians, residuals, columns, nearest.bincount(minlength=len(columns)), gradient, hessian)
-        return Linearization(cost.view(1), gradient.view(1, -1), hessian.unsqueeze(0))
-
-    def _columns(self, nearest: Tensor) -> Tensor:
-        """Return (P, P): the solids that residuals of points depend on, by the solid that is nearest to them."""
-        columns = self.neighbors.bool().clone()
-        columns[nearest, self.owners] = True
-        return columns
-
-    @staticmethod
-    def _add_groups(
-        jacobians: Tensor, residuals: Tensor, columns: Tensor, counts: Tensor, gradient: Tensor, hessian: Tensor
-    ) -> None:
-        """Add the terms of all points to the gradient (D,) and the Hessian (D, D).
-
-        Args:
-            jacobians: (M, width, 3) of the pairs of points and solids, those of one nearest solid after the other.
-            residuals: (N, 3) in the same order.
-            columns: (P, P) see `_columns`.
-            counts: (P,) points by their nearest solid.
-            gradient: changed in place.
-            hessian: changed in place.
-        """
-        width, pair, point = jacobians.shape[1], 0, 0
-        within = torch.arange(width)
-        for part, count in enumerate(counts.tolist()):
-            if not count:
-                continue
-            solids = columns[part].nonzero()
-            rows = jacobians[pair : pair + count * len(solids)].reshape(count, -1, 3).permute(1, 0, 2).flatten(1)
-            entries = (solids * width + within).flatten()
-            gradient[entries] += rows @ residuals[point : point + count].flatten()
-            hessian[entries[:, None], entries] += rows @ rows.mT
-            pair, point = pair + count * len(solids), point + count
-
-    def _residuals(self, distances: Tensor) -> list[tuple[Tensor, Tensor, float]]:
-        """Return the residuals (N,), the solids' weights (N, P) in them, and the weight of each of the three terms."""
+        turned = (rotations.mT.flatten(0, 1) @ self.points.mT).unflatten(0, (-1, 3))
+        local = turned - rotations.mT @ centers.unsqueeze(-1)
+        x, y, z = local.unbind(1)
+        distances = self.solids.plane_distance((x, y, z), sizes).mT
         fused, shares = fuse(distances, self.neighbors, self.nu)
-        owner = nn.functional.one_hot(self.owners, len(self.solids)).to(distances)
-        dominating = nn.functional.one_hot(distances.argmin(-1), len(self.solids)).to(distances)
-        owned, nearest = (distances * owner).sum(-1), distances.amin(-1)
-        return [
-            (fused, shares, 1.0),
-            (owned, owner, _REFINEMENT.owner_weight),
-            (owned - nearest, owner - dominating, _REFINEMENT.excess_weight),
-        ]
+        least, nearest = distances.min(-1)
+        owned = distances.gather(-1, self.owners.unsqueeze(-1)).squeeze(-1)
+        residuals = torch.stack([fused, owned, owned - least], dim=-1)
+        rows = state.view(len(self.solids), self.width)
+        offset = torch.cat([(rows[:, None, :3] @ rotations).squeeze(-2), rows[:, 3:]], dim=-1)
+        return _Fields(offset, sizes, local, shares, nearest, residuals, (residuals / self._scale).square())
+
+    @property
+    def _scale(self) -> float:
+        """The robust scale of the residuals, metres."""
+        return _REFINEMENT.robust_scale * self.nu
+
+    @cached_property
+    def _weights(self) -> Tensor:
+        """The weights (3,) of the residuals."""
+        return torch.tensor([1.0, _REFINEMENT.owner_weight, _REFINEMENT.excess_weight], dtype=torch.float64)
+
+    @cached_property
+    def _stiffness(self) -> Tensor:
+        """The stiffness (P, width) of the prior at the start."""
+        extent = self.solids.reaches(list(self.solids.sizes)) / BALL_FACTOR
+        by_size = self.nu / extent.unsqueeze(-1).expand(-1, 3)
+        by_turn = torch.full((len(extent), self.width - 3), self.nu, dtype=torch.float64)
+        return (_REFINEMENT.stiffness * torch.cat([by_size, by_turn], dim=-1)).square()
+
+    def cost(self, fields: _Fields) -> Tensor:
+        """Return the cost () of a state."""
+        robust = self._scale**2 * (self._weights * cauchy_loss(fields.squared)).sum()
+        return 0.5 * (robust + (self._stiffness * fields.offset.square()).sum())
+
+    def derivatives(self, fields: _Fields) -> tuple[Tensor, Tensor]:
+        """Return gradient (D,) and Gauss-Newton Hessian (D, D) at a state.
+
+        A point's residuals depend on its own solid and on those that share in the fused distance there, a few of many:
+        only these pairs of points and solids are differentiated, and points with the same solids are taken together.
+        """
+        gradient, hessian = (self._stiffness * fields.offset).flatten(), self._stiffness.flatten().diag()
+        concerned = fields.shares > _REFINEMENT.least_share
+        for always in (self.owners, fields.nearest):
+            concerned.scatter_(-1, always.unsqueeze(-1), True)
+        order, sets = _equal_rows(concerned)
+        points, parts = concerned[order].nonzero().unbind(-1)
+        points = order[points]
+        is_own, is_nearest = ((parts == index[points]).double() for index in (self.owners, fields.nearest))
+        roots = (self._weights * cauchy_weight(fields.squared)).sqrt()
+        shares = torch.stack([fields.shares[points, parts], is_own, is_own - is_nearest], -1) * roots[points]
+        motions = self._motions(fields.local[parts, :, points], parts, fields.sizes)
+        jacobians = motions.unsqueeze(-1) * shares.unsqueeze(-2)
+        _add_sets(jacobians, (roots * fields.residuals)[order], parts, sets, gradient, hessian)
+        return gradient, hessian
 
     def _motions(self, local: Tensor, parts: Tensor, sizes: Sequence[Tensor]) -> Tensor:
         """Return (M, width): derivatives of distances by the motion and the logarithms of sizes of their solids.
@@ -203,12 +227,41 @@ class _RefinementProblem:
             found[rows, 6 : 6 + size.shape[-1]] = by_size * own * self.solids.get_buffer(f"scalable_{kind}")
         return found
 
-    def _prior(self, state: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return cost, gradient and Hessian of the prior at the start."""
-        rows = state.view(len(self.solids), self.width)
-        local = (rows[:, None, :3] @ rotations).squeeze(-2)
-        offset = torch.cat([local, rows[:, 3:]], dim=-1)
-        extent = self.solids.reaches(list(self.solids.sizes)) / BALL_FACTOR
-        spread = torch.cat([extent.unsqueeze(-1).expand(-1, 3), torch.ones_like(rows[:, 3:])], dim=-1)
-        stiffness = (_REFINEMENT.stiffness * self.nu / spread).square()
-        return 0.5 * (stiffness * offset.square()).sum(), (stiffness * offset).flatten(), stiffness.flatten().diag()
+
+def _equal_rows(rows: Tensor) -> tuple[Tensor, list[tuple[int, int]]]:
+    """Return an order of boolean rows (N, P) in which equal ones follow each other: how many, and their sums."""
+    weights = torch.rand(rows.shape[1], generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    # Equal sums of random weights are those of equal rows.
+    keys, order = (rows.double() @ weights).sort()
+    counts = keys.unique_consecutive(return_counts=True)[1]
+    sums = rows[order[counts.cumsum(0) - 1]].sum(-1)
+    return order, list(zip(counts.tolist(), sums.tolist(), strict=True))
+
+
+def _add_sets(
+    jacobians: Tensor,
+    residuals: Tensor,
+    parts: Tensor,
+    sets: Sequence[tuple[int, int]],
+    gradient: Tensor,
+    hessian: Tensor,
+) -> None:
+    """Add the terms of all points to the gradient (D,) and the Hessian (D, D).
+
+    Args:
+        jacobians: (M, width, 3) of the pairs of points and solids, point after point.
+        residuals: (N, 3) of the points.
+        parts: (M,) numbers of the pairs' solids.
+        sets: points in a row that have the same solids, and the number of these.
+        gradient: changed in place.
+        hessian: changed in place.
+    """
+    width, pair, point = jacobians.shape[1], 0, 0
+    entries = parts.unsqueeze(-1) * width + torch.arange(width)
+    for count, solids in sets:
+        end = pair + count * solids
+        rows = jacobians[pair:end].view(count, -1, 3).transpose(0, 1).flatten(1)
+        columns = entries[pair : pair + solids].flatten()
+        gradient[columns] += rows @ residuals[point : point + count].flatten()
+        hessian[columns[:, None], columns] += rows @ rows.mT
+        pair, point = end, point + count

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from torchreg._threads import in_new_thread, one_thread
 from torchreg.errors import ModelError
 from torchreg.geometry.primitives import PRIMITIVE_KINDS, Planes
 from torchreg.geometry.rigid import RIGID_TOLERANCE, rigid_matrix, rotation_error
@@ -32,6 +35,39 @@ class Primitive:
     kind: str
     sizes: tuple[float, ...]
     pose: Tensor
+
+
+class DeferredSolids:
+    """Solids that are made when they are first asked for, once for all copies.
+
+    Args:
+        guess: of every part, of the same kinds.
+        make: returns the solids, one per part.
+    """
+
+    def __init__(self, guess: Sequence[Primitive], make: Callable[[], Sequence[Primitive]]) -> None:
+        self.guess, self._make = tuple(guess), make
+
+    def __len__(self) -> int:
+        return len(self.guess)
+
+    def __iter__(self) -> Iterator[Primitive]:
+        return iter(self.made)
+
+    def __getitem__(self, part: int) -> Primitive:
+        return self.made[part]
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> DeferredSolids:
+        return self  # nothing changes it
+
+    @cached_property
+    def made(self) -> tuple[Primitive, ...]:
+        """The solids, made on first access, whatever modes of torch the caller is in."""
+        return in_new_thread(self._made_here)
+
+    def _made_here(self) -> tuple[Primitive, ...]:
+        with one_thread():
+            return tuple(self._make())
 
 
 class _SizeTables(nn.Module):

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_choice, check_finite, check_shape
+from torchreg._threads import one_thread
 from torchreg.errors import FileWarning, InputError, ModelError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
@@ -21,7 +23,7 @@ from torchreg.io.gltf import load_rig
 from torchreg.io.gltf_document import parents_first
 from torchreg.shapes.kinematics import neighbor_matrix, part_parents
 from torchreg.shapes.primitive_refinement import refine_primitives
-from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.primitives import DeferredSolids, Primitive
 from torchreg.shapes.spec import SOLID_CHOICES, RigSurface, ShapeSpec, fitted_solid, fusion_length, with_long_axis
 
 Axes = Mapping[str, Sequence[str | Sequence[float]]]
@@ -59,10 +61,14 @@ def spec_from_gltf(
     """Return the `ShapeSpec` of a rigged glTF file; see `ArticulatedShape.from_gltf`."""
     rig = load_rig(path, parents=parents, skin=skin)
     with naming(path):
-        return spec_from_arrays(
+        spec = spec_from_arrays(
             rig.vertices, rig.faces, rig.weights, rig.joint_transforms, _one_tree(rig.parents, rig.joint_names),
-            joint_names=rig.joint_names, axes=axes, limits=limits, primitive=primitive,
+            joint_names=rig.joint_names, axes={**dict.fromkeys(rig.fixed, ()), **(axes or {})}, limits=limits,
+            primitive=primitive, slides=rig.slides,
         )  # fmt: skip
+    if not rig.is_rigid or spec.surface is None:
+        return spec
+    return replace(spec, surface=replace(spec.surface, is_rigid=True))
 
 
 def _one_tree(parents: Sequence[int], names: Sequence[str]) -> list[int]:
@@ -102,11 +108,13 @@ def spec_from_arrays(
     limits: Limits | None = None,
     primitive: str = "ellipsoid",
     solids: Sequence[Primitive] | None = None,
+    slides: Sequence[str] = (),
     up: Direction = Y_UP,
 ) -> ShapeSpec:
     """Return the `ShapeSpec` of a skinned mesh; see `ArticulatedShape.from_skinned_mesh`.
 
-    Solids of the parts, in their joints' frames, are fitted unless they are given.
+    Solids of the parts, in their joints' frames, are fitted unless they are given. Joints in ``slides`` slide, too,
+    along the axes of their frames.
     """
     check_choice(primitive, "primitive", SOLID_CHOICES)
     vertices = as_float_tensor(vertices, "vertices").double()
@@ -121,18 +129,30 @@ def spec_from_arrays(
         raise InputError(f"{count} joints need {count} names and parents, got {len(names)} and {len(parent_list)}")
     order = topological_order(parent_list, names)
     used = _carries_skin(parent_list, order, weights)
-    tree, last_frame = _ball_joint_tree(order, parent_list, names, frames, used, axes=axes or {}, limits=limits or {})
+    reach = float((vertices.amax(0) - vertices.amin(0)).norm())
+    tree, last_frame = _ball_joint_tree(
+        order,
+        parent_list,
+        names,
+        frames,
+        used,
+        axes=axes or {},
+        limits=limits or {},
+        slides=dict.fromkeys(slides, reach),
+    )
     parts = [index for index in order if bool(weights[:, index].max() > 0)]
     part_frames = tuple(last_frame[index] for index in parts)
+    found: tuple[Primitive, ...] | DeferredSolids
     if solids is None:
-        solids, nu = _fitted_solids(vertices, weights, parts, tree, part_frames, primitive)
-        solids = [_in_joint_frame(*pair, frames, parent_list) for pair in zip(solids, parts, strict=True)]
+        neighbors = neighbor_matrix(part_parents(tree, [tree.index(name) for name in part_frames]))
+        in_frames = partial(_in_joint_frames, joints=parts, frames=frames, parents=parent_list)
+        found, nu = _fitted_solids(vertices, weights, parts, neighbors, primitive, in_frames)
     else:
-        nu = fusion_length(solids, _FIT.nu_per_thickness)
+        found, nu = tuple(solids), fusion_length(solids, _FIT.nu_per_thickness)
     return ShapeSpec(
         tree=tree,
         part_frames=part_frames,
-        primitives=tuple(solids),
+        primitives=found,
         nu=nu,
         part_names=tuple(names[index] for index in parts),
         surface=RigSurface(vertices, mesh.faces, weights[:, parts]),
@@ -141,15 +161,33 @@ def spec_from_arrays(
 
 
 def _fitted_solids(
-    vertices: Tensor, weights: Tensor, parts: Sequence[int], tree: KinematicTree, frames: Sequence[str], primitive: str
-) -> tuple[list[Primitive], float]:
-    """Return solids (one per part) fitted to the vertices of the parts, in their coordinates, and a fusion length."""
+    vertices: Tensor,
+    weights: Tensor,
+    parts: Sequence[int],
+    neighbors: Tensor,
+    primitive: str,
+    in_frames: Callable[[Sequence[Primitive]], list[Primitive]],
+) -> tuple[DeferredSolids, float]:
+    """Return solids (one per part) fitted to the vertices of the parts, refined when needed, and a fusion length."""
     owners = weights.argmax(-1)
-    solids = [fitted_solid(_owned_vertices(vertices, weights[:, part], owners == part), primitive) for part in parts]
-    nu = fusion_length(solids, _FIT.nu_per_thickness)
-    neighbors = neighbor_matrix(part_parents(tree, [tree.index(name) for name in frames]))
+    with one_thread():
+        guess = [fitted_solid(_owned_vertices(vertices, weights[:, part], owners == part), primitive) for part in parts]
+    nu = fusion_length(guess, _FIT.nu_per_thickness)
     spread = torch.linspace(0, len(vertices) - 1, min(len(vertices), _FIT.refined_points)).long()
-    return refine_primitives(solids, neighbors, nu, vertices[spread], weights[spread][:, parts].argmax(-1)), nu
+    data = vertices[spread], weights[spread][:, parts].argmax(-1)
+    return DeferredSolids(in_frames(guess), partial(_refined_solids, guess, neighbors, nu, *data, in_frames)), nu
+
+
+def _refined_solids(
+    guess: Sequence[Primitive],
+    neighbors: Tensor,
+    nu: float,
+    points: Tensor,
+    owners: Tensor,
+    in_frames: Callable[[Sequence[Primitive]], list[Primitive]],
+) -> list[Primitive]:
+    """Return solids refined together, see `refine_primitives`, in their joints' frames."""
+    return in_frames(refine_primitives(guess, neighbors, nu, points, owners))
 
 
 def _skin_weights(weights: Tensor, shape: tuple[int, int]) -> Tensor:
@@ -219,6 +257,23 @@ def _carries_skin(parents: Sequence[int], order: Sequence[int], weights: Tensor)
     return used
 
 
+@dataclass(frozen=True)
+class _Move:
+    """A degree of freedom of a rig's joint.
+
+    Args:
+        suffix: of its name.
+        axis: in the joint's frame.
+        kind: of `Joint`.
+        limits: smallest and largest value, radians or metres.
+    """
+
+    suffix: str
+    axis: str | Sequence[float]
+    kind: str
+    limits: tuple[float, float]
+
+
 def _ball_joint_tree(
     order: Sequence[int],
     parents: Sequence[int],
@@ -228,6 +283,7 @@ def _ball_joint_tree(
     *,
     axes: Axes,
     limits: Limits,
+    slides: Mapping[str, float],
 ) -> tuple[KinematicTree, dict[int, str]]:
     """Return the tree, with several stacked frames per rig joint, and the name of each rig joint's last frame."""
     unknown = sorted((set(axes) | set(limits)) - set(names))
@@ -237,6 +293,7 @@ def _ball_joint_tree(
         )
     joints: list[Joint] = []
     last: dict[int, int] = {}
+    taken = set(names)
     for index in order:
         parent, name = parents[index], names[index]
         offset = frames[index] if parent < 0 else invert_rigid(frames[parent]) @ frames[index]
@@ -245,20 +302,37 @@ def _ball_joint_tree(
         bounds = limits.get(name, [(-torch.pi, torch.pi)] * len(chosen))
         if len(bounds) != len(chosen):
             raise ModelError(f"joint {name!r} has {len(chosen)} axes but {len(bounds)} pairs of limits")
-        for number, (axis, (low, high)) in enumerate(zip(chosen, bounds, strict=True)):
+        far = slides.get(name, 0.0) if parent >= 0 else 0.0
+        moves = [_Move(f"slide_{axis}", axis, "prismatic", (-far, far)) for axis in _UNIT_AXES if far]
+        for number, (axis, bound) in enumerate(zip(chosen, bounds, strict=True)):
+            moves.append(_Move(axis if isinstance(axis, str) else str(number), axis, "revolute", bound))
+        for move in moves:
             joints.append(
                 Joint(
-                    name=f"{name}_{axis if isinstance(axis, str) else number}",
+                    name=_free_name(f"{name}_{move.suffix}", taken),
                     parent=len(joints) - 1,
                     offset=torch.eye(4, dtype=torch.float64),
-                    kind="revolute",
-                    axis=_as_unit_axis(axis, name),
-                    lower=float(low),
-                    upper=float(high),
+                    kind=move.kind,
+                    axis=_as_unit_axis(move.axis, name),
+                    lower=float(move.limits[0]),
+                    upper=float(move.limits[1]),
                 )
             )
         last[index] = len(joints) - 1
     return KinematicTree(tuple(joints)), {index: joints[frame].name for index, frame in last.items()}
+
+
+def _free_name(name: str, taken: set[str]) -> str:
+    """Return a name, with ``#`` behind it as often as another frame is called so, and take it."""
+    free = name
+    while free in taken:
+        free += "#"
+    if free != name:
+        warnings.warn(
+            f"a degree of freedom is called {free!r}, as a joint is called {name!r}", FileWarning, stacklevel=2
+        )
+    taken.add(free)
+    return free
 
 
 def _as_unit_axis(axis: str | Sequence[float], name: str) -> tuple[float, float, float]:
@@ -280,10 +354,15 @@ def _owned_vertices(vertices: Tensor, weights: Tensor, owned: Tensor) -> Tensor:
     return vertices[owned]
 
 
-def _in_joint_frame(solid: Primitive, joint: int, frames: Tensor, parents: Sequence[int]) -> Primitive:
-    """Return the solid in its joint's frame, its long axis along the bone: to the next joints, or to its own center."""
-    to_joint = invert_rigid(frames[joint])
-    pose = to_joint @ solid.pose
-    children = [index for index, parent in enumerate(parents) if parent == joint]
-    end = transform_points(to_joint, frames[children, :3, 3]).mean(0) if children else pose[:3, 3]
-    return with_long_axis(Primitive(solid.kind, solid.sizes, pose), end)
+def _in_joint_frames(
+    solids: Sequence[Primitive], *, joints: Sequence[int], frames: Tensor, parents: Sequence[int]
+) -> list[Primitive]:
+    """Return solids in their joints' frames, the long axis along the bone: to the next joints, or to their center."""
+    placed = []
+    for solid, joint in zip(solids, joints, strict=True):
+        to_joint = invert_rigid(frames[joint])
+        pose = to_joint @ solid.pose
+        children = [index for index, parent in enumerate(parents) if parent == joint]
+        end = transform_points(to_joint, frames[children, :3, 3]).mean(0) if children else pose[:3, 3]
+        placed.append(with_long_axis(Primitive(solid.kind, solid.sizes, pose), end))
+    return placed

@@ -12,7 +12,7 @@ from torchreg.geometry.kinematic_tree import KinematicTree
 from torchreg.geometry.primitive_fit import fit_primitive
 from torchreg.geometry.primitives import PRIMITIVE_KINDS
 from torchreg.geometry.upright import Z_UP, Direction
-from torchreg.shapes.primitives import Primitive
+from torchreg.shapes.primitives import DeferredSolids, Primitive
 
 # Kinds of solids by name, or the one nearest to the points.
 SOLID_CHOICES = ("auto", *PRIMITIVE_KINDS)
@@ -54,7 +54,7 @@ class ShapeSpec:
 
     tree: KinematicTree
     part_frames: tuple[str, ...]
-    primitives: tuple[Primitive, ...]
+    primitives: tuple[Primitive, ...] | DeferredSolids
     nu: float
     part_names: tuple[str, ...]
     surface: RigSurface | None = None

@@ -1,0 +1,98 @@
+"""Geometry of glTF files that Draco compresses (KHR_draco_mesh_compression), by the library DracoPy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from torchreg.errors import FormatError
+from torchreg.io.raw_cloud import Array
+
+if TYPE_CHECKING:
+    from torchreg.io.gltf_document import GltfDocument
+
+NAME = "KHR_draco_mesh_compression"
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Where an accessor's numbers are: the number of a buffer view, and of an attribute (None: the triangles)."""
+
+    view: int
+    attribute: int | None
+
+
+class DracoGeometry:
+    """The compressed primitives of a document, each unpacked once, when it is asked for.
+
+    Args:
+        document: they are of.
+    """
+
+    def __init__(self, document: GltfDocument) -> None:
+        self._document = document
+        self._unpacked: dict[int, Any] = {}
+
+    @cached_property
+    def _sources(self) -> dict[int, _Source]:
+        """Where the numbers of accessors are."""
+        entry, found = self._document.entry, dict[int, _Source]()
+        for mesh in self._document.items("meshes"):
+            for primitive in entry(mesh, "primitives", list):
+                if not isinstance(primitive, dict):
+                    continue
+                packed = entry(entry(primitive, "extensions", dict), NAME, dict)
+                if not packed:
+                    continue
+                view, attributes = packed.get("bufferView"), entry(packed, "attributes", dict)
+                accessors: dict[Any, Any] = entry(primitive, "attributes", dict)
+                pairs = [(accessors.get(name), number) for name, number in attributes.items()]
+                for accessor, number in [*pairs, (primitive.get("indices"), None)]:
+                    if type(accessor) is int and type(view) is int and type(number) in (int, type(None)):
+                        found[accessor] = _Source(view, number)
+        return found
+
+    def numbers(self, accessor: int, what: str, shape: tuple[int, int]) -> Array | None:
+        """Return the numbers of an accessor, None where it is not compressed.
+
+        Args:
+            accessor: its number.
+            what: it holds, for messages.
+            shape: (N, W) that it claims.
+
+        Raises:
+            FormatError: if DracoPy is not installed, or the data are damaged.
+        """
+        source = self._sources.get(accessor)
+        if source is None:
+            return None
+        if source.view not in self._unpacked:
+            self._unpacked[source.view] = _decoded(bytes(self._document.view({"bufferView": source.view}, what)), what)
+        mesh = self._unpacked[source.view]
+        rows = [one["data"] for one in mesh.attributes if one["unique_id"] == source.attribute]
+        if source.attribute is None:
+            rows = [mesh.faces]
+        if not rows or np.size(rows[0]) != shape[0] * shape[1]:
+            raise FormatError(f"{what} must be {shape[0]} x {shape[1]} numbers, which its Draco data are not")
+        return np.asarray(rows[0]).reshape(shape)
+
+
+def _decoded(content: bytes, what: str) -> Any:
+    """Return the mesh of DracoPy of compressed bytes."""
+    try:
+        import DracoPy
+    except ImportError:
+        raise FormatError(
+            f"{what} is compressed by {NAME}: install its reader with pip install 'torchreg-articulated[draco]', or "
+            f"save the file again without mesh compression"
+        ) from None
+    try:
+        mesh = DracoPy.decode(content)
+    except Exception as error:  # DracoPy has errors of its own, without a common class
+        raise FormatError(f"the Draco data of {what} are damaged ({error})") from error
+    if getattr(mesh, "faces", None) is None:
+        raise FormatError(f"the Draco data of {what} hold no triangles")
+    return mesh
