@@ -45,5 +45,9 @@ class UnitsWarning(TorchregWarning):
     """The sizes of data and model differ so much that the units probably do too."""
 
 
+class OutputWarning(TorchregWarning):
+    """What a command writes beside its result could not be drawn or written; the message names the file."""
+
+
 class FileWarning(TorchregWarning):
     """Part of a file was left out, or read otherwise than it says; the message names the file and counts."""

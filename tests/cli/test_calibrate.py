@@ -47,6 +47,17 @@ def test_the_base_is_written_as_numbers_for_ros_and_drawn(run, folder, clouds, t
     assert len(list((tmp_path / "base_seen").glob("*.png"))) == 2
 
 
+def test_what_cannot_be_drawn_loses_no_result(run, folder, clouds, tmp_path, failing):
+    failing("torchreg.viz.figures.draw_alignment")
+    answer = run(
+        "calibrate", folder / "arm.urdf", *clouds, "--joints", folder / "joints.csv", "-o", tmp_path / "base"
+    )  # fmt: skip
+    assert answer.exit_code == 1
+    assert "base_seen is not written: ArithmeticError: no room" in answer.output
+    assert (tmp_path / "base.safetensors").exists()
+    assert (tmp_path / "base_transform.json").exists()
+
+
 def test_what_does_not_fit_is_told(error_of, folder, clouds, tmp_path):
     robot, output = folder / "arm.urdf", ["-o", tmp_path / "out"]
     table = tmp_path / "joints.csv"

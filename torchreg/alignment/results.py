@@ -9,7 +9,9 @@ from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
+from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError
+from torchreg.geometry.loaded import as_points
 from torchreg.result import Result, Status, stored_as
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
@@ -62,7 +64,7 @@ class AlignResult(Result):
         evidence: (E,) what the confidence rests on, see `alignment.reliability.Evidence`.
         doubt: what is doubtful, in a sentence; empty where nothing is. A tuple for a batch.
         crop: (H, W) bool, the pixels of a whole depth picture in which the shape was found; distances, inliers and
-            posterior are those of ``frame.cropped(crop).points``. None where what was aligned to was given.
+            posterior are those of `points_of` the picture. None where what was aligned to was given.
         origin: (3,) float64 about which it was computed, where the data lie so far from that of coordinates that the
             shape's precision would round them; pose, registered points and keypoints are float64 then. None elsewhere.
         coefficients: (C,) of the shape, where they were fitted too; the distances and all else are those of
@@ -104,6 +106,14 @@ class AlignResult(Result):
     def named_pose(self) -> dict[str, Any]:
         """The pose by name of degree of freedom: numbers, metres and radians; tensors (B,) for a batch."""
         return named_pose(self.shape, self.pose)
+
+    def points_of(self, data: Any) -> Tensor:
+        """Return the points (M, 3) of what was aligned to that distances and inliers belong to.
+
+        Args:
+            data: as `align` was given it, one cloud or picture: of a whole picture the points of its crop are returned.
+        """
+        return as_points(data.cropped(self.crop) if self.crop is not None and isinstance(data, DepthFrame) else data)
 
     def moved(self, origin: Tensor) -> Self:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""

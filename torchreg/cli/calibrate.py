@@ -12,7 +12,7 @@ import typer
 from torchreg.cli.align_options import NanPolicy, Scale, cloud_files, read_cloud
 from torchreg.cli.cameras import Depth, DepthRange, Intrinsics, Mask, Seen, check_used, depth_source, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
-from torchreg.cli.reporting import ExitCode, reporting
+from torchreg.cli.reporting import ExitCode, OptionalOutput, reporting
 from torchreg.cli.shape_argument import PackageDir, Shape, load_shape
 from torchreg.errors import InputError
 
@@ -90,9 +90,11 @@ def calibrate(
     from torchreg.alignment.calibrate_base import calibrate_base
 
     found = calibrate_base(model, given, rows, offsets)
-    _write_transform(transform, model, found)
-    _draw_frames(folder, model, found, frames, given, rows)
     found.save(output)
+    with OptionalOutput(transform):
+        _write_transform(transform, model, found)
+    with OptionalOutput(folder):
+        _draw_frames(folder, model, found, frames, given, rows)
     if not quiet:
         typer.echo(f"{_summary(model, found, frames)} -> {transform}")
     if not found.status.usable:
