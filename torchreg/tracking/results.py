@@ -45,11 +45,6 @@ class FrameResult(AlignResult):
     inlier_ratio: float
     residual: float
 
-    @property
-    def std(self) -> Tensor:
-        """Standard deviations (num_dofs,) of the pose, metres and radians."""
-        return self.covariance.diagonal().sqrt()
-
 
 @dataclass(frozen=True)
 class TrackResult(Result):
