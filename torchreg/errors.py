@@ -45,6 +45,10 @@ class UnitsWarning(TorchregWarning):
     """The sizes of data and model differ so much that the units probably do too."""
 
 
+class FramesWarning(TorchregWarning):
+    """Frames were left out, as the shape was not surely found in them; the message names them."""
+
+
 class OutputWarning(TorchregWarning):
     """What a command writes beside its result could not be drawn or written; the message names the file."""
 

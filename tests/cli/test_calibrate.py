@@ -1,15 +1,19 @@
 """Where a robot's base is in a camera, from the command line."""
 
 import json
+import re
+from dataclasses import replace
 
 import pytest
 import torch
 
+import torchreg.alignment.calibrate as calibrate_module
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.visibility import sample_visible
 from torchreg.io.points import save_points
+from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.storage import load
 
@@ -75,8 +79,17 @@ def test_what_does_not_fit_is_told(error_of, folder, clouds, tmp_path):
     assert "--mask has no meaning without --depth" in masks
 
 
-def test_a_hand_is_fitted_to_clouds(run, folder, tmp_path):
-    answer = run("calibrate", "hand", folder / "cloud0.ply", "-o", tmp_path / "hand")
-    assert answer.exit_code in (0, 1), answer.output
-    assert "times those of the shape" in answer.output
-    assert load(tmp_path / "hand.safetensors").poses.shape == (1, 27)
+def test_a_hand_is_searched_and_fitted_to_clouds_and_what_is_left_out_is_told(run, folder, tmp_path, monkeypatch):
+    clouds = folder / "cloud0.ply", folder / "cloud3.ply"
+    answer = run("calibrate", "hand", *clouds, "-o", tmp_path / "hand")
+    assert answer.exit_code == 0, answer.output
+    assert float(re.search(r"lengths ([\d.]+) times those of the shape", answer.output)[1]) == pytest.approx(
+        1, abs=0.05
+    )
+    found = load(tmp_path / "hand.safetensors")
+    assert found.poses.shape == (2, 27)
+    doubtful = replace(found, outliers=(1,), status=Status.WITH_WARNINGS)
+    monkeypatch.setattr(calibrate_module, "calibrate", lambda *given: doubtful)
+    answer = run("calibrate", "hand", *clouds, "-o", tmp_path / "hand", "--force", "--quiet")
+    assert answer.exit_code == 0
+    assert answer.output == "torchreg: warning: not surely found in cloud3.ply, left out of 2 frames\n"

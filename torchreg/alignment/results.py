@@ -195,6 +195,7 @@ class Calibration(Result):
         status: of the calibration at its end.
         coefficients: (C,) that all frames share, where the shape has coefficients; it is then that of the person.
         coefficient_covariance: (C, C) of them.
+        outliers: frames that were left out, by number, as the shape was not surely found in them.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -214,6 +215,7 @@ class Calibration(Result):
     status: Status
     coefficients: Tensor | None = None
     coefficient_covariance: Tensor | None = None
+    outliers: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
