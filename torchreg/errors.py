@@ -45,5 +45,13 @@ class UnitsWarning(TorchregWarning):
     """The sizes of data and model differ so much that the units probably do too."""
 
 
+class FramesWarning(TorchregWarning):
+    """Frames were left out, as the shape was not surely found in them; the message names them."""
+
+
+class OutputWarning(TorchregWarning):
+    """What a command writes beside its result could not be drawn or written; the message names the file."""
+
+
 class FileWarning(TorchregWarning):
     """Part of a file or of its data was left out, or read otherwise than it says; the message names it and counts."""

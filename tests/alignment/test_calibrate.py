@@ -10,7 +10,8 @@ from torchreg.alignment.calibrate import CalibrateConfig, calibrate
 from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.results import Calibration
 from torchreg.alignment.scale_fit import scale_jacobian
-from torchreg.datasets.hand import hand_motion, make_hand_cloud
+from torchreg.datasets.hand import hand_motion, make_hand_cloud, random_hand_pose
+from torchreg.errors import FramesWarning
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.rigid import rigid_matrix
 from torchreg.result import Status
@@ -293,6 +294,33 @@ def test_a_hand_of_other_proportions_seen_from_one_side(plain_hand, other_hand):
     # The median, because a descent loses a finger now and then whatever the shape.
     assert float(errors[1].median()) < 0.003
     assert float(errors[1].median()) < 0.6 * float(errors[0].median())
+
+
+def test_a_hand_of_another_size_is_searched_in_clouds_and_what_shows_none_is_left_out(plain_hand):
+    """The first two frames show a smaller hand, turned otherwise in each, the third a box."""
+    truth = set_scales(Hand(), [math.log(0.88)] * 16, [math.log(0.88)] * 16).requires_grad_(False)
+    poses = torch.stack([random_hand_pose(truth, torch.Generator().manual_seed(seed), bend=0.3) for seed in (20, 21)])
+    generator = torch.Generator().manual_seed(0)
+    clouds = [
+        make_hand_cloud(truth, pose, num_points=600, outlier_ratio=0.0, generator=generator).points for pose in poses
+    ]
+    box = torch.rand(600, 3, generator=generator)
+    box[torch.arange(600), torch.randint(3, (600,), generator=generator)] = torch.randint(
+        2, (600,), generator=generator
+    ).float()
+    with pytest.warns(FramesWarning, match="not surely found in frames 2 of 3, counted from 0"):
+        found = calibrate(plain_hand, [*clouds, 0.15 * box])
+    assert (found.status, found.outliers) == (Status.WITH_WARNINGS, (2,))
+    assert float(found.log_length_scales.exp().mean()) == pytest.approx(0.88, abs=0.03)
+    off = found.shape.keypoints(found.poses[:2]).detach() - truth.keypoints(poses)
+    assert float(off.norm(dim=-1).mean()) < 0.004
+
+
+def test_without_any_frame_that_can_be_trusted_the_result_is_doubtful(plain_hand):
+    cloud = 0.05 * torch.randn(150, 3, generator=torch.Generator().manual_seed(0))
+    with pytest.warns(FramesWarning, match="frames 0 of 1"):
+        found = calibrate(plain_hand, [cloud], config=CalibrateConfig(rounds=1))
+    assert not found.status.usable
 
 
 def test_non_finite_data_may_be_left_out(arm_frames, arm_starts, arm_found):

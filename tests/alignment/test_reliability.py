@@ -142,6 +142,56 @@ def test_one_datum_on_a_handle_tells_no_turn_surely():
     assert std(10) < 0.2 * std(0)
 
 
+ROBOT = """<robot name="arm"><link name="base"><visual><geometry><box size="0.3 0.2 0.1"/></geometry></visual></link>
+{links}</robot>"""
+LINK = """<link name="{name}"><visual><origin xyz="0 0 0.15"/><geometry>{solid}</geometry></visual></link>
+<joint name="{joint}" type="{kind}"><parent link="{parent}"/><child link="{name}"/><origin xyz="0 0 {height}"/>
+<axis xyz="{axis}"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint>"""
+BOX, CYLINDER = '<box size="0.06 0.09 0.3"/>', '<cylinder radius="0.05" length="0.3"/>'
+
+
+@pytest.mark.parametrize(("solid", "kind", "seen", "is_open"), [
+    (BOX, "revolute", True, False), (CYLINDER, "revolute", True, True), (CYLINDER, "continuous", True, True),
+    (BOX, "continuous", False, True),
+])  # fmt: skip
+def test_joints_that_no_data_determine_are_named_whatever_the_status(tmp_path, solid, kind, seen, is_open):
+    """The turn of a cylinder about its own axis, which has the facets of a mesh, and that of a missing link."""
+    links = [
+        ("upper", BOX, "lift", "revolute", "base", 0.05, "0 1 0"),
+        ("tool", solid, "roll", kind, "upper", 0.3, "0 0 1"),
+    ]
+    names = "name", "solid", "joint", "kind", "parent", "height", "axis"
+    rows = [LINK.format(**dict(zip(names, link, strict=True))) for link in links]
+    (tmp_path / "arm.urdf").write_text(ROBOT.format(links="".join(rows)))
+    arm = ArticulatedShape.from_urdf(tmp_path / "arm.urdf", free_base=False)
+    pose = arm.pose_from_dict({"lift": 0.6, "roll": 0.4})
+    skin = tr.sample_skin(arm, 900)
+    kept = torch.ones(len(skin), dtype=torch.bool) if seen else skin.weights.argmax(-1) < 2
+    data = skin(pose)[kept] + 0.001 * torch.randn(int(kept.sum()), 3, generator=torch.Generator().manual_seed(0))
+    found = tr.align(arm, data, pose, config=tr.AlignConfig(search="never"))
+    assert ("not determined by the data: roll (+- " in found.doubt) is is_open
+    assert "lift (" not in found.doubt
+    # Without data the standard deviation is a radian, as the limits are wider than that of it.
+    assert found.named_std["roll"] == pytest.approx(1.0, rel=0.1) if is_open else found.named_std["roll"] < 0.1
+    assert found.named_std["lift"] < 0.05
+    confidence = dict(zip(arm.dof_names, found.dof_confidence.tolist(), strict=True))
+    assert (confidence["roll"] < 0.2, confidence["lift"] > 0.99, confidence["base_x"]) == (is_open, True, 1.0)
+    held = tr.align(arm, data, pose, locked=["roll"], config=tr.AlignConfig(search="never"))
+    assert "roll" not in held.doubt
+    assert held.dof_confidence[-1] > 0.99
+
+
+def test_a_batch_names_deviations_as_it_names_poses_and_what_is_seen_is_determined(plain_hand, plain_hand_skin):
+    pose = plain_hand.rest_pose().expand(2, -1)
+    noise = 0.001 * torch.randn(2, len(plain_hand_skin), 3, generator=torch.Generator().manual_seed(0))
+    found = tr.align(plain_hand, plain_hand_skin(pose) + noise, pose, config=tr.AlignConfig(search="never"))
+    assert not any("determined" in doubt for doubt in found.doubt)
+    assert list(found.named_std) == list(found.named_pose)
+    assert found.named_std["little_dip_flexion"].shape == (2,)
+    assert found.dof_confidence.shape == (2, plain_hand.num_dofs)
+    assert bool((found.dof_confidence > 0.5).all())
+
+
 def test_the_covariance_is_that_of_shapes_of_other_proportions(links, links_skin, measured):
     pose, _ = measured
     generator, other, clouds = torch.Generator().manual_seed(2), copy.deepcopy(links), []

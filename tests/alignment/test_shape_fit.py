@@ -87,6 +87,17 @@ def test_scans_of_one_person_share_its_coefficients(shape):
     torch.testing.assert_close(found.shape(rest).points, shape.vertices(rest, found.coefficients))
 
 
+def test_scans_of_one_person_are_searched_without_starts(shape):
+    coefficients = torch.tensor([-0.7, 0.8, 0.5])
+    pairs = [scan(shape, coefficients, seed, count=500, one_sided=False) for seed in (1, 2)]
+    found = calibrate(shape, [data for _, data in pairs], config=CalibrateConfig(align=QUICK))
+    assert float((found.coefficients - coefficients).abs().max()) < 0.12
+    # It looks the same from the back.
+    wanted = shape.vertices(torch.stack([pose for pose, _ in pairs]), coefficients)
+    assert float(nearest_neighbor(shape.vertices(found.poses, found.coefficients), wanted)[1].mean()) < 0.02
+    assert (found.status.usable, found.outliers) == (True, ())
+
+
 def test_bones_of_a_rig_take_the_lengths_of_another(shape):
     plain = shape.with_coefficients(torch.zeros(3))
     coefficients = torch.tensor([0.9, 0.6, 0.8])

@@ -49,6 +49,20 @@ def error_of(run):
     return error
 
 
+@pytest.fixture
+def failing(monkeypatch):
+    """Return the function that lets functions fail, named by module and name, as a library that draws may."""
+
+    def fail(*names):
+        def broken(*arguments, **options):
+            raise ArithmeticError("no\nroom")
+
+        for name in names:
+            monkeypatch.setattr(name, broken)
+
+    return fail
+
+
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
     """Return a folder with four clouds of a moving hand, a start, a robot and a rig whose nodes are flat."""

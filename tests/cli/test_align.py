@@ -60,6 +60,37 @@ def test_one_cloud_is_aligned_and_everything_asked_for_is_written(run, folder, t
     assert abs(named["index_mcp_flexion"] - truth["index_mcp_flexion"]) < 0.15
 
 
+def test_joints_that_the_data_do_not_determine_are_printed(run, folder, tmp_path):
+    arm = torchreg.ArticulatedShape.from_urdf(folder / "arm.urdf")
+    skin = arm.file_skin()
+    save_points(tmp_path / "cloud.ply", skin(arm.rest_pose())[skin.weights.argmax(-1) < 2])
+    (tmp_path / "start.json").write_text("{}")
+    answer = run(
+        "align", folder / "arm.urdf", tmp_path / "cloud.ply", "-o", tmp_path / "r", "--start", tmp_path / "start.json",
+        *QUICK,
+    )  # fmt: skip
+    assert "not determined by the data: " in answer.output
+    assert "rail (+- " in answer.output
+
+
+def test_what_cannot_be_drawn_or_written_loses_no_result(run, folder, tmp_path, failing):
+    failing("torchreg.viz.figures.draw_alignment", "torchreg.io.points.save_points")
+    answer = run(
+        "align", "hand", folder / "cloud0.ply", folder / "cloud1.ply", "-o", tmp_path / "r", "--start",
+        folder / "truth0.json", "--pose", tmp_path / "pose.csv", "--ply", tmp_path / "skin.ply", "--picture",
+        tmp_path / "p.png", "--gltf", tmp_path / "hand.glb", "--quiet", *QUICK,
+    )  # fmt: skip
+    assert answer.exit_code == 1
+    assert [line.split("/")[-1] for line in answer.output.splitlines()] == [
+        f"{name}_{number}.{ending} is not written: ArithmeticError: no room; the result does not suffer"
+        for number in (1, 2) for name, ending in (("skin", "ply"), ("p", "png"))
+    ]  # fmt: skip
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "hand.glb", *(f"{name}_{number}.{end}" for number in (1, 2)
+                      for name, end in (("pose", "csv"), ("r", "json"), ("r", "safetensors")))
+    }  # fmt: skip
+
+
 def test_clouds_are_numbered_and_each_starts_from_the_pose_before(run, folder, tmp_path, monkeypatch):
     starts = watch_align(monkeypatch)
     clouds = [folder / f"cloud{index}.ply" for index in range(3)]

@@ -1,15 +1,19 @@
 """Where a robot's base is in a camera, from the command line."""
 
 import json
+import re
+from dataclasses import replace
 
 import pytest
 import torch
 
+import torchreg.alignment.calibrate as calibrate_module
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.rigid import rigid_matrix, transform_points
 from torchreg.geometry.rotation import so3_exp
 from torchreg.geometry.visibility import sample_visible
 from torchreg.io.points import save_points
+from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.storage import load
 
@@ -47,6 +51,17 @@ def test_the_base_is_written_as_numbers_for_ros_and_drawn(run, folder, clouds, t
     assert len(list((tmp_path / "base_seen").glob("*.png"))) == 2
 
 
+def test_what_cannot_be_drawn_loses_no_result(run, folder, clouds, tmp_path, failing):
+    failing("torchreg.viz.figures.draw_alignment")
+    answer = run(
+        "calibrate", folder / "arm.urdf", *clouds, "--joints", folder / "joints.csv", "-o", tmp_path / "base"
+    )  # fmt: skip
+    assert answer.exit_code == 1
+    assert "base_seen is not written: ArithmeticError: no room" in answer.output
+    assert (tmp_path / "base.safetensors").exists()
+    assert (tmp_path / "base_transform.json").exists()
+
+
 def test_what_does_not_fit_is_told(error_of, folder, clouds, tmp_path):
     robot, output = folder / "arm.urdf", ["-o", tmp_path / "out"]
     table = tmp_path / "joints.csv"
@@ -64,8 +79,17 @@ def test_what_does_not_fit_is_told(error_of, folder, clouds, tmp_path):
     assert "--mask has no meaning without --depth" in masks
 
 
-def test_a_hand_is_fitted_to_clouds(run, folder, tmp_path):
-    answer = run("calibrate", "hand", folder / "cloud0.ply", "-o", tmp_path / "hand")
-    assert answer.exit_code in (0, 1), answer.output
-    assert "times those of the shape" in answer.output
-    assert load(tmp_path / "hand.safetensors").poses.shape == (1, 27)
+def test_a_hand_is_searched_and_fitted_to_clouds_and_what_is_left_out_is_told(run, folder, tmp_path, monkeypatch):
+    clouds = folder / "cloud0.ply", folder / "cloud3.ply"
+    answer = run("calibrate", "hand", *clouds, "-o", tmp_path / "hand")
+    assert answer.exit_code == 0, answer.output
+    assert float(re.search(r"lengths ([\d.]+) times those of the shape", answer.output)[1]) == pytest.approx(
+        1, abs=0.05
+    )
+    found = load(tmp_path / "hand.safetensors")
+    assert found.poses.shape == (2, 27)
+    doubtful = replace(found, outliers=(1,), status=Status.WITH_WARNINGS)
+    monkeypatch.setattr(calibrate_module, "calibrate", lambda *given: doubtful)
+    answer = run("calibrate", "hand", *clouds, "-o", tmp_path / "hand", "--force", "--quiet")
+    assert answer.exit_code == 0
+    assert answer.output == "torchreg: warning: not surely found in cloud3.ply, left out of 2 frames\n"

@@ -63,6 +63,19 @@ def test_pictures_of_a_pattern_are_aligned(run, pictures, tmp_path):
     assert len(first.distances) == len(frame.points)
 
 
+def test_a_shape_found_in_a_whole_picture_is_drawn_over_the_points_of_its_crop(run, pictures, tmp_path):
+    answer = run(
+        "align", "hand", pictures / "depth" / "0.png", "--depth", "--intrinsics", pictures / "camera.json", "-o",
+        tmp_path / "r", "--picture", tmp_path / "p.png", "--quiet",
+    )  # fmt: skip
+    assert answer.exit_code == 0, answer.output
+    assert (tmp_path / "p.png").stat().st_size > 0
+    result = load(tmp_path / "r.safetensors")
+    frame = tr.DepthFrame.load(pictures / "depth" / "0.png", pictures / "camera.json")
+    assert result.inliers.shape == (len(result.points_of(frame)),) != (len(frame.points),)
+    assert result.plot(frame).figure is not None
+
+
 def test_a_folder_of_pictures_is_tracked_with_keypoints_in_them(run, pictures, tmp_path):
     answer = run(
         "track", "hand", pictures / "depth", *options(pictures, tmp_path), "--movie", "none", "--no-gltf",

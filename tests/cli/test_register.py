@@ -59,6 +59,19 @@ def test_what_scans_stand_on_is_left_out(run, error_of, scans, tmp_path, monkeyp
     assert "no meaning with --urdf" in error_of("register", folder, "--urdf", "--support", "keep")
 
 
+def test_what_cannot_be_drawn_or_written_loses_no_result(run, scans, tmp_path, monkeypatch, failing):
+    folder, known = scans
+    monkeypatch.setattr(pipeline, "register", known)
+    failing("torchreg.viz.scan_gltf.save_grid_animation", "torchreg.viz.bone_colors.save_weight_ply")
+    answer = run(
+        "register", folder / "source.ply", folder / "target.ply", "-o", tmp_path / "out.glb", "--bones", 6, "--grid",
+        25, "--weights", tmp_path / "bones.ply", "--errors", tmp_path / "errors.ply", "--quiet",
+    )  # fmt: skip
+    assert answer.exit_code == 1
+    assert sum("is not written: ArithmeticError" in line for line in answer.output.splitlines()) == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["errors.ply", "out.json", "out.safetensors"]
+
+
 def test_what_cannot_be_written_is_told_first(run, error_of, scans, tmp_path, monkeypatch):
     folder, known = scans
     monkeypatch.setattr(pipeline, "register", known)
@@ -156,7 +169,7 @@ def test_scans_of_a_robot_become_its_description(run, error_of, scans, tmp_path,
     monkeypatch.setattr(register_sequence, "register_sequence", known)
     answer = run(*three, "-o", tmp_path / "robot", "--urdf", "--bones", 8, "--grid", 25)
     assert answer.exit_code == 0, answer.output
-    assert asked == [(3, 8, 25), tmp_path / "robot.urdf", tmp_path / "robot.safetensors"]
+    assert asked == [(3, 8, 25), tmp_path / "robot.safetensors", tmp_path / "robot.urdf"]
     assert "converged, confidence 70% in the worst scan: 2 links, 1 hinges and 0 sliders" in answer.output
     assert "joint_1 does not explain how its two links move" in answer.output
     lines = (tmp_path / "robot_joints.csv").read_text().splitlines()

@@ -93,6 +93,15 @@ def test_the_table_below_is_left_out_with_one_sentence(run, error_of, frames, tm
     assert "auto, keep" in error_of("spine", frames, "-o", tmp_path / "no.glb", "--support", "cut")
 
 
+def test_what_cannot_be_drawn_or_written_loses_no_result(run, frames, tmp_path, failing):
+    failing("torchreg.viz.spine_gltf.save_spine_animation", "torchreg.viz.spines.draw_measurements")
+    beside = "--table", tmp_path / "a.csv", "--plot", tmp_path / "a.png", "--npz", tmp_path / "a.npz"
+    answer = run("spine", frames, "-o", tmp_path / "a.glb", "--tips", 5, "--samples", 12, *beside)
+    assert answer.exit_code == 1
+    assert all(f"a.{end} is not written: ArithmeticError" in answer.output for end in ("glb", "png"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "a.json", "a.npz", "a.safetensors"]
+
+
 def test_files_are_put_in_order_and_work_goes_on(run, frames, tmp_path):
     files = sorted(frames.iterdir())  # by name: frame10, frame11, frame2
     options = ("-o", tmp_path / "b", "--progress", tmp_path / "kept", "--tips", 5, "--samples", 12)

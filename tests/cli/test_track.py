@@ -83,6 +83,16 @@ def same(first, second):
     )
 
 
+def test_what_cannot_be_drawn_or_written_loses_no_result_and_is_told_once(run, command, whole, tmp_path, failing):
+    failing("torchreg.viz.tracking.draw_track_frame", "torchreg.viz.track_bvh.save_track_bvh")
+    answer = run(*command("--pictures", tmp_path / "live", "--bvh", tmp_path / "r.bvh", "--quiet"))
+    assert answer.exit_code == 1
+    told = [line.split("/")[-1] for line in answer.output.splitlines()]
+    assert [line.split(" is not written: ")[0] for line in told] == ["torchreg: warning: --pictures", "r.gif", "r.bvh"]
+    assert same(load(tmp_path / "r.safetensors"), whole)
+    assert (tmp_path / "r.glb").exists()
+
+
 def stop_at(monkeypatch, frame, error=KeyboardInterrupt):
     """Let the tracker be stopped while it works on a frame."""
     step = Tracker.step

@@ -38,6 +38,7 @@ from torchreg.alignment.inputs import (
 )
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmark_fit import align_keypoints, measured_alone
+from torchreg.alignment.observability import dof_confidence
 from torchreg.alignment.person_gradient import person_with_gradients
 from torchreg.alignment.pose_proposer import HoldsProposer, PoseProposer
 from torchreg.alignment.problem import (
@@ -268,6 +269,7 @@ def _align_person(
             history=tuple(history),
             coefficients=fitted.coefficients,
             covariance=fitted.covariance[0, :dofs, :dofs],
+            dof_confidence=dof_confidence(shape, fitted.covariance[0, :dofs, :dofs], batch.problem.size),
             coefficient_covariance=fitted.covariance[0, dofs:, dofs:],
         ))  # fmt: skip
     if not by_data:
@@ -402,6 +404,7 @@ def _result(
         status=tuple(_status(*row) for row in zip(*(row.tolist() for row in rows), strict=True)),
         history=tuple(batch.history),
         covariance=judgement.covariance,
+        dof_confidence=judgement.dof_confidence,
         confidence=confidence,
         evidence=judgement.evidence.table(),
         doubt=judgement.doubt,

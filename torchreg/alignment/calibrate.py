@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import torch
@@ -12,8 +12,8 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from torchreg._checks import as_float_tensor, check_count, check_finite, check_positive, check_shape
-from torchreg.alignment.align import align
 from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.found_frames import FramePoses
 from torchreg.alignment.inputs import check_clouds
 from torchreg.alignment.problem import model_size
 from torchreg.alignment.results import Calibration
@@ -97,6 +97,9 @@ def calibrate(
     all data, robustly (eqs. 21 and 22 summed over the frames), with a hierarchical prior on the scales: one overall
     size, one ratio of radii to lengths, and small deviations of each part. Both are repeated with the better shape.
 
+    Without initial poses the shape is searched in every frame, all in one batch. Frames in which it is not surely found
+    are left out, and searched again with the size that the others tell; where none is sure, the surest ones tell it.
+
     Of a shape with coefficients, the frames are scans of one person: its coefficients and all poses are fitted
     together, as ``align(..., fit_shape=True)`` fits those of one scan.
 
@@ -104,22 +107,28 @@ def calibrate(
         shape: where to start, in metres; it is not changed. It has coefficients, or its solids are fitted: then it must
             not have come from a file with a mesh.
         frames: T clouds: (T, M, 3), or a sequence of (M_t, 3), metres. One to ten frames whose joints move help most.
-        initial_poses: (T, num_dofs) or (num_dofs,) for all; the rest pose by default.
+        initial_poses: (T, num_dofs) or (num_dofs,) for all, as ``shape.rest_pose()``; without any, the shape is
+            searched for.
         masks: (T, M) False where data are padding; for frames in one tensor.
         config: see `CalibrateConfig`.
         on_step: called with a `CalibrateRecord` after each joint fit.
 
     Returns:
-        a `Calibration`. Its status is FEW_INLIERS, or DEGENERATE, if a frame could not be aligned; such frames do not
-            count.
+        a `Calibration`. With initial poses its status is FEW_INLIERS, or DEGENERATE, if a frame could not be aligned;
+            such frames do not count. Without, the frames left out are its ``outliers``; its status is WITH_WARNINGS
+            then, and DOUBTFUL if they are more than half of all.
 
     Raises:
         InputError: if frames are empty, not finite, or do not fit the poses, or the shape has a surface of its own.
         InputTypeError: if an argument has the wrong type.
 
+    Warns:
+        FramesWarning: if frames are left out.
+
     Differentiable: no.
 
-    Cost: per step, a Jacobian of T M distances and a Cholesky factorization of size T num_dofs + 2 P.
+    Cost: without initial poses that of `find_pose` for each frame, up to twice. Per step, a Jacobian of T M distances
+    and a Cholesky factorization of size T num_dofs + 2 P.
 
     References: Dewaele et al. 2006, section 3.4, for the distances.
     """
@@ -133,23 +142,28 @@ def calibrate(
         )
     with torch.no_grad():
         data, valid = _check_frames(shape, frames, masks, config.align.nan_policy)
-        poses = _check_poses(shape, initial_poses, len(data))
+        frame_poses = FramePoses.of(_check_poses(shape, initial_poses, len(data)), initial_poses is None)
+        poses = frame_poses.poses
         fitted = copy.deepcopy(shape).requires_grad_(False)
         prior = None
         for number in range(config.rounds):
             skin = sample_skin(fitted, config.align.num_model_points, sharpness=config.align.sharpness)
             size = model_size(skin)
+            known = frame_poses.known
+            frame_poses = replace(frame_poses, poses=poses).aligned(fitted, data, valid, config.align, skin)
+            poses = torch.where(known.unsqueeze(-1), poses, frame_poses.poses)
             prior = prior or ScalePrior.from_shape(
                 shape, poses, size, joint_std=config.align.prior_std, size_std=config.size_std,
                 radius_std=config.radius_std, part_std=config.part_std,
             )  # fmt: skip
-            found = align(fitted, data, poses, model_points=skin, mask=valid, config=config.align)
-            aligned = torch.tensor([_rests_on_data(status) for status in found.statuses], device=valid.device)
-            problem = ScaleProblem(fitted, data, valid & aligned.unsqueeze(-1), prior, size, config.max_points)
-            better = problem.unexplained(found.pose) < problem.unexplained(poses)
-            poses = torch.where(better.unsqueeze(-1), found.pose, poses)
+            # Of a frame that was searched the prior is about what was found.
+            prior = replace(prior, poses=torch.where(known.unsqueeze(-1), prior.poses, poses))
+            counts = valid & frame_poses.counting.unsqueeze(-1)
+            problem = ScaleProblem(fitted, data, counts, prior, size, config.max_points)
+            better = problem.unexplained(frame_poses.poses) < problem.unexplained(poses)
+            poses = torch.where(better.unsqueeze(-1), frame_poses.poses, poses)
             poses, cost, change = _fit_jointly(problem, poses, config, number, on_step)
-    failed = {status for status in found.statuses if not _rests_on_data(status)}
+    frame_poses.warn()
     status = Status.CONVERGED if change <= config.align.pose_atol else Status.MAX_STEPS
     for parameter, original in zip(fitted.parameters(), shape.parameters(), strict=True):
         parameter.requires_grad_(original.requires_grad)
@@ -159,7 +173,8 @@ def calibrate(
         log_length_scales=fitted.log_length_scales.detach().clone(),
         log_radius_scales=fitted.log_radius_scales.detach().clone(),
         cost=cost,
-        status=Status.DEGENERATE if Status.DEGENERATE in failed else Status.FEW_INLIERS if failed else status,
+        status=frame_poses.status(status),
+        outliers=frame_poses.left_out,
     )
 
 
@@ -173,26 +188,27 @@ def _calibrate_person(
     """Return the person whom frames show: one set of coefficients, and a pose for each frame."""
     with torch.inference_mode():
         data, valid = _check_frames(shape, frames, masks, config.align.nan_policy)
-        poses = _check_poses(shape, initial_poses, len(data))
-    fitted = fit_coefficients(shape, data, valid, poses, config=config.align)
+        frame_poses = FramePoses.of(_check_poses(shape, initial_poses, len(data)), initial_poses is None)
+    if frame_poses.searched:
+        frame_poses = frame_poses.of_person(shape, data, valid, config.align)
+    counts = frame_poses.known | ~frame_poses.known.any()
+    fitted = fit_coefficients(shape, data[counts], valid[counts], frame_poses.poses[counts], config=config.align)
+    poses = frame_poses.poses.index_put((counts,), fitted.poses)
+    frame_poses.warn()
     person = shape.with_coefficients(fitted.coefficients)
     shared = shared_covariance(fitted.covariance, shape.num_dofs)
     status = Status.CONVERGED if bool(fitted.error.converged.all()) else Status.MAX_STEPS
     return normal_copy(Calibration(
         shape=person,
-        poses=fitted.poses,
+        poses=poses,
         log_length_scales=person.log_length_scales.detach().clone(),
         log_radius_scales=person.log_radius_scales.detach().clone(),
         cost=fitted.cost,
-        status=status,
+        status=frame_poses.status(status),
+        outliers=frame_poses.left_out,
         coefficients=fitted.coefficients,
         coefficient_covariance=shared.to(poses),
     ))  # fmt: skip
-
-
-def _rests_on_data(status: Status) -> bool:
-    """Return whether a frame counts: a doubtful one does, as the scales are not fitted yet."""
-    return status.usable or status is Status.DOUBTFUL
 
 
 def _fit_jointly(

@@ -12,6 +12,7 @@ from torchreg.alignment.confidence import end_motions, end_variances, limb_ends
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmarks import Landmarks, MeasuredKeypoints, keypoint_extent
 from torchreg.alignment.limb_search import distinct_first
+from torchreg.alignment.observability import dof_confidence, told_open
 from torchreg.alignment.pose_search import mean_distances
 from torchreg.alignment.problem import PRIOR_SHARE, AlignProblem, centered_problem
 from torchreg.alignment.reliability import CALIBRATION, plausible_precision
@@ -221,13 +222,14 @@ def align_keypoints(
         wrong = int(fit.landmarks.seen.sum()) - right
         reasons = [f"{wrong} of the seen keypoints do not agree with the pose"] * (wrong > 0)
         reasons += ["keypoints alone do not tell where the limbs end"] * (not sure)
+        reasons += filter(None, [told_open(shape, covariance[0], fit.problem.size)])
         status = Status.CONVERGED if sure else Status.DOUBTFUL
         found = AlignResult(
             pose=pose, registered=skin(pose), keypoints=skin.shape.keypoints(pose), distances=none,
             inliers=none.bool(), posterior=none, sigma=none.sum(), cost=fit.costs[0],
             status=Status.FEW_INLIERS if right < _SEARCH.least else status,
             covariance=covariance[0], confidence=confidence,
-            doubt="; ".join(reasons),
+            doubt="; ".join(reasons), dof_confidence=dof_confidence(shape, covariance[0], fit.problem.size),
         )  # fmt: skip
         return normal_copy(found)
 

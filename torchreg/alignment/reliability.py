@@ -13,9 +13,10 @@ from torch import Tensor
 
 from torchreg.alignment.clusters import OFF_SURFACE, clusters_beside
 from torchreg.alignment.confidence import EVIDENCE, DataOnSurface, end_spreads, limb_points, share_beside
+from torchreg.alignment.observability import dof_confidence, far_variance, plausible_variance, told_open
 from torchreg.alignment.other_explanations import open_rims, planes_instead
 from torchreg.alignment.patches import errors_per_patch
-from torchreg.alignment.problem import BROAD_PRIOR, INLIER_SHARE, AlignProblem, free_space_loss
+from torchreg.alignment.problem import INLIER_SHARE, AlignProblem, free_space_loss
 from torchreg.alignment.shape_errors import shape_covariance
 from torchreg.alignment.surface_fit import SURFACE_FIT, pose_covariance, surface_noise, surface_objective
 from torchreg.capture.depth_frame import DepthFrame
@@ -64,7 +65,6 @@ class _Scales:
     """Scales of the evidence."""
 
     rival_share: float = 0.02  # of the data by which a pose leads: at which a rival counts 1 / e
-    least_span: float = 1e-3  # of the limits of a joint that does not move, radians or metres
     num_correlated: int = 1000  # data by which the correlation of residuals is measured
     lattice: int = 12  # neighbors to each side whose correlation counts
     max_correlation: float = 0.95  # of neighboring residuals
@@ -171,6 +171,7 @@ class Judgement:
 
     Args:
         covariance: (B, num_dofs, num_dofs) in tangent coordinates.
+        dof_confidence: (B, num_dofs) share of the variance without data that they removed.
         converged: (B,) whether a further step would hardly matter.
         evidence: for and against them.
         confidence: (B,) that they are right.
@@ -178,6 +179,7 @@ class Judgement:
     """
 
     covariance: Tensor
+    dof_confidence: Tensor
     converged: Tensor
     evidence: Evidence
     confidence: Tensor
@@ -211,12 +213,20 @@ def judge(
         evidence, calibration = replace(evidence, unknown=error.unknown(problem.size)), SHAPE_CALIBRATION
         limbs = [limb for limb, _ in limb_points(problem.skin)]
         converged, loose = error.converged, error.loose(limbs, problem.size)
+    shape, precision = problem.skin.shape, plausible_precision(problem, pose)
+    far = far_variance(problem, pose, lying, noise=around.noise, shared=around.shared, precision=precision)
+    diagonal = around.covariance.diagonal(dim1=-2, dim2=-1)
+    covariance = around.covariance + torch.diag_embed((far - diagonal).clamp_min(0))
+    left_open = [told_open(shape, row, problem.size) for row in covariance]
     return Judgement(
-        covariance=around.covariance,
+        covariance=covariance,
+        dof_confidence=dof_confidence(shape, covariance, problem.size),
         converged=converged,
         evidence=evidence,
         confidence=confidence_of(evidence.table(), calibration),
-        doubt=told_doubts(problem, evidence, loose),
+        doubt=tuple(
+            "; ".join(filter(None, row)) for row in zip(told_doubts(problem, evidence, loose), left_open, strict=True)
+        ),
     )
 
 
@@ -298,10 +308,14 @@ class Curvature:
     Args:
         covariance: (B, num_dofs, num_dofs) in tangent coordinates.
         gain: (B,) log-likelihood that a further step would gain.
+        noise: (B,) of the data, metres.
+        shared: (B,) number of data that err together.
     """
 
     covariance: Tensor
     gain: Tensor
+    noise: Tensor
+    shared: Tensor
 
     @property
     def converged(self) -> Tensor:
@@ -352,7 +366,7 @@ def curvature(problem: AlignProblem, pose: Tensor, lying: DataOnSurface | None =
         covariance=pose_covariance(jacobian, near, noise, precision), share=correlation,
     )  # fmt: skip
     misplaced = torch.diag_embed(_misplaced_share(problem, lying.limb_data) / precision)
-    return Curvature((covariance + misplaced + inexact_shape).to(pose), gain)
+    return Curvature((covariance + misplaced + inexact_shape).to(pose), gain, noise, shared)
 
 
 def _sure_covariance(jacobian: Tensor, weights: Tensor, noise: Tensor, precision: Tensor) -> Tensor:
@@ -430,8 +444,7 @@ def _misplaced_share(problem: AlignProblem, limb_data: Tensor) -> Tensor:
 def plausible_precision(problem: AlignProblem, pose: Tensor) -> Tensor:
     """Return 1 / variance (B, num_dofs) of poses of which no more is known than the limits of the joints."""
     spans = (problem.upper - problem.lower).expand_as(pose)
-    uniform = 12 / spans.square().clamp_min(_SCALES.least_span**2)
-    plausible = torch.maximum(uniform, BROAD_PRIOR.precision(problem.skin.shape, problem.size))
+    plausible = plausible_variance(problem.skin.shape, problem.size, spans).reciprocal()
     return plausible if problem.told_precision is None else torch.maximum(plausible, problem.told_precision)
 
 

@@ -9,7 +9,9 @@ from typing import Any, ClassVar, Self
 
 from torch import Tensor
 
+from torchreg.capture.depth_frame import DepthFrame
 from torchreg.errors import InputError
+from torchreg.geometry.loaded import as_points
 from torchreg.result import Result, Status, stored_as
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.pose_algebra import shifted
@@ -60,9 +62,10 @@ class AlignResult(Result):
         confidence: probability, from 0 to 1, that the ends of the limbs are right to a twentieth of the shape's size on
             average; calibrated on made-up data, see `alignment.reliability`.
         evidence: (E,) what the confidence rests on, see `alignment.reliability.Evidence`.
-        doubt: what is doubtful, in a sentence; empty where nothing is. A tuple for a batch.
+        doubt: what is doubtful, in a sentence, and what the data do not determine, whatever the status; empty where
+            nothing is. A tuple for a batch.
         crop: (H, W) bool, the pixels of a whole depth picture in which the shape was found; distances, inliers and
-            posterior are those of ``frame.cropped(crop).points``. None where what was aligned to was given.
+            posterior are those of `points_of` the picture. None where what was aligned to was given.
         origin: (3,) float64 about which it was computed, where the data lie so far from that of coordinates that the
             shape's precision would round them; pose, registered points and keypoints are float64 then. None elsewhere.
         coefficients: (C,) of the shape, where they were fitted too; the distances and all else are those of
@@ -71,12 +74,15 @@ class AlignResult(Result):
         shape: that was aligned; where coefficients were fitted, the rig of that person. A file keeps it
             without its mesh where that takes more than 4 MB.
         up: the upright direction, where it is known, as from a file's format; pictures else guess it from the points.
+        dof_confidence: (num_dofs,) from 0 to 1, how well each degree of freedom is known: ``1 - var / var_0``, the
+            share of its variance without data that is gone. ``var`` is that of the covariance, ``var_0`` that of the
+            uniform distribution over the limits, at most the square of a radian, or of half the size where it slides.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
         "pose": "D", "registered": "N 3", "keypoints": "K 3", "distances": "M", "inliers": "M", "posterior": "M",
         "sigma": "", "cost": "", "covariance": "D D", "confidence": "", "evidence": "E", "crop": "H W",
-        "coefficients": "C", "coefficient_covariance": "C C",
+        "coefficients": "C", "coefficient_covariance": "C C", "dof_confidence": "D",
     }  # fmt: skip
 
     pose: Tensor
@@ -99,11 +105,32 @@ class AlignResult(Result):
     coefficient_covariance: Tensor | None = None
     shape: ArticulatedShape | None = field(default=None, metadata=stored_as(record_kept_shape, build_kept_shape))
     up: tuple[float, float, float] | None = None
+    dof_confidence: Tensor | None = None
 
     @property
     def named_pose(self) -> dict[str, Any]:
         """The pose by name of degree of freedom: numbers, metres and radians; tensors (B,) for a batch."""
         return named_pose(self.shape, self.pose)
+
+    @property
+    def std(self) -> Tensor:
+        """Standard deviations (num_dofs,) of the pose, metres and radians, by its covariance."""
+        if self.covariance is None:
+            raise InputError("this result keeps no covariance; align again")
+        return self.covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+
+    @property
+    def named_std(self) -> dict[str, Any]:
+        """The standard deviations by name of degree of freedom, as `named_pose` gives the pose."""
+        return named_pose(self.shape, self.std)
+
+    def points_of(self, data: Any) -> Tensor:
+        """Return the points (M, 3) of what was aligned to that distances and inliers belong to.
+
+        Args:
+            data: as `align` was given it, one cloud or picture: of a whole picture the points of its crop are returned.
+        """
+        return as_points(data.cropped(self.crop) if self.crop is not None and isinstance(data, DepthFrame) else data)
 
     def moved(self, origin: Tensor) -> Self:
         """Return the result, whose coordinates begin at an origin (3,), in those in which the origin is given."""
@@ -168,6 +195,7 @@ class Calibration(Result):
         status: of the calibration at its end.
         coefficients: (C,) that all frames share, where the shape has coefficients; it is then that of the person.
         coefficient_covariance: (C, C) of them.
+        outliers: frames that were left out, by number, as the shape was not surely found in them.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
@@ -187,6 +215,7 @@ class Calibration(Result):
     status: Status
     coefficients: Tensor | None = None
     coefficient_covariance: Tensor | None = None
+    outliers: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from torchreg.cli.initializer_option import Initializer, read_initializer
 from torchreg.cli.keypoint_options import Keypoints, KeypointStd, MeasuredFrames, read_keypoints
 from torchreg.cli.known_options import Joints, JointStd, Known, Locked, observability, read_known
 from torchreg.cli.outputs import PICTURE_ENDINGS, Force, Quiet, check_outputs, numbered, with_ending
-from torchreg.cli.reporting import ExitCode, interruption, reporting
+from torchreg.cli.reporting import ExitCode, OptionalOutput, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, chosen_skin, load_shape
 from torchreg.cli.upright import Up, Upright, known_up, remembering
 from torchreg.errors import InputError
@@ -150,8 +150,8 @@ def align(
     What is known of the pose, --joints, counts with its --joint-std against data of which neighbors err together.
     So do keypoints that a detector saw, --keypoints, of which some may be wrong.
 
-    Exit codes: 0; 1 if an alignment is doubtful, or found too few inliers to mean anything; 2 for an error; 130 for
-    Ctrl-C.
+    Exit codes: 0; 1 if an alignment is doubtful, or found too few inliers to mean anything, or an output beside the
+    results could not be written; 2 for an error; 130 for Ctrl-C.
     """
     check_used(depth, "--depth", {"--intrinsics": intrinsics, "--mask": mask, "--depth-range": depth_range})
     check_used(fit_shape, "--fit-shape", {"--rig": rig})
@@ -202,7 +202,8 @@ def align(
         except KeyboardInterrupt:
             interrupted = True
         if gltf is not None and run.results:
-            run.save_motion(gltf)
+            with OptionalOutput(gltf):
+                run.save_motion(gltf)
     if interrupted:
         raise interruption(f"{len(run.results)} of {len(clouds)} clouds are done")
     if not all(result.statuses[0].usable for result in run.results):
@@ -274,7 +275,6 @@ class _AlignRun:
     def align(self, number: int, path: Path, files: _Files, on_step: Callable[[Any], None]) -> AlignResult:
         """Return the alignment to one cloud or picture, after writing it."""
         from torchreg.alignment.align import align
-        from torchreg.geometry.loaded import as_points
 
         data = self._data(number, path)
         result = align(
@@ -283,8 +283,9 @@ class _AlignRun:
             on_step=on_step, **self.measured.of(number),
         )  # fmt: skip
         result = remembering(result, self.up)
-        self._write(result, as_points(data), files)
+        result.save(files.result)
         self.results.append(result)
+        self._write_others(result, data, files)
         if result.statuses[0].usable and not self.fit_shape:
             self.start = result.pose
         return result
@@ -317,26 +318,32 @@ class _AlignRun:
         self.skin = sample_skin(found, self.config.num_model_points, sharpness=self.config.sharpness)
         return found.side
 
-    def _write(self, result: AlignResult, data: Tensor, files: _Files) -> None:
+    def _write_others(self, result: AlignResult, data: Any, files: _Files) -> None:
+        """Write what is asked for beside the result, which is saved: none of it keeps the others from being written."""
         if files.pose is not None:
-            write_pose(files.pose, self.shape, result.pose)
+            with OptionalOutput(files.pose):
+                write_pose(files.pose, self.shape, result.pose)
         if files.ply is not None:
             from torchreg.io.points import save_points
 
-            save_points(files.ply, result.registered)
+            with OptionalOutput(files.ply):
+                save_points(files.ply, result.registered)
         if files.picture is not None:
-            from torchreg.viz.figures import save_scene
-            from torchreg.viz.posed_scenes import posed_scene
-
-            shown = result.local(self.shape.rest)
-            near = data if result.origin is None else (data - result.origin).to(self.shape.rest)
-            shape, surface = self.fitted(result)
-            scene = posed_scene(shape, shown.pose[None], [near], [result.inliers], skin=surface, up=self.up)
-            save_scene(files.picture, scene)
+            with OptionalOutput(files.picture):
+                self._draw(result, result.points_of(data), files.picture)
         if files.rig is not None:
-            result.to_gltf(files.rig, self.source[0], skin=self.source[1])
-        # The result is written last: if it exists, all others do.
-        result.save(files.result)
+            with OptionalOutput(files.rig):
+                result.to_gltf(files.rig, self.source[0], skin=self.source[1])
+
+    def _draw(self, result: AlignResult, data: Tensor, path: Path) -> None:
+        """Draw the shape over the points (M, 3) that it was aligned to."""
+        from torchreg.viz.figures import save_scene
+        from torchreg.viz.posed_scenes import posed_scene
+
+        shown = result.local(self.shape.rest)
+        near = data if result.origin is None else (data - result.origin).to(self.shape.rest)
+        shape, surface = self.fitted(result)
+        save_scene(path, posed_scene(shape, shown.pose[None], [near], [result.inliers], skin=surface, up=self.up))
 
     def save_motion(self, path: Path) -> None:
         """Write all poses found as an animation."""

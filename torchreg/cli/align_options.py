@@ -98,11 +98,9 @@ def alignment_summary(result: AlignResult) -> str:
     """Return status, confidence, what is doubtful, inliers, residual and cost of an alignment in one line."""
     near = result.distances[result.inliers]
     rms = f"rms {1e3 * float(near.square().mean().sqrt()):.2f} mm, " if len(near) else ""
-    from torchreg.result import Status
-
     counts = f"{len(near)} of {len(result.distances)} points inliers"
     sure = "" if result.confidence is None else f" (confidence {float(result.confidence):.2f})"
-    doubt = f"; {result.doubt}" if result.statuses[0] is Status.DOUBTFUL and result.doubt else ""
+    doubt = f"; {result.doubt}" if result.doubt else ""
     return f"{result.statuses[0].value}{sure}, {counts}, {rms}cost {float(result.cost):.4g}{doubt}"
 
 

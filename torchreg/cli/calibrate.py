@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,9 +13,9 @@ import typer
 from torchreg.cli.align_options import NanPolicy, Scale, cloud_files, read_cloud
 from torchreg.cli.cameras import Depth, DepthRange, Intrinsics, Mask, Seen, check_used, depth_source, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, with_ending
-from torchreg.cli.reporting import ExitCode, reporting
+from torchreg.cli.reporting import ExitCode, OptionalOutput, reporting
 from torchreg.cli.shape_argument import PackageDir, Shape, load_shape
-from torchreg.errors import InputError
+from torchreg.errors import FramesWarning, InputError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -66,7 +67,10 @@ def calibrate(
     picture of the robot over each frame. Joints whose names are those of the robot's file are read; offsets of joints
     that the frames do not tell stay zero.
 
-    Exit codes: 0; 1 if no frame shows the robot; 2 for an error; 130 for Ctrl-C.
+    A hand is searched in every cloud. Clouds in which it is not surely found are told and left out.
+
+    Exit codes: 0; 1 if no frame shows the robot, hardly any the hand, or an output beside the result could not be
+    written; 2 for an error; 130 for Ctrl-C.
     """
     output = with_ending(output, (".safetensors",), add=True)
     is_hand = not Path(shape).suffix
@@ -80,7 +84,7 @@ def calibrate(
     frames, images = _given_frames(frames, depth, intrinsics, mask, depth_range)
     model = load_shape(shape, package_dirs=package_dir)
     if is_hand or transform is None:
-        _calibrate_hand(model, [read_cloud(path, scale, nan_policy) for path in frames], output, quiet)
+        _calibrate_hand(model, frames, [read_cloud(path, scale, nan_policy) for path in frames], output, quiet)
         return
     if joints is None:
         raise InputError("a robot takes --joints TABLE.csv with the joints of each frame")
@@ -90,9 +94,11 @@ def calibrate(
     from torchreg.alignment.calibrate_base import calibrate_base
 
     found = calibrate_base(model, given, rows, offsets)
-    _write_transform(transform, model, found)
-    _draw_frames(folder, model, found, frames, given, rows)
     found.save(output)
+    with OptionalOutput(transform):
+        _write_transform(transform, model, found)
+    with OptionalOutput(folder):
+        _draw_frames(folder, model, found, frames, given, rows)
     if not quiet:
         typer.echo(f"{_summary(model, found, frames)} -> {transform}")
     if not found.status.usable:
@@ -123,12 +129,19 @@ def _given_frames(
     return [Path(name) for name in source.names], list(source)
 
 
-def _calibrate_hand(shape: ArticulatedShape, clouds: Sequence[Tensor], output: Path, quiet: bool) -> None:
+def _calibrate_hand(
+    shape: ArticulatedShape, paths: Sequence[Path], clouds: Sequence[Tensor], output: Path, quiet: bool
+) -> None:
     """Fit a hand to clouds and write it."""
     from torchreg.alignment.calibrate import calibrate as fit
 
-    found = fit(shape, clouds)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FramesWarning)  # told below, by the names of files
+        found = fit(shape, clouds)
     found.save(output)
+    if found.outliers:
+        names = ", ".join(paths[number].name for number in found.outliers)
+        warnings.warn(f"not surely found in {names}, left out of {len(paths)} frames", FramesWarning, stacklevel=2)
     if not quiet:
         length = float(found.log_length_scales.exp().mean())
         typer.echo(f"{found.status.value}: lengths {length:.3f} times those of the shape on average -> {output}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from torchreg.cli.outputs import Force, Quiet, check_outputs, counted
-from torchreg.cli.reporting import interruption, reporting
+from torchreg.cli.reporting import OptionalOutput, interruption, reporting
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -51,20 +51,23 @@ def demo(
         result = run_demo(frames, seed, on_frame=lambda done, planned: bar.update())
     count, hand = len(result.clouds), Hand()
     result.save(track)
-    write_poses(poses, result.track)
+    with OptionalOutput(poses):
+        write_poses(poses, result.track)
     if not quiet:
         typer.echo(_speed(result))
         _print_tip_errors("all", result.tip_errors.flatten())
         _print_tip_errors("seen by the cameras", result.tip_errors[result.tips_seen])
-    save_track_gltf(scene, hand, result.track, up=guess_up(list(result.track.keypoints)))
+    with OptionalOutput(scene):
+        save_track_gltf(scene, hand, result.track, up=guess_up(list(result.track.keypoints)))
     if not no_movie:
-        with tqdm(total=count, unit="frame", desc="drawing", leave=False, disable=quiet) as bar:
+        bar = tqdm(total=count, unit="frame", desc="drawing", leave=False, disable=quiet)
+        with OptionalOutput(movie), bar:
             animate_track(
                 movie, hand, result.track, result.clouds, inliers=result.inliers, fps=DEMO_FPS,
                 on_frame=lambda done, planned: bar.update(),
             )  # fmt: skip
     if not quiet:
-        typer.echo(f"wrote {', '.join(str(path) for path in wanted)}")
+        typer.echo(f"wrote {', '.join(str(path) for path in wanted if path.exists())}")
     if count < frames:
         raise interruption(f"{count} of {frames} frames are done")
 

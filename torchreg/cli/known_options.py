@@ -124,13 +124,10 @@ def _read_angle(text: str | None) -> float:
 
 def observability(shape: ArticulatedShape, result: AlignResult) -> str:
     """Return in a sentence which joints the data do not hold; empty if they hold all."""
+    from torchreg.alignment.observability import spread_of
+
     if result.covariance is None:
         return ""
-    std = result.covariance.diagonal().clamp_min(0).sqrt()[6:].tolist()
-    words = []
-    for name, value, slides in zip(shape.dof_names[6:], std, shape.is_sliding[6:].tolist(), strict=True):
-        if value > (_TOLD.loose_slide if slides else _TOLD.loose):
-            words.append(
-                f"{name} (+- {1e3 * value:.0f} mm)" if slides else f"{name} (+- {math.degrees(value):.0f} deg)"
-            )
+    rows = zip(shape.dof_names[6:], result.std[6:].tolist(), shape.is_sliding[6:].tolist(), strict=True)
+    words = [spread_of(*row) for row in rows if row[1] > (_TOLD.loose_slide if row[2] else _TOLD.loose)]
     return f"data and prior leave open {', '.join(words)}" if words else ""

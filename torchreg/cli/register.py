@@ -12,7 +12,7 @@ import typer
 from torchreg.cli.align_options import NanPolicy, cloud_files
 from torchreg.cli.cameras import Depth, DepthRange, Seen, check_used, seen_folder
 from torchreg.cli.outputs import Force, Quiet, check_outputs, tell_origin, with_ending
-from torchreg.cli.reporting import ExitCode, reporting
+from torchreg.cli.reporting import ExitCode, OptionalOutput, reporting
 from torchreg.cli.robot import RobotFiles, check_alone, write_scanned_robot
 from torchreg.cli.support_option import Support
 from torchreg.cli.upright import Up, known_up, remembering
@@ -101,7 +101,8 @@ def register(
 
     OMP_NUM_THREADS=2 in the environment makes a second core help to find where the source goes.
 
-    Exit codes: 0; 1 if the result is doubtful or too few points match; 2 for an error; 130 for Ctrl-C.
+    Exit codes: 0; 1 if the result is doubtful or too few points match, or an output beside it could not be written; 2
+    for an error; 130 for Ctrl-C.
     """
     scans = cloud_files(scans) if not depth else scans
     if urdf:
@@ -144,10 +145,11 @@ def register(
     with tqdm(desc="initialize", unit="step", leave=False, disable=quiet) as bar:
         found = run(first, second, bones, grid, on_step=partial(_show, bar), support=support)
     found = remembering(found, known_up(up, scans, camera=depth))
+    found.save(result)
     _write(found, scene, weights, errors)
     if depth:
-        images[1].draw_over(found, folder / "registered.png")
-    found.save(result)
+        with OptionalOutput(folder / "registered.png"):
+            images[1].draw_over(found, folder / "registered.png")
     if not quiet:
         typer.echo(f"{_summary(found)} -> {scene or result}")
     if not found.status.usable:
@@ -217,7 +219,8 @@ class _DepthImage:
         column, row = self.camera.project(found.points.double())[0].round().long().unbind(-1)
         kept = torch.zeros(self.depth.shape, dtype=torch.bool)
         kept[row.clamp(0, self.camera.height - 1), column.clamp(0, self.camera.width - 1)] = True
-        save_image(picture, cut_picture(self.depth, kept))
+        with OptionalOutput(picture):
+            save_image(picture, cut_picture(self.depth, kept))
         return found
 
     def draw_over(self, found: ScanRegistration, picture: Path) -> None:
@@ -259,15 +262,18 @@ def _write(found: ScanRegistration, scene: Path | None, weights: Path | None, er
         from torchreg.viz.scan_gltf import save_grid_animation
 
         near = found.local()
-        save_grid_animation(scene, near.model, near.points, found.faces, up=found.up or guess_up([found.points]))
-        tell_origin(scene, found.origin)
+        with OptionalOutput(scene):
+            save_grid_animation(scene, near.model, near.points, found.faces, up=found.up or guess_up([found.points]))
+            tell_origin(scene, found.origin)
     if weights is not None or errors is not None:
         from torchreg.viz.bone_colors import save_error_ply, save_weight_ply
 
         if weights is not None:
-            save_weight_ply(weights, found.model, found.points, found.faces, moved=True)
+            with OptionalOutput(weights):
+                save_weight_ply(weights, found.model, found.points, found.faces, moved=True)
         if errors is not None:
-            save_error_ply(errors, found.deformed, found.distances, found.faces)
+            with OptionalOutput(errors):
+                save_error_ply(errors, found.deformed, found.distances, found.faces)
 
 
 def _summary(found: ScanRegistration) -> str:

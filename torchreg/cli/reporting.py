@@ -9,16 +9,20 @@ import warnings
 from collections.abc import Callable
 from contextvars import ContextVar
 from enum import IntEnum
+from pathlib import Path
+from types import TracebackType
 from typing import Any, TextIO
 
 import typer
 from typer.models import OptionInfo
 
 from torchreg.cli.hints import in_options
-from torchreg.errors import TorchregError, TorchregWarning
+from torchreg.errors import OutputWarning, TorchregError, TorchregWarning
 
 # The options of the command that runs, for hints.
 _options: ContextVar[tuple[str, ...]] = ContextVar("options", default=())
+# Whether it could not write something beside its result.
+_incomplete: ContextVar[bool] = ContextVar("incomplete", default=False)
 
 
 class ExitCode(IntEnum):
@@ -35,6 +39,7 @@ def reporting(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def run(*arguments: Any, **options: Any) -> None:
         _options.set(options_of(command))
+        _incomplete.set(False)
         with warnings.catch_warnings():
             warnings.simplefilter("always", TorchregWarning)
             warnings.showwarning = show_warning
@@ -47,8 +52,38 @@ def reporting(command: Callable[..., None]) -> Callable[..., None]:
             except (TorchregError, OSError) as error:
                 typer.echo(f"torchreg: {in_options(_one_line(error), _options.get())}", err=True)
                 raise typer.Exit(ExitCode.ERROR) from None
+            if _incomplete.get():
+                raise typer.Exit(ExitCode.UNUSABLE)
 
     return run
+
+
+class OptionalOutput:
+    """A ``with`` block that draws, exports or tabulates: where it fails, a warning and exit code 1; no result is lost.
+
+    Args:
+        output: that is written, its path or what it is.
+
+    Attributes:
+        failed: whether a block did.
+    """
+
+    def __init__(self, output: Path | str) -> None:
+        self.output, self.failed = output, False
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool:
+        if not isinstance(error, Exception) or isinstance(error, (typer.Exit, BrokenPipeError)):
+            return False
+        self.failed = True
+        _incomplete.set(True)
+        cause = _one_line(error) if isinstance(error, (TorchregError, OSError)) else f"{type(error).__name__}: {error}"
+        warnings.warn(f"{self.output} is not written: {cause}; the result does not suffer", OutputWarning, stacklevel=2)
+        return True
 
 
 def interruption(done: str = "") -> typer.Exit:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from torchreg.cli.outputs import check_outputs, with_ending
+from torchreg.cli.reporting import OptionalOutput
 from torchreg.errors import InputError
 
 if TYPE_CHECKING:
@@ -44,18 +45,20 @@ def write_scanned_robot(
     from torchreg.registration.register_sequence import register_sequence
 
     found = register_sequence(scans, bones, grid, on_step=on_step)
-    robot = found.to_urdf(files.urdf)
     found.save(files.result)
-    joints = [joint.name for joint in robot.tree.joints[1:]]
-    rows = [[name.name, *row] for name, row in zip(names, robot.joint_values.tolist(), strict=True)]
-    save_pose_table(files.table, ["scan", *joints], rows)
-    if tell:
-        typer.echo(f"{_summary(found, robot)} -> {files.urdf}, {files.table}")
-        for name in robot.loose:
-            typer.echo(
-                f"torchreg: {name} does not explain how its two links move: a part between may be missing",
-                err=True,
-            )
+    with OptionalOutput(files.urdf):
+        robot = found.to_urdf(files.urdf)
+        with OptionalOutput(files.table):
+            joints = [joint.name for joint in robot.tree.joints[1:]]
+            rows = [[name.name, *row] for name, row in zip(names, robot.joint_values.tolist(), strict=True)]
+            save_pose_table(files.table, ["scan", *joints], rows)
+        if tell:
+            typer.echo(f"{_summary(found, robot)} -> {files.urdf}, {files.table}")
+            for name in robot.loose:
+                typer.echo(
+                    f"torchreg: {name} does not explain how its two links move: a part between may be missing",
+                    err=True,
+                )
     return found.status.usable
 
 

@@ -22,7 +22,7 @@ from torchreg.cli.outputs import (
     tell_origin,
     with_ending,
 )
-from torchreg.cli.reporting import interruption, reporting
+from torchreg.cli.reporting import OptionalOutput, interruption, reporting
 from torchreg.cli.support_option import Support
 from torchreg.cli.upright import Up, known_up, remembering
 
@@ -114,7 +114,7 @@ def spine(
     name, or all are in the order of the cameras. How hulls cover masks goes to OUT_seen: white, red where a hull misses
     its mask, blue beyond it.
 
-    Exit codes: 0; 2 for an error; 130 for Ctrl-C.
+    Exit codes: 0; 1 if an output beside the result could not be written; 2 for an error; 130 for Ctrl-C.
     """
     from torchreg._checks import check_positive
 
@@ -158,12 +158,14 @@ def spine(
         found.save(result)
         _write(found, meshes, glb, curves, npz, fps)
         if table is not None:
-            found.measurements().save_csv(table)
+            with OptionalOutput(table):
+                found.measurements().save_csv(table)
         if plot is not None:
             from torchreg.viz.figures import save_picture
             from torchreg.viz.spines import draw_measurements
 
-            save_picture(draw_measurements(found.measurements()), plot)
+            with OptionalOutput(plot):
+                save_picture(draw_measurements(found.measurements()), plot)
         _draw(found, meshes, movie, pictures, fps)
     if not quiet:
         for warning in found.warnings:
@@ -248,10 +250,11 @@ def _hulls(source: SilhouetteFrames, folder: Path, progress: Path | None, quiet:
     from torchreg.io.images import save_image
     from torchreg.viz.seen import hull_sheet
 
-    meshes = []
+    meshes, drawing = [], OptionalOutput(folder)
     for number in tqdm(range(len(source)), unit="frame", desc="hulls", leave=False, disable=quiet):
         meshes.append(source.mesh(number, progress))
-        save_image(folder / f"hull_{number:04d}.png", hull_sheet(source.masks(number), source.cameras, meshes[-1]))
+        with drawing:
+            save_image(folder / f"hull_{number:04d}.png", hull_sheet(source.masks(number), source.cameras, meshes[-1]))
     return meshes
 
 
@@ -264,18 +267,21 @@ def _write(
     from torchreg.io.swc import save_swc
     from torchreg.viz.spine_gltf import save_spine_animation
 
-    near, mesh = found.local(), meshes[found.reference]
-    if found.origin is not None:
-        mesh = TriangleMesh(mesh.vertices - found.origin, mesh.faces)
-    save_spine_animation(glb, near.model, mesh, found.reference, fps=fps, up=found.up)
-    tell_origin(glb, found.origin)
+    with OptionalOutput(glb):
+        near, mesh = found.local(), meshes[found.reference]
+        if found.origin is not None:
+            mesh = TriangleMesh(mesh.vertices - found.origin, mesh.faces)
+        save_spine_animation(glb, near.model, mesh, found.reference, fps=fps, up=found.up)
+        tell_origin(glb, found.origin)
     for frame, path in enumerate(swc):
         if path is not None:
-            save_swc(path, found.skeleton(frame), f"frame {frame}")
+            with OptionalOutput(path):
+                save_swc(path, found.skeleton(frame), f"frame {frame}")
     if npz is not None:
         names = ["tips", "junctions", "graph", "curves", "radii", "frames", "times", "found", "own", "confidence"]
         names += ["births", "ends"] if found.births is not None else []
-        save_arrays(npz, {name: getattr(found, name) for name in names})
+        with OptionalOutput(npz):
+            save_arrays(npz, {name: getattr(found, name) for name in names})
 
 
 def _draw(
@@ -284,9 +290,11 @@ def _draw(
     from torchreg.viz.spines import save_spine_movie, save_spine_pictures
 
     if pictures is not None:
-        save_spine_pictures(pictures, found, meshes)
+        with OptionalOutput(pictures):
+            save_spine_pictures(pictures, found, meshes)
     if movie is not None:
-        save_spine_movie(movie, found, meshes, fps=fps)
+        with OptionalOutput(movie):
+            save_spine_movie(movie, found, meshes, fps=fps)
 
 
 def _named(warning: str, names: tuple[str, ...]) -> str:

@@ -31,7 +31,7 @@ from torchreg.cli.initializer_option import Initializer, read_initializer
 from torchreg.cli.keypoint_options import Keypoints, KeypointStd, read_keypoints
 from torchreg.cli.known_options import Joints, JointStd, Locked, read_known
 from torchreg.cli.outputs import Force, Quiet, check_outputs, claimed, shifted_to, tell_origin, with_ending
-from torchreg.cli.reporting import ExitCode, interruption, reporting
+from torchreg.cli.reporting import ExitCode, OptionalOutput, interruption, reporting
 from torchreg.cli.shape_argument import FreeBase, PackageDir, Parents, Shape, Skin, load_shape
 from torchreg.cli.track_run import Clouds, Report, TrackFiles, TrackRun, summary, track_job
 from torchreg.cli.upright import Up, Upright, known_up
@@ -171,8 +171,8 @@ def track(
     With --depth --intrinsics FILE frames are depth pictures, and what they say of free space counts too. Keypoints that
     a detector saw, --keypoints, count beside any frames.
 
-    Exit codes: 0; 1 if in any frame the shape was lost or is doubtful, or there were no data; 2 for an error; 130 for
-    Ctrl-C.
+    Exit codes: 0; 1 if in any frame the shape was lost or is doubtful, or there were no data, or an output beside the
+    result could not be written; 2 for an error; 130 for Ctrl-C.
     """
     files, resumed = _files(output, movie, gltf, no_gltf, pictures, resume, force)
     poses, bvh = with_ending(poses, (".csv",)), with_ending(bvh, (".bvh",))
@@ -229,9 +229,11 @@ def track(
             run.live = _live_page(pages, port, browser, quiet, run.up)
         complete = _run(run, bar, resumed)
     if poses is not None:
-        _write_poses(poses, model, run.located)
+        with OptionalOutput(poses):
+            _write_poses(poses, model, run.located)
     if bvh is not None:
-        _write_motion(bvh, run)
+        with OptionalOutput(bvh):
+            _write_motion(bvh, run)
     _report_end(run, model, complete, quiet)
 
 

@@ -16,7 +16,7 @@ import typer
 from torchreg.cli.keypoint_options import MeasuredFrames
 from torchreg.cli.known_options import Known
 from torchreg.cli.outputs import check_outputs, tell_origin
-from torchreg.cli.reporting import show_warning
+from torchreg.cli.reporting import OptionalOutput, show_warning
 from torchreg.cli.upright import remembering
 from torchreg.errors import FormatError, InputError, UnitsWarning
 
@@ -291,7 +291,8 @@ class TrackRun:
                 self._part(range(self.state.frame, end))
             complete = self.state.frame == end
             contents = [self.clouds.content(number) for number in range(self.state.frame)]
-            save_progress(self.files.progress, TrackProgress(self.result, self.state, self.job, contents))
+            with OptionalOutput(self.files.progress):
+                save_progress(self.files.progress, TrackProgress(self.result, self.state, self.job, contents))
         self.clouds.on_drop = None
         remembering(self.located, self.up).save(self.files.result)
         return complete
@@ -301,8 +302,10 @@ class TrackRun:
         from torchreg.cli.track_checkpoint import first_frames
 
         def note(points: Tensor, frame: FrameResult) -> None:
-            for overlay in self._overlays:
-                overlay(points, frame)
+            for optional, overlay in self._overlays:
+                if not optional.failed:
+                    with optional:
+                        overlay(points, frame)
             self.report.frame(frame)
             # A frame counts as done when all of it is.
             self.state = self.tracker.state
@@ -323,15 +326,21 @@ class TrackRun:
         self.parts.append(first_frames(result, done))
 
     @cached_property
-    def _overlays(self) -> list[OnFrame]:
+    def _overlays(self) -> list[tuple[OptionalOutput, OnFrame]]:
         """What draws each frame as soon as it is done; made after the first, which tells who is fitted."""
-        drawn = [begin(self.surface) for begin in (self.seen, self.live) if begin is not None]
-        if self.files.pictures is not None:
-            from torchreg.viz.tracking import FrameOverlays
-
-            overlays = FrameOverlays(self.tracker.shape, self.surface, up=self.up)
-            drawn.append(lambda points, frame: overlays.save(self.files.frame(frame.frame), points, frame))
+        drawn = []
+        pictures = None if self.files.pictures is None else self._drawn
+        for name, begin in (("what was seen", self.seen), ("the page", self.live), ("--pictures", pictures)):
+            optional = OptionalOutput(name)
+            with optional:
+                drawn += [(optional, begin(self.surface))] if begin is not None else []
         return drawn
+
+    def _drawn(self, surface: LinearBlendSkin) -> OnFrame:
+        from torchreg.viz.tracking import FrameOverlays
+
+        overlays = FrameOverlays(self.tracker.shape, surface, up=self.up)
+        return lambda points, frame: overlays.save(self.files.frame(frame.frame), points, frame)
 
     def write(self, on_frame: Callable[[int, int], None]) -> None:
         """Write the moving shape and the moving picture, where asked for."""
@@ -340,14 +349,16 @@ class TrackRun:
 
         result, shape = self.result, self.tracker.shape
         if self.files.gltf is not None and bool(result.poses.isfinite().all(-1).any()):
-            up = self.up or guess_up(list(result.keypoints))
-            save_track_gltf(self.files.gltf, shape, result, up=up)
-            tell_origin(self.files.gltf, self.clouds.origin)
+            with OptionalOutput(self.files.gltf):
+                up = self.up or guess_up(list(result.keypoints))
+                save_track_gltf(self.files.gltf, shape, result, up=up)
+                tell_origin(self.files.gltf, self.clouds.origin)
         if self.files.movie is not None:
-            animate_track(
-                self.files.movie, shape, result, self.clouds, fps=self.fps, skin=self.surface, up=self.up,
-                on_frame=on_frame,
-            )  # fmt: skip
+            with OptionalOutput(self.files.movie):
+                animate_track(
+                    self.files.movie, shape, result, self.clouds, fps=self.fps, skin=self.surface, up=self.up,
+                    on_frame=on_frame,
+                )  # fmt: skip
 
 
 def summary(result: TrackResult) -> str:

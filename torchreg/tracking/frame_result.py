@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.annealed_em import outlier_level
+from torchreg.alignment.observability import dof_confidence
 from torchreg.alignment.reliability import CALIBRATION, confidence_of
 from torchreg.result import Status
 from torchreg.solvers.e_step import expectation
@@ -41,7 +42,7 @@ def fitted_result(
         keypoints=fitter.shape.placed_keypoints(fit.transforms) + origin, distances=distances, posterior=posterior,
         sigma=sigma, cost=posed.new_tensor(fit.cost), covariance=covariance, acquired=fit.acquired,
         status=fit_status(converged, float(confidence)), residual=float(fit.residual), confidence=confidence,
-        evidence=evidence.table()[0],
+        evidence=evidence.table()[0], dof_confidence=dof_confidence(fitter.shape, covariance, fitter.size),
     )  # fmt: skip
 
 
@@ -61,6 +62,7 @@ def predicted_result(fitter: FrameFitter, state: TrackState, frame: Frame, pose:
         distances=distances, posterior=torch.zeros_like(distances), sigma=unknown, cost=unknown,
         covariance=unknown.expand(len(pose), len(pose)).clone(), status=status,
         acquired="lost" if status is Status.LOST else "held", residual=math.nan, confidence=torch.zeros_like(unknown),
+        dof_confidence=torch.zeros_like(pose),
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ from torchreg.alignment.pose_search import PoseSearch, fit_candidates, score_can
 from torchreg.alignment.problem import centered_problem
 from torchreg.alignment.start_source import StartSource
 from torchreg.alignment.surface_fit import SURFACE_FIT
+from torchreg.geometry.neighbors import NeighborTree, sampling_distance
 from torchreg.geometry.rotation import compose_rotation_vectors
 from torchreg.shapes.pose_algebra import difference, shifted
 from torchreg.shapes.skin import LinearBlendSkin
@@ -44,6 +45,8 @@ class RecoveryPlan:
     max_motion: float = 0.4  # of the base from its prediction per interval: on little data much seems to fit
     max_repetitions: int = 3  # of the first search everywhere, with other draws: nothing is known yet
     more_candidates: int = 2  # of a repetition, in those of the first search
+    new_distance: float = 0.05  # from all of them of what is new, or three times their own distance from each other
+    new_share: float = 0.02  # of the data that is new: something has come that may be the shape
 
 
 _PLAN = RecoveryPlan()
@@ -93,13 +96,13 @@ class Recovery:
             fit = rival
         return fit, replace(state, pending_checks=0)
 
-    def everywhere(self, state: TrackState, frame: Frame) -> FrameFit | None:
+    def everywhere(self, state: TrackState, frame: Frame, repetitions: int = _PLAN.max_repetitions) -> FrameFit | None:
         """Return the fit of a search everywhere; of equivalent poses after a loss, that of the one nearest to the last.
 
         A fit whose data lie beside the surface is no pose of the shape: the first search is repeated with more effort.
         """
         best = self._find(state, frame, FindPoseConfig(seed=state.seed))
-        for number in range(1, _PLAN.max_repetitions + 1):
+        for number in range(1, repetitions + 1):
             if state.lost or (best is not None and not lies_beside_data(best, state)):
                 break
             config = FindPoseConfig(
@@ -139,11 +142,26 @@ class Recovery:
         return max((fit for fit in fits if fit is not None), key=lambda fit: fit.soft_inliers, default=None)
 
     def _first(self, state: TrackState, frame: Frame) -> tuple[FrameFit | None, TrackState]:
-        """Return the fit and the state where the shape was never fitted: only a search everywhere helps."""
-        if state.cool_down > 0 or self.level != "full":
+        """Return the fit and the state where the shape was never fitted: only a search everywhere helps.
+
+        What came since the last search may be the shape: it is searched at once, but not as thoroughly.
+        """
+        due = state.cool_down == 0
+        if self.level != "full" or not (due or self._shows_new(state, frame)):
             return None, after_pause(state)
-        fit = self.everywhere(state, frame)
-        return fit, after_search(state, is_supported(fit, state))
+        fit = self.everywhere(state, frame) if due else self.everywhere(state, frame, repetitions=0)
+        successful = is_supported(fit, state)
+        seen = None if successful else subsample(frame.data, _PLAN.max_data, frame_generator(state))
+        return fit, replace(after_search(state, successful), searched=seen)
+
+    def _shows_new(self, state: TrackState, frame: Frame) -> bool:
+        """Return whether a frame has data that the last one searched had not."""
+        if state.searched is None:
+            return False
+        apart = 3 * sampling_distance(state.searched)
+        distance = NeighborTree(state.searched).nearest(frame.data)[1]
+        new = distance > max(apart, _PLAN.new_distance * self.fitter.size)
+        return bool(new.float().mean() > _PLAN.new_share)
 
     def _around(
         self, state: TrackState, frame: Frame, view: FrameView | None, fit: FrameFit | None

@@ -45,11 +45,6 @@ class FrameResult(AlignResult):
     inlier_ratio: float
     residual: float
 
-    @property
-    def std(self) -> Tensor:
-        """Standard deviations (num_dofs,) of the pose, metres and radians."""
-        return self.covariance.diagonal().sqrt()
-
 
 @dataclass(frozen=True)
 class TrackResult(Result):
@@ -135,11 +130,14 @@ class TrackState(Result):
         coefficients: (C,) of the person tracked, where they are fitted and a frame showed any.
         coefficient_covariance: (C, C) of them.
         person: (C,) coefficients of the rig that is followed; another one is made when its surface is off.
+        sure: whether the fit to any frame was usable.
+        searched: (F, 3) some data of the last frame that was searched, before the shape was first found; then None.
     """
 
     shapes: ClassVar[Mapping[str, str]] = {
         "pose": "D", "velocity": "D", "points": "N 3", "weights": "N P", "reference_pose": "D", "keyframes": "K D",
         "unexplained": "S 3", "innovation": "3", "coefficients": "C", "coefficient_covariance": "C C", "person": "C",
+        "searched": "F 3",
     }  # fmt: skip
 
     frame: int
@@ -168,6 +166,8 @@ class TrackState(Result):
     coefficients: Tensor | None = None
     coefficient_covariance: Tensor | None = None
     person: Tensor | None = None
+    sure: bool = True
+    searched: Tensor | None = None
 
     @property
     def found(self) -> bool:

@@ -201,12 +201,15 @@ class Tracker:
                 pose = self._fitter.predict(state, elapsed)
                 view = self._fitter.look(state, frame, pose)
                 fit = self._fit(state, frame, view)
+                if self._was_mistaken(state, fit):
+                    state, view, fit = self._forgotten(state), None, None
                 if self._is_trusted(state, frame, fit):
                     state = after_search(state, successful=True)
                 else:
                     fit, state = self._recover(state, frame, view, fit)
                 fit, state = self._recover.cross_check(state, frame, fit)
                 result, state = self._accept(state, frame, fit)
+                state = replace(state, sure=state.sure or result.statuses[0].usable)
                 if self._person is not None and fit is not None and result.statuses[0].usable:
                     state = _learned(self._person, state, frame, fit)
             self._state = normal_copy(state)
@@ -361,7 +364,7 @@ class Tracker:
             weights=skin.weights, reference_pose=skin.reference_pose, keyframes=pose[None][:0],
             unexplained=skin.points[:0], prediction_error=0.0, innovation=skin.points.new_zeros(3), num_data=0.0,
             num_inliers=0.0, ratio_in_reach=0.0, residual=0.0, limit_share=0.0, lost=0, cool_down=0, failed_searches=0,
-            pending_checks=0, seed=self.config.seed,
+            pending_checks=0, seed=self.config.seed, sure=False,
         )  # fmt: skip
 
     def _rejection(self, data: Tensor) -> Status | None:
@@ -397,6 +400,16 @@ class Tracker:
         """Return whether a fit needs no comparison with others."""
         continuous = not state.tracked or frame.elapsed < _SETTINGS.long_gap
         return continuous and is_supported(fit, state) and not is_doubtful(fit, state)
+
+    def _was_mistaken(self, state: TrackState, fit: FrameFit | None) -> bool:
+        """Return whether the shape is lost that was doubtful in all frames: then it was something else."""
+        return self.config.recovery == "full" and state.tracked and not state.sure and not is_supported(fit, state)
+
+    def _forgotten(self, state: TrackState) -> TrackState:
+        """Return a state as before the first fit, at the same frame."""
+        names = ["frame", "time", "interval", "origin", "coefficients", "coefficient_covariance", "person", "lost"]
+        kept = {name: getattr(state, name) for name in names}
+        return replace(self._initial_state(torch.full_like(state.pose, torch.nan)), **kept)
 
     def _accept(self, state: TrackState, frame: Frame, fit: FrameFit | None) -> tuple[FrameResult, TrackState]:
         """Return the result of a frame with the best fit that was found, and the state after it."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -42,15 +42,15 @@ def plot(
         InputError: if sizes do not fit, or there is no such frame.
         InputTypeError: if there is no picture of such a value.
     """
-    scene = result_scene(result, shape=shape, data=_frames(data))
+    scene = result_scene(result, shape=shape, data=_frames(data, getattr(result, "points_of", as_points)))
     if not -scene.num_frames <= frame < scene.num_frames:
         raise InputError(f"frame must be from 0 to {scene.num_frames - 1}, got {frame}")
     return draw_scene(scene if up is None else replace(scene, up=up), frame % scene.num_frames, ax)
 
 
-def _frames(data: Any) -> Sequence[Tensor | TriangleMesh]:
+def _frames(data: Any, points_of: Callable[[Any], Tensor]) -> Sequence[Tensor | TriangleMesh]:
     """Return measurements as one cloud or mesh per frame."""
     if data is None:
         return ()
     several = data if isinstance(data, (list, tuple)) else [data]
-    return [item if isinstance(item, TriangleMesh) else as_points(item) for item in several]
+    return [item if isinstance(item, TriangleMesh) else points_of(item) for item in several]
