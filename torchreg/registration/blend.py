@@ -13,22 +13,9 @@ from torchreg.geometry.rotation_representations import quaternion_from_rotation
 
 
 def turn_about(transforms: Tensor, twists: Tensor, centers: Tensor) -> Tensor:
-    """Return rigid motions updated by twists: turned about centers, then shifted.
+    """Return rigid motions (..., 4, 4) updated by twists (..., 6), translation and rotation, about centers (..., 3).
 
-    ``R <- exp(w) R``, ``t <- c + exp(w) (t - c) + v``: the point that the motion takes to c ends at c + v. Turning
-    about a point near the bone decouples rotation and translation, which solvers and optimizers need.
-
-    Convention: twists are (translation, rotation).
-
-    Args:
-        transforms: (..., 4, 4).
-        twists: (..., 6), unit of length and radians.
-        centers: (..., 3).
-
-    Returns:
-        (..., 4, 4).
-
-    Differentiable: in all, also at zero twists.
+    ``R <- exp(w) R``, ``t <- c + exp(w) (t - c) + v``: about a point near the bone, rotation and translation decouple.
     """
     turn = so3_exp(twists[..., 3:])
     arm = transforms[..., :3, 3] - centers
@@ -37,41 +24,15 @@ def turn_about(transforms: Tensor, twists: Tensor, centers: Tensor) -> Tensor:
 
 
 def blend_linear(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
-    """Return ``sum_j w_j (R_j x + t_j)``.
-
-    Args:
-        points: (..., N, 3).
-        weights: (..., N, B), rows sum to one.
-        transforms: (..., B, 4, 4), all with broadcastable batch dimensions.
-
-    Returns:
-        (..., N, 3).
-
-    Differentiable: in all.
-
-    References: Chang and Zwicker 2009, eq. 1.
-    """
+    """Return points (..., N, 3) moved by ``sum_j w_j (R_j x + t_j)`` (Chang and Zwicker 2009, eq. 1)."""
     rows = (weights @ transforms[..., :3, :].flatten(-2)).unflatten(-1, (3, 4))
     return (rows[..., :3] @ points.unsqueeze(-1)).squeeze(-1) + rows[..., 3]
 
 
 def blend_dual_quaternion(points: Tensor, weights: Tensor, transforms: Tensor) -> Tensor:
-    """Return the points moved by the normalized weighted sum of the bones' unit dual quaternions.
+    """Return points moved by the normalized weighted sum of unit dual quaternions (Kavan et al. 2007, eqs. 16-17).
 
-    The blend is rigid for any weights: a twisted limb keeps its girth, which the linear blend shrinks. Quaternions take
-    the sign nearest to that of the bone with the largest weight, so that no blend turns by more than half a turn.
-
-    Args:
-        points: (..., N, 3).
-        weights: (..., N, B), rows sum to one.
-        transforms: (..., B, 4, 4) rigid, all with broadcastable batch dimensions.
-
-    Returns:
-        (..., N, 3).
-
-    Differentiable: in all, where the largest weight is alone.
-
-    References: Kavan et al. 2007, eqs. 16-17.
+    Quaternions take the sign nearest to that of the largest weight's bone: no blend turns by more than half a turn.
     """
     real, dual, sign = _signed_quaternions(weights, transforms)
     signed = weights * sign
@@ -79,16 +40,7 @@ def blend_dual_quaternion(points: Tensor, weights: Tensor, transforms: Tensor) -
 
 
 def blend_linear_jacobian(points: Tensor, weights: Tensor, transforms: Tensor, centers: Tensor) -> Tensor:
-    """Return the derivatives (..., N, 3, B, 6) of `blend_linear` by the bones' twists about centers (..., B, 3).
-
-    Args:
-        points: see `blend_linear`.
-        weights: see `blend_linear`.
-        transforms: see `blend_linear`.
-        centers: see `turn_about`.
-
-    Differentiable: in all.
-    """
+    """Return the derivatives (..., N, 3, B, 6) of `blend_linear` by the bones' twists about centers (..., B, 3)."""
     moved = points.unsqueeze(-3) @ transforms[..., :3, :3].mT + transforms[..., None, :3, 3]
     arms = (moved - centers.unsqueeze(-2)).transpose(-2, -3)
     identity = torch.eye(3, dtype=arms.dtype, device=arms.device).expand(*arms.shape, 3)
@@ -97,16 +49,7 @@ def blend_linear_jacobian(points: Tensor, weights: Tensor, transforms: Tensor, c
 
 
 def blend_dual_quaternion_jacobian(points: Tensor, weights: Tensor, transforms: Tensor, centers: Tensor) -> Tensor:
-    """Return the derivatives (..., N, 3, B, 6) of `blend_dual_quaternion` by the bones' twists about centers.
-
-    Args:
-        points: see `blend_dual_quaternion`.
-        weights: see `blend_dual_quaternion`.
-        transforms: see `blend_dual_quaternion`.
-        centers: see `turn_about`.
-
-    Differentiable: in all, where the largest weight is alone.
-    """
+    """Return the derivatives (..., N, 3, B, 6) of `blend_dual_quaternion` by the bones' twists about centers."""
     real, dual, sign = _signed_quaternions(weights, transforms)
     share = (weights * sign).unsqueeze(-1)
     by_real, by_dual = _move_jacobian(

@@ -43,12 +43,6 @@ class FrameToFrame:
 
     Small bones would follow noise, which adds up, as does drift along the surface. A few large bones cannot bend in all
     joints, so that none of them may be firm.
-
-    Args:
-        label_cost: lower bound.
-        smoothness: lower bound.
-        point_to_point: lower bound.
-        joint_weight: upper bound.
     """
 
     label_cost: float = 0.002
@@ -70,24 +64,19 @@ class FrameToFrame:
 
 @dataclass(frozen=True)
 class Motion:
-    """Steps of points from frame to frame as an autoregression: a share of the last one is kept, the rest is new.
-
-    Share and variance are estimated from the steps so far and, as the first may not be like the next, one more step
-    that keeps what is known beforehand.
+    """Steps of points from frame to frame as an autoregression whose share and variance are estimated from the steps.
 
     Args:
-        momentum: the share kept beforehand; with all of it, hidden limbs would run away.
+        momentum: the prior share of the last step that is kept; with all of it, hidden limbs would run away.
     """
 
     momentum: float = 0.5
 
     def predict(self, places: Sequence[Tensor], seen: Tensor | None = None) -> ExpectedPlaces | None:
-        """Return where points (N, 3) are expected after places so far, the latest last; None before two of them.
+        """Return the expected positions of points (N, 3) after the places so far, latest last; None before two of them.
 
-        Args:
-            places: T of (N, 3).
-            seen: (N,) from 0 to 1, how surely a point was in the latest place; ones by default. Of a point that was
-                hidden the last step is itself a prediction, and what is known beforehand holds.
+        ``seen`` (N,) is how surely a point was observed in the latest place: a hidden point's last step is a
+        prediction.
         """
         if len(places) < 2:
             return None
@@ -109,10 +98,8 @@ class AllFrames:
         match_steps: lower bound; borders between parts are drawn by motions, which should have converged.
         refine_steps: lower bound, unless there are none.
         rtol: upper bound; displacements along the surface converge slowly.
-        joint_weight: lower bound, unless joints are left out; many frames determine joints well, so that these may be
-            firm.
-        turn_scale: lower bound, radians; bones hold each other in wide turns too, since twists that scans do not show
-            would be lost in every frame anew.
+        joint_weight: lower bound, unless joints are left out; many frames determine joints well.
+        turn_scale: lower bound, radians; bones hold each other in wide turns too, else each frame loses twists anew.
         point_to_point: upper bound; positions along the surface drift.
     """
 
@@ -242,8 +229,7 @@ def _aligned_frames(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the reference's points aligned with every frame, (T, N, 3), their confidence (T, N), and that of frames.
 
-    Those of the dense alignments: small parts move in them for which the few bones have no room that move the reference
-    on from frame to frame.
+    They come from the dense alignments, in which small parts move that the few bones cannot represent.
     """
     source, few_bones = scans[reference], FRAME_TO_FRAME.apply(config)
     aligned, confidence = {reference: source.points}, {reference: torch.ones(len(source)).to(source.points)}
@@ -314,8 +300,7 @@ def _back_to_reference(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return all points (K, 3) of all scans in the pose of the reference, their normals and their frames (K,).
 
-    Every point moves by the inverse of the motion of the nearest point of the moved reference (T, N, 3), which has
-    weights (N, B).
+    Each moves by the inverse motion of the nearest point of the moved reference (T, N, 3), of weights (N, B).
     """
     points, normals, frames = [], [], []
     for frame, scan in enumerate(scans):

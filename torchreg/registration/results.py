@@ -148,10 +148,7 @@ def _parts(deformed: Tensor, transforms: Tensor, labels: Tensor, weights: Tensor
 
 
 def _residual_sums(points: Tensor, motions: Tensor, labels: Tensor, members: Tensor) -> Tensor:
-    """Return (B, B): summed distances of each bone's moved points (N, 3) from where every bone would move them.
-
-    In diagonals of the moved points; ``members`` (N, B) are the bones' points.
-    """
+    """Return (B, B): summed distances of each bone's moved points from where every bone moves them, in diagonals."""
     size = (points.amax(0) - points.amin(0)).norm()
     rest = (torch.linalg.inv(motions)[labels] @ nn.functional.pad(points, (0, 1), value=1.0).unsqueeze(-1))[:, :3, 0]
     positions = rest @ motions[:, :3, :3].mT + motions[:, None, :3, 3]

@@ -75,10 +75,7 @@ class _FirstDamping:
     """Damping of the first step, which grows with the squared distance of the handles from their targets.
 
     Args:
-        far: root mean squared distance, as a share of the model's size, at which displacements cost as much as
-            residuals.
-        least: smallest damping.
-        most: largest damping.
+        far: root mean squared distance, as a share of the model's size, at which displacements cost like residuals.
     """
 
     far: float = 0.2
@@ -135,12 +132,7 @@ def solve_pose(
 
 
 class PoseSolver:
-    """Poses of one model, its joints found once.
-
-    Args:
-        model: the model to pose; later changes of it go unnoticed.
-        config: see `SolvePoseConfig`.
-    """
+    """Poses of one model, its joints found once; later changes of the model are not noticed."""
 
     @torch.no_grad()
     def __init__(self, model: GridLBS, *, config: SolvePoseConfig | None = None) -> None:
@@ -243,12 +235,7 @@ def _checked_weights(weights: Tensor, like: Tensor, count: int) -> Tensor:
 
 
 class _JointTree:
-    """The tree of B bones and the J joints between bones and their parents.
-
-    Args:
-        tree: the skeleton.
-        centers: (B, 3) of the bones' bodies, about which twists turn them.
-    """
+    """The tree of B bones, which turn about centers (B, 3), and the J joints between bones and their parents."""
 
     def __init__(self, tree: BoneTree, centers: Tensor) -> None:
         self._centers, self._parents = centers, torch.tensor(tree.parents, device=centers.device)

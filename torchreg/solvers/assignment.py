@@ -8,19 +8,10 @@ from torch import Tensor
 
 
 def assign(costs: Tensor, unmatched_cost: Tensor | float | None = None) -> Tensor:
-    """Return the column of each row in the assignment of least total cost; no column is given twice.
+    """Return the column (N,) int64 of each row in the least-cost assignment (Kuhn 1955) of costs (N, M), none twice.
 
-    Args:
-        costs: (N, M), finite.
-        unmatched_cost: cost of leaving a row without a column, or (N,) costs; None: rows stay unmatched only if there
-            are too few columns.
-
-    Returns:
-        Columns (N,) int64, -1 for unmatched rows.
-
-    Differentiable: no.
-
-    References: Kuhn 1955; Crouse 2016 for the algorithm behind `scipy.optimize.linear_sum_assignment`.
+    Rows that stay unmatched get -1: at ``unmatched_cost``, a number or (N,), or, if that is None, only for lack of
+    columns.
     """
     rows, columns = costs.shape
     table = costs.detach()

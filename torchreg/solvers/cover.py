@@ -21,25 +21,9 @@ def best_covers(
 ) -> tuple[Tensor, Tensor]:
     """Return the best combinations of one row per table, ``min sum_j min(u_j, min_f T_f[k_f, j]) + sum_f c_f[k_f]``.
 
-    A beam search over the tables, in their order; then, for the best combinations, pairs of rows are exchanged for the
-    best pair given all other rows, which finds two rows that must change at once.
-
-    Args:
-        uncovered: (B, M) cost of a column that no row covers.
-        tables: F tensors (B, K_f, M), cost of a column covered by a row; at least one.
-        costs: F tensors (B, K_f), cost of choosing a row.
-        count: combinations returned, at most.
-        beam: combinations kept from table to table.
-        num_exchanged: best combinations that are improved by exchanges; 0 leaves the exchanges out.
-        sweeps: over all pairs of tables.
-
-    Returns:
-        Indices (B, C, F) int64 of the chosen rows and total costs (B, C), best first; C is at most ``count``. If there
-        are fewer combinations, repeated ones come last.
-
-    Differentiable: in the cost.
-
-    Cost: O(B M beam sum K_f + B M num_exchanged sweeps sum_fg K_f K_g).
+    From u (B, M), F tables (B, K_f, M) and their row costs (B, K_f): indices (B, C, F) int64 and total costs (B, C),
+    best first, repeated ones last. A beam search over the tables, in their order, then, for the best ``num_exchanged``,
+    exchanges of pairs of rows, which find two rows that must change at once.
     """
     index, total = _beam(uncovered, tables, costs, max(beam, count))
     if num_exchanged > 0 and len(tables) > 1:

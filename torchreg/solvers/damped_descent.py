@@ -35,8 +35,6 @@ class DampingRule:
         down: factor after a step with such a decrease.
         doubtful: factor after a step with a smaller decrease.
         up: factor after a step that raised the cost, or whose system could not be solved.
-        least: smallest damping, against rounding.
-        most: largest damping, at which steps vanish.
     """
 
     trusted: float
@@ -51,8 +49,6 @@ class Trial(NamedTuple, Generic[State]):
     """A step before its cost is known.
 
     Args:
-        state: after the step.
-        step: (..., D), or of any shape.
         promised: (...) decrease of the cost in the quadratic model, ``-g^T s / 2``.
         sound: (...) False where the damped system had no solution and the step is zero.
     """
@@ -64,15 +60,11 @@ class Trial(NamedTuple, Generic[State]):
 
 
 class Descent(NamedTuple, Generic[State, AnySystem]):
-    """Result of the iteration.
+    """State of lowest cost, and the system around it, of which only the cost is up to date after ``final_cost``.
 
     Args:
-        state: of the lowest cost.
-        system: the problem around it; after ``final_cost`` only its cost is up to date.
-        damping: (...) to continue with.
         last_step: the last accepted step, zero if there was none.
         num_steps: steps tried.
-        done: (...) whether the problem has converged.
     """
 
     state: State
@@ -96,27 +88,10 @@ def damped_descent(
     start: AnySystem | None = None,
     final_cost: Callable[[State], Tensor] | None = None,
 ) -> Descent[State, AnySystem]:
-    """Return the state of lowest cost that damped steps find; problems of a batch proceed independently.
+    """Return the state of lowest cost that damped steps find (Levenberg 1944; Marquardt 1963), each problem by itself.
 
-    A step that raises the cost is rejected and the damping raised; one that lowers it is accepted, and the damping
-    updated by its decrease, see `DampingRule`.
-
-    Args:
-        linearize: the problem around a state.
-        solve: (state, problem, damping (...)) to a step.
-        state: initial state.
-        damping: (...) initial damping.
-        rule: update of the damping.
-        max_steps: largest number of steps tried.
-        converged: (trial, cost before, cost after) to (...) whether a problem has converged and keeps its state; None:
-            never.
-        done: (...) problems that have converged already.
-        start: the problem around the initial state, if known.
-        final_cost: cost (...) of a state, if that is cheaper: the last trial needs no more.
-
-    Differentiable: no.
-
-    References: Levenberg 1944; Marquardt 1963.
+    ``solve`` maps (state, system, damping (...)) to a step, ``converged`` (trial, cost before, cost after) to (...)
+    whether a problem keeps its state. ``final_cost`` is a cheaper cost (...) of a state, for the last trial.
     """
     current = linearize(state) if start is None else start
     done = torch.zeros_like(current.cost, dtype=torch.bool) if done is None else done

@@ -51,18 +51,9 @@ class EStep:
 
 
 def outlier_constant(num_points: int, sigma: Tensor, volume: Tensor) -> Tensor:
-    """Return c of eq. 18, ``3 sqrt(pi / 2) (1 - n v / V)`` with ``v = 4 pi sigma^3 / 3``.
+    """Return c of eq. 18, ``3 sqrt(pi / 2) (1 - n v / V)`` with ``v = 4 pi sigma^3 / 3``, the bracket at least 0.05.
 
-    The bracket is kept at 0.05 or above.
-
-    Args:
-        num_points: n, the number of model points.
-        sigma: (...) metres.
-        volume: (...) V, the working volume, cubic metres; see `working_volume`.
-
-    Differentiable: in ``sigma`` and ``volume``.
-
-    References: Dewaele et al. 2006, eq. 18.
+    The working volume V is in cubic metres, see `working_volume` (Dewaele et al. 2006).
     """
     matched = num_points * 4 / 3 * math.pi * sigma**3
     return OUTLIER_CONSTANT * (1 - matched / volume).clamp_min(_KERNEL.min_free_share)
@@ -76,27 +67,11 @@ def expectation(
     *,
     mask: Tensor | None = None,
 ) -> EStep:
-    """Return lambda_i, G_i and the total posterior of every datum, without storing the N x M posterior.
+    """Return the E-step of data (..., M, 3) and posed model points (..., N, 3), metres, without the N x M posterior.
 
-    ``alpha_ij = exp(-|Y_j - X_i|^2 / 2 sigma^2) / (sum_k exp(-|Y_j - X_k|^2 / 2 sigma^2) + c)``,
-    ``lambda_i = sum_j alpha_ij``, ``G_i = sum_j alpha_ij Y_j / lambda_i``. All exponents are at most zero and c is
-    positive, so nothing overflows, and a far outlier gets posterior 0.
-
-    Args:
-        model: (..., N, 3) posed model points, metres.
-        data: (..., M, 3), metres, with batch dimensions that broadcast with the model's.
-        sigma: (...) metres, positive.
-        outlier: (...) c, positive.
-        mask: (..., M) False where a datum is padding, whose coordinates are ignored.
-
-    Returns:
-        An `EStep`; a padded datum has posterior 0.
-
-    Differentiable: no (see `EMLoss`).
-
-    Cost: O(N M) time, bounded memory.
-
-    References: Dewaele et al. 2006, eqs. 17, 18, 20.
+    ``alpha_ij = exp(-|Y_j - X_i|^2 / 2 sigma^2) / (sum_k exp(-|Y_j - X_k|^2 / 2 sigma^2) + c)``, ``lambda_i = sum_j
+    alpha_ij``, ``G_i = sum_j alpha_ij Y_j / lambda_i``. Data that the mask (..., M) excludes have posterior 0 (Dewaele
+    et al. 2006, eqs. 17, 18, 20).
     """
     batch = model.shape[:-2]
     if batch != data.shape[:-2]:  # broadcast_shapes is slow, and imports sympy when first called
@@ -140,24 +115,7 @@ def posterior(
     *,
     mask: Tensor | None = None,
 ) -> Tensor:
-    """Return the full posterior alpha (..., N, M), for inspection or small problems.
-
-    Args:
-        model: (..., N, 3), metres.
-        data: (..., M, 3), metres.
-        sigma: (...) metres, positive.
-        outlier: (...) c, positive.
-        mask: (..., M) False where a datum is padding (its column is zero).
-
-    Returns:
-        Posteriors (..., N, M); columns sum to the probability that the datum is an inlier.
-
-    Differentiable: in ``model``, ``data`` and ``sigma``.
-
-    Cost: O(N M) memory.
-
-    References: Dewaele et al. 2006, eq. 17.
-    """
+    """Return the posterior alpha (..., N, M) of eq. 17, for small problems; columns sum to inlier probabilities."""
     sigma = torch.as_tensor(sigma, dtype=model.dtype, device=model.device)
     # Scaled before squaring: the square of a small sigma underflows.
     scale = (2**-0.5 / sigma)[..., None, None, None]
@@ -168,35 +126,13 @@ def posterior(
 
 
 def responsibilities(exponent: Tensor, outlier: Tensor | float, *, dim: int) -> Tensor:
-    """Return ``exp(e_i) / (sum_k exp(e_k) + c)`` over the candidates of each datum, in the log domain.
-
-    Args:
-        exponent: (...) log-likelihoods, up to a constant, of the candidates along ``dim``.
-        outlier: c, positive, a number or of the shape of ``exponent`` with size one along ``dim``.
-        dim: dimension of the candidates.
-
-    Returns:
-        Probabilities (...); the rest to one along ``dim`` is the probability of an outlier.
-
-    Differentiable: in both.
-
-    References: Dewaele et al. 2006, eq. 17.
-    """
+    """Return ``exp(e_i) / (sum_k exp(e_k) + c)`` over the candidates of each datum along ``dim`` (eq. 17)."""
     level = torch.as_tensor(outlier, dtype=exponent.dtype, device=exponent.device).log()
     return (exponent - torch.logaddexp(exponent.logsumexp(dim, keepdim=True), level)).exp()
 
 
 def working_volume(model: Tensor, data: Tensor, sigma: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Return V of eq. 18 (...), the volume of the bounding box of data and posed model grown by 3 sigma, cubic metres.
-
-    Args:
-        model: (..., N, 3), metres.
-        data: (..., M, 3), metres.
-        sigma: (...) metres.
-        mask: (..., M) False where a datum is padding.
-
-    Differentiable: in all but ``mask``.
-    """
+    """Return V of eq. 18 (...), the volume of the bounding box of data and model grown by 3 sigma, cubic metres."""
     low, high = data, data
     if mask is not None:
         low = torch.where(mask.unsqueeze(-1), data, torch.inf)
@@ -264,14 +200,7 @@ def _expanded_kernel(model: Tensor, raised: Tensor) -> Tensor:
 
 
 def gaussian_kernel(model: Tensor, data: Tensor) -> Tensor:
-    """Return ``exp(-|x - y|^2)`` (B, N, M) of scaled points, zero up to 1e-26.
-
-    Args:
-        model: (B, N, 3), in units of sqrt(2) sigma.
-        data: (B, M, 3), in the same units.
-
-    Differentiable: no; it works in place.
-    """
+    """Return ``exp(-|x - y|^2)`` (B, N, M), zero up to 1e-26, of points (B, N or M, 3) in units of sqrt(2) sigma."""
     exponent = model[..., 0:1] - data[..., 0].unsqueeze(-2)
     exponent.mul_(exponent)
     for axis in (1, 2):

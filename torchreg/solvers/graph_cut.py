@@ -33,14 +33,7 @@ _REDUCTION = _Reduction()
 
 @dataclass(frozen=True)
 class Labeling:
-    """A labeling of a graph.
-
-    Args:
-        labels: (N,) int64.
-        energy: of the labels.
-        num_sweeps: sweeps over all labels that were begun.
-        converged: whether no expansion of any label lowers the energy any more.
-    """
+    """Labels (N,) int64 and their energy; ``converged`` where no expansion lowers it any more."""
 
     labels: Tensor
     energy: float
@@ -62,36 +55,13 @@ def alpha_expansion(
     """Return labels that lower ``sum_i U_i(f_i) + sum_ij V_ij(f_i, f_j) + sum_l h_l [l is used]``.
 
     ``V_ij(a, b) = w_ij [a != b] + t_ij min(|p_ij(a) - p_ij(b)|, 1)``: a Potts term, and the distance between the
-    positions to which two labels move the edge, by which seams are judged.
+    positions p (E, L, D) to which two labels move the edge, in units of the distance at which the cost saturates.
 
-    Each move lets every node keep its label or take a given label, alpha, in the best way, by a minimum cut. Labels
-    take turns until none of them lowers the energy; it never rises. Two labels end in the least energy, to the rounding
-    of `min_cut`; more labels, without label costs and with ``U >= 0``, within ``2 max V_ij / min V_ij`` times the least
-    (of different labels, at the edge where that is most; 2 for Potts).
+    Each expansion is one minimum cut; the energy never rises. Two labels end in the least energy, more labels, without
+    label costs and with ``U >= 0``, within ``2 max V_ij / min V_ij`` times the least (2 for Potts).
 
-    Args:
-        unary: (N, L) U, finite.
-        edges: (E, 2) integers, pairs of different nodes, each pair once.
-        weights: (E,) w, not negative.
-        positions: (E, L, D) p, the position of the edge under each label, in units of the distance at which the cost
-            saturates; without them that term is left out.
-        position_weights: (E,) t, not negative; ones by default.
-        label_costs: (L,) h, not negative; zero by default.
-        initial: (N,) labels to start from; the least U of each node by default.
-        max_sweeps: largest number of rounds in which every label has its turn.
-
-    Returns:
-        A `Labeling`, on the device of ``unary``.
-
-    Raises:
-        SolverError: if a flow and its cut differ.
-
-    Differentiable: no.
-
-    Cost: one minimum cut per label and sweep; labels are skipped while nothing changed since their last turn.
-
-    References: Boykov, Veksler and Zabih 2001; Kolmogorov and Zabih 2004; Delong et al. 2012 for label costs; Kwatra
-    et al. 2003 for seams.
+    References: Boykov, Veksler and Zabih 2001; Kolmogorov and Zabih 2004; Delong et al. 2012 for label costs; Kwatra et
+    al. 2003 for seams.
     """
     num_labels = unary.shape[1]
     seams = None
@@ -212,26 +182,11 @@ def _sweep(energy: _LabelingEnergy, labels: Integers, max_sweeps: int, device: t
 
 
 def min_cut(unary: Floats, edges: Integers, forward: Floats, backward: Floats) -> tuple[Flags, float]:
-    """Return the least cut, ``min_x sum_i u_i x_i + sum_ij (1 - x_i) x_j c_ij + x_i (1 - x_j) r_ij``.
+    """Return the least cut, ``min_x sum_i u_i x_i + sum_ij (1 - x_i) x_j c_ij + x_i (1 - x_j) r_ij``, of N nodes.
 
-    Nodes whose side is plain from their own costs are set first. What is left goes to a maximum flow over 32-bit
-    integers: capacities are multiplied by the largest power of two for which their sum still fits, and rounded, so
-    that integers whose sum is below 2^31 stay exact. Flow and cut are checked to be equal.
-
-    Args:
-        unary: (N,) u, paid by nodes on the side of the sink, of any sign.
-        edges: (E, 2) pairs of different nodes; pairs may repeat.
-        forward: (E,) c, paid when the first node is on the source's side and the second is not, not negative.
-        backward: (E,) r, paid in the opposite case, not negative.
-
-    Returns:
-        Mask (N,) of the nodes on the sink's side, of several least cuts the smallest, and the most by which the cut can
-        exceed the least one: the sum of the roundings, at most ``n^2 2^-31`` of the mean capacity of n arcs.
-
-    Raises:
-        SolverError: if flow and cut differ.
-
-    References: Boykov and Kolmogorov 2004; Hammer, Hansen and Simeone 1984 for the nodes set first.
+    That is a mask (N,) of the nodes on the sink's side, the smallest of several least cuts, and a bound on its excess:
+    capacities are rounded to 32-bit integers, after nodes whose side follows from their own costs are fixed (Boykov and
+    Kolmogorov 2004; Hammer, Hansen and Simeone 1984).
     """
     fixed, unary, alive = _plain_sides(unary, edges, forward, backward)
     nodes = np.flatnonzero(fixed < 0)

@@ -51,15 +51,7 @@ class Linearization(NamedTuple):
 
 @dataclass(frozen=True)
 class LMResult:
-    """Result of the iteration.
-
-    Args:
-        state: (B, D).
-        cost: (B,) at the state.
-        damping: (B,) to continue with.
-        last_step: (B, D) the last accepted step, zero if there was none.
-        num_steps: steps tried.
-    """
+    """States (B, D), their costs (B,), damping to continue with, the last accepted step (zero if none), steps tried."""
 
     state: Tensor
     cost: Tensor
@@ -81,31 +73,10 @@ def levenberg_marquardt(
     start: Linearization | None = None,
     cost: Callable[[Tensor], Tensor] | None = None,
 ) -> LMResult:
-    """Return the state of lowest cost that the iteration finds; problems of a batch proceed independently.
+    """Return the states of lowest cost by steps ``(H + damping diag(H)) s = -g``, each problem of the batch by itself.
 
-    Each step solves ``(H + damping diag(H)) s = -g``. Variables at a limit whose gradient pushes outwards are frozen
-    for the step; the others are clamped at the limit. A step that raises the cost, or whose system has no Cholesky
-    factor, is rejected and the damping raised; one that lowers it by much less than predicted is accepted and the
-    damping raised a little.
-
-    Args:
-        linearize: state (B, D) to `Linearization`.
-        state: (B, D) initial state; clamped to the limits first.
-        retract: (state, step) to state; addition by default.
-        lower: (D,) or (B, D) limits of the state, or None.
-        upper: (D,) or (B, D) limits of the state, none below ``lower``, or None.
-        damping: (B,) initial relative damping; 1e-3 by default.
-        max_steps: number of linearizations after the first.
-        atol: stop when every problem's largest step component is at most this.
-        start: the linearization at ``state``, which must lie within the limits, if known.
-        cost: state (B, D) to cost (B,) like ``linearize``'s, if that is cheaper; the last trial needs no more.
-
-    Returns:
-        An `LMResult`; the initial state of problems without finite cost there.
-
-    Differentiable: no.
-
-    Cost: ``max_steps + 1`` linearizations and ``max_steps`` batched Cholesky factorizations.
+    Variables at a limit whose gradient pushes outwards are frozen for the step, others clamped at it. All problems stop
+    when the largest step component of each is at most ``atol``; ``cost`` is a cheaper cost (B,) for the last trial.
 
     References: Marquardt 1963; Bertsekas 1982 for the limits.
     """
@@ -141,20 +112,9 @@ def levenberg_marquardt(
 
 
 def damped_step(problem: Linearization, damping: Tensor, *, frozen: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Return the step ``-(H + damping diag(H))^-1 g``, zero in frozen and in unconstrained variables.
+    """Return steps (B, D) ``-(H + damping diag(H))^-1 g``, and a mask (B,) of the systems with a Cholesky factor.
 
-    A variable is unconstrained when its curvature is below the rounding of the largest one's. A problem whose damped
-    system has no Cholesky factor gets a zero step.
-
-    Args:
-        problem: the linearized problem.
-        damping: (B,) relative damping.
-        frozen: (B, D) True for variables to hold.
-
-    Returns:
-        Steps (B, D), and a mask (B,) of the systems that could be factored.
-
-    Differentiable: no.
+    Steps are zero in the other systems, in frozen variables (B, D), and where the curvature is rounding of the largest.
     """
     hessian, gradient = problem.hessian, problem.gradient
     diagonal = hessian.diagonal(dim1=-2, dim2=-1)

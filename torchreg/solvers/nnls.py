@@ -47,13 +47,11 @@ class NNLSResult:
     """A non-negative least-squares solution.
 
     Args:
-        x: (n,), on the dtype and device of the right-hand side.
         objective: squared residual at ``x``.
         kkt_residual: largest violation of the optimality conditions (slope where x > 0, negative slope where x = 0),
             with every variable scaled to unit curvature, relative to the largest slope at x = 0.
         ridge: added to the Hessian as a share of its diagonal because that was singular; 0 if none was needed.
         num_steps: rounds of freeing variables.
-        num_solves: linear systems solved.
         converged: whether ``kkt_residual`` came below the tolerance, without the ridge.
     """
 
@@ -69,30 +67,11 @@ class NNLSResult:
 def nnls(
     matrix: Any, target: Tensor, *, start: Tensor | None = None, max_steps: int = 50, tol: float = 1e-7
 ) -> NNLSResult:
-    """Return ``argmin_{x >= 0} |A x - b|^2``.
+    """Return ``argmin_{x >= 0} |A x - b|^2``, or the best found; A (m, n) is a torch or scipy matrix, sparse or dense.
 
-    An active set is found by elimination: the least squares over the free variables are solved and all that came out
-    negative are held at zero, until none is. Then variables at zero with a negative slope are freed and it starts over,
-    until there are none. A round that fails to lower the objective is repeated in steps that never leave x >= 0 and
-    always lower it, so that the iteration cannot cycle.
-
-    Args:
-        matrix: (m, n) A: a tensor, sparse or dense, or a scipy sparse matrix.
-        target: (m,) b.
-        start: (n,) near the solution; its positive entries are free first, without it all are.
-        max_steps: largest number of rounds.
-        tol: of the KKT residual.
-
-    Returns:
-        An `NNLSResult`; without convergence, the best found.
-
-    Raises:
-        SolverError: if the systems stay unsolvable within the ridges allowed, 1e-8 of the diagonal.
-
-    Differentiable: no.
-
-    Cost: systems of up to 300 free variables by Cholesky factors, larger ones by preconditioned conjugate gradients,
-    or sparse LU factors where those are too slow.
+    The free variables are solved and the negative ones held at zero, until none is; then variables at zero with a
+    negative slope are freed. A round that does not lower the objective is repeated in steps that always do, so it
+    cannot cycle.
 
     References: Schaefer and Yuksel 2007 for the elimination; Lawson and Hanson 1974 for the steps that cannot cycle.
     """
@@ -172,11 +151,7 @@ class _Quadratic:
         return float(np.where(y > 0, np.abs(slope), np.maximum(-slope, 0.0)).max(initial=0.0))
 
     def solve(self, free: Flags, start: Floats, share: float) -> Floats:
-        """Return the minimum over the free variables, all others zero, to ``share`` of the largest slope at zero.
-
-        Raises:
-            _Singular: if none is found.
-        """
+        """Return the minimum over the free variables, all others zero, to ``share`` of the largest slope at zero."""
         self.num_solves += 1
         index = np.flatnonzero(free)
         solution = np.zeros_like(self.linear)
@@ -217,11 +192,7 @@ def _lu(matrix: csr_matrix, right: Floats) -> Floats:
 
 
 def _conjugate_gradients(matrix: csr_matrix, right: Floats, start: Floats, atol: float) -> Floats | None:
-    """Return x with ``|A x - b| <= atol`` in every entry, or None if steps run out; A has about unit diagonal.
-
-    Raises:
-        _Singular: if a direction has no curvature.
-    """
+    """Return x with ``|A x - b| <= atol`` in every entry, or None if steps run out; A has about unit diagonal."""
     x = start.copy()
     residual = right - matrix @ x
     direction, square = residual.copy(), residual @ residual
@@ -277,8 +248,7 @@ def _eliminate(problem: _Quadratic, free: Flags, start: Floats) -> Floats:
 def _descend(problem: _Quadratic, y: Floats, entering: Flags) -> Floats:
     """Return a point of lower value: the minimum over the positive and entering variables, approached within y >= 0.
 
-    ``y`` is the minimum over its positive variables, so that an entering one comes out positive however many of them
-    are dropped.
+    ``y`` is the minimum over its positive variables, so an entering one comes out positive however many are dropped.
     """
     fine = _SETTINGS.fine * problem.tol
     y, positive = y.copy(), y > 0

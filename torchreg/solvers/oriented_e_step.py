@@ -14,26 +14,10 @@ CONCENTRATION = 3.0
 def oriented_expectation(
     model: Tensor, data: Tensor, sigma: Tensor, outlier: Tensor | float, *, mask: Tensor | None = None
 ) -> EStep:
-    """Return the E-step in which normals differ by a von Mises-Fisher law, beside the Gaussian of the positions.
+    """Return the E-step of positions and unit normals, (B, N, 6) of the model and (B, M, 6) of data, in O(N M) memory.
 
-    ``alpha_ij`` is in proportion to ``exp(-|Y_j - X_i|^2 / 2 sigma^2 + kappa (m_j . n_i - |m_j|))``, beside c. A wide
-    kernel then leaves the far side of a limb alone, whose normals oppose those of the data.
-
-    Args:
-        model: (B, N, 6) posed model points, metres, and their unit normals n.
-        data: (B, M, 6), metres, and unit normals m; zero where they are unknown.
-        sigma: (B,) metres.
-        outlier: (B,) c, or a number.
-        mask: (B, M) False where a datum is padding.
-
-    Returns:
-        An `EStep`, of positions alone.
-
-    Differentiable: no.
-
-    Cost: O(N M) time and memory.
-
-    References: Dewaele et al. 2006, eqs. 17 and 20; Mardia and Jupp 2000 for the law of directions.
+    ``alpha_ij ~ exp(-|Y_j - X_i|^2 / 2 sigma^2 + kappa (m_j . n_i - |m_j|))``: normals differ by a von Mises-Fisher law
+    (Mardia and Jupp 2000), so that a wide kernel ignores the far side of a limb. Unknown normals m are zero.
     """
     model, model_normals = model.split(3, dim=-1)
     data, data_normals = data.split(3, dim=-1)

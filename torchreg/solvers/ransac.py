@@ -63,35 +63,12 @@ def ransac_rigid(
     min_difference: float = 3.0,
     generator: torch.Generator | None = None,
 ) -> RansacResult:
-    """Return several distinct rigid motions supported by matched points, however many matches are wrong.
+    """Return K distinct rigid motions of each group that matches (..., N, 3) support, however many of these are wrong.
 
-    The first match of a sample is drawn by weight, stratified over the samples; each further one among those that
-    preserve the distances to the samples before it (and, with normals, the angles), with a probability that grows with
-    the distance. Three matches, or two with normals, determine a motion. All motions of all groups are scored together;
-    the best are refitted to their inliers repeatedly, and then picked in the order of their scores, without those that
-    move the group's points nearly like one picked before.
-
-    Args:
-        source: (..., N, 3), any unit; leading dimensions are groups with motions of their own.
-        target: (..., N, 3) the matches, row by row; a point may occur in several rows.
-        threshold: distance below which a match is an inlier, in the unit of the points.
-        source_normals: (..., N, 3) unit, consistently oriented in source and target; None to ignore normals.
-        target_normals: (..., N, 3), given with ``source_normals``.
-        max_angle: between a rotated normal and its match's in an inlier, radians.
-        weights: (..., N) not negative, of the matches; ones by default. A row of weight zero is no inlier.
-        mask: (..., N) bool, False for padding, which may hold anything.
-        num_trials: samples per group.
-        num_hypotheses: K, motions returned per group.
-        min_difference: root mean square distance, in thresholds, by which motions must move the points apart to be
-            distinct.
-        generator: draws the samples; a default one of seed 0 if none is given.
-
-    Returns:
-        A `RansacResult`; the same for the same generator state, however the groups are batched up to rounding.
-
-    Differentiable: no.
-
-    Cost: O(groups num_trials N) in time; memory in chunks of trials.
+    The first match of a sample is drawn by weight, each further one among those that preserve the distances (and angles
+    of normals) to those before; three, or two with normals, determine a motion. The best motions are refitted to their
+    inliers, and must move the points apart by ``min_difference`` thresholds (root mean square) to be distinct. Angles
+    are in radians; matches of weight zero, or masked False, are no inliers.
 
     References: Fischler and Bolles 1981; Torr and Zisserman 2000 for the score.
     """

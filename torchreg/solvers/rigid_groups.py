@@ -7,21 +7,11 @@ from torch import Tensor
 
 
 def merge_alike(residuals: Tensor, counts: Tensor, adjacent: Tensor, tolerance: float) -> Tensor:
-    """Return the part of each piece after the two adjacent pieces of most similar motion are merged repeatedly.
+    """Return the part (B,) of each piece, the index of one of its pieces: adjacent pieces of like motion are merged.
 
-    A merged piece moves as its larger member, so that chains of pieces, each of which moves much like the next, do not
-    merge into one part. It ends when, of any two adjacent pieces, the motion of neither explains the points of the
-    other within the tolerance, on average.
-
-    Args:
-        residuals: (T, B, B) sum of the distances of the points of piece b from their observed positions under the
-            motion of piece a, ``[t, a, b]``, in each of T frames.
-        counts: (B,) points of each piece; pieces without points are not merged.
-        adjacent: (B, B) bool, symmetric.
-        tolerance: of the mean residual over the points in the worst frame, in the unit of ``residuals``.
-
-    Returns:
-        Parts (B,) int64, each the index of one of its pieces.
+    ``residuals[t, a, b]`` sums the distances of the points of piece b from their observed positions under the motion of
+    piece a in frame t. A merged piece moves as its larger member, so that chains of pieces do not merge into one part;
+    merging ends at a mean residual of ``tolerance`` in the worst frame.
     """
     residuals, counts, adjacent = residuals.clone(), counts.clone(), adjacent.clone().fill_diagonal_(False)
     part = torch.arange(len(counts), device=counts.device)

@@ -20,49 +20,31 @@ from torch import Tensor
 
 
 def welsch_weight(squared_ratio: Tensor) -> Tensor:
-    """Return ``exp(-z)``: 0.37 at the scale, 1e-4 at three scales.
-
-    References: Dennis and Welsch 1978.
-    """
+    """Return ``exp(-z)``: 0.37 at the scale, 1e-4 at three scales (Dennis and Welsch 1978)."""
     # In place on what neg() allocates: backward needs the result alone.
     return squared_ratio.neg().exp_()
 
 
 def welsch_loss(squared_ratio: Tensor) -> Tensor:
-    """Return ``1 - exp(-z)``, one minus the weight, below 1; its sum over data is a soft count of the outliers.
-
-    References: Dennis and Welsch 1978.
-    """
+    """Return ``1 - exp(-z)``, below 1; its sum over data is a soft count of the outliers (Dennis and Welsch 1978)."""
     return 1 - welsch_weight(squared_ratio)
 
 
 def geman_mcclure_weight(squared_ratio: Tensor) -> Tensor:
-    """Return ``1 / (1 + z)^2``: 1/4 at the scale, 1/100 at three scales; far residuals still count a little.
-
-    References: Geman and McClure 1987.
-    """
+    """Return ``1 / (1 + z)^2``: 1/4 at the scale, 1/100 at three scales (Geman and McClure 1987)."""
     return (1 + squared_ratio).pow_(-2)
 
 
 def geman_mcclure_loss(squared_ratio: Tensor) -> Tensor:
-    """Return ``z / (1 + z)``, below 1.
-
-    References: Geman and McClure 1987.
-    """
+    """Return ``z / (1 + z)``, below 1 (Geman and McClure 1987)."""
     return squared_ratio / (1 + squared_ratio)
 
 
 def cauchy_weight(squared_ratio: Tensor) -> Tensor:
-    """Return ``1 / (1 + z)``: 1/2 at the scale, 1/10 at three scales; the influence of a residual decays slowly.
-
-    References: Holland and Welsch 1977.
-    """
+    """Return ``1 / (1 + z)``: 1/2 at the scale, 1/10 at three scales (Holland and Welsch 1977)."""
     return (1 + squared_ratio).reciprocal_()
 
 
 def cauchy_loss(squared_ratio: Tensor) -> Tensor:
-    """Return ``log(1 + z)``, without bound.
-
-    References: Holland and Welsch 1977.
-    """
+    """Return ``log(1 + z)``, without bound (Holland and Welsch 1977)."""
     return squared_ratio.log1p()

@@ -7,22 +7,10 @@ from torch import Tensor
 
 
 def nearest_on_simplex(rows: Tensor) -> Tensor:
-    """Return ``argmin_x |x - v|^2`` subject to ``x >= 0, sum_j x_j = 1`` for every row v.
+    """Return ``argmin_x |x - v|^2`` subject to ``x >= 0, sum_j x_j = 1`` for every row v of rows (..., B).
 
-    A non-negative least-squares problem whose solution is ``max(v - theta, 0)``: its KKT conditions leave one number
-    theta, which the largest entries that stay positive determine.
-
-    Args:
-        rows: (..., B) finite, of any size.
-
-    Returns:
-        (..., B), in the dtype of the rows.
-
-    Differentiable: no.
-
-    Cost: that of sorting the rows.
-
-    References: Held, Wolfe and Crowder 1974; Duchi et al. 2008.
+    The solution is ``max(v - theta, 0)``, theta given by the largest entries (Held, Wolfe and Crowder 1974; Duchi et
+    al. 2008).
     """
     # An amount added to a whole row changes nothing, and entries more than one below the largest end at zero: so
     # large rows keep their digits.

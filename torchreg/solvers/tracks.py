@@ -14,12 +14,12 @@ _NUM_SCALINGS = 200  # of rows and columns, towards sums of one: what is sure co
 
 @dataclass(frozen=True, eq=False)
 class TrackGraph:
-    """N detections, and log-odds of what may be of them.
+    """N detections, and the log-odds of their links, starts and stops.
 
     Args:
         links: (E, 2) an earlier detection and a later one, each pair once.
-        gains: (E,) log-odds that the second is what becomes of the first, against chance.
-        real: (N,) log-odds that a detection is none of clutter.
+        gains: (E,) log-odds that the second continues the first, against chance.
+        real: (N,) log-odds that a detection is not clutter.
         starts: (N,) log-probability that a track starts with it.
         stops: (N,) log-probability that a track stops with it.
     """
@@ -33,10 +33,8 @@ class TrackGraph:
     def best_tracks(self) -> tuple[Tensor, Tensor, float]:
         """Return the links (E,) of the most probable tracks, bool, which detections (N,) are real, and the score.
 
-        Every detection is on one track or clutter. That is an assignment of each detection to the one that follows it,
-        to a stop, or, if it is clutter, to itself.
-
-        References: Zhang, Li and Nevatia 2008.
+        One assignment of each detection to its successor, to a stop, or, if it is clutter, to itself (Zhang, Li and
+        Nevatia 2008).
         """
         count = len(self.real)
         numbers, (first, second) = torch.arange(count), self.links.unbind(1)
@@ -56,9 +54,7 @@ class TrackGraph:
         return used, real, float(score)
 
     def link_probabilities(self) -> tuple[Tensor, Tensor]:
-        """Return the probabilities of links (E,) and of starts (N,).
-
-        They are those of the soft assignment of most entropy: whatever becomes of a detection sums to one.
+        """Return the probabilities of links (E,) and of starts (N,), those of the soft assignment of most entropy.
 
         References: Sinkhorn 1964; Chertkov et al. 2010 for such probabilities of tracks.
         """

@@ -30,14 +30,7 @@ from torchreg.registration.results import RegisterRecord
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Source points that are matched, and their positions in F frames by an alignment.
-
-    Args:
-        points: (n, 3) before they are moved.
-        normals: (n, 3) unit normals there.
-        moved: (F, n, 3) their positions.
-        confidence: (F, n) of the moved points, positive.
-    """
+    """Source points (n, 3) with normals, their positions (F, n, 3) in F frames by an alignment, and confidences > 0."""
 
     # Weight of points of no confidence, which follow the alignment of their surroundings.
     LEAST_CONFIDENCE: ClassVar[float] = 0.1
@@ -58,21 +51,9 @@ class ReducedFit:
     """A registration under way: F frames of one source, in units of the source's diagonal.
 
     Args:
-        data: the grid and the samples in it.
-        samples: the samples.
-        targets: F scans.
-        config: see `BoneConfig`.
-        num_bones: most bones.
-        labels: (C,) bones of the cells to start from, from 0 without gaps; by default parts that move rigidly.
-        on_step: called with a `RegisterRecord` after each step.
-
-    Attributes:
-        labels: (C,) bone of each cell, from 0 without gaps.
-        model: the bones and weights, its poses the F frames.
-        moments: of the regions that bones share by their labels. Continuous weights spread far: bones share some of
-            them that no joint holds together.
-        correspondences: of the moved samples.
-        history: records so far.
+        labels: (C,) bones of the cells to start from, 0 without gaps; by default parts that move rigidly.
+        Attributes: ``labels`` (C,), ``model`` (its poses the F frames), ``correspondences``, ``history``, and
+            ``moments`` of the regions that bones share by their labels: continuous weights spread too far for joints.
     """
 
     labels: Tensor
@@ -177,8 +158,8 @@ class ReducedFit:
     def update_correspondences(self, progress: float) -> None:
         """Match the moved samples anew, with thresholds that tighten as ``progress`` goes from 0 to 1.
 
-        The target of a matched sample is its position in the alignment, projected onto the tangent plane of its match;
-        that of others the position in the alignment.
+        A matched sample's target is its aligned position on the match's tangent plane, that of others the aligned
+        position.
         """
         moved, normals = self.moved(self.samples.points, self.samples.normals)
         max_distance = geometric_at(self.config.max_distance, progress)

@@ -25,7 +25,8 @@ def _refinement() -> WeightsConfig:
 class BoneConfig:
     """Settings by which bones, labels and weights are fitted to an alignment of a source with one scan or more.
 
-    Pairs of numbers are a first and a last value, between which a setting runs in even ratios.
+    Pairs of numbers are a first and a last value, between which a setting runs in even ratios. The paper's values:
+    Chang and Zwicker 2009, section 5.
 
     Args:
         num_samples: source points that are matched, evenly spread.
@@ -39,13 +40,13 @@ class BoneConfig:
         label_cost: root of the mean squared distance that a label must save to be used; ``num_bones`` is a cap, and
             `ScanRegistration.parts` joins bones that moved as one.
         joint_weight: beta, the weight of the joints against the mean squared distance, over the rounds of labels; zeros
-            leave out joints and the costs of turns, and the paper's (1, 0.05) holds bones together where matches do
-            not, which here the dense alignment does, so that joints that are wrong need not resist.
+            leave out joints and the costs of turns. The paper's (1, 0.05) hold bones together where matches do not,
+            which the dense alignment does here, so that wrong joints need not resist.
         turn_weight: cost per squared radian by which bones that share weight turn against each other, so that the twist
-            of a round limb, which scans do not tell, stays as it was.
+            of a round limb, which scans do not observe, stays as it was.
         turn_scale: robust scale of those turns, radians.
         hinge_weight: cost per squared radian of turns about other axes than the one about which two bones mostly turn,
-            where three frames or more tell it, since most joints are hinges.
+            where three frames or more determine it, since most joints are hinges.
         max_distance: largest distance of a match, never below two sampling distances of the target; and the robust
             scale of the gaps that motions tear open at joints, since not all that meets is joined.
         max_angle: largest angle between the normals of a match, radians.
@@ -56,11 +57,6 @@ class BoneConfig:
         rtol: relative change of the energy over a round below which rounds end.
         refine: refinement of the weights.
         blend: of the bones, see `GridLBS`; weights are refined as if it were linear.
-
-    Raises:
-        InputError: if a value is out of range.
-
-    References: Chang and Zwicker 2009, section 5, for the paper's values.
     """
 
     num_samples: int = 4000

@@ -13,10 +13,9 @@ from torchreg.errors import InputError
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Targets of N points in each problem of a batch, and how residuals from them are measured.
+    """Targets (..., N, 3) of N points in each problem of a batch, and how residuals from them are measured.
 
     Args:
-        targets: (..., N, 3).
         normals: (..., N, 3) unit normals at the targets; None measures from point to point alone.
         weights: (..., N) not negative, zero for a dropped match, whose target and normal may be anything.
         point_to_point: share s of the point-to-point distance, see `squared_residuals`.
@@ -34,10 +33,7 @@ class Correspondences:
         return squared_residuals(positions - self.targets[frame], normals, self.point_to_point)
 
     def residual_rows(self) -> Tensor:
-        """Return rows (..., N, m, 3) whose products with an offset sum up to the squared residual when squared.
-
-        They are the root of ``(1 - s) n n^T + s I``, or ``n`` alone where s is zero.
-        """
+        """Return rows (..., N, m, 3) of the root of ``(1 - s) n n^T + s I``, or ``n`` alone where s is zero."""
         identity = torch.eye(3, dtype=self.targets.dtype, device=self.targets.device)
         if self.normals is None or self.point_to_point == 1:
             return identity.expand(self.targets.shape[-2], 3, 3)
@@ -59,17 +55,9 @@ def squared_residuals(offsets: Tensor, normals: Tensor | None, point_to_point: f
 
 
 class ScanDistance(nn.Module):
-    """Weighted mean of the squared residuals of moved points.
+    """Weighted mean of the squared residuals of moved points (Chang and Zwicker 2009, section 4.1).
 
     ``E = sum_k b_k ((1 - s) (n_k . d_k)^2 + s |d_k|^2) / sum_k b_k``, ``d_k = x_k - y_k``, see `squared_residuals`.
-
-    Args:
-        point_to_point: s, from 0 to 1.
-
-    Raises:
-        InputError: if ``point_to_point`` is out of range.
-
-    References: Chang and Zwicker 2009, section 4.1.
     """
 
     def __init__(self, point_to_point: float = 0.0) -> None:
@@ -84,20 +72,9 @@ class ScanDistance(nn.Module):
     def forward(
         self, moved: Tensor, targets: Tensor, normals: Tensor | None = None, match_weights: Tensor | None = None
     ) -> Tensor:
-        """Return the loss (...) of every problem of the batch, squared units.
+        """Return the loss (...) of every problem of the batch, squared units, zero where all match weights are.
 
-        Args:
-            moved: (..., N, 3) points of one scan, moved onto the other.
-            targets: (..., N, 3) the points that they correspond to, of the same dtype.
-            normals: (..., N, 3) unit normals at the targets; not needed for point to point alone.
-            match_weights: (..., N) not negative, zero for a match that was dropped, whose target is never looked at;
-                ones by default. Where all are zero the loss is zero.
-
-        Raises:
-            InputError: if a shape does not fit, or normals are missing.
-            InputTypeError: if dtypes or devices differ.
-
-        Differentiable: in all; in ``match_weights`` where they are positive.
+        Moved points, targets and unit normals are (..., N, 3), match weights (..., N); a dropped match has weight zero.
         """
         check_shape(moved, "moved", ("N", 3), batch=True)
         check_shape(targets, "targets", (moved.shape[-2], 3), batch=True)

@@ -9,18 +9,7 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class GridLBSRecord:
-    """A `GridLBS` as plain data.
-
-    Args:
-        cells: of the grid, see `SparseGrid`.
-        shape: of the grid.
-        origin: of the grid.
-        axes: of the grid.
-        spacing: of the grid.
-        weights: (K, B) before rows are divided by their sums.
-        transforms: (..., B, 4, 4).
-        blend: see `GridLBS`.
-    """
+    """A `GridLBS` as plain data: its grid, see `SparseGrid`, weights (K, B) before they are normalized, and motions."""
 
     cells: Tensor
     shape: tuple[int, int, int]

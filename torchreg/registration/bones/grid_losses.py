@@ -11,13 +11,8 @@ from torchreg.registration.bones.joint_moments import JointMoments, gaps_at, mot
 class JointEnergy(nn.Module):
     """Mean squared distance between the images of what two bones share, summed over pairs of bones.
 
-    ``E = sum_{i < j} tau_ij int w_i w_j |T_i x - T_j x|^2 dx`` over the grid, ``tau_ij = 1 / int w_i w_j dx``, in
-    closed form: ``tr((A_i - A_j) M_ij (A_i - A_j)^T) tau_ij`` with ``A = [R t]``. Each pair counts once. It is zero
-    when all bones move alike.
-
-    The gradient in the weights comes through `joint_moments` with ``pairs`` given.
-
-    References: Chang and Zwicker 2009, eq. 4.
+    ``E = sum_{i < j} tau_ij int w_i w_j |T_i x - T_j x|^2 dx`` over the grid, ``tau_ij = 1 / int w_i w_j dx`` (Chang
+    and Zwicker 2009, eq. 4). The gradient in the weights comes through `joint_moments` with ``pairs`` given.
     """
 
     def forward(self, transforms: Tensor, moments: JointMoments, pair_weights: Tensor | None = None) -> Tensor:
@@ -62,20 +57,10 @@ def smoothness_energy(weights: Tensor, edges: Tensor) -> Tensor:
 
 
 def normalization_energy(weights: Tensor) -> Tensor:
-    """Return ``E = sum_c (1 - sum_j v_cj)^2`` (...) of weights (..., K, B).
-
-    Differentiable: in ``weights``.
-
-    References: Chang and Zwicker 2009, eq. 7.
-    """
+    """Return ``E = sum_c (1 - sum_j v_cj)^2`` (...) of weights (..., K, B), eq. 7."""
     return (1 - weights.sum(-1)).square().sum(-1)
 
 
 def closeness_energy(weights: Tensor, label_weights: Tensor) -> Tensor:
-    """Return ``E = sum_c |v_c - v*_c|^2`` (...) of weights (..., K, B) and those of the labels (..., K, B), eq. 12.
-
-    Differentiable: in both.
-
-    References: Chang and Zwicker 2009, eq. 13.
-    """
+    """Return ``E = sum_c |v_c - v*_c|^2`` (...) of weights (..., K, B) and those of the labels, eqs. 12 and 13."""
     return (weights - label_weights).square().sum((-1, -2))

@@ -14,16 +14,10 @@ from torchreg.registration.bones.sparse_grid import GridLocation, SparseGrid, lo
 
 
 class GridModule(nn.Module):
-    """A module that holds a sparse grid: it moves with the module, and ``state_dict()`` tells all of it.
+    """A module that holds a sparse grid, which is part of its ``state_dict()``.
 
-    Entries of the state: ``grid_cells``, ``grid_origin`` and ``grid_axes``, buffers; ``grid_shape`` and
-    ``grid_spacing``, which are Python numbers here, so that the module can be compiled and no cast rounds them.
-
-    ``load_state_dict`` takes states of the same cells. States without any of these entries, which were saved before
-    grids were part of them, are taken as being of this grid.
-
-    Args:
-        grid: the grid.
+    Shape and spacing are Python numbers, so that the module can be compiled and no cast rounds them. States without
+    entries of the grid, saved before grids were part of them, are taken as being of this grid.
     """
 
     grid_origin: Tensor
@@ -93,12 +87,7 @@ class GridModule(nn.Module):
 
 
 def check_state(state: Any, names: Sequence[str], kind: str) -> None:
-    """Raise unless a state holds finite tensors of these names, those of a kind of module, and nothing else.
-
-    Raises:
-        InputTypeError: if it is no mapping, or an entry is no tensor.
-        InputError: if entries are missing, unknown or not finite.
-    """
+    """Raise unless a state holds finite tensors of these names, those of a kind of module, and nothing else."""
     if not isinstance(state, Mapping):
         raise InputTypeError(f"state must be the state_dict() of a {kind}, got {type(state).__name__}")
     missing = [name for name in names if name not in state]
@@ -116,12 +105,7 @@ def check_state(state: Any, names: Sequence[str], kind: str) -> None:
 
 
 def grid_of_state(state: Mapping[str, Tensor]) -> SparseGrid:
-    """Return the grid of a state that `check_state` passes.
-
-    Raises:
-        InputError: if the entries describe no grid.
-        InputTypeError: if the cells are not integers.
-    """
+    """Return the grid of a state that `check_state` passes."""
     check_shape(state["grid_shape"], "grid_shape", (3,))
     check_shape(state["grid_spacing"], "grid_spacing", ())
     return SparseGrid.from_cells(

@@ -29,10 +29,7 @@ _HINGES = _Hinges()
 
 
 def joint_weights(gaps: Tensor, scale: float) -> Tensor:
-    """Return weights (P,) of joints with gaps (..., P): less, the farther apart motions take their bones.
-
-    References: Geman and McClure 1987.
-    """
+    """Return weights (P,) of joints, which fall with their gaps (..., P) (Geman and McClure 1987)."""
     square = gaps.square().reshape(-1, gaps.shape[-1]).mean(0)
     return geman_mcclure_weight(square / scale**2)
 
@@ -40,14 +37,8 @@ def joint_weights(gaps: Tensor, scale: float) -> Tensor:
 def with_stiffness(moments: JointMoments, rotations: Tensor, config: BoneConfig, joint_weight: float) -> JointMoments:
     """Return joints as points, with a spread by which the joint energy penalizes turns of bones against each other.
 
-    ``|R_i - R_j|^2`` is about twice the squared angle between two bones, and a spread ``s I`` costs s times as much.
-    Robust weights: the wider bones turn against each other, the less they resist.
-
-    Args:
-        moments: of P pairs of bones.
-        rotations: (F, B, 3, 3) of the bones in all frames.
-        config: see `BoneConfig`.
-        joint_weight: beta, by which the energy multiplies the spread.
+    ``|R_i - R_j|^2`` is about twice the squared angle, and a spread ``s I`` costs s times as much, divided by beta
+    here. The weights are robust: the wider bones turn against each other, the less they resist.
     """
     first, second = rotations[..., moments.pairs.mT, :, :].unbind(-4)
     differences = first - second
@@ -63,7 +54,8 @@ def with_stiffness(moments: JointMoments, rotations: Tensor, config: BoneConfig,
 def _hinge_spread(squares: Tensor, config: BoneConfig) -> Tensor:
     """Return spreads (P, 3, 3) along hinge axes, of means (P, 3, 3) of ``(R_i - R_j)^T (R_i - R_j)``.
 
-    A hinge is a pin along its axis, which both bones must keep to. It holds less, the less their motions tell the axis.
+    A hinge is a pin along its axis, which both bones must keep to; it holds less where motions determine the axis
+    poorly.
     """
     chords, axes = torch.linalg.eigh(squares)
     axis, (least, second, _) = axes[..., 0], chords.clamp(min=0).unbind(-1)

@@ -19,8 +19,8 @@ class Regularization:
 
     Args:
         found: of joints found from motions that are given.
-        fitted: of joints fitted together with the motions: bones share weight at the surface that was scanned, joints
-            lie inside, and a firmer lambda draws them out, by up to a limb's radius.
+        fitted: of joints fitted with the motions: bones share weight at the surface, joints lie inside, and a firmer
+            lambda draws them out, by up to a limb's radius.
     """
 
     found: float = 0.01
@@ -32,11 +32,10 @@ REGULARIZATION = Regularization()
 
 @dataclass(frozen=True)
 class Joints:
-    """Joints of pairs of bones.
+    """Joints of pairs (P, 2) of bones.
 
     Args:
-        pairs: (P, 2) int64 bones, the lower first.
-        centers: (P, 3) joint centers, where the two motions of a pair agree, in the space that the motions start from.
+        centers: (P, 3), where the two motions of a pair agree, in the space that the motions start from.
         mass: (P,) of what the bones of a pair share, see `JointMoments`; zero for those that only come near.
         gaps: (..., P) distances between the images of each center under the two motions.
     """
@@ -49,35 +48,18 @@ class Joints:
 
 @dataclass(frozen=True)
 class BoneTree:
-    """A skeleton of bones.
-
-    Args:
-        parents: B indices, -1 for the root of each tree.
-        origins: (B, 3) the joint of each bone with its parent; of a root, its middle.
-    """
+    """The parents of B bones, -1 for roots, and the joint (B, 3) of each with its parent, a root's being its middle."""
 
     parents: tuple[int, ...]
     origins: Tensor
 
 
 def find_joints(moments: JointMoments, transforms: Tensor, *, regularization: float = REGULARIZATION.found) -> Joints:
-    """Return the points that pairs of bones move alike, as nearly as there is one.
+    """Return the points that pairs of bones move alike in all poses (..., B, 4, 4), as nearly as there is one.
 
-    ``argmin_c mean |(R_i - R_j) c + t_i - t_j|^2 + lambda |c - m|^2`` with m the center of what the two bones share: it
-    decides where the motions do not, along the axis of a hinge, or everywhere where the bones turn alike. The root of
-    lambda is the angle between the bones, in radians, at which either counts the same.
-
-    Args:
-        moments: of the bones that share weight.
-        transforms: (..., B, 4, 4); all poses of a batch count alike.
-        regularization: lambda.
-
-    Returns:
-        `Joints`.
-
-    Differentiable: in ``transforms`` and the moments.
-
-    References: Schaefer and Yuksel 2007, section 5, for the regularized least squares.
+    ``argmin_c mean |(R_i - R_j) c + t_i - t_j|^2 + lambda |c - m|^2``, m the center of what the two share. The root of
+    lambda is the angle between the bones, radians, at which both terms count alike (Schaefer and Yuksel 2007, section
+    5).
     """
     differences = motion_differences(transforms, moments.pairs)
     turn, gaps = differences[..., :3], gaps_at(differences, moments.center)
@@ -98,26 +80,11 @@ def bridged(
     *,
     regularization: float = REGULARIZATION.found,
 ) -> JointMoments:
-    """Return moments with those of pairs added that join groups of bones which share no weight.
+    """Return moments with pairs added, of no mass and spread, that join groups of bones which share no weight.
 
-    A scan falls apart where something nearer hides a joint. Between two groups, the joint is the pair of bones with the
-    least sum of three lengths: the distance of their nearest corners, the distance from the middle of these to the
-    point that both bones move alike, and the gap that their motions leave there. The shortest pairs that make one group
-    of all are added, with no mass and no spread, their centers in the middles.
-
-    Args:
-        moments: of the bones that share weight.
-        corners: (K, 3) of the grid.
-        weights: (K, B) at the corners.
-        transforms: (..., B, 4, 4); all poses of a batch count alike.
-        regularization: see `find_joints`.
-
-    Returns:
-        `JointMoments`, pairs in order; the same where the bones with weight are one group.
-
-    Differentiable: no.
-
-    Cost: O(K log K) per group; 9 ms for 5,000 corners in three groups.
+    A scan falls apart where something nearer hides a joint. Between two groups the pair is added with the least sum of
+    three lengths: the distance of their nearest corners (K, 3), that from their middle to the point that both bones
+    move alike, and the gap of their motions there.
     """
     group, bone = connected_components(moments.pairs, weights.shape[1]), weights.argmax(1)
     if len(group[bone].unique()) < 2:
@@ -139,13 +106,7 @@ def bridged(
 
 
 def _nearest_pairs(corners: Tensor, bone: Tensor, group: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return pairs (P, 2) of each bone and the nearest bone of each later group, with middles and lengths between.
-
-    Args:
-        corners: (K, 3).
-        bone: (K,) with the largest weight at each corner.
-        group: (B,) of the bones.
-    """
+    """Return pairs (P, 2) of each bone and the nearest bone of each later group, with middles and lengths between."""
     pairs, middles, lengths = [], [], []
     corner_group = group[bone]
     for number in corner_group.unique()[1:].tolist():
@@ -162,18 +123,7 @@ def _nearest_pairs(corners: Tensor, bone: Tensor, group: Tensor) -> tuple[Tensor
 
 
 def bone_tree(joints: Joints, middles: Tensor, sizes: Sequence[float] | Tensor) -> BoneTree:
-    """Return the trees of the strongest joints: those of greatest mass that close no circle.
-
-    Args:
-        joints: of B bones.
-        middles: (B, 3) of the bones, where a root has its origin.
-        sizes: (B,) of the bones; the largest of each tree is its root.
-
-    Returns:
-        a `BoneTree`.
-
-    Differentiable: the origins, in the joints' centers and the middles.
-    """
+    """Return the trees of the joints of greatest mass that close no circle; the root of each is its largest bone."""
     count = len(middles)
     chosen = minimum_spanning_forest(joints.pairs, -joints.mass, count).chosen()
     pairs = joints.pairs[chosen]

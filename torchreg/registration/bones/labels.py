@@ -20,11 +20,9 @@ from torchreg.solvers.graph_cut import alpha_expansion
 
 @dataclass(frozen=True, eq=False)
 class CellData:
-    """A grid of C cells, and sample points of the surface in it.
+    """A grid of C cells, and sample points (n, 3) of the surface in it, before they are moved.
 
     Args:
-        grid: the grid.
-        points: (n, 3) samples before they are moved.
         num_patches: of the cells, about, from which parts are merged.
         linked: whether labels of separate regions should agree with those of the cells nearest to them.
         gap: most empty cells between regions that count as connected: holes of scans cut limbs in two.
@@ -76,14 +74,13 @@ class CellData:
 
 @dataclass(frozen=True)
 class LabelCosts:
-    """Costs of the W-step beside the squared residuals, which are a mean per cell, in squared cells.
+    """Costs of the W-step in addition to the squared residuals, which are a mean per cell, in squared cells.
 
     Args:
         smoothness: mu, of two neighboring cells with different labels.
         label: of each label in use: the number of bones is a cap, not a goal.
         truncation: largest distance of a sample, in cells; the paper's.
-        seam: nu, of two neighboring cells with different labels, per cell of the gap that their motions open at the
-            side between them, of one cell at most.
+        seam: nu, of neighboring cells with different labels, per cell of the gap, up to one, that their motions open.
     """
 
     smoothness: float
@@ -101,16 +98,9 @@ def labels_of_parts(data: CellData, points: Tensor, parts: Tensor) -> Tensor:
 
 
 def first_labels(data: CellData, moved: Tensor, weights: Tensor, num_bones: int, costs: LabelCosts) -> Tensor:
-    """Return labels (C,) of at most ``num_bones`` parts that move rigidly, in all frames.
+    """Return labels (C,) of at most ``num_bones`` parts that move rigidly, in all frames of moved samples (F, n, 3).
 
-    Unlike the paper's random segmentation this one follows the motion: patches that move together belong together.
-
-    Args:
-        data: the grid and its samples.
-        moved: (F, n, 3) samples moved by an alignment.
-        weights: (F, n) of the samples.
-        num_bones: most parts; fewer where a part saves less than a label costs.
-        costs: see `LabelCosts`.
+    Unlike the paper's random segmentation this one follows the motion; a part must save what a label costs.
     """
     moments, patches = data.moments(moved, weights), data.patches
     part = merge_rigid(moments, patches[data.bridged], num_bones, tolerance=costs.label / data.per_cell(weights))
@@ -128,18 +118,9 @@ def relabel(
     """Return labels (C,) of least energy, and the energy: the W-step.
 
     ``sum_C W(C, f_C) + sum_{(C, D)} (mu [f_C != f_D] + nu min(|T_{f_C} x_CD - T_{f_D} x_CD|, 1)) + h |used labels|``
-    with W the sum of squared residuals of the cell's samples under the motion of a bone, in all frames, and
-    x_CD in the middle between two cells; correspondences stay while labels change. Near a joint both bones move a
-    sample alike, so that residuals alone put the border anywhere there. Unlike in the paper, the pairwise term is the
-    discontinuity of the deformation across the border, so that it passes through the joint; it is truncated, as not
-    all parts that touch are joined.
-
-    Args:
-        data: the grid and its samples.
-        correspondences: of the samples in F frames.
-        transforms: (F, B, 4, 4) motions of the bones.
-        labels: (C,) to start from.
-        costs: see `LabelCosts`.
+    with W the squared residuals of the cell's samples under the motion of a bone, in all frames, and x_CD midway
+    between two cells. Unlike in the paper, the pairwise term is the discontinuity of the deformation across the border,
+    which thus passes through the joint; it is truncated, as not all parts that touch are joined.
 
     References: Chang and Zwicker 2009, eq. 11; Delong et al. 2012 for the costs of labels.
     """

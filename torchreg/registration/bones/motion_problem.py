@@ -20,13 +20,10 @@ from torchreg.solvers.levenberg_marquardt import Linearization
 
 @dataclass(frozen=True)
 class Binding:
-    """Skinning weights as a list of entries: most points follow one or two of many bones.
+    """Skinning weights (N, B) as a list of E entries: most points follow one or two of many bones.
 
     Args:
-        weights: (N, B) of the points.
-        point: (E,) int64, of each entry.
-        bone: (E,) int64, of each entry.
-        values: (E,) weight of the entry's bone at its point.
+        point: (E,) int64, of each entry; ``bone`` and ``values`` likewise.
         first: (Q,) int64, first entry of every pair of entries of one point, an entry with itself included.
         second: (Q,) int64, second entry of every pair, not before the first.
         block: (Q,) int64, block of the Hessian that the pair adds to: first bone times B plus second bone.
@@ -72,22 +69,14 @@ class Binding:
 
 @dataclass(frozen=True)
 class BoneBodies:
-    """Distribution of the points that each bone moves.
-
-    Args:
-        center: (B, 3) weighted mean.
-        spread: (B, 3, 3) weighted mean of ``(x - center) (x - center)^T``, squared units.
-    """
+    """Weighted mean (B, 3) and covariance (B, 3, 3) of the points that each bone moves."""
 
     center: Tensor
     spread: Tensor
 
     @classmethod
     def from_weights(cls, points: Tensor, weights: Tensor) -> BoneBodies:
-        """Return the bodies of bones with weights (N, B) at points (N, 3); a bone without weight moves all points.
-
-        Differentiable: in both.
-        """
+        """Return the bodies of bones with weights (N, B) at points (N, 3); a bone without weight moves all points."""
         mass = weights.sum(0)
         shares = torch.where(mass > 0, weights / mass.clamp_min(torch.finfo(mass.dtype).tiny), 1 / len(points))
         origin = points.mean(0)
@@ -99,7 +88,7 @@ class BoneBodies:
 
 @dataclass(frozen=True)
 class BoneProblem:
-    """The energy of the bones' motions; problems of a batch share points, weights and bodies.
+    """The energy of the bones' motions (eq. 5); problems of a batch share points, weights and bodies.
 
     ``E = E_dist + beta sum_{i<j} b_ij tau_ij int w_i w_j |T_i x - T_j x|^2 dx + sum_i a_i E_anchor,i``: the mean
     squared residual, see `ScanDistance`; the joint energy, see `JointEnergy`; and the mean squared distance of each
@@ -107,17 +96,11 @@ class BoneProblem:
 
     Args:
         points: (N, 3) before they are moved.
-        binding: of the points to B bones.
-        correspondences: of the moved points, (..., N).
         bodies: of the bones, which turn about their centers.
-        moments: of the joints; none by default.
         joint_weight: beta.
         pair_weights: (..., P) b, of the joints; ones by default.
         anchors: (..., B, 4, 4) motions to stay near; none by default.
         anchor_weights: a, one for all bones or (..., B).
-        blend: of the bones, see `GridLBS`.
-
-    References: Chang and Zwicker 2009, eq. 5.
     """
 
     points: Tensor
@@ -160,9 +143,7 @@ class BoneProblem:
     def linearize(self, transforms: Tensor, joints: Tensor | None = None) -> Linearization:
         """Return half of E, its gradient and Gauss-Newton Hessian by the 6 B twists at motions (..., B, 4, 4).
 
-        Args:
-            transforms: (..., B, 4, 4).
-            joints: (P, 3) centers of the joints, instead of those of the moments.
+        Given ``joints`` (P, 3) replace the centers of the moments.
         """
         transforms = self.batched(transforms)
         equations = _NormalEquations(transforms, self.centers(transforms))
@@ -267,7 +248,6 @@ class _Springs(NamedTuple):
             the mean over the body.
         root: (..., S) of the springs' weights.
         blocks: of the Hessian: those of every end that moves, then those of the joints' pairs.
-        num_joints: springs between two bones.
     """
 
     ends: Tensor

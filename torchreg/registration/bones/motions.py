@@ -21,7 +21,7 @@ class TStep:
     """The numbers of a T-step.
 
     Args:
-        damping: first weight of the mean squared displacement of the bodies: nothing beside the residuals, of which a
+        damping: first weight of the mean squared displacement of the bodies: nothing against the residuals, of which a
             bone gets one part in B, but enough against rounding where a bone has none.
         rtol: relative change of the energy below which a step is the last.
         rounding: units in the last place of the squared size of the bodies by which rounding alone changes the cost.

@@ -22,13 +22,7 @@ _RULE = DampingRule(trusted=0.0, down=0.25, doubtful=0.25, up=4.0, least=0.0)
 
 @dataclass(frozen=True)
 class JointFit:
-    """Motions that fit correspondences, and joints that hold in all frames.
-
-    Args:
-        transforms: (F, B, 4, 4).
-        centers: (P, 3) of the joints, in the space that the motions start from.
-        energy: (F,) of the problem at them.
-    """
+    """Motions (F, B, 4, 4), joints (P, 3) that hold in all frames, where motions start from, and energies (F,)."""
 
     transforms: Tensor
     centers: Tensor
@@ -45,30 +39,11 @@ def fit_bones_and_joints(
     max_steps: int = 5,
     rtol: float = T_STEP.rtol,
 ) -> JointFit:
-    """Return the motions of all frames and the centers of the joints that have the least energy together.
+    """Return the motions of all frames and the centers (P, 3) of the joints that have the least energy together.
 
-    ``sum_f E(T_f, c) + F beta lambda sum_p |c_p - m_p|^2``, with E that of the problem, its joints at c, and m the
-    centers of its moments. Alternating with `find_joints` instead moves stiff joints by very little in each round:
-    the alternation is biased, as motions adapt to wrong centers. Motions are eliminated frame by frame, so that a step
-    solves F systems of 6 B unknowns and one of 3 P.
-
-    Args:
-        problem: of F frames, with joints of positive weight.
-        transforms: (F, B, 4, 4) to start from.
-        centers: (P, 3) to start from.
-        regularization: lambda, see `find_joints`.
-        max_steps: most linear systems.
-        rtol: relative change of the energy below which a step is the last.
-
-    Returns:
-        a `JointFit`.
-
-    Differentiable: no.
-
-    Cost: 0.05 s a step for ten frames, 2,500 points and 14 bones on one core.
-
-    References: Chang and Zwicker 2009, eq. 5, where centers are given; Triggs et al. 2000, section 6.1, for the
-    elimination.
+    ``sum_f E(T_f, c) + F beta lambda sum_p |c_p - m_p|^2``, m the centers of the moments. Alternating with
+    `find_joints` instead is biased and moves stiff joints by very little, as motions adapt to wrong centers. Motions
+    are eliminated frame by frame: F systems of 6 B unknowns and one of 3 P (eq. 5; Triggs et al. 2000, section 6.1).
     """
 
     def linearize(state: _State) -> _JointSystem:
@@ -101,16 +76,12 @@ class _State(NamedTuple):
 
 
 class _JointSystem(NamedTuple):
-    """Half the energy around motions and centers.
+    """Half the energy around twists of the motions (F, 6 B) and centers (P, 3), whose Hessians are block-diagonal.
 
     Args:
         costs: (F,) half the problem's energy.
         cost: () of all frames, and of the centers.
-        gradient: (F, 6 B) by the twists.
-        hessian: (F, 6 B, 6 B).
-        center_gradient: (P, 3).
-        center_hessian: (P, 3, 3), of each center with itself.
-        mixed: (F, 6 B, 3 P).
+        mixed: (F, 6 B, 3 P), the Hessian between both.
     """
 
     costs: Tensor
@@ -145,13 +116,7 @@ def _linearized(problem: BoneProblem, state: _State, regularization: float) -> _
 
 
 class _JointResiduals(NamedTuple):
-    """Weighted offsets between the images of joints under the motions of their two bones, and their derivatives.
-
-    Args:
-        residual: (F, P, 3).
-        by_center: (F, P, 3, 3).
-        by_twist: (F, P, 3, 6) by twists of the first bone of each pair, and of the second.
-    """
+    """Weighted offsets (F, P, 3) between the images of joints under their two bones' motions, and their derivatives."""
 
     residual: Tensor
     by_center: Tensor

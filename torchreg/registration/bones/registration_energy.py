@@ -25,13 +25,9 @@ from torchreg.registration.bones.joint_moments import JointMoments
 
 @dataclass(frozen=True, eq=False)
 class EnergyState:
-    """What the terms of the energy are functions of.
+    """What the terms of the energy are functions of: points (..., N, 3) before they are moved, and the model's state.
 
     Args:
-        model: the bones and their weights.
-        transforms: (..., B, 4, 4) of the bones.
-        points: (..., N, 3) before they are moved.
-        correspondences: (..., N) of the moved points.
         edges: (E, 2) corners that an edge of a cell joins.
         label_weights: (K, B) of the labels.
         known_moments: of what bones share, where they are known already.
@@ -91,12 +87,7 @@ def _discontinuity(state: EnergyState) -> Tensor:
 
 
 class EnergyTerm(NamedTuple):
-    """A term of the energy.
-
-    Args:
-        value: of a state, (...) or () where the motions do not matter.
-        weight: by default: the paper's, to which it lets that of the joints fall.
-    """
+    """A term of the energy: its value (...) of a state, () where motions do not matter, and the paper's weight."""
 
     value: Callable[[EnergyState], Tensor]
     weight: float
@@ -113,11 +104,7 @@ TERMS = {
 
 
 def term_weights(**given: float) -> dict[str, float]:
-    """Return the weights of all terms by name: those given, and the defaults of all others.
-
-    Raises:
-        InputError: if there is no term of a name, or a weight is negative.
-    """
+    """Return the weights of all terms by name: those given, and the defaults of all others."""
     if unknown := [name for name in given if name not in TERMS]:
         raise InputError(f"there is no energy term {unknown[0]!r}; known: {', '.join(TERMS)}")
     for name, weight in given.items():

@@ -12,20 +12,10 @@ from torchreg.registration.bones.sparse_grid import SparseGrid
 
 
 def grid_patches(grid: SparseGrid, count: int, gap: float = 0.0) -> Tensor:
-    """Return the patch (C,) int64 of each cell: that of the seed nearest along the cells.
+    """Return the patch (C,) int64 of each cell, that of the seed nearest along the cells, of about ``count`` patches.
 
-    Seeds are spread evenly, and every connected region has one at least.
-
-    Args:
-        grid: the grid.
-        count: patches wanted; fewer if there are fewer cells, more if there are more regions.
-        gap: see `SparseGrid.neighbors`.
-
-    Differentiable: no.
-
-    Cost: 5 ms for 1,000 cells and 100 patches.
-
-    References: Chang and Zwicker 2009, section 4.3, but along the surface: patches do not span limbs that come near.
+    Seeds are spread evenly, one at least in every connected region; patches do not span limbs that come near each
+    other.
     """
     pairs = grid.neighbors(gap).cpu()
     cells = grid.cells.cpu().double()
@@ -41,22 +31,10 @@ def grid_patches(grid: SparseGrid, count: int, gap: float = 0.0) -> Tensor:
 
 @torch.no_grad()
 def merge_rigid(moments: RigidMoments, edges: Tensor, num_parts: int, *, tolerance: float = 0.0) -> Tensor:
-    """Return the part (G,) int64 of each patch after the cheapest neighbors are merged again and again.
+    """Return the part (G,) int64 of each patch after the cheapest neighbors are merged again and again (Ward 1963).
 
-    A merger costs by how much the squared error of one rigid motion for both exceeds that of a motion each, summed over
-    the poses of a batch. Parts are numbered from 0 by their first patches.
-
-    Args:
-        moments: of G patches.
-        edges: (E, 2) pairs of patches that touch; parts that no edge joins never merge, however many there are.
-        num_parts: merging goes on at any cost until so many parts are left.
-        tolerance: it goes on then while a merger costs at most this, in the unit of `RigidMoments.cost`.
-
-    Differentiable: no.
-
-    Cost: 20 ms for 100 patches.
-
-    References: Ward 1963, for merging by the growth of the squared error.
+    A merger costs by how much the squared error of one rigid motion for both exceeds that of a motion each. Merging
+    goes on at any cost until ``num_parts`` are left, then while it costs at most ``tolerance``.
     """
     size = moments.num_groups
     sums = moments.sums.reshape(-1, size, moments.sums.shape[-1]).clone()

@@ -50,7 +50,8 @@ class GridLocation(NamedTuple):
 class SparseGrid:
     """The cells of a regular grid that hold points of a surface, their corners shared between them.
 
-    Grid coordinates ``u = axes^T (x - origin) / spacing`` count cells; cell (i, j, k) is the unit cube from there.
+    Grid coordinates ``u = axes^T (x - origin) / spacing`` count cells; cell (i, j, k) is the unit cube from there
+    (Chang and Zwicker 2009, section 3).
 
     Args:
         cells: (C, 3) int64, different, in the order of their coordinates.
@@ -58,8 +59,6 @@ class SparseGrid:
         origin: (3,) corner of the box, float32 or float64.
         axes: (3, 3) directions of the grid as columns, a rotation.
         spacing: edge length h of a cell, in the unit of the points.
-
-    References: Chang and Zwicker 2009, section 3.
     """
 
     cells: Tensor
@@ -70,12 +69,7 @@ class SparseGrid:
 
     @classmethod
     def from_cells(cls, cells: Any, shape: Any, origin: Any, axes: Any, spacing: float) -> SparseGrid:
-        """Return the grid of given cells; arguments as of the class.
-
-        Raises:
-            InputError: if a shape is wrong, a cell lies outside the box or is there twice, or the axes are no rotation.
-            InputTypeError: if the cells are not integers.
-        """
+        """Return the grid of given cells, after checks; arguments as of the class."""
         cells = _checked_cells(cells, shape)
         origin = as_float_tensor(origin, "origin")
         axes = as_float_tensor(axes, "axes", like=origin)
@@ -179,38 +173,19 @@ class SparseGrid:
         return self.origin + (self.spacing * coordinates) @ self.axes.mT
 
     def coordinates(self, points: Tensor) -> Tensor:
-        """Return grid coordinates (..., N, 3) of points (..., N, 3), in cells from the origin.
-
-        Differentiable: in ``points``.
-        """
+        """Return grid coordinates (..., N, 3) of points (..., N, 3), in cells from the origin."""
         return ((points - self.origin) @ self.axes) / self.spacing
 
     def locate(self, points: Tensor) -> GridLocation:
-        """Return the cell of every point, and the trilinear coefficients of its corners.
+        """Return the cell of every point (..., N, 3), and the trilinear coefficients of its corners.
 
-        A point that no occupied cell holds belongs to the occupied one nearest to its own cell of the box, or for a
-        point outside the box to the nearest cell of its side, and takes the values of the nearest point there: nothing
-        is extrapolated.
-
-        Args:
-            points: (..., N, 3) in the dtype of the grid.
-
-        Returns:
-            a `GridLocation`.
-
-        Differentiable: the coefficients, in ``points``, within cells.
+        A point outside all occupied cells belongs to the one nearest to its own cell, or to the nearest cell of its
+        side of the box, and takes the values of the nearest point there: nothing is extrapolated.
         """
         return locate_in_cells(self.coordinates(points), self.shape, self.cells, self.nearest)
 
     def interpolate(self, values: Tensor, points: Tensor) -> Tensor:
-        """Return values (..., N, B) at points, of values (K, B) at the corners.
-
-        Args:
-            values: (K, B).
-            points: (..., N, 3).
-
-        Differentiable: in both.
-        """
+        """Return values (..., N, B) at points (..., N, 3), of values (K, B) at the corners."""
         location = self.locate(points)
         return (location.coefficients.unsqueeze(-2) @ values[self.cell_corners[location.cell]]).squeeze(-2)
 
@@ -236,10 +211,8 @@ class SparseGrid:
     def neighbors(self, gap: float = 0.0) -> Tensor:
         """Return the pairs of cells (A, 2) that share a side, the lower number first, in order.
 
-        Args:
-            gap: regions that no chain of sides joins are joined where they come near each other, by the pairs of cells
-                within ``gap`` empty cells that are nearest to each other. Zero joins regions that touch at edges and
-                corners of cells; negative nothing.
+        Regions that no chain of sides joins are joined by their nearest pairs of cells within ``gap`` empty cells: zero
+        joins what touches at edges and corners, a negative gap nothing.
         """
         pairs = torch.cat([self._side_by_side(axis) for axis in range(3)])
         if gap >= 0:
@@ -290,16 +263,7 @@ class SparseGrid:
 
 
 def locate_in_cells(coordinates: Tensor, shape: Sequence[int], cells: Tensor, nearest: Tensor) -> GridLocation:
-    """Return cells and coefficients of points, as `SparseGrid.locate` does, from tables that can be compiled.
-
-    Args:
-        coordinates: (..., N, 3) grid coordinates of the points.
-        shape: of the grid.
-        cells: (C, 3) of the grid.
-        nearest: (prod(shape),) of the grid.
-
-    Differentiable: the coefficients, in ``coordinates``, within cells.
-    """
+    """Return cells and coefficients of points, as `SparseGrid.locate` does, from tables that can be compiled."""
     last = torch.tensor([n - 1 for n in shape], dtype=coordinates.dtype, device=coordinates.device)
     inside = torch.minimum(coordinates.detach().floor().clamp(min=0), last).long()
     cell = nearest[_cell_numbers(inside, shape)]

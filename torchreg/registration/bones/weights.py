@@ -18,18 +18,15 @@ from torchreg.solvers.nnls import nnls
 
 @dataclass(frozen=True)
 class WeightsConfig:
-    """Weights of the terms of the refinement, beside that of the mean squared residual, in cells, per cell of the grid.
+    """Weights of the terms of the refinement against the mean squared residual, in cells, per cell of the grid.
+
+    The paper's values in cells: mu 0.5 to 1, nu 1, closeness 0.1 to 0.5 (Chang and Zwicker 2009, section 5).
 
     Args:
         smoothness: mu, of the squared differences between neighboring corners.
         normalization: nu, of the squared deviations of the sums from one.
         closeness: of the squared differences from the labels.
         reach: a bone may get weight at corners up to that many edges from where it has a label.
-
-    Raises:
-        InputError: if a value is out of range.
-
-    References: Chang and Zwicker 2009, section 5, for the values in cells: mu 0.5 to 1, nu 1, closeness 0.1 to 0.5.
     """
 
     smoothness: float = 0.5
@@ -47,13 +44,7 @@ class WeightsConfig:
 
 @dataclass(frozen=True)
 class RefinedWeights:
-    """Weights that a refinement found.
-
-    Args:
-        weights: (K, B) rows divided by their sums.
-        objective: least value found, before that division.
-        converged: whether the solver met its tolerance.
-    """
+    """Weights (K, B), rows divided by their sums, the least objective before that, and whether the solver converged."""
 
     weights: Tensor
     objective: float
@@ -64,30 +55,10 @@ class RefinedWeights:
 def refine_weights(
     model: GridLBS, points: Tensor, correspondences: Correspondences, config: WeightsConfig | None = None
 ) -> RefinedWeights:
-    """Return weights that fit correspondences, vary smoothly, add up to one and stay near the labels.
+    """Return weights that fit correspondences, vary smoothly, add up to one and stay near the labels (eqs. 8 and 13).
 
     ``argmin_{v >= 0} a E_dist + mu E_smooth + nu E_norm + lambda E_disc`` over the corners times the bones in reach,
-    the motions fixed. The residual of a correspondence is that of ``sum_j w_j (T_j x - y)``: the same as of the moved
-    point where weights add up to one, and where they do not, independent of the origin.
-
-    Args:
-        model: the bones' motions, and the labels' weights, see `GridLBS.from_labels`; it is not changed. A batch of
-            poses counts together.
-        points: (N, 3) before they are moved.
-        correspondences: (..., N) of the moved points, in every pose.
-        config: see `WeightsConfig`.
-
-    Returns:
-        `RefinedWeights`.
-
-    Raises:
-        SolverError: if the system cannot be solved.
-
-    Differentiable: no.
-
-    Cost: 0.15 s for 1,000 cells, 10 bones and 1,500 matches.
-
-    References: Chang and Zwicker 2009, eqs. 8 and 13.
+    the motions fixed, all poses together. The residual is that of ``sum_j w_j (T_j x - y)``, independent of the origin.
     """
     config = WeightsConfig() if config is None else config
     problem = _WeightsProblem(model, points, correspondences, config)
@@ -108,12 +79,7 @@ class _Rows(NamedTuple):
 
 
 class _WeightsProblem:
-    """The refinement as a function of the weights in reach, in cells of the grid and double precision.
-
-    Attributes:
-        labels: (K, B) weights of the labels.
-        start: (V,) weights of the labels at the variables.
-    """
+    """The refinement as a function of the V weights in reach, in cells of the grid and double precision."""
 
     def __init__(self, model: GridLBS, points: Tensor, correspondences: Correspondences, config: WeightsConfig) -> None:
         grid = model.grid
