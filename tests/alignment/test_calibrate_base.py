@@ -89,6 +89,22 @@ def test_the_base_is_found_without_a_start_and_a_frame_of_something_else_is_name
     assert again.status is found.status
 
 
+@pytest.mark.parametrize(("wrong", "by", "noise"), [
+    (2, (0.5, -0.5, 0.0), 0.0), (0, (0.0, 0.4, 0.0), 0.0), (1, (0.4, 0.0, 0.0), 0.004), (None, (0.0, 0.0, 0.0), 0.004),
+])  # fmt: skip
+def test_joints_that_do_not_fit_their_frame_are_named_and_do_not_count(arm, clouds, wrong, by, noise):
+    """Of three; the clutter of each, and a person beside the robot in the first, are no reason."""
+    generator, given = torch.Generator().manual_seed(2), JOINTS.clone()
+    person = BASE[:3, 3] + torch.tensor([0.4, 0.1, 0.1]) + 0.05 * torch.randn(60, 3, generator=generator)
+    seen = [cloud + noise * torch.randn(cloud.shape, generator=generator) for cloud in clouds]
+    if wrong is not None:
+        given[wrong] += torch.tensor(by)
+    found = tr.calibrate_base(arm, [torch.cat([seen[0], person]), *seen[1:]], given)
+    assert found.outliers == (() if wrong is None else (wrong,))
+    assert found.status is (tr.Status.CONVERGED if wrong is None else tr.Status.WITH_WARNINGS)
+    assert errors(found.T_camera_base)[0] < 0.004
+
+
 def test_the_fit_ends_at_one_base_wherever_near_it_begins(arm):
     """Where pictures are 5 mm too deep, data near outlines change the surface that they are on as the base moves."""
     generator, clouds = torch.Generator().manual_seed(0), []

@@ -51,6 +51,16 @@ def test_the_base_is_written_as_numbers_for_ros_and_drawn(run, folder, clouds, t
     assert len(list((tmp_path / "base_seen").glob("*.png"))) == 2
 
 
+def test_joints_that_do_not_fit_are_told_by_the_name_of_their_file(run, folder, clouds, tmp_path):
+    (tmp_path / "joints.csv").write_text("shoulder,rail\n0.6,0.05\n-0.5,0.2\n")
+    answer = run(
+        "calibrate", folder / "arm.urdf", *clouds, "--joints", tmp_path / "joints.csv", "-o", tmp_path / "base"
+    )  # fmt: skip
+    assert answer.exit_code == 0, answer.output
+    assert "or in other joints: robot1.ply" in answer.output
+    assert json.loads((tmp_path / "base_transform.json").read_text())["outliers"] == [1]
+
+
 def test_what_cannot_be_drawn_loses_no_result(run, folder, clouds, tmp_path, failing):
     failing("torchreg.viz.figures.draw_alignment")
     answer = run(

@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
+from torch.nn.utils.rnn import pad_sequence
 
 from torchreg._threads import one_thread
+from torchreg.alignment.align import align
 from torchreg.alignment.base_fit import BASE_FIT, BaseFit, BaseProblem, approach_base, base_of, fit_base, fit_offsets
 from torchreg.alignment.base_frames import BaseFrame, read_frames
 from torchreg.alignment.base_search import PosedModel, rank_bases, search_base, seen_shares
+from torchreg.alignment.config import AlignConfig
 from torchreg.alignment.problem import fitted_surface, model_size
 from torchreg.alignment.results import BaseCalibration
+from torchreg.alignment.surface_fit import SURFACE_FIT
 from torchreg.capture.depth_frame import DepthFrame
+from torchreg.errors import TorchregWarning
+from torchreg.geometry.rigid import invert_rigid, transform_points
 from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
+from torchreg.shapes.pose_algebra import BASE_DOFS
 from torchreg.shapes.skin import sample_skin
+from torchreg.solvers.robust import welsch_weight
 
 
 @dataclass(frozen=True)
@@ -30,6 +40,9 @@ class _Numbers:
     num_coarse: int = 400  # data of each frame in these fits
     least_seen: float = 0.2  # share of the side towards the camera that data show: a frame with less has no robot
     outlying: float = 0.5  # of the frames' median share, below which a frame is outlying
+    num_moved: int = 600  # data of each frame by which its joints are compared with others
+    gained: float = 0.04  # share of them that other joints of a frame explain beyond what they do of other frames
+    least_gained: int = 12  # the same in data
     rival: float = 0.2  # relative lead of the best candidate over a different one: less is a doubt
 
 
@@ -47,7 +60,8 @@ def calibrate_base(
     All frames together are searched for the base, without a start: rotations from all around, iterated closest points,
     and the side of the robot that faces the camera. The best candidates are fitted to the exact surfaces of the links,
     robustly, together with the depth by which the camera sees all surfaces too far or too near. Depth frames also say
-    where nothing is.
+    where nothing is. Then the joints of each frame are let go: where others explain more of its data, and not so in the
+    other frames, its joints are wrong, and the fit is repeated without it.
 
     Args:
         shape: the robot, in metres.
@@ -58,9 +72,9 @@ def calibrate_base(
         offsets: whether to look for constant offsets of the joints, too; those that the data do not tell stay zero.
 
     Returns:
-        a `BaseCalibration`. Frames that do not show the robot where the others have it do not count and are named in
-        its ``outliers``; the status is WITH_WARNINGS then, and where another base explains the data as well, and
-        FEW_INLIERS if no frame shows the robot.
+        a `BaseCalibration`. Frames that do not show the robot where the others have it, or not in the joints given, do
+            not count and are named in its ``outliers``; the status is WITH_WARNINGS then, and where another base
+            explains the data as well, and FEW_INLIERS if no frame shows the robot.
 
     Raises:
         InputError: if there is no frame, one is empty, or joints lie beyond their limits, lack, or are not finite.
@@ -83,11 +97,44 @@ def calibrate_base(
         used = (seen >= max(_NUMBERS.least_seen, _NUMBERS.outlying * float(seen.median()))).tolist()
         kept = [frame for frame, is_used in zip(given, used, strict=True) if is_used]
         problem = BaseProblem.of(kept or given, surface, skin, size)
-        fit = fit_base(problem, problem.state(base), BASE_FIT.widths[-1:])
-        if offsets:
-            fit = fit_offsets(fit)
+        fit = _fitted(problem, base, offsets)
+        wrong = iter(_wrong_joints(shape, fit)) if kept else iter(())
+        used = [is_used and not next(wrong) for is_used in used]
+        if sum(used) < len(kept):
+            kept = [frame for frame, is_used in zip(given, used, strict=True) if is_used]
+            fit = _fitted(BaseProblem.of(kept, surface, skin, size), fit.base, offsets)
         outliers = tuple(number for number, is_used in enumerate(used) if not is_used)
         return _result(fit, given, outliers, is_lost=not kept, is_sole=lead > _NUMBERS.rival)
+
+
+def _fitted(problem: BaseProblem, base: Tensor, offsets: bool) -> BaseFit:
+    """Return the fit from a base (4, 4) near the best."""
+    fit = fit_base(problem, problem.state(base), BASE_FIT.widths[-1:])
+    return fit_offsets(fit) if offsets else fit
+
+
+def _wrong_joints(shape: ArticulatedShape, fit: BaseFit) -> list[bool]:
+    """Return of each frame of a fit whether other joints explain more of its data, compared with the other frames."""
+    surface = fit.problem.surface
+    to_base, thinned = invert_rigid(fit.base), [frame.thinned(_NUMBERS.num_moved) for frame in fit.problem.frames]
+    rows = [transform_points(to_base, frame.points).to(shape.rest) for frame in thinned]
+    data = pad_sequence(rows, batch_first=True)
+    valid = torch.arange(data.shape[1]) < torch.tensor([len(row) for row in rows]).unsqueeze(-1)
+    joints = torch.stack([frame.joints for frame in thinned]) + fit.offsets
+    starts = pad(joints, (BASE_DOFS, 0)).to(shape.rest)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", TorchregWarning)  # what is odd about a frame was told when it was read
+        config = AlignConfig(search="never", prior_std=None)
+        moved = align(shape, data, starts, model_points=fit.problem.skin, mask=valid, locked="base", config=config)
+    width = SURFACE_FIT.width_per_noise * fit.noise
+    before, after = (
+        (welsch_weight(((surface.distance(data, pose) - fit.depth) / width).square()) * valid).sum(-1)
+        for pose in (starts, moved.pose)
+    )
+    gain = (after - before) / after.clamp_min(1)
+    usual = gain.median() if len(gain) > 2 else gain.min()
+    wrong = (gain > usual.clamp_min(0) + _NUMBERS.gained) & (after - before > _NUMBERS.least_gained)
+    return (wrong & (len(gain) > 1)).tolist()
 
 
 def _best_base(problem: BaseProblem, models: Sequence[PosedModel]) -> tuple[Tensor, float]:

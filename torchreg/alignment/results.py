@@ -231,7 +231,7 @@ class BaseCalibration(Result):
             along the camera's axes.
         residuals: (T,) median distance of each frame's data from the robot's surface, metres.
         depth_offset: () distance by which the camera sees surfaces too near, along their normals, metres.
-        outliers: frames that do not show the robot where the others have it, by number.
+        outliers: frames that do not show the robot where the others have it, or not in their joints, by number.
         status: of the calibration at its end.
     """
 

@@ -240,7 +240,9 @@ def _summary(shape: ArticulatedShape, found: BaseCalibration, paths: Sequence[Pa
         f"data {1e3 * float(found.residuals.median()):.1f} mm from the robot",
     ]
     if found.outliers:
-        words.append("does not show the robot there: " + ", ".join(paths[k].name for k in found.outliers))
+        words.append(
+            "does not show the robot there, or in other joints: " + ", ".join(paths[k].name for k in found.outliers)
+        )
     told = [
         f"{name} {math.degrees(value):+.2f} degrees"
         for name, value in zip(shape.dof_names[6:], found.offsets.tolist(), strict=True)
