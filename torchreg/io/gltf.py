@@ -160,7 +160,11 @@ def _rigid_meshes(document: GltfDocument, skeleton: Skeleton, budget: VertexBudg
         surfaces.append(stored.on_joint(joint, len(skeleton.nodes), motion))
         kept.append(f"{document.node_label(node)} on {skeleton.names[joint]!r}")
     if kept:
-        warn(f"{len(kept)} meshes without a skin are rigid parts of the joints they hang on: {', '.join(kept[:5])}")
+        listed = ", ".join(kept[:5])
+        warn(
+            f"{len(kept)} meshes without a skin are rigid parts of the joints they hang on: {listed}; "
+            f"skin= leaves them out"
+        )
     if left:
         warn(f"{len(left)} meshes without a skin hang on no joint and are left out: {', '.join(left[:5])}")
     return surfaces

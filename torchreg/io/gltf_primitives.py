@@ -52,7 +52,8 @@ class Surface:
         if len(motions) == 1 and np.array_equal(motions[0], np.eye(4)):
             return Surface(self.vertices, self.faces, self.normals, weights)
         linear = motions[:, :3, :3]
-        vertices = (linear @ self.vertices[..., None])[..., 0] + motions[:, :3, 3]
+        turned = self.vertices @ linear[0].T if len(motions) == 1 else (linear @ self.vertices[..., None])[..., 0]
+        vertices = turned + motions[:, :3, 3]
         determinants = np.linalg.det(linear)
         normals = None if self.normals is None else turned_normals(self.normals, linear, determinants)
         mirrored = np.broadcast_to(determinants < 0, len(vertices))[self.faces[:, :1]]

@@ -209,9 +209,10 @@ def _shared_joints(
     every = world[[node for own in listed.values() for node in own], :3]
     near = SKIN_TOLERANCES.equal * float(np.ptp(every[..., 3], axis=0).max())
     for own in listed.values():
-        by_name = {document.item("nodes", node).get("name"): joint for joint, node in enumerate(nodes)}
+        by_name = {str(document.item("nodes", node).get("name")): joint for joint, node in enumerate(nodes)}
         for node in own:
-            twin = by_name.get(document.item("nodes", node).get("name") or ())
+            name = document.item("nodes", node).get("name")
+            twin = by_name.get(str(name)) if name else None
             apart = np.inf if twin is None else np.abs(world[nodes[twin]][:3, 3] - world[node][:3, 3]).max()
             if node not in number and twin is not None and apart <= near and nodes[twin] not in own:
                 number[node] = twin

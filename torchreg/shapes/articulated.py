@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchreg._checks import as_float_tensor, check_count, check_direction, check_finite, check_shape
+from torchreg._threads import one_thread
 from torchreg.errors import InputError
 from torchreg.geometry.upright import Y_UP
 from torchreg.io.file_format import naming
@@ -159,7 +160,9 @@ class ArticulatedShape(Articulation):
     ) -> ArticulatedShape:
         """Return the shape of a rigged glTF: its skeleton as tree, with solids fitted to the vertices of each joint.
 
-        The rest pose (zeros) is the file's bind pose.
+        All skins of the file are one shape. The rest pose (zeros) is the file's bind pose, standing in its scene as a
+        viewer shows it, y up. Meshes that hang on joints without a skin are rigid parts; in a file without any skin,
+        the nodes that a clip turns or slides, or all nodes with a mesh where one hangs on another, are the joints.
 
         Args:
             path: a .glb or .gltf file.
@@ -170,20 +173,22 @@ class ArticulatedShape(Articulation):
             primitive: kind of the fitted solids.
             nu: fusion length, metres; from the parts' thickness by default.
             dtype: of the module; the default dtype if None.
-            skin: name or number of the skin, where the file has several.
+            skin: name or number of the one skin to read, where the file has several; all by default.
 
         Returns:
-            The shape; `file_skin` gives the file's own skin.
+            The shape; `file_skin` gives the file's own skin. Its solids are refined when they are first asked for.
 
         Raises:
-            FormatError: if the file is damaged, oversized, or has no skin.
-            ModelError: if the hierarchy is cyclic or flat, or a name is unknown.
+            FormatError: if the file is damaged, oversized, or compressed by what is not read or not installed.
+            ModelError: if nothing in it moves, the hierarchy is cyclic or flat, or a name is unknown.
 
         Warns:
-            FileWarning: if part of the file was left out or put right; several roots hang on one.
+            FileWarning: if part of the file was left out or put right; several roots hang on one; joints have one name,
+                or scale their part of the skin unlike others, which is baked into the rest pose unless it is little.
         """
-        spec = spec_from_gltf(path, parents=parents, axes=axes, limits=limits, primitive=primitive, skin=skin)
-        return cls.from_spec(spec, nu=nu, dtype=dtype)
+        with one_thread():
+            spec = spec_from_gltf(path, parents=parents, axes=axes, limits=limits, primitive=primitive, skin=skin)
+            return cls.from_spec(spec, nu=nu, dtype=dtype)
 
     @classmethod
     def from_skinned_mesh(

@@ -294,6 +294,9 @@ def _ball_joint_tree(
     joints: list[Joint] = []
     last: dict[int, int] = {}
     taken = set(names)
+    if len(taken) < len(names):
+        repeated = ", ".join(sorted({name for name in names if names.count(name) > 1})[:5])
+        raise ModelError(f"frame names must be unique, these occur more than once: {repeated}")
     for index in order:
         parent, name = parents[index], names[index]
         offset = frames[index] if parent < 0 else invert_rigid(frames[parent]) @ frames[index]
