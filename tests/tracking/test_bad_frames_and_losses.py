@@ -96,6 +96,43 @@ def test_what_is_nowhere_stays_unknown_and_is_searched_ever_more_rarely(noise_fr
     assert len(searched) == before
 
 
+def wall(seed, behind):
+    """Return 600 points of a wall behind the hand, other ones each time."""
+    generator = torch.Generator().manual_seed(seed)
+    across = 0.5 * (torch.rand(600, 2, generator=generator) - 0.5)
+    return torch.cat([across, behind + 0.002 * torch.randn(600, 1, generator=generator)], dim=-1)
+
+
+def test_what_comes_into_a_room_is_searched_at_once_and_the_room_alone_ever_more_rarely(
+    plain_hand, tracker, frames, find, truths
+):
+    made = tracker(None)
+    away = float(frames[0][:, 2].mean()) + 0.4
+    searched = []
+
+    def found(number):
+        searched.append(made.state.frame)
+        return truths[6:7] if made.state.frame == 6 else truths[:1] + 2.0
+
+    find(found, [10.0])
+    result = made.run([*(wall(k, away) for k in range(6)), torch.cat([wall(6, away), frames[6]])])
+    assert sorted(set(searched)) == [0, 1, 4, 6]
+    assert result.acquired == ("lost",) * 6 + ("found",)
+    assert (plain_hand.keypoints(result.poses[6]) - plain_hand.keypoints(truths[6])).norm(dim=-1).mean() < 0.005
+
+
+def test_what_was_doubtful_in_all_frames_is_forgotten_when_it_is_gone(plain_hand, tracker, frames, find, truths):
+    """The first frames show a wall on which the hand seems to lie."""
+    made, away = tracker(None), float(frames[0][:, 2].mean()) + 0.4
+    lying = truths[0].clone()
+    lying[:3] += torch.tensor([0.0, 0.0, away]) - plain_hand.keypoints(truths[0]).mean(0)
+    find(lambda number: truths[2:3] if made.state.frame == 2 else lying[None], [10.0])
+    records = [made.step(points) for points in (wall(0, away), wall(1, away), frames[2], frames[3])]
+    assert [record.status for record in records[:2]] == [Status.DOUBTFUL, Status.DOUBTFUL]
+    assert [record.acquired for record in records[2:]] == ["found", "tracked"]
+    assert (plain_hand.keypoints(records[2].pose) - plain_hand.keypoints(truths[2])).norm(dim=-1).mean() < 0.005
+
+
 def test_a_lost_hand_is_found_where_it_is_nearest(plain_hand, noise_frame, truths, frames, tracker, tracked, find):
     """The hand vanishes for frames and comes back far away; of equally good poses the one near the last is taken."""
     calls = find(torch.stack([moved(truths[5], 0.3), truths[5], truths[5]]), [10.0, 11.0, 300.0])
