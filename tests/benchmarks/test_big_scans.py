@@ -27,6 +27,6 @@ def test_clouds_of_the_arm_lie_on_it_but_for_the_outliers(bench, tmp_path):
 
 def test_bars_are_of_time_memory_and_error(bench, capsys):
     for cost in (bench.Cost(9, 1, 1, 1, 0.1), bench.Cost(9, 11, 1, 1, 0), bench.Cost(9, 1, 1, 9000, 0)):
-        bench.print_cost("x", cost, 10.0, 0.05)
-    bench.print_cost("x", bench.Cost(9, 1, 1, 1, 0), 10.0, 0.05)
+        bench.print_cost("x", cost, 10.0, 0.05, 2000.0)
+    bench.print_cost("x", bench.Cost(9, 1, 1, 9000, 0), 10.0, 0.05)
     assert [line.split()[-1] for line in capsys.readouterr().out.splitlines()] == ["FAIL", "FAIL", "FAIL", "pass"]
