@@ -36,11 +36,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import torchreg as tr
+from experiments.made_up.walks import walking_figure
 from torchreg.datasets.creatures import STARFISH, creature_sequence
 from torchreg.datasets.depth_scanner import DepthScanner
 from torchreg.datasets.hand import make_hand_cloud, random_hand_pose
-from torchreg.datasets.scan_sequences import walking_figure
 from torchreg.geometry.mesh import sample_surface
 
 POINTS = (1_000, 10_000, 100_000, 300_000, 1_000_000, 5_000_000)

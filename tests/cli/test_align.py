@@ -74,7 +74,7 @@ def test_joints_that_the_data_do_not_determine_are_printed(run, folder, tmp_path
 
 
 def test_what_cannot_be_drawn_or_written_loses_no_result(run, folder, tmp_path, failing):
-    failing("torchreg.viz.figures.draw_alignment", "torchreg.io.points.save_points")
+    failing("torchreg.viz.figures.save_scene", "torchreg.io.points.save_points")
     answer = run(
         "align", "hand", folder / "cloud0.ply", folder / "cloud1.ply", "-o", tmp_path / "r", "--start",
         folder / "truth0.json", "--pose", tmp_path / "pose.csv", "--ply", tmp_path / "skin.ply", "--picture",

@@ -62,7 +62,7 @@ def test_joints_that_do_not_fit_are_told_by_the_name_of_their_file(run, folder, 
 
 
 def test_what_cannot_be_drawn_loses_no_result(run, folder, clouds, tmp_path, failing):
-    failing("torchreg.viz.figures.draw_alignment")
+    failing("torchreg.viz.figures.save_scene")
     answer = run(
         "calibrate", folder / "arm.urdf", *clouds, "--joints", folder / "joints.csv", "-o", tmp_path / "base"
     )  # fmt: skip

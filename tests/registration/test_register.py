@@ -62,7 +62,7 @@ def test_bones_filter_the_noise_of_the_start(pair, known):
 def test_the_table_below_is_left_out_of_both_scans(pair):
     noise = torch.randn(pair.truth.shape, generator=torch.Generator().manual_seed(0))
     start = pair.truth + 0.004 * pair.source.diagonal * noise
-    parts = pair.moving_labels().clamp_max(7)
+    parts = moving_labels(pair).clamp_max(7)
     plain = register(pair.source, pair.target, 8, 30, start=start, parts=parts)
     low = float(min(pair.source.points[:, 1].min(), pair.target.points[:, 1].min()))
     steps = 1.5 * pair.source.diagonal * torch.linspace(-1, 1, 25)

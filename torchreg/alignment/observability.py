@@ -101,7 +101,7 @@ def far_variance(
         moved = (turned - pose[row]).gather(1, column)[:, 0].abs()
         rise = (objective.cost(turned) - here).clamp_min(0) * share[row] / shared[row]
         least = torch.where(moved > 0.5 * step, torch.minimum(least, rise), least)
-    found[row, dof] = step.square() * (-least).exp()
+    found[row, dof] = (step.square() * (-least).exp()).to(found)
     return found
 
 
