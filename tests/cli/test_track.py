@@ -84,7 +84,11 @@ def same(first, second):
 
 
 def test_what_cannot_be_drawn_or_written_loses_no_result_and_is_told_once(run, command, whole, tmp_path, failing):
-    failing("torchreg.viz.tracking.save_scene", "torchreg.viz.track_bvh.save_track_bvh")
+    failing(
+        "torchreg.viz.tracking.save_scene",
+        "torchreg.viz.tracking.animate_scene",
+        "torchreg.viz.track_bvh.save_track_bvh",
+    )
     answer = run(*command("--pictures", tmp_path / "live", "--bvh", tmp_path / "r.bvh", "--quiet"))
     assert answer.exit_code == 1
     told = [line.split("/")[-1] for line in answer.output.splitlines()]
