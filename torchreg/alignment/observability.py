@@ -47,7 +47,7 @@ def dof_confidence(shape: Articulation, covariance: Tensor, size: float) -> Tens
     """Return the share (..., num_dofs) of the variance without data that a covariance no longer has; one if held."""
     moves = shape.upper - shape.lower > _OPEN.least_span
     left = covariance.diagonal(dim1=-2, dim2=-1) / plausible_variance(shape, size)
-    return torch.where(moves, 1 - left, 1.0).clamp(0, 1)
+    return torch.where(moves, 1 - left, 1.0).clamp(0, 1).to(covariance)
 
 
 def told_open(shape: Articulation, covariance: Tensor, size: float) -> str:
@@ -101,7 +101,7 @@ def far_variance(
         moved = (turned - pose[row]).gather(1, column)[:, 0].abs()
         rise = (objective.cost(turned) - here).clamp_min(0) * share[row] / shared[row]
         least = torch.where(moved > 0.5 * step, torch.minimum(least, rise), least)
-    found[row, dof] = step.square() * (-least).exp()
+    found[row, dof] = (step.square() * (-least).exp()).to(pose)
     return found
 
 
