@@ -24,7 +24,7 @@ class _Open:
     least_span: float = 1e-3  # of the limits of a joint that does not move, radians or metres
     confidence: float = 1 / 3  # share of the variance without data that must be gone
     turn: float = math.radians(25)  # standard deviation from which on a joint that turns is open in any case
-    slope: float = 0.35  # of the surface along its own motion, on average: of less it may be one of revolution
+    slope: float = 0.2  # of the surface along its own motion, on average: of less it may be one of revolution
     num_data: int = 500  # by which its turns are told apart
     most_named: int = 8  # in a sentence
 
