@@ -24,7 +24,7 @@ class _Open:
     least_span: float = 1e-3  # of the limits of a joint that does not move, radians or metres
     confidence: float = 1 / 3  # share of the variance without data that must be gone
     turn: float = math.radians(25)  # standard deviation from which on a joint that turns is open in any case
-    slope: float = 0.35  # of the surface along its own motion, on average: of less it may be one of revolution
+    slope: float = 0.2  # of the surface along its own motion, on average: of less it may be one of revolution
     num_data: int = 500  # by which its turns are told apart
     most_named: int = 8  # in a sentence
 
@@ -47,7 +47,7 @@ def dof_confidence(shape: Articulation, covariance: Tensor, size: float) -> Tens
     """Return the share (..., num_dofs) of the variance without data that a covariance no longer has; one if held."""
     moves = shape.upper - shape.lower > _OPEN.least_span
     left = covariance.diagonal(dim1=-2, dim2=-1) / plausible_variance(shape, size)
-    return torch.where(moves, 1 - left, 1.0).clamp(0, 1)
+    return torch.where(moves, 1 - left, 1.0).clamp(0, 1).to(covariance)
 
 
 def told_open(shape: Articulation, covariance: Tensor, size: float) -> str:
