@@ -1,8 +1,8 @@
 """A shape among other things: whole depth pictures of rooms, tables and crates, with it and without.
 
-    python benchmarks/scenes.py                  # 60 pictures of hands and arms, some minutes
-    python benchmarks/scenes.py --calibrate      # fits the weights of what else may explain a picture, on other seeds
-    python benchmarks/scenes.py --smoke          # two small pictures, to see that it runs
+    python benchmarks/scenes.py                         # 60 pictures of hands and arms, some minutes
+    python benchmarks/scenes.py --calibrate --count 68  # on other seeds: weights of what else may explain a picture
+    python benchmarks/scenes.py --smoke                 # two pictures, to see that it runs
 
 Each picture is drawn: a camera looks onto a table before a wall, with crates, cans and balls on it; a hand with its
 forearm held over it, or an arm of random links that stands on it; in half of them neither. Depths have the errors of a

@@ -78,6 +78,19 @@ def test_a_skeleton_that_is_written_once_per_skin_is_one(tmp_path, scene):
     assert (shape.num_parts, len(vertices)) == (2, 72)
 
 
+def test_skins_with_skeletons_of_their_own_are_read_with_a_sentence_that_names_the_choice(tmp_path, scene):
+    scene.rig()
+    # Another character, three metres aside.
+    number = scene.node(name="other_tip", translation=[0, 1, 0])
+    base = scene.node(root=True, name="other_root", translation=[3, 0, 0], children=[number])
+    second_skin(scene, [base, number], [shift(-3, 0, 0), shift(-3, -1, 0)], vertices=VERTICES + np.array([3.0, 0, 0]))
+    path = scene.save(tmp_path / "a.glb")
+    with pytest.warns(FileWarning, match=r"a\.glb: skins 0 and 1 have skeletons of their own.*skin= reads one of them"):
+        rig = load_rig(path)
+    assert len(rig.joint_names) == 4
+    assert load_rig(path, skin=1).joint_names == ("other_root", "other_tip")
+
+
 @pytest.mark.parametrize("tip", [{}, {"rotation": TURN}, {"rotation": list(Rotation.from_euler("x", 0.4).as_quat())}])
 @pytest.mark.parametrize("joint", [False, True])
 def test_an_armature_that_turns_its_rig_stands_it_up(tmp_path, tip, joint):

@@ -10,7 +10,7 @@ from torchreg.errors import FormatError, InputError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh
 from torchreg.geometry.range_scan import RangeScan
-from torchreg.io.urdf import UrdfPrimitive
+from torchreg.io.urdf_record import UrdfPrimitive
 from torchreg.registration.robots.model import find_robot, write_robot
 from torchreg.registration.robots.surfaces import Target
 from torchreg.shapes.articulated import ArticulatedShape

@@ -8,7 +8,7 @@ import torch
 from torchreg.errors import InputError
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.mesh import TriangleMesh, concatenate
-from torchreg.io.urdf import UrdfPrimitive
+from torchreg.io.urdf_record import UrdfPrimitive
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.link_surface import LinkSurface, has_rigid_links, link_meshes
 from torchreg.shapes.primitives import Primitive

@@ -15,7 +15,7 @@ from torch import nn
 from torchreg.errors import FileWarning, FormatError, InputError, ModelError
 from torchreg.geometry.mesh import unit_sphere
 from torchreg.io.gltf import load_rig
-from torchreg.io.urdf import UrdfPrimitive
+from torchreg.io.urdf_record import UrdfPrimitive
 from torchreg.shapes import rigs
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.primitive_refinement import refine_primitives

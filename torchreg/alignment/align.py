@@ -246,16 +246,10 @@ def _align_person(
         if clouds.ndim != 2:
             raise InputError("fit_shape takes one cloud; calibrate fits several scans of one person")
     pose = None if initial_pose is None else _check_start(shape, initial_pose, clouds[None])[0]
-    history: list[AlignRecord] = []
-
-    def record(step: AlignRecord) -> None:
-        history.append(step)
-        if on_step is not None:
-            on_step(step)
-
+    history = _History(on_step)
     viewpoints = torch.stack([frame.camera.position for frame in seen.frames]) if seen.frames else None
     fitted = fit_coefficients(
-        shape, clouds[None], valid[None], pose, config=config, viewpoints=viewpoints, on_step=record
+        shape, clouds[None], valid[None], pose, config=config, viewpoints=viewpoints, on_step=history
     )
     person = shape.with_coefficients(fitted.coefficients)
     with torch.inference_mode():
@@ -266,7 +260,7 @@ def _align_person(
         dofs = shape.num_dofs
         result = normal_copy(replace(
             result,
-            history=tuple(history),
+            history=tuple(history.steps),
             coefficients=fitted.coefficients,
             covariance=fitted.covariance[0, :dofs, :dofs],
             dof_confidence=dof_confidence(shape, fitted.covariance[0, :dofs, :dofs], batch.problem.size),
@@ -276,6 +270,18 @@ def _align_person(
         return result
     found_pose, coefficients = person_with_gradients(shape, fitted, seen.points, valid)
     return replace(result, pose=found_pose, coefficients=coefficients)
+
+
+class _History:
+    """Keeps the records of an alignment, and passes them on."""
+
+    def __init__(self, on_step: OnStep | None) -> None:
+        self.steps, self._on_step = list[AlignRecord](), on_step
+
+    def __call__(self, step: AlignRecord) -> None:
+        self.steps.append(step)
+        if self._on_step is not None:
+            self._on_step(step)
 
 
 def _align_about(

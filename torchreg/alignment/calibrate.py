@@ -152,10 +152,7 @@ def calibrate(
             known = frame_poses.known
             frame_poses = replace(frame_poses, poses=poses).aligned(fitted, data, valid, config.align, skin)
             poses = torch.where(known.unsqueeze(-1), poses, frame_poses.poses)
-            prior = prior or ScalePrior.from_shape(
-                shape, poses, size, joint_std=config.align.prior_std, size_std=config.size_std,
-                radius_std=config.radius_std, part_std=config.part_std,
-            )  # fmt: skip
+            prior = prior or _scale_prior(shape, poses, size, config)
             # Of a frame that was searched the prior is about what was found.
             prior = replace(prior, poses=torch.where(known.unsqueeze(-1), prior.poses, poses))
             counts = valid & frame_poses.counting.unsqueeze(-1)
@@ -165,10 +162,8 @@ def calibrate(
             poses, cost, change = _fit_jointly(problem, poses, config, number, on_step)
     frame_poses.warn()
     status = Status.CONVERGED if change <= config.align.pose_atol else Status.MAX_STEPS
-    for parameter, original in zip(fitted.parameters(), shape.parameters(), strict=True):
-        parameter.requires_grad_(original.requires_grad)
     return Calibration(
-        shape=fitted,
+        shape=_learning_like(shape, fitted),
         poses=poses,
         log_length_scales=fitted.log_length_scales.detach().clone(),
         log_radius_scales=fitted.log_radius_scales.detach().clone(),
@@ -176,6 +171,21 @@ def calibrate(
         status=frame_poses.status(status),
         outliers=frame_poses.left_out,
     )
+
+
+def _scale_prior(shape: ArticulatedShape, poses: Tensor, size: float, config: CalibrateConfig) -> ScalePrior:
+    """Return the prior on the scales and the poses (T, num_dofs)."""
+    return ScalePrior.from_shape(
+        shape, poses, size, joint_std=config.align.prior_std, size_std=config.size_std, radius_std=config.radius_std,
+        part_std=config.part_std,
+    )  # fmt: skip
+
+
+def _learning_like(shape: ArticulatedShape, fitted: ArticulatedShape) -> ArticulatedShape:
+    """Return a fitted copy of a shape whose parameters take gradients where those of the shape do."""
+    for parameter, original in zip(fitted.parameters(), shape.parameters(), strict=True):
+        parameter.requires_grad_(original.requires_grad)
+    return fitted
 
 
 def _calibrate_person(

@@ -16,8 +16,15 @@ from torchreg.result import Status
 from torchreg.shapes.articulated import ArticulatedShape
 from torchreg.shapes.skin import LinearBlendSkin
 
-# Frames by which a first size is fitted where none can be trusted: the surest, as a shape of another size is near them.
-_FIRST = 3
+
+@dataclass(frozen=True)
+class _Trust:
+    """Numbers of the trust in frames."""
+
+    surest: int = 3  # frames that give a first size where none can be trusted: a shape of another size is near them
+
+
+_TRUST = _Trust()
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +98,7 @@ class FramePoses:
             return torch.tensor([status not in self.failed for status in self.statuses], device=self.known.device)
         if bool(self.known.any()):
             return self.known
-        surest = self.confidence.topk(min(_FIRST, len(self.known))).indices
+        surest = self.confidence.topk(min(_TRUST.surest, len(self.known))).indices
         return self.known.index_fill(0, surest, True)
 
     @property

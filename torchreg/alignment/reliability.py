@@ -85,22 +85,11 @@ class Calibration:
     A pose is right if the ends of the shape's limbs are off by at most `right` of its size on average. Fitted by
     ``benchmarks/confidence.py --calibrate`` to 143 made-up alignments of hands, a robot arm and a fox, and tested on
     310 others (``docs/measured/confidence.txt``), of which halves give no better one. The last two weights, of what
-    else may explain a picture, are fitted by ``benchmarks/scenes.py --calibrate`` to 68 made-up rooms, others held.
+    else may explain a picture, are fitted by ``benchmarks/scenes.py --calibrate --count 68``, the others held.
     """
 
     bias: float = 5.35
-    weights: tuple[float, ...] = (
-        1.36,
-        4.4,
-        8.69,
-        3.46,
-        8.53,
-        5.48,
-        1.03,
-        3.93,
-        20.0,
-        4.05,
-    )  # in the order of `Evidence`
+    weights: tuple[float, ...] = (1.36, 4.4, 8.69, 3.46, 8.53, 5.48, 1.03, 3.93, 20.44, 3.78)  # as `Evidence` has them
     right: float = 0.058  # of the size: 15 mm of a hand
     doubtful: float = 0.5  # confidence below which a result is doubtful
 
@@ -112,7 +101,7 @@ CALIBRATION = Calibration()
 # `benchmarks/shape_confidence.py --calibrate` fits one to what it draws; its area under the curve on 72 others, a third
 # of them searched, is .96. Pictures and rivals were not among the 59: their weights are those of poses.
 SHAPE_CALIBRATION = Calibration(
-    bias=5.37, weights=(0.0, 2.45, 3.1, 2.83, 8.53, 10.78, 1.03, 3.93, 20.0, 4.05), right=0.015
+    bias=5.37, weights=(0.0, 2.45, 3.1, 2.83, 8.53, 10.78, 1.03, 3.93, 20.44, 3.78), right=0.015
 )
 
 

@@ -30,7 +30,7 @@ def likely_pair(ratio: float) -> tuple[str, str, float]:
 
 
 def robust_size(points: Tensor) -> float:
-    """Return twice the median distance of finite points (N, 3) from their median, which strays and holes hardly change.
+    """Return twice the median distance of finite points (N, 3) from their median, which outliers hardly change.
 
     Points that mostly lie at one place have that of their bounding box.
     """

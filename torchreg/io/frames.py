@@ -182,7 +182,7 @@ def load_frames(
         if archive is not None:
             names = [f"{files[0]}, frame {number}" for number in range(len(archive.rows))]
             sources, faces = list(archive.rows), archive.faces
-    return Frames(names, sources, nan_policy, limits, dtype, scale, faces)
+    return Frames(names, sources, nan_policy, limits, dtype, scale=scale, faces=faces)
 
 
 def save_frames(path: PathLike, frames: Sequence[Any]) -> list[Path]:

@@ -92,7 +92,7 @@ def load_rig(
         FileWarning: if something was left out or put right: primitives without positions or skin, vertices without
             weight (they follow the nearest vertex that has some), joints that move nothing and were stored without a
             place (they stand where their node does), joints of one name, joints that scale their part of the skin
-            unlike others, meshes without a skin.
+            unlike others, skins with skeletons of their own, meshes without a skin.
     """
     source = local_path(path)
     content = read_bytes(source, limits)
@@ -102,6 +102,7 @@ def load_rig(
         if read is None:
             return _record_of_parts(document, source.stem, mesh, parents or {}, limits)
         skeleton, budget = read
+        _warn_about_several_skeletons(skeleton)
         place_skins(document, skeleton)
         surfaces = [skeleton.placed_surface(skin) for skin in skeleton.skins]
         if mesh is None and skin is None:
@@ -109,6 +110,18 @@ def load_rig(
         skins = {skin.index for skin in skeleton.skins}
         own_name = document.item("skins", min(skins)).get("name") if len(skins) == 1 else None
         return _record(str(own_name or source.stem), skeleton, surfaces)
+
+
+def _warn_about_several_skeletons(skeleton: Skeleton) -> None:
+    """Warn if skins share no root, as those of two characters: one shape holds both."""
+    tops: dict[int, list[str]] = {}
+    for skin in skeleton.skins:
+        joint = int(skin.joints[0])
+        top = ([joint, *ancestors(joint, skeleton.parents)])[-1]
+        tops.setdefault(top, []).append(str(skin.index))
+    if len(tops) > 1:
+        groups = " and ".join(", ".join(numbers) for numbers in tops.values())
+        warn(f"skins {groups} have skeletons of their own, and are read as one shape; skin= reads one of them")
 
 
 def _record(name: str, skeleton: Skeleton, surfaces: list[Surface]) -> RigRecord:

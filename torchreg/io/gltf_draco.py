@@ -4,17 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from torchreg.errors import FormatError
 from torchreg.io.raw_cloud import Array
 
-if TYPE_CHECKING:
-    from torchreg.io.gltf_document import GltfDocument
-
 NAME = "KHR_draco_mesh_compression"
+
+
+class Document(Protocol):
+    """What is asked of a glTF document."""
+
+    @staticmethod
+    def entry(owner: dict[str, Any], key: str, kind: type, default: Any = None) -> Any:
+        """Return an entry of an object of the file."""
+
+    def items(self, collection: str) -> list[dict[str, Any]]:
+        """Return the objects of a list of the file."""
+
+    def view(self, owner: dict[str, Any], what: str) -> memoryview:
+        """Return the bytes of the buffer view of an object."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +43,7 @@ class DracoGeometry:
         document: they are of.
     """
 
-    def __init__(self, document: GltfDocument) -> None:
+    def __init__(self, document: Document) -> None:
         self._document = document
         self._unpacked: dict[int, Any] = {}
 
@@ -91,7 +102,7 @@ def _decoded(content: bytes, what: str) -> Any:
         ) from None
     try:
         mesh = DracoPy.decode(content)
-    except Exception as error:  # DracoPy has errors of its own, without a common class
+    except (DracoPy.FileTypeException, ValueError, RuntimeError) as error:
         raise FormatError(f"the Draco data of {what} are damaged ({error})") from error
     if getattr(mesh, "faces", None) is None:
         raise FormatError(f"the Draco data of {what} hold no triangles")

@@ -68,7 +68,7 @@ def read_parts(document: GltfDocument, name: str, limits: FileLimits) -> RigidPa
     rest = np.stack([np.eye(4) if node < 0 else world[node] for node in nodes])
     kinds = [moves.get(node, set[str]()) for node in nodes]
     return RigidParts(
-        Skeleton(nodes, names, tuple(above), number, rest, rest, []),
+        Skeleton(nodes, names, parents=tuple(above), number=number, world=rest, places=rest, skins=[]),
         surfaces,
         tuple(name for name, kind in zip(names, kinds, strict=True) if "translation" in kind),
         tuple(name for name, kind in zip(names, kinds, strict=True) if "rotation" not in kind),

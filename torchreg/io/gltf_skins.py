@@ -135,7 +135,10 @@ def read_skeleton(
     if not skins:
         reason = f": {budget.left_out[0]}" if budget.left_out else ""
         raise ModelError(f"the skinned mesh has no triangles that a skin moves{reason}")
-    return Skeleton(nodes, names, all_parents, number, world[nodes], world[nodes].copy(), skins), budget
+    at_rest = world[nodes]
+    return Skeleton(
+        nodes, names, parents=all_parents, number=number, world=at_rest, places=at_rest.copy(), skins=skins
+    ), budget  # fmt: skip
 
 
 def _choose_skins(document: GltfDocument, mesh: str | int | None, skin: str | int | None) -> dict[int, list[int]]:

@@ -6,7 +6,6 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -14,9 +13,7 @@ from torch import Tensor
 from torchreg.errors import UnitsWarning
 from torchreg.geometry.rigid import transform_points
 from torchreg.geometry.units import likely_unit
-
-if TYPE_CHECKING:
-    from torchreg.io.urdf import UrdfRecord
+from torchreg.io.urdf_record import UrdfRecord
 
 
 @dataclass(frozen=True)

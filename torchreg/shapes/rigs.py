@@ -131,15 +131,9 @@ def spec_from_arrays(
     used = _carries_skin(parent_list, order, weights)
     reach = float((vertices.amax(0) - vertices.amin(0)).norm())
     tree, last_frame = _ball_joint_tree(
-        order,
-        parent_list,
-        names,
-        frames,
-        used,
-        axes=axes or {},
-        limits=limits or {},
+        order, parent_list, names, frames, used, axes=axes or {}, limits=limits or {},
         slides=dict.fromkeys(slides, reach),
-    )
+    )  # fmt: skip
     parts = [index for index in order if bool(weights[:, index].max() > 0)]
     part_frames = tuple(last_frame[index] for index in parts)
     found: tuple[Primitive, ...] | DeferredSolids

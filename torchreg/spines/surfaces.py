@@ -198,13 +198,13 @@ class FrameSurfaces(Sequence[TriangleMesh]):
     def chosen(self, numbers: Sequence[int]) -> FrameSurfaces:
         """Return some frames."""
         return FrameSurfaces(
-            _Chosen(self.frames, numbers),
-            tuple(self.names[number] for number in numbers),
-            {place: self.made[number] for place, number in enumerate(numbers) if number in self.made},
-            tuple(self.notes[number] for number in numbers),
-            tuple(self.samples[number] for number in numbers),
-            self.shift,
-            {place: self.supports[number] for place, number in enumerate(numbers) if number in self.supports},
+            frames=_Chosen(self.frames, numbers),
+            names=tuple(self.names[number] for number in numbers),
+            made={place: self.made[number] for place, number in enumerate(numbers) if number in self.made},
+            notes=tuple(self.notes[number] for number in numbers),
+            samples=tuple(self.samples[number] for number in numbers),
+            shift=self.shift,
+            supports={place: self.supports[number] for place, number in enumerate(numbers) if number in self.supports},
         )
 
     def shifted(self, shift: Tensor) -> FrameSurfaces:

@@ -209,7 +209,6 @@ class Tracker:
                     fit, state = self._recover(state, frame, view, fit)
                 fit, state = self._recover.cross_check(state, frame, fit)
                 result, state = self._accept(state, frame, fit)
-                state = replace(state, sure=state.sure or result.statuses[0].usable)
                 if self._person is not None and fit is not None and result.statuses[0].usable:
                     state = _learned(self._person, state, frame, fit)
             self._state = normal_copy(state)
@@ -417,7 +416,8 @@ class Tracker:
             return self._hold(state, frame, Status.LOST)
         covariance, observed = self._fitter.covariance(fit)
         result = fitted_result(self._fitter, state, frame, fit, covariance)
-        return result, self._state_after(state, frame, fit, observed)
+        after = self._state_after(state, frame, fit, observed)
+        return result, replace(after, sure=after.sure or result.statuses[0].usable)
 
     def _state_after(self, state: TrackState, frame: Frame, fit: FrameFit, observed: Tensor) -> TrackState:
         """Return the state after a fit, of whose degrees of freedom data tell the observed share (num_dofs,)."""
