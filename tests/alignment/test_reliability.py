@@ -6,16 +6,9 @@ import pytest
 import torch
 
 import torchreg as tr
+from torchreg.alignment.curvature import correlated_count, curvature, neighbor_correlation
 from torchreg.alignment.problem import centered_problem, masked_mean
-from torchreg.alignment.reliability import (
-    CALIBRATION,
-    Evidence,
-    confidence_of,
-    correlated_count,
-    curvature,
-    judge,
-    neighbor_correlation,
-)
+from torchreg.alignment.reliability import CALIBRATION, Evidence, confidence_of, judge
 from torchreg.geometry.kinematic_tree import Joint, KinematicTree
 from torchreg.geometry.sampling import farthest_points
 from torchreg.shapes.articulated import ArticulatedShape

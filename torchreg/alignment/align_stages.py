@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.annealed_em import ANNEALING, OnStep, StageResult, anneal, outlier_level
+from torchreg.alignment.curvature import curvature
 from torchreg.alignment.local_search import explore, needs_search
 from torchreg.alignment.problem import INLIER_SHARE, AlignProblem, alignment_cost
-from torchreg.alignment.reliability import curvature
 from torchreg.alignment.results import AlignRecord
 from torchreg.alignment.surface_fit import SURFACE_FIT, fit_surface
 from torchreg.geometry.budget import BUDGET

@@ -9,13 +9,14 @@ import torch
 from torch import Tensor
 
 from torchreg.alignment.confidence import end_motions, end_variances, limb_ends
+from torchreg.alignment.curvature import plausible_precision
 from torchreg.alignment.known_dofs import KnownDofs
 from torchreg.alignment.landmarks import Landmarks, MeasuredKeypoints, keypoint_extent
 from torchreg.alignment.limb_search import distinct_first
 from torchreg.alignment.observability import dof_confidence, told_open
 from torchreg.alignment.pose_search import mean_distances
 from torchreg.alignment.problem import PRIOR_SHARE, AlignProblem, centered_problem
-from torchreg.alignment.reliability import CALIBRATION, plausible_precision
+from torchreg.alignment.reliability import CALIBRATION
 from torchreg.alignment.results import AlignResult, PoseStarts
 from torchreg.alignment.rough_poses import bent_pose, spread_rotations, typical_poses
 from torchreg.errors import InputError

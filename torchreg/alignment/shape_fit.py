@@ -13,6 +13,7 @@ from torch.nn.functional import pad
 from torchreg.alignment.annealed_em import ANNEALING, OnStep, StageResult, anneal
 from torchreg.alignment.clusters import leaves_clusters
 from torchreg.alignment.confidence import EVIDENCE, end_variances
+from torchreg.alignment.curvature import correlated_count, neighbor_correlation
 from torchreg.alignment.objectives import GaussianPosePrior
 from torchreg.alignment.person_search import find_people, lead_over_rivals, swung_people, turned_people
 from torchreg.alignment.problem import (
@@ -21,7 +22,7 @@ from torchreg.alignment.problem import (
     masked_mean,
     model_size,
 )
-from torchreg.alignment.reliability import SurfaceError, correlated_count, neighbor_correlation
+from torchreg.alignment.reliability import SurfaceError
 from torchreg.alignment.results import AlignRecord
 from torchreg.alignment.shape_problem import ShapeProblem
 from torchreg.alignment.sigma_schedule import SigmaSchedule

@@ -13,11 +13,12 @@ from torch import Tensor
 from torchreg.alignment.annealed_em import anneal
 from torchreg.alignment.confidence import end_motions, end_variances, limb_ends, share_beside
 from torchreg.alignment.config import AlignConfig
+from torchreg.alignment.curvature import hardly_gains
 from torchreg.alignment.free_space_term import INTRUSION, FreeSpaceTerm
 from torchreg.alignment.landmarks import keypoint_skin
 from torchreg.alignment.objectives import GaussianPosePrior
 from torchreg.alignment.problem import INLIER_SHARE, AlignProblem, alignment_cost, centered_problem, free_space_loss
-from torchreg.alignment.reliability import Evidence, hardly_gains, weigh
+from torchreg.alignment.reliability import Evidence, weigh
 from torchreg.alignment.sigma_schedule import SigmaSchedule
 from torchreg.alignment.surface_fit import SURFACE_FIT, SurfaceResult, pose_covariance, refine_surface, surface_noise
 from torchreg.geometry.neighbors import sampling_distance

@@ -1,0 +1,213 @@
+"""The covariance of fitted poses: which errors data share, what no data determine, and what another step would gain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchreg.alignment.confidence import DataOnSurface, limb_points
+from torchreg.alignment.observability import plausible_variance
+from torchreg.alignment.patches import errors_per_patch
+from torchreg.alignment.problem import AlignProblem
+from torchreg.alignment.shape_errors import shape_covariance
+from torchreg.alignment.surface_fit import SURFACE_FIT, pose_covariance, surface_noise, surface_objective
+from torchreg.geometry.neighbors import NeighborTree
+from torchreg.solvers.levenberg_marquardt import held_at_limits
+from torchreg.solvers.robust import welsch_weight
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """How data err together, and when a fit has ended."""
+
+    num_correlated: int = 1000  # data by which the correlation of residuals is measured
+    lattice: int = 12  # neighbors to each side whose correlation counts
+    max_correlation: float = 0.95  # of neighboring residuals
+    limb_data: float = 12.0  # that nothing but one limb explains: so many, and it is misplaced with probability 1 / e
+    patches: float = 4.0  # of a part, within which the shape's surface errs alike
+    gain: float = 0.1  # of a further step in log-likelihood: less than half a standard deviation of the pose
+
+
+_ERRORS = _Errors()
+
+
+@dataclass(frozen=True, eq=False)
+class Curvature:
+    """The objective around fitted poses.
+
+    Args:
+        covariance: (B, num_dofs, num_dofs) in tangent coordinates.
+        gain: (B,) log-likelihood that a further step would gain.
+        noise: (B,) of the data, metres.
+        shared: (B,) number of data that err together.
+    """
+
+    covariance: Tensor
+    gain: Tensor
+    noise: Tensor
+    shared: Tensor
+
+    @property
+    def converged(self) -> Tensor:
+        """Whether a further step would hardly matter, (B,)."""
+        return self.gain <= _ERRORS.gain
+
+
+def curvature(problem: AlignProblem, pose: Tensor, lying: DataOnSurface | None = None) -> Curvature:
+    """Return the covariance of fitted poses (B, num_dofs), and what another step would gain.
+
+    Neighboring data err together: the correlation of their residuals says how many of them count as one. Beside noise,
+    a patch of the surface errs by what the model is not exact, and of solids so does the whole surface; their
+    proportions may be wrong, too. One datum or two tell nothing surely. What no data tell is as uncertain as the
+    joints' limits leave it, and so is a limb that hardly any data show.
+
+    Args:
+        problem: the batch.
+        pose: fitted.
+        lying: how its data lie in these poses, where that is known.
+    """
+    lying = lying or DataOnSurface.of(problem, pose)
+    distance, jacobian = lying.distance, lying.jacobian
+    noise = surface_noise(distance, problem.valid, problem.size)
+    sigma = SURFACE_FIT.width_per_noise * noise
+    near = welsch_weight((distance / sigma.unsqueeze(-1)).square()) * problem.valid
+    patches = _ERRORS.patches * problem.skin.shape.num_parts
+    inexact = (SURFACE_FIT.min_noise(problem.size) / noise).square() * near.sum(-1) / patches
+    correlation = neighbor_correlation(problem.data, distance, near)
+    shared = correlated_count(correlation) + inexact
+    if problem.told_precision is not None:
+        # As the fit weighed the data against what was told.
+        shared = torch.maximum(shared, errors_per_patch(problem.data, problem.valid, problem.size))
+    precision = plausible_precision(problem, pose)
+    fitted = pose_covariance(jacobian, near, noise * shared.sqrt(), precision)
+    covariance = _sure_covariance(jacobian, near, noise * shared.sqrt(), precision)
+    if problem.landmarks is not None:
+        fitted, covariance = (problem.landmarks.informed(each, pose) for each in (fitted, covariance))
+    gain = _gain(problem, pose, distance, jacobian, noise, fitted) / shared.square()
+    if problem.told_precision is not None:
+        # A fit takes noise for no larger than a share of the size, so that it keeps its hold; what is known must not.
+        error = surface_noise(distance, problem.valid, problem.size, clamped=False)
+        # A depth camera sees all surfaces off by one distance, of the order of the noise: it moves what is not held.
+        gradient = jacobian.mT @ (near / (noise.square() * shared).unsqueeze(-1)).unsqueeze(-1)
+        moved = covariance @ gradient * error[:, None, None]
+        covariance = _of_noisier_data(covariance, precision, (error / noise).square()) + moved @ moved.mT
+    inexact_shape = shape_covariance(
+        problem, pose, distance=distance, jacobian=jacobian, factor=near.sqrt() / noise.unsqueeze(-1),
+        covariance=pose_covariance(jacobian, near, noise, precision), share=correlation,
+    )  # fmt: skip
+    misplaced = torch.diag_embed(_misplaced_share(problem, lying.limb_data) / precision)
+    return Curvature((covariance + misplaced + inexact_shape).to(pose), gain, noise, shared)
+
+
+def _sure_covariance(jacobian: Tensor, weights: Tensor, noise: Tensor, precision: Tensor) -> Tensor:
+    """Return the covariance of `pose_covariance` by what the data surely tell, not one of them or two by chance.
+
+    What they tell of a direction, in units of what is known without them, is a sum over the data, whose standard
+    deviation, if others of their kind had been measured, is the root of the sum of squares: the lower end is taken. A
+    few outliers on the surface seem to tell of turns that a round part does not show; of what hundreds tell it takes a
+    tenth.
+
+    References: Efron 1979, the variance of a sum over resampled data.
+    """
+    known = precision.double().rsqrt()
+    rows = (jacobian * (weights.sqrt() / noise.unsqueeze(-1)).unsqueeze(-1)).double() * known.unsqueeze(-2)
+    told, directions = torch.linalg.eigh(rows.mT @ rows)
+    sure = (told - (rows @ directions).pow(4).sum(-2).sqrt()).clamp_min(0)
+    scaled = directions * known.unsqueeze(-1)
+    return ((scaled / (1 + sure).unsqueeze(-2)) @ scaled.mT).to(jacobian)
+
+
+def _of_noisier_data(covariance: Tensor, precision: Tensor, excess: Tensor) -> Tensor:
+    """Return the covariance of a fit whose data err more than it assumed, by the sandwich of its own weights.
+
+    The fit's estimate has the covariance ``F (e A + P) F`` where ``F = (A + P)^-1``: A is what it took the data to
+    tell, P what was told, and e by how much the data's variance is larger, at least one.
+
+    Args:
+        covariance: (B, D, D) F.
+        precision: (B, D) diagonal of P.
+        excess: (B,) e.
+
+    References: Huber 1967; White 1982.
+    """
+    by_data = covariance - (covariance * precision.to(covariance).unsqueeze(-2)) @ covariance
+    return covariance + (excess.clamp_min(1) - 1)[:, None, None] * by_data
+
+
+def _gain(
+    problem: AlignProblem, pose: Tensor, distance: Tensor, jacobian: Tensor, noise: Tensor, covariance: Tensor
+) -> Tensor:
+    """Return the log-likelihood (B,) that another step of the last fit promises, all data counted."""
+    objective = surface_objective(problem, SURFACE_FIT.width_per_noise * noise, noise)
+    gradient = objective.linearize(pose, distance, jacobian).gradient
+    slope = gradient * ~held_at_limits(gradient, pose, problem.lower, problem.upper)
+    return 0.5 * (slope.unsqueeze(-2) @ covariance @ slope.unsqueeze(-1)).flatten()
+
+
+def hardly_gains(
+    problem: AlignProblem, pose: Tensor, distance: Tensor, jacobian: Tensor, noise: Tensor, covariance: Tensor
+) -> Tensor:
+    """Return whether another step of the last fit would hardly matter, (B,).
+
+    Args:
+        problem: the batch.
+        pose: (B, num_dofs), fitted.
+        distance: (B, M) of the data from the surface.
+        jacobian: (B, M, num_dofs) of the distances.
+        noise: (B,) of the data.
+        covariance: (B, num_dofs, num_dofs), all data counted.
+    """
+    patches = _ERRORS.patches * problem.skin.shape.num_parts
+    shared = (problem.valid.sum(-1) / patches).clamp_min(1)
+    return _gain(problem, pose, distance, jacobian, noise, covariance) / shared <= _ERRORS.gain
+
+
+def _misplaced_share(problem: AlignProblem, limb_data: Tensor) -> Tensor:
+    """Return the probability (B, num_dofs) that a joint is anywhere: that of a limb which hardly any data show."""
+    share = torch.zeros_like(problem.prior.mean)
+    missing = (-limb_data / _ERRORS.limb_data).exp()
+    for column, (limb, _) in enumerate(limb_points(problem.skin)):
+        share[:, limb.dofs] = missing[:, column : column + 1]
+    return share
+
+
+def plausible_precision(problem: AlignProblem, pose: Tensor) -> Tensor:
+    """Return 1 / variance (B, num_dofs) of poses of which no more is known than the limits of the joints."""
+    spans = (problem.upper - problem.lower).expand_as(pose)
+    plausible = plausible_variance(problem.skin.shape, problem.size, spans).reciprocal()
+    return plausible if problem.told_precision is None else torch.maximum(plausible, problem.told_precision)
+
+
+def correlated_count(correlation: Tensor) -> Tensor:
+    """Return how many data (B,) err as one: the sum of the correlations of a residual with all around it.
+
+    The correlation (B,) of nearest neighbors, taken to fall off as a Gaussian with the distance, is summed over a
+    lattice.
+    """
+    step = torch.arange(-_ERRORS.lattice, _ERRORS.lattice + 1).to(correlation)
+    return (correlation.unsqueeze(-1) ** step.square()).sum(-1).square()
+
+
+def neighbor_correlation(data: Tensor, residual: Tensor, weight: Tensor) -> Tensor:
+    """Return the correlation (B,) of the residuals of nearest neighbors, not negative.
+
+    Args:
+        data: (B, M, 3).
+        residual: (B, M) metres.
+        weight: (B, M) of the residuals, from 0 to 1.
+    """
+    stride = -(-data.shape[1] // _ERRORS.num_correlated)
+    together = []
+    for points, errors, shares in zip(data, residual, weight, strict=True):
+        chosen = (shares > 0).nonzero()[:, 0]
+        if len(chosen) < 2:
+            together.append(errors.new_zeros(()))
+            continue
+        points, errors, shares = points[chosen], errors[chosen], shares[chosen]
+        neighbor = NeighborTree(points).k_nearest(points[::stride], 2)[0][:, 1]
+        both = (shares[::stride] * shares[neighbor]).sqrt()
+        product = (both * errors[::stride] * errors[neighbor]).sum() / both.sum().clamp_min(1e-12)
+        together.append(product / ((shares * errors.square()).sum() / shares.sum()).clamp_min(1e-30))
+    return torch.stack(together).clamp(0, _ERRORS.max_correlation)
