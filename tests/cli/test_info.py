@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+import trimesh
+
 
 def test_info_shows_limits_in_degrees_and_meters(run, folder):
     lines = [line.split() for line in run("info", folder / "arm.urdf", "--fixed-base").output.splitlines()]
@@ -22,6 +24,21 @@ def test_info_tells_what_a_result_holds(run, folder, tmp_path, result, plain_han
         assert ["status", "converged"] in lines
         assert ["shape", "Hand"] in lines
         assert ["index_pip_flexion", "0", "deg"] in lines
+
+
+def test_meshes_in_millimeters_are_named_with_the_factor_in_every_command(run, tmp_path):
+    trimesh.creation.box((60.0, 40.0, 300.0)).export(tmp_path / "link.stl")
+    link = "<link name='{}'><visual><geometry><mesh filename='link.stl'/></geometry></visual></link>"
+    (tmp_path / "arm.urdf").write_text(
+        f"<robot name='r'>{link.format('base')}{link.format('upper')}"
+        "<joint name='j' type='revolute'><parent link='base'/><child link='upper'/><origin xyz='0 0 .3'/>"
+        "<axis xyz='1 0 0'/><limit lower='-1' upper='1' effort='1' "
+        "velocity='1'/></joint></robot>"
+    )
+    remedy = 'give <mesh> the attribute scale "0.001 0.001 0.001"'
+    assert remedy in " ".join(run("info", tmp_path / "arm.urdf").output.split())
+    (tmp_path / "cloud.xyz").write_text("nothing\n")
+    assert remedy in run("align", tmp_path / "arm.urdf", tmp_path / "cloud.xyz", "-o", tmp_path / "r").output
 
 
 def test_near_misses_of_shapes_are_answered(error_of):

@@ -200,10 +200,10 @@ def times(numbers, factor, only=None):
     ("content", "words"),
     [
         (chained(times(RIGHT, 1000)), r"links 'base', 'turret', 'upper' and 1 more are .*in millimeters; .* by 0\.001"),
-        (chained(times(RIGHT, 1000), mesh="unit.stl"), r"in millimeters; give <mesh> scale=\"0\.001 0\.001 0\.001\""),
+        (chained(times(RIGHT, 1000), mesh="unit.stl"), r"in millimeters; give <mesh> the .* scale \"0\.001 0\.001 0\.001\""),
         (chained(times(RIGHT, 1000, 2), mesh="unit.stl"), r"link 'upper' is .* beside joints 0\.4 m .*millimeters"),
-        (chained(times(RIGHT, 100), mesh="unit.stl"), r"in centimeters; give <mesh> scale=\"0\.01 0\.01 0\.01\""),
-        (chained(times(RIGHT, 1 / 0.0254), mesh="unit.stl"), r"in inches; give <mesh> scale=\"0\.0254 0\.0254 0"),
+        (chained(times(RIGHT, 100), mesh="unit.stl"), r"in centimeters; give <mesh> the .* scale \"0\.01 0\.01 0\.01\""),
+        (chained(times(RIGHT, 1 / 0.0254), mesh="unit.stl"), r"in inches; give <mesh> the .* scale \"0\.0254 0\.0254 0"),
         (chained(RIGHT, times(STEPS, 1000)), r"joints .*'to_upper'.* up to 400 m from .*beside links .*in millimeters"),
         (chained(RIGHT, times(STEPS, 1000, 1)), r"joint 'to_upper' is up to 400 m from the parent"),
         (chained(RIGHT, slide="0 85"), r"joint 'grip' slides from 0 to 85 m, .* in millimeters; write 0 to 0\.085"),

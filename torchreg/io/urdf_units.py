@@ -74,10 +74,8 @@ def _warn_about_links(
         usual = (step or _median(sizes)) * (_PLAUSIBLE.longest if sum(large) > 1 else 1.0)
         unit, factor = likely_unit(most / usual)
         is_mesh = any(record.link_meshes[link] is not None for link, is_large in enumerate(large) if is_large)
-        scale = f'scale="{factor:g} {factor:g} {factor:g}"'
-        remedy = (
-            f"give <mesh> {scale}, or multiply the scale it has" if is_mesh else f"multiply the sizes by {factor:g}"
-        )
+        attribute = f'the attribute scale "{factor:g} {factor:g} {factor:g}"'  # with "=", it is an option of commands
+        remedy = f"give <mesh> {attribute}, or multiply the one it has" if is_mesh else f"multiply sizes by {factor:g}"
         _warn(
             f"{path}: {_names('link', large, record.link_names)} up to {most:.4g} m large, {beside}: the geometry "
             f"seems to be in {unit}; {remedy}"
