@@ -1,5 +1,7 @@
 """Robot descriptions as ROS's tools read them: XML that is not strict, meshes that are elsewhere or missing."""
 
+import re
+
 import pytest
 import trimesh
 
@@ -169,6 +171,11 @@ def test_a_missing_visual_mesh_gives_way_to_other_geometry(tmp_path):
         assert [solid.kind for solid in load_urdf(path).link_primitives[0]] == ["box"]
 
 
+def rescaled(unit, factor):
+    """The words of a warning about meshes in a unit."""
+    return re.escape(f'in {unit}; give <mesh> the attribute scale "{factor} {factor} {factor}"')
+
+
 def chained(sizes, steps=(0.12, 0.4, 0.36), slide="0 0.08", mount="base", mesh=None):
     """Return a robot of four links, one upon the other, and a finger that slides on the last."""
     names = ("base", "turret", "upper", "fore")
@@ -200,10 +207,10 @@ def times(numbers, factor, only=None):
     ("content", "words"),
     [
         (chained(times(RIGHT, 1000)), r"links 'base', 'turret', 'upper' and 1 more are .*in millimeters; .* by 0\.001"),
-        (chained(times(RIGHT, 1000), mesh="unit.stl"), r"in millimeters; give <mesh> the .* scale \"0\.001 0\.001 0\.001\""),
+        (chained(times(RIGHT, 1000), mesh="unit.stl"), rescaled("millimeters", 0.001)),
         (chained(times(RIGHT, 1000, 2), mesh="unit.stl"), r"link 'upper' is .* beside joints 0\.4 m .*millimeters"),
-        (chained(times(RIGHT, 100), mesh="unit.stl"), r"in centimeters; give <mesh> the .* scale \"0\.01 0\.01 0\.01\""),
-        (chained(times(RIGHT, 1 / 0.0254), mesh="unit.stl"), r"in inches; give <mesh> the .* scale \"0\.0254 0\.0254 0"),
+        (chained(times(RIGHT, 100), mesh="unit.stl"), rescaled("centimeters", 0.01)),
+        (chained(times(RIGHT, 1 / 0.0254), mesh="unit.stl"), rescaled("inches", 0.0254)),
         (chained(RIGHT, times(STEPS, 1000)), r"joints .*'to_upper'.* up to 400 m from .*beside links .*in millimeters"),
         (chained(RIGHT, times(STEPS, 1000, 1)), r"joint 'to_upper' is up to 400 m from the parent"),
         (chained(RIGHT, slide="0 85"), r"joint 'grip' slides from 0 to 85 m, .* in millimeters; write 0 to 0\.085"),
