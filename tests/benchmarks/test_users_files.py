@@ -14,7 +14,7 @@ def bench(loaded_benchmark):
 @pytest.fixture
 def cases(tmp_path):
     """Two cases of which one is right."""
-    for name, content in (("new_bom_xyz", "0 0 0\n" * 50), ("numpy_array", "0 0 0\n" * 49)):
+    for name, content in (("new_bom_xyz", "1 0 0\n" * 50), ("numpy_array", "1 0 0\n" * 49)):
         (tmp_path / name).mkdir()
         (tmp_path / name / "cloud.xyz").write_text(content)
     command = "python: import torchreg; print(len(torchreg.load_points('{dir}/cloud.xyz')), 'points')"
