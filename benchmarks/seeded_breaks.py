@@ -5,9 +5,10 @@
     python benchmarks/seeded_breaks.py --smoke                # one break, to see that it runs
 
 A break swaps a comparison, a sum and a difference, a product and a quotient, "and" and "or", or doubles a number, in
-a function of torchreg, in a copy of the checkout. Places are drawn evenly over the lines of all rooms, the same ones
-for a seed as long as the code stays. The tests of a break are those that import its module, then those of its room and
-of all public names; it is noticed if one of them fails within the limit of time.
+a function of torchreg, in a copy of the checkout. Places are drawn evenly over the lines of all rooms, by a hash of
+the function's name and of what stands there: a function that only moves to another file keeps its breaks.
+The tests of a break are those that import its module, then those of its room and of all public names; it is noticed if
+one of them fails within the limit of time.
 Breaks that change nothing (a bound that no input reaches) stay unnoticed in any suite: compare shares of two suites.
 """
 
@@ -15,8 +16,8 @@ from __future__ import annotations
 
 import argparse
 import ast
+import hashlib
 import os
-import random
 import shutil
 import subprocess
 import sys
@@ -50,9 +51,15 @@ class Break:
     """A place in a file, and the text that stands there instead."""
 
     file: Path
+    function: str
+    original: str
     start: tuple[int, int]
     end: tuple[int, int]
     text: str
+
+    def rank(self, seed: int) -> str:
+        """Return a number drawn for the place, which moving its function to another file does not change."""
+        return hashlib.sha256(f"{seed} {self.function} {self.original} {self.text}".encode()).hexdigest()
 
     @property
     def room(self) -> str:
@@ -76,7 +83,7 @@ def breaks_of(file: Path, root: Path) -> Iterator[Break]:
             pair = replacement(node, source)
             if pair is not None:
                 place, text = pair
-                yield Break(file, (place[0], place[1]), (place[2], place[3]), text)
+                yield Break(file, function.name, ast.dump(node), (place[0], place[1]), (place[2], place[3]), text)
 
 
 def replacement(node: ast.AST, source: str) -> tuple[tuple[int, int, int, int], str] | None:
@@ -107,12 +114,10 @@ def compiles(found: Break, root: Path) -> bool:
 
 def drawn(count: int, seed: int, root: Path, rooms: Sequence[str] = ()) -> list[Break]:
     """Return breaks at seeded places, spread over the lines of all rooms."""
-    generator = random.Random(seed)
     every = [
         found for path in sorted((root / "torchreg").rglob("*.py")) for found in breaks_of(path.relative_to(root), root)
     ]
-    every = [found for found in every if not rooms or found.room in rooms]
-    generator.shuffle(every)
+    every = sorted((found for found in every if not rooms or found.room in rooms), key=lambda found: found.rank(seed))
     chosen = (found for found in every if compiles(found, root))
     return [found for _, found in zip(range(count), chosen, strict=False)]
 
@@ -179,7 +184,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     made, seen = Counter(found.room for found in chosen), Counter()
     for found, is_seen in zip(chosen, noticed, strict=True):
         seen[found.room] += is_seen
-        print(f"{'noticed' if is_seen else 'MISSED '} {found.file}:{found.start[0]} {found.text.strip()}")
+        print(
+            f"{'noticed' if is_seen else 'MISSED '} {found.file}:{found.start[0]} {found.function} {found.text.strip()}"
+        )
     for room, count in sorted(made.items()):
         print(f"{room:14} {seen[room]:4} of {count:4}")
     print(f"noticed {sum(noticed)} of {len(noticed)}, {sum(noticed) / max(len(noticed), 1):.0%}")
