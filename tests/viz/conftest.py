@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 import torchreg as tr
 from torchreg.registration.bones.sparse_grid import SparseGrid
@@ -17,7 +17,7 @@ DOUBLE = {"dtype": torch.float64}
 
 
 class GltfViewer:
-    """Evaluates a file as the specification says: tracks at the key frames, hierarchy, inverse bind matrices, skin."""
+    """Evaluates a file as the specification says: tracks, hierarchy, inverse bind matrices, skin, moved shapes."""
 
     def __init__(self, path):
         self.gltf = pygltflib.GLTF2().load(str(path))
@@ -33,24 +33,44 @@ class GltfViewer:
         return self.read(self.gltf.animations[0].samplers[0].input)[:, 0]
 
     def attribute(self, name):
-        return self.read(getattr(self.gltf.meshes[0].primitives[0].attributes, name))
+        index = getattr(self.gltf.meshes[0].primitives[0].attributes, name, None)
+        return None if index is None else self.read(index)
 
     def joint_names(self):
         return [self.gltf.nodes[node].name for node in self.gltf.skins[0].joints]
 
     def vertices(self, frame):
+        return self.at(float(self.seconds()[frame]))
+
+    def at(self, time):
+        """Return the vertices (V, 3) at a time, in seconds."""
+        if not self.gltf.skins:
+            return self.morphed(time)
+        world, skin = self.placed(time), self.gltf.skins[0]
+        inverse = self.read(skin.inverseBindMatrices).astype(float).reshape(-1, 4, 4).transpose(0, 2, 1)
+        joints = np.stack([world[node] @ bind for node, bind in zip(skin.joints, inverse, strict=True)])
+        points = np.c_[self.attribute("POSITION").astype(float), np.ones(len(self.attribute("POSITION")))]
+        total = np.zeros_like(points)
+        for number in "01":
+            if (index := self.attribute(f"JOINTS_{number}")) is not None:
+                moved = np.einsum("vsij,vj->vsi", joints[index], points)
+                total += np.einsum("vs,vsi->vi", self.attribute(f"WEIGHTS_{number}"), moved)
+        return total[:, :3]
+
+    def placed(self, time):
+        """Return the transforms of the nodes in the world."""
         local = [np.eye(4) for _ in self.gltf.nodes]
         for matrix, node in zip(local, self.gltf.nodes, strict=True):
             matrix[:3, :3] = Rotation.from_quat(node.rotation or (0, 0, 0, 1)).as_matrix()
             matrix[:3, 3] = node.translation or (0, 0, 0)
-        animation = self.gltf.animations[0]
-        for channel in animation.channels:
-            value = self.read(animation.samplers[channel.sampler].output)[frame].astype(np.float64)
-            matrix = local[channel.target.node]
+        for channel in self.gltf.animations[0].channels:
+            sampler = self.gltf.animations[0].samplers[channel.sampler]
+            keys, values = self.read(sampler.input)[:, 0].astype(float), self.read(sampler.output).astype(float)
+            at, matrix = float(np.clip(time, keys[0], keys[-1])), local[channel.target.node]
             if channel.target.path == "translation":
-                matrix[:3, 3] = value
+                matrix[:3, 3] = [np.interp(at, keys, row) for row in values.T]
             else:
-                matrix[:3, :3] = Rotation.from_quat(value).as_matrix()
+                matrix[:3, :3] = Slerp(keys, Rotation.from_quat(values))(at).as_matrix()
         world = {}
 
         def visit(node, above):
@@ -60,17 +80,15 @@ class GltfViewer:
 
         for root in self.gltf.scenes[0].nodes:
             visit(root, np.eye(4))
-        skin = self.gltf.skins[0]
-        inverse = self.read(skin.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1)
-        joints = np.stack([world[node] @ bind for node, bind in zip(skin.joints, inverse, strict=True)])
-        positions = self.attribute("POSITION")
-        points = np.c_[positions, np.ones(len(positions))]
-        total = np.zeros_like(points)
-        for name in ("0", "1"):
-            if getattr(self.gltf.meshes[0].primitives[0].attributes, f"JOINTS_{name}", None) is not None:
-                moved = np.einsum("vsij,vj->vsi", joints[self.attribute(f"JOINTS_{name}")], points)
-                total += np.einsum("vs,vsi->vi", self.attribute(f"WEIGHTS_{name}"), moved)
-        return total[:, :3]
+        return world
+
+    def morphed(self, time):
+        primitive, (sampler,) = self.gltf.meshes[0].primitives[0], self.gltf.animations[0].samplers
+        keys = self.read(sampler.input)[:, 0]
+        shares = self.read(sampler.output).reshape(len(keys), -1)
+        targets = zip(shares.T, primitive.targets, strict=True)
+        moves = [np.interp(time, keys, row) * self.read(target["POSITION"]) for row, target in targets]
+        return self.read(primitive.attributes.POSITION) + sum(moves)
 
 
 def _ball(level, dtype=torch.float32):
