@@ -119,9 +119,7 @@ def test_a_killed_worker_does_not_stop_the_sweep(engine_name, store, probe_sweep
     )
     assert (summary.ran, summary.failed, summary.unfinished) == (3, 1, 0)
     records = {record.config["outcome"]: record for record in store.records()[0]}
-    assert {name: record.status for name, record in records.items()} == {
-        "done": "done", "killed once": "done", "killed": "failed",
-    }  # fmt: skip
+    assert [records[name].status for name in ("done", "killed once", "killed")] == ["done", "done", "failed"]
     assert "died 3 times" in records["killed"].note
     assert records["killed once"].attempt == 2
 
@@ -147,15 +145,11 @@ def test_all_engines_find_the_same_bit_for_bit(tmp_path, ray_cluster, monkeypatc
     assert found("none", "adaptive") != expected
 
 
-def test_an_engine_passes_on_that_results_cannot_be_written(tmp_path, monkeypatch):
+def test_an_engine_passes_on_that_results_cannot_be_written(tmp_path):
     """The folder is gone when the worker gets there."""
     engine = make_engine("local", EngineConfig())
-    job = Job(str(tmp_path / "gone"), "probe", "x", {}, "s")
-    try:
-        with pytest.raises(StoreError, match=r"gone/claims/x cannot be written: No such file or directory"):
-            list(engine.run([job]))
-    finally:
-        engine.close()
+    with contextlib.closing(engine), pytest.raises(StoreError, match=r"gone/claims/x cannot be written: No such file"):
+        list(engine.run([Job(str(tmp_path / "gone"), "probe", "x", {}, "s")]))
 
 
 def test_two_drivers_share_a_sweep(tmp_path, start_driver):
@@ -203,33 +197,29 @@ def test_engines_that_cannot_be_are_refused(name, settings, message, monkeypatch
         make_engine(name, EngineConfig(**settings))
 
 
-def test_gpus_are_found_without_torch(monkeypatch, tmp_path):
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2, 5")
-    assert visible_gpus() == ["2", "5"]
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
-    assert visible_gpus() == []
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+def test_gpus_are_found_without_torch_and_shared_out_among_local_workers(monkeypatch, tmp_path):
     tool = tmp_path / "nvidia-smi"
     tool.write_text("#!/bin/sh\necho 'GPU 0: a'\necho 'GPU 1: b'\n")
     tool.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
-    assert visible_gpus() == ["0", "1"]
-    monkeypatch.setenv("PATH", "")
-    assert visible_gpus() == []
-
-
-def test_gpus_are_shared_out_among_local_workers(store, probe_sweep, monkeypatch):
-    """Each worker sees one; a task without use for it does not see it."""
+    found = f"{tmp_path}:/usr/bin:/bin"
+    cases = (("2, 5", "", ["2", "5"]), ("", found, []), (None, found, ["0", "1"]), (None, "", []))
+    for visible, path, expected in cases:
+        with monkeypatch.context() as patch:
+            patch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+            if visible is not None:
+                patch.setenv("CUDA_VISIBLE_DEVICES", visible)
+            patch.setenv("PATH", path)
+            assert visible_gpus() == expected
+    # Each worker sees one.
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "4,7")
     engine = make_engine("local", EngineConfig(jobs=3))
     try:
         pools = [engine._new_pool(slot) for slot in range(3)]
-        seen = [pool.submit(os.getenv, "CUDA_VISIBLE_DEVICES").result() for pool in pools]
+        assert [pool.submit(os.getenv, "CUDA_VISIBLE_DEVICES").result() for pool in pools] == ["4", "7", "4"]
         for pool in pools:
             pool.shutdown()
     finally:
         engine.close()
-    assert seen == ["4", "7", "4"]
 
 
 def test_ray_listens_on_the_loopback_alone_and_its_death_is_an_error(monkeypatch):
