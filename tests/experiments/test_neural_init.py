@@ -134,25 +134,6 @@ def test_a_refiner_thinks_in_the_frame_of_the_palm(hand, clouds):
     torch.testing.assert_close(other, one @ half + shift, atol=1e-4, rtol=0)
 
 
-def test_a_network_in_half_precision_may_stand_around_the_initializer(hand, clouds, prior):
-    """Its poses come in bfloat16 under autocast; the layer between computes in float32, and hands gradients back."""
-    some, model = clouds.rows(slice(2)), PoseRegressor(hand, 8)
-    model.start_from_(prior)
-    layer = tr.PoseInitializer(hand, tr.PoseInitializerConfig(fit_steps=3, newton_steps=1))
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        start = model(some)
-        raw = model.net(some.points - some.centers.unsqueeze(1), some.points.new_zeros(2, 0))
-        found = layer(some.points, start=start)
-    assert raw.dtype == torch.bfloat16
-    assert found.pose.dtype == found.keypoints.dtype == torch.float32
-    exact = layer(some.points, start=start.detach().requires_grad_())
-    assert apart(hand, found.pose, exact.pose).max() < 1e-5
-    found.keypoints.square().sum().backward()
-    gradient = model.net.last.weight.grad
-    assert gradient.dtype == torch.float32
-    assert 0 < gradient.abs().max() < math.inf
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
