@@ -89,13 +89,6 @@ def test_bars_of_big_scans_are_of_time_memory_and_error(load, capsys, cost, verd
     assert big_scan(load("big_scans"), capsys, *cost) == verdict
 
 
-def test_intervals_of_shares_hold_them_and_shrink(load):
-    for share, count in ((0.0, 5), (0.7, 10), (1.0, 40)):
-        (low, high), (lower, higher) = (load("confidence").wilson_interval(share, n) for n in (count, 4 * count))
-        assert -1e-9 <= low <= share <= high <= 1 + 1e-9
-        assert higher - lower < high - low
-
-
 def test_true_correspondences_have_the_largest_logits(load):
     truth, places = (
         tensor([[0.0, 0, 0], [1, 0, 0], [9, 0, 0]]).double(),

@@ -35,11 +35,6 @@ def test_big_clouds_of_the_arm_lie_on_it_but_for_the_outliers(load, tmp_path):
     assert 0.85 < float(near.double().mean()) < 0.97
 
 
-def test_sizes_of_modules_are_learned_within_a_few_steps(load):
-    rows = dict(load("modules").sizes_rows(load("modules").Effort(steps=25, frames=2, points=300)))
-    assert float(rows["sizes, poses known"].split()[-4]) < 0.5
-
-
 def test_poses_to_find_have_any_rotation_and_joints_bent_to_half_their_range(load, plain_hand):
     bench, generator = load("find_pose"), torch.Generator().manual_seed(1)
     poses = torch.stack([bench.random_pose(plain_hand, generator) for _ in range(300)])
@@ -335,22 +330,3 @@ def test_spines_of_files_are_judged_by_their_vertices_and_timed(load, tmp_path, 
     bench.main(["--smoke", "--part", "speed", "--data", str(tmp_path)])
     assert given == [(3, 2)]
     assert "3 frames of" in capsys.readouterr().out
-
-
-def test_people_who_are_found_are_counted(load, capsys, monkeypatch):
-    bench, vertices = load("shape_fit"), torch.rand(50, 3, generator=torch.Generator().manual_seed(0)).double()
-    person = SimpleNamespace(vertices=vertices)
-    fits = iter([(0.001, tr.Status.CONVERGED), (0.4, tr.Status.CONVERGED), (0.4, tr.Status.DOUBTFUL)])
-
-    def fit(shape, person, start, config):
-        assert start is None
-        assert config.upright == (0, 0, 1)
-        off, status = next(fits)
-        return vertices + off, SimpleNamespace(status=status, confidence=0.5), 1.0
-
-    for name, value in (("load_model", lambda *_: None), ("make_person", lambda *_: person), ("fit", fit)):
-        monkeypatch.setattr(bench, name, value)
-    anny = SimpleNamespace(part_names=["root"], up=(0, 0, 1))
-    monkeypatch.setattr(tr.ArticulatedShape, "from_anny", lambda kind: anny)
-    assert not bench.search("body", range(3), upright=True)
-    assert "within 1.5% of the size: 1 of 3; 1 converged and not within" in capsys.readouterr().out

@@ -156,15 +156,6 @@ def test_truths_of_animals_are_where_the_target_was_scanned(load, bar, monkeypat
     assert "all" in printed
 
 
-def test_without_mujoco_there_are_no_animals(load, tmp_path, capsys, monkeypatch):
-    bench = load("scan_animals")
-    monkeypatch.setitem(bench.ANIMALS, "dog", "dog.xml")
-    (tmp_path / "dog.xml").write_text("<mujoco/>")
-    monkeypatch.setattr(bench.importlib.util, "find_spec", lambda name: None)
-    assert bench.main(["--animals", str(tmp_path)]) == 0
-    assert "torchreg-articulated[benchmark]" in capsys.readouterr().out
-
-
 def test_skins_follow_their_bones_as_mujoco_draws_them(load):
     mujoco, bench, data = pytest.importorskip("mujoco"), load("scan_animals"), []
     folder = bench.animals_folder() or pytest.skip("dm_control is not installed")
