@@ -1,6 +1,5 @@
 """The example of neural poses: what each variant of training starts from and sees, its data, and its summary."""
 
-import math
 from dataclasses import replace
 
 import pytest

@@ -116,16 +116,6 @@ def test_a_sweep_runs_once_and_a_longer_one_runs_the_rest(store, probe_sweep, in
     assert set(inline_engine.ran.values()) == {1}
 
 
-def test_failed_trials_run_again_on_request_only(store, probe_sweep, inline_engine):
-    sweep = probe_sweep(grid={"outcome": ["done", "failed", "skipped"]})
-    first = run(sweep, store, inline_engine)
-    assert (first.failed, first.skipped, first.ran) == (1, 1, 3)
-    again = run(sweep, store, inline_engine)
-    assert (again.kept, again.ran, again.failed, again.skipped) == (3, 0, 1, 1)
-    retried = run(sweep, store, inline_engine, retry_failed=True)
-    assert (retried.kept, retried.ran) == (1, 2)
-
-
 def test_an_edited_configuration_keeps_the_old_results(store, probe_sweep, inline_engine):
     run(probe_sweep(trial=ProbeTrial(size=4)), store, inline_engine)
     before = {path.name: path.read_bytes() for path in store.trials.iterdir()}
