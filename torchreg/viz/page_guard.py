@@ -83,7 +83,7 @@ class PageGuard:
 
     @contextmanager
     def around_start(self) -> Iterator[None]:
-        """Guard the server that is started in a ``with`` block; ``engaged`` tells whether one was."""
+        """Guard the server that is started in a ``with`` block; ``engaged`` says whether one was."""
         from websockets.asyncio import server
 
         plain = server.serve

@@ -62,7 +62,7 @@ class PoseEditor:
         frame: of a `SequenceRegistration`, whose pose is the first one.
         start: (B, 4, 4) the first pose instead, such as ``transforms`` of a `PoseSolution`.
         config: of the solver.
-        up: the upright direction; by default that of the registration, or as its points tell it.
+        up: the upright direction; by default that of the registration, or guessed from its points.
 
     Raises:
         InputError: if there is no such frame or ``start`` does not fit.
