@@ -25,15 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AlignBatch:
-    """Alignments in centered coordinates.
-
-    Args:
-        problem: of B clouds.
-        start: (B, num_dofs).
-        origin: (B, 3) of the coordinates.
-        on_step: the caller's.
-        history: records of all stages, to which those of any rows are added.
-    """
+    """B alignments in centered coordinates: starts (B, num_dofs), origins (B, 3), and the records of all stages."""
 
     problem: AlignProblem
     start: Tensor
@@ -109,10 +101,7 @@ def fit_batch_surface(batch: AlignBatch, found: StageResult, config: AlignConfig
 
 
 def keep_searched(batch: AlignBatch, found: StageResult, config: AlignConfig) -> StageResult:
-    """Return the result, or the start on the surface where that is better: a pose that was searched for needs no EM.
-
-    Data of one side draw an EM, whose kernel is wide at first, into the shape.
-    """
+    """Return the result, or the fitted start where that is better: an EM may draw one-sided data inwards."""
     if config.surface_steps == 0:
         return found
     steps, widths = max(config.surface_steps, SURFACE_FIT.search_steps), SURFACE_FIT.widths[-1:]

@@ -41,13 +41,7 @@ _SEARCH = _BaseSearch()
 
 @dataclass(frozen=True, eq=False)
 class PosedModel:
-    """The robot in the joints of a frame, in base coordinates.
-
-    Args:
-        points: (N, 3) of its surface.
-        normals: (N, 3) outwards.
-        tree: of the points.
-    """
+    """The robot in the joints of a frame, in base coordinates: points and outward normals (N, 3)."""
 
     points: Tensor
     normals: Tensor
@@ -62,16 +56,11 @@ class PosedModel:
 
 
 def search_base(frames: Sequence[BaseFrame], models: Sequence[PosedModel], size: float) -> tuple[Tensor, Tensor]:
-    """Return candidates (K, 4, 4) ``T_camera_base``, different ones, best first, and their costs (K,).
+    """Return different candidates (K, 4, 4) ``T_camera_base``, best first, and their costs (K,).
 
-    Rotations from all around, each with the base where the seen sides of the models lie on the clouds; then iterated
-    closest points with a kernel that narrows, over all frames together, of ever fewer candidates. Costs count data far
-    from the model, and model points that face the camera where nothing was seen.
+    Iterated closest points with a narrowing kernel from rotations all around. Costs count data far from the model, and
 
-    Args:
-        frames: T clouds.
-        models: T models of the robot in the frames' joints.
-        size: of the robot, metres.
+    model points that face the camera where nothing was measured.
     """
     data = _drawn(frames)
     candidates = _starts(data, models)

@@ -59,18 +59,7 @@ class CalibrateConfig:
 
 @dataclass(frozen=True)
 class CalibrateRecord:
-    """One joint fit at one kernel width, as given to ``on_step``.
-
-    Args:
-        round: number of the round.
-        step: number of the fit in the round.
-        num_steps: fits per round.
-        sigma: kernel width, metres.
-        cost: of the fit.
-        poses: (T, num_dofs).
-        log_length_scales: (P,).
-        log_radius_scales: (P,).
-    """
+    """One joint fit at one kernel width, as given to ``on_step``: poses (T, num_dofs), scales (P,), sigma in metres."""
 
     round: int
     step: int

@@ -41,13 +41,7 @@ _MISFIT = _Misfit()
 
 @dataclass(frozen=True, eq=False)
 class DataOnSurface:
-    """How the data lie on the surface in some poses.
-
-    Args:
-        distance: (B, M) of the data from it, metres.
-        jacobian: (B, M, num_dofs) of the distances.
-        limb_data: (B, L) number of data that only one limb explains, see `limb_data`.
-    """
+    """Distances (B, M) of data from the surface in some poses, metres, their Jacobian, and `limb_data` (B, L)."""
 
     distance: Tensor
     jacobian: Tensor
@@ -60,16 +54,7 @@ class DataOnSurface:
 
 
 def pose_confidence(problem: AlignProblem, pose: Tensor, lead: Tensor) -> Tensor:
-    """Return the confidence (B,) in poses, from 0 to 1.
-
-    It is low if a different pose explains nearly as many data, if data lie beside the surface or in dense clusters, or
-    if the data do not determine where the limbs end.
-
-    Args:
-        problem: the batch; its prior holds joints that no data show.
-        pose: (B, num_dofs), fitted.
-        lead: (B,) by how many data more than the best of different poses it explains.
-    """
+    """Return the confidence (B,) in fitted poses from the ``lead`` over rivals, misfit, clusters and limbs' ends."""
     return explains(problem, pose, lead) * known_ends(problem, pose)
 
 
@@ -86,10 +71,7 @@ def left_over(problem: AlignProblem, pose: Tensor) -> Tensor:
 
 
 def is_misfit(problem: AlignProblem, pose: Tensor) -> Tensor:
-    """Return a mask (B,) of poses that leave too many data beside the surface: outliers are spread more thinly.
-
-    The noise is left out, since a wrong pose makes it look larger than it is: noisy data are misfits, too.
-    """
+    """Return a mask (B,) of poses that leave too many data near the surface; outliers are spread more thinly."""
     return beside_share(problem, pose, OffSurface(noises=0.0)) > _MISFIT.share
 
 
@@ -107,25 +89,15 @@ def share_beside(problem: AlignProblem, distance: Tensor, off: OffSurface = OFF_
 
 
 def known_ends(problem: AlignProblem, pose: Tensor) -> Tensor:
-    """Return the probability (B,) that the limbs end where poses (B, num_dofs) have them.
-
-    The mean of the ends' spreads is taken for that of a Rayleigh distribution's squares, of which a share lies within
-    the tolerance.
-    """
+    """Return the probability (B,), by Rayleigh's distribution, that the ends of limbs lie within the tolerance."""
     spread = end_spreads(problem, pose).mean(-1)
     return 1 - (-(EVIDENCE.tolerance * problem.size / spread).square()).exp()
 
 
 def end_spreads(problem: AlignProblem, pose: Tensor, lying: DataOnSurface | None = None) -> Tensor:
-    """Return by how much the ends (B, L) of the limbs may be off in poses (B, num_dofs), metres.
+    """Return the standard deviations (B, L) of the limbs' ends, metres, by the covariance of the pose.
 
-    The position of an end spreads by the covariance of the pose, given the data near the surface and the prior; that of
-    a limb which explains no data alone spreads by the prior.
-
-    Args:
-        problem: the batch.
-        pose: (B, num_dofs), fitted.
-        lying: how its data lie in these poses, where that is known.
+    A limb without data of its own spreads by the prior. ``lying`` are precomputed residuals.
     """
     if problem.data.shape[-2] > EVIDENCE.num_data:
         problem, lying = problem.draw(EVIDENCE.num_data, torch.Generator().manual_seed(0)), None

@@ -226,12 +226,7 @@ def search_everywhere(
 
 @dataclass(frozen=True, eq=False)
 class FoundStarts:
-    """Starts, and by how much the first is better than others.
-
-    Args:
-        starts: best first.
-        lead: (B,) cost by which the best of different poses is worse than the first; infinite where there is none.
-    """
+    """Starts, best first, and the cost (B,) by which the best of different poses is worse, or infinity."""
 
     starts: PoseStarts
     lead: Tensor
@@ -240,10 +235,7 @@ class FoundStarts:
 def _find(
     problem: AlignProblem, frames: Sequence[DepthFrame], source: StartSource, config: FindPoseConfig
 ) -> tuple[Tensor, Tensor]:
-    """Return candidates (B, H, num_dofs), best first, and their costs: a network's, and those of a search if doubtful.
-
-    The search is of no use where all that is doubtful is where limbs end that no data show.
-    """
+    """Return candidates (B, H, num_dofs), best first, and costs: a network's, and a search's if in doubt."""
     problem, proposed = source.proposed(problem, _CANDIDATES.proposed)
     if proposed.shape[1] == 0:
         return _search_with_retries(problem, source, config, proposed)
@@ -281,14 +273,7 @@ def _search_with_retries(
 def _search(
     problem: AlignProblem, source: StartSource, config: FindPoseConfig, proposed: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return candidates (B, H, num_dofs) after one search, best first, and their costs.
-
-    Args:
-        problem: the batch.
-        source: of rough poses.
-        config: of the search.
-        proposed: (B, K, num_dofs) that lie on the data already.
-    """
+    """Return candidates (B, H, num_dofs) after one search, best first, and their costs."""
     generator = torch.Generator().manual_seed(config.seed)
     search = PoseSearch(problem, generator)
     rough = source.rough(search.problem, generator)
@@ -304,11 +289,7 @@ def _search(
 
 
 def _registered(problem: AlignProblem, poses: Tensor, config: FindPoseConfig, generator: torch.Generator) -> Tensor:
-    """Return the best candidates (B, H, num_dofs) of some (B, K, num_dofs) after an alignment of all their joints.
-
-    The limbs of a skin are not placed one after another: the solids that stand for its parts are too rough for that,
-    and bones of a spine, rather than a trunk that is found first, lie between them.
-    """
+    """Return the best candidates (B, H, num_dofs) after an alignment of all joints: limbs of skins are not placed."""
     settings, found, count = AlignConfig(), [], poses.shape[1]
     drawn = replace(problem.draw(SEARCH_BUDGET.num_data, generator), debias=settings.debias)
     schedule, shape = ANNEALING.schedule(problem.size), problem.skin.shape

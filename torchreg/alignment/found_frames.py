@@ -29,15 +29,7 @@ _TRUST = _Trust()
 
 @dataclass(frozen=True, eq=False)
 class FramePoses:
-    """Poses of T frames.
-
-    Args:
-        poses: (T, num_dofs).
-        statuses: of the alignments, T.
-        confidence: (T,) in them.
-        known: (T,) bool, whether the pose is a start for the next alignment; else the shape is searched in the frame.
-        searched: whether poses were not given.
-    """
+    """Poses (T, num_dofs), statuses, confidence (T,), and which are ``known`` (T,), starts for the next alignment."""
 
     poses: Tensor
     statuses: tuple[Status, ...]

@@ -27,14 +27,7 @@ Answer = TypeVar("Answer", AlignResult, PoseStarts)
 def surest_crop(
     frame: DepthFrame, size: float, answer: Callable[[DepthFrame], Answer], glance: Callable[[DepthFrame], float]
 ) -> tuple[Answer, DepthFrame]:
-    """Return the answer of highest confidence for the crops of a frame, and that crop; nearer ones are tried first.
-
-    Args:
-        frame: the picture.
-        size: of the shape, metres.
-        answer: what is found in a crop.
-        glance: how well a crop is explained at first sight, from 0 to 1: of a surface, the best are tried first.
-    """
+    """Return the answer of highest confidence for the crops of a frame, and that crop; near ones are tried first."""
     best: tuple[Answer, DepthFrame] | None = None
     for crops in candidate_crops(frame, size):
         for crop, is_likely in _likely_first(crops, glance):

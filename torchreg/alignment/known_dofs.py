@@ -25,13 +25,7 @@ _HELD_STD = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class KnownDofs:
-    """What is known of a pose.
-
-    Args:
-        locked: (num_dofs,) True for what is held at its start.
-        mean: (num_dofs,) or (B, num_dofs) of a prior; zero where it has none.
-        std: of the prior, of the same size; infinite where it has none.
-    """
+    """Locked degrees of freedom (num_dofs,), and mean and std ((B,) num_dofs) of a prior; zero and infinite without."""
 
     locked: Tensor
     mean: Tensor
@@ -39,18 +33,7 @@ class KnownDofs:
 
     @classmethod
     def of(cls, shape: ArticulatedShape, locked: Any, prior: Any) -> KnownDofs | None:
-        """Return what users say; None if that is nothing.
-
-        Args:
-            shape: the articulated shape.
-            locked: names of degrees of freedom, "base" for all six of the base, or a mask (num_dofs,).
-            prior: mean and standard deviation, metres and radians: each a tensor (num_dofs,) or (B, num_dofs), or a
-                dictionary by name; the deviation also one number for all that the mean names, the joints of a tensor.
-
-        Raises:
-            InputError: if a name is unknown, a size does not fit or a deviation is not positive.
-            InputTypeError: if something has the wrong type.
-        """
+        """Parse ``locked`` and ``prior`` as given to `align`; None if there is neither."""
         held = _read_locked(shape, locked)
         if prior is None:
             return (
@@ -90,9 +73,9 @@ class KnownDofs:
         return replace(self, mean=torch.where(self.std.isfinite(), shifted(self.mean, -origin.to(self.mean)), 0.0))
 
     def applied(self, problem: AlignProblem, start: Tensor) -> AlignProblem:
-        """Return a problem whose prior and limits hold what is known, about starts (B, num_dofs), centered as it is.
+        """Return a problem with this prior and these limits about starts (B, num_dofs), centered as the problem is.
 
-        Neighboring data err together: the prior counts as many times as data share an error.
+        The prior counts as many times as data share an error.
         """
         has_prior = self.std.isfinite()
         mean = torch.where(has_prior, shifted(self.mean.expand_as(start), -problem.origin), problem.prior.mean)

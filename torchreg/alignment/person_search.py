@@ -56,18 +56,11 @@ def find_people(
     generator: torch.Generator,
     upright: Direction | None = None,
 ) -> Tensor:
-    """Return states (count, D + K) of people that may be what a scan shows, the likeliest first.
+    """Return states (count, D + K) from a global search of pose and coefficients in a scan, best first.
 
-    People of all sizes, in evenly spread rotations or turned about the vertical, are registered rigidly to the scan,
-    and ranked by the data far from them and by how much of them is far from the data.
+    Coefficients (S, K) in evenly spread or upright rotations are registered rigidly, and ranked by unexplained data and
 
-    Args:
-        problem: of one scan.
-        rig: whose degrees of freedom a state begins with.
-        people: (S, K) coefficients.
-        count: of states, at most.
-        generator: of what is drawn.
-        upright: see `AlignConfig`.
+    surface.
     """
     turns = spread_rotations(_SEARCH.num_rotations) if upright is None else UprightRotations(upright).rotations(rig.up)
     rotations = so3_log(turns).to(people)
@@ -88,17 +81,9 @@ def find_people(
 
 
 def swung_people(problem: ShapeProblem, state: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Return a person (D + K,) with one limb swung to where more of a scan is explained, (count, D + K), best first.
+    """Return a state (D + K,) with one limb re-initialized where it explains more data, (count, D + K), best first.
 
-    A limb that begins on the data of another does not leave them, and its own are left over. Each limb, with all that
-    hangs on it, is tried over the range of each of its joints, the others as the prior has them, those above it also as
-    they are; what explains data and is explained by them is ranked first, as in `find_people`.
-
-    Args:
-        problem: of one scan.
-        state: fitted; its size and the rest of its pose are kept.
-        count: of states, at most; none without limbs of less than half of the surface.
-        generator: of the data that are looked at.
+    A limb that begins on the data of another does not leave them. Each is sampled over its joints' ranges.
     """
     rig, mean, size = problem.skin.shape.rig, problem.prior.mean[0], problem.size
     bodies, drawn = find_bodies(rig), problem.draw(_SEARCH.num_data, generator)
@@ -140,14 +125,7 @@ def _with_joints(state: Tensor, bodies: Sequence[Body], values: Tensor) -> Tenso
 
 
 def turned_people(problem: ShapeProblem, state: Tensor) -> Tensor:
-    """Return a person (D + K,) turned to both sides about each axis of space, joints as the prior has them, (6, D + K).
-
-    A person that leans explains one leg by the other, whose own data are left; no step leads upright from there.
-
-    Args:
-        problem: of one scan.
-        state: fitted; its size is kept.
-    """
+    """Return a state (D + K,) rotated to both sides about each axis, joints at the prior's mean, (6, D + K)."""
     num_dofs = problem.skin.shape.rig.num_dofs
     axes = torch.eye(3).to(state)
     turned = state.repeat(6, 1)
@@ -158,13 +136,7 @@ def turned_people(problem: ShapeProblem, state: Tensor) -> Tensor:
 
 
 def lead_over_rivals(problem: AlignProblem, states: Tensor, costs: Tensor) -> Tensor:
-    """Return the cost (1,) by which the best of different states (S, D + K) is worse than the best, or infinity.
-
-    Args:
-        problem: of one scan, in rows as the states.
-        states: fitted.
-        costs: (S,).
-    """
+    """Return the cost (1,) by which the best of different states (S, D + K) is worse than the best, or infinity."""
     best = int(costs.argmin())
     apart = mean_distances(problem, states.unsqueeze(0))[0, best] > _SEARCH.other * problem.size
     return torch.where(apart, costs, math.inf).amin().unsqueeze(0) - costs[best]

@@ -25,19 +25,18 @@ from torchreg.shapes.limbs import Limb
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What speaks for or against poses, (B,) each, from 0 (good) to about 1.
+    """Evidence against poses, (B,) each, from 0 (good) to about 1.
 
     Args:
         noise: of the data about the surface, from the least (0) to the largest (1) that a fit assumes, in logarithms.
-        beside: root of the share of the data that lie beside the surface, not far.
+        beside: root of the share of near outliers.
         clusters: root of the data in dense clusters off the surface, as a share of those on it.
         off: share of the data that are not on the surface.
-        free_space: root of the data that the shape's points in free space stand for, as a share of the data.
-        unknown: probability that the data do not tell where the limbs end.
-        rival: how near the second-best pose of a search comes, 0 for a start that was given.
-        rival_share: the same, relative to the number of data.
-        open_rim: square of `open_rims`, as a little of it is usual; zero for clouds.
-        planes: square of `planes_instead`, as for the rim.
+        free_space: root of the data that points in free space stand for, as a share of the data.
+        unknown: probability that the data do not determine the ends of the limbs.
+        rival: how near the second-best pose of a search comes, 0 for a given start; `rival_share` relative to the data.
+        open_rim: square of `open_rims`; zero for clouds.
+        planes: square of `planes_instead`.
     """
 
     noise: Tensor
@@ -97,12 +96,9 @@ SHAPE_CALIBRATION = Calibration(
 
 @dataclass(frozen=True)
 class SurfaceError:
-    """Standard errors of the surface of a fit of pose and shape together, by their joint covariance.
+    """Standard errors, metres, of a surface fitted with its coefficients: the whole (B,), the parts (B, P).
 
-    Args:
-        whole: (B,) root mean square over the surface, metres.
-        parts: (B, P) the same over each part, zero where it has no points.
-        moved: (B,) root mean square by which the fit's last step moved the surface, metres.
+    `moved` (B,) is the root mean square by which the last step moved the surface.
     """
 
     whole: Tensor
@@ -125,13 +121,7 @@ class SurfaceError:
 
 
 def without_cut(problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame]) -> AlignProblem:
-    """Return a problem without the data that a crop cuts off, as a forearm: they speak neither for nor against a pose.
-
-    Args:
-        problem: the batch.
-        pose: (B, num_dofs), fitted.
-        frames: whose points the data are, in their order; others stay.
-    """
+    """Return a problem without the data that a crop cuts off, such as a forearm, in fitted poses (B, num_dofs)."""
     if len(frames) != len(pose):
         return problem
     distance = problem.surface.distance(problem.data, pose)
@@ -146,15 +136,9 @@ def without_cut(problem: AlignProblem, pose: Tensor, frames: Sequence[DepthFrame
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What can be trusted of fitted poses.
+    """Covariance (B, D, D) in tangent coordinates, evidence, confidence (B,) and doubts of fitted poses.
 
-    Args:
-        covariance: (B, num_dofs, num_dofs) in tangent coordinates.
-        dof_confidence: (B, num_dofs) share of the variance without data that they removed.
-        converged: (B,) whether a further step would hardly matter.
-        evidence: for and against them.
-        confidence: (B,) that they are right.
-        doubt: what is doubtful, a sentence each, empty where nothing is.
+    `dof_confidence` (B, D) is the share of the variance without data that the data removed.
     """
 
     covariance: Tensor
@@ -172,15 +156,7 @@ def judge(
     error: SurfaceError | None = None,
     frames: Sequence[DepthFrame] = (),
 ) -> Judgement:
-    """Return what can be trusted of poses (B, num_dofs).
-
-    Args:
-        problem: the batch.
-        pose: fitted.
-        lead: see `gather_evidence`.
-        error: of fits of pose and shape together.
-        frames: whose points the data are.
-    """
+    """Return covariance, evidence, confidence and doubts of fitted poses (B, num_dofs), see `gather_evidence`."""
     lying = DataOnSurface.of(problem, pose)
     around, spreads = curvature(problem, pose, lying), end_spreads(problem, pose, lying)
     evidence, calibration = gather_evidence(problem, pose, lying.distance, lead, spreads), CALIBRATION
@@ -212,15 +188,9 @@ def judge(
 def gather_evidence(
     problem: AlignProblem, pose: Tensor, distance: Tensor, lead: Tensor | None, spreads: Tensor
 ) -> Evidence:
-    """Return the evidence for poses (B, num_dofs).
+    """Return the evidence for poses (B, num_dofs), with distances (B, M) of the data and `end_spreads` (B, L).
 
-    Args:
-        problem: the batch.
-        pose: fitted.
-        distance: (B, M) of the data from the surface.
-        lead: (B,) cost by which the second best pose of a search was worse, infinite where there was none; None for
-            starts that were given.
-        spreads: (B, L), see `end_spreads`.
+    ``lead`` (B,) is the cost by which the second-best pose of a search was worse; None for given starts.
     """
     clustered, on_surface = clusters_beside(problem, distance)
     return weigh(
@@ -244,17 +214,7 @@ def weigh(
     intruding: Tensor | float,
     lead: Tensor | None = None,
 ) -> Evidence:
-    """Return the evidence for poses, of which the costly part is known.
-
-    Args:
-        problem: the batch.
-        distance: (B, M) of the data from the surface.
-        beside: (B,) share of the data beside the surface, see `beside_share`.
-        clustered: (B,) data in clusters, as a share of those on the surface.
-        spread: (B,) mean of `end_spreads`, metres.
-        intruding: (B,) the `free_space_loss` of width `INLIER_SHARE`.
-        lead: see `gather_evidence`.
-    """
+    """Return the evidence for poses from precomputed distances (B, M), shares (B,) and spreads (B,)."""
     noise = surface_noise(distance, problem.valid, problem.size)
     least = SURFACE_FIT.min_noise(problem.size)
     count = problem.valid.sum(-1).clamp_min(1).to(distance)
@@ -281,13 +241,7 @@ def confidence_of(evidence: Tensor, calibration: Calibration = CALIBRATION) -> T
 
 
 def told_doubts(problem: AlignProblem, evidence: Evidence, loose: Tensor) -> tuple[str, ...]:
-    """Return what is doubtful about poses, a sentence each, empty where nothing is.
-
-    Args:
-        problem: the batch.
-        evidence: for its poses.
-        loose: (B, L) limbs whose ends the data hardly show.
-    """
+    """Return the doubts about poses, a sentence each, empty where there is none; loose (B, L) limbs are named."""
     limbs = [limb for limb, _ in limb_points(problem.skin)]
     sentences = []
     for row, loose_limbs in enumerate(loose.tolist()):

@@ -22,13 +22,7 @@ from torchreg.solvers.levenberg_marquardt import (
 
 @dataclass(frozen=True)
 class ShapeProblem(AlignProblem):
-    """Alignments whose degrees of freedom end with shape coefficients, which successive rows may share.
-
-    Args:
-        skin: model points, of a `ShapedTree`.
-        surface: the surface that the surface fit fits.
-        scans: rows, one after another, of one person.
-    """
+    """Alignments whose degrees of freedom end with shape coefficients, shared by successive rows, ``scans`` each."""
 
     skin: ShapedSkin  # type: ignore[assignment]
     surface: ShapedSurface

@@ -26,13 +26,7 @@ from torchreg.shapes.skin import LinearBlendSkin
 
 @dataclass(frozen=True)
 class StartSource:
-    """Where candidates come from.
-
-    Args:
-        sources: of rough poses, which are searched on from.
-        proposer: a network, whose poses need a fit alone, or None.
-        known: what is known beforehand, or None.
-    """
+    """Sources of rough poses to search from, a network whose poses need a fit alone, and known degrees of freedom."""
 
     sources: Sequence[PoseSource]
     proposer: PoseProposer | None = None
@@ -46,12 +40,7 @@ class StartSource:
         initializer: PoseProposer | HoldsProposer | None = None,
         upright: Direction | None = None,
     ) -> StartSource:
-        """Return what is given, or else the default for a shape: upright poses alone where it is known to stand.
-
-        Raises:
-            InputError: if the sources are an empty list, or the network is for another shape.
-            InputTypeError: if the network is none.
-        """
+        """Return the given sources, or else the default for a shape: upright poses alone where ``upright`` is given."""
         if sources is None and upright is not None:
             sources = (UprightRotations(upright),)
         if sources is not None and not sources:
@@ -70,10 +59,7 @@ class StartSource:
         return self._told(problem, torch.cat([source(problem, generator) for source in self.sources], dim=1))
 
     def proposed(self, problem: AlignProblem, count: int) -> tuple[AlignProblem, Tensor]:
-        """Return the problem with the network's pose as the prior, and its poses (B, count, num_dofs) after a fit.
-
-        Without a network there are none (B, 0, num_dofs), and the problem stays.
-        """
+        """Return the problem with the network's pose as the prior, and its fitted poses (B, count, num_dofs)."""
         if self.proposer is None:
             return problem, problem.prior.mean.new_zeros(len(problem.data), 0, problem.prior.mean.shape[-1])
         proposals = self.proposer.propose(problem.data, problem.valid)
